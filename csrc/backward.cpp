@@ -1,0 +1,93 @@
+// The backward pass: the two terms, and what they found turned into the gradients of the user's arrays.
+
+#include <algorithm>
+#include <vector>
+
+#include "boundary.h"
+#include "interior.h"
+#include "render.h"
+
+namespace edgegrad {
+
+namespace {
+
+constexpr int64_t block = 4096;  // fixed, so that sums are rounded alike at any number of threads
+
+// δI = (1 − coverage) δbackground, pixel by pixel: exact for the image that the forward pass made.
+template <class T>
+void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint, const T* coverage, int threads, double* grad) {
+    const int C = scene.channels;
+    if (scene.background_is_image) {
+#pragma omp parallel for num_threads(threads) schedule(static)
+        for (int64_t p = 0; p < pixels; ++p)
+            for (int c = 0; c < C; ++c) grad[p * C + c] += (1 - double(coverage[p])) * adjoint[p * C + c];
+        return;
+    }
+    const int64_t blocks = (pixels + block - 1) / block;
+    std::vector<double> sum(blocks * C, 0.0);
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (int64_t k = 0; k < blocks; ++k)
+        for (int64_t p = k * block; p < std::min(pixels, (k + 1) * block); ++p)
+            for (int c = 0; c < C; ++c) sum[k * C + c] += (1 - double(coverage[p])) * adjoint[p * C + c];
+    for (int64_t k = 0; k < blocks; ++k)
+        for (int c = 0; c < C; ++c) grad[c] += sum[k * C + c];
+}
+
+}  // namespace
+
+void add_world(const Camera& camera, const double* verts, const std::vector<double>& q_bar, int threads, const SceneGrad& grad) {
+    const int64_t V = q_bar.size() / 3, blocks = (V + block - 1) / block;
+    std::vector<double> sum(grad.world_to_camera ? 12 * blocks : 0, 0.0);
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (int64_t k = 0; k < blocks; ++k)
+        for (int64_t v = k * block; v < std::min(V, (k + 1) * block); ++v) {
+            const double *q = q_bar.data() + 3 * v, *p = verts + 3 * v;
+            if (grad.verts) {
+                const Vec3 p_bar = transposed_times(camera.R, {q[0], q[1], q[2]});
+                grad.verts[3 * v] += p_bar.x, grad.verts[3 * v + 1] += p_bar.y, grad.verts[3 * v + 2] += p_bar.z;
+            }
+            if (grad.world_to_camera)
+                for (int i = 0; i < 3; ++i) {
+                    for (int j = 0; j < 3; ++j) sum[12 * k + 4 * i + j] += q[i] * p[j];
+                    sum[12 * k + 4 * i + 3] += q[i];
+                }
+        }
+    if (grad.world_to_camera)
+        for (int64_t k = 0; k < blocks; ++k)
+            for (int i = 0; i < 12; ++i) grad.world_to_camera[i] += sum[12 * k + i];
+}
+
+template <class T>
+BackwardCounts render_backward(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry,
+                               const BackwardOptions& o, const T* adjoint, const T* coverage, const SceneGrad& grad) {
+    BackwardCounts counts;
+    if (grad.background) add_background(scene, int64_t(camera.width) * camera.height, adjoint, coverage, o.threads, grad.background);
+
+    const bool interior_geometry = grad.geometry() && o.interior_geometry, boundary = grad.geometry() && o.boundary;
+    if (!interior_geometry && !boundary && !grad.appearance()) return counts;
+
+    const ViewVolume volume(camera, o.filter.radius() - 0.5);
+    const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, o.threads);
+    const FilteredAdjoint<T> filtered(adjoint, scene, o.filter, camera.width, camera.height);
+    const Importance importance(adjoint, camera.width, camera.height, scene.channels, o.filter.radius() - 0.5);
+    const BackwardView<T> view{scene, camera, geometry, volume, vertices, filtered, importance, o, camera.R_inverse * -camera.t};
+
+    std::vector<double> q_bar(grad.geometry() ? 3 * scene.n_verts : 0, 0.0);
+    Destination to;
+    to.channels = scene.channels;
+    to.q = grad.geometry() ? q_bar.data() : nullptr;
+    to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels;
+    dispatch_channels(scene.channels, [&]<int N>() {
+        if (interior_geometry || grad.appearance()) counts.surface_samples = add_interior<N>(view, interior_geometry, to);
+        if (boundary) counts.edge_samples = add_boundary<N>(view, to);
+    });
+    if (grad.geometry()) add_world(camera, scene.verts, q_bar, o.threads, grad);
+    if (grad.K)
+        for (int i = 0; i < 6; ++i) grad.K[i] += to.k[i];
+    return counts;
+}
+
+template BackwardCounts render_backward(const SceneView<float>&, const Camera&, const Geometry&, const BackwardOptions&, const float*, const float*, const SceneGrad&);
+template BackwardCounts render_backward(const SceneView<double>&, const Camera&, const Geometry&, const BackwardOptions&, const double*, const double*, const SceneGrad&);
+
+}  // namespace edgegrad

@@ -1,0 +1,172 @@
+// Cameras: pixel → ray and point → pixel, in camera coordinates q = R p + t; each with its _vjp.
+//
+// A camera is the affine map K of normalised image coordinates n, which are (X/Z, Y/Z) in perspective and (X, Y) in an
+// orthographic view. World coordinates come in only at the ends: vertices are transformed once, and the cotangents of q
+// are turned into those of p, R and t once, when all samples are done.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "math.h"
+
+namespace edgegrad {
+
+struct Ray {
+    Vec3 origin, direction;
+};
+
+struct Camera {
+    Mat3 R;
+    Vec3 t;
+    double k[6];  // the upper two rows of K: x = k0 n.x + k1 n.y + k2, y = k3 n.x + k4 n.y + k5
+    bool perspective;
+    int width, height;
+    Mat3 R_inverse;
+    double k_det;
+
+    // world_to_camera (4, 4) and K (3, 3), row by row.
+    Camera(const double* world_to_camera, const double* K, bool perspective_, int width_, int height_)
+        : perspective(perspective_), width(width_), height(height_) {
+        for (int i = 0; i < 3; ++i)
+            R.row[i] = {world_to_camera[4 * i], world_to_camera[4 * i + 1], world_to_camera[4 * i + 2]};
+        t = {world_to_camera[3], world_to_camera[7], world_to_camera[11]};
+        for (int i = 0; i < 6; ++i) k[i] = K[i];
+        R_inverse = inverse(R);
+        k_det = k[0] * k[4] - k[1] * k[3];
+    }
+
+    Vec3 to_camera(Vec3 p) const { return R * p + t; }
+
+    // Direction in which a viewer looks at q: from the eye, or along the axis.
+    Vec3 view_direction(Vec3 q) const { return perspective ? q : Vec3{0, 0, 1}; }
+
+    // Denominator of the projection.
+    double depth_weight(Vec3 q) const { return perspective ? q.z : 1.0; }
+
+    // Orientation of (q0, q1, q2) in the image, x to the right and y down: > 0 where (x1 − x0) ∧ (x2 − x0) > 0.
+    // The triple product decides for triangles that reach behind the camera too, and it is one number for the three
+    // edges of a face, so that they never disagree.
+    int facing(Vec3 q0, Vec3 q1, Vec3 q2) const {
+        const double s = dot(view_direction(q0), cross(q1 - q0, q2 - q0)) * k_det;
+        return (s > 0) - (s < 0);
+    }
+};
+
+// Pixel position of q.
+inline Vec2 project(const Camera& c, Vec3 q) {
+    const double w = 1.0 / c.depth_weight(q);
+    const Vec2 n{q.x * w, q.y * w};
+    return {c.k[0] * n.x + c.k[1] * n.y + c.k[2], c.k[3] * n.x + c.k[4] * n.y + c.k[5]};
+}
+
+inline void project_vjp(const Camera& c, Vec3 q, Vec2 bar, Vec3& q_bar, double k_bar[6]) {
+    const double w = 1.0 / c.depth_weight(q);
+    const Vec2 n{q.x * w, q.y * w};
+    k_bar[0] += bar.x * n.x, k_bar[1] += bar.x * n.y, k_bar[2] += bar.x;
+    k_bar[3] += bar.y * n.x, k_bar[4] += bar.y * n.y, k_bar[5] += bar.y;
+    const Vec2 n_bar{c.k[0] * bar.x + c.k[3] * bar.y, c.k[1] * bar.x + c.k[4] * bar.y};
+    q_bar += Vec3{n_bar.x * w, n_bar.y * w, c.perspective ? -(n_bar.x * n.x + n_bar.y * n.y) * w : 0.0};
+}
+
+// The ray of everything seen at pixel position x. Perspective: from the eye, direction with Z = 1. Orthographic: along
+// +Z, the origin in the plane Z = 0.
+inline Ray pixel_ray(const Camera& c, Vec2 x) {
+    const double s = 1.0 / c.k_det, dx = x.x - c.k[2], dy = x.y - c.k[5];
+    const Vec2 n{s * (c.k[4] * dx - c.k[1] * dy), s * (c.k[0] * dy - c.k[3] * dx)};
+    return c.perspective ? Ray{{0, 0, 0}, {n.x, n.y, 1}} : Ray{{n.x, n.y, 0}, {0, 0, 1}};
+}
+
+// n = A⁻¹ (x − c), so δn = −A⁻¹ (δA n + δc) with A the 2 × 2 part of K and c its last column.
+inline void pixel_ray_vjp(const Camera& c, const Ray& ray, const Ray& bar, double k_bar[6]) {
+    const Vec3 n = c.perspective ? ray.direction : ray.origin, n_bar = c.perspective ? bar.direction : bar.origin;
+    const double s = 1.0 / c.k_det;
+    const Vec2 m{s * (c.k[4] * n_bar.x - c.k[3] * n_bar.y), s * (c.k[0] * n_bar.y - c.k[1] * n_bar.x)};  // A⁻ᵀ n̄
+    k_bar[0] -= m.x * n.x, k_bar[1] -= m.x * n.y, k_bar[2] -= m.x;
+    k_bar[3] -= m.y * n.x, k_bar[4] -= m.y * n.y, k_bar[5] -= m.y;
+}
+
+// The image rectangle widened by the radius of the pixel filter, as four planes n · q + d ≥ 0 through the camera and
+// the rectangle's sides. Whatever lies inside all four is in front of the camera (adding opposite planes gives
+// Z · width ≥ 0), so no near plane is needed.
+struct ViewVolume {
+    Vec3 normal[4];
+    double offset[4];
+
+    ViewVolume(const Camera& c, double margin) {
+        const double bound[4] = {-margin, c.width + margin, -margin, c.height + margin};
+        for (int i = 0; i < 4; ++i) {
+            const double* row = c.k + (i < 2 ? 0 : 3);
+            const double sign = i % 2 ? -1.0 : 1.0, constant = sign * (row[2] - bound[i]);
+            normal[i] = {sign * row[0], sign * row[1], c.perspective ? constant : 0.0};
+            offset[i] = c.perspective ? 0.0 : constant;
+        }
+    }
+
+    double distance(int plane, Vec3 q) const { return dot(normal[plane], q) + offset[plane]; }
+
+    // Bit i set: outside plane i.
+    uint8_t outcode(Vec3 q) const {
+        uint8_t code = 0;
+        for (int i = 0; i < 4; ++i) code |= (distance(i, q) < 0) << i;
+        return code;
+    }
+
+    // The part [t0, t1] of the segment (1 − t) a + t b that lies inside; false when there is none.
+    bool clip_segment(Vec3 a, Vec3 b, double& t0, double& t1) const {
+        t0 = 0, t1 = 1;
+        for (int i = 0; i < 4; ++i) {
+            const double da = distance(i, a), db = distance(i, b);
+            if (da < 0 && db < 0) return false;
+            if (da < 0) t0 = std::fmax(t0, da / (da - db));
+            if (db < 0) t1 = std::fmin(t1, da / (da - db));
+        }
+        return t0 < t1;
+    }
+
+    // Clips the convex polygon of n corners in place (Sutherland and Hodgman 1974); room for n + 4 corners is needed.
+    int clip_polygon(Vec3* polygon, int n) const {
+        for (int i = 0; i < 4 && n > 0; ++i) {
+            Vec3 out[8];
+            int m = 0;
+            for (int j = 0; j < n; ++j) {
+                const Vec3 p = polygon[j], r = polygon[(j + 1) % n];
+                const double dp = distance(i, p), dr = distance(i, r);
+                if (dp >= 0) out[m++] = p;
+                if ((dp >= 0) != (dr >= 0)) out[m++] = p + (dp / (dp - dr)) * (r - p);
+            }
+            n = m;
+            for (int j = 0; j < n; ++j) polygon[j] = out[j];
+        }
+        return n;
+    }
+};
+
+// Everything about the vertices that one camera needs: camera coordinates, pixel position, and on which side of the
+// view volume. The pixel position holds only where the outcode is zero.
+struct VertexView {
+    std::vector<Vec3> q;
+    std::vector<Vec2> x;
+    std::vector<uint8_t> outcode;
+};
+
+inline std::vector<Vec3> camera_vertices(const Camera& camera, const double* verts, int64_t n, int threads) {
+    std::vector<Vec3> q(n);
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (int64_t v = 0; v < n; ++v) q[v] = camera.to_camera({verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]});
+    return q;
+}
+
+inline VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n, int threads) {
+    VertexView view{camera_vertices(camera, verts, n, threads), std::vector<Vec2>(n), std::vector<uint8_t>(n)};
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (int64_t v = 0; v < n; ++v) {
+        const Vec3 q = view.q[v];
+        // At the eye itself every plane is met and the projection is undefined: call it outside all.
+        view.outcode[v] = camera.perspective && q.z <= 0 ? volume.outcode(q) | 16 : volume.outcode(q);
+        if (!view.outcode[v]) view.x[v] = project(camera, q);
+    }
+    return view;
+}
+
+}  // namespace edgegrad

@@ -1,0 +1,111 @@
+// Where the image jumps along an edge: silhouettes, open borders and creases, for any number of faces on the edge.
+//
+// On each side of the edge in the image, what is seen next to it is the incident face on that side that lies in front,
+// or, if there is none, what lies behind. If both sides carry the same radiance by construction, there is no curve.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "interior.h"
+#include "shading/shade.h"
+#include "topology.h"
+
+namespace edgegrad {
+
+struct Curve {
+    int64_t edge = -1;
+    HalfEdge minus, plus;  // the faces next to the curve; face −1: none, what lies behind is seen
+    Vec3 a, b;             // ends of the edge, camera coordinates
+    double t0 = 0, t1 = 0;  // its part within the view
+    double w0 = 1, w1 = 1;  // denominators of the projection at t0 and t1
+    Vec2 x0, x1;            // their pixel positions
+    double length = 0;      // px; zero: no curve
+
+    Vec2 tangent() const { return x1 - x0; }  // dx/ds, the same everywhere: a pinhole sees a straight line
+
+    // At the fraction s of the curve in the image: the pixel position, and t on the edge (1 − t) a + t b.
+    Vec2 position(double s) const { return x0 + s * (x1 - x0); }
+    double parameter(double s) const { return t0 + (t1 - t0) * (s * w0 / ((1 - s) * w1 + s * w0)); }
+};
+
+// Barycentrics, in a face, of the point t of an edge of that face. Exact: the face is known, nothing is intersected.
+inline Barycentrics at_edge(const HalfEdge& h, double t) {
+    double b[3] = {0, 0, 0};
+    b[h.first()] = 1 - t, b[h.second()] = t;
+    return {b[1], b[2]};
+}
+
+template <class T>
+int32_t vertex(const SceneView<T>& scene, const HalfEdge& h, int corner) {
+    return scene.faces[3 * int64_t(h.face) + corner];
+}
+
+// Whether, of two faces on the same side of the edge (a, b) in the image, the first lies in front. Then its plane
+// separates the other one from the viewer.
+template <class T>
+bool in_front(const BackwardView<T>& view, const HalfEdge& first, const HalfEdge& second, Vec3 a, Vec3 b) {
+    const auto opposite = [&](const HalfEdge& h) { return view.vertices.q[vertex(view.scene, h, (h.corner + 2) % 3)]; };
+    const Vec3 normal = cross(b - a, opposite(first) - a);
+    const double viewer = -dot(normal, view.camera.view_direction(a)), other = dot(normal, opposite(second) - a);
+    return other == 0 || (viewer > 0) != (other > 0);
+}
+
+// Whether two faces may differ in radiance along the edge they share: their values at its ends are compared.
+template <class T>
+bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
+    const bool textured = is_textured(scene, m.face);
+    if (textured != is_textured(scene, p.face)) return true;
+    if (textured && scene.face_texture[m.face] != scene.face_texture[p.face]) return true;
+    const auto row = [&](const HalfEdge& h, int corner) { return int64_t(scene.corners[3 * int64_t(h.face) + corner]); };
+    const int64_t ends[2][2] = {{row(m, m.first()), row(p, p.first())}, {row(m, m.second()), row(p, p.second())}};
+    for (const auto& [i, j] : ends) {
+        if (i == j) continue;
+        if (textured && !std::equal(scene.uvs + 2 * i, scene.uvs + 2 * i + 2, scene.uvs + 2 * j)) return true;
+        const int C = scene.channels;
+        if (!textured && !std::equal(scene.colors + C * i, scene.colors + C * (i + 1), scene.colors + C * j)) return true;
+    }
+    return false;
+}
+
+// The curve of an edge; its length is zero when there is none. `facing` gives the orientation of each face in the image.
+template <class T>
+Curve find_curve(const BackwardView<T>& view, const int8_t* facing, int64_t edge) {
+    Curve c;
+    const auto halves = view.geometry.topology().half_edges(edge);
+    const int32_t va = vertex(view.scene, halves[0], halves[0].first()), vb = vertex(view.scene, halves[0], halves[0].second());
+    const VertexView& p = view.vertices;
+    if (p.outcode[va] & p.outcode[vb]) return c;
+    c.a = p.q[va], c.b = p.q[vb];
+
+    HalfEdge side[2];  // minus, plus
+    side[0].face = side[1].face = -1;
+    for (const HalfEdge& h : halves) {
+        // A face that turns clockwise in the image (x right, y down) lies to the right of its sides, where the normal
+        // (τ_y, −τ_x) does not point. One seen exactly edge-on covers nothing.
+        const int turn = h.backwards ? -facing[h.face] : facing[h.face];
+        if (turn == 0) continue;
+        HalfEdge& seen = side[turn > 0 ? 0 : 1];
+        if (seen.face < 0 || !in_front(view, seen, h, c.a, c.b)) seen = h;
+    }
+    if (side[0].face < 0 && side[1].face < 0) return c;
+    if (side[0].face >= 0 && side[1].face >= 0 && !carries_jump(view.scene, side[0], side[1])) return c;
+
+    if (!(p.outcode[va] | p.outcode[vb])) {
+        c.t0 = 0, c.t1 = 1;
+        c.x0 = p.x[va], c.x1 = p.x[vb];
+        c.w0 = view.camera.depth_weight(c.a), c.w1 = view.camera.depth_weight(c.b);
+    } else {
+        if (!view.volume.clip_segment(c.a, c.b, c.t0, c.t1)) return c;
+        const Vec3 q0 = (1 - c.t0) * c.a + c.t0 * c.b, q1 = (1 - c.t1) * c.a + c.t1 * c.b;
+        c.w0 = view.camera.depth_weight(q0), c.w1 = view.camera.depth_weight(q1);
+        if (!(c.w0 > 0 && c.w1 > 0)) return c;  // ends in the eye itself
+        c.x0 = project(view.camera, q0), c.x1 = project(view.camera, q1);
+    }
+    c.edge = edge, c.minus = side[0], c.plus = side[1];
+    c.length = length(c.tangent());
+    return c;
+}
+
+}  // namespace edgegrad

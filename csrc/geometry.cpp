@@ -1,0 +1,68 @@
+#include "geometry.h"
+
+#include <algorithm>
+#include <cstring>
+#include <list>
+#include <mutex>
+
+namespace edgegrad {
+
+Geometry::Geometry(const int32_t* faces, int64_t n_faces, int64_t n_verts)
+    : faces_(faces, faces + 3 * n_faces), caster_(faces_.data(), n_faces, n_verts) {}
+
+namespace {
+
+std::mutex mutex;
+std::list<std::shared_ptr<Geometry>> kept;  // the most recently used first
+constexpr size_t most_kept = 8;
+
+template <class T>
+bool same(const std::vector<T>& kept_values, const T* values, int64_t n) {
+    return int64_t(kept_values.size()) == n && std::memcmp(kept_values.data(), values, n * sizeof(T)) == 0;
+}
+
+}  // namespace
+
+std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts, int64_t n_verts,
+                                                 double spacing, bool want_topology, int threads) {
+    const std::lock_guard lock(mutex);
+    auto found = kept.end();
+    bool moved = true;
+    for (auto it = kept.begin(); it != kept.end(); ++it) {
+        if (!same((*it)->faces_, faces, 3 * n_faces)) continue;
+        if (same((*it)->verts_, verts, 3 * n_verts)) {
+            found = it, moved = false;
+            break;
+        }
+        // In use only by this list: free to be moved.
+        if (found == kept.end() && it->use_count() == 1 && (*it)->verts_.size() == size_t(3 * n_verts)) found = it;
+    }
+    std::shared_ptr<Geometry> geometry;
+    if (found != kept.end()) {
+        geometry = *found;
+        kept.erase(found);
+    } else {
+        geometry = std::make_shared<Geometry>(faces, n_faces, n_verts);
+    }
+    if (moved) {
+        geometry->verts_.clear();  // should the update fail, these positions must not be taken for it
+        geometry->caster_.update(verts, threads);
+        geometry->verts_.assign(verts, verts + 3 * n_verts);
+        geometry->welded_ = false;
+    }
+    if (want_topology && !geometry->welded_) {
+        if (!geometry->topology_) geometry->topology_ = std::make_unique<Topology>(geometry->faces_.data(), n_faces, n_verts);
+        geometry->topology_->weld(verts, spacing);
+        geometry->welded_ = true;
+    }
+    kept.push_front(geometry);
+    while (kept.size() > most_kept) kept.pop_back();
+    return geometry;
+}
+
+void clear_geometry() {
+    const std::lock_guard lock(mutex);
+    kept.clear();
+}
+
+}  // namespace edgegrad

@@ -1,0 +1,42 @@
+// What depends on faces and positions alone, kept between calls: the ray structure and the edges.
+#pragma once
+
+#include <cstdint>
+#include <memory>
+#include <vector>
+
+#include "raycast.h"
+#include "topology.h"
+
+namespace edgegrad {
+
+class Geometry {
+   public:
+    Geometry(const int32_t* faces, int64_t n_faces, int64_t n_verts);
+
+    const RayCaster& caster() const { return caster_; }
+
+    // The edges at the current positions; made when first asked for. Not to be called by two threads at once for the
+    // same geometry: acquire_geometry does it.
+    const Topology& topology() const { return *topology_; }
+
+   private:
+    friend std::shared_ptr<const Geometry> acquire_geometry(const int32_t*, int64_t, const double*, int64_t, double, bool, int);
+
+    std::vector<int32_t> faces_;
+    std::vector<double> verts_;
+    RayCaster caster_;
+    std::unique_ptr<Topology> topology_;
+    bool welded_ = false;  // at the current positions
+};
+
+// The geometry of these faces at these positions, with its topology if wanted. One that is still in memory is used
+// again: as it is when the positions are the same, updated when they moved and nobody else uses it. What is compared is
+// the content of the arrays, so tensors may be copied, changed in place or freed without harm.
+std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts, int64_t n_verts,
+                                                 double spacing, bool want_topology, int threads);
+
+// Forgets all kept geometry that is not in use.
+void clear_geometry();
+
+}  // namespace edgegrad

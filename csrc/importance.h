@@ -1,0 +1,61 @@
+// How much the loss looks at a region of the image: the mean size of the adjoint over a rectangle, in constant time.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "math.h"
+
+namespace edgegrad {
+
+// A summed-area table (Crow 1984) over integers, so that differences are exact: a rectangle gives zero if and only if
+// every adjoint in it is zero, and then leaving it out is no bias. A pixel with an adjoint counts 1 + 8 |A| / mean, the
+// one being the defensive floor that bounds the weight of what is small but not zero.
+class Importance {
+   public:
+    template <class T>
+    Importance(const T* adjoint, int width, int height, int channels, double radius)
+        : width_(width), height_(height), radius_(radius), table_(size_t(width + 1) * (height + 1), 0) {
+        const int64_t n = int64_t(width) * height;
+        std::vector<double> size(n);
+        double sum = 0;
+        int64_t nonzero = 0;
+        for (int64_t p = 0; p < n; ++p) {
+            double a = 0;
+            for (int c = 0; c < channels; ++c) a += std::fabs(double(adjoint[p * channels + c]));
+            size[p] = a, sum += a, nonzero += a > 0;
+        }
+        const double scale = sum > 0 ? 8.0 * unit * nonzero / sum : 0;
+        for (int j = 0; j < height; ++j) {
+            int64_t row = 0;
+            for (int i = 0; i < width; ++i) {
+                // The cap keeps the sum of 2³¹ pixels within 63 bits; only an adjoint 2²⁰ times the mean meets it.
+                const double a = size[int64_t(j) * width + i];
+                if (a > 0) row += unit + int64_t(std::min(scale * a, 0x1p32));
+                table_[index(i + 1, j + 1)] = table_[index(i + 1, j)] + row;
+            }
+        }
+    }
+
+    // Mean over the pixels that a filter of this radius reaches from the box [low, high]; 0 if no adjoint is there.
+    double mean(Vec2 low, Vec2 high) const {
+        const int i0 = clamp(std::floor(low.x - radius_), width_), i1 = clamp(std::floor(high.x + radius_) + 1, width_);
+        const int j0 = clamp(std::floor(low.y - radius_), height_), j1 = clamp(std::floor(high.y + radius_) + 1, height_);
+        if (i0 >= i1 || j0 >= j1) return 0;
+        const int64_t sum = table_[index(i1, j1)] - table_[index(i0, j1)] - table_[index(i1, j0)] + table_[index(i0, j0)];
+        return double(sum) / (double(unit) * (i1 - i0) * double(j1 - j0));
+    }
+
+   private:
+    static constexpr int64_t unit = 1 << 8;
+    static int clamp(double x, int most) { return int(std::clamp(x, 0.0, double(most))); }
+    size_t index(int i, int j) const { return size_t(j) * (width_ + 1) + i; }
+
+    int width_, height_;
+    double radius_;
+    std::vector<int64_t> table_;
+};
+
+}  // namespace edgegrad

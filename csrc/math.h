@@ -1,0 +1,63 @@
+// Vectors and matrices in double precision; each operation with its reverse-mode derivative (_vjp) beneath.
+// A _vjp takes the inputs, the cotangent of the output, and adds to the cotangents of the inputs.
+#pragma once
+
+#include <cmath>
+
+namespace edgegrad {
+
+struct Vec2 {
+    double x = 0, y = 0;
+};
+
+inline Vec2 operator+(Vec2 a, Vec2 b) { return {a.x + b.x, a.y + b.y}; }
+inline Vec2 operator-(Vec2 a, Vec2 b) { return {a.x - b.x, a.y - b.y}; }
+inline Vec2 operator*(double s, Vec2 a) { return {s * a.x, s * a.y}; }
+inline double length(Vec2 a) { return std::hypot(a.x, a.y); }
+
+// a ∧ b, twice the signed area of the triangle (0, a, b).
+inline double wedge(Vec2 a, Vec2 b) { return a.x * b.y - a.y * b.x; }
+
+struct Vec3 {
+    double x = 0, y = 0, z = 0;
+};
+
+inline Vec3 operator+(Vec3 a, Vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+inline Vec3 operator-(Vec3 a, Vec3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+inline Vec3 operator-(Vec3 a) { return {-a.x, -a.y, -a.z}; }
+inline Vec3 operator*(double s, Vec3 a) { return {s * a.x, s * a.y, s * a.z}; }
+inline Vec3& operator+=(Vec3& a, Vec3 b) { return a = a + b; }
+inline Vec3& operator-=(Vec3& a, Vec3 b) { return a = a - b; }
+
+inline double dot(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+inline void dot_vjp(Vec3 a, Vec3 b, double bar, Vec3& a_bar, Vec3& b_bar) {
+    a_bar += bar * b;
+    b_bar += bar * a;
+}
+
+inline Vec3 cross(Vec3 a, Vec3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
+// bar · (δa × b + a × δb) = δa · (b × bar) + δb · (bar × a)
+inline void cross_vjp(Vec3 a, Vec3 b, Vec3 bar, Vec3& a_bar, Vec3& b_bar) {
+    a_bar += cross(b, bar);
+    b_bar += cross(bar, a);
+}
+
+inline double length(Vec3 a) { return std::sqrt(dot(a, a)); }
+
+struct Mat3 {
+    Vec3 row[3];
+};
+
+inline Vec3 operator*(const Mat3& m, Vec3 v) { return {dot(m.row[0], v), dot(m.row[1], v), dot(m.row[2], v)}; }
+
+// mᵀ v: what a cotangent of m p becomes at p.
+inline Vec3 transposed_times(const Mat3& m, Vec3 v) { return v.x * m.row[0] + v.y * m.row[1] + v.z * m.row[2]; }
+
+inline Mat3 inverse(const Mat3& m) {
+    const Vec3 a = m.row[0], b = m.row[1], c = m.row[2];
+    const Vec3 bc = cross(b, c), ca = cross(c, a), ab = cross(a, b);  // columns of the adjugate
+    const double s = 1.0 / dot(a, bc);
+    return {{{s * bc.x, s * ca.x, s * ab.x}, {s * bc.y, s * ca.y, s * ab.y}, {s * bc.z, s * ca.z, s * ab.z}}};
+}
+
+}  // namespace edgegrad

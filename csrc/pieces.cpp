@@ -1,0 +1,158 @@
+// The small functions with their _vjp, and the parts of topology and sampling, bound one by one so that the tests can
+// compare each with its definition.
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include <array>
+#include <tuple>
+#include <vector>
+
+#include "camera.h"
+#include "film.h"
+#include "importance.h"
+#include "sampler.h"
+#include "shading/texture.h"
+#include "surface.h"
+#include "systematic.h"
+#include "topology.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace edgegrad {
+
+namespace {
+
+using A2 = std::array<double, 2>;
+using A3 = std::array<double, 3>;
+using A6 = std::array<double, 6>;
+
+Vec2 vec(const A2& a) { return {a[0], a[1]}; }
+Vec3 vec(const A3& a) { return {a[0], a[1], a[2]}; }
+A2 array(Vec2 a) { return {a.x, a.y}; }
+A3 array(Vec3 a) { return {a.x, a.y, a.z}; }
+
+FilterKind kind(const std::string& name) {
+    return name == "box" ? FilterKind::box : name == "tent" ? FilterKind::tent : FilterKind::gaussian;
+}
+
+}  // namespace
+
+void bind_pieces(nb::module_& m) {
+    nb::module_ p = m.def_submodule("pieces", "Single functions of the kernel, for its tests.");
+
+    p.def("project", [](const Camera& c, A3 q) { return array(project(c, vec(q))); });
+    p.def("project_vjp", [](const Camera& c, A3 q, A2 bar) {
+        Vec3 q_bar;
+        A6 k_bar{};
+        project_vjp(c, vec(q), vec(bar), q_bar, k_bar.data());
+        return std::tuple(array(q_bar), k_bar);
+    });
+    p.def("pixel_ray", [](const Camera& c, A2 x) {
+        const Ray r = pixel_ray(c, vec(x));
+        return std::tuple(array(r.origin), array(r.direction));
+    });
+    p.def("pixel_ray_vjp", [](const Camera& c, A2 x, A3 origin_bar, A3 direction_bar) {
+        A6 k_bar{};
+        pixel_ray_vjp(c, pixel_ray(c, vec(x)), {vec(origin_bar), vec(direction_bar)}, k_bar.data());
+        return k_bar;
+    });
+    p.def("cross", [](A3 a, A3 b) { return array(cross(vec(a), vec(b))); });
+    p.def("cross_vjp", [](A3 a, A3 b, A3 bar) {
+        Vec3 a_bar, b_bar;
+        cross_vjp(vec(a), vec(b), vec(bar), a_bar, b_bar);
+        return std::tuple(array(a_bar), array(b_bar));
+    });
+    p.def("dot", [](A3 a, A3 b) { return dot(vec(a), vec(b)); });
+    p.def("dot_vjp", [](A3 a, A3 b, double bar) {
+        Vec3 a_bar, b_bar;
+        dot_vjp(vec(a), vec(b), bar, a_bar, b_bar);
+        return std::tuple(array(a_bar), array(b_bar));
+    });
+    p.def("intersect", [](A3 origin, A3 direction, std::array<A3, 3> q) {
+        const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])};
+        Barycentrics b;
+        const bool met = intersect({vec(origin), vec(direction)}, corner, b);
+        return std::tuple(met, A2{b.u, b.v});
+    });
+    p.def("intersect_vjp", [](A3 origin, A3 direction, std::array<A3, 3> q, A2 bar) {
+        const Ray ray{vec(origin), vec(direction)};
+        const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])};
+        Barycentrics b;
+        intersect(ray, corner, b);
+        Vec3 q_bar[3];
+        Ray ray_bar;
+        intersect_vjp(ray, corner, b, {bar[0], bar[1]}, q_bar, ray_bar);
+        return std::tuple(array(ray_bar.origin), array(ray_bar.direction), std::array<A3, 3>{array(q_bar[0]), array(q_bar[1]), array(q_bar[2])});
+    });
+    p.def("inside", [](double u, double v) {
+        const Barycentrics b = inside({u, v});
+        return A2{b.u, b.v};
+    });
+
+    using Texels = nb::ndarray<const double, nb::numpy, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+    p.def("texture_eval", [](Texels texels, A2 uv) {
+        const Texture<double> t{texels.data(), 0, int64_t(texels.shape(0)), int64_t(texels.shape(1))};
+        std::vector<double> out(texels.shape(2));
+        eval<0>(t, footprint(t, vec(uv)), int(texels.shape(2)), out.data());
+        return out;
+    });
+    p.def("texture_eval_vjp", [](Texels texels, A2 uv, std::vector<double> bar) {
+        const Texture<double> t{texels.data(), 0, int64_t(texels.shape(0)), int64_t(texels.shape(1))};
+        const Footprint f = footprint(t, vec(uv));
+        std::array<int64_t, 4> texel;
+        std::array<double, 4> weight;
+        for (int i = 0; i < 4; ++i) texel[i] = f.texel[i], weight[i] = f.weight(i);
+        return std::tuple(array(eval_vjp<0>(t, f, int(texels.shape(2)), bar.data())), texel, weight);
+    });
+
+    p.def("filter_radius", [](const std::string& name) { return Filter(kind(name)).radius(); });
+    p.def("filter_weight", [](const std::string& name, double d) { return Filter(kind(name)).weight(d); });
+    p.def("filter_sample", [](const std::string& name, double u) { return Filter(kind(name)).sample(u); });
+    p.def("lattice", [](uint64_t random, int n) {
+        const ShiftedLattice lattice(mix(random), n);
+        std::vector<A2> points;
+        for (int i = 0; i < n; ++i) points.push_back(array(lattice(i)));
+        return points;
+    });
+    p.def("sequence", [](uint64_t random, int n) {
+        const ShiftedSequence sequence(mix(random));
+        std::vector<A2> points;
+        for (int i = 0; i < n; ++i) points.push_back(array(sequence(i)));
+        return points;
+    });
+    p.def("systematic", [](std::vector<double> measure, int64_t n, double shift) {
+        Systematic systematic(measure, 1);
+        systematic.draw(n, shift);
+        std::vector<std::tuple<int64_t, double>> out;  // primitive, weight
+        for (int64_t i = 0; i < n; ++i) {
+            const int64_t k = systematic.primitive(systematic.position(i));
+            out.emplace_back(k, systematic.weight(k));
+        }
+        return out;
+    });
+    using Image = nb::ndarray<const double, nb::numpy, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+    p.def("importance", [](Image adjoint, double radius, A2 low, A2 high) {
+        const Importance importance(adjoint.data(), int(adjoint.shape(1)), int(adjoint.shape(0)), int(adjoint.shape(2)), radius);
+        return importance.mean(vec(low), vec(high));
+    });
+
+    using Verts = nb::ndarray<const double, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+    using Faces = nb::ndarray<const int32_t, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+    // The faces of each edge, as (face, corner, backwards).
+    p.def("edges", [](Verts verts, Faces faces, double spacing) {
+        Topology topology(faces.data(), faces.shape(0), verts.shape(0));
+        topology.weld(verts.data(), spacing);
+        std::vector<std::vector<std::tuple<int, int, bool>>> out(topology.n_edges());
+        for (int64_t e = 0; e < topology.n_edges(); ++e)
+            for (const HalfEdge& h : topology.half_edges(e)) out[e].emplace_back(h.face, h.corner, h.backwards);
+        return out;
+    });
+}
+
+}  // namespace edgegrad

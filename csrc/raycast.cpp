@@ -1,0 +1,196 @@
+#include "raycast.h"
+
+#ifdef _WIN32
+#include <windows.h>
+#else
+#include <dlfcn.h>
+#endif
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <mutex>
+#include <new>
+#include <stdexcept>
+
+#include "embree_api.h"
+
+namespace edgegrad {
+
+using namespace embree;
+
+namespace {
+
+struct Library {
+#define EDGEGRAD_DECLARE(name, result, parameters) result(*name) parameters = nullptr;
+    EDGEGRAD_EMBREE_FUNCTIONS(EDGEGRAD_DECLARE)
+#undef EDGEGRAD_DECLARE
+    Device device = nullptr;
+    int version = 0;
+} rtc;
+
+void* open_library(const std::string& path) {
+#ifdef _WIN32
+    return reinterpret_cast<void*>(LoadLibraryExA(path.c_str(), nullptr, LOAD_WITH_ALTERED_SEARCH_PATH));
+#else
+    return dlopen(path.c_str(), RTLD_NOW | RTLD_LOCAL);
+#endif
+}
+
+void* symbol(void* library, const char* name) {
+#ifdef _WIN32
+    return reinterpret_cast<void*>(GetProcAddress(static_cast<HMODULE>(library), name));
+#else
+    return dlsym(library, name);
+#endif
+}
+
+std::string open_error() {
+#ifdef _WIN32
+    return "error " + std::to_string(GetLastError());
+#else
+    const char* text = dlerror();
+    return text ? text : "unknown error";
+#endif
+}
+
+// Embree keeps one error a thread and device; asking clears it.
+void throw_on_error(const char* doing) {
+    const int error = rtc.rtcGetDeviceError(rtc.device);
+    if (error == ERROR_OUT_OF_MEMORY) throw std::bad_alloc();
+    if (error != ERROR_NONE) throw std::runtime_error(std::string("Embree failed while ") + doing + ", error " + std::to_string(error));
+}
+
+}  // namespace
+
+void open_embree(const std::string& path) {
+    static std::mutex mutex;
+    const std::lock_guard lock(mutex);
+    if (rtc.device) return;
+    void* library = open_library(path);
+    if (!library) throw std::runtime_error("cannot open " + path + ": " + open_error());
+    Library found;
+#define EDGEGRAD_LOAD(name, result, parameters)                                                 \
+    found.name = reinterpret_cast<result(*) parameters>(symbol(library, #name));                \
+    if (!found.name) throw std::runtime_error(path + " lacks " #name "; version 4.x is needed");
+    EDGEGRAD_EMBREE_FUNCTIONS(EDGEGRAD_LOAD)
+#undef EDGEGRAD_LOAD
+    found.device = found.rtcNewDevice(nullptr);
+    if (!found.device) throw std::runtime_error("Embree cannot make a device on this processor, error " + std::to_string(found.rtcGetDeviceError(nullptr)));
+    found.version = int(found.rtcGetDeviceProperty(found.device, DEVICE_PROPERTY_VERSION));
+    if (found.rtcGetDeviceProperty(found.device, DEVICE_PROPERTY_VERSION_MAJOR) != 4)
+        throw std::runtime_error("expected Embree 4.x, got version " + std::to_string(found.version) + " in " + path);
+    rtc = found;
+}
+
+int embree_version() { return rtc.version; }
+
+RayCaster::RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts)
+    : n_faces_(n_faces), n_verts_(n_verts), positions_(3 * size_t(n_verts) + 1, 0.f) {  // Embree reads 16 bytes a vertex
+    if (!rtc.device) throw std::runtime_error("Embree is not open");
+    Geometry geometry = rtc.rtcNewGeometry(rtc.device, GEOMETRY_TYPE_TRIANGLE);
+    rtc.rtcSetSharedGeometryBuffer(geometry, BUFFER_TYPE_INDEX, 0, FORMAT_UINT3, faces, 0, 12, n_faces);
+    rtc.rtcSetSharedGeometryBuffer(geometry, BUFFER_TYPE_VERTEX, 0, FORMAT_FLOAT3, positions_.data(), 0, 12, n_verts);
+    rtc.rtcSetGeometryEnableFilterFunctionFromArguments(geometry, true);
+    Scene scene = rtc.rtcNewScene(rtc.device);
+    geometry_ = geometry, scene_ = scene;
+    // Low quality and dynamic at every build: fast, and which of two faces at the same depth wins does then not depend
+    // on what was rendered before.
+    rtc.rtcSetGeometryBuildQuality(geometry, BUILD_QUALITY_LOW);
+    rtc.rtcSetSceneBuildQuality(scene, BUILD_QUALITY_LOW);
+    rtc.rtcSetSceneFlags(scene, SCENE_FLAG_DYNAMIC | SCENE_FLAG_ROBUST | SCENE_FLAG_FILTER_FUNCTION_IN_ARGUMENTS);
+    rtc.rtcAttachGeometry(scene, geometry);
+    throw_on_error("making a scene");
+}
+
+RayCaster::~RayCaster() {
+    rtc.rtcReleaseGeometry(static_cast<Geometry>(geometry_));
+    rtc.rtcReleaseScene(static_cast<Scene>(scene_));
+}
+
+void RayCaster::update(const double* verts, int threads) {
+    double low[3], high[3];
+    for (int a = 0; a < 3; ++a) {
+        double lo = verts[a], hi = verts[a];
+#pragma omp parallel for num_threads(threads) reduction(min : lo) reduction(max : hi) schedule(static)
+        for (int64_t v = 0; v < n_verts_; ++v) lo = std::min(lo, verts[3 * v + a]), hi = std::max(hi, verts[3 * v + a]);
+        low[a] = lo, high[a] = hi;
+    }
+    centre_ = {0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), 0.5 * (low[2] + high[2])};
+    radius_ = 0.5 * length(Vec3{high[0] - low[0], high[1] - low[1], high[2] - low[2]});
+    if (!(radius_ > 0)) radius_ = 1;  // a single point
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (int64_t v = 0; v < n_verts_; ++v) {
+        const Vec3 p = (1 / radius_) * (Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]} - centre_);
+        positions_[3 * v] = float(p.x), positions_[3 * v + 1] = float(p.y), positions_[3 * v + 2] = float(p.z);
+    }
+    if (committed_) rtc.rtcUpdateGeometryBuffer(static_cast<Geometry>(geometry_), BUFFER_TYPE_VERTEX, 0);
+    rtc.rtcCommitGeometry(static_cast<Geometry>(geometry_));
+    rtc.rtcCommitScene(static_cast<Scene>(scene_));
+    throw_on_error("building the ray structure");
+    committed_ = true;
+}
+
+void RayCaster::set(RayPacket& packet, int lane, Vec3 origin, Vec3 direction, bool from_infinity) const {
+    Vec3 o = (1 / radius_) * (origin - centre_);
+    // Everything lies in the unit ball. Seen from afar, float positions of the origin would be coarser than the scene,
+    // so the ray starts where it comes within reach, computed here in double.
+    const double along = -dot(o, direction) / dot(direction, direction), far = 4 / length(direction);
+    if (from_infinity || along > far) o += (along - 0.5 * far) * direction;
+    packet.origin_x[lane] = float(o.x), packet.origin_y[lane] = float(o.y), packet.origin_z[lane] = float(o.z);
+    packet.direction_x[lane] = float(direction.x), packet.direction_y[lane] = float(direction.y);
+    packet.direction_z[lane] = float(direction.z);
+}
+
+namespace {
+
+alignas(32) constexpr int valid_lanes[9][8] = {
+    {0, 0, 0, 0, 0, 0, 0, 0},        {-1, 0, 0, 0, 0, 0, 0, 0},      {-1, -1, 0, 0, 0, 0, 0, 0},
+    {-1, -1, -1, 0, 0, 0, 0, 0},     {-1, -1, -1, -1, 0, 0, 0, 0},   {-1, -1, -1, -1, -1, 0, 0, 0},
+    {-1, -1, -1, -1, -1, -1, 0, 0},  {-1, -1, -1, -1, -1, -1, -1, 0}, {-1, -1, -1, -1, -1, -1, -1, -1}};
+
+void intersect8(Scene scene, RayPacket& p, IntersectArguments& arguments) {
+    RayHit8 r;
+    for (int i = 0; i < 8; ++i) {
+        r.org_x[i] = p.origin_x[i], r.org_y[i] = p.origin_y[i], r.org_z[i] = p.origin_z[i];
+        r.dir_x[i] = p.direction_x[i], r.dir_y[i] = p.direction_y[i], r.dir_z[i] = p.direction_z[i];
+        r.tnear[i] = 0, r.tfar[i] = std::numeric_limits<float>::infinity(), r.time[i] = 0;
+        r.mask[i] = ~0u, r.id[i] = i, r.flags[i] = 0;
+        r.geomID[i] = INVALID_GEOMETRY_ID, r.primID[i] = INVALID_GEOMETRY_ID;
+        r.instID[i] = INVALID_GEOMETRY_ID, r.instPrimID[i] = INVALID_GEOMETRY_ID;
+    }
+    rtc.rtcIntersect8(valid_lanes[p.count], scene, &r, &arguments);
+    for (int i = 0; i < 8; ++i) p.face[i] = r.geomID[i] == INVALID_GEOMETRY_ID ? -1 : int32_t(r.primID[i]);
+}
+
+struct RejectContext {
+    RayQueryContext query;  // first, so that a pointer to it is a pointer to this
+    const std::span<const int32_t>* rejected;
+};
+
+void reject(const FilterArguments* a) {
+    const auto* context = reinterpret_cast<const RejectContext*>(a->context);
+    const auto* id = static_cast<const unsigned*>(a->ray) + 10 * a->N;
+    const auto* face = static_cast<const unsigned*>(a->hit) + 5 * a->N;
+    for (unsigned i = 0; i < a->N; ++i)
+        if (a->valid[i])
+            for (const int32_t f : context->rejected[id[i]])
+                if (f == int32_t(face[i])) a->valid[i] = 0;
+}
+
+}  // namespace
+
+void RayCaster::cast(RayPacket& packet) const {
+    RayQueryContext context{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}};
+    IntersectArguments arguments{RAY_QUERY_FLAG_COHERENT, FEATURE_FLAG_ALL, &context, nullptr, nullptr, 0};
+    intersect8(static_cast<Scene>(scene_), packet, arguments);
+}
+
+void RayCaster::cast(RayPacket& packet, const std::span<const int32_t>* rejected) const {
+    RejectContext context{{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}}, rejected};
+    IntersectArguments arguments{RAY_QUERY_FLAG_COHERENT | RAY_QUERY_FLAG_INVOKE_ARGUMENT_FILTER, FEATURE_FLAG_ALL,
+                                 &context.query, reject, nullptr, 0};
+    intersect8(static_cast<Scene>(scene_), packet, arguments);
+}
+
+}  // namespace edgegrad

@@ -1,0 +1,48 @@
+// Plain views of the arrays of a scene, as edgegrad/scene.py lays them out, and SceneGrad, their mirror.
+#pragma once
+
+#include <cstdint>
+
+#include "math.h"
+
+namespace edgegrad {
+
+// A corner of a face refers to a row of `colors`, or, where the face carries a texture, to a row of `uvs`.
+// Colours of vertices, faces and corners differ only in that index. T is float or double.
+template <class T>
+struct SceneView {
+    const double* verts;  // (V, 3) world units
+    int64_t n_verts;
+    const int32_t* faces;  // (F, 3) rows of verts
+    int64_t n_faces;
+    const int32_t* corners;  // (F, 3) rows of colors or of uvs
+    const T* colors;         // (A, C) linear radiance
+    int64_t n_colors;
+    const double* uvs;  // (T, 2), v running up
+    int64_t n_uvs;
+    const T* texels;  // (X, C) all textures, row by row
+    int64_t n_texels;
+    const int64_t* textures;      // (N, 3) first texel, height, width
+    const int32_t* face_texture;  // (F,) row of textures, −1 for none; null when the scene has no texture
+    const T* background;          // (C,) or (H, W, C)
+    bool background_is_image;
+    int channels;  // C
+
+    const T* background_at(int64_t pixel) const { return background_is_image ? background + pixel * channels : background; }
+};
+
+// Where gradients are added, in double whatever the arrays hold; null where none is wanted.
+struct SceneGrad {
+    double* verts = nullptr;
+    double* colors = nullptr;
+    double* uvs = nullptr;
+    double* texels = nullptr;
+    double* background = nullptr;
+    double* world_to_camera = nullptr;  // (4, 4)
+    double* K = nullptr;                // (3, 3)
+
+    bool geometry() const { return verts || world_to_camera || K; }
+    bool appearance() const { return colors || uvs || texels; }
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,92 @@
+// Radiance of a face at given barycentrics: interpolated colours, or a texture at interpolated coordinates.
+// A new light or material is one more file here and one more line in shade and shade_vjp.
+#pragma once
+
+#include "../scatter.h"
+#include "../scene.h"
+#include "../surface.h"
+#include "texture.h"
+
+namespace edgegrad {
+
+template <class T>
+bool is_textured(const SceneView<T>& scene, int64_t face) {
+    return scene.face_texture && scene.face_texture[face] >= 0;
+}
+
+template <class T>
+Texture<T> texture_of(const SceneView<T>& scene, int64_t face) {
+    const int64_t* row = scene.textures + 3 * int64_t(scene.face_texture[face]);
+    return {scene.texels, row[0], row[1], row[2]};
+}
+
+template <class T>
+Vec2 interpolated_uv(const SceneView<T>& scene, int64_t face, Barycentrics b) {
+    const int32_t* row = scene.corners + 3 * face;
+    const auto uv = [&](int i) { return Vec2{scene.uvs[2 * int64_t(row[i])], scene.uvs[2 * int64_t(row[i]) + 1]}; };
+    const Vec2 uv0 = uv(0);
+    return uv0 + b.u * (uv(1) - uv0) + b.v * (uv(2) - uv0);
+}
+
+// Radiance, C numbers. N is C at compile time, or 0.
+template <int N, class T>
+void shade(const SceneView<T>& scene, int64_t face, Barycentrics b, double* out) {
+    const int C = N ? N : scene.channels;
+    if (is_textured(scene, face)) {
+        const Texture<T> texture = texture_of(scene, face);
+        eval<N>(texture, footprint(texture, interpolated_uv(scene, face, b)), C, out);
+        return;
+    }
+    const int32_t* row = scene.corners + 3 * face;
+    const T *c0 = scene.colors + int64_t(row[0]) * C, *c1 = scene.colors + int64_t(row[1]) * C,
+            *c2 = scene.colors + int64_t(row[2]) * C;
+    // With differences, a face of one colour has exactly that colour, and its derivatives are exactly zero.
+    for (int c = 0; c < C; ++c) out[c] = c0[c] + b.u * (double(c1[c]) - c0[c]) + b.v * (double(c2[c]) - c0[c]);
+}
+
+// Cotangents of the three corners of one face (colours, or texture coordinates), summed over a run of samples.
+struct CornerGrad {
+    std::vector<double> value;  // (3, width)
+    void reset(int width) { value.assign(3 * size_t(width), 0.0); }
+};
+
+// Returns the cotangent of the barycentrics; adds those of the corners to `corners`, those of texels to `grad`.
+template <int N, class T>
+Barycentrics shade_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, const double* bar, bool want_texels,
+                       CornerGrad& corners, ChunkGrad& grad) {
+    const int C = N ? N : scene.channels;
+    const int32_t* row = scene.corners + 3 * face;
+    Barycentrics b_bar;
+    if (is_textured(scene, face)) {
+        const Texture<T> texture = texture_of(scene, face);
+        const Footprint f = footprint(texture, interpolated_uv(scene, face, b));
+        const Vec2 uv_bar = eval_vjp<N>(texture, f, C, bar);
+        if (want_texels) {
+            double stack[16];
+            std::vector<double> heap(C > 16 ? C : 0);
+            double* row_bar = C > 16 ? heap.data() : stack;
+            for (int i = 0; i < 4; ++i) {
+                for (int c = 0; c < C; ++c) row_bar[c] = f.weight(i) * bar[c];
+                grad.texels.add(f.texel[i], row_bar);
+            }
+        }
+        for (int i = 0; i < 3; ++i) corners.value[2 * i] += b[i] * uv_bar.x, corners.value[2 * i + 1] += b[i] * uv_bar.y;
+        const double* uv[3];
+        for (int i = 0; i < 3; ++i) uv[i] = scene.uvs + 2 * int64_t(row[i]);
+        b_bar.u = uv_bar.x * (uv[1][0] - uv[0][0]) + uv_bar.y * (uv[1][1] - uv[0][1]);
+        b_bar.v = uv_bar.x * (uv[2][0] - uv[0][0]) + uv_bar.y * (uv[2][1] - uv[0][1]);
+        return b_bar;
+    }
+    const T *c0 = scene.colors + int64_t(row[0]) * C, *c1 = scene.colors + int64_t(row[1]) * C,
+            *c2 = scene.colors + int64_t(row[2]) * C;
+    for (int c = 0; c < C; ++c) {
+        corners.value[c] += (1 - b.u - b.v) * bar[c];
+        corners.value[C + c] += b.u * bar[c];
+        corners.value[2 * C + c] += b.v * bar[c];
+        b_bar.u += bar[c] * (double(c1[c]) - c0[c]);
+        b_bar.v += bar[c] * (double(c2[c]) - c0[c]);
+    }
+    return b_bar;
+}
+
+}  // namespace edgegrad

@@ -1,0 +1,63 @@
+// Systematic sampling: n equally spaced points over a cumulative measure, all moved by one random shift. It serves
+// triangles and curves. Each point by itself is distributed as the measure, so sums weighted with M / (n m) are
+// unbiased; and because neighbours in the list get neighbouring points, the error falls faster than 1/√n.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <vector>
+
+namespace edgegrad {
+
+class Systematic {
+   public:
+    // `measure` holds one number ≥ 0 for each primitive and is turned into its running sum.
+    Systematic(std::vector<double>& measure, int threads) : end_(measure) {
+        // Blocks of fixed size, so that the sums are rounded alike at any number of threads.
+        const int64_t n = end_.size(), block = 4096, blocks = (n + block - 1) / block;
+        std::vector<double> before(blocks + 1, 0.0);
+#pragma omp parallel for num_threads(threads) schedule(static)
+        for (int64_t k = 0; k < blocks; ++k) {
+            double sum = 0;
+            for (int64_t i = k * block; i < std::min(n, (k + 1) * block); ++i) end_[i] = sum += end_[i];
+            before[k + 1] = sum;
+        }
+        for (int64_t k = 0; k < blocks; ++k) before[k + 1] += before[k];
+#pragma omp parallel for num_threads(threads) schedule(static)
+        for (int64_t k = 1; k < blocks; ++k)
+            for (int64_t i = k * block; i < std::min(n, (k + 1) * block); ++i) end_[i] += before[k];
+    }
+
+    double total() const { return end_.empty() ? 0 : end_.back(); }
+
+    void draw(int64_t n, double shift) { n_ = n, shift_ = shift; }
+
+    // Position of point i along the measure.
+    double position(int64_t i) const { return (double(i) + shift_) * (total() / double(n_)); }
+
+    // The primitive at a position; walks on from `hint` when the positions ascend.
+    int64_t primitive(double position) const {
+        const auto it = std::upper_bound(end_.begin(), end_.end(), position);
+        if (it != end_.end()) return it - end_.begin();
+        // Rounding put the last point on the end: it belongs to the last primitive that has a measure.
+        return std::lower_bound(end_.begin(), end_.end(), total()) - end_.begin();
+    }
+    int64_t primitive(double position, int64_t hint) const {
+        for (int64_t k = hint; k < hint + 8 && k < int64_t(end_.size()); ++k)
+            if (position < end_[k]) return k;
+        return primitive(position);
+    }
+
+    double begin_of(int64_t k) const { return k ? end_[k - 1] : 0; }
+    double measure_of(int64_t k) const { return end_[k] - begin_of(k); }
+
+    // M / (n m): the inverse of the density of points on primitive k, relative to its measure.
+    double weight(int64_t k) const { return total() / (double(n_) * measure_of(k)); }
+
+   private:
+    std::vector<double>& end_;
+    int64_t n_ = 1;
+    double shift_ = 0.5;
+};
+
+}  // namespace edgegrad

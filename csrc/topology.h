@@ -1,0 +1,52 @@
+// Edges on welded positions with all their faces.
+//
+// Whether two faces share an edge is a matter of position, not of index: a file that splits vertices at its seams, or a
+// soup of triangles, has borders by index where the surface has none. So vertices on borders by index are welded where
+// they coincide. Indices alone decide inside, so a closed mesh pays nothing for this.
+#pragma once
+
+#include <cstdint>
+#include <span>
+#include <vector>
+
+namespace edgegrad {
+
+// A face at an edge: the face, and which of its sides (corner i to corner i + 1) lies on the edge.
+struct HalfEdge {
+    int32_t face;
+    int8_t corner;   // of the face, where the side begins
+    bool backwards;  // against the direction of the edge, which is that of its first half-edge
+
+    int first() const { return backwards ? (corner + 1) % 3 : corner; }   // corner of the face at the edge's start
+    int second() const { return backwards ? corner : (corner + 1) % 3; }  // … and at its end
+};
+
+class Topology {
+   public:
+    Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts);
+
+    // Welds what coincides at these positions (V, 3). `spacing` is the relative spacing of the numbers the user gave.
+    void weld(const double* verts, double spacing);
+
+    int64_t n_edges() const { return int64_t(offset_.size()) - 1; }
+    std::span<const HalfEdge> half_edges(int64_t edge) const {
+        return {half_edge_.data() + offset_[edge], half_edge_.data() + offset_[edge + 1]};
+    }
+    // The faces of an edge, for a ray that must not see them.
+    std::span<const int32_t> faces(int64_t edge) const {
+        return {face_.data() + offset_[edge], face_.data() + offset_[edge + 1]};
+    }
+
+   private:
+    void build();
+
+    const int32_t* faces_;
+    int64_t n_faces_, n_verts_;
+    std::vector<int32_t> welded_;      // for each vertex the first one at its place; empty: every vertex is its own
+    std::vector<int32_t> candidates_;  // vertices on borders by index
+    std::vector<int64_t> offset_;
+    std::vector<HalfEdge> half_edge_;
+    std::vector<int32_t> face_;
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,108 @@
+"""Checks of user input. Every message names the argument, what was expected, what came, and how to fix it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+def as_tensor(name: str, value: object, *, like: Tensor | None = None) -> Tensor:
+    """`value` as a tensor: tensors pass unchanged, numbers, sequences and NumPy arrays are converted.
+
+    Raises TypeError when `value` is none of these.
+    """
+    if isinstance(value, Tensor):
+        return value
+    try:
+        tensor = torch.as_tensor(value, device=None if like is None else like.device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(
+            f"{name}: expected a tensor, array or nested sequence of numbers, got {type(value).__name__}; "
+            f"convert it with torch.as_tensor ({error})"
+        ) from None
+    if not tensor.is_floating_point() and like is not None and like.is_floating_point():
+        tensor = tensor.to(like.dtype)
+    return tensor
+
+
+def shape_text(shape: Sequence[int | str]) -> str:
+    return "(" + ", ".join(str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
+
+
+def check_shape(name: str, tensor: Tensor, *expected: Sequence[int | str], fix: str = "") -> None:
+    """`tensor.shape` must match one of `expected`; a string stands for any size ≥ 1, "V*" for any size ≥ 0.
+
+    Raises ValueError.
+    """
+
+    def matches(shape: Sequence[int | str]) -> bool:
+        return len(shape) == tensor.dim() and all(
+            (n >= (0 if want.endswith("*") else 1)) if isinstance(want, str) else n == want
+            for n, want in zip(tensor.shape, shape, strict=True)
+        )
+
+    if not any(matches(shape) for shape in expected):
+        want = " or ".join(shape_text([n.rstrip("*") if isinstance(n, str) else n for n in s]) for s in expected)
+        raise ValueError(f"{name}: expected shape {want}, got {shape_text(tensor.shape)}{fix and '; ' + fix}")
+
+
+def check_float(name: str, tensor: Tensor) -> None:
+    """float32 or float64. Raises TypeError."""
+    if tensor.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"{name}: expected float32 or float64, got {tensor.dtype}; convert it with .float()")
+
+
+def check_integer(name: str, tensor: Tensor) -> None:
+    """An integer dtype that holds indices. Raises TypeError."""
+    if tensor.dtype not in (torch.int32, torch.int64, torch.int16, torch.uint8):
+        raise TypeError(f"{name}: expected an integer dtype (int32 or int64), got {tensor.dtype}; use .long()")
+
+
+def values_visible() -> bool:
+    """Whether values may be looked at: not while torch.compile traces, where the kernel's own checks take over."""
+    return not torch.compiler.is_compiling()
+
+
+def check_finite(name: str, tensor: Tensor) -> None:
+    """No NaN, no infinity; names the first bad index. Raises ValueError."""
+    if not values_visible() or tensor.device.type == "meta":
+        return
+    # A sum is finite unless a term is not (or the sum overflows): one fast pass, then the exact answer.
+    if bool(torch.isfinite(tensor.detach().sum())):
+        return
+    bad = ~torch.isfinite(tensor.detach())
+    if bool(bad.any()):
+        index = tuple(bad.nonzero()[0].tolist())
+        value = tensor.detach()[index].item()
+        where = ", ".join(str(i) for i in index)
+        raise ValueError(
+            f"{name}: expected finite numbers, got {value} at [{where}] ({int(bad.sum())} such values in all); "
+            "look for a division by zero or a diverged optimisation step before this call"
+        )
+
+
+def check_indices(name: str, tensor: Tensor, count: int, of: str) -> None:
+    """All in [0, count). Raises ValueError."""
+    if not values_visible() or tensor.numel() == 0:
+        return
+    low, high = (int(v) for v in torch.aminmax(tensor))
+    if low < 0 or high >= count:
+        value = low if low < 0 else high
+        index = tuple((tensor == value).nonzero()[0].tolist())
+        where = ", ".join(str(i) for i in index)
+        raise ValueError(
+            f"{name}: expected indices from 0 to {count - 1} ({of} has {count} rows), got {value} at [{where}]; "
+            "indices count from zero"
+        )
+
+
+def check_positive_int(name: str, value: object, *, most: int = 2**31 - 1) -> int:
+    """An int ≥ 1. Raises TypeError or ValueError."""
+    if isinstance(value, bool) or not hasattr(value, "__index__"):
+        raise TypeError(f"{name}: expected an int, got {type(value).__name__} ({value!r})")
+    number = value.__index__()  # type: ignore[attr-defined]
+    if not 1 <= number <= most:
+        raise ValueError(f"{name}: expected an int from 1 to {most}, got {number}")
+    return number

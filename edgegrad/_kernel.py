@@ -1,0 +1,38 @@
+"""Opens Embree and imports the compiled kernel."""
+
+from __future__ import annotations
+
+import importlib.metadata
+
+import torch  # noqa: F401  first, so that the kernel shares torch's OpenMP runtime
+
+HOW_TO_GET_EMBREE = (
+    "edgegrad needs the Embree 4 library that comes with the embreex package; install it with "
+    "`pip install 'embreex>=4.4,<5'` (wheels exist for x86-64 Linux, Windows and macOS)"
+)
+
+
+def embree_path() -> str:
+    """Path of libembree4 among the files of the installed embreex distribution. Raises ImportError."""
+    try:
+        files = importlib.metadata.distribution("embreex").files or []
+    except importlib.metadata.PackageNotFoundError:
+        raise ImportError(f"{HOW_TO_GET_EMBREE}; embreex is not installed") from None
+    for file in files:
+        if "embree4" in file.name and (".so" in file.name or file.suffix in (".dll", ".dylib")):
+            return str(file.locate())
+    raise ImportError(f"{HOW_TO_GET_EMBREE}; the installed embreex {importlib.metadata.version('embreex')} carries no libembree4")
+
+
+def load():
+    """The kernel module, with Embree open. Raises ImportError that says how to get what is missing."""
+    from . import _core
+
+    try:
+        _core.open_embree(embree_path())
+    except RuntimeError as error:
+        raise ImportError(f"{HOW_TO_GET_EMBREE}; {error}") from None
+    return _core
+
+
+core = load()

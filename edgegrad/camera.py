@@ -1,0 +1,267 @@
+"""Cameras: where a point lands in the image.
+
+A point p in world units goes to camera coordinates `q = R p + t` (+X right, +Y down, +Z forward, as in OpenCV) and
+from there to the pixel position (x, y), x to the right and y down, the corner of the image at (0, 0), pixel centres at +0.5:
+
+    perspective   (x, y) = K[:2] (X/Z, Y/Z, 1)
+    orthographic  (x, y) = K[:2] (X, Y, 1)        everything on the line is seen, also behind the camera's position
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape, values_visible
+
+Vector = Tensor | Sequence[float]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One camera, or a batch of B that look at one scene.
+
+    world_to_camera  (4, 4) or (B, 4, 4) float   rigid: a rotation and a translation, last row (0, 0, 0, 1)
+    K                (3, 3) or (B, 3, 3) float   pixels (orthographic: pixels a world unit), last row (0, 0, 1); skew allowed
+    size             (H, W)                      image size in pixels
+    projection       "perspective" or "orthographic"
+
+    All tensors are differentiable. Raises TypeError for a wrong type, ValueError for a wrong shape or value.
+    """
+
+    world_to_camera: Tensor
+    K: Tensor
+    size: tuple[int, int]
+    projection: str = "perspective"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "world_to_camera", as_tensor("world_to_camera", self.world_to_camera))
+        object.__setattr__(self, "K", as_tensor("K", self.K, like=self.world_to_camera))
+        for name in ("world_to_camera", "K"):
+            check_float(name, getattr(self, name))
+        check_shape("world_to_camera", self.world_to_camera, (4, 4), ("B", 4, 4))
+        check_shape("K", self.K, (3, 3), ("B", 3, 3))
+        if self.K.dim() == self.world_to_camera.dim() == 3 and self.K.shape[0] != self.world_to_camera.shape[0]:
+            raise ValueError(
+                f"K: expected a batch of {self.world_to_camera.shape[0]} like world_to_camera, got {self.K.shape[0]}; "
+                "give one K (3, 3) for all or as many as cameras"
+            )
+        if isinstance(self.size, int) or len(self.size) != 2:
+            raise TypeError(f"size: expected (height, width), got {self.size!r}")
+        object.__setattr__(self, "size", tuple(check_positive_int("size", n, most=65536) for n in self.size))
+        if self.projection not in ("perspective", "orthographic"):
+            raise ValueError(f'projection: expected "perspective" or "orthographic", got {self.projection!r}')
+        if values_visible():
+            self._check_values()
+
+    def _check_values(self) -> None:
+        check_finite("world_to_camera", self.world_to_camera)
+        check_finite("K", self.K)
+        M, K = self.world_to_camera.detach().double(), self.K.detach().double()
+        for name, matrix, last in (("world_to_camera", M, [0.0, 0.0, 0.0, 1.0]), ("K", K, [0.0, 0.0, 1.0])):
+            if not torch.equal(matrix[..., -1, :], matrix.new_tensor(last).expand_as(matrix[..., -1, :])):
+                got = matrix[..., -1, :].reshape(-1, len(last))[0].tolist()
+                raise ValueError(f"{name}: expected the last row {last}, got {got}; is it transposed?")
+        R = M[..., :3, :3]
+        # 1e-3: far above what float32 rounding leaves of a product of rotations (1e-6), far below a scale in the matrix.
+        error = (R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().max().item()
+        if error > 1e-3:
+            raise ValueError(
+                f"world_to_camera: expected a rotation in the upper 3 × 3, got one with |R Rᵀ − 1| up to {error:.3g}; "
+                "keep it orthogonal (for example optimise a rotation vector and use torch.linalg.matrix_exp)"
+            )
+        if bool((torch.linalg.det(R) < 0).any()):
+            raise ValueError("world_to_camera: expected a rotation, got a reflection (determinant −1); flip one axis")
+        if bool((torch.linalg.det(K[..., :2, :2]).abs() == 0).any()):
+            raise ValueError("K: expected focal lengths that are not zero, got a singular matrix")
+
+    # -- how to make one ------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def look_at(
+        eye: Vector, target: Vector, up: Vector = (0.0, 1.0, 0.0), fov_y: float | Tensor = 40.0,
+        size: tuple[int, int] = (256, 256),
+    ) -> Camera:
+        """Perspective camera at `eye` (3,) looking at `target` (3,), with `up` (3,) upwards in the image.
+
+        fov_y: full vertical field of view in degrees, in (0, 180); square pixels, principal point in the middle.
+        """
+        world_to_camera = _look_at(eye, target, up)
+        fov_y = as_tensor("fov_y", fov_y, like=world_to_camera)
+        if values_visible() and not 0.0 < float(fov_y.detach()) < 180.0:
+            raise ValueError(f"fov_y: expected degrees between 0 and 180, got {float(fov_y):g}")
+        H, W = _size(size)
+        focal = 0.5 * H / torch.tan(torch.deg2rad(fov_y.to(world_to_camera)) * 0.5)
+        return Camera(world_to_camera, _intrinsics(focal, focal, 0.5 * W, 0.5 * H), (H, W))
+
+    @staticmethod
+    def orthographic(
+        eye: Vector, target: Vector, up: Vector = (0.0, 1.0, 0.0), height: float | Tensor = 2.0,
+        size: tuple[int, int] = (256, 256),
+    ) -> Camera:
+        """Orthographic camera that looks from `eye` towards `target` and shows `height` world units from top to bottom."""
+        world_to_camera = _look_at(eye, target, up)
+        height = as_tensor("height", height, like=world_to_camera)
+        if values_visible() and not float(height.detach()) > 0.0:
+            raise ValueError(f"height: expected world units above 0, got {float(height):g}")
+        H, W = _size(size)
+        scale = H / height.to(world_to_camera)
+        return Camera(world_to_camera, _intrinsics(scale, scale, 0.5 * W, 0.5 * H), (H, W), "orthographic")
+
+    @staticmethod
+    def from_opencv(R: Vector, t: Vector, K: Vector, size: tuple[int, int]) -> Camera:
+        """From OpenCV's extrinsics: R (3, 3) and t (3,) with `q = R p + t`, and K (3, 3) in pixels.
+
+        OpenCV puts the centre of the first pixel at 0, edgegrad at 0.5: K's principal point is shifted by half a pixel.
+        """
+        R = as_tensor("R", R)
+        t = as_tensor("t", t, like=R)
+        K = as_tensor("K", K, like=R)
+        check_shape("R", R, (3, 3))
+        check_shape("K", K, (3, 3))
+        if t.numel() != 3:
+            raise ValueError(f"t: expected 3 numbers, got shape {tuple(t.shape)}")
+        half = torch.zeros_like(K)
+        half[:2, 2] = 0.5
+        return Camera(_rigid(R, t.reshape(3)), K + half, size)
+
+    @staticmethod
+    def from_opengl(
+        camera_to_world: Vector, size: tuple[int, int], fov_y: float | Tensor | None = None, K: Vector | None = None
+    ) -> Camera:
+        """From an OpenGL or Blender pose: camera_to_world (4, 4), +X right, +Y up, looking along −Z.
+
+        Give fov_y (degrees, square pixels, centred) or K (3, 3) in pixels with pixel centres at +0.5.
+        """
+        pose = as_tensor("camera_to_world", camera_to_world)
+        check_float("camera_to_world", pose)
+        check_shape("camera_to_world", pose, (4, 4))
+        if (fov_y is None) == (K is None):
+            raise TypeError("from_opengl: expected one of fov_y and K, got " + ("both" if K is not None else "none"))
+        flip = torch.tensor([1.0, -1.0, -1.0], dtype=pose.dtype, device=pose.device)
+        R = (pose[:3, :3] * flip).mT
+        t = -(R * pose[:3, 3]).sum(-1)
+        if K is None:
+            H, W = _size(size)
+            half = torch.deg2rad(as_tensor("fov_y", fov_y, like=pose).to(pose)) * 0.5
+            focal = 0.5 * H / torch.tan(half)
+            K = _intrinsics(focal, focal, 0.5 * W, 0.5 * H)
+        return Camera(_rigid(R, t), as_tensor("K", K, like=pose), size)
+
+    @staticmethod
+    def stack(cameras: Sequence[Camera]) -> Camera:
+        """One batch from cameras of the same size and projection."""
+        if not cameras:
+            raise ValueError("cameras: expected at least one camera, got none")
+        first = cameras[0]
+        for i, camera in enumerate(cameras):
+            if camera.size != first.size or camera.projection != first.projection or camera.batch is not None:
+                raise ValueError(
+                    f"cameras[{i}]: expected a single {first.projection} camera of size {first.size}, got {camera!r}"
+                )
+        return Camera(
+            torch.stack([c.world_to_camera for c in cameras]), torch.stack([c.K for c in cameras]),
+            first.size, first.projection,
+        )
+
+    # -- what one can do with it ----------------------------------------------------------------------------------
+
+    @property
+    def batch(self) -> int | None:
+        """B, or None for a single camera."""
+        if self.world_to_camera.dim() == 3:
+            return self.world_to_camera.shape[0]
+        return self.K.shape[0] if self.K.dim() == 3 else None
+
+    def crop(self, top: int, left: int, height: int, width: int) -> Camera:
+        """The camera of a part of the image, in pixels; it may reach beyond the image."""
+        shift = torch.zeros_like(self.K)
+        shift[..., 0, 2] = left
+        shift[..., 1, 2] = top
+        return self.replace(K=self.K - shift, size=(height, width))
+
+    def resized(self, size: tuple[int, int]) -> Camera:
+        """The same view with another number of pixels (H, W)."""
+        H, W = _size(size)
+        factor = self.K.new_tensor([[W / self.size[1]], [H / self.size[0]], [1.0]])
+        return self.replace(K=self.K * factor, size=(H, W))
+
+    def replace(self, **fields: object) -> Camera:
+        """This camera with some fields replaced."""
+        return dataclasses.replace(self, **fields)  # type: ignore[arg-type]
+
+    def project(self, points: Tensor) -> Tensor:
+        """Pixel positions (…, 2) of world points (…, 3), differentiable; a single camera only."""
+        M, K = self.world_to_camera, self.K
+        q = (M[:3, :3] * points[..., None, :]).sum(-1) + M[:3, 3]
+        uv = q[..., :2] / q[..., 2:] if self.projection == "perspective" else q[..., :2]
+        return (K[:2, :2] * uv[..., None, :]).sum(-1) + K[:2, 2]
+
+    def to(self, *args: object, **kwargs: object) -> Camera:
+        """Tensors moved to a device or dtype, as `torch.Tensor.to`."""
+        return self.replace(
+            world_to_camera=self.world_to_camera.to(*args, **kwargs),  # type: ignore[call-overload]
+            K=self.K.to(*args, **kwargs),  # type: ignore[call-overload]
+        )
+
+    def __repr__(self) -> str:
+        many = "" if self.batch is None else f"{self.batch} × "
+        return f"Camera({many}{self.projection}, {self.size[0]} × {self.size[1]} pixels, {self.world_to_camera.dtype})"
+
+
+def _size(size: tuple[int, int]) -> tuple[int, int]:
+    if isinstance(size, int) or len(size) != 2:
+        raise TypeError(f"size: expected (height, width), got {size!r}")
+    return check_positive_int("size", size[0], most=65536), check_positive_int("size", size[1], most=65536)
+
+
+def _vector(name: str, value: Vector, like: Tensor | None = None) -> Tensor:
+    tensor = as_tensor(name, value, like=like)
+    if not tensor.is_floating_point():
+        tensor = tensor.to(torch.get_default_dtype())
+    check_shape(name, tensor, (3,))
+    return tensor
+
+
+def _rigid(R: Tensor, t: Tensor) -> Tensor:
+    last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=R.dtype, device=R.device)
+    return torch.cat([torch.cat([R, t.to(R)[:, None]], 1), last])
+
+
+def _look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
+    tensors = [v for v in (eye, target, up) if isinstance(v, Tensor) and v.is_floating_point()]
+    like = max(tensors, key=lambda v: v.element_size()) if tensors else None
+    e, g, u = _vector("eye", eye, like), _vector("target", target, like), _vector("up", up, like)
+    if like is not None:
+        e, g, u = e.to(like), g.to(like), u.to(like)
+    forward = g - e
+    right = torch.linalg.cross(forward, u)
+    if values_visible():
+        check_finite("eye", e), check_finite("target", g), check_finite("up", u)
+        length, height = (float(v.detach().norm()) for v in (forward, u))
+        if length == 0.0:
+            raise ValueError(f"target: expected a point apart from eye, got both at {e.tolist()}")
+        # 1e-6 of the sine of the angle: below it float32 rounding alone decides where right is.
+        if float(right.detach().norm()) <= 1e-6 * length * height:
+            raise ValueError(f"up: expected a direction apart from the line of sight, got {u.tolist()}; try another axis")
+    forward = forward / forward.norm()
+    right = right / right.norm()
+    R = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    return _rigid(R, -(R * e).sum(-1))
+
+
+def _intrinsics(fx: Tensor, fy: Tensor, cx: float, cy: float) -> Tensor:
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    return torch.stack([
+        torch.stack([fx, zero, cx * one]), torch.stack([zero, fy, cy * one]), torch.stack([zero, zero, one])
+    ])
+
+
+def fov_to_focal(fov_y: float, height: int) -> float:
+    """Focal length in pixels from the full vertical field of view in degrees."""
+    return 0.5 * height / math.tan(math.radians(fov_y) * 0.5)

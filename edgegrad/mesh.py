@@ -1,0 +1,149 @@
+"""Triangle meshes: vertices, faces, and what they look like."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ._check import as_tensor, check_finite, check_float, check_indices, check_integer, check_shape
+
+PLAIN = 0.7  # radiance of a mesh without colours, in every channel
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh whose tensors may all require gradients.
+
+    verts          (V, 3) float   positions, in the user's world units and axes
+    faces          (F, 3) int     vertex indices, from zero; both sides of a face are seen
+    At most one of the following gives the radiance (linear, any number of channels C); without any, the mesh is plain grey.
+    colors         (V, C) float   one a vertex, interpolated over the faces
+    face_colors    (F, C) float   one a face, constant over it
+    corner_colors  (F, 3, C) float  one a corner of a face; jumps across edges where they differ
+    texture        (h, w, C) float  image on the faces: row 0 on top, texel centres at +0.5, bilinear, repeated; needs
+    uvs            (T, 2) float   texture coordinates, v running up (as in OBJ), and
+    uv_faces       (F, 3) int     indices into uvs, apart from `faces`, so that vertices stay welded at seams
+
+    Faces of zero area render nothing. Raises TypeError for a wrong type, ValueError for a wrong shape, index or a value that is not finite.
+    """
+
+    verts: Tensor
+    faces: Tensor
+    colors: Tensor | None = None
+    face_colors: Tensor | None = None
+    corner_colors: Tensor | None = None
+    texture: Tensor | None = None
+    uvs: Tensor | None = None
+    uv_faces: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if value is not None and not isinstance(value, Tensor):
+                like = self.verts if field.name not in ("verts", "faces", "uv_faces") else None
+                object.__setattr__(self, field.name, as_tensor(field.name, value, like=like))
+        check_float("verts", self.verts)
+        check_shape("verts", self.verts, ("V", 3))
+        check_integer("faces", self.faces)
+        check_shape("faces", self.faces, ("F", 3), fix="triangulate polygons first")
+        V, F = self.verts.shape[0], self.faces.shape[0]
+
+        kinds = [k for k in ("colors", "face_colors", "corner_colors", "texture") if getattr(self, k) is not None]
+        if len(kinds) > 1:
+            raise ValueError(f"{kinds[1]}: expected one kind of colour, got {' and '.join(kinds)}; keep one of them")
+        shapes = {"colors": (V, "C"), "face_colors": (F, "C"), "corner_colors": (F, 3, "C"), "texture": ("h", "w", "C")}
+        for kind in kinds:
+            check_float(kind, getattr(self, kind))
+            check_shape(kind, getattr(self, kind), shapes[kind])
+        if self.texture is not None:
+            if self.uvs is None or self.uv_faces is None:
+                missing = "uvs" if self.uvs is None else "uv_faces"
+                raise ValueError(f"{missing}: expected with a texture, got None; pass uvs (T, 2) and uv_faces (F, 3)")
+            check_float("uvs", self.uvs)
+            check_shape("uvs", self.uvs, ("T", 2))
+            check_integer("uv_faces", self.uv_faces)
+            check_shape("uv_faces", self.uv_faces, (F, 3))
+        elif self.uvs is not None or self.uv_faces is not None:
+            extra = "uvs" if self.uvs is not None else "uv_faces"
+            raise ValueError(f"{extra}: expected None without a texture, got a tensor; pass texture=… or leave it out")
+
+        check_finite("verts", self.verts)
+        check_indices("faces", self.faces, V, "verts")
+        for kind in kinds:
+            check_finite(kind, getattr(self, kind))
+        if self.uvs is not None and self.uv_faces is not None:
+            check_finite("uvs", self.uvs)
+            check_indices("uv_faces", self.uv_faces, self.uvs.shape[0], "uvs")
+
+    @property
+    def channels(self) -> int | None:
+        """C, or None for a plain mesh, which takes the channels of its scene."""
+        for value in (self.colors, self.face_colors, self.corner_colors, self.texture):
+            if value is not None:
+                return value.shape[-1]
+        return None
+
+    def replace(self, **fields: Tensor | None) -> Mesh:
+        """This mesh with some tensors replaced: `mesh.replace(verts=v)` keeps faces and colours.
+
+        Giving another kind of colour removes the one there was.
+        """
+        known = {field.name for field in dataclasses.fields(self)}
+        for name in fields:
+            if name not in known:
+                raise TypeError(f"replace: expected one of {', '.join(sorted(known))}, got {name!r}")
+        appearance = {"colors", "face_colors", "corner_colors", "texture"}
+        if any(name in appearance and fields[name] is not None for name in fields):
+            gone = appearance | (set() if fields.get("texture") is not None else {"uvs", "uv_faces"})
+            fields = {**dict.fromkeys(gone - set(fields)), **fields}
+        return dataclasses.replace(self, **fields)  # type: ignore[arg-type]
+
+    def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Mesh:
+        """The mesh with vertices `scale · R v + t`, differentiable in all four.
+
+        R (3, 3) any matrix, identity when None; t (3,) world units, zero when None; scale a number or 0-d tensor.
+        """
+        v = self.verts
+        scale = as_tensor("scale", scale, like=v)
+        if scale.numel() != 1:
+            raise ValueError(f"scale: expected one number, got shape {tuple(scale.shape)}; scale the verts yourself")
+        if R is not None:
+            R = as_tensor("R", R, like=v)
+            check_float("R", R)
+            check_shape("R", R, (3, 3))
+            # Column by column rather than by a matrix product: each row is then rounded alike, so that copies of
+            # one vertex stay equal and its edges stay welded.
+            v = v[:, 0:1] * R[:, 0] + v[:, 1:2] * R[:, 1] + v[:, 2:3] * R[:, 2]
+        v = v * scale.reshape(())
+        if t is not None:
+            t = as_tensor("t", t, like=v)
+            check_float("t", t)
+            check_shape("t", t, (3,))
+            v = v + t
+        return self.replace(verts=v)
+
+    def to(self, *args: object, **kwargs: object) -> Mesh:
+        """All tensors moved to a device; floating-point tensors also to a dtype, as `torch.Tensor.to`."""
+        moved = {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if value is None:
+                continue
+            if value.is_floating_point():
+                moved[field.name] = value.to(*args, **kwargs)
+            else:
+                moved[field.name] = value.to(torch.empty(0).to(*args, **kwargs).device)
+        return dataclasses.replace(self, **moved)
+
+    def detach(self) -> Mesh:
+        """The same mesh, cut from the autograd graph."""
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return Mesh(**{k: v if v is None else v.detach() for k, v in values.items()})
+
+    def __repr__(self) -> str:
+        kinds = [k for k in ("colors", "face_colors", "corner_colors", "texture") if getattr(self, k) is not None]
+        look = f"{kinds[0]} {tuple(getattr(self, kinds[0]).shape)}" if kinds else "plain"
+        return f"Mesh({self.verts.shape[0]} vertices, {self.faces.shape[0]} faces, {look}, {self.verts.dtype})"

@@ -1,0 +1,214 @@
+"""render(): the image of a scene, differentiable. An autograd.Function over two operators of the kernel.
+
+The image is an estimate from samples, and so is the gradient, with samples of its own: both are unbiased, the gradient for
+the derivative of the expected image.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ._check import check_positive_int, check_shape
+from ._kernel import core
+from .camera import Camera
+from .mesh import Mesh
+from .scene import Flat, Scene, flatten
+
+FILTERS = ("box", "tent", "gaussian")
+
+
+def render(
+    scene: Scene | Mesh,
+    camera: Camera,
+    spp: int = 16,
+    seed: int = 0,
+    *,
+    surface_samples: int | None = None,
+    edge_samples: int | None = None,
+    visibility: bool = True,
+    filter: str = "box",
+    grad_seed: int | None = None,
+) -> Tensor:
+    """The image (H, W, C) of a scene, or (B, H, W, C) for a batch of cameras: linear radiance, row 0 on top.
+
+    spp              samples a pixel of the image
+    seed             the same seed gives the same bits, image and gradient, at any number of threads; cameras of a batch
+                     get samples of their own
+    surface_samples  samples of the gradient inside faces, for each camera: an int in all, or None for one per unit of surface
+                     measure, (area + longest side · 1 px) summed over the triangles in view
+    edge_samples     samples of the gradient at edges, for each camera: an int in all, or None for 16 a pixel of curve
+    visibility       False leaves out what moves at silhouettes and other jumps; the gradient is then that of the shading alone
+    filter           "box" (1 px wide), "tent" (2 px) or "gaussian" (σ ½ px, 3 px)
+    grad_seed        seed of the gradient's samples; derived from `seed` when None
+
+    Differentiable in every floating-point tensor of the scene and the camera. The image has the dtype of the colours and
+    comes back on the scene's device. Raises TypeError or ValueError that names the argument.
+    """
+    if isinstance(scene, Mesh):
+        scene = Scene([scene])
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: expected a Scene or a Mesh, got {type(scene).__name__}")
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
+    spp = check_positive_int("spp", spp, most=1 << 20)
+    seed = _check_seed("seed", seed)
+    grad_seed = _derived_seed(seed) if grad_seed is None else _check_seed("grad_seed", grad_seed)
+    counts = [
+        -1 if n is None else check_positive_int(name, n, most=1 << 40)
+        for name, n in (("surface_samples", surface_samples), ("edge_samples", edge_samples))
+    ]
+    if filter not in FILTERS:
+        raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {filter!r}")
+    if scene.background is not None and scene.background.dim() == 3:
+        check_shape("background", scene.background, (*camera.size, "C"), fix="give it the camera's size")
+
+    flat = flatten(scene)
+    world_to_camera = camera.world_to_camera.cpu().double().reshape(-1, 4, 4)
+    K = camera.K.cpu().double().reshape(-1, 3, 3)
+    B = max(world_to_camera.shape[0], K.shape[0])
+    # Whether the radiance varies over a face; if not, moving it changes nothing inside.
+    varies = any(m.colors is not None or m.corner_colors is not None or m.texture is not None for m in scene.meshes)
+    # The spacing of the coarsest numbers among the vertices, to which copies of a point may differ.
+    spacing = max(torch.finfo(mesh.verts.dtype).eps for mesh in scene.meshes)
+    image, _ = _Render.apply(
+        *flat,
+        world_to_camera.expand(B, 4, 4).contiguous(),
+        K.expand(B, 3, 3).contiguous(),
+        camera.projection == "perspective", *camera.size, spp, filter, seed, spacing,
+        *counts, grad_seed, varies, visibility,
+    )  # fmt: skip
+    return (image if camera.batch is not None else image[0]).to(scene.meshes[0].verts.device)
+
+
+def _check_seed(name: str, seed: object) -> int:
+    if isinstance(seed, bool) or not hasattr(seed, "__index__"):
+        raise TypeError(f"{name}: expected an int, got {type(seed).__name__} ({seed!r})")
+    number = seed.__index__()  # type: ignore[attr-defined]
+    if not 0 <= number < 2**63:
+        raise ValueError(f"{name}: expected an int from 0 to 2⁶³ − 1, got {number}")
+    return number
+
+
+def _derived_seed(seed: int, stream: int = 1) -> int:
+    """Another seed for each stream: multiplication by an odd number is a bijection, so no two seeds meet."""
+    return (seed * 0x5851F42D4C957F2D + stream * 0x14057B7EF767814F) & (2**63 - 1)
+
+
+# -- operators -------------------------------------------------------------------------------------------------------
+
+_SCENE = (
+    "Tensor verts, Tensor faces, Tensor corners, Tensor colors, Tensor uvs, Tensor texels, Tensor textures, "
+    "Tensor face_texture, Tensor background, Tensor world_to_camera, Tensor K"
+)
+_IMAGE = "bool perspective, int height, int width, int spp, str filter, int seed, float spacing"
+_GRADIENT = "int surface_samples, int edge_samples, int grad_seed, bool interior_geometry, bool boundary"
+
+torch.library.define("edgegrad::render", f"({_SCENE}, {_IMAGE}) -> (Tensor, Tensor)")
+torch.library.define(
+    "edgegrad::render_backward",
+    f"(Tensor adjoint, Tensor coverage, {_SCENE}, {_IMAGE}, {_GRADIENT}, bool[] wanted)"
+    " -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)",
+)
+
+
+def _kernel_scene(flat: Flat, spacing: float):
+    kind = core.SceneDouble if flat.colors.dtype == torch.float64 else core.SceneFloat
+    background = flat.background if flat.background.dim() == 3 else flat.background[None, None]
+    arrays = [t.detach().contiguous().numpy() for t in (*flat[:-1], background)]
+    return kind(*arrays, spacing)
+
+
+def _kernel_camera(world_to_camera: Tensor, K: Tensor, perspective: bool, height: int, width: int):
+    return core.Camera(
+        world_to_camera.detach().contiguous().numpy(), K.detach().contiguous().numpy(), perspective, width, height
+    )
+
+
+@torch.library.impl("edgegrad::render", "CPU")
+def _render_cpu(*args: Any) -> tuple[Tensor, Tensor]:
+    flat, (world_to_camera, K) = Flat(*args[:9]), args[9:11]
+    perspective, height, width, spp, filter, seed, spacing = args[11:]
+    scene = _kernel_scene(flat, spacing)
+    B, C = world_to_camera.shape[0], flat.background.shape[-1]
+    image = torch.empty((B, height, width, C), dtype=flat.colors.dtype)
+    coverage = torch.empty((B, height, width), dtype=flat.colors.dtype)
+    for b in range(B):
+        camera = _kernel_camera(world_to_camera[b], K[b], perspective, height, width)
+        camera_seed = seed if b == 0 else _derived_seed(seed, b + 1)
+        scene.forward(camera, spp, filter, camera_seed, torch.get_num_threads(), image[b].numpy(), coverage[b].numpy())
+    return image, coverage
+
+
+@torch.library.register_fake("edgegrad::render")
+def _render_fake(*args: Any) -> tuple[Tensor, Tensor]:
+    flat, world_to_camera, height, width = Flat(*args[:9]), args[9], args[12], args[13]
+    B, C = world_to_camera.shape[0], flat.background.shape[-1]
+    return flat.colors.new_empty((B, height, width, C)), flat.colors.new_empty((B, height, width))
+
+
+# The differentiable arguments, in the order of the gradients that render_backward returns.
+_DIFFERENTIABLE = (0, 3, 4, 5, 8, 9, 10)  # verts, colors, uvs, texels, background, world_to_camera, K
+
+
+@torch.library.impl("edgegrad::render_backward", "CPU")
+def _render_backward_cpu(adjoint: Tensor, coverage: Tensor, *args: Any) -> tuple[Tensor, ...]:
+    flat, (world_to_camera, K) = Flat(*args[:9]), args[9:11]
+    perspective, height, width, _, filter, _, spacing = args[11:18]
+    surface_samples, edge_samples, grad_seed, interior_geometry, boundary, wanted = args[18:]
+    scene = _kernel_scene(flat, spacing)
+    # Sums are taken in double whatever the arrays hold.
+    grads = [torch.zeros(args[i].shape, dtype=torch.float64) if want else None for i, want in zip(_DIFFERENTIABLE, wanted, strict=True)]
+    verts, colors, uvs, texels, background, gw2c, gK = (None if g is None else g.numpy() for g in grads)
+    if background is not None and background.ndim == 1:
+        background = background[None, None]
+    adjoint = adjoint.detach().contiguous()
+    for b in range(world_to_camera.shape[0]):
+        scene.backward(
+            _kernel_camera(world_to_camera[b], K[b], perspective, height, width),
+            surface_samples, edge_samples, filter, grad_seed if b == 0 else _derived_seed(grad_seed, b + 1),
+            torch.get_num_threads(), interior_geometry, boundary, adjoint[b].numpy(), coverage[b].numpy(),
+            verts, colors, uvs, texels, background,
+            None if gw2c is None else gw2c[b], None if gK is None else gK[b],
+        )  # fmt: skip
+    return tuple(
+        torch.empty(0) if g is None else g.to(args[i].dtype) for i, g in zip(_DIFFERENTIABLE, grads, strict=True)
+    )
+
+
+@torch.library.register_fake("edgegrad::render_backward")
+def _render_backward_fake(adjoint: Tensor, coverage: Tensor, *args: Any) -> tuple[Tensor, ...]:
+    return tuple(
+        torch.empty_like(args[i]) if want else adjoint.new_empty(0, dtype=torch.float32)
+        for i, want in zip(_DIFFERENTIABLE, args[-1], strict=True)
+    )
+
+
+class _Render(torch.autograd.Function):
+    """edgegrad::render, differentiated by edgegrad::render_backward."""
+
+    @staticmethod
+    def forward(*args: Any) -> tuple[Tensor, Tensor]:
+        return torch.ops.edgegrad.render(*args[:18])
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        _, coverage = output
+        ctx.mark_non_differentiable(coverage)
+        ctx.save_for_backward(coverage, *inputs[:11])
+        ctx.options = inputs[11:]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+        coverage, *tensors = ctx.saved_tensors
+        wanted = [ctx.needs_input_grad[i] for i in _DIFFERENTIABLE]
+        grads = torch.ops.edgegrad.render_backward(grad_outputs[0], coverage, *tensors, *ctx.options, wanted)
+        out: list[Tensor | None] = [None] * (len(tensors) + len(ctx.options))
+        for i, want, grad in zip(_DIFFERENTIABLE, wanted, grads, strict=True):
+            if want:
+                out[i] = grad
+        return tuple(out)

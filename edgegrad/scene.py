@@ -1,0 +1,154 @@
+"""Scenes: meshes before a background, and the flat arrays that the kernel reads."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ._check import as_tensor, check_finite, check_float, check_shape
+from .mesh import PLAIN, Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Meshes that hide one another, before a background.
+
+    meshes      a sequence of Mesh (or one), all with the same number of channels C
+    background  (C,) or (H, W, C) float, linear radiance where nothing is hit; black when None. An image is laid behind
+                the pixels: I = Σ samples that hit + (1 − coverage) · background
+
+    Raises TypeError or ValueError.
+    """
+
+    meshes: Sequence[Mesh]
+    background: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        meshes = (self.meshes,) if isinstance(self.meshes, Mesh) else tuple(self.meshes)
+        object.__setattr__(self, "meshes", meshes)
+        if not meshes:
+            raise ValueError("meshes: expected at least one Mesh, got none")
+        for i, mesh in enumerate(meshes):
+            if not isinstance(mesh, Mesh):
+                raise TypeError(f"meshes[{i}]: expected a Mesh, got {type(mesh).__name__}")
+        known = {mesh.channels for mesh in meshes if mesh.channels is not None}
+        if len(known) > 1:
+            i = next(i for i, m in enumerate(meshes) if m.channels not in (None, meshes[0].channels))
+            raise ValueError(
+                f"meshes[{i}]: expected {meshes[0].channels} channels like meshes[0], got {meshes[i].channels}; "
+                "give all colours and textures the same number of channels"
+            )
+        devices = {mesh.verts.device for mesh in meshes}
+        if len(devices) > 1:
+            raise ValueError(f"meshes: expected one device, got {sorted(map(str, devices))}; move them with mesh.to(…)")
+        if self.background is not None:
+            background = as_tensor("background", self.background, like=meshes[0].verts)
+            object.__setattr__(self, "background", background)
+            C = next(iter(known)) if known else "C"
+            check_float("background", background)
+            check_shape("background", background, (C,), ("H", "W", C))
+            check_finite("background", background)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels C; 3 for a plain scene on black."""
+        for mesh in self.meshes:
+            if mesh.channels is not None:
+                return mesh.channels
+        return 3 if self.background is None else self.background.shape[-1]
+
+    def replace(self, **fields: object) -> Scene:
+        """This scene with some fields replaced."""
+        return dataclasses.replace(self, **fields)  # type: ignore[arg-type]
+
+    def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Scene:
+        """All meshes moved together; see Mesh.transformed."""
+        return self.replace(meshes=[mesh.transformed(R, t, scale) for mesh in self.meshes])
+
+    def to(self, *args: object, **kwargs: object) -> Scene:
+        """All tensors moved to a device or dtype, as `torch.Tensor.to`."""
+        background = None if self.background is None else self.background.to(*args, **kwargs)  # type: ignore[call-overload]
+        return Scene([mesh.to(*args, **kwargs) for mesh in self.meshes], background)
+
+    def __repr__(self) -> str:
+        back = "black" if self.background is None else f"background {tuple(self.background.shape)}"
+        return f"Scene({', '.join(map(repr, self.meshes))}; {back})"
+
+
+class Flat(NamedTuple):
+    """A scene as the kernel reads it: the meshes laid end to end, on the CPU. A corner of a face refers to a row of
+    `colors`, or, where the face is textured, to a row of `uvs`; colours of vertices, faces and corners differ only in that index.
+    """
+
+    verts: Tensor  # (V, 3) float64
+    faces: Tensor  # (F, 3) int32, rows of verts
+    corners: Tensor  # (F, 3) int32, rows of colors or of uvs
+    colors: Tensor  # (A, C) float32 or float64
+    uvs: Tensor  # (T, 2) float64
+    texels: Tensor  # (X, C), the textures end to end, row by row
+    textures: Tensor  # (N, 3) int64: first texel, height, width
+    face_texture: Tensor  # (F,) int32: texture of the face, −1 for none; (0,) when the scene has no texture
+    background: Tensor  # (C,) or (H, W, C)
+
+
+def flatten(scene: Scene) -> Flat:
+    """The arrays of a scene; every step is a differentiable torch operation, so gradients find their way back."""
+    C = scene.channels
+    floats = [t for m in scene.meshes for t in (m.colors, m.face_colors, m.corner_colors, m.texture) if t is not None]
+    floats += [scene.background] if scene.background is not None else []
+    dtype = torch.float64 if any(t.dtype == torch.float64 for t in floats) else torch.float32
+    if not floats and scene.meshes[0].verts.dtype == torch.float64:
+        dtype = torch.float64
+    any_texture = any(mesh.texture is not None for mesh in scene.meshes)
+
+    def empty(width: int, kind: torch.dtype) -> Tensor:
+        return torch.empty((0, width), dtype=kind)
+
+    verts, faces, corners, colors, uvs, texels, textures, face_texture = ([] for _ in range(8))
+    n_verts = n_colors = n_uvs = n_texels = 0
+    for mesh in scene.meshes:
+        V, F = mesh.verts.shape[0], mesh.faces.shape[0]
+        mesh_faces = mesh.faces.cpu().to(torch.int32)
+        verts.append(mesh.verts.cpu().double())
+        faces.append(mesh_faces + n_verts if n_verts else mesh_faces)
+        if mesh.texture is not None:
+            assert mesh.uvs is not None and mesh.uv_faces is not None
+            h, w = mesh.texture.shape[:2]
+            face_texture.append(torch.full((F,), len(textures), dtype=torch.int32))
+            textures.append([n_texels, h, w])
+            texels.append(mesh.texture.cpu().to(dtype).reshape(h * w, C))
+            uvs.append(mesh.uvs.cpu().double())
+            index = mesh.uv_faces.cpu().to(torch.int32)
+            corners.append(index + n_uvs if n_uvs else index)
+            n_uvs, n_texels = n_uvs + mesh.uvs.shape[0], n_texels + h * w
+        else:
+            if mesh.colors is not None:
+                rows, index = mesh.colors, mesh_faces
+            elif mesh.corner_colors is not None:
+                rows, index = mesh.corner_colors.reshape(3 * F, C), torch.arange(3 * F, dtype=torch.int32).reshape(F, 3)
+            elif mesh.face_colors is not None:
+                rows, index = mesh.face_colors, torch.arange(F, dtype=torch.int32)[:, None].expand(F, 3)
+            else:
+                rows, index = torch.full((1, C), PLAIN, dtype=dtype), torch.zeros((F, 3), dtype=torch.int32)
+            colors.append(rows.cpu().to(dtype))
+            corners.append(index + n_colors if n_colors else index)
+            n_colors += rows.shape[0]
+            if any_texture:
+                face_texture.append(torch.full((F,), -1, dtype=torch.int32))
+        n_verts += V
+
+    def join(parts: list[Tensor], otherwise: Tensor) -> Tensor:
+        return (parts[0] if len(parts) == 1 else torch.cat(parts) if parts else otherwise).contiguous()
+
+    background = torch.zeros(C, dtype=dtype) if scene.background is None else scene.background.cpu().to(dtype).contiguous()
+    return Flat(
+        join(verts, empty(3, torch.float64)), join(faces, empty(3, torch.int32)), join(corners, empty(3, torch.int32)),
+        join(colors, empty(C, dtype)), join(uvs, empty(2, torch.float64)), join(texels, empty(C, dtype)),
+        torch.tensor(textures, dtype=torch.int64).reshape(-1, 3), join(face_texture, torch.empty(0, dtype=torch.int32)),
+        background,
+    )
