@@ -4,6 +4,7 @@
 #include "boundary.h"
 
 #include <algorithm>
+#include <limits>
 #include <vector>
 
 #include "curve.h"
@@ -74,7 +75,7 @@ class BoundaryChunk {
             const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
             if (intersect(lane.ray, corner, b)) b = inside(b);
             const double depth = b[0] * corner[0].z + b[1] * corner[1].z + b[2] * corner[2].z;
-            if (depth < point.z - tolerance(curve)) return;  // occluded
+            if (depth < point.z - tolerance(curve, corner)) return;  // occluded
         }
         const double jump = adjoint_radiance(lane, curve.minus, behind, b, adjoint) - adjoint_radiance(lane, curve.plus, behind, b, adjoint);
         const double scale = lane.weight * jump;
@@ -88,14 +89,16 @@ class BoundaryChunk {
     }
 
     // Surfaces that touch at the edge (a cube on the ground) are not before it: they may seem nearer by what the
-    // rounding of the input leaves, some spacings of the coordinates there.
-    double tolerance(const Curve& curve) const {
+    // rounding of the input leaves, some spacings of the coordinates there, and by what doubles leave of the depth on
+    // the face that was hit, some of theirs at the size of that face.
+    double tolerance(const Curve& curve, const Vec3 hit[3]) const {
         const HalfEdge& h = curve.minus.face >= 0 ? curve.minus : curve.plus;
-        double size = 0;
+        double edge = 0, face = 0;
         for (const int corner : {h.first(), h.second()})
             for (int axis = 0; axis < 3; ++axis)
-                size = std::max(size, std::fabs(view_.scene.verts[3 * int64_t(vertex(view_.scene, h, corner)) + axis]));
-        return 8 * view_.options.spacing * size;
+                edge = std::max(edge, std::fabs(view_.scene.verts[3 * int64_t(vertex(view_.scene, h, corner)) + axis]));
+        for (int i = 0; i < 3; ++i) face = std::max({face, std::fabs(hit[i].x), std::fabs(hit[i].y), std::fabs(hit[i].z)});
+        return 8 * view_.options.spacing * edge + 64 * std::numeric_limits<double>::epsilon() * face;
     }
 
     // The gradient goes to the vertices of the face that ends at the curve; where a face lies on either side, half to

@@ -86,7 +86,7 @@ void open_embree(const std::string& path) {
 int embree_version() { return rtc.version; }
 
 RayCaster::RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts)
-    : n_faces_(n_faces), n_verts_(n_verts), positions_(3 * size_t(n_verts) + 1, 0.f) {  // Embree reads 16 bytes a vertex
+    : faces_(faces), n_faces_(n_faces), n_verts_(n_verts), positions_(3 * size_t(n_verts) + 1, 0.f) {  // Embree reads 16 bytes a vertex
     if (!rtc.device) throw std::runtime_error("Embree is not open");
     Geometry geometry = rtc.rtcNewGeometry(rtc.device, GEOMETRY_TYPE_TRIANGLE);
     rtc.rtcSetSharedGeometryBuffer(geometry, BUFFER_TYPE_INDEX, 0, FORMAT_UINT3, faces, 0, 12, n_faces);
@@ -108,17 +108,41 @@ RayCaster::~RayCaster() {
     rtc.rtcReleaseScene(static_cast<Scene>(scene_));
 }
 
+// Where the detail is: the mean of the faces' centroids weighted with 1 / (longest side)². Floats are as fine as their
+// distance to the origin is short, so a small object on a wide ground plane keeps its shape.
+Vec3 RayCaster::detail_centre(const double* verts, int threads) const {
+    // Blocks of fixed size, so that the sum is rounded alike at any number of threads.
+    const int64_t block = 4096, blocks = (n_faces_ + block - 1) / block;
+    const auto vertex = [&](int32_t v) { return Vec3{verts[3 * int64_t(v)], verts[3 * int64_t(v) + 1], verts[3 * int64_t(v) + 2]}; };
+    const Vec3 base = vertex(faces_[0]);
+    std::vector<Vec3> sum(blocks);
+    std::vector<double> weight(blocks, 0.0);
+#pragma omp parallel for num_threads(threads) schedule(static)
+    for (int64_t k = 0; k < blocks; ++k)
+        for (int64_t f = k * block; f < std::min(n_faces_, (k + 1) * block); ++f) {
+            const Vec3 a = vertex(faces_[3 * f]), b = vertex(faces_[3 * f + 1]), c = vertex(faces_[3 * f + 2]);
+            const double side = std::max({dot(b - a, b - a), dot(c - b, c - b), dot(a - c, a - c)});
+            const double w = 1 / side;
+            if (!std::isfinite(w)) continue;  // a single point
+            weight[k] += w;
+            sum[k] += (w / 3) * (a - base + (b - base) + (c - base));
+        }
+    Vec3 total;
+    double total_weight = 0;
+    for (int64_t k = 0; k < blocks; ++k) total += sum[k], total_weight += weight[k];
+    const Vec3 centre = base + (1 / total_weight) * total;
+    return std::isfinite(centre.x + centre.y + centre.z) ? centre : base;
+}
+
 void RayCaster::update(const double* verts, int threads) {
-    double low[3], high[3];
-    for (int a = 0; a < 3; ++a) {
-        double lo = verts[a], hi = verts[a];
-#pragma omp parallel for num_threads(threads) reduction(min : lo) reduction(max : hi) schedule(static)
-        for (int64_t v = 0; v < n_verts_; ++v) lo = std::min(lo, verts[3 * v + a]), hi = std::max(hi, verts[3 * v + a]);
-        low[a] = lo, high[a] = hi;
+    centre_ = detail_centre(verts, threads);
+    double farthest = 0;
+#pragma omp parallel for num_threads(threads) reduction(max : farthest) schedule(static)
+    for (int64_t v = 0; v < n_verts_; ++v) {
+        const Vec3 p = Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]} - centre_;
+        farthest = std::max(farthest, dot(p, p));
     }
-    centre_ = {0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), 0.5 * (low[2] + high[2])};
-    radius_ = 0.5 * length(Vec3{high[0] - low[0], high[1] - low[1], high[2] - low[2]});
-    if (!(radius_ > 0)) radius_ = 1;  // a single point
+    radius_ = farthest > 0 ? std::sqrt(farthest) : 1;  // 1: a single point
 #pragma omp parallel for num_threads(threads) schedule(static)
     for (int64_t v = 0; v < n_verts_; ++v) {
         const Vec3 p = (1 / radius_) * (Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]} - centre_);

@@ -46,6 +46,9 @@ class RayCaster {
     void cast(RayPacket& packet, const std::span<const int32_t>* rejected) const;
 
    private:
+    Vec3 detail_centre(const double* verts, int threads) const;
+
+    const int32_t* faces_;
     int64_t n_faces_, n_verts_;
     // Embree sees (p − centre) / radius: a scene keeps its float precision wherever it lies and whatever its unit.
     Vec3 centre_;

@@ -14,7 +14,7 @@ from edgegrad.scene import Scene
 
 
 def front_camera(size: int | tuple[int, int] = 64, projection: str = "perspective") -> Camera:
-    """A camera 4 units from the origin, a little off every axis and tilted, that sees the ball of radius 1.2 around it."""
+    """A camera 4 units from the origin, off every axis and tilted, that sees the ball of radius 1.2 around it."""
     size = (size, size) if isinstance(size, int) else size
     eye = 4.0 * torch.nn.functional.normalize(torch.tensor([0.31, 0.23, 1.0], dtype=torch.float64), dim=0)
     target, up = torch.zeros_like(eye), torch.tensor([0.17, 1.0, 0.0], dtype=torch.float64)
@@ -57,15 +57,17 @@ def cube(half: float = 0.6) -> Mesh:
 
 
 def icosphere(subdivisions: int = 3) -> Mesh:
-    """Unit sphere of 20 · 4^subdivisions faces (3: 1,280; 6: 81,920), watertight, outward, with smooth vertex colours."""
+    """Unit sphere of 20 · 4^subdivisions faces (3: 1,280; 6: 81,920), watertight, outward, with smooth colours."""
     phi = (1.0 + math.sqrt(5.0)) / 2.0
-    pairs = np.array([[-1, phi], [1, phi], [-1, -phi], [1, -phi]])
-    zero = np.zeros((4, 1))
-    verts = np.concatenate([np.hstack([pairs, zero]), np.hstack([zero, pairs]), np.hstack([pairs[:, 1:], zero, pairs[:, :1]])])
+    # Corners (0, ±1, ±φ) and its rotations of coordinates: three rectangles, one in each plane.
+    rectangle = np.array([[-1, phi, 0], [1, phi, 0], [-1, -phi, 0], [1, -phi, 0]])
+    verts = np.concatenate([np.roll(rectangle, shift, axis=1) for shift in range(3)])
     # fmt: off
     faces = np.array([
-        [0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11], [1, 5, 9], [5, 11, 4], [11, 10, 2], [10, 7, 6], [7, 1, 8],
-        [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8], [3, 8, 9], [4, 9, 5], [2, 4, 11], [6, 2, 10], [8, 6, 7], [9, 8, 1],
+        [0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11],  # around corner 0
+        [1, 5, 9], [5, 11, 4], [11, 10, 2], [10, 7, 6], [7, 1, 8],  # next to those
+        [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8], [3, 8, 9],  # around corner 3
+        [4, 9, 5], [2, 4, 11], [6, 2, 10], [8, 6, 7], [9, 8, 1],  # next to those
     ])
     # fmt: on
     for _ in range(subdivisions):

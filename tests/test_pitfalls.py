@@ -1,0 +1,262 @@
+"""Cases in which other edge-sampling renderers were wrong, each against finite differences of the forward renderer: the
+ratio must lie within 1 ± 0.02. The comment at each test says what went wrong elsewhere.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from exact import exact_image
+from finite_differences import check_ratio, gradient, loss, rotation
+from scenes import cube, front_camera, icosphere, smooth_adjoint, smooth_colors
+from torch import Tensor
+
+import edgegrad as eg
+
+F64 = torch.float64
+BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)
+ALONG = torch.tensor([0.7, 0.6, -0.2], dtype=F64)
+SAMPLES = {"surface_samples": 20_000, "edge_samples": 20_000}
+
+
+def tilted_cube(half: float = 0.5) -> eg.Mesh:
+    return cube(half).transformed(rotation((0.48, 0.6, 0.64), torch.tensor(0.6, dtype=F64)))
+
+
+def soup(mesh: eg.Mesh) -> eg.Mesh:
+    """Every face with vertices of its own."""
+    assert mesh.colors is not None
+    index = mesh.faces.reshape(-1)
+    return eg.Mesh(mesh.verts[index], torch.arange(len(index)).reshape(-1, 3), colors=mesh.colors[index])
+
+
+def moving(mesh: eg.Mesh, camera: eg.Camera, direction: Tensor = ALONG):
+    return lambda theta: (eg.Scene([mesh.transformed(t=theta * direction)], BACKGROUND), camera)
+
+
+def test_crop() -> None:
+    """0.25: the sample weight lacked the area of the crop."""
+    camera = front_camera(96).crop(top=20, left=14, height=48, width=48)
+    check_ratio(moving(tilted_cube(), camera), 0.004, **SAMPLES)
+
+
+def test_orthographic_silhouette() -> None:
+    """0: silhouettes were tested against an eye point."""
+    check_ratio(moving(icosphere(2).transformed(scale=0.7), front_camera(48, "orthographic")), 0.006, **SAMPLES)
+
+
+def test_edge_that_crosses_the_camera_plane() -> None:
+    """1.08 … 1.15: a sign slip where the edge was clipped. The triangle starts behind the camera."""
+    camera = eg.Camera.look_at((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 60.0, (48, 48)).to(F64)
+    verts = torch.tensor([[-1.1, -0.9, 1.5], [0.35, -0.8, 1.2], [0.4, 0.9, -6.0]], dtype=F64)
+    mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2]]), colors=smooth_colors(verts))
+    check_ratio(moving(mesh, camera, torch.tensor([0.9, 0.3, 0.2], dtype=F64)), 0.006, spp=2048, **SAMPLES)
+
+    def vertex_behind(theta: Tensor):
+        move = torch.zeros_like(verts)
+        move[0] = torch.tensor([0.6, -0.5, 0.7])
+        return eg.Scene([mesh.replace(verts=verts + theta * move)], BACKGROUND), camera
+
+    check_ratio(vertex_behind, 0.02, spp=2048, **SAMPLES)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_triangle_soup(dtype: torch.dtype) -> None:
+    """2.00: each copy of a seam's edge was counted in full."""
+    mesh = soup(tilted_cube()).to(dtype)
+    camera = front_camera(48)
+
+    def moved(theta: Tensor):
+        return eg.Scene([mesh.replace(verts=mesh.verts + (theta * ALONG).to(dtype))], BACKGROUND), camera
+
+    check_ratio(moved, 0.006, **SAMPLES)
+
+
+def test_cube_split_at_its_edges() -> None:
+    """92 % off: a cube of 24 vertices instead of 8, turned by a matrix product in float32 as users do."""
+    mesh = soup(tilted_cube()).to(torch.float32)
+    camera = front_camera(48)
+    axis = (0.6, 0.0, 0.8)
+
+    def turned(theta: Tensor):
+        R = rotation(axis, theta + 0.3).float()
+        t = (theta * ALONG).float()
+        return eg.Scene([mesh.replace(verts=mesh.verts @ R.T + t)], BACKGROUND), camera
+
+    check_ratio(turned, 0.01, **SAMPLES)
+
+
+def test_color_step_between_coplanar_faces() -> None:
+    """0: flat edges were deleted. Two coplanar faces of unlike colours; only the vertex between them moves."""
+    camera = front_camera(48)
+    verts = torch.tensor([[-0.8, -0.7, 0.0], [0.8, -0.6, 0.0], [0.7, 0.8, 0.0], [-0.75, 0.7, 0.0], [0.05, 0.1, 0.0]], dtype=F64)
+    faces = torch.tensor([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    colors = torch.tensor([[0.9, 0.1, 0.2], [0.2, 0.8, 0.3], [0.1, 0.3, 0.9], [0.8, 0.7, 0.1]], dtype=F64)
+
+    def inner_vertex(theta: Tensor):
+        move = torch.zeros_like(verts)
+        move[4] = torch.tensor([0.6, -0.8, 0.0])
+        return eg.Scene([eg.Mesh(verts + theta * move, faces, face_colors=colors)], BACKGROUND), camera
+
+    check_ratio(inner_vertex, 0.01, **SAMPLES)
+    assert gradient(inner_vertex, 2, visibility=False).mean == 0
+
+
+def test_flat_shading() -> None:
+    """37 % off: the creases of a flat-shaded mesh are discontinuities. Against exact integrals."""
+    sphere = icosphere(1).transformed(scale=0.8)
+    normals = torch.linalg.cross(*(sphere.verts[sphere.faces[:, i]] - sphere.verts[sphere.faces[:, 0]] for i in (1, 2)))
+    light = torch.tensor([0.3, 0.5, 0.8], dtype=F64)
+    shade = torch.nn.functional.normalize(normals, dim=1) @ light
+    mesh = eg.Mesh(sphere.verts, sphere.faces, face_colors=shade[:, None] * torch.tensor([0.9, 0.6, 0.4], dtype=F64) + 0.5)
+    camera, adjoint = front_camera(64), smooth_adjoint(64, 64, 3)
+
+    def verts_gradient(render) -> Tensor:
+        verts = mesh.verts.clone().requires_grad_()
+        return torch.autograd.grad((render(eg.Scene([mesh.replace(verts=verts)], BACKGROUND), camera) * adjoint).sum(), verts)[0]
+
+    def one_color(scene: eg.Scene) -> eg.Scene:
+        return scene.replace(meshes=[scene.meshes[0].replace(face_colors=torch.full((len(mesh.faces), 3), 0.6, dtype=F64))])
+
+    exact = verts_gradient(exact_image)
+    got = verts_gradient(lambda s, c: eg.render(s, c, edge_samples=200_000))
+    assert (got - exact).norm() < 0.005 * exact.norm()
+    silhouettes = verts_gradient(lambda s, c: exact_image(one_color(s), c))
+    assert (silhouettes - exact).norm() > 0.3 * exact.norm()  # the creases are what this test is about
+
+
+def test_smooth_mesh_pays_for_silhouettes_alone() -> None:
+    """Variance × 420: every edge was sampled as a silhouette. Equal face colours, or corner colours that agree, make no curve."""
+    sphere = icosphere(3)
+    assert sphere.colors is not None
+    camera, adjoint = front_camera(64), smooth_adjoint(64, 64, 3)
+    kinds = {
+        "vertex": sphere,
+        "corner": eg.Mesh(sphere.verts, sphere.faces, corner_colors=sphere.colors[sphere.faces]),
+        "face": eg.Mesh(sphere.verts, sphere.faces, face_colors=torch.full((len(sphere.faces), 3), 0.6, dtype=F64)),
+    }
+    counts, grads = {}, {}
+    for kind, mesh in kinds.items():
+        verts = mesh.verts.clone().requires_grad_()
+        eg.render(mesh.replace(verts=verts), camera, edge_samples=3000, surface_samples=50_000).backward(adjoint)
+        grads[kind] = verts.grad
+        counts[kind] = samples_of(mesh, camera, adjoint)[1]
+    assert counts["vertex"] == counts["corner"] == counts["face"]
+    # The silhouette of the unit ball seen from 4 away: a circle, 16 samples a pixel.
+    radius = 32 / torch.tan(torch.deg2rad(torch.tensor(18.0))) / 15**0.5
+    assert abs(counts["vertex"] / (16 * 2 * torch.pi * radius.item()) - 1) < 0.03
+    assert torch.equal(grads["vertex"], grads["corner"])
+
+
+def samples_of(mesh: eg.Mesh, camera: eg.Camera, adjoint: Tensor) -> tuple[int, int]:
+    """Default numbers of surface and edge samples, as the kernel chose them."""
+    from edgegrad.render import _kernel_camera, _kernel_scene
+    from edgegrad.scene import flatten
+
+    scene = _kernel_scene(flatten(eg.Scene([mesh])), torch.finfo(mesh.verts.dtype).eps)
+    kernel_camera = _kernel_camera(camera.world_to_camera, camera.K, camera.projection == "perspective", *camera.size)
+    H, W = camera.size
+    grad = torch.zeros(mesh.verts.shape, dtype=F64).numpy()
+    return scene.backward(
+        kernel_camera, -1, -1, "box", 0, 1, True, True, adjoint.contiguous().numpy(), torch.zeros(H, W, dtype=F64).numpy(), verts=grad
+    )
+
+
+@pytest.mark.parametrize("fov", [3.0, 1.0, 0.3, 0.1])
+def test_narrow_field_of_view(fov: float) -> None:
+    """0.99 / 0.55 / 0.12 / 0.05: a fixed offset on the screen fell below the spacing of floats. The camera is turned."""
+    distance = 1.3 / torch.tan(torch.deg2rad(torch.tensor(fov, dtype=F64) / 2))
+    eye = distance * torch.nn.functional.normalize(torch.tensor([0.5, 0.4, 0.77], dtype=F64), dim=0)
+    camera = eg.Camera.look_at(eye, torch.zeros(3, dtype=F64), torch.tensor([0.2, 1.0, 0.1], dtype=F64), fov, (48, 48))
+    check_ratio(moving(tilted_cube(), camera), 0.006, **SAMPLES)
+
+
+def test_very_large_triangle() -> None:
+    """0: both offset rays hit the ground plane. Its horizon, and a cube that stands on it and meets it exactly."""
+    ground = torch.tensor([[-3e4, 0.0, -3e4], [3e4, 0.0, -2.8e4], [-2e3, 0.0, 4e4]], dtype=F64)
+    plane = eg.Mesh(ground, torch.tensor([[0, 2, 1]]), face_colors=torch.tensor([[0.3, 0.6, 0.2]], dtype=F64))
+    camera = eg.Camera.look_at((1.1, 1.4, 3.0), (0.05, 0.5, 0.0), (0.45, 1.0, 0.0), 50.0, (48, 48)).to(F64)
+
+    def plane_turns(theta: Tensor):
+        return eg.Scene([plane.transformed(rotation((0.8, 0.0, 0.6), theta))], BACKGROUND), camera
+
+    check_ratio(plane_turns, 0.004, spp=4096, **SAMPLES)
+
+    standing = cube(0.4).transformed(rotation((0.0, 1.0, 0.0), torch.tensor(0.5, dtype=F64)), torch.tensor([0.0, 0.4, 0.0], dtype=F64))
+
+    def cube_slides(theta: Tensor):
+        t = theta * torch.tensor([0.8, 0.0, 0.6], dtype=F64)
+        return eg.Scene([plane, standing.transformed(t=t)], BACKGROUND), camera
+
+    check_ratio(cube_slides, 0.01, **SAMPLES)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
+def test_scaled_scene(unit: float) -> None:
+    """A black image: a fixed epsilon along the ray. The same picture and the same relative gradient in any unit."""
+    camera = front_camera(48)
+    M = camera.world_to_camera.clone()
+    M[:3, 3] *= unit
+    camera = camera.replace(world_to_camera=M)
+    mesh = tilted_cube().transformed(scale=unit)
+    assert eg.render(eg.Scene([mesh]), camera).mean() > 0.05
+    check_ratio(moving(mesh, camera, unit * ALONG), 0.006, **SAMPLES)
+
+
+def test_far_from_the_origin() -> None:
+    """Positions are taken relative to the scene: 10⁵ units away nothing is lost (float64 input)."""
+    far = torch.tensor([1e5, -2e5, 3e5], dtype=F64)
+    camera = front_camera(48)
+    M = camera.world_to_camera.clone()
+    M[:3, 3] -= M[:3, :3] @ far
+    mesh = tilted_cube().transformed(t=far)
+    check_ratio(moving(mesh, camera.replace(world_to_camera=M)), 0.006, **SAMPLES)
+
+
+@pytest.mark.parametrize("faces_on_edge", [1, 3, 4])
+def test_non_manifold_edge(faces_on_edge: int) -> None:
+    """A fan of faces around one edge, each of its own colour: on each side the one in front counts."""
+    a, b = torch.tensor([0.05, -0.7, 0.1], dtype=F64), torch.tensor([-0.1, 0.75, -0.05], dtype=F64)
+    angles = torch.tensor([0.4, 2.2, 3.3, 5.2], dtype=F64)[:faces_on_edge]
+    tips = torch.stack([0.8 * angles.cos(), 0.1 * angles, 0.8 * angles.sin()], -1)
+    verts = torch.cat([torch.stack([a, b]), tips])
+    faces = torch.tensor([[0, 1, 2 + i] if i % 2 else [1, 0, 2 + i] for i in range(faces_on_edge)])
+    colors = smooth_colors(7.0 * tips)
+    camera = front_camera(48)
+
+    def edge_moves(theta: Tensor):
+        move = torch.zeros_like(verts)
+        move[:2] = torch.tensor([0.9, -0.4, 0.2])
+        return eg.Scene([eg.Mesh(verts + theta * move, faces, face_colors=colors)], BACKGROUND), camera
+
+    check_ratio(edge_moves, 0.01, spp=2048, **SAMPLES)
+
+
+def test_loss_of_a_sparse_adjoint() -> None:
+    """Where the loss does not look, no samples go, and the gradient stays right: one pixel on a silhouette, against the
+    exact integral."""
+    mesh, camera = tilted_cube(), front_camera(48)
+    with torch.no_grad():
+        covered = eg.render(mesh.replace(face_colors=torch.ones(12, 1, dtype=F64)), camera, spp=256)[..., 0]
+    y, x = (index[0].item() for index in torch.where((covered > 0.3) & (covered < 0.7)))
+    adjoint = torch.zeros(48, 48, 3, dtype=F64)
+    adjoint[y, x] = torch.tensor([1.0, -0.5, 0.3], dtype=F64)
+
+    def verts_gradient(render) -> Tensor:
+        verts = mesh.verts.clone().requires_grad_()
+        return torch.autograd.grad((render(eg.Scene([mesh.replace(verts=verts)], BACKGROUND), camera) * adjoint).sum(), verts)[0]
+
+    exact = verts_gradient(exact_image)
+    got = torch.stack([verts_gradient(lambda s, c, seed=seed: eg.render(s, c, spp=1, grad_seed=seed)) for seed in range(64)])
+    error = (got.std(0) / 8).norm()
+    assert error < 0.02 * exact.norm()
+    assert (got.mean(0) - exact).norm() < 4 * error
+    _, edge_samples = samples_of(mesh, camera, adjoint)
+    assert edge_samples < 16 * 40  # curves whose bounding box meets the pixel, not the whole outline
+
+
+def test_the_ratio_check_rejects() -> None:
+    camera = front_camera(48)
+    with pytest.raises(AssertionError, match="ratio"):
+        check_ratio(moving(tilted_cube(), camera), 0.006, visibility=False)
+    assert loss(*moving(tilted_cube(), camera)(torch.zeros((), dtype=F64))).isfinite()
