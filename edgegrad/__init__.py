@@ -1,10 +1,22 @@
 """edgegrad: a PyTorch layer that renders triangle meshes on the CPU and returns correct gradients, also at silhouettes."""
 
 from .camera import Camera
+from .io import load_camera, load_mesh, load_scene, read_image, save_camera, write_image
 from .mesh import Mesh
 from .render import render
 from .scene import Scene
 
 __version__ = "0.1.0"
 
-__all__ = ["Camera", "Mesh", "Scene", "render"]
+__all__ = [
+    "Camera",
+    "Mesh",
+    "Scene",
+    "load_camera",
+    "load_mesh",
+    "load_scene",
+    "read_image",
+    "render",
+    "save_camera",
+    "write_image",
+]

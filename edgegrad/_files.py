@@ -1,0 +1,69 @@
+"""Paths in and out: checked before a library sees them, written whole or not at all."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import secrets
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+
+PathLike = str | os.PathLike[str]
+
+
+def require(module: str, package: str, purpose: str) -> ModuleType:
+    """A module that is imported only when it is needed. Raises ImportError with the way to install it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f"{purpose} needs {package}; install it with: pip install {package} ({error})") from error
+
+
+def check_readable(path: PathLike, suffixes: Collection[str]) -> Path:
+    """An existing, non-empty file whose name ends in one of `suffixes`.
+
+    Raises FileNotFoundError when nothing is there, ValueError when it is a directory, of another kind or empty.
+    """
+    file = check_suffix(path, suffixes)
+    if file.is_dir():
+        raise ValueError(f"{path}: expected a file, got a directory; name a file in it")
+    if not file.exists():
+        raise FileNotFoundError(f"{path}: expected a file, got no such file; look for it in {file.absolute().parent}")
+    if file.stat().st_size == 0:
+        raise ValueError(f"{path}: expected data, got an empty file; export it again")
+    return file
+
+
+def check_suffix(path: PathLike, suffixes: Collection[str]) -> Path:
+    """`path` when its name ends in one of `suffixes`, in any case. Raises TypeError or ValueError."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"path: expected a str or pathlib.Path, got {type(path).__name__}")
+    file = Path(path)
+    if file.suffix.lower() not in suffixes and not file.is_dir():
+        raise ValueError(
+            f"{path}: expected a file name that ends in {', '.join(suffixes)}, got {file.suffix or 'no ending'!r}; "
+            "convert the file or rename it"
+        )
+    return file
+
+
+@contextmanager
+def replacing(path: PathLike) -> Iterator[Path]:
+    """A temporary file beside `path` that takes its place when the block succeeds and vanishes when it fails.
+
+    Raises FileNotFoundError when the folder does not exist, ValueError when `path` is a directory.
+    """
+    file = Path(path)
+    if file.is_dir():
+        raise ValueError(f"{path}: expected a file name, got a directory; add a name to it")
+    if not file.parent.is_dir():
+        raise FileNotFoundError(f"{path}: expected the folder {file.parent} to exist; make it first with Path.mkdir")
+    # The same ending, since libraries choose the format by it; not tempfile, whose files only their owner may read.
+    temporary = file.with_name(f".{file.stem[:64]}-{secrets.token_hex(6)}{file.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, file)
+    finally:
+        temporary.unlink(missing_ok=True)
