@@ -70,7 +70,8 @@ BackwardCounts render_backward(const SceneView<T>& scene, const Camera& camera, 
     const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, o.threads);
     const FilteredAdjoint<T> filtered(adjoint, scene, o.filter, camera.width, camera.height);
     const Importance importance(adjoint, camera.width, camera.height, scene.channels, o.filter.radius() - 0.5);
-    const BackwardView<T> view{scene, camera, geometry, volume, vertices, filtered, importance, o, camera.R_inverse * -camera.t};
+    const RayFrame frame(geometry.caster(), camera);
+    const BackwardView<T> view{scene, camera, geometry, volume, vertices, filtered, importance, o, frame};
 
     std::vector<double> q_bar(grad.geometry() ? 3 * scene.n_verts : 0, 0.0);
     Destination to;

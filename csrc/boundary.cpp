@@ -29,10 +29,7 @@ class BoundaryChunk {
         if (!view_.adjoint.template at<N>(x, adjoint_.data() + lane * C_)) return;
         lane_[lane] = {curve, x, curve.parameter(s), weight, pixel_ray(view_.camera, x)};
         rejected_[lane] = view_.geometry.topology().faces(curve.edge);
-        const Ray& ray = lane_[lane].ray;
-        const Camera& camera = view_.camera;
-        const Vec3 origin = camera.perspective ? view_.eye : camera.R_inverse * (ray.origin - camera.t);
-        view_.geometry.caster().set(packet_, lane, origin, camera.R_inverse * ray.direction, !camera.perspective);
+        view_.frame.set(packet_, lane, lane_[lane].ray);
         if (++packet_.count == RayPacket::size) cast();
     }
 

@@ -15,7 +15,7 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
                    const std::vector<Vec3>& q, T* image, T* coverage) {
     const int C = N ? N : scene.channels, tile = 16;
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + tile - 1) / tile;
-    const Vec3 eye = camera.R_inverse * -camera.t;
+    const RayFrame frame(caster, camera);
 
 #pragma omp parallel num_threads(o.threads)
     {
@@ -36,8 +36,7 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
                         for (int i = 0; i < packet.count; ++i) {
                             const Vec2 u = lattice(first + i);
                             rays[i] = pixel_ray(camera, {x + 0.5 + o.filter.sample(u.x), y + 0.5 + o.filter.sample(u.y)});
-                            const Vec3 origin = camera.perspective ? eye : camera.R_inverse * (rays[i].origin - camera.t);
-                            caster.set(packet, i, origin, camera.R_inverse * rays[i].direction, !camera.perspective);
+                            frame.set(packet, i, rays[i]);
                         }
                         caster.cast(packet);
                         for (int i = 0; i < packet.count; ++i) {

@@ -83,9 +83,7 @@ class InteriorChunk {
         face_[lane] = face;
         ray_[lane] = pixel_ray(view_.camera, x);
         for (int c = 0; c < C_; ++c) weighted_[lane * C_ + c] = weight * adjoint_[c];
-        const Camera& camera = view_.camera;
-        const Vec3 origin = camera.perspective ? view_.eye : camera.R_inverse * (ray_[lane].origin - camera.t);
-        view_.geometry.caster().set(packet_, lane, origin, camera.R_inverse * ray_[lane].direction, !camera.perspective);
+        view_.frame.set(packet_, lane, ray_[lane]);
         if (packet_.count == RayPacket::size) cast();
     }
 

@@ -18,7 +18,7 @@ struct BackwardView {
     const FilteredAdjoint<T>& adjoint;
     const Importance& importance;
     const BackwardOptions& options;
-    Vec3 eye;  // world units
+    const RayFrame& frame;
 };
 
 // Adds to `to`; `geometry` says whether points and camera are wanted too. Returns the number of samples.

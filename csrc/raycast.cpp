@@ -155,16 +155,12 @@ void RayCaster::update(const double* verts, int threads) {
     committed_ = true;
 }
 
-void RayCaster::set(RayPacket& packet, int lane, Vec3 origin, Vec3 direction, bool from_infinity) const {
-    Vec3 o = (1 / radius_) * (origin - centre_);
-    // Everything lies in the unit ball. Seen from afar, float positions of the origin would be coarser than the scene,
-    // so the ray starts where it comes within reach, computed here in double.
-    const double along = -dot(o, direction) / dot(direction, direction), far = 4 / length(direction);
-    if (from_infinity || along > far) o += (along - 0.5 * far) * direction;
-    packet.origin_x[lane] = float(o.x), packet.origin_y[lane] = float(o.y), packet.origin_z[lane] = float(o.z);
-    packet.direction_x[lane] = float(direction.x), packet.direction_y[lane] = float(direction.y);
-    packet.direction_z[lane] = float(direction.z);
-}
+RayFrame::RayFrame(const RayCaster& caster, const Camera& camera)
+    : rotation_(camera.R_inverse),
+      eye_((1 / caster.radius_) * (camera.R_inverse * -camera.t - caster.centre_)),
+      inverse_radius_(1 / caster.radius_),
+      perspective_(camera.perspective),
+      far_(!camera.perspective || length(eye_) > 4) {}
 
 namespace {
 

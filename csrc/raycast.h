@@ -6,7 +6,7 @@
 #include <string>
 #include <vector>
 
-#include "math.h"
+#include "camera.h"
 
 namespace edgegrad {
 
@@ -36,9 +36,6 @@ class RayCaster {
     // New positions (V, 3), world units.
     void update(const double* verts, int threads);
 
-    // Puts a ray given in world coordinates into a lane.
-    void set(RayPacket& packet, int lane, Vec3 origin, Vec3 direction, bool from_infinity) const;
-
     // The nearest face along each ray.
     void cast(RayPacket& packet) const;
 
@@ -46,6 +43,7 @@ class RayCaster {
     void cast(RayPacket& packet, const std::span<const int32_t>* rejected) const;
 
    private:
+    friend class RayFrame;
     Vec3 detail_centre(const double* verts, int threads) const;
 
     const int32_t* faces_;
@@ -56,6 +54,33 @@ class RayCaster {
     std::vector<float> positions_;
     void *scene_ = nullptr, *geometry_ = nullptr;
     bool committed_ = false;
+};
+
+// The rays of one camera as Embree sees them.
+class RayFrame {
+   public:
+    RayFrame(const RayCaster& caster, const Camera& camera);
+
+    // Puts a ray, given in camera coordinates, into a lane.
+    void set(RayPacket& packet, int lane, const Ray& ray) const {
+        Vec3 o = eye_;
+        const Vec3 d = rotation_ * ray.direction;
+        if (!perspective_) o += inverse_radius_ * (rotation_ * ray.origin);
+        if (far_) {
+            // Everything lies in the unit ball. Float positions of a far origin would be coarser than the scene, so the
+            // ray starts just before the ball, computed here in double; never behind the eye.
+            const double start = -dot(o, d) / dot(d, d) - 2;
+            o += (perspective_ && start < 0 ? 0 : start) * d;
+        }
+        packet.origin_x[lane] = float(o.x), packet.origin_y[lane] = float(o.y), packet.origin_z[lane] = float(o.z);
+        packet.direction_x[lane] = float(d.x), packet.direction_y[lane] = float(d.y), packet.direction_z[lane] = float(d.z);
+    }
+
+   private:
+    Mat3 rotation_;
+    Vec3 eye_;
+    double inverse_radius_;
+    bool perspective_, far_;
 };
 
 }  // namespace edgegrad
