@@ -15,7 +15,8 @@ constexpr int64_t block = 4096;  // fixed, so that sums are rounded alike at any
 
 // δI = (1 − coverage) δbackground, pixel by pixel: exact for the image that the forward pass made.
 template <class T>
-void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint, const T* coverage, int threads, double* grad) {
+void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint, const T* coverage, int threads,
+                    double* grad) {
     const int C = scene.channels;
     if (scene.background_is_image) {
 #pragma omp parallel for num_threads(threads) schedule(static)
@@ -35,7 +36,8 @@ void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint,
 
 }  // namespace
 
-void add_world(const Camera& camera, const double* verts, const std::vector<double>& q_bar, int threads, const SceneGrad& grad) {
+void add_world(const Camera& camera, const double* verts, const std::vector<double>& q_bar, int threads,
+               const SceneGrad& grad) {
     const int64_t V = q_bar.size() / 3, blocks = (V + block - 1) / block;
     std::vector<double> sum(grad.world_to_camera ? 12 * blocks : 0, 0.0);
 #pragma omp parallel for num_threads(threads) schedule(static)
@@ -61,7 +63,8 @@ template <class T>
 BackwardCounts render_backward(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry,
                                const BackwardOptions& o, const T* adjoint, const T* coverage, const SceneGrad& grad) {
     BackwardCounts counts;
-    if (grad.background) add_background(scene, int64_t(camera.width) * camera.height, adjoint, coverage, o.threads, grad.background);
+    if (grad.background)
+        add_background(scene, int64_t(camera.width) * camera.height, adjoint, coverage, o.threads, grad.background);
 
     const bool interior_geometry = grad.geometry() && o.interior_geometry, boundary = grad.geometry() && o.boundary;
     if (!interior_geometry && !boundary && !grad.appearance()) return counts;
@@ -79,7 +82,8 @@ BackwardCounts render_backward(const SceneView<T>& scene, const Camera& camera, 
     to.q = grad.geometry() ? q_bar.data() : nullptr;
     to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels;
     dispatch_channels(scene.channels, [&]<int N>() {
-        if (interior_geometry || grad.appearance()) counts.surface_samples = add_interior<N>(view, interior_geometry, to);
+        if (interior_geometry || grad.appearance())
+            counts.surface_samples = add_interior<N>(view, interior_geometry, to);
         if (boundary) counts.edge_samples = add_boundary<N>(view, to);
     });
     if (grad.geometry()) add_world(camera, scene.verts, q_bar, o.threads, grad);
@@ -88,7 +92,9 @@ BackwardCounts render_backward(const SceneView<T>& scene, const Camera& camera, 
     return counts;
 }
 
-template BackwardCounts render_backward(const SceneView<float>&, const Camera&, const Geometry&, const BackwardOptions&, const float*, const float*, const SceneGrad&);
-template BackwardCounts render_backward(const SceneView<double>&, const Camera&, const Geometry&, const BackwardOptions&, const double*, const double*, const SceneGrad&);
+template BackwardCounts render_backward(const SceneView<float>&, const Camera&, const Geometry&, const BackwardOptions&,
+                                        const float*, const float*, const SceneGrad&);
+template BackwardCounts render_backward(const SceneView<double>&, const Camera&, const Geometry&,
+                                        const BackwardOptions&, const double*, const double*, const SceneGrad&);
 
 }  // namespace edgegrad

@@ -1,5 +1,5 @@
-// Checks, array views, exceptions; nothing else. Tensors come as NumPy views without a copy, outputs are arrays that the
-// caller made, and the interpreter's lock is released while the kernel works.
+// Checks, array views, exceptions; nothing else. Tensors come as NumPy views without a copy, outputs are arrays that
+// the caller made, and the interpreter's lock is released while the kernel works.
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -30,7 +30,8 @@ using Out = nb::ndarray<T, nb::numpy, nb::ndim<Dimensions>, nb::c_contig, nb::de
 [[noreturn]] void refuse(const std::string& text) { throw nb::value_error(text.c_str()); }
 
 std::string at(int64_t index, int64_t width) {
-    return width == 1 ? "[" + std::to_string(index) + "]" : "[" + std::to_string(index / width) + ", " + std::to_string(index % width) + "]";
+    return width == 1 ? "[" + std::to_string(index) + "]"
+                      : "[" + std::to_string(index / width) + ", " + std::to_string(index % width) + "]";
 }
 
 template <class T>
@@ -40,14 +41,16 @@ void check_finite(const char* name, const T* values, int64_t n, int64_t width) {
     for (int64_t i = 0; i < n; ++i) zero += values[i] * T(0);
     if (zero == 0) return;
     for (int64_t i = 0; i < n; ++i)
-        if (!std::isfinite(values[i])) refuse(std::string(name) + ": expected finite numbers, got " + std::to_string(values[i]) + " at " + at(i, width));
+        if (!std::isfinite(values[i]))
+            refuse(std::string(name) + ": expected finite numbers, got " + std::to_string(values[i]) + " at " +
+                   at(i, width));
 }
 
 void check_indices(const char* name, const int32_t* values, int64_t n, int64_t count, const char* of) {
     for (int64_t i = 0; i < n; ++i)
         if (values[i] < 0 || values[i] >= count)
-            refuse(std::string(name) + ": expected indices from 0 to " + std::to_string(count - 1) + " (rows of " + of + "), got " +
-                   std::to_string(values[i]) + " at " + at(i, 3));
+            refuse(std::string(name) + ": expected indices from 0 to " + std::to_string(count - 1) + " (rows of " + of +
+                   "), got " + std::to_string(values[i]) + " at " + at(i, 3));
 }
 
 // The arrays of a scene, kept alive, checked, and seen as the kernel sees them.
@@ -63,12 +66,23 @@ struct SceneArrays {
     In<T, 3> background;  // (1, 1, C) or (H, W, C)
     double spacing;
 
-    SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int32_t, 2> corners_, In<T, 2> colors_, In<double, 2> uvs_,
-                In<T, 2> texels_, In<int64_t, 2> textures_, In<int32_t, 1> face_texture_, In<T, 3> background_, double spacing_)
-        : verts(verts_), faces(faces_), corners(corners_), colors(colors_), uvs(uvs_), texels(texels_), textures(textures_),
-          face_texture(face_texture_), background(background_), spacing(spacing_) {
+    SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int32_t, 2> corners_, In<T, 2> colors_,
+                In<double, 2> uvs_, In<T, 2> texels_, In<int64_t, 2> textures_, In<int32_t, 1> face_texture_,
+                In<T, 3> background_, double spacing_)
+        : verts(verts_),
+          faces(faces_),
+          corners(corners_),
+          colors(colors_),
+          uvs(uvs_),
+          texels(texels_),
+          textures(textures_),
+          face_texture(face_texture_),
+          background(background_),
+          spacing(spacing_) {
         const auto width = [](const char* name, size_t got, size_t expected) {
-            if (got != expected) refuse(std::string(name) + ": expected " + std::to_string(expected) + " columns, got " + std::to_string(got));
+            if (got != expected)
+                refuse(std::string(name) + ": expected " + std::to_string(expected) + " columns, got " +
+                       std::to_string(got));
         };
         const size_t C = background.shape(2);
         width("verts", verts.shape(1), 3), width("faces", faces.shape(1), 3), width("corners", corners.shape(1), 3);
@@ -90,29 +104,46 @@ struct SceneArrays {
         if (face_texture.shape(0) != faces.shape(0)) refuse("face_texture: expected one number a face");
         for (size_t i = 0; i < textures.shape(0); ++i) {
             const int64_t first = textures(i, 0), h = textures(i, 1), w = textures(i, 2);
-            if (h < 1 || w < 1 || first < 0 || first + h * w > int64_t(texels.shape(0))) refuse("textures: row " + std::to_string(i) + " lies outside the texels");
+            if (h < 1 || w < 1 || first < 0 || first + h * w > int64_t(texels.shape(0)))
+                refuse("textures: row " + std::to_string(i) + " lies outside the texels");
         }
         for (size_t f = 0; f < faces.shape(0); ++f) {
-            if (face_texture(f) >= int64_t(textures.shape(0))) refuse("face_texture: expected a texture's number, got " + std::to_string(face_texture(f)));
+            if (face_texture(f) >= int64_t(textures.shape(0)))
+                refuse("face_texture: expected a texture's number, got " + std::to_string(face_texture(f)));
             const bool t = face_texture(f) >= 0;
-            check_indices(t ? "uv_faces" : "colors", corners.data() + 3 * f, 3, t ? uvs.shape(0) : colors.shape(0), t ? "uvs" : "colors");
+            check_indices(t ? "uv_faces" : "colors", corners.data() + 3 * f, 3, t ? uvs.shape(0) : colors.shape(0),
+                          t ? "uvs" : "colors");
         }
     }
 
     SceneView<T> view() const {
-        return {verts.data(), int64_t(verts.shape(0)), faces.data(), int64_t(faces.shape(0)), corners.data(),
-                colors.data(), int64_t(colors.shape(0)), uvs.data(), int64_t(uvs.shape(0)), texels.data(), int64_t(texels.shape(0)),
-                textures.data(), textures.shape(0) ? face_texture.data() : nullptr, background.data(),
-                background.shape(0) * background.shape(1) > 1, int(background.shape(2))};
+        return {verts.data(),
+                int64_t(verts.shape(0)),
+                faces.data(),
+                int64_t(faces.shape(0)),
+                corners.data(),
+                colors.data(),
+                int64_t(colors.shape(0)),
+                uvs.data(),
+                int64_t(uvs.shape(0)),
+                texels.data(),
+                int64_t(texels.shape(0)),
+                textures.data(),
+                textures.shape(0) ? face_texture.data() : nullptr,
+                background.data(),
+                background.shape(0) * background.shape(1) > 1,
+                int(background.shape(2))};
     }
 
     std::shared_ptr<const Geometry> geometry(bool want_topology, int threads) const {
-        return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, want_topology, threads);
+        return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, want_topology,
+                                threads);
     }
 };
 
 Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, bool perspective, int width, int height) {
-    if (world_to_camera.shape(0) != 4 || world_to_camera.shape(1) != 4) refuse("world_to_camera: expected shape (4, 4)");
+    if (world_to_camera.shape(0) != 4 || world_to_camera.shape(1) != 4)
+        refuse("world_to_camera: expected shape (4, 4)");
     if (K.shape(0) != 3 || K.shape(1) != 3) refuse("K: expected shape (3, 3)");
     check_finite("world_to_camera", world_to_camera.data(), 16, 4);
     check_finite("K", K.data(), 9, 3);
@@ -136,15 +167,16 @@ void check_image(const char* name, const Out<T, 3>& image, const Camera& camera,
 
 template <class T>
 void check_background(const SceneArrays<T>& scene, const Camera& camera) {
-    const auto &b = scene.background;
+    const auto& b = scene.background;
     if (b.shape(0) * b.shape(1) > 1 && (int(b.shape(0)) != camera.height || int(b.shape(1)) != camera.width))
-        refuse("background: expected the size of the image, " + std::to_string(camera.height) + " x " + std::to_string(camera.width) + ", got " +
-               std::to_string(b.shape(0)) + " x " + std::to_string(b.shape(1)));
+        refuse("background: expected the size of the image, " + std::to_string(camera.height) + " x " +
+               std::to_string(camera.width) + ", got " + std::to_string(b.shape(0)) + " x " +
+               std::to_string(b.shape(1)));
 }
 
 template <class T>
-void forward(const SceneArrays<T>& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed, int threads,
-             Out<T, 3> image, Out<T, 2> coverage) {
+void forward(const SceneArrays<T>& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed,
+             int threads, Out<T, 3> image, Out<T, 2> coverage) {
     check_background(scene, camera);
     check_image("image", image, camera, scene.background.shape(2));
     const ForwardOptions options{spp, make_filter(filter), seed, threads};
@@ -154,12 +186,13 @@ void forward(const SceneArrays<T>& scene, const Camera& camera, int spp, const s
 }
 
 template <class T>
-std::tuple<int64_t, int64_t> backward(
-    const SceneArrays<T>& scene, const Camera& camera, int64_t surface_samples, int64_t edge_samples, const std::string& filter,
-    uint64_t seed, int threads, bool interior_geometry, bool boundary, Out<T, 3> adjoint, Out<T, 2> coverage,
-    std::optional<Out<double, 2>> verts, std::optional<Out<double, 2>> colors, std::optional<Out<double, 2>> uvs,
-    std::optional<Out<double, 2>> texels, std::optional<Out<double, 3>> background,
-    std::optional<Out<double, 2>> world_to_camera, std::optional<Out<double, 2>> K) {
+std::tuple<int64_t, int64_t> backward(const SceneArrays<T>& scene, const Camera& camera, int64_t surface_samples,
+                                      int64_t edge_samples, const std::string& filter, uint64_t seed, int threads,
+                                      bool interior_geometry, bool boundary, Out<T, 3> adjoint, Out<T, 2> coverage,
+                                      std::optional<Out<double, 2>> verts, std::optional<Out<double, 2>> colors,
+                                      std::optional<Out<double, 2>> uvs, std::optional<Out<double, 2>> texels,
+                                      std::optional<Out<double, 3>> background,
+                                      std::optional<Out<double, 2>> world_to_camera, std::optional<Out<double, 2>> K) {
     check_background(scene, camera);
     check_image("adjoint", adjoint, camera, scene.background.shape(2));
     check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2));
@@ -174,10 +207,12 @@ std::tuple<int64_t, int64_t> backward(
     grad.background = data(background, scene.background, "background");
     grad.world_to_camera = world_to_camera ? world_to_camera->data() : nullptr;
     grad.K = K ? K->data() : nullptr;
-    const BackwardOptions options{surface_samples, edge_samples, make_filter(filter), seed, threads, interior_geometry, boundary, scene.spacing};
+    const BackwardOptions options{surface_samples,   edge_samples, make_filter(filter), seed, threads,
+                                  interior_geometry, boundary,     scene.spacing};
     nb::gil_scoped_release release;
     const auto geometry = scene.geometry(grad.geometry() && boundary, threads);
-    const BackwardCounts counts = render_backward(scene.view(), camera, *geometry, options, adjoint.data(), coverage.data(), grad);
+    const BackwardCounts counts =
+        render_backward(scene.view(), camera, *geometry, options, adjoint.data(), coverage.data(), grad);
     return {counts.surface_samples, counts.edge_samples};
 }
 
@@ -185,28 +220,41 @@ template <class T>
 void bind_scene(nb::module_& m, const char* name) {
     using Scene = SceneArrays<T>;
     nb::class_<Scene>(m, name)
-        .def(nb::init<In<double, 2>, In<int32_t, 2>, In<int32_t, 2>, In<T, 2>, In<double, 2>, In<T, 2>, In<int64_t, 2>, In<int32_t, 1>, In<T, 3>, double>(),
-             "verts"_a.noconvert(), "faces"_a.noconvert(), "corners"_a.noconvert(), "colors"_a.noconvert(), "uvs"_a.noconvert(),
-             "texels"_a.noconvert(), "textures"_a.noconvert(), "face_texture"_a.noconvert(), "background"_a.noconvert(), "spacing"_a)
-        .def("forward", &forward<T>, "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a, "image"_a.noconvert(), "coverage"_a.noconvert())
-        .def("backward", &backward<T>, "camera"_a, "surface_samples"_a, "edge_samples"_a, "filter"_a, "seed"_a, "threads"_a,
-             "interior_geometry"_a, "boundary"_a, "adjoint"_a.noconvert(), "coverage"_a.noconvert(), "verts"_a = nb::none(),
-             "colors"_a = nb::none(), "uvs"_a = nb::none(), "texels"_a = nb::none(), "background"_a = nb::none(),
-             "world_to_camera"_a = nb::none(), "K"_a = nb::none())
-        .def("shade_at", [](const Scene& scene, const Camera& camera, In<int32_t, 1> faces, In<double, 2> points, Out<double, 2> radiance) {
-            check_indices("faces", faces.data(), faces.size(), scene.faces.shape(0), "faces");
-            shade_at(scene.view(), camera, faces.size(), faces.data(), points.data(), radiance.data());
-        }, "camera"_a, "faces"_a.noconvert(), "points"_a.noconvert(), "radiance"_a.noconvert())
-        .def("shade_at_vjp", [](const Scene& scene, const Camera& camera, In<int32_t, 1> faces, In<double, 2> points, In<double, 2> radiance_bar,
-                                Out<double, 2> verts, Out<double, 2> colors, Out<double, 2> uvs, Out<double, 2> texels,
-                                Out<double, 2> world_to_camera, Out<double, 2> K) {
-            check_indices("faces", faces.data(), faces.size(), scene.faces.shape(0), "faces");
-            SceneGrad grad;
-            grad.verts = verts.data(), grad.colors = colors.data(), grad.uvs = uvs.data(), grad.texels = texels.data();
-            grad.world_to_camera = world_to_camera.data(), grad.K = K.data();
-            shade_at_vjp(scene.view(), camera, faces.size(), faces.data(), points.data(), radiance_bar.data(), grad);
-        }, "camera"_a, "faces"_a.noconvert(), "points"_a.noconvert(), "radiance_bar"_a.noconvert(), "verts"_a.noconvert(), "colors"_a.noconvert(),
-           "uvs"_a.noconvert(), "texels"_a.noconvert(), "world_to_camera"_a.noconvert(), "K"_a.noconvert());
+        .def(nb::init<In<double, 2>, In<int32_t, 2>, In<int32_t, 2>, In<T, 2>, In<double, 2>, In<T, 2>, In<int64_t, 2>,
+                      In<int32_t, 1>, In<T, 3>, double>(),
+             "verts"_a.noconvert(), "faces"_a.noconvert(), "corners"_a.noconvert(), "colors"_a.noconvert(),
+             "uvs"_a.noconvert(), "texels"_a.noconvert(), "textures"_a.noconvert(), "face_texture"_a.noconvert(),
+             "background"_a.noconvert(), "spacing"_a)
+        .def("forward", &forward<T>, "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a, "image"_a.noconvert(),
+             "coverage"_a.noconvert())
+        .def("backward", &backward<T>, "camera"_a, "surface_samples"_a, "edge_samples"_a, "filter"_a, "seed"_a,
+             "threads"_a, "interior_geometry"_a, "boundary"_a, "adjoint"_a.noconvert(), "coverage"_a.noconvert(),
+             "verts"_a = nb::none(), "colors"_a = nb::none(), "uvs"_a = nb::none(), "texels"_a = nb::none(),
+             "background"_a = nb::none(), "world_to_camera"_a = nb::none(), "K"_a = nb::none())
+        .def(
+            "shade_at",
+            [](const Scene& scene, const Camera& camera, In<int32_t, 1> faces, In<double, 2> points,
+               Out<double, 2> radiance) {
+                check_indices("faces", faces.data(), faces.size(), scene.faces.shape(0), "faces");
+                shade_at(scene.view(), camera, faces.size(), faces.data(), points.data(), radiance.data());
+            },
+            "camera"_a, "faces"_a.noconvert(), "points"_a.noconvert(), "radiance"_a.noconvert())
+        .def(
+            "shade_at_vjp",
+            [](const Scene& scene, const Camera& camera, In<int32_t, 1> faces, In<double, 2> points,
+               In<double, 2> radiance_bar, Out<double, 2> verts, Out<double, 2> colors, Out<double, 2> uvs,
+               Out<double, 2> texels, Out<double, 2> world_to_camera, Out<double, 2> K) {
+                check_indices("faces", faces.data(), faces.size(), scene.faces.shape(0), "faces");
+                SceneGrad grad;
+                grad.verts = verts.data(), grad.colors = colors.data(), grad.uvs = uvs.data(),
+                grad.texels = texels.data();
+                grad.world_to_camera = world_to_camera.data(), grad.K = K.data();
+                shade_at_vjp(scene.view(), camera, faces.size(), faces.data(), points.data(), radiance_bar.data(),
+                             grad);
+            },
+            "camera"_a, "faces"_a.noconvert(), "points"_a.noconvert(), "radiance_bar"_a.noconvert(),
+            "verts"_a.noconvert(), "colors"_a.noconvert(), "uvs"_a.noconvert(), "texels"_a.noconvert(),
+            "world_to_camera"_a.noconvert(), "K"_a.noconvert());
 }
 
 }  // namespace
@@ -216,7 +264,9 @@ NB_MODULE(_core, m) {
     m.def("open_embree", &open_embree, "path"_a);
     m.def("embree_version", &embree_version);
     m.def("clear_geometry", &clear_geometry);
-    nb::class_<Camera>(m, "Camera").def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "perspective"_a, "width"_a, "height"_a);
+    nb::class_<Camera>(m, "Camera")
+        .def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "perspective"_a, "width"_a,
+             "height"_a);
     bind_scene<float>(m, "SceneFloat");
     bind_scene<double>(m, "SceneDouble");
     bind_pieces(m);

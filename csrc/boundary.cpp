@@ -1,5 +1,5 @@
-// Curve samples. One ray for each: the radiance of an incident face is known exactly at the edge, so the ray through the
-// edge point, blind to the faces of that edge, finds what lies behind, or that something lies before.
+// Curve samples. One ray for each: the radiance of an incident face is known exactly at the edge, so the ray through
+// the edge point, blind to the faces of that edge, finds what lies behind, or that something lies before.
 
 #include "boundary.h"
 
@@ -19,8 +19,7 @@ template <int N, class T>
 class BoundaryChunk {
    public:
     BoundaryChunk(const BackwardView<T>& view, ChunkGrad& grad)
-        : view_(view), grad_(grad), C_(N ? N : view.scene.channels),
-          adjoint_(RayPacket::size * C_), radiance_(C_) {}
+        : view_(view), grad_(grad), C_(N ? N : view.scene.channels), adjoint_(RayPacket::size * C_), radiance_(C_) {}
 
     // The point at the fraction s of the curve.
     void add(const Curve& curve, double s, double weight) {
@@ -53,7 +52,8 @@ class BoundaryChunk {
     }
 
     // Ã · L, where `known` is next to the curve; else what the ray found, or the background.
-    double adjoint_radiance(const Lane& lane, const HalfEdge& known, int64_t behind, Barycentrics b, const double* adjoint) {
+    double adjoint_radiance(const Lane& lane, const HalfEdge& known, int64_t behind, Barycentrics b,
+                            const double* adjoint) {
         if (known.face < 0 && behind < 0) return view_.adjoint.template times_background<N>(lane.x);
         if (known.face >= 0) shade<N>(view_.scene, known.face, at_edge(known, lane.t), radiance_.data());
         else shade<N>(view_.scene, behind, b, radiance_.data());
@@ -74,7 +74,8 @@ class BoundaryChunk {
             const double depth = b[0] * corner[0].z + b[1] * corner[1].z + b[2] * corner[2].z;
             if (depth < point.z - tolerance(curve, corner)) return;  // occluded
         }
-        const double jump = adjoint_radiance(lane, curve.minus, behind, b, adjoint) - adjoint_radiance(lane, curve.plus, behind, b, adjoint);
+        const double jump = adjoint_radiance(lane, curve.minus, behind, b, adjoint) -
+                            adjoint_radiance(lane, curve.plus, behind, b, adjoint);
         const double scale = lane.weight * jump;
         const Vec2 tangent = curve.tangent();
         Vec3 point_bar;
@@ -94,7 +95,8 @@ class BoundaryChunk {
         for (const int corner : {h.first(), h.second()})
             for (int axis = 0; axis < 3; ++axis)
                 edge = std::max(edge, std::fabs(view_.scene.verts[3 * int64_t(vertex(view_.scene, h, corner)) + axis]));
-        for (int i = 0; i < 3; ++i) face = std::max({face, std::fabs(hit[i].x), std::fabs(hit[i].y), std::fabs(hit[i].z)});
+        for (int i = 0; i < 3; ++i)
+            face = std::max({face, std::fabs(hit[i].x), std::fabs(hit[i].y), std::fabs(hit[i].z)});
         return 8 * view_.options.spacing * edge + 64 * std::numeric_limits<double>::epsilon() * face;
     }
 
@@ -176,8 +178,10 @@ int64_t add_boundary(const BackwardView<T>& view, Destination& to) {
 }
 
 #define EDGEGRAD_INSTANTIATE(N, T) template int64_t add_boundary<N, T>(const BackwardView<T>&, Destination&);
-EDGEGRAD_INSTANTIATE(0, float) EDGEGRAD_INSTANTIATE(1, float) EDGEGRAD_INSTANTIATE(3, float) EDGEGRAD_INSTANTIATE(4, float)
-EDGEGRAD_INSTANTIATE(0, double) EDGEGRAD_INSTANTIATE(1, double) EDGEGRAD_INSTANTIATE(3, double) EDGEGRAD_INSTANTIATE(4, double)
+EDGEGRAD_INSTANTIATE(0, float)
+EDGEGRAD_INSTANTIATE(1, float) EDGEGRAD_INSTANTIATE(3, float) EDGEGRAD_INSTANTIATE(4, float)
+    EDGEGRAD_INSTANTIATE(0, double) EDGEGRAD_INSTANTIATE(1, double) EDGEGRAD_INSTANTIATE(3, double)
+        EDGEGRAD_INSTANTIATE(4, double)
 #undef EDGEGRAD_INSTANTIATE
 
 }  // namespace edgegrad

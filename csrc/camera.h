@@ -157,7 +157,8 @@ inline std::vector<Vec3> camera_vertices(const Camera& camera, const double* ver
     return q;
 }
 
-inline VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n, int threads) {
+inline VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n,
+                                int threads) {
     VertexView view{camera_vertices(camera, verts, n, threads), std::vector<Vec2>(n), std::vector<uint8_t>(n)};
 #pragma omp parallel for num_threads(threads) schedule(static)
     for (int64_t v = 0; v < n; ++v) {

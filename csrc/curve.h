@@ -16,8 +16,8 @@ namespace edgegrad {
 
 struct Curve {
     int64_t edge = -1;
-    HalfEdge minus, plus;  // the faces next to the curve; face −1: none, what lies behind is seen
-    Vec3 a, b;             // ends of the edge, camera coordinates
+    HalfEdge minus, plus;   // the faces next to the curve; face −1: none, what lies behind is seen
+    Vec3 a, b;              // ends of the edge, camera coordinates
     double t0 = 0, t1 = 0;  // its part within the view
     double w0 = 1, w1 = 1;  // denominators of the projection at t0 and t1
     Vec2 x0, x1;            // their pixel positions
@@ -58,23 +58,28 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
     const bool textured = is_textured(scene, m.face);
     if (textured != is_textured(scene, p.face)) return true;
     if (textured && scene.face_texture[m.face] != scene.face_texture[p.face]) return true;
-    const auto row = [&](const HalfEdge& h, int corner) { return int64_t(scene.corners[3 * int64_t(h.face) + corner]); };
+    const auto row = [&](const HalfEdge& h, int corner) {
+        return int64_t(scene.corners[3 * int64_t(h.face) + corner]);
+    };
     const int64_t ends[2][2] = {{row(m, m.first()), row(p, p.first())}, {row(m, m.second()), row(p, p.second())}};
     for (const auto& [i, j] : ends) {
         if (i == j) continue;
         if (textured && !std::equal(scene.uvs + 2 * i, scene.uvs + 2 * i + 2, scene.uvs + 2 * j)) return true;
         const int C = scene.channels;
-        if (!textured && !std::equal(scene.colors + C * i, scene.colors + C * (i + 1), scene.colors + C * j)) return true;
+        if (!textured && !std::equal(scene.colors + C * i, scene.colors + C * (i + 1), scene.colors + C * j))
+            return true;
     }
     return false;
 }
 
-// The curve of an edge; its length is zero when there is none. `facing` gives the orientation of each face in the image.
+// The curve of an edge; its length is zero when there is none. `facing` gives the orientation of each face in the
+// image.
 template <class T>
 Curve find_curve(const BackwardView<T>& view, const int8_t* facing, int64_t edge) {
     Curve c;
     const auto halves = view.geometry.topology().half_edges(edge);
-    const int32_t va = vertex(view.scene, halves[0], halves[0].first()), vb = vertex(view.scene, halves[0], halves[0].second());
+    const int32_t va = vertex(view.scene, halves[0], halves[0].first()),
+                  vb = vertex(view.scene, halves[0], halves[0].second());
     const VertexView& p = view.vertices;
     if (p.outcode[va] & p.outcode[vb]) return c;
     c.a = p.q[va], c.b = p.q[vb];

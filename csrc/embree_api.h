@@ -1,5 +1,5 @@
-// The part of Embree's C interface (version 4, https://www.embree.org/api.html) that raycast.cpp uses. The library comes
-// with the embreex wheel, which carries no headers; it is opened at run time.
+// The part of Embree's C interface (version 4, https://www.embree.org/api.html) that raycast.cpp uses. The library
+// comes with the embreex wheel, which carries no headers; it is opened at run time.
 #pragma once
 
 #include <cstddef>
@@ -54,23 +54,23 @@ struct IntersectArguments {
 };
 
 // One member for each function: name, result, parameters.
-#define EDGEGRAD_EMBREE_FUNCTIONS(X)                                                                  \
-    X(rtcNewDevice, Device, (const char*))                                                            \
-    X(rtcGetDeviceProperty, ptrdiff_t, (Device, int))                                                 \
-    X(rtcGetDeviceError, int, (Device))                                                               \
-    X(rtcNewScene, Scene, (Device))                                                                   \
-    X(rtcReleaseScene, void, (Scene))                                                                 \
-    X(rtcSetSceneFlags, void, (Scene, int))                                                           \
-    X(rtcSetSceneBuildQuality, void, (Scene, int))                                                    \
-    X(rtcCommitScene, void, (Scene))                                                                  \
-    X(rtcNewGeometry, Geometry, (Device, int))                                                        \
-    X(rtcReleaseGeometry, void, (Geometry))                                                           \
+#define EDGEGRAD_EMBREE_FUNCTIONS(X)                                                                         \
+    X(rtcNewDevice, Device, (const char*))                                                                   \
+    X(rtcGetDeviceProperty, ptrdiff_t, (Device, int))                                                        \
+    X(rtcGetDeviceError, int, (Device))                                                                      \
+    X(rtcNewScene, Scene, (Device))                                                                          \
+    X(rtcReleaseScene, void, (Scene))                                                                        \
+    X(rtcSetSceneFlags, void, (Scene, int))                                                                  \
+    X(rtcSetSceneBuildQuality, void, (Scene, int))                                                           \
+    X(rtcCommitScene, void, (Scene))                                                                         \
+    X(rtcNewGeometry, Geometry, (Device, int))                                                               \
+    X(rtcReleaseGeometry, void, (Geometry))                                                                  \
     X(rtcSetSharedGeometryBuffer, void, (Geometry, int, unsigned, int, const void*, size_t, size_t, size_t)) \
-    X(rtcUpdateGeometryBuffer, void, (Geometry, int, unsigned))                                       \
-    X(rtcSetGeometryBuildQuality, void, (Geometry, int))                                              \
-    X(rtcSetGeometryEnableFilterFunctionFromArguments, void, (Geometry, bool))                        \
-    X(rtcCommitGeometry, void, (Geometry))                                                            \
-    X(rtcAttachGeometry, unsigned, (Scene, Geometry))                                                 \
+    X(rtcUpdateGeometryBuffer, void, (Geometry, int, unsigned))                                              \
+    X(rtcSetGeometryBuildQuality, void, (Geometry, int))                                                     \
+    X(rtcSetGeometryEnableFilterFunctionFromArguments, void, (Geometry, bool))                               \
+    X(rtcCommitGeometry, void, (Geometry))                                                                   \
+    X(rtcAttachGeometry, unsigned, (Scene, Geometry))                                                        \
     X(rtcIntersect8, void, (const int*, Scene, RayHit8*, IntersectArguments*))
 
 }  // namespace edgegrad::embree

@@ -99,7 +99,8 @@ class FilteredAdjoint {
         const int j1 = std::min(height_ - 1, int(std::floor(box ? x.y : x.y + r - 0.5)));
         for (int j = j0; j <= j1; ++j) {
             const double wy = filter_.weight(x.y - j - 0.5);
-            for (int i = i0; i <= i1; ++i) visit(int64_t(j) * width_ + i, box ? 1.0 : wy * filter_.weight(x.x - i - 0.5));
+            for (int i = i0; i <= i1; ++i)
+                visit(int64_t(j) * width_ + i, box ? 1.0 : wy * filter_.weight(x.x - i - 0.5));
         }
     }
 

@@ -35,7 +35,8 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
                         packet.count = std::min(RayPacket::size, o.spp - first);
                         for (int i = 0; i < packet.count; ++i) {
                             const Vec2 u = lattice(first + i);
-                            rays[i] = pixel_ray(camera, {x + 0.5 + o.filter.sample(u.x), y + 0.5 + o.filter.sample(u.y)});
+                            rays[i] =
+                                pixel_ray(camera, {x + 0.5 + o.filter.sample(u.x), y + 0.5 + o.filter.sample(u.y)});
                             frame.set(packet, i, rays[i]);
                         }
                         caster.cast(packet);
@@ -63,12 +64,15 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
 }  // namespace
 
 template <class T>
-void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ForwardOptions& o, T* image, T* coverage) {
+void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ForwardOptions& o,
+                    T* image, T* coverage) {
     const std::vector<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, o.threads);
     dispatch_channels(scene.channels, [&]<int N>() { render_pixels<N>(scene, camera, caster, o, q, image, coverage); });
 }
 
-template void render_forward(const SceneView<float>&, const Camera&, const RayCaster&, const ForwardOptions&, float*, float*);
-template void render_forward(const SceneView<double>&, const Camera&, const RayCaster&, const ForwardOptions&, double*, double*);
+template void render_forward(const SceneView<float>&, const Camera&, const RayCaster&, const ForwardOptions&, float*,
+                             float*);
+template void render_forward(const SceneView<double>&, const Camera&, const RayCaster&, const ForwardOptions&, double*,
+                             double*);
 
 }  // namespace edgegrad

@@ -23,8 +23,8 @@ bool same(const std::vector<T>& kept_values, const T* values, int64_t n) {
 
 }  // namespace
 
-std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts, int64_t n_verts,
-                                                 double spacing, bool want_topology, int threads) {
+std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
+                                                 int64_t n_verts, double spacing, bool want_topology, int threads) {
     const std::lock_guard lock(mutex);
     auto found = kept.end();
     bool moved = true;
@@ -51,7 +51,8 @@ std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n
         geometry->welded_ = false;
     }
     if (want_topology && !geometry->welded_) {
-        if (!geometry->topology_) geometry->topology_ = std::make_unique<Topology>(geometry->faces_.data(), n_faces, n_verts);
+        if (!geometry->topology_)
+            geometry->topology_ = std::make_unique<Topology>(geometry->faces_.data(), n_faces, n_verts);
         geometry->topology_->weld(verts, spacing);
         geometry->welded_ = true;
     }

@@ -21,7 +21,8 @@ class Geometry {
     const Topology& topology() const { return *topology_; }
 
    private:
-    friend std::shared_ptr<const Geometry> acquire_geometry(const int32_t*, int64_t, const double*, int64_t, double, bool, int);
+    friend std::shared_ptr<const Geometry> acquire_geometry(const int32_t*, int64_t, const double*, int64_t, double,
+                                                            bool, int);
 
     std::vector<int32_t> faces_;
     std::vector<double> verts_;
@@ -33,8 +34,8 @@ class Geometry {
 // The geometry of these faces at these positions, with its topology if wanted. One that is still in memory is used
 // again: as it is when the positions are the same, updated when they moved and nobody else uses it. What is compared is
 // the content of the arrays, so tensors may be copied, changed in place or freed without harm.
-std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts, int64_t n_verts,
-                                                 double spacing, bool want_topology, int threads);
+std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
+                                                 int64_t n_verts, double spacing, bool want_topology, int threads);
 
 // Forgets all kept geometry that is not in use.
 void clear_geometry();

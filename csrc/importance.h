@@ -42,9 +42,11 @@ class Importance {
     // Mean over the pixels that a filter of this radius reaches from the box [low, high]; 0 if no adjoint is there.
     double mean(Vec2 low, Vec2 high) const {
         const int i0 = clamp(std::floor(low.x - radius_), width_), i1 = clamp(std::floor(high.x + radius_) + 1, width_);
-        const int j0 = clamp(std::floor(low.y - radius_), height_), j1 = clamp(std::floor(high.y + radius_) + 1, height_);
+        const int j0 = clamp(std::floor(low.y - radius_), height_),
+                  j1 = clamp(std::floor(high.y + radius_) + 1, height_);
         if (i0 >= i1 || j0 >= j1) return 0;
-        const int64_t sum = table_[index(i1, j1)] - table_[index(i0, j1)] - table_[index(i1, j0)] + table_[index(i0, j0)];
+        const int64_t sum =
+            table_[index(i1, j1)] - table_[index(i0, j1)] - table_[index(i1, j0)] + table_[index(i0, j0)];
         return double(sum) / (double(unit) * (i1 - i0) * double(j1 - j0));
     }
 

@@ -1,8 +1,8 @@
 // Surface samples: points on the triangles rather than pixels that happen to hit them.
 //
-// Triangles are laid end to end by the measure m = (area + longest side · 1 px) · (how much the loss looks there), image
-// units, clipped to the view. A point uniform in the image of its triangle then has the weight area · M / (n m). At a
-// grazing angle the integrand grows as 1 / area, and the product stays bounded.
+// Triangles are laid end to end by the measure m = (area + longest side · 1 px) · (how much the loss looks there),
+// image units, clipped to the view. A point uniform in the image of its triangle then has the weight area · M / (n m).
+// At a grazing angle the integrand grows as 1 / area, and the product stays bounded.
 
 #include "interior.h"
 
@@ -21,7 +21,7 @@ namespace {
 struct VisiblePolygon {
     Vec2 corner[7];
     int n = 0;
-    double area = 0;  // px²
+    double area = 0;     // px²
     double longest = 0;  // px
     Vec2 low, high;
 
@@ -74,8 +74,14 @@ template <int N, class T>
 class InteriorChunk {
    public:
     InteriorChunk(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
-        : view_(view), geometry_(geometry), want_rows_(to.colors || to.uvs), want_texels_(to.texels), grad_(grad),
-          C_(N ? N : view.scene.channels), weighted_(RayPacket::size * C_), adjoint_(C_) {}
+        : view_(view),
+          geometry_(geometry),
+          want_rows_(to.colors || to.uvs),
+          want_texels_(to.texels),
+          grad_(grad),
+          C_(N ? N : view.scene.channels),
+          weighted_(RayPacket::size * C_),
+          adjoint_(C_) {}
 
     void add(int64_t face, Vec2 x, double weight) {
         if (!view_.adjoint.template at<N>(x, adjoint_.data())) return;
@@ -125,7 +131,8 @@ class InteriorChunk {
         const bool textured = is_textured(view_.scene, current_);
         for (int i = 0; i < 3; ++i) {
             if (geometry_) grad_.q.add(v[i], &corner_bar_[i].x);
-            if (want_rows_) (textured ? grad_.uvs : grad_.colors).add(row[i], rows_.value.data() + i * (textured ? 2 : C_));
+            if (want_rows_)
+                (textured ? grad_.uvs : grad_.colors).add(row[i], rows_.value.data() + i * (textured ? 2 : C_));
         }
         current_ = -1;
     }
@@ -160,7 +167,8 @@ int64_t add_interior(const BackwardView<T>& view, bool geometry, Destination& to
         for (int64_t f = k * block; f < std::min(F, (k + 1) * block); ++f) {
             const VisiblePolygon polygon(view, f);
             if (!(polygon.area > 0)) continue;
-            const double m = polygon.area + polygon.longest, importance = view.importance.mean(polygon.low, polygon.high);
+            const double m = polygon.area + polygon.longest,
+                         importance = view.importance.mean(polygon.low, polygon.high);
             measure[f] = m * importance;
             if (importance > 0) size[k] += m;
         }
@@ -187,8 +195,10 @@ int64_t add_interior(const BackwardView<T>& view, bool geometry, Destination& to
 }
 
 #define EDGEGRAD_INSTANTIATE(N, T) template int64_t add_interior<N, T>(const BackwardView<T>&, bool, Destination&);
-EDGEGRAD_INSTANTIATE(0, float) EDGEGRAD_INSTANTIATE(1, float) EDGEGRAD_INSTANTIATE(3, float) EDGEGRAD_INSTANTIATE(4, float)
-EDGEGRAD_INSTANTIATE(0, double) EDGEGRAD_INSTANTIATE(1, double) EDGEGRAD_INSTANTIATE(3, double) EDGEGRAD_INSTANTIATE(4, double)
+EDGEGRAD_INSTANTIATE(0, float)
+EDGEGRAD_INSTANTIATE(1, float) EDGEGRAD_INSTANTIATE(3, float) EDGEGRAD_INSTANTIATE(4, float)
+    EDGEGRAD_INSTANTIATE(0, double) EDGEGRAD_INSTANTIATE(1, double) EDGEGRAD_INSTANTIATE(3, double)
+        EDGEGRAD_INSTANTIATE(4, double)
 #undef EDGEGRAD_INSTANTIATE
 
 }  // namespace edgegrad

@@ -88,7 +88,8 @@ void bind_pieces(nb::module_& m) {
         Vec3 q_bar[3];
         Ray ray_bar;
         intersect_vjp(ray, corner, b, {bar[0], bar[1]}, q_bar, ray_bar);
-        return std::tuple(array(ray_bar.origin), array(ray_bar.direction), std::array<A3, 3>{array(q_bar[0]), array(q_bar[1]), array(q_bar[2])});
+        return std::tuple(array(ray_bar.origin), array(ray_bar.direction),
+                          std::array<A3, 3>{array(q_bar[0]), array(q_bar[1]), array(q_bar[2])});
     });
     p.def("inside", [](double u, double v) {
         const Barycentrics b = inside({u, v});
@@ -138,7 +139,8 @@ void bind_pieces(nb::module_& m) {
     });
     using Image = nb::ndarray<const double, nb::numpy, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
     p.def("importance", [](Image adjoint, double radius, A2 low, A2 high) {
-        const Importance importance(adjoint.data(), int(adjoint.shape(1)), int(adjoint.shape(0)), int(adjoint.shape(2)), radius);
+        const Importance importance(adjoint.data(), int(adjoint.shape(1)), int(adjoint.shape(0)), int(adjoint.shape(2)),
+                                    radius);
         return importance.mean(vec(low), vec(high));
     });
 

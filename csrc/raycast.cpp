@@ -58,7 +58,8 @@ std::string open_error() {
 void throw_on_error(const char* doing) {
     const int error = rtc.rtcGetDeviceError(rtc.device);
     if (error == ERROR_OUT_OF_MEMORY) throw std::bad_alloc();
-    if (error != ERROR_NONE) throw std::runtime_error(std::string("Embree failed while ") + doing + ", error " + std::to_string(error));
+    if (error != ERROR_NONE)
+        throw std::runtime_error(std::string("Embree failed while ") + doing + ", error " + std::to_string(error));
 }
 
 }  // namespace
@@ -70,13 +71,15 @@ void open_embree(const std::string& path) {
     void* library = open_library(path);
     if (!library) throw std::runtime_error("cannot open " + path + ": " + open_error());
     Library found;
-#define EDGEGRAD_LOAD(name, result, parameters)                                                 \
-    found.name = reinterpret_cast<result(*) parameters>(symbol(library, #name));                \
+#define EDGEGRAD_LOAD(name, result, parameters)                                  \
+    found.name = reinterpret_cast<result(*) parameters>(symbol(library, #name)); \
     if (!found.name) throw std::runtime_error(path + " lacks " #name "; version 4.x is needed");
     EDGEGRAD_EMBREE_FUNCTIONS(EDGEGRAD_LOAD)
 #undef EDGEGRAD_LOAD
     found.device = found.rtcNewDevice(nullptr);
-    if (!found.device) throw std::runtime_error("Embree cannot make a device on this processor, error " + std::to_string(found.rtcGetDeviceError(nullptr)));
+    if (!found.device)
+        throw std::runtime_error("Embree cannot make a device on this processor, error " +
+                                 std::to_string(found.rtcGetDeviceError(nullptr)));
     found.version = int(found.rtcGetDeviceProperty(found.device, DEVICE_PROPERTY_VERSION));
     if (found.rtcGetDeviceProperty(found.device, DEVICE_PROPERTY_VERSION_MAJOR) != 4)
         throw std::runtime_error("expected Embree 4.x, got version " + std::to_string(found.version) + " in " + path);
@@ -86,7 +89,10 @@ void open_embree(const std::string& path) {
 int embree_version() { return rtc.version; }
 
 RayCaster::RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts)
-    : faces_(faces), n_faces_(n_faces), n_verts_(n_verts), positions_(3 * size_t(n_verts) + 1, 0.f) {  // Embree reads 16 bytes a vertex
+    : faces_(faces),
+      n_faces_(n_faces),
+      n_verts_(n_verts),
+      positions_(3 * size_t(n_verts) + 1, 0.f) {  // Embree reads 16 bytes a vertex
     if (!rtc.device) throw std::runtime_error("Embree is not open");
     Geometry geometry = rtc.rtcNewGeometry(rtc.device, GEOMETRY_TYPE_TRIANGLE);
     rtc.rtcSetSharedGeometryBuffer(geometry, BUFFER_TYPE_INDEX, 0, FORMAT_UINT3, faces, 0, 12, n_faces);
@@ -113,7 +119,9 @@ RayCaster::~RayCaster() {
 Vec3 RayCaster::detail_centre(const double* verts, int threads) const {
     // Blocks of fixed size, so that the sum is rounded alike at any number of threads.
     const int64_t block = 4096, blocks = (n_faces_ + block - 1) / block;
-    const auto vertex = [&](int32_t v) { return Vec3{verts[3 * int64_t(v)], verts[3 * int64_t(v) + 1], verts[3 * int64_t(v) + 2]}; };
+    const auto vertex = [&](int32_t v) {
+        return Vec3{verts[3 * int64_t(v)], verts[3 * int64_t(v) + 1], verts[3 * int64_t(v) + 2]};
+    };
     const Vec3 base = vertex(faces_[0]);
     std::vector<Vec3> sum(blocks);
     std::vector<double> weight(blocks, 0.0);
@@ -165,9 +173,9 @@ RayFrame::RayFrame(const RayCaster& caster, const Camera& camera)
 namespace {
 
 alignas(32) constexpr int valid_lanes[9][8] = {
-    {0, 0, 0, 0, 0, 0, 0, 0},        {-1, 0, 0, 0, 0, 0, 0, 0},      {-1, -1, 0, 0, 0, 0, 0, 0},
-    {-1, -1, -1, 0, 0, 0, 0, 0},     {-1, -1, -1, -1, 0, 0, 0, 0},   {-1, -1, -1, -1, -1, 0, 0, 0},
-    {-1, -1, -1, -1, -1, -1, 0, 0},  {-1, -1, -1, -1, -1, -1, -1, 0}, {-1, -1, -1, -1, -1, -1, -1, -1}};
+    {0, 0, 0, 0, 0, 0, 0, 0},       {-1, 0, 0, 0, 0, 0, 0, 0},       {-1, -1, 0, 0, 0, 0, 0, 0},
+    {-1, -1, -1, 0, 0, 0, 0, 0},    {-1, -1, -1, -1, 0, 0, 0, 0},    {-1, -1, -1, -1, -1, 0, 0, 0},
+    {-1, -1, -1, -1, -1, -1, 0, 0}, {-1, -1, -1, -1, -1, -1, -1, 0}, {-1, -1, -1, -1, -1, -1, -1, -1}};
 
 void intersect8(Scene scene, RayPacket& p, IntersectArguments& arguments) {
     RayHit8 r;
@@ -208,8 +216,12 @@ void RayCaster::cast(RayPacket& packet) const {
 
 void RayCaster::cast(RayPacket& packet, const std::span<const int32_t>* rejected) const {
     RejectContext context{{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}}, rejected};
-    IntersectArguments arguments{RAY_QUERY_FLAG_COHERENT | RAY_QUERY_FLAG_INVOKE_ARGUMENT_FILTER, FEATURE_FLAG_ALL,
-                                 &context.query, reject, nullptr, 0};
+    IntersectArguments arguments{RAY_QUERY_FLAG_COHERENT | RAY_QUERY_FLAG_INVOKE_ARGUMENT_FILTER,
+                                 FEATURE_FLAG_ALL,
+                                 &context.query,
+                                 reject,
+                                 nullptr,
+                                 0};
     intersect8(static_cast<Scene>(scene_), packet, arguments);
 }
 

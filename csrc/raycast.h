@@ -73,7 +73,8 @@ class RayFrame {
             o += (perspective_ && start < 0 ? 0 : start) * d;
         }
         packet.origin_x[lane] = float(o.x), packet.origin_y[lane] = float(o.y), packet.origin_z[lane] = float(o.z);
-        packet.direction_x[lane] = float(d.x), packet.direction_y[lane] = float(d.y), packet.direction_z[lane] = float(d.z);
+        packet.direction_x[lane] = float(d.x), packet.direction_y[lane] = float(d.y),
+        packet.direction_z[lane] = float(d.z);
     }
 
    private:

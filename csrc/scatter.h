@@ -1,8 +1,8 @@
 // The only writer of gradients: the same bits at any number of threads.
 //
 // Samples are worked on in chunks of fixed size. A chunk writes rows (index, values) into buffers of its own; then each
-// thread walks over all rows in order and adds those whose destination it owns. So each sum has one owner and one order.
-// Chunks are taken in waves, which bounds the memory.
+// thread walks over all rows in order and adds those whose destination it owns. So each sum has one owner and one
+// order. Chunks are taken in waves, which bounds the memory.
 #pragma once
 
 #include <algorithm>

@@ -28,7 +28,9 @@ struct SceneView {
     bool background_is_image;
     int channels;  // C
 
-    const T* background_at(int64_t pixel) const { return background_is_image ? background + pixel * channels : background; }
+    const T* background_at(int64_t pixel) const {
+        return background_is_image ? background + pixel * channels : background;
+    }
 };
 
 // Where gradients are added, in double whatever the arrays hold; null where none is wanted.

@@ -25,7 +25,8 @@ inline bool intersect(const Ray& ray, const Vec3 q[3], Barycentrics& b) {
     return std::isfinite(b.u) && std::isfinite(b.v);
 }
 
-inline void intersect_vjp(const Ray& ray, const Vec3 q[3], const Barycentrics& b, Barycentrics bar, Vec3 q_bar[3], Ray& ray_bar) {
+inline void intersect_vjp(const Ray& ray, const Vec3 q[3], const Barycentrics& b, Barycentrics bar, Vec3 q_bar[3],
+                          Ray& ray_bar) {
     const Vec3 e1 = q[1] - q[0], e2 = q[2] - q[0], s = ray.origin - q[0];
     const Vec3 P = cross(ray.direction, e2), Q = cross(s, e1);
     const double inverse_det = 1.0 / dot(e1, P);

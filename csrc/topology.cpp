@@ -33,7 +33,8 @@ void Topology::weld(const double* verts, double spacing) {
         const double* p = verts + 3 * int64_t(v);
         order.push_back({0.5257311 * p[0] + 0.6889372 * p[1] + 0.4991206 * p[2], v});
     }
-    std::sort(order.begin(), order.end(), [](const Key& a, const Key& b) { return a.s < b.s || (a.s == b.s && a.vertex < b.vertex); });
+    std::sort(order.begin(), order.end(),
+              [](const Key& a, const Key& b) { return a.s < b.s || (a.s == b.s && a.vertex < b.vertex); });
 
     // Two copies that went through the same rotation and translation differ by a few roundings at most.
     const auto reach = [&](int32_t v) {
@@ -69,7 +70,9 @@ void Topology::build() {
         return welded_.empty() ? v : welded_[v];
     };
     // A face that uses a place twice has no area and no part in the surface.
-    const auto degenerate = [&](int64_t f) { return at(f, 0) == at(f, 1) || at(f, 1) == at(f, 2) || at(f, 2) == at(f, 0); };
+    const auto degenerate = [&](int64_t f) {
+        return at(f, 0) == at(f, 1) || at(f, 1) == at(f, 2) || at(f, 2) == at(f, 0);
+    };
 
     std::vector<int64_t> begin(n_verts_ + 1, 0);
     for (int64_t f = 0; f < n_faces_; ++f) {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 
 import torch
@@ -98,11 +99,27 @@ def check_indices(name: str, tensor: Tensor, count: int, of: str) -> None:
         )
 
 
+def as_int(name: str, value: object) -> int:
+    """`value` as an int: ints of Python and NumPy, and tensors of one integer. Raises TypeError."""
+    try:
+        if isinstance(value, bool):
+            raise TypeError
+        return operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        raise TypeError(f"{name}: expected an int, got {type(value).__name__} ({value!r})") from None
+
+
+def as_scalar(name: str, value: object, *, like: Tensor) -> Tensor:
+    """A number, or a tensor of one, as a 0-d tensor of the dtype of `like`. Raises TypeError or ValueError."""
+    tensor = as_tensor(name, value, like=like)
+    if tensor.numel() != 1:
+        raise ValueError(f"{name}: expected one number, got shape {shape_text(tensor.shape)}")
+    return tensor.to(like).reshape(())
+
+
 def check_positive_int(name: str, value: object, *, most: int = 2**31 - 1) -> int:
     """An int ≥ 1. Raises TypeError or ValueError."""
-    if isinstance(value, bool) or not hasattr(value, "__index__"):
-        raise TypeError(f"{name}: expected an int, got {type(value).__name__} ({value!r})")
-    number = value.__index__()  # type: ignore[attr-defined]
+    number = as_int(name, value)
     if not 1 <= number <= most:
         raise ValueError(f"{name}: expected an int from 1 to {most}, got {number}")
     return number

@@ -21,7 +21,9 @@ def embree_path() -> str:
     for file in files:
         if "embree4" in file.name and (".so" in file.name or file.suffix in (".dll", ".dylib")):
             return str(file.locate())
-    raise ImportError(f"{HOW_TO_GET_EMBREE}; the installed embreex {importlib.metadata.version('embreex')} carries no libembree4")
+    raise ImportError(
+        f"{HOW_TO_GET_EMBREE}; the installed embreex {importlib.metadata.version('embreex')} carries no libembree4"
+    )
 
 
 def load():

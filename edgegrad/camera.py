@@ -13,11 +13,12 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape, values_visible
+from ._check import as_scalar, as_tensor, check_finite, check_float, check_positive_int, check_shape, values_visible
 
 Vector = Tensor | Sequence[float]
 
@@ -51,9 +52,7 @@ class Camera:
                 f"K: expected a batch of {self.world_to_camera.shape[0]} like world_to_camera, got {self.K.shape[0]}; "
                 "give one K (3, 3) for all or as many as cameras"
             )
-        if isinstance(self.size, int) or len(self.size) != 2:
-            raise TypeError(f"size: expected (height, width), got {self.size!r}")
-        object.__setattr__(self, "size", tuple(check_positive_int("size", n, most=65536) for n in self.size))
+        object.__setattr__(self, "size", _size(self.size))
         if self.projection not in ("perspective", "orthographic"):
             raise ValueError(f'projection: expected "perspective" or "orthographic", got {self.projection!r}')
         if values_visible():
@@ -84,7 +83,10 @@ class Camera:
 
     @staticmethod
     def look_at(
-        eye: Vector, target: Vector, up: Vector = (0.0, 1.0, 0.0), fov_y: float | Tensor = 40.0,
+        eye: Vector,
+        target: Vector,
+        up: Vector = (0.0, 1.0, 0.0),
+        fov_y: float | Tensor = 40.0,
         size: tuple[int, int] = (256, 256),
     ) -> Camera:
         """Perspective camera at `eye` (3,) looking at `target` (3,), with `up` (3,) upwards in the image.
@@ -92,25 +94,25 @@ class Camera:
         fov_y: full vertical field of view in degrees, in (0, 180); square pixels, principal point in the middle.
         """
         world_to_camera = _look_at(eye, target, up)
-        fov_y = as_tensor("fov_y", fov_y, like=world_to_camera)
-        if values_visible() and not 0.0 < float(fov_y.detach()) < 180.0:
-            raise ValueError(f"fov_y: expected degrees between 0 and 180, got {float(fov_y):g}")
         H, W = _size(size)
-        focal = 0.5 * H / torch.tan(torch.deg2rad(fov_y.to(world_to_camera)) * 0.5)
+        focal = _focal(fov_y, H, like=world_to_camera)
         return Camera(world_to_camera, _intrinsics(focal, focal, 0.5 * W, 0.5 * H), (H, W))
 
     @staticmethod
     def orthographic(
-        eye: Vector, target: Vector, up: Vector = (0.0, 1.0, 0.0), height: float | Tensor = 2.0,
+        eye: Vector,
+        target: Vector,
+        up: Vector = (0.0, 1.0, 0.0),
+        height: float | Tensor = 2.0,
         size: tuple[int, int] = (256, 256),
     ) -> Camera:
         """Orthographic camera that looks from `eye` towards `target` and shows `height` world units from top to bottom."""
         world_to_camera = _look_at(eye, target, up)
-        height = as_tensor("height", height, like=world_to_camera)
-        if values_visible() and not float(height.detach()) > 0.0:
+        height = as_scalar("height", height, like=world_to_camera)
+        if values_visible() and not 0.0 < float(height.detach()) < math.inf:
             raise ValueError(f"height: expected world units above 0, got {float(height):g}")
         H, W = _size(size)
-        scale = H / height.to(world_to_camera)
+        scale = H / height
         return Camera(world_to_camera, _intrinsics(scale, scale, 0.5 * W, 0.5 * H), (H, W), "orthographic")
 
     @staticmethod
@@ -148,8 +150,7 @@ class Camera:
         t = -(R * pose[:3, 3]).sum(-1)
         if K is None:
             H, W = _size(size)
-            half = torch.deg2rad(as_tensor("fov_y", fov_y, like=pose).to(pose)) * 0.5
-            focal = 0.5 * H / torch.tan(half)
+            focal = _focal(fov_y, H, like=pose)
             K = _intrinsics(focal, focal, 0.5 * W, 0.5 * H)
         return Camera(_rigid(R, t), as_tensor("K", K, like=pose), size)
 
@@ -160,13 +161,17 @@ class Camera:
             raise ValueError("cameras: expected at least one camera, got none")
         first = cameras[0]
         for i, camera in enumerate(cameras):
+            if not isinstance(camera, Camera):
+                raise TypeError(f"cameras[{i}]: expected a Camera, got {type(camera).__name__}")
             if camera.size != first.size or camera.projection != first.projection or camera.batch is not None:
                 raise ValueError(
                     f"cameras[{i}]: expected a single {first.projection} camera of size {first.size}, got {camera!r}"
                 )
         return Camera(
-            torch.stack([c.world_to_camera for c in cameras]), torch.stack([c.K for c in cameras]),
-            first.size, first.projection,
+            torch.stack([c.world_to_camera for c in cameras]),
+            torch.stack([c.K for c in cameras]),
+            first.size,
+            first.projection,
         )
 
     # -- what one can do with it ----------------------------------------------------------------------------------
@@ -191,22 +196,24 @@ class Camera:
         factor = self.K.new_tensor([[W / self.size[1]], [H / self.size[0]], [1.0]])
         return self.replace(K=self.K * factor, size=(H, W))
 
-    def replace(self, **fields: object) -> Camera:
+    def replace(self, **fields: Any) -> Camera:
         """This camera with some fields replaced."""
-        return dataclasses.replace(self, **fields)  # type: ignore[arg-type]
+        return dataclasses.replace(self, **fields)
 
     def project(self, points: Tensor) -> Tensor:
         """Pixel positions (…, 2) of world points (…, 3), differentiable; a single camera only."""
+        if self.batch is not None:
+            raise ValueError(f"project: expected a single camera, got a batch of {self.batch}; call once for each")
         M, K = self.world_to_camera, self.K
         q = (M[:3, :3] * points[..., None, :]).sum(-1) + M[:3, 3]
         uv = q[..., :2] / q[..., 2:] if self.projection == "perspective" else q[..., :2]
         return (K[:2, :2] * uv[..., None, :]).sum(-1) + K[:2, 2]
 
-    def to(self, *args: object, **kwargs: object) -> Camera:
+    def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Tensors moved to a device or dtype, as `torch.Tensor.to`."""
         return self.replace(
-            world_to_camera=self.world_to_camera.to(*args, **kwargs),  # type: ignore[call-overload]
-            K=self.K.to(*args, **kwargs),  # type: ignore[call-overload]
+            world_to_camera=self.world_to_camera.to(*args, **kwargs),
+            K=self.K.to(*args, **kwargs),
         )
 
     def __repr__(self) -> str:
@@ -215,9 +222,11 @@ class Camera:
 
 
 def _size(size: tuple[int, int]) -> tuple[int, int]:
-    if isinstance(size, int) or len(size) != 2:
-        raise TypeError(f"size: expected (height, width), got {size!r}")
-    return check_positive_int("size", size[0], most=65536), check_positive_int("size", size[1], most=65536)
+    try:
+        H, W = size
+    except (TypeError, ValueError):
+        raise TypeError(f"size: expected (height, width), got {size!r}") from None
+    return check_positive_int("size", H, most=65536), check_positive_int("size", W, most=65536)
 
 
 def _vector(name: str, value: Vector, like: Tensor | None = None) -> Tensor:
@@ -248,7 +257,9 @@ def _look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
             raise ValueError(f"target: expected a point apart from eye, got both at {e.tolist()}")
         # 1e-6 of the sine of the angle: below it float32 rounding alone decides where right is.
         if float(right.detach().norm()) <= 1e-6 * length * height:
-            raise ValueError(f"up: expected a direction apart from the line of sight, got {u.tolist()}; try another axis")
+            raise ValueError(
+                f"up: expected a direction apart from the line of sight, got {u.tolist()}; try another axis"
+            )
     forward = forward / forward.norm()
     right = right / right.norm()
     R = torch.stack([right, torch.linalg.cross(forward, right), forward])
@@ -257,9 +268,17 @@ def _look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
 
 def _intrinsics(fx: Tensor, fy: Tensor, cx: float, cy: float) -> Tensor:
     zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-    return torch.stack([
-        torch.stack([fx, zero, cx * one]), torch.stack([zero, fy, cy * one]), torch.stack([zero, zero, one])
-    ])
+    return torch.stack(
+        [torch.stack([fx, zero, cx * one]), torch.stack([zero, fy, cy * one]), torch.stack([zero, zero, one])]
+    )
+
+
+def _focal(fov_y: float | Tensor, height: int, like: Tensor) -> Tensor:
+    """Focal length in pixels, differentiable, from the full vertical field of view in degrees."""
+    degrees = as_scalar("fov_y", fov_y, like=like)
+    if values_visible() and not 0.0 < float(degrees.detach()) < 180.0:
+        raise ValueError(f"fov_y: expected degrees between 0 and 180, got {float(degrees):g}")
+    return 0.5 * height / torch.tan(torch.deg2rad(degrees) * 0.5)
 
 
 def fov_to_focal(fov_y: float, height: int) -> float:

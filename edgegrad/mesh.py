@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,7 +28,8 @@ class Mesh:
     uvs            (T, 2) float   texture coordinates, v running up (as in OBJ), and
     uv_faces       (F, 3) int     indices into uvs, apart from `faces`, so that vertices stay welded at seams
 
-    Faces of zero area render nothing. Raises TypeError for a wrong type, ValueError for a wrong shape, index or a value that is not finite.
+    Faces of zero area render nothing. Raises TypeError for a wrong type, ValueError for a wrong shape, a wrong index or a
+    value that is not finite.
     """
 
     verts: Tensor
@@ -42,7 +44,7 @@ class Mesh:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value is not None and not isinstance(value, Tensor):
+            if not isinstance(value, Tensor) and (value is not None or field.name in ("verts", "faces")):
                 like = self.verts if field.name not in ("verts", "faces", "uv_faces") else None
                 object.__setattr__(self, field.name, as_tensor(field.name, value, like=like))
         check_float("verts", self.verts)
@@ -86,7 +88,7 @@ class Mesh:
                 return value.shape[-1]
         return None
 
-    def replace(self, **fields: Tensor | None) -> Mesh:
+    def replace(self, **fields: Any) -> Mesh:
         """This mesh with some tensors replaced: `mesh.replace(verts=v)` keeps faces and colours.
 
         Giving another kind of colour removes the one there was.
@@ -99,7 +101,7 @@ class Mesh:
         if any(name in appearance and fields[name] is not None for name in fields):
             gone = appearance | (set() if fields.get("texture") is not None else {"uvs", "uv_faces"})
             fields = {**dict.fromkeys(gone - set(fields)), **fields}
-        return dataclasses.replace(self, **fields)  # type: ignore[arg-type]
+        return dataclasses.replace(self, **fields)
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Mesh:
         """The mesh with vertices `scale · R v + t`, differentiable in all four.
@@ -125,7 +127,7 @@ class Mesh:
             v = v + t
         return self.replace(verts=v)
 
-    def to(self, *args: object, **kwargs: object) -> Mesh:
+    def to(self, *args: Any, **kwargs: Any) -> Mesh:
         """All tensors moved to a device; floating-point tensors also to a dtype, as `torch.Tensor.to`."""
         moved = {}
         for field in dataclasses.fields(self):
@@ -140,8 +142,8 @@ class Mesh:
 
     def detach(self) -> Mesh:
         """The same mesh, cut from the autograd graph."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return Mesh(**{k: v if v is None else v.detach() for k, v in values.items()})
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return dataclasses.replace(self, **{name: v.detach() for name, v in values.items() if v is not None})
 
     def __repr__(self) -> str:
         kinds = [k for k in ("colors", "face_colors", "corner_colors", "texture") if getattr(self, k) is not None]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ._check import check_positive_int, check_shape
+from ._check import as_int, check_positive_int, check_shape
 from ._kernel import core
 from .camera import Camera
 from .mesh import Mesh
@@ -61,12 +61,17 @@ def render(
         -1 if n is None else check_positive_int(name, n, most=1 << 40)
         for name, n in (("surface_samples", surface_samples), ("edge_samples", edge_samples))
     ]
+    if not isinstance(visibility, bool):
+        raise TypeError(f"visibility: expected True or False, got {type(visibility).__name__} ({visibility!r})")
     if filter not in FILTERS:
         raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {filter!r}")
     if scene.background is not None and scene.background.dim() == 3:
         check_shape("background", scene.background, (*camera.size, "C"), fix="give it the camera's size")
 
     flat = flatten(scene)
+    if torch.compiler.is_compiling():
+        # Dynamo does not trace a function that is given one tensor twice; corners of vertex colours are the faces.
+        flat = flat._replace(corners=flat.corners.clone())
     world_to_camera = camera.world_to_camera.cpu().double().reshape(-1, 4, 4)
     K = camera.K.cpu().double().reshape(-1, 3, 3)
     B = max(world_to_camera.shape[0], K.shape[0])
@@ -85,9 +90,7 @@ def render(
 
 
 def _check_seed(name: str, seed: object) -> int:
-    if isinstance(seed, bool) or not hasattr(seed, "__index__"):
-        raise TypeError(f"{name}: expected an int, got {type(seed).__name__} ({seed!r})")
-    number = seed.__index__()  # type: ignore[attr-defined]
+    number = as_int(name, seed)
     if not 0 <= number < 2**63:
         raise ValueError(f"{name}: expected an int from 0 to 2⁶³ − 1, got {number}")
     return number
@@ -134,8 +137,8 @@ def _render_cpu(*args: Any) -> tuple[Tensor, Tensor]:
     perspective, height, width, spp, filter, seed, spacing = args[11:]
     scene = _kernel_scene(flat, spacing)
     B, C = world_to_camera.shape[0], flat.background.shape[-1]
-    image = torch.empty((B, height, width, C), dtype=flat.colors.dtype)
-    coverage = torch.empty((B, height, width), dtype=flat.colors.dtype)
+    image = flat.colors.new_empty((B, height, width, C))
+    coverage = flat.colors.new_empty((B, height, width))
     for b in range(B):
         camera = _kernel_camera(world_to_camera[b], K[b], perspective, height, width)
         camera_seed = seed if b == 0 else _derived_seed(seed, b + 1)
@@ -161,7 +164,10 @@ def _render_backward_cpu(adjoint: Tensor, coverage: Tensor, *args: Any) -> tuple
     surface_samples, edge_samples, grad_seed, interior_geometry, boundary, wanted = args[18:]
     scene = _kernel_scene(flat, spacing)
     # Sums are taken in double whatever the arrays hold.
-    grads = [torch.zeros(args[i].shape, dtype=torch.float64) if want else None for i, want in zip(_DIFFERENTIABLE, wanted, strict=True)]
+    grads = [
+        torch.zeros_like(args[i], dtype=torch.float64) if want else None
+        for i, want in zip(_DIFFERENTIABLE, wanted, strict=True)
+    ]
     verts, colors, uvs, texels, background, gw2c, gK = (None if g is None else g.numpy() for g in grads)
     if background is not None and background.ndim == 1:
         background = background[None, None]
@@ -175,7 +181,8 @@ def _render_backward_cpu(adjoint: Tensor, coverage: Tensor, *args: Any) -> tuple
             None if gw2c is None else gw2c[b], None if gK is None else gK[b],
         )  # fmt: skip
     return tuple(
-        torch.empty(0) if g is None else g.to(args[i].dtype) for i, g in zip(_DIFFERENTIABLE, grads, strict=True)
+        adjoint.new_empty(0, dtype=torch.float32) if g is None else g.to(args[i].dtype)
+        for i, g in zip(_DIFFERENTIABLE, grads, strict=True)
     )
 
 
@@ -203,7 +210,7 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
         coverage, *tensors = ctx.saved_tensors
         wanted = [ctx.needs_input_grad[i] for i in _DIFFERENTIABLE]
         grads = torch.ops.edgegrad.render_backward(grad_outputs[0], coverage, *tensors, *ctx.options, wanted)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,6 +29,8 @@ class Scene:
     background: Tensor | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.meshes, (Mesh, Sequence)):
+            raise TypeError(f"meshes: expected a Mesh or a sequence of them, got {type(self.meshes).__name__}")
         meshes = (self.meshes,) if isinstance(self.meshes, Mesh) else tuple(self.meshes)
         object.__setattr__(self, "meshes", meshes)
         if not meshes:
@@ -38,9 +40,11 @@ class Scene:
                 raise TypeError(f"meshes[{i}]: expected a Mesh, got {type(mesh).__name__}")
         known = {mesh.channels for mesh in meshes if mesh.channels is not None}
         if len(known) > 1:
-            i = next(i for i, m in enumerate(meshes) if m.channels not in (None, meshes[0].channels))
+            first = next(i for i, m in enumerate(meshes) if m.channels is not None)
+            C = meshes[first].channels
+            i = next(i for i, m in enumerate(meshes) if m.channels not in (None, C))
             raise ValueError(
-                f"meshes[{i}]: expected {meshes[0].channels} channels like meshes[0], got {meshes[i].channels}; "
+                f"meshes[{i}]: expected {C} channels like meshes[{first}], got {meshes[i].channels}; "
                 "give all colours and textures the same number of channels"
             )
         devices = {mesh.verts.device for mesh in meshes}
@@ -62,17 +66,17 @@ class Scene:
                 return mesh.channels
         return 3 if self.background is None else self.background.shape[-1]
 
-    def replace(self, **fields: object) -> Scene:
+    def replace(self, **fields: Any) -> Scene:
         """This scene with some fields replaced."""
-        return dataclasses.replace(self, **fields)  # type: ignore[arg-type]
+        return dataclasses.replace(self, **fields)
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Scene:
         """All meshes moved together; see Mesh.transformed."""
         return self.replace(meshes=[mesh.transformed(R, t, scale) for mesh in self.meshes])
 
-    def to(self, *args: object, **kwargs: object) -> Scene:
+    def to(self, *args: Any, **kwargs: Any) -> Scene:
         """All tensors moved to a device or dtype, as `torch.Tensor.to`."""
-        background = None if self.background is None else self.background.to(*args, **kwargs)  # type: ignore[call-overload]
+        background = None if self.background is None else self.background.to(*args, **kwargs)
         return Scene([mesh.to(*args, **kwargs) for mesh in self.meshes], background)
 
     def __repr__(self) -> str:
@@ -99,6 +103,7 @@ class Flat(NamedTuple):
 def flatten(scene: Scene) -> Flat:
     """The arrays of a scene; every step is a differentiable torch operation, so gradients find their way back."""
     C = scene.channels
+    cpu = torch.device("cpu")  # said everywhere, for a user may have set another default device
     floats = [t for m in scene.meshes for t in (m.colors, m.face_colors, m.corner_colors, m.texture) if t is not None]
     floats += [scene.background] if scene.background is not None else []
     dtype = torch.float64 if any(t.dtype == torch.float64 for t in floats) else torch.float32
@@ -107,7 +112,7 @@ def flatten(scene: Scene) -> Flat:
     any_texture = any(mesh.texture is not None for mesh in scene.meshes)
 
     def empty(width: int, kind: torch.dtype) -> Tensor:
-        return torch.empty((0, width), dtype=kind)
+        return torch.empty((0, width), dtype=kind, device=cpu)
 
     verts, faces, corners, colors, uvs, texels, textures, face_texture = ([] for _ in range(8))
     n_verts = n_colors = n_uvs = n_texels = 0
@@ -119,7 +124,7 @@ def flatten(scene: Scene) -> Flat:
         if mesh.texture is not None:
             assert mesh.uvs is not None and mesh.uv_faces is not None
             h, w = mesh.texture.shape[:2]
-            face_texture.append(torch.full((F,), len(textures), dtype=torch.int32))
+            face_texture.append(torch.full((F,), len(textures), dtype=torch.int32, device=cpu))
             textures.append([n_texels, h, w])
             texels.append(mesh.texture.cpu().to(dtype).reshape(h * w, C))
             uvs.append(mesh.uvs.cpu().double())
@@ -130,25 +135,36 @@ def flatten(scene: Scene) -> Flat:
             if mesh.colors is not None:
                 rows, index = mesh.colors, mesh_faces
             elif mesh.corner_colors is not None:
-                rows, index = mesh.corner_colors.reshape(3 * F, C), torch.arange(3 * F, dtype=torch.int32).reshape(F, 3)
+                rows = mesh.corner_colors.reshape(3 * F, C)
+                index = torch.arange(3 * F, dtype=torch.int32, device=cpu).reshape(F, 3)
             elif mesh.face_colors is not None:
-                rows, index = mesh.face_colors, torch.arange(F, dtype=torch.int32)[:, None].expand(F, 3)
+                rows = mesh.face_colors
+                index = torch.arange(F, dtype=torch.int32, device=cpu)[:, None].expand(F, 3)
             else:
-                rows, index = torch.full((1, C), PLAIN, dtype=dtype), torch.zeros((F, 3), dtype=torch.int32)
+                rows = torch.full((1, C), PLAIN, dtype=dtype, device=cpu)
+                index = torch.zeros((F, 3), dtype=torch.int32, device=cpu)
             colors.append(rows.cpu().to(dtype))
             corners.append(index + n_colors if n_colors else index)
             n_colors += rows.shape[0]
             if any_texture:
-                face_texture.append(torch.full((F,), -1, dtype=torch.int32))
+                face_texture.append(torch.full((F,), -1, dtype=torch.int32, device=cpu))
         n_verts += V
 
     def join(parts: list[Tensor], otherwise: Tensor) -> Tensor:
         return (parts[0] if len(parts) == 1 else torch.cat(parts) if parts else otherwise).contiguous()
 
-    background = torch.zeros(C, dtype=dtype) if scene.background is None else scene.background.cpu().to(dtype).contiguous()
+    if scene.background is None:
+        background = torch.zeros(C, dtype=dtype, device=cpu)
+    else:
+        background = scene.background.cpu().to(dtype).contiguous()
     return Flat(
-        join(verts, empty(3, torch.float64)), join(faces, empty(3, torch.int32)), join(corners, empty(3, torch.int32)),
-        join(colors, empty(C, dtype)), join(uvs, empty(2, torch.float64)), join(texels, empty(C, dtype)),
-        torch.tensor(textures, dtype=torch.int64).reshape(-1, 3), join(face_texture, torch.empty(0, dtype=torch.int32)),
+        join(verts, empty(3, torch.float64)),
+        join(faces, empty(3, torch.int32)),
+        join(corners, empty(3, torch.int32)),
+        join(colors, empty(C, dtype)),
+        join(uvs, empty(2, torch.float64)),
+        join(texels, empty(C, dtype)),
+        torch.tensor(textures, dtype=torch.int64, device=cpu).reshape(-1, 3),
+        join(face_texture, torch.empty(0, dtype=torch.int32, device=cpu)),
         background,
     )

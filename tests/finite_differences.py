@@ -46,7 +46,9 @@ def finite_difference(case: Case, step: float, spp: int, seeds: int, **options: 
     values = []
     with torch.no_grad():
         for seed in range(seeds):
-            high, low = (loss(*case(torch.tensor(h, dtype=torch.float64)), spp=spp, seed=seed, **options) for h in (step, -step))
+            high, low = (
+                loss(*case(torch.tensor(h, dtype=torch.float64)), spp=spp, seed=seed, **options) for h in (step, -step)
+            )
             values.append(((high - low) / (2 * step)).item())
     return estimate(values)
 
@@ -61,7 +63,13 @@ def gradient(case: Case, seeds: int, **options: object) -> Estimate:
 
 
 def check(
-    case: Case, step: float, spp: int = 1024, seeds: int = 4, truncation: float = 0.01, filter: str = "box", **options: object
+    case: Case,
+    step: float,
+    spp: int = 1024,
+    seeds: int = 4,
+    truncation: float = 0.01,
+    filter: str = "box",
+    **options: object,
 ) -> tuple[Estimate, Estimate]:
     """Asserts agreement; returns (finite difference, gradient)."""
     fd = finite_difference(case, step, spp, seeds, filter=filter)
@@ -71,7 +79,9 @@ def check(
     return fd, g
 
 
-def check_ratio(case: Case, step: float, spp: int = 1024, seeds: int = 4, filter: str = "box", **options: object) -> float:
+def check_ratio(
+    case: Case, step: float, spp: int = 1024, seeds: int = 4, filter: str = "box", **options: object
+) -> float:
     """The gradient over the finite difference lies within 1 ± 0.02, and both are known well enough to say so."""
     fd = finite_difference(case, step, spp, seeds, filter=filter)
     g = gradient(case, 2 * seeds, filter=filter, **options)

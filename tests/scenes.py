@@ -109,6 +109,28 @@ def random_slivers(count: int, seed: int, camera: Camera) -> Mesh:
     return Mesh(verts, torch.arange(3 * count).reshape(-1, 3), face_colors=colors)
 
 
+def default_samples(mesh: Mesh, camera: Camera, adjoint: Tensor) -> tuple[int, int]:
+    """How many surface and edge samples the kernel takes when it is not told, for the gradient of the vertices."""
+    from edgegrad.render import _kernel_camera, _kernel_scene
+    from edgegrad.scene import flatten
+
+    scene = _kernel_scene(flatten(Scene([mesh])), torch.finfo(mesh.verts.dtype).eps)
+    kernel_camera = _kernel_camera(
+        camera.world_to_camera.double(), camera.K.double(), camera.projection == "perspective", *camera.size
+    )
+    dtype = scene_dtype(mesh)
+    coverage = torch.zeros(camera.size, dtype=dtype)
+    return scene.backward(
+        kernel_camera, -1, -1, "box", 0, 1, True, True, adjoint.to(dtype).contiguous().numpy(), coverage.numpy(),
+        verts=torch.zeros(mesh.verts.shape, dtype=torch.float64).numpy(),
+    )  # fmt: skip
+
+
+def scene_dtype(mesh: Mesh) -> torch.dtype:
+    """The dtype of the colours of a mesh, which is that of its image."""
+    return next(t.dtype for t in (mesh.colors, mesh.face_colors, mesh.corner_colors, mesh.texture) if t is not None)
+
+
 def _background() -> Tensor:
     return torch.tensor([0.15, 0.25, 0.4], dtype=torch.float64)
 

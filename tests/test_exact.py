@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
@@ -28,7 +29,9 @@ SCENES = {
     "slivers": lambda: eg.Scene([random_slivers(100, 0, front_camera(SIZE))], BACKGROUND),
 }
 # The slivers are laid out for the perspective camera.
-CASES = [(name, p) for name in SCENES for p in ("perspective", "orthographic") if (name, p) != ("slivers", "orthographic")]
+CASES = [
+    (name, p) for name in SCENES for p in ("perspective", "orthographic") if (name, p) != ("slivers", "orthographic")
+]
 Render = Callable[[eg.Scene, eg.Camera], Tensor]
 
 
@@ -86,16 +89,16 @@ def test_gradients(name: str, projection: str) -> None:
     for surface, edge in ((4_000, 2_000), (16_000, 8_000), (64_000, 32_000)):
         samples: dict[str, list[Tensor]] = {key: [] for key in exact}
         for seed in range(SEEDS):
-            got = gradients(
-                scene, camera, lambda s, c, seed=seed: eg.render(s, c, spp=16, seed=seed, surface_samples=surface, edge_samples=edge)
-            )
+            options = {"spp": 16, "seed": seed, "surface_samples": surface, "edge_samples": edge}
+            got = gradients(scene, camera, partial(eg.render, **options))
             for key, value in got.items():
                 samples[key].append(value)
         for key, values in samples.items():
             # All components hang on the few random shifts of one estimate, so they count as a single one: 16.6 is the
             # 99.9 % quantile of the square of t₁₅. A bias of one standard deviation of an estimate would give 17.
             assert mean_z2(values, exact[key]) < 16.6, (key, surface)
-            error = (torch.stack(values) - exact[key]).square().sum().div(SEEDS).sqrt().item() / exact[key].norm().item()
+            square = (torch.stack(values) - exact[key]).square().sum().item() / SEEDS
+            error = math.sqrt(square) / exact[key].norm().item()
             if key in previous and key != "background":  # the background's error is that of the image
                 assert error < 0.6 * previous[key], (key, surface, error, previous[key])
             previous[key] = error
@@ -106,10 +109,8 @@ def test_boundary_error_falls_like_one_over_n(name: str) -> None:
     scene, camera = SCENES[name](), front_camera(SIZE)
 
     def verts_gradient(edge: int, seed: int, visibility: bool = True, surface: int = 64) -> Tensor:
-        grads = gradients(
-            scene, camera,
-            lambda s, c: eg.render(s, c, spp=1, grad_seed=seed, surface_samples=surface, edge_samples=edge, visibility=visibility),
-        )  # fmt: skip
+        options = {"grad_seed": seed, "surface_samples": surface, "edge_samples": edge, "visibility": visibility}
+        grads = gradients(scene, camera, partial(eg.render, spp=1, **options))
         return torch.cat([g for key, g in grads.items() if key.startswith("verts")])
 
     # With the same seed the interior part has the same bits with and without the boundary term: the difference is the
@@ -134,12 +135,15 @@ def test_a_wrong_gradient_is_rejected() -> None:
     scene, camera = one_triangle(), front_camera(SIZE)
     exact = gradients(scene, camera, exact_image)["verts 0"]
     samples = [
-        gradients(scene, camera, lambda s, c, seed=seed: eg.render(s, c, spp=1, grad_seed=seed))["verts 0"] for seed in range(SEEDS)
+        gradients(scene, camera, lambda s, c, seed=seed: eg.render(s, c, spp=1, grad_seed=seed))["verts 0"]
+        for seed in range(SEEDS)
     ]
     assert mean_z2(samples, exact) < 3
     assert mean_z2([s + torch.stack(samples).std(0) for s in samples], exact) > 10
     interior = [
-        gradients(scene, camera, lambda s, c, seed=seed: eg.render(s, c, spp=1, grad_seed=seed, visibility=False))["verts 0"]
+        gradients(scene, camera, lambda s, c, seed=seed: eg.render(s, c, spp=1, grad_seed=seed, visibility=False))[
+            "verts 0"
+        ]
         for seed in range(SEEDS)
     ]
     assert mean_z2(interior, exact) > 100

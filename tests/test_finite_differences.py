@@ -22,6 +22,7 @@ def mixed_meshes() -> dict[str, eg.Mesh]:
     texture = torch.stack([0.5 + 0.4 * torch.sin(xx + k) * torch.cos(1.3 * yy + k) for k in range(3)], -1)
     tetrahedron = torch.tensor([[0.0, 0.5, 0.55], [-0.5, -0.3, 0.4], [0.45, -0.35, 0.5], [0.05, 0.0, 0.95]], dtype=f64)
     fan = torch.tensor([[0.55, 0.3, 0.3], [1.0, 0.2, 0.2], [0.95, 0.75, 0.35], [0.45, 0.85, 0.25]], dtype=f64)
+    turn = rotation(AXIS, torch.tensor(0.7, dtype=f64))
     corners = smooth_colors(torch.arange(18, dtype=f64).reshape(6, 3)).reshape(2, 3, 3)
     return {
         "texture": eg.Mesh(quad, torch.tensor([[0, 1, 2], [0, 2, 3]]), texture=texture,
@@ -30,13 +31,15 @@ def mixed_meshes() -> dict[str, eg.Mesh]:
         "face_colors": eg.Mesh(tetrahedron, torch.tensor([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]),
                                face_colors=smooth_colors(3.0 * tetrahedron)),
         "corner_colors": eg.Mesh(fan, torch.tensor([[0, 1, 2], [0, 2, 3]]), corner_colors=corners),
-        "colors": cube(0.22).transformed(rotation(AXIS, torch.tensor(0.7, dtype=f64)), torch.tensor([-0.6, 0.55, 0.5], dtype=f64)),
+        "colors": cube(0.22).transformed(turn, torch.tensor([-0.6, 0.55, 0.5], dtype=f64)),
     }  # fmt: skip
 
 
 def background_image() -> Tensor:
     """Smooth, so that a step of half a pixel sees no other background than the derivative does."""
-    y, x = torch.meshgrid(torch.arange(SIZE, dtype=torch.float64), torch.arange(SIZE, dtype=torch.float64), indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(SIZE, dtype=torch.float64), torch.arange(SIZE, dtype=torch.float64), indexing="ij"
+    )
     return smooth_colors(torch.stack([x, y, x - y], -1).reshape(-1, 3) * (2.0 / SIZE)).reshape(SIZE, SIZE, 3)
 
 
@@ -100,15 +103,21 @@ def camera_rotation(theta: Tensor, camera: eg.Camera):
 
 
 def focal_length(theta: Tensor, camera: eg.Camera):
-    return build(), camera.replace(K=camera.K * (1 + theta * torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0]], dtype=torch.float64)))
+    return build(), camera.replace(
+        K=camera.K * (1 + theta * torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0]], dtype=torch.float64))
+    )
 
 
 def principal_point(theta: Tensor, camera: eg.Camera):
-    return build(), camera.replace(K=camera.K + theta * torch.tensor([[0, 0, 0.8], [0, 0, -0.6], [0, 0, 0]], dtype=torch.float64))
+    return build(), camera.replace(
+        K=camera.K + theta * torch.tensor([[0, 0, 0.8], [0, 0, -0.6], [0, 0, 0]], dtype=torch.float64)
+    )
 
 
 def skew(theta: Tensor, camera: eg.Camera):
-    return build(), camera.replace(K=camera.K + theta * torch.tensor([[0, 1.0, 0], [0, 0, 0], [0, 0, 0]], dtype=torch.float64))
+    return build(), camera.replace(
+        K=camera.K + theta * torch.tensor([[0, 1.0, 0], [0, 0, 0], [0, 0, 0]], dtype=torch.float64)
+    )
 
 
 def appearance(kind: str):
@@ -159,7 +168,13 @@ CASES = {
     "background image": (background, 0.5),
     "background colour": (constant_background, 0.5),
 }
-VIEWS = [("perspective", "box"), ("orthographic", "box"), ("crop", "box"), ("perspective", "tent"), ("crop", "gaussian")]
+VIEWS = [
+    ("perspective", "box"),
+    ("orthographic", "box"),
+    ("crop", "box"),
+    ("perspective", "tent"),
+    ("crop", "gaussian"),
+]
 
 
 @pytest.mark.parametrize(("view", "filter"), VIEWS)
@@ -177,7 +192,14 @@ def test_gradient_is_the_derivative_of_the_image(name: str, view: str, filter: s
 def test_gradient_is_the_derivative_of_the_image_in_every_combination(name: str, view: str, filter: str) -> None:
     case, step = CASES[name]
     camera = camera_of(view)
-    check(lambda theta: case(theta, camera), step / 2, spp=4096, filter=filter, surface_samples=200_000, edge_samples=200_000)
+    check(
+        lambda theta: case(theta, camera),
+        step / 2,
+        spp=4096,
+        filter=filter,
+        surface_samples=200_000,
+        edge_samples=200_000,
+    )
 
 
 def test_the_check_rejects_a_wrong_gradient() -> None:

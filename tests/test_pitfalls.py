@@ -8,7 +8,7 @@ import pytest
 import torch
 from exact import exact_image
 from finite_differences import check_ratio, gradient, loss, rotation
-from scenes import cube, front_camera, icosphere, smooth_adjoint, smooth_colors
+from scenes import cube, default_samples, front_camera, icosphere, smooth_adjoint, smooth_colors
 from torch import Tensor
 
 import edgegrad as eg
@@ -89,7 +89,9 @@ def test_cube_split_at_its_edges() -> None:
 def test_color_step_between_coplanar_faces() -> None:
     """0: flat edges were deleted. Two coplanar faces of unlike colours; only the vertex between them moves."""
     camera = front_camera(48)
-    verts = torch.tensor([[-0.8, -0.7, 0.0], [0.8, -0.6, 0.0], [0.7, 0.8, 0.0], [-0.75, 0.7, 0.0], [0.05, 0.1, 0.0]], dtype=F64)
+    verts = torch.tensor(
+        [[-0.8, -0.7, 0.0], [0.8, -0.6, 0.0], [0.7, 0.8, 0.0], [-0.75, 0.7, 0.0], [0.05, 0.1, 0.0]], dtype=F64
+    )
     faces = torch.tensor([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
     colors = torch.tensor([[0.9, 0.1, 0.2], [0.2, 0.8, 0.3], [0.1, 0.3, 0.9], [0.8, 0.7, 0.1]], dtype=F64)
 
@@ -108,15 +110,21 @@ def test_flat_shading() -> None:
     normals = torch.linalg.cross(*(sphere.verts[sphere.faces[:, i]] - sphere.verts[sphere.faces[:, 0]] for i in (1, 2)))
     light = torch.tensor([0.3, 0.5, 0.8], dtype=F64)
     shade = torch.nn.functional.normalize(normals, dim=1) @ light
-    mesh = eg.Mesh(sphere.verts, sphere.faces, face_colors=shade[:, None] * torch.tensor([0.9, 0.6, 0.4], dtype=F64) + 0.5)
+    mesh = eg.Mesh(
+        sphere.verts, sphere.faces, face_colors=shade[:, None] * torch.tensor([0.9, 0.6, 0.4], dtype=F64) + 0.5
+    )
     camera, adjoint = front_camera(64), smooth_adjoint(64, 64, 3)
 
     def verts_gradient(render) -> Tensor:
         verts = mesh.verts.clone().requires_grad_()
-        return torch.autograd.grad((render(eg.Scene([mesh.replace(verts=verts)], BACKGROUND), camera) * adjoint).sum(), verts)[0]
+        return torch.autograd.grad(
+            (render(eg.Scene([mesh.replace(verts=verts)], BACKGROUND), camera) * adjoint).sum(), verts
+        )[0]
 
     def one_color(scene: eg.Scene) -> eg.Scene:
-        return scene.replace(meshes=[scene.meshes[0].replace(face_colors=torch.full((len(mesh.faces), 3), 0.6, dtype=F64))])
+        return scene.replace(
+            meshes=[scene.meshes[0].replace(face_colors=torch.full((len(mesh.faces), 3), 0.6, dtype=F64))]
+        )
 
     exact = verts_gradient(exact_image)
     got = verts_gradient(lambda s, c: eg.render(s, c, edge_samples=200_000))
@@ -140,26 +148,12 @@ def test_smooth_mesh_pays_for_silhouettes_alone() -> None:
         verts = mesh.verts.clone().requires_grad_()
         eg.render(mesh.replace(verts=verts), camera, edge_samples=3000, surface_samples=50_000).backward(adjoint)
         grads[kind] = verts.grad
-        counts[kind] = samples_of(mesh, camera, adjoint)[1]
+        counts[kind] = default_samples(mesh, camera, adjoint)[1]
     assert counts["vertex"] == counts["corner"] == counts["face"]
     # The silhouette of the unit ball seen from 4 away: a circle, 16 samples a pixel.
     radius = 32 / torch.tan(torch.deg2rad(torch.tensor(18.0))) / 15**0.5
     assert abs(counts["vertex"] / (16 * 2 * torch.pi * radius.item()) - 1) < 0.03
     assert torch.equal(grads["vertex"], grads["corner"])
-
-
-def samples_of(mesh: eg.Mesh, camera: eg.Camera, adjoint: Tensor) -> tuple[int, int]:
-    """Default numbers of surface and edge samples, as the kernel chose them."""
-    from edgegrad.render import _kernel_camera, _kernel_scene
-    from edgegrad.scene import flatten
-
-    scene = _kernel_scene(flatten(eg.Scene([mesh])), torch.finfo(mesh.verts.dtype).eps)
-    kernel_camera = _kernel_camera(camera.world_to_camera, camera.K, camera.projection == "perspective", *camera.size)
-    H, W = camera.size
-    grad = torch.zeros(mesh.verts.shape, dtype=F64).numpy()
-    return scene.backward(
-        kernel_camera, -1, -1, "box", 0, 1, True, True, adjoint.contiguous().numpy(), torch.zeros(H, W, dtype=F64).numpy(), verts=grad
-    )
 
 
 @pytest.mark.parametrize("fov", [3.0, 1.0, 0.3, 0.1])
@@ -182,7 +176,9 @@ def test_very_large_triangle() -> None:
 
     check_ratio(plane_turns, 0.004, spp=4096, **SAMPLES)
 
-    standing = cube(0.4).transformed(rotation((0.0, 1.0, 0.0), torch.tensor(0.5, dtype=F64)), torch.tensor([0.0, 0.4, 0.0], dtype=F64))
+    standing = cube(0.4).transformed(
+        rotation((0.0, 1.0, 0.0), torch.tensor(0.5, dtype=F64)), torch.tensor([0.0, 0.4, 0.0], dtype=F64)
+    )
 
     def cube_slides(theta: Tensor):
         t = theta * torch.tensor([0.8, 0.0, 0.6], dtype=F64)
@@ -244,14 +240,18 @@ def test_loss_of_a_sparse_adjoint() -> None:
 
     def verts_gradient(render) -> Tensor:
         verts = mesh.verts.clone().requires_grad_()
-        return torch.autograd.grad((render(eg.Scene([mesh.replace(verts=verts)], BACKGROUND), camera) * adjoint).sum(), verts)[0]
+        return torch.autograd.grad(
+            (render(eg.Scene([mesh.replace(verts=verts)], BACKGROUND), camera) * adjoint).sum(), verts
+        )[0]
 
     exact = verts_gradient(exact_image)
-    got = torch.stack([verts_gradient(lambda s, c, seed=seed: eg.render(s, c, spp=1, grad_seed=seed)) for seed in range(64)])
+    got = torch.stack(
+        [verts_gradient(lambda s, c, seed=seed: eg.render(s, c, spp=1, grad_seed=seed)) for seed in range(64)]
+    )
     error = (got.std(0) / 8).norm()
     assert error < 0.02 * exact.norm()
     assert (got.mean(0) - exact).norm() < 4 * error
-    _, edge_samples = samples_of(mesh, camera, adjoint)
+    _, edge_samples = default_samples(mesh, camera, adjoint)
     assert edge_samples < 16 * 40  # curves whose bounding box meets the pixel, not the whole outline
 
 

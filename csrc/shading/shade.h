@@ -70,7 +70,8 @@ Barycentrics shade_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, 
                 grad.texels.add(f.texel[i], row_bar);
             }
         }
-        for (int i = 0; i < 3; ++i) corners.value[2 * i] += b[i] * uv_bar.x, corners.value[2 * i + 1] += b[i] * uv_bar.y;
+        for (int i = 0; i < 3; ++i)
+            corners.value[2 * i] += b[i] * uv_bar.x, corners.value[2 * i + 1] += b[i] * uv_bar.y;
         const double* uv[3];
         for (int i = 0; i < 3; ++i) uv[i] = scene.uvs + 2 * int64_t(row[i]);
         b_bar.u = uv_bar.x * (uv[1][0] - uv[0][0]) + uv_bar.y * (uv[1][1] - uv[0][1]);
