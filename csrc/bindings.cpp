@@ -46,11 +46,13 @@ void check_finite(const char* name, const T* values, int64_t n, int64_t width) {
                    at(i, width));
 }
 
-void check_indices(const char* name, const int32_t* values, int64_t n, int64_t count, const char* of) {
+// `n` indices, in rows of three, of which the first is number `first`.
+void check_indices(const char* name, const int32_t* values, int64_t n, int64_t count, const char* of,
+                   int64_t first = 0) {
     for (int64_t i = 0; i < n; ++i)
         if (values[i] < 0 || values[i] >= count)
             refuse(std::string(name) + ": expected indices from 0 to " + std::to_string(count - 1) + " (rows of " + of +
-                   "), got " + std::to_string(values[i]) + " at " + at(i, 3));
+                   "), got " + std::to_string(values[i]) + " at " + at(first + i, 3));
 }
 
 // The arrays of a scene, kept alive, checked, and seen as the kernel sees them.
@@ -112,7 +114,7 @@ struct SceneArrays {
                 refuse("face_texture: expected a texture's number, got " + std::to_string(face_texture(f)));
             const bool t = face_texture(f) >= 0;
             check_indices(t ? "uv_faces" : "colors", corners.data() + 3 * f, 3, t ? uvs.shape(0) : colors.shape(0),
-                          t ? "uvs" : "colors");
+                          t ? "uvs" : "colors", 3 * f);
         }
     }
 
@@ -179,6 +181,7 @@ void forward(const SceneArrays<T>& scene, const Camera& camera, int spp, const s
              int threads, Out<T, 3> image, Out<T, 2> coverage) {
     check_background(scene, camera);
     check_image("image", image, camera, scene.background.shape(2));
+    if (coverage.size() != size_t(camera.width) * camera.height) refuse("coverage: expected the size of the image");
     const ForwardOptions options{spp, make_filter(filter), seed, threads};
     nb::gil_scoped_release release;
     const auto geometry = scene.geometry(false, threads);
@@ -195,6 +198,7 @@ std::tuple<int64_t, int64_t> backward(const SceneArrays<T>& scene, const Camera&
                                       std::optional<Out<double, 2>> world_to_camera, std::optional<Out<double, 2>> K) {
     check_background(scene, camera);
     check_image("adjoint", adjoint, camera, scene.background.shape(2));
+    if (coverage.size() != size_t(camera.width) * camera.height) refuse("coverage: expected the size of the image");
     check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2));
     const auto data = [](auto& array, const auto& like, const char* name) -> double* {
         if (!array) return nullptr;
@@ -205,6 +209,8 @@ std::tuple<int64_t, int64_t> backward(const SceneArrays<T>& scene, const Camera&
     grad.verts = data(verts, scene.verts, "verts"), grad.colors = data(colors, scene.colors, "colors");
     grad.uvs = data(uvs, scene.uvs, "uvs"), grad.texels = data(texels, scene.texels, "texels");
     grad.background = data(background, scene.background, "background");
+    if (world_to_camera && world_to_camera->size() != 16) refuse("gradient of world_to_camera: expected shape (4, 4)");
+    if (K && K->size() != 9) refuse("gradient of K: expected shape (3, 3)");
     grad.world_to_camera = world_to_camera ? world_to_camera->data() : nullptr;
     grad.K = K ? K->data() : nullptr;
     const BackwardOptions options{surface_samples,   edge_samples, make_filter(filter), seed, threads,

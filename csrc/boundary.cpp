@@ -179,9 +179,9 @@ int64_t add_boundary(const BackwardView<T>& view, Destination& to) {
 
 #define EDGEGRAD_INSTANTIATE(N, T) template int64_t add_boundary<N, T>(const BackwardView<T>&, Destination&);
 EDGEGRAD_INSTANTIATE(0, float)
-EDGEGRAD_INSTANTIATE(1, float) EDGEGRAD_INSTANTIATE(3, float) EDGEGRAD_INSTANTIATE(4, float)
-    EDGEGRAD_INSTANTIATE(0, double) EDGEGRAD_INSTANTIATE(1, double) EDGEGRAD_INSTANTIATE(3, double)
-        EDGEGRAD_INSTANTIATE(4, double)
+EDGEGRAD_INSTANTIATE(1, float)
+EDGEGRAD_INSTANTIATE(3, float) EDGEGRAD_INSTANTIATE(4, float) EDGEGRAD_INSTANTIATE(0, double)
+    EDGEGRAD_INSTANTIATE(1, double) EDGEGRAD_INSTANTIATE(3, double) EDGEGRAD_INSTANTIATE(4, double)
 #undef EDGEGRAD_INSTANTIATE
 
 }  // namespace edgegrad

@@ -30,7 +30,7 @@ std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n
     bool moved = true;
     for (auto it = kept.begin(); it != kept.end(); ++it) {
         if (!same((*it)->faces_, faces, 3 * n_faces)) continue;
-        if (same((*it)->verts_, verts, 3 * n_verts)) {
+        if (same((*it)->verts_, verts, 3 * n_verts) && (*it)->spacing_ == spacing) {
             found = it, moved = false;
             break;
         }
@@ -48,6 +48,7 @@ std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n
         geometry->verts_.clear();  // should the update fail, these positions must not be taken for it
         geometry->caster_.update(verts, threads);
         geometry->verts_.assign(verts, verts + 3 * n_verts);
+        geometry->spacing_ = spacing;
         geometry->welded_ = false;
     }
     if (want_topology && !geometry->welded_) {

@@ -28,6 +28,7 @@ class Geometry {
     std::vector<double> verts_;
     RayCaster caster_;
     std::unique_ptr<Topology> topology_;
+    double spacing_ = 0;   // of the numbers in which the user gave the positions: decides what is welded
     bool welded_ = false;  // at the current positions
 };
 

@@ -196,9 +196,9 @@ int64_t add_interior(const BackwardView<T>& view, bool geometry, Destination& to
 
 #define EDGEGRAD_INSTANTIATE(N, T) template int64_t add_interior<N, T>(const BackwardView<T>&, bool, Destination&);
 EDGEGRAD_INSTANTIATE(0, float)
-EDGEGRAD_INSTANTIATE(1, float) EDGEGRAD_INSTANTIATE(3, float) EDGEGRAD_INSTANTIATE(4, float)
-    EDGEGRAD_INSTANTIATE(0, double) EDGEGRAD_INSTANTIATE(1, double) EDGEGRAD_INSTANTIATE(3, double)
-        EDGEGRAD_INSTANTIATE(4, double)
+EDGEGRAD_INSTANTIATE(1, float)
+EDGEGRAD_INSTANTIATE(3, float) EDGEGRAD_INSTANTIATE(4, float) EDGEGRAD_INSTANTIATE(0, double)
+    EDGEGRAD_INSTANTIATE(1, double) EDGEGRAD_INSTANTIATE(3, double) EDGEGRAD_INSTANTIATE(4, double)
 #undef EDGEGRAD_INSTANTIATE
 
 }  // namespace edgegrad

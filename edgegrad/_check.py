@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 
-def as_tensor(name: str, value: object, *, like: Tensor | None = None) -> Tensor:
-    """`value` as a tensor: tensors pass unchanged, numbers, sequences and NumPy arrays are converted.
+def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating: bool = False) -> Tensor:
+    """`value` as a tensor: tensors pass unchanged, numbers, sequences and NumPy arrays are converted, to the device of
+    `like` and, if `like` is floating-point, to a floating-point dtype; with `floating` always to one.
 
     Raises TypeError when `value` is none of these.
     """
@@ -25,6 +26,8 @@ def as_tensor(name: str, value: object, *, like: Tensor | None = None) -> Tensor
         ) from None
     if not tensor.is_floating_point() and like is not None and like.is_floating_point():
         tensor = tensor.to(like.dtype)
+    elif floating and not tensor.is_floating_point():
+        tensor = tensor.to(torch.get_default_dtype())
     return tensor
 
 
@@ -86,7 +89,7 @@ def check_finite(name: str, tensor: Tensor) -> None:
 
 def check_indices(name: str, tensor: Tensor, count: int, of: str) -> None:
     """All in [0, count). Raises ValueError."""
-    if not values_visible() or tensor.numel() == 0:
+    if not values_visible() or tensor.device.type == "meta" or tensor.numel() == 0:
         return
     low, high = (int(v) for v in torch.aminmax(tensor))
     if low < 0 or high >= count:

@@ -320,8 +320,12 @@ def _gltf_primitives(tree: dict[str, Any], geometry: dict[str, Any]) -> dict[str
 
 
 def _gltf_look(
-    tree: dict[str, Any], primitive: dict[str, Any], raw: dict[str, Any],
-    materials: bool, folder: _Folder, textures: _Textures,
+    tree: dict[str, Any],
+    primitive: dict[str, Any],
+    raw: dict[str, Any],
+    materials: bool,
+    folder: _Folder,
+    textures: _Textures,
 ) -> dict[str, object]:
     """The fields of a part that say what it looks like; texture, factor and vertex colours are multiplied."""
     visual = raw.get("visual")

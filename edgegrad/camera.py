@@ -41,7 +41,7 @@ class Camera:
     projection: str = "perspective"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "world_to_camera", as_tensor("world_to_camera", self.world_to_camera))
+        object.__setattr__(self, "world_to_camera", as_tensor("world_to_camera", self.world_to_camera, floating=True))
         object.__setattr__(self, "K", as_tensor("K", self.K, like=self.world_to_camera))
         for name in ("world_to_camera", "K"):
             check_float(name, getattr(self, name))
@@ -121,7 +121,8 @@ class Camera:
 
         OpenCV puts the centre of the first pixel at 0, edgegrad at 0.5: K's principal point is shifted by half a pixel.
         """
-        R = as_tensor("R", R)
+        R = as_tensor("R", R, floating=True)
+        check_float("R", R)
         t = as_tensor("t", t, like=R)
         K = as_tensor("K", K, like=R)
         check_shape("R", R, (3, 3))
@@ -140,7 +141,7 @@ class Camera:
 
         Give fov_y (degrees, square pixels, centred) or K (3, 3) in pixels with pixel centres at +0.5.
         """
-        pose = as_tensor("camera_to_world", camera_to_world)
+        pose = as_tensor("camera_to_world", camera_to_world, floating=True)
         check_float("camera_to_world", pose)
         check_shape("camera_to_world", pose, (4, 4))
         if (fov_y is None) == (K is None):

@@ -25,8 +25,14 @@ from .mesh import Mesh
 from .scene import Scene
 
 __all__ = [
-    "linear_to_srgb", "load_camera", "load_mesh", "load_scene",
-    "read_image", "save_camera", "srgb_to_linear", "write_image",
+    "linear_to_srgb",
+    "load_camera",
+    "load_mesh",
+    "load_scene",
+    "read_image",
+    "save_camera",
+    "srgb_to_linear",
+    "write_image",
 ]
 
 

@@ -46,7 +46,9 @@ class Mesh:
             value = getattr(self, field.name)
             if not isinstance(value, Tensor) and (value is not None or field.name in ("verts", "faces")):
                 like = self.verts if field.name not in ("verts", "faces", "uv_faces") else None
-                object.__setattr__(self, field.name, as_tensor(field.name, value, like=like))
+                object.__setattr__(
+                    self, field.name, as_tensor(field.name, value, like=like, floating=field.name == "verts")
+                )
         check_float("verts", self.verts)
         check_shape("verts", self.verts, ("V", 3))
         check_integer("faces", self.faces)

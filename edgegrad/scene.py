@@ -100,6 +100,12 @@ class Flat(NamedTuple):
     background: Tensor  # (C,) or (H, W, C)
 
 
+def _int32(index: Tensor) -> Tensor:
+    """Indices as the kernel takes them; what does not fit stays out of range, for the kernel to refuse."""
+    index = index.cpu()
+    return index.clamp(-1, 2**31 - 1).to(torch.int32) if index.dtype == torch.int64 else index.to(torch.int32)
+
+
 def flatten(scene: Scene) -> Flat:
     """The arrays of a scene; every step is a differentiable torch operation, so gradients find their way back."""
     C = scene.channels
@@ -118,7 +124,7 @@ def flatten(scene: Scene) -> Flat:
     n_verts = n_colors = n_uvs = n_texels = 0
     for mesh in scene.meshes:
         V, F = mesh.verts.shape[0], mesh.faces.shape[0]
-        mesh_faces = mesh.faces.cpu().to(torch.int32)
+        mesh_faces = _int32(mesh.faces)
         verts.append(mesh.verts.cpu().double())
         faces.append(mesh_faces + n_verts if n_verts else mesh_faces)
         if mesh.texture is not None:
@@ -128,7 +134,7 @@ def flatten(scene: Scene) -> Flat:
             textures.append([n_texels, h, w])
             texels.append(mesh.texture.cpu().to(dtype).reshape(h * w, C))
             uvs.append(mesh.uvs.cpu().double())
-            index = mesh.uv_faces.cpu().to(torch.int32)
+            index = _int32(mesh.uv_faces)
             corners.append(index + n_uvs if n_uvs else index)
             n_uvs, n_texels = n_uvs + mesh.uvs.shape[0], n_texels + h * w
         else:

@@ -1,0 +1,223 @@
+"""Radiance of a fixed sample, its face given, and its derivatives: what one interior sample of the gradient does.
+
+The kernel's adjoint is checked against central differences of the kernel (gradcheck); its values and gradients against
+the float64 twin in PyTorch.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from scenes import front_camera, smooth_colors
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+import edgegrad as eg
+from edgegrad import reference
+from edgegrad.render import _kernel_camera, _kernel_scene
+from edgegrad.scene import Flat, flatten
+
+F64 = torch.float64
+
+
+class Shade(torch.autograd.Function):
+    """Radiance (N, C) at the points (N, 2) of the given faces (N,)."""
+
+    @staticmethod
+    def forward(ctx, verts, colors, uvs, texels, world_to_camera, K, flat, view, faces, points):
+        flat = flat._replace(verts=verts, colors=colors, uvs=uvs, texels=texels)
+        kernel = _kernel_scene(flat, spacing=0.0), _kernel_camera(world_to_camera, K, *view)
+        radiance = torch.empty((len(points), flat.background.shape[-1]), dtype=F64)
+        kernel[0].shade_at(kernel[1], faces.int().numpy(), points.numpy(), radiance.numpy())
+        ctx.save_for_backward(verts, colors, uvs, texels, world_to_camera, K)
+        ctx.rest = kernel, faces, points
+        return radiance
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, radiance_bar):
+        (scene, camera), faces, points = ctx.rest
+        grads = [torch.zeros_like(x) for x in ctx.saved_tensors]
+        arrays = [x.numpy() for x in (faces.int(), points, radiance_bar.contiguous(), *grads)]
+        scene.shade_at_vjp(camera, *arrays)
+        return (*grads, None, None, None, None)
+
+
+def shade(scene: eg.Scene, camera: eg.Camera, faces: Tensor, points: Tensor) -> Tensor:
+    flat = flatten(scene)
+    assert flat.colors.dtype == F64
+    view = camera.projection == "perspective", *camera.size
+    # The kernel's scene is built in forward from the four that may require gradients, and the rest.
+    fixed = Flat(*(t.detach() for t in flat))
+    return Shade.apply(
+        flat.verts, flat.colors, flat.uvs, flat.texels, camera.world_to_camera, camera.K, fixed, view, faces, points
+    )
+
+
+# -- scenes -----------------------------------------------------------------------------------------------------------
+
+VERTS = torch.tensor([[-0.9, -0.8, 0.2], [0.9, -0.7, -0.3], [0.8, 0.9, 0.4], [-0.7, 0.8, -0.1]], dtype=F64)
+FACES = torch.tensor([[0, 1, 2], [2, 3, 0]])
+UVS = torch.tensor(
+    [[0.1, 0.15], [0.93, 0.07], [1.31, 1.2], [-0.35, 0.81], [0.4, 0.6]], dtype=F64
+)  # beyond a texture's border
+UV_FACES = torch.tensor([[0, 1, 2], [4, 3, 0]])
+CHANNELS = 2
+
+
+def values(*shape: int) -> Tensor:
+    """Anything but constant."""
+    n = torch.tensor(shape).prod()
+    return smooth_colors(torch.stack([torch.arange(n) * k for k in (1.0, 0.37, -0.61)], -1).double())[:, 0].reshape(
+        shape
+    )
+
+
+LOOKS = {
+    "colors": {"colors": values(4, CHANNELS)},
+    "face_colors": {"face_colors": values(2, CHANNELS)},
+    "corner_colors": {"corner_colors": values(2, 3, CHANNELS)},
+    "texture": {"texture": values(3, 4, CHANNELS), "uvs": UVS},
+}
+VIEWS = ["perspective", "orthographic"]
+
+
+def mesh(look: str, verts: Tensor = VERTS) -> eg.Mesh:
+    return eg.Mesh(verts, FACES, uv_faces=UV_FACES if look == "texture" else None, **LOOKS[look])
+
+
+def skewed_camera(view: str) -> eg.Camera:
+    """Not square pixels, and not a right angle between their sides."""
+    camera = front_camera((20, 24), view)
+    return camera.replace(
+        K=camera.K * torch.tensor([[1.0], [1.2], [1.0]], dtype=F64) + torch.diag(torch.ones(2, dtype=F64), 1)
+    )
+
+
+def samples(scene: eg.Scene, camera: eg.Camera) -> tuple[Tensor, Tensor]:
+    """Two points on each face (N,) where they are seen in the image (N, 2), hidden or not."""
+    corners = torch.cat([m.verts[m.faces] for m in scene.meshes]).detach()
+    barycentrics = torch.tensor([[0.2, 0.31, 0.49], [0.55, 0.24, 0.21]], dtype=F64)
+    faces = torch.arange(len(corners)).repeat_interleave(2)
+    return faces, camera.project((barycentrics @ corners).reshape(-1, 3)).detach()
+
+
+# -- against central differences --------------------------------------------------------------------------------------
+
+
+# gradcheck steps by 1e-6 in double: errors of 1e-12 from third derivatives and, from rounding, 1e-10 of the radiance
+# (≤ 1) and 1e-9 of the pixel positions (≤ 30) that it depends on. Below, a thousand times that.
+STEP, ATOL, RTOL = 1e-6, 1e-6, 1e-6
+
+
+def check_gradient(scene: eg.Scene, camera: eg.Camera, inputs: dict[str, Tensor]) -> None:
+    """In fields of the scene's first mesh, and in the upper rows of "world_to_camera" and "K"; the last are fixed."""
+    faces, points = samples(scene, camera)
+    names = list(inputs)
+
+    def function(*tensors: Tensor) -> Tensor:
+        given = dict(zip(names, tensors, strict=True))
+        of_camera = {
+            name: torch.cat([given.pop(name), getattr(camera, name)[-1:]])
+            for name in ("world_to_camera", "K")
+            if name in given
+        }
+        meshes = [scene.meshes[0].replace(**given), *scene.meshes[1:]]
+        return shade(scene.replace(meshes=meshes), camera.replace(**of_camera), faces, points)
+
+    leaves = [t.detach().clone().requires_grad_() for t in inputs.values()]
+    assert torch.autograd.gradcheck(function, leaves, eps=STEP, atol=ATOL, rtol=RTOL)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("look", LOOKS)
+def test_gradcheck(look, view):
+    """Every input at once: vertices, what the mesh looks like, the pose's entries and those of K."""
+    camera = skewed_camera(view)
+    inputs = {"verts": VERTS, **LOOKS[look], "world_to_camera": camera.world_to_camera[:3], "K": camera.K[:2]}
+    check_gradient(eg.Scene(mesh(look)), camera, inputs)
+
+
+@pytest.mark.parametrize("look", ["colors", "texture"])
+def test_gradcheck_of_a_face_that_reaches_behind_the_camera(look):
+    """A floor under the camera, of which the part before it is seen."""
+    camera = skewed_camera("perspective")
+    to_world = torch.linalg.inv(camera.world_to_camera)
+    q = torch.tensor([[-3.0, 0.9, 6.0], [3.0, 1.0, 6.0], [2.0, 0.8, -4.0], [-2.0, 1.1, -5.0]], dtype=F64)
+    verts = q @ to_world[:3, :3].mT + to_world[:3, 3]
+    scene = eg.Scene(mesh(look, verts))
+    faces = torch.tensor([0, 0, 1])
+    points = torch.tensor([[12.0, 16.5], [15.2, 18.1], [10.3, 19.2]], dtype=F64)
+    torch.testing.assert_close(shade(scene, camera, faces, points), reference.radiance(scene, camera, points, faces))
+
+    def function(verts: Tensor, pose: Tensor) -> Tensor:
+        moved = camera.replace(world_to_camera=torch.cat([pose, camera.world_to_camera[3:]]))
+        return shade(scene.replace(meshes=[scene.meshes[0].replace(verts=verts)]), moved, faces, points)
+
+    leaves = [t.clone().requires_grad_() for t in (verts, camera.world_to_camera[:3])]
+    assert torch.autograd.gradcheck(function, leaves, eps=STEP, atol=ATOL, rtol=RTOL)
+
+
+def test_gradcheck_rejects_a_wrong_gradient():
+    """Colours taken for those of the mesh turned by one face: the check must not be blind to it."""
+    scene, camera = eg.Scene(mesh("corner_colors")), skewed_camera("perspective")
+    faces, points = samples(scene, camera)
+    right = LOOKS["corner_colors"]["corner_colors"].clone().requires_grad_()
+
+    def wrong(colors: Tensor) -> Tensor:
+        value = shade(eg.Scene(scene.meshes[0].replace(corner_colors=colors)), camera, faces, points)
+        other = shade(eg.Scene(scene.meshes[0].replace(corner_colors=colors.flip(0))), camera, faces, points)
+        return value.detach() + other - other.detach()
+
+    with pytest.raises(RuntimeError, match="Jacobian mismatch"):
+        torch.autograd.gradcheck(wrong, [right], eps=STEP, atol=ATOL, rtol=RTOL)
+
+
+# -- against the float64 twin -----------------------------------------------------------------------------------------
+
+
+def mixed_scene() -> eg.Scene:
+    """Every look at once, two textures of different size, and a mesh without any, at different places."""
+    meshes = [mesh(look, VERTS + torch.tensor([0.1 * i, 0.0, -0.2 * i])) for i, look in enumerate(LOOKS)]
+    other = mesh("texture", VERTS * 0.7).replace(
+        texture=values(5, 2, CHANNELS), uvs=UVS + 0.1, uv_faces=UV_FACES.flip(0)
+    )
+    return eg.Scene([*meshes, eg.Mesh(VERTS * 0.5, FACES), other])
+
+
+def leaves_of(scene: eg.Scene, camera: eg.Camera) -> tuple[eg.Scene, eg.Camera, dict[str, Tensor]]:
+    """The same, all their floating-point tensors made leaves that require gradients."""
+    leaves = {}
+
+    def leaf(name: str, tensor: Tensor) -> Tensor:
+        leaves[name] = tensor.detach().clone().requires_grad_()
+        return leaves[name]
+
+    meshes = []
+    for i, m in enumerate(scene.meshes):
+        fields = {n: v for n, v in vars(m).items() if v is not None and v.is_floating_point()}
+        meshes.append(m.replace(**{n: leaf(f"{n} of mesh {i}", v) for n, v in fields.items()}))
+    camera = camera.replace(world_to_camera=leaf("world_to_camera", camera.world_to_camera), K=leaf("K", camera.K))
+    return eg.Scene(meshes), camera, leaves
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("look", [*LOOKS, "mixed"])
+def test_equals_the_twin(look, view):
+    """Value and gradient, to what rounding in double leaves: two formulas for the same barycentrics."""
+    scene = mixed_scene() if look == "mixed" else eg.Scene(mesh(look))
+    scene, camera, leaves = leaves_of(scene, skewed_camera(view))
+    faces, points = samples(scene, camera)
+    ours, twin = shade(scene, camera, faces, points), reference.radiance(scene, camera, points, faces)
+    torch.testing.assert_close(ours, twin, rtol=0, atol=1e-12)
+
+    bar = values(*ours.shape)
+    grads = [
+        torch.autograd.grad((image * bar).sum(), list(leaves.values()), allow_unused=True) for image in (ours, twin)
+    ]
+    for name, a, b in zip(leaves, *grads, strict=True):
+        # The last row of K is fixed; only the twin, written with homogeneous coordinates, has a derivative there.
+        rows = slice(2) if name == "K" else slice(None)
+        a, b = (torch.zeros_like(leaves[name]) if g is None else g for g in (a, b))
+        atol = 1e-9 * max(1.0, float(b.abs().max()))
+        torch.testing.assert_close(a[rows], b[rows], rtol=0, atol=atol, msg=lambda text, name=name: f"{name}: {text}")
