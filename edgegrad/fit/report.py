@@ -1,0 +1,137 @@
+"""Pictures of a fit: what was compared, how the loss fell, and how the mesh moved."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
+
+from .._files import PathLike, replacing
+from ..image import linear_to_srgb
+from .result import PoseFit, Step
+from .task import Level, PoseTask
+
+PANEL, FRAME = 512, 256  # most pixels on a side of a panel, in draw_fit and in draw_animation
+FRAMES = 30
+SPP = 64
+INK, FAINT = "#303030", "#c4c4c4"
+
+
+def draw_fit(path: PathLike, fit: PoseFit) -> None:
+    """Writes target | start | fit | difference as one image; with a mask all over black, as they were compared.
+
+    Raises ValueError for a fit that did not take a step or came from JSON, OSError when the file cannot be written.
+    """
+    task = _task(fit)
+    level = _level(task, PANEL)
+    target = _shown(level.target)
+    start, end = (_render(task, level, step) for step in (fit.history[0], _way(fit)[-1]))
+    difference = np.abs(end - target)
+    # Errors of a good fit are too faint to see as they are; by a power of two, so that the caption is easy to read.
+    factor = 2 ** int(np.clip(np.floor(-np.log2(np.quantile(difference, 0.999) + 1e-9)), 0, 4))
+    titles = "target", "start", "fit", "difference" + (f" × {factor}" if factor > 1 else "")
+    h, w = np.array(target.shape[:2]) / max(target.shape[:2])
+    figure = Figure(figsize=(4 * 2.4 * w + 0.3, 2.4 * h + 0.34), dpi=200, layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.04, wspace=0.0, hspace=0.0)  # type: ignore[union-attr]
+    images = target, start, end, np.clip(factor * difference, 0, 1)
+    for axes, title, image in zip(figure.subplots(1, 4), titles, images, strict=True):
+        axes.imshow(image, interpolation="nearest")
+        axes.set_title(title, fontsize=9, color=INK, pad=4)
+        axes.set_axis_off()
+    with replacing(path) as temporary:
+        figure.savefig(temporary)
+
+
+def draw_loss(path: PathLike, fit: PoseFit) -> None:
+    """Writes the loss of every step: one colour for each level of the image pyramid, grey where a search came to nothing.
+
+    Raises ValueError for a fit that did not take a step or came from JSON, OSError when the file cannot be written.
+    """
+    _task(fit)
+    # The last entry of a whole fit is no step but the final comparison, which has less noise.
+    history = fit.history[:-1] if len(fit.history) > 1 and not fit.interrupted else fit.history
+    begins = [k for k, step in enumerate(history) if k == 0 or step.size != history[k - 1].size]
+    figure = Figure(figsize=(6.4, 3.2), dpi=200, layout="constrained")
+    axes = figure.subplots()
+    axes.plot(range(1, len(history) + 1), [step.loss for step in history], ".", color=FAINT, markersize=4)
+    for number, (begin, end) in enumerate(zip(begins, [*begins[1:], len(history)], strict=True)):
+        best = [k for k in range(begin, end) if history[k].best]
+        h, w = history[begin].size
+        color = colormaps["viridis"](0.85 * number / max(1, len(begins) - 1))
+        axes.plot([k + 1 for k in best], [history[k].loss for k in best], ".-", color=color, label=f"{w} × {h} px")
+    axes.set_yscale("log")
+    axes.set_xlabel("step")
+    axes.set_ylabel("mean squared difference")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8, title="best so far", title_fontsize=8)
+    with replacing(path) as temporary:
+        figure.savefig(temporary)
+
+
+def draw_animation(path: PathLike, fit: PoseFit) -> None:
+    """Writes target | fit | difference on the way from start to end as an animated WebP.
+
+    Raises ValueError for a fit that did not take a step or came from JSON, OSError when the file cannot be written.
+    """
+    task = _task(fit)
+    level = _level(task, FRAME)
+    target = _shown(level.target)
+    font = ImageFont.load_default(max(9, round(0.05 * target.shape[0])))
+    frames = []
+    for step in _frames(_way(fit)):
+        image = _render(task, level, step)
+        panels = np.concatenate([target, image, np.clip(2.0 * np.abs(image - target), 0, 1)], 1)
+        frame = Image.fromarray((panels * 255.0).round().astype(np.uint8))
+        edge = round(0.03 * frame.height)
+        for k, title in enumerate(("target", f"fit at {max(step.size)} px", "difference x 2")):
+            place = k * frame.width // 3 + edge, edge
+            ImageDraw.Draw(frame).text(place, title, "white", font, stroke_width=1, stroke_fill="black")
+        frames.append(frame)
+    durations = [1000, *[200] * (len(frames) - 2), 2500][-len(frames) :]  # milliseconds
+    with replacing(path) as temporary:
+        frames[0].save(temporary, save_all=True, append_images=frames[1:], duration=durations, loop=0, quality=85)
+
+
+def _task(fit: PoseFit) -> PoseTask:
+    if fit.task is None or not fit.history:
+        raise ValueError(
+            "fit: expected one that took a step, got one without; draw what fit_pose returns, not from_json"
+        )
+    return fit.task
+
+
+def _way(fit: PoseFit) -> list[Step]:
+    """The best poses in turn; the last one is what the fit returned."""
+    return [step for step in fit.history if step.best]
+
+
+def _frames(way: list[Step]) -> list[Step]:
+    """The steps that moved the mesh by more than a FRAMES-th of the whole way, and the ends."""
+    poses = torch.stack([step.pose.matrix[:3] for step in way])
+    left = poses - poses[-1]
+    # Rotation and translation count alike, each in proportion to the whole way.
+    turn, shift = (part.flatten(1).norm(dim=1) for part in (left[..., :3], left[..., 3:]))
+    far = turn / (turn.max() + 1e-30) + shift / (shift.max() + 1e-30)
+    kept = [0]
+    for k in range(1, len(way) - 1):
+        if abs(float(far[k] - far[kept[-1]])) > 2.0 / FRAMES:
+            kept.append(k)
+    return [way[k] for k in kept] + ([way[-1]] if len(way) > 1 else [])
+
+
+def _level(task: PoseTask, most: int) -> Level:
+    """The whole picture, at most so many pixels on its longer side."""
+    return task.level(min(1.0, most / max(task.camera.size)), blur=0.0, coarseness=1.0, spp=SPP, free=[])
+
+
+def _render(task: PoseTask, level: Level, step: Step) -> np.ndarray:
+    with torch.no_grad():
+        return _shown(task.image(level, step.pose, level.spp, seed=0))
+
+
+def _shown(image: torch.Tensor) -> np.ndarray:
+    """(H, W, 3) sRGB in 0 … 1 from linear radiance; the mask's channel is left out."""
+    colors = image[..., :3] if image.shape[-1] >= 3 else image[..., :1].expand(-1, -1, 3)
+    return linear_to_srgb(colors.clamp(0.0, 1.0)).numpy()

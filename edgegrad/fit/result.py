@@ -1,0 +1,150 @@
+"""What a fit returns: a pose, the steps that led there, and its JSON form."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .._check import check_finite, check_shape
+from ..camera import Camera
+
+if TYPE_CHECKING:
+    from .task import PoseTask
+
+
+class Pose(NamedTuple):
+    """Mesh to world, `world = scale · R v + t`, and the focal length relative to the given camera's. All float64."""
+
+    R: Tensor  # (3, 3)
+    t: Tensor  # (3,) world units
+    scale: Tensor  # ()
+    focal: Tensor  # ()
+
+    @property
+    def matrix(self) -> Tensor:
+        """(4, 4) float64, for column vectors."""
+        last = self.t.new_tensor([[0.0, 0.0, 0.0, 1.0]])
+        return torch.cat([torch.cat([self.scale * self.R, self.t[:, None]], 1), last])
+
+
+class Step(NamedTuple):
+    """One render of the fit."""
+
+    size: tuple[int, int]  # pixels (H, W) of this level of the pyramid
+    loss: float  # mean squared difference, blurred alike; comparable within one level
+    pose: Pose
+    best: bool  # whether it was the best so far
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFit:
+    """What fit_pose found.
+
+    R (3, 3), t (3,) float64 and scale place the mesh: `world = scale · R v + t`, t in world units. `camera` is the given
+    one, with the focal length found when that was asked for. `loss` is the mean squared difference to the picture,
+    linear radiance, over pixels and channels, at the finest level.
+    """
+
+    R: Tensor
+    t: Tensor
+    scale: float
+    camera: Camera
+    loss: float
+    steps: int
+    seconds: float
+    converged: bool
+    interrupted: bool = False
+    history: list[Step] = field(default_factory=list, repr=False)  # its last `best` step is this pose
+    task: PoseTask | None = field(default=None, repr=False)  # what was compared, for pictures; not kept in JSON
+
+    @property
+    def matrix(self) -> Tensor:
+        """Mesh to world, (4, 4) float64, for column vectors: `scale · R` and `t`."""
+        one = torch.ones((), dtype=torch.float64)
+        return Pose(self.R, self.t, self.scale * one, one).matrix
+
+    def to_json(self) -> str:
+        """The pose as JSON text: `mesh_to_world` 4 × 4 by rows, for column vectors; camera and figures of the fit beside it."""
+        return json.dumps(
+            {
+                "mesh_to_world": self.matrix.tolist(),
+                "scale": self.scale,
+                "camera": {
+                    "world_to_camera": self.camera.world_to_camera.tolist(),
+                    "K": self.camera.K.tolist(),
+                    "size": list(self.camera.size),
+                    "projection": self.camera.projection,
+                },
+                "loss": self.loss if math.isfinite(self.loss) else None,  # none yet when interrupted at once
+                "steps": self.steps,
+                "seconds": round(self.seconds, 3),
+                "converged": self.converged,
+                "interrupted": self.interrupted,
+            },
+            indent=2,
+        )
+
+    @staticmethod
+    def from_json(text: str) -> PoseFit:
+        """From what to_json wrote; the history is not kept. Raises ValueError that names what is missing or wrong."""
+        data = _parsed(text, "mesh_to_world", "camera", "loss", "steps", "seconds", "converged", "interrupted")
+        pose = pose_from_matrix("mesh_to_world", data["mesh_to_world"])
+        try:
+            camera = data["camera"]
+            M, K = (torch.tensor(camera[key], dtype=torch.float64) for key in ("world_to_camera", "K"))
+            view = Camera(M, K, camera["size"], camera["projection"])
+            loss = math.nan if data["loss"] is None else float(data["loss"])
+            steps, seconds = int(data["steps"]), float(data["seconds"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"pose: expected what PoseFit.to_json writes, got a fault in it ({error})") from error
+        flags = bool(data["converged"]), bool(data["interrupted"])
+        return PoseFit(pose.R, pose.t, float(pose.scale), view, loss, steps, seconds, *flags)
+
+
+def pose_from_json(text: str) -> Pose:
+    """The pose alone, from a JSON object with `mesh_to_world`, 4 × 4 by rows. Raises ValueError."""
+    return pose_from_matrix("mesh_to_world", _parsed(text, "mesh_to_world")["mesh_to_world"])
+
+
+def pose_from_matrix(name: str, matrix: object) -> Pose:
+    """A pose from a 4 × 4 similarity for column vectors. Raises TypeError or ValueError."""
+    if not isinstance(matrix, Tensor):
+        try:
+            matrix = torch.tensor(matrix, dtype=torch.float64)  # lists would become float32
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name}: expected 4 × 4 numbers, got something else ({error})") from error
+    M = matrix.detach().cpu().double()
+    check_shape(name, M, (4, 4))
+    check_finite(name, M)
+    if M[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        raise ValueError(f"{name}: expected the last row 0, 0, 0, 1, got {M[3].tolist()}; is it transposed?")
+    det = float(torch.linalg.det(M[:3, :3]))
+    if det <= 0:
+        raise ValueError(f"{name}: expected a rotation times a scale above 0, got determinant {det:.3g}; flip one axis")
+    scale = det ** (1 / 3)
+    R = M[:3, :3] / scale
+    # 1e-3: far above what writing a matrix with six digits leaves, far below any shear that one means.
+    if (error := float((R @ R.T - torch.eye(3)).abs().max())) > 1e-3:
+        raise ValueError(
+            f"{name}: expected a rotation times a scale, got |R Rᵀ − 1| up to {error:.2g}; remove the shear"
+        )
+    U, _, Vh = torch.linalg.svd(R)
+    one = torch.ones((), dtype=torch.float64)
+    return Pose(U @ Vh, M[:3, 3].clone(), scale * one, one)
+
+
+def _parsed(text: str, *keys: str) -> dict[str, Any]:
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"pose: expected JSON, got text that is not ({error})") from None
+    if not isinstance(data, dict):
+        raise ValueError(f"pose: expected a JSON object, got {type(data).__name__}; write {{…}}")
+    if missing := [key for key in keys if key not in data]:
+        raise ValueError(f"pose: expected the entry {missing[0]!r}, got {', '.join(data) or 'none'}; add it")
+    return data

@@ -1,0 +1,199 @@
+"""The command line end to end, on files that the tests write."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, silhouette
+
+import edgegrad as eg
+from edgegrad import cli
+from edgegrad.fit import PoseFit
+from edgegrad.image import linear_to_srgb, read_image, write_image
+from edgegrad.io import save_camera
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A folder with mesh.ply, camera.json, target.png, mask.png and init.json; the mesh's colours survive 8 bit."""
+    mesh = bracket()
+    colors = (linear_to_srgb(mesh.face_colors) * 255).round().to(torch.uint8).numpy()
+    trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), face_colors=colors, process=False).export(
+        tmp_path / "mesh.ply"
+    )
+    view = camera(48)
+    save_camera(tmp_path / "camera.json", view)
+    write_image(tmp_path / "target.png", picture(view))
+    write_image(tmp_path / "mask.png", silhouette(view))
+    (tmp_path / "init.json").write_text(json.dumps({"mesh_to_world": START.tolist()}))
+    return tmp_path
+
+
+def run(*arguments):
+    return cli.main([str(argument) for argument in arguments])
+
+
+def fit(files, *more):
+    return run("fit-pose", files / "mesh.ply", files / "target.png", "--camera", files / "camera.json", *more)
+
+
+def test_fit_pose(files, capsys):
+    out = files / "new" / "out"
+    assert fit(files, "--init", files / "init.json", "--out", out) == 0
+    found = PoseFit.from_json((out / "pose.json").read_text())
+    assert max(errors(found)) < 1.0 and found.converged
+    said = capsys.readouterr()
+    assert (
+        "converged" in said.out
+        and "mesh to world:" in said.out
+        and "pose.json, fit.png, loss.png, fit.webp" in said.out
+    )
+    assert "loss" in said.err  # the progress bar
+    assert sorted(p.name for p in out.iterdir()) == ["fit.png", "fit.webp", "loss.png", "pose.json"]
+
+    sheet = Image.open(out / "fit.png")
+    assert sheet.width > 3 * sheet.height
+    assert Image.open(out / "loss.png").width > 500
+    movie = Image.open(out / "fit.webp")
+    assert movie.size == (3 * 48, 48) and movie.n_frames > 3
+
+    # What render makes of the pose is the target.
+    assert run("render", files / "mesh.ply", "--pose", out / "pose.json", "--out", files / "again.exr") == 0
+    again = read_image(files / "again.exr")
+    covered = read_image(files / "mask.png", channels=1) > 0.99
+    assert again.shape == (48, 48, 3)
+    assert float(((again - picture(camera(48))).abs() * covered).mean()) < 0.01
+
+
+def test_fit_pose_with_mask_background_and_alpha(files):
+    assert fit(files, "--init", files / "init.json", "--mask", files / "mask.png", "--out", files / "a") == 0
+    colour = "#" + bytes((linear_to_srgb(BACKGROUND) * 255).round().to(torch.uint8).tolist()).hex()
+    assert fit(files, "--init", files / "init.json", "--background", colour, "--out", files / "b") == 0
+    view = camera(48)
+    write_image(files / "target.png", torch.cat([picture(view), silhouette(view)], -1))
+    assert fit(files, "--init", files / "init.json", "--out", files / "c") == 0
+    for folder in "abc":
+        found = PoseFit.from_json((files / folder / "pose.json").read_text())
+        assert max(errors(found)) < 2.0
+
+
+def test_an_interrupted_fit_is_written(files, capsys, monkeypatch):
+    count = 0
+
+    def write_pose(folder, found):
+        nonlocal count
+        count += 1
+        write(folder, found)
+        if count == 5:
+            raise KeyboardInterrupt
+
+    write = cli._write_pose
+    monkeypatch.setattr(cli, "SAVE_EVERY", 0.0)
+    monkeypatch.setattr(cli, "_write_pose", write_pose)
+    assert fit(files, "--init", files / "init.json", "--out", files / "out") == cli.INTERRUPTED
+    found = PoseFit.from_json((files / "out" / "pose.json").read_text())
+    assert found.interrupted and found.steps == 5
+    assert (files / "out" / "fit.webp").exists() and "interrupted" in capsys.readouterr().out
+
+
+def test_a_failed_write_still_prints_the_pose(files, capsys, monkeypatch):
+    def full(folder, found):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(cli, "_write_pose", full)
+    assert fit(files, "--init", files / "init.json", "--steps", 1, "--out", files / "out") == 2
+    said = capsys.readouterr()
+    assert "mesh to world:" in said.out
+    assert "pose.json: expected to write it, got: No space left on device" in said.err
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (["none.ply", "target.png"], "none.ply: expected a file"),
+        (["mesh.ply", "none.png"], "none.png: expected a file"),
+        (["mesh.ply", "mesh.ply"], "mesh.ply: expected a file name that ends in"),
+        (["mesh.ply", "target.png", "--camera", "bad.json"], "bad.json: "),
+        (["mesh.ply", "target.png", "--camera", "init.json"], "init.json: K: expected the keys"),
+        (["mesh.ply", "target.png", "--camera", "camera.json", "--fov", "30"], "--camera: expected none of --fov"),
+        (["mesh.ply", "target.png", "--camera", "wide.json"], "wide.json: expected a camera for 48 × 48 pixels"),
+        (["mesh.ply", "target.png", "--init", "none.json"], "none.json: expected a file"),
+        (["mesh.ply", "target.png", "--init", "bad.json"], "bad.json: pose: expected JSON"),
+        (["mesh.ply", "target.png", "--mask", "small.png"], "small.png: expected 48 × 48 pixels like"),
+        (["mesh.ply", "target.png", "--mask", "mask.png", "--background", "#102030"], "--background: expected none"),
+        (["mesh.ply", "target.png", "--background", "#1020"], "--background: expected #rrggbb"),
+        (["mesh.ply", "target.png", "--background", "small.png"], "small.png: expected 48 × 48 pixels"),
+        (["mesh.ply", "target.png", "--fov", "200"], "--fov: expected degrees between 0 and 180, got 200"),
+        (["mesh.ply", "target.png", "--out", "mesh.ply/out"], "mesh.ply/out (Not a directory); choose another"),
+        (["mesh.ply", "target.png", "--steps", "0"], "argument --steps: expected a whole number from 1 up, got '0'"),
+        (["mesh.ply"], "the following arguments are required: IMAGE"),
+    ],
+)
+def test_errors_are_one_line(files, capsys, monkeypatch, change, message):
+    monkeypatch.chdir(files)
+    (files / "bad.json").write_text("{")
+    save_camera(files / "wide.json", camera(48).replace(size=(48, 96)))
+    write_image(files / "small.png", torch.ones(8, 8, 3))
+    try:
+        code = run("fit-pose", *change, *(() if "--out" in change else ("--out", "out")))
+    except SystemExit as stop:  # from argparse
+        code = stop.code
+    said = capsys.readouterr().err
+    assert code == 2
+    assert said.startswith("edgegrad: error: ") and said.count("\n") == 1 and message in said
+
+
+def test_render_frames_the_mesh(files):
+    out = files / "new" / "view.exr"
+    assert (
+        run("render", files / "mesh.ply", "--out", out, "--size", "64x48", "--spp", 4, "--background", "#000000") == 0
+    )
+    image = read_image(out)
+    assert image.shape == (48, 64, 3)
+    seen = image.sum(-1) > 0
+    assert 0.15 < float(seen.float().mean()) < 0.9
+    assert not bool(seen[0].any() | seen[-1].any() | seen[:, 0].any() | seen[:, -1].any())
+    assert (
+        run("render", files / "mesh.ply", "--out", files / "view.png", "--eye", 1, 1, 6, "--fov", 30, "--size", 32) == 0
+    )
+    assert read_image(files / "view.png").shape == (32, 32, 3)
+
+
+def test_render_with_a_pose_by_hand(files):
+    (files / "pose.json").write_text(json.dumps({"mesh_to_world": about_center(rotation(0.0, 0.6, 0.0)).tolist()}))
+    for name, more in (("a", ()), ("b", ("--pose", files / "pose.json"))):
+        assert (
+            run("render", files / "mesh.ply", "--camera", files / "camera.json", "--out", files / f"{name}.exr", *more)
+            == 0
+        )
+    a, b = (read_image(files / f"{name}.exr") for name in "ab")
+    turned = bracket().transformed(rotation(0.0, 0.6, 0.0), about_center(rotation(0.0, 0.6, 0.0))[:3, 3])
+    expected = eg.render(turned, camera(48), spp=64)
+    assert float((a - b).abs().mean()) > 0.01
+    # Colours went through 8 bit, vertices through float32.
+    assert float((b - expected).abs().mean()) < 0.005
+
+
+def test_demo_prints_errors_and_writes_pictures(tmp_path, capsys):
+    pytest.importorskip("pyvista", reason="needs the extra edgegrad[demo]")
+    assert run("demo", "--runs", 1, "--out", tmp_path / "demo") == 0
+    said = capsys.readouterr().out
+    assert "1 of 1 within 0.5° and 0.5 %" in said
+    assert sorted(p.name for p in (tmp_path / "demo").iterdir()) == ["fit.png", "fit.webp", "loss.png", "pose.json"]
+
+
+def test_demo_without_pyvista_says_how_to_get_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyvista.examples", None)
+    assert run("demo", "--out", tmp_path) == 2
+    assert "pip install edgegrad[demo]" in capsys.readouterr().err
+
+
+def test_version_as_a_program():
+    done = subprocess.run(
+        [sys.executable, "-m", "edgegrad.cli", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == f"edgegrad {eg.__version__}\n"
