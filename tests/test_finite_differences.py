@@ -195,10 +195,11 @@ def test_gradient_is_the_derivative_of_the_image_in_every_combination(name: str,
     check(
         lambda theta: case(theta, camera),
         step / 2,
-        spp=4096,
+        spp=1024,
+        seeds=8,
         filter=filter,
-        surface_samples=200_000,
-        edge_samples=200_000,
+        surface_samples=100_000,
+        edge_samples=100_000,
     )
 
 

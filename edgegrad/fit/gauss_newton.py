@@ -46,10 +46,10 @@ class GaussNewton:
         rows = []
         for _ in range(probes):
             signs = torch.randint(0, 2, residual.shape, generator=self.generator).to(residual) * 2.0 - 1.0
-            rows.append(torch.autograd.grad(residual, p, signs, retain_graph=True)[0])
+            rows.append(_pulled_back(residual, p, signs))
         fresh = torch.stack(rows).T @ torch.stack(rows) / probes
         self._curvature = MEMORY * self._curvature + (1.0 - MEMORY) * fresh if self.accepted else fresh
-        self._gradient = torch.autograd.grad(residual, p, residual.detach())[0]
+        self._gradient = _pulled_back(residual, p, residual.detach())
         if self.accepted:
             self.damping = max(self.damping / 3.0, LEAST_DAMPING)
         self.loss = loss
@@ -69,3 +69,9 @@ class GaussNewton:
         step = -torch.linalg.solve(damped, self._gradient)
         shrink = min(1.0, LONGEST / float(step.abs().max().clamp(min=1e-30)))
         return step * shrink / (1.0 + DECAY * max(0, self.accepted - FULL_STEPS))
+
+
+def _pulled_back(residual: Tensor, p: Tensor, image: Tensor) -> Tensor:
+    """Jᵀ image (n,)."""
+    # Of a sum, because torch imports SymPy, for more than a second, when it is handed an image as grad_outputs.
+    return torch.autograd.grad((residual * image).sum(), p, retain_graph=True)[0]
