@@ -5,6 +5,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := pyproject.toml $(shell find csrc -name '*.cpp' -o -name '*.h' -o -name CMakeLists.txt)
 
+# Threads that wait should not spin: see edgegrad/__init__.py.
+export OMP_WAIT_POLICY ?= passive
+
 .PHONY: demo test test-slow bench lint format clean
 .DELETE_ON_ERROR:
 

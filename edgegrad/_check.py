@@ -19,6 +19,8 @@ def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating:
         return value
     try:
         tensor = torch.as_tensor(value, device=None if like is None else like.device)
+        if like is not None and like.is_floating_point() and tensor.dtype != like.dtype and not hasattr(value, "dtype"):
+            tensor = torch.as_tensor(value, dtype=like.dtype, device=like.device)  # numbers of Python are double
     except (TypeError, ValueError, RuntimeError) as error:
         raise TypeError(
             f"{name}: expected a tensor, array or nested sequence of numbers, got {type(value).__name__}; "

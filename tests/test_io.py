@@ -66,13 +66,23 @@ def glb(tree, *arrays):
         if not isinstance(array, bytes):
             kinds = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}
             shape = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
-            accessors.append({
-                "bufferView": len(views) - 1, "componentType": kinds[array.dtype.str[1:]], "count": len(array),
-                "type": shape, "normalized": array.dtype.kind == "u" and array.ndim == 2,
-            })
+            accessors.append(
+                {
+                    "bufferView": len(views) - 1,
+                    "componentType": kinds[array.dtype.str[1:]],
+                    "count": len(array),
+                    "type": shape,
+                    "normalized": array.dtype.kind == "u" and array.ndim == 2,
+                }
+            )
         blob += content + b"\0" * (-len(content) % 4)
-    tree = {"asset": {"version": "2.0"}, "accessors": accessors, "bufferViews": views,
-            "buffers": [{"byteLength": len(blob)}], **tree}
+    tree = {
+        "asset": {"version": "2.0"},
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(blob)}],
+        **tree,
+    }
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob
@@ -264,8 +274,11 @@ def test_glb_base_colour_is_linear_and_not_rounded(tmp_path):
 
 def test_glb_nodes_place_their_parts(tmp_path):
     turn = [0.0, 0.0, 2**-0.5, 2**-0.5]  # a quarter turn about z, as (x, y, z, w)
-    nodes = [{"mesh": 0, "translation": [5, 0, 0], "children": [1]}, {"mesh": 0, "scale": [2, 2, 2], "rotation": turn},
-             {"mesh": 0, "scale": [-1, 1, 1]}]
+    nodes = [
+        {"mesh": 0, "translation": [5, 0, 0], "children": [1]},
+        {"mesh": 0, "scale": [2, 2, 2], "rotation": turn},
+        {"mesh": 0, "scale": [-1, 1, 1]},
+    ]
     (tmp_path / "n.glb").write_bytes(square_glb(nodes=nodes, scenes=[{"nodes": [0, 2]}]))
     scene = load_scene(tmp_path / "n.glb")
     assert isinstance(scene, Scene) and len(scene.meshes) == 3
@@ -299,8 +312,12 @@ def test_merging_welds_across_parts(tmp_path):
 
 
 def test_gltf_with_files_beside_it(tmp_path):
-    whole = square_glb({"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}, uv=True,
-                       images=[{"uri": "my%20skin.png"}], textures=[{"source": 0}])
+    whole = square_glb(
+        {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}},
+        uv=True,
+        images=[{"uri": "my%20skin.png"}],
+        textures=[{"source": 0}],
+    )
     size = struct.unpack("<I", whole[12:16])[0]
     tree = json.loads(whole[20 : 20 + size])
     tree["buffers"][0]["uri"] = "data.bin"
@@ -385,8 +402,7 @@ def test_3mf_parts(tmp_path):
 GOOD = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 OFF = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 STL = (
-    "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
-    "endloop\nendfacet\nendsolid a\n"
+    "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n"
 )
 MIXED = ply([*SQUARE, [2, 2, 0]], [[0, 1, 2, 3], [0, 1, 4]], face_colors=[[1, 2, 3]] * 2)
 
