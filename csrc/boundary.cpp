@@ -152,7 +152,7 @@ int64_t add_boundary(const BackwardView<T>& view, Destination& to) {
             const double importance = view.importance.mean({std::min(c.x0.x, c.x1.x), std::min(c.x0.y, c.x1.y)},
                                                            {std::max(c.x0.x, c.x1.x), std::max(c.x0.y, c.x1.y)});
             measure[e] = c.length * importance;
-            if (importance > 0) length[k] += c.length;
+            if (importance > 0 && std::isfinite(c.length)) length[k] += c.length;
         }
     double total = 0;
     for (const double l : length) total += l;

@@ -31,7 +31,7 @@ class Importance {
         for (int j = 0; j < height; ++j) {
             int64_t row = 0;
             for (int i = 0; i < width; ++i) {
-                // The cap keeps the sum of 2³¹ pixels within 63 bits; only an adjoint 2²⁰ times the mean meets it.
+                // The cap keeps the conversion defined; only an adjoint 2²⁰ times the mean meets it.
                 const double a = size[int64_t(j) * width + i];
                 if (a > 0) row += unit + int64_t(std::min(scale * a, 0x1p32));
                 table_[index(i + 1, j + 1)] = table_[index(i + 1, j)] + row;
@@ -52,7 +52,7 @@ class Importance {
 
    private:
     static constexpr int64_t unit = 1 << 8;
-    static int clamp(double x, int most) { return int(std::clamp(x, 0.0, double(most))); }
+    static int clamp(double x, int most) { return x > 0 ? (x < most ? int(x) : most) : 0; }
     size_t index(int i, int j) const { return size_t(j) * (width_ + 1) + i; }
 
     int width_, height_;

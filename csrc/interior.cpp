@@ -170,7 +170,7 @@ int64_t add_interior(const BackwardView<T>& view, bool geometry, Destination& to
             const double m = polygon.area + polygon.longest,
                          importance = view.importance.mean(polygon.low, polygon.high);
             measure[f] = m * importance;
-            if (importance > 0) size[k] += m;
+            if (importance > 0 && std::isfinite(m)) size[k] += m;
         }
     double total = 0;
     for (const double s : size) total += s;

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 #include <vector>
 
@@ -19,7 +20,11 @@ class Systematic {
 #pragma omp parallel for num_threads(threads) schedule(static)
         for (int64_t k = 0; k < blocks; ++k) {
             double sum = 0;
-            for (int64_t i = k * block; i < std::min(n, (k + 1) * block); ++i) end_[i] = sum += end_[i];
+            for (int64_t i = k * block; i < std::min(n, (k + 1) * block); ++i) {
+                // What overflows the range of doubles (coordinates beyond 1e150) cannot be sampled.
+                if (!std::isfinite(end_[i])) end_[i] = 0;
+                end_[i] = sum += end_[i];
+            }
             before[k + 1] = sum;
         }
         for (int64_t k = 0; k < blocks; ++k) before[k + 1] += before[k];

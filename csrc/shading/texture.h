@@ -30,7 +30,7 @@ Footprint footprint(const Texture<T>& t, Vec2 uv) {
     // Reduced in floating point: uv may lie so far out that an integer would overflow.
     const auto wrap = [](double i, int64_t n) {
         const int64_t r = int64_t(i - n * std::floor(i / n));
-        return r < n ? r : 0;
+        return r >= 0 && r < n ? r : 0;  // rounding up to n, or a coordinate beyond the range of doubles
     };
     const int64_t i0 = wrap(fx, t.width), j0 = wrap(fy, t.height);
     const int64_t i1 = i0 + 1 < t.width ? i0 + 1 : 0, j1 = j0 + 1 < t.height ? j0 + 1 : 0;
