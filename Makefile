@@ -24,7 +24,7 @@ bench: $(VENV)/.ready
 	$(BIN)/python benchmarks/gradient_error.py
 
 lint: $(VENV)/.ready
-	$(BIN)/uv pip install --quiet --python $(BIN)/python ".[dev]" --no-deps ruff pyright clang-format
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[dev,demo,test]"
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
 	$(BIN)/clang-format --dry-run --Werror $(filter-out %.txt %.toml,$(SOURCES))
 

@@ -177,11 +177,15 @@ int64_t add_boundary(const BackwardView<T>& view, Destination& to) {
     return n;
 }
 
-#define EDGEGRAD_INSTANTIATE(N, T) template int64_t add_boundary<N, T>(const BackwardView<T>&, Destination&);
-EDGEGRAD_INSTANTIATE(0, float)
-EDGEGRAD_INSTANTIATE(1, float)
-EDGEGRAD_INSTANTIATE(3, float) EDGEGRAD_INSTANTIATE(4, float) EDGEGRAD_INSTANTIATE(0, double)
-    EDGEGRAD_INSTANTIATE(1, double) EDGEGRAD_INSTANTIATE(3, double) EDGEGRAD_INSTANTIATE(4, double)
+// clang-format off
+#define EDGEGRAD_INSTANTIATE(N) \
+    template int64_t add_boundary<N, float>(const BackwardView<float>&, Destination&); \
+    template int64_t add_boundary<N, double>(const BackwardView<double>&, Destination&);
+EDGEGRAD_INSTANTIATE(0)
+EDGEGRAD_INSTANTIATE(1)
+EDGEGRAD_INSTANTIATE(3)
+EDGEGRAD_INSTANTIATE(4)
 #undef EDGEGRAD_INSTANTIATE
+// clang-format on
 
 }  // namespace edgegrad

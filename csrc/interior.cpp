@@ -194,11 +194,15 @@ int64_t add_interior(const BackwardView<T>& view, bool geometry, Destination& to
     return n;
 }
 
-#define EDGEGRAD_INSTANTIATE(N, T) template int64_t add_interior<N, T>(const BackwardView<T>&, bool, Destination&);
-EDGEGRAD_INSTANTIATE(0, float)
-EDGEGRAD_INSTANTIATE(1, float)
-EDGEGRAD_INSTANTIATE(3, float) EDGEGRAD_INSTANTIATE(4, float) EDGEGRAD_INSTANTIATE(0, double)
-    EDGEGRAD_INSTANTIATE(1, double) EDGEGRAD_INSTANTIATE(3, double) EDGEGRAD_INSTANTIATE(4, double)
+// clang-format off
+#define EDGEGRAD_INSTANTIATE(N) \
+    template int64_t add_interior<N, float>(const BackwardView<float>&, bool, Destination&); \
+    template int64_t add_interior<N, double>(const BackwardView<double>&, bool, Destination&);
+EDGEGRAD_INSTANTIATE(0)
+EDGEGRAD_INSTANTIATE(1)
+EDGEGRAD_INSTANTIATE(3)
+EDGEGRAD_INSTANTIATE(4)
 #undef EDGEGRAD_INSTANTIATE
+// clang-format on
 
 }  // namespace edgegrad

@@ -28,7 +28,7 @@ def embree_path() -> str:
 
 def load():
     """The kernel module, with Embree open. Raises ImportError that says how to get what is missing."""
-    from . import _core
+    from . import _core  # pyright: ignore[reportAttributeAccessIssue]  the compiled module
 
     try:
         _core.open_embree(embree_path())

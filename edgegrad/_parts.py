@@ -132,7 +132,7 @@ def read_parts(path: PathLike, materials: bool = True, split: bool = False, unwr
         for name, raw, matrix in placed:
             try:
                 part, origin = _shape(name, raw, matrix)
-                if primitives is None:
+                if primitives is None or tree is None:
                     look = _look(raw, origin, materials, folder, textures)
                 else:
                     look = _gltf_look(tree, primitives[name], raw, materials, folder, textures)
@@ -209,7 +209,7 @@ def _look(
     look: dict[str, object] = {"uvs": _uvs(visual)}
     image = getattr(getattr(visual, "material", None), "image", None)
     diffuse = getattr(getattr(visual, "material", None), "kwargs", {}).get("kd")
-    if materials and getattr(image, "format", None):  # the grey image that trimesh makes up comes from no format
+    if materials and image is not None and image.format:  # the grey image that trimesh makes up comes from no format
         look["texture"] = textures.get(image.info.get("file_path") or next(iter(folder.contents)), image)
     elif raw.get("vertex_colors") is not None:
         look["colors"] = _colors("vertex", raw["vertex_colors"], srgb=True)

@@ -150,6 +150,7 @@ class Camera:
         R = (pose[:3, :3] * flip).mT
         t = -(R * pose[:3, 3]).sum(-1)
         if K is None:
+            assert fov_y is not None
             H, W = _size(size)
             focal = _focal(fov_y, H, like=pose)
             K = _intrinsics(focal, focal, 0.5 * W, 0.5 * H)
@@ -252,7 +253,8 @@ def _look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
     forward = g - e
     right = torch.linalg.cross(forward, u)
     if values_visible():
-        check_finite("eye", e), check_finite("target", g), check_finite("up", u)
+        for name, vector in (("eye", e), ("target", g), ("up", u)):
+            check_finite(name, vector)
         length, height = (float(v.detach().norm()) for v in (forward, u))
         if length == 0.0:
             raise ValueError(f"target: expected a point apart from eye, got both at {e.tolist()}")

@@ -210,7 +210,7 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         coverage, *tensors = ctx.saved_tensors
         wanted = [ctx.needs_input_grad[i] for i in _DIFFERENTIABLE]
         grads = torch.ops.edgegrad.render_backward(grad_outputs[0], coverage, *tensors, *ctx.options, wanted)
