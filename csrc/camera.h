@@ -124,10 +124,12 @@ struct ViewVolume {
         return t0 < t1;
     }
 
-    // Clips the convex polygon of n corners in place (Sutherland and Hodgman 1974); room for n + 4 corners is needed.
-    int clip_polygon(Vec3* polygon, int n) const {
+    // Clips a triangle in place (Sutherland and Hodgman 1974). Returns the number of corners, at most `most_corners`.
+    static constexpr int most_corners = 3 + 4;
+    int clip_triangle(Vec3* polygon) const {
+        int n = 3;
         for (int i = 0; i < 4 && n > 0; ++i) {
-            Vec3 out[8];
+            Vec3 out[2 * most_corners];
             int m = 0;
             for (int j = 0; j < n; ++j) {
                 const Vec3 p = polygon[j], r = polygon[(j + 1) % n];
@@ -135,6 +137,9 @@ struct ViewVolume {
                 if (dp >= 0) out[m++] = p;
                 if ((dp >= 0) != (dr >= 0)) out[m++] = p + (dp / (dp - dr)) * (r - p);
             }
+            // A plane adds one corner to a convex polygon. More come only from rounding, where the polygon reaches into
+            // the eye itself, and it has no image that could be sampled.
+            if (m > n + 1) return 0;
             n = m;
             for (int j = 0; j < n; ++j) polygon[j] = out[j];
         }

@@ -19,7 +19,7 @@ namespace {
 
 // The part of a triangle inside the view: a convex polygon in the image.
 struct VisiblePolygon {
-    Vec2 corner[7];
+    Vec2 corner[ViewVolume::most_corners];
     int n = 0;
     double area = 0;     // px²
     double longest = 0;  // px
@@ -35,8 +35,8 @@ struct VisiblePolygon {
             n = 3;
             for (int i = 0; i < 3; ++i) corner[i] = p.x[v[i]];
         } else {
-            Vec3 polygon[8] = {p.q[v[0]], p.q[v[1]], p.q[v[2]]};
-            n = view.volume.clip_polygon(polygon, 3);
+            Vec3 polygon[ViewVolume::most_corners] = {p.q[v[0]], p.q[v[1]], p.q[v[2]]};
+            n = view.volume.clip_triangle(polygon);
             for (int i = 0; i < n; ++i) {
                 // Only a triangle through the eye itself has a corner there; it has no image to sample.
                 if (!(view.camera.depth_weight(polygon[i]) > 0)) n = 0;

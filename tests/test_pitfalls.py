@@ -260,3 +260,20 @@ def test_the_ratio_check_rejects() -> None:
     with pytest.raises(AssertionError, match="ratio"):
         check_ratio(moving(tilted_cube(), camera), 0.006, visibility=False)
     assert loss(*moving(tilted_cube(), camera)(torch.zeros((), dtype=F64))).isfinite()
+
+
+def test_vertex_in_the_eye() -> None:
+    """Clipping a triangle that reaches into the eye, up to rounding, once wrote beyond its corners."""
+    camera = eg.Camera(
+        torch.eye(4, dtype=F64), torch.tensor([[10.0, 0, 5], [0, 10, 5], [0, 0, 1]], dtype=F64), (10, 10)
+    )
+    at_eye = [0.0, -1.0930554040108831e-18, -7.1293334889470566e-18]
+    others = [[-0.25, -0.25000000052974081, 0.50000000069431005], [0.74999999999043598, 0.75, 1.5]]
+    generator = torch.Generator().manual_seed(0)
+    for trial in range(2000):
+        noise = 1e-9 * torch.randn((3, 3), dtype=F64, generator=generator) if trial else torch.zeros((3, 3), dtype=F64)
+        verts = torch.tensor([others[0], at_eye, others[1]], dtype=F64) + noise * torch.tensor([[1.0], [1e-9], [1.0]])
+        verts.requires_grad_()
+        mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2]]), colors=torch.eye(3, dtype=F64))
+        eg.render(mesh, camera, spp=1).sum().backward()
+        assert verts.grad is not None and verts.grad.isfinite().all()
