@@ -71,8 +71,7 @@ class BoundaryChunk {
             const auto& q = view_.vertices.q;
             const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
             if (intersect(lane.ray, corner, b)) b = inside(b);
-            const double depth = b[0] * corner[0].z + b[1] * corner[1].z + b[2] * corner[2].z;
-            if (depth < point.z - tolerance(curve, corner)) return;  // occluded
+            if (hides(corner, point, curve)) return;
         }
         const double jump = adjoint_radiance(lane, curve.minus, behind, b, adjoint) -
                             adjoint_radiance(lane, curve.plus, behind, b, adjoint);
@@ -86,18 +85,25 @@ class BoundaryChunk {
         b_bar_ += lane.t * point_bar;
     }
 
-    // Surfaces that touch at the edge (a cube on the ground) are not before it: they may seem nearer by what the
-    // rounding of the input leaves, some spacings of the coordinates there, and by what doubles leave of the depth on
-    // the face that was hit, some of theirs at the size of that face.
-    double tolerance(const Curve& curve, const Vec3 hit[3]) const {
+    // Whether a face that the ray meets lies before the point: its plane has the point on one side and the viewer on
+    // the other. Surfaces that touch at the edge (a cube on the ground) are not before it, however flat the view: the
+    // point may lie behind the plane by what the rounding of the input leaves, some spacings of the coordinates there,
+    // and by what doubles leave of a plane of that size, some of theirs.
+    bool hides(const Vec3 face[3], Vec3 point, const Curve& curve) const {
+        const Vec3 normal = cross(face[1] - face[0], face[2] - face[0]);
+        const Vec3 to_viewer = view_.camera.perspective ? -face[0] : Vec3{0, 0, -1};
+        const double viewer = dot(normal, to_viewer), behind = dot(normal, point - face[0]) * (viewer > 0 ? -1 : 1);
         const HalfEdge& h = curve.minus.face >= 0 ? curve.minus : curve.plus;
-        double edge = 0, face = 0;
+        double coordinate = 0, size = 0;
         for (const int corner : {h.first(), h.second()})
             for (int axis = 0; axis < 3; ++axis)
-                edge = std::max(edge, std::fabs(view_.scene.verts[3 * int64_t(vertex(view_.scene, h, corner)) + axis]));
+                coordinate = std::max(coordinate,
+                                      std::fabs(view_.scene.verts[3 * int64_t(vertex(view_.scene, h, corner)) + axis]));
         for (int i = 0; i < 3; ++i)
-            face = std::max({face, std::fabs(hit[i].x), std::fabs(hit[i].y), std::fabs(hit[i].z)});
-        return 8 * view_.options.spacing * edge + 64 * std::numeric_limits<double>::epsilon() * face;
+            size = std::max({size, std::fabs(face[i].x), std::fabs(face[i].y), std::fabs(face[i].z)});
+        const double rounding =
+            8 * view_.options.spacing * coordinate + 64 * std::numeric_limits<double>::epsilon() * size;
+        return behind > rounding * length(normal);
     }
 
     // The gradient goes to the vertices of the face that ends at the curve; where a face lies on either side, half to

@@ -124,12 +124,14 @@ struct ViewVolume {
         return t0 < t1;
     }
 
-    // Clips a triangle in place (Sutherland and Hodgman 1974). Returns the number of corners, at most `most_corners`.
-    static constexpr int most_corners = 3 + 4;
+    // Clips a triangle in place (Sutherland and Hodgman 1974). Returns the number of corners. A plane adds one corner
+    // to a convex polygon; but where corners lie on a plane up to rounding, their signs may alternate, and then it can
+    // double the number. Such a polygon is convex up to rounding too, so there is nothing to mend, but room to leave.
+    static constexpr int most_corners = 3 << 4;
     int clip_triangle(Vec3* polygon) const {
         int n = 3;
         for (int i = 0; i < 4 && n > 0; ++i) {
-            Vec3 out[2 * most_corners];
+            Vec3 out[most_corners];
             int m = 0;
             for (int j = 0; j < n; ++j) {
                 const Vec3 p = polygon[j], r = polygon[(j + 1) % n];
@@ -137,9 +139,6 @@ struct ViewVolume {
                 if (dp >= 0) out[m++] = p;
                 if ((dp >= 0) != (dr >= 0)) out[m++] = p + (dp / (dp - dr)) * (r - p);
             }
-            // A plane adds one corner to a convex polygon. More come only from rounding, where the polygon reaches into
-            // the eye itself, and it has no image that could be sampled.
-            if (m > n + 1) return 0;
             n = m;
             for (int j = 0; j < n; ++j) polygon[j] = out[j];
         }

@@ -38,19 +38,18 @@ def shape_text(shape: Sequence[int | str]) -> str:
 
 
 def check_shape(name: str, tensor: Tensor, *expected: Sequence[int | str], fix: str = "") -> None:
-    """`tensor.shape` must match one of `expected`; a string stands for any size ≥ 1, "V*" for any size ≥ 0.
+    """`tensor.shape` must match one of `expected`; a string stands for any size ≥ 1.
 
     Raises ValueError.
     """
 
     def matches(shape: Sequence[int | str]) -> bool:
         return len(shape) == tensor.dim() and all(
-            (n >= (0 if want.endswith("*") else 1)) if isinstance(want, str) else n == want
-            for n, want in zip(tensor.shape, shape, strict=True)
+            n >= 1 if isinstance(want, str) else n == want for n, want in zip(tensor.shape, shape, strict=True)
         )
 
     if not any(matches(shape) for shape in expected):
-        want = " or ".join(shape_text([n.rstrip("*") if isinstance(n, str) else n for n in s]) for s in expected)
+        want = " or ".join(shape_text(shape) for shape in expected)
         raise ValueError(f"{name}: expected shape {want}, got {shape_text(tensor.shape)}{fix and '; ' + fix}")
 
 

@@ -159,6 +159,7 @@ class Camera:
     @staticmethod
     def stack(cameras: Sequence[Camera]) -> Camera:
         """One batch from cameras of the same size and projection."""
+        cameras = list(cameras)
         if not cameras:
             raise ValueError("cameras: expected at least one camera, got none")
         first = cameras[0]
@@ -282,8 +283,3 @@ def _focal(fov_y: float | Tensor, height: int, like: Tensor) -> Tensor:
     if values_visible() and not 0.0 < float(degrees.detach()) < 180.0:
         raise ValueError(f"fov_y: expected degrees between 0 and 180, got {float(degrees):g}")
     return 0.5 * height / torch.tan(torch.deg2rad(degrees) * 0.5)
-
-
-def fov_to_focal(fov_y: float, height: int) -> float:
-    """Focal length in pixels from the full vertical field of view in degrees."""
-    return 0.5 * height / math.tan(math.radians(fov_y) * 0.5)

@@ -52,7 +52,10 @@ class Mesh:
         check_float("verts", self.verts)
         check_shape("verts", self.verts, ("V", 3))
         check_integer("faces", self.faces)
-        check_shape("faces", self.faces, ("F", 3), fix="triangulate polygons first")
+        some = self.faces.dim() == 2 and self.faces.shape[0] > 0
+        check_shape(
+            "faces", self.faces, ("F", 3), fix="triangulate polygons first" if some else "give at least one face"
+        )
         V, F = self.verts.shape[0], self.faces.shape[0]
 
         kinds = [k for k in ("colors", "face_colors", "corner_colors", "texture") if getattr(self, k) is not None]

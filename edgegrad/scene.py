@@ -100,10 +100,15 @@ class Flat(NamedTuple):
     background: Tensor  # (C,) or (H, W, C)
 
 
-def _int32(index: Tensor) -> Tensor:
-    """Indices as the kernel takes them; what does not fit stays out of range, for the kernel to refuse."""
+def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
+    """Indices into `count` rows as indices into all rows, int32. What is out of range stays so, for the kernel to refuse: it
+    must not wrap around, nor reach into the rows of another mesh, so unless the mesh is alone it becomes −1."""
     index = index.cpu()
-    return index.clamp(-1, 2**31 - 1).to(torch.int32) if index.dtype == torch.int64 else index.to(torch.int32)
+    if alone:
+        index = index.clamp(-1, 2**31 - 1) if index.dtype == torch.int64 else index
+    else:
+        index = torch.where((index >= 0) & (index < count), index + offset, -1)
+    return index.to(torch.int32)
 
 
 def flatten(scene: Scene) -> Flat:
@@ -122,11 +127,12 @@ def flatten(scene: Scene) -> Flat:
 
     verts, faces, corners, colors, uvs, texels, textures, face_texture = ([] for _ in range(8))
     n_verts = n_colors = n_uvs = n_texels = 0
+    alone = len(scene.meshes) == 1
     for mesh in scene.meshes:
         V, F = mesh.verts.shape[0], mesh.faces.shape[0]
-        mesh_faces = _int32(mesh.faces)
+        mesh_faces = _rows(mesh.faces, V, n_verts, alone)
         verts.append(mesh.verts.cpu().double())
-        faces.append(mesh_faces + n_verts if n_verts else mesh_faces)
+        faces.append(mesh_faces)
         if mesh.texture is not None:
             assert mesh.uvs is not None and mesh.uv_faces is not None
             h, w = mesh.texture.shape[:2]
@@ -134,12 +140,11 @@ def flatten(scene: Scene) -> Flat:
             textures.append([n_texels, h, w])
             texels.append(mesh.texture.cpu().to(dtype).reshape(h * w, C))
             uvs.append(mesh.uvs.cpu().double())
-            index = _int32(mesh.uv_faces)
-            corners.append(index + n_uvs if n_uvs else index)
+            corners.append(_rows(mesh.uv_faces, mesh.uvs.shape[0], n_uvs, alone))
             n_uvs, n_texels = n_uvs + mesh.uvs.shape[0], n_texels + h * w
         else:
             if mesh.colors is not None:
-                rows, index = mesh.colors, mesh_faces
+                rows, index = mesh.colors, mesh_faces - n_verts if n_verts else mesh_faces
             elif mesh.corner_colors is not None:
                 rows = mesh.corner_colors.reshape(3 * F, C)
                 index = torch.arange(3 * F, dtype=torch.int32, device=cpu).reshape(F, 3)

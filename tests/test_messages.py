@@ -522,3 +522,13 @@ def test_import_without_a_usable_embree(tmp_path):
     for message, reason in zip(messages, reasons, strict=True):
         assert message.startswith("edgegrad needs the Embree 4 library") and "pip install 'embreex" in message
         assert reason in message
+
+
+def test_index_into_another_mesh_in_place() -> None:
+    """After the checks, an index beyond its own mesh must not read the next one."""
+    for bad in (len(VERTS), -1):
+        for changed in (0, 1):
+            meshes = [eg.Mesh(VERTS.clone(), FACES.clone()) for _ in range(2)]
+            meshes[changed].faces[2, 1] = bad
+            with pytest.raises(ValueError, match="faces: expected indices from 0 to"):
+                eg.render(eg.Scene(meshes), CAMERA)
