@@ -277,3 +277,22 @@ def test_vertex_in_the_eye() -> None:
         mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2]]), colors=torch.eye(3, dtype=F64))
         eg.render(mesh, camera, spp=1).sum().backward()
         assert verts.grad is not None and verts.grad.isfinite().all()
+
+
+def test_corners_on_the_border_up_to_rounding() -> None:
+    """Corners that lie on the view's planes up to rounding must not cost the triangle: all its colour gradient was lost."""
+    camera = eg.Camera(
+        torch.eye(4, dtype=F64), torch.tensor([[10.0, 0, 5], [0, 10, 5], [0, 0, 1]], dtype=F64), (10, 10)
+    )
+    verts = [
+        [-0.33333333333334758, 0.33333333333333331, 0.66666666666657715],
+        [1.0291062870682302, -1.0777817553333022, 1.9888984891734294],
+        [1.0, 1.0, 2.0],
+    ]
+    colors = torch.ones((3, 1), dtype=F64, requires_grad=True)
+    image = eg.render(
+        eg.Mesh(torch.tensor(verts, dtype=F64), torch.tensor([[0, 1, 2]]), colors=colors), camera, spp=256
+    )
+    image.sum().backward()
+    assert colors.grad is not None
+    assert abs(colors.grad.sum() / image.sum() - 1) < 0.01  # the image is linear in its one colour
