@@ -194,9 +194,9 @@ def test_gradient_is_the_derivative_of_the_image_in_every_combination(name: str,
     camera = camera_of(view)
     check(
         lambda theta: case(theta, camera),
-        step / 2,
-        spp=1024,
-        seeds=8,
+        step,
+        spp=512,
+        seeds=16,
         filter=filter,
         surface_samples=100_000,
         edge_samples=100_000,
