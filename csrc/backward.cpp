@@ -60,41 +60,55 @@ void add_world(const Camera& camera, const double* verts, const std::vector<doub
 }
 
 template <class T>
-BackwardCounts render_backward(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry,
-                               const BackwardOptions& o, const T* adjoint, const T* coverage, const SceneGrad& grad) {
-    BackwardCounts counts;
+BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry,
+                                const BackwardOptions& o, const T* adjoint, const ForwardView<T>& forward,
+                                const SceneGrad& grad) {
+    BackwardProfile profile;
+    Stopwatch watch;
     if (grad.background)
-        add_background(scene, int64_t(camera.width) * camera.height, adjoint, coverage, o.threads, grad.background);
+        add_background(scene, int64_t(camera.width) * camera.height, adjoint, forward.coverage, o.threads,
+                       grad.background);
 
     const bool interior_geometry = grad.geometry() && o.interior_geometry, boundary = grad.geometry() && o.boundary;
-    if (!interior_geometry && !boundary && !grad.appearance()) return counts;
+    if (!interior_geometry && !boundary && !grad.appearance()) return profile;
 
     const ViewVolume volume(camera, o.filter.radius() - 0.5);
     const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, o.threads);
     const FilteredAdjoint<T> filtered(adjoint, scene, o.filter, camera.width, camera.height);
-    const Importance importance(adjoint, camera.width, camera.height, scene.channels, o.filter.radius() - 0.5);
+    const Importance importance(adjoint, camera.width, camera.height, scene.channels, o.filter.radius() - 0.5,
+                                o.threads);
     const RayFrame frame(geometry.caster(), camera);
-    const BackwardView<T> view{scene, camera, geometry, volume, vertices, filtered, importance, o, frame};
+    const BackwardView<T> view{scene, camera, geometry, volume, vertices, filtered, importance, o, frame, forward.seen};
+    profile.view = watch.lap();
 
     std::vector<double> q_bar(grad.geometry() ? 3 * scene.n_verts : 0, 0.0);
     Destination to;
     to.channels = scene.channels;
+    to.want_k = grad.K;
     to.q = grad.geometry() ? q_bar.data() : nullptr;
     to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels;
     dispatch_channels(scene.channels, [&]<int N>() {
-        if (interior_geometry || grad.appearance())
-            counts.surface_samples = add_interior<N>(view, interior_geometry, to);
-        if (boundary) counts.edge_samples = add_boundary<N>(view, to);
+        if (o.pixel_spp) {
+            const ForwardOptions pixels{o.pixel_spp, o.filter, o.seed, o.threads};
+            profile.surface[0] = add_interior_of_pixels<N>(view, pixels, adjoint, interior_geometry, to);
+        } else if (interior_geometry || grad.appearance()) {
+            add_interior<N>(view, interior_geometry, to, profile);
+        }
+        if (boundary) add_boundary<N>(view, to, profile);
     });
+    watch.lap();
     if (grad.geometry()) add_world(camera, scene.verts, q_bar, o.threads, grad);
     if (grad.K)
         for (int i = 0; i < 6; ++i) grad.K[i] += to.k[i];
-    return counts;
+    profile.world = watch.lap();
+    return profile;
 }
 
-template BackwardCounts render_backward(const SceneView<float>&, const Camera&, const Geometry&, const BackwardOptions&,
-                                        const float*, const float*, const SceneGrad&);
-template BackwardCounts render_backward(const SceneView<double>&, const Camera&, const Geometry&,
-                                        const BackwardOptions&, const double*, const double*, const SceneGrad&);
+template BackwardProfile render_backward(const SceneView<float>&, const Camera&, const Geometry&,
+                                         const BackwardOptions&, const float*, const ForwardView<float>&,
+                                         const SceneGrad&);
+template BackwardProfile render_backward(const SceneView<double>&, const Camera&, const Geometry&,
+                                         const BackwardOptions&, const double*, const ForwardView<double>&,
+                                         const SceneGrad&);
 
 }  // namespace edgegrad

@@ -3,15 +3,17 @@
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/map.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
-#include <nanobind/stl/tuple.h>
 
 #include <cmath>
+#include <map>
 #include <optional>
 #include <string>
 
 #include "render.h"
+#include "stopwatch.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -34,10 +36,13 @@ std::string at(int64_t index, int64_t width) {
                       : "[" + std::to_string(index / width) + ", " + std::to_string(index % width) + "]";
 }
 
+constexpr int64_t parallel_from = 1 << 18;  // numbers; below, threads cost more than they save
+
 template <class T>
 void check_finite(const char* name, const T* values, int64_t n, int64_t width) {
     // x · 0 is zero unless x is NaN or infinite; the sum is one fast pass.
     T zero = 0;
+#pragma omp parallel for simd reduction(+ : zero) if (n > parallel_from)
     for (int64_t i = 0; i < n; ++i) zero += values[i] * T(0);
     if (zero == 0) return;
     for (int64_t i = 0; i < n; ++i)
@@ -49,6 +54,10 @@ void check_finite(const char* name, const T* values, int64_t n, int64_t width) {
 // `n` indices, in rows of three, of which the first is number `first`.
 void check_indices(const char* name, const int32_t* values, int64_t n, int64_t count, const char* of,
                    int64_t first = 0) {
+    int64_t bad = 0;
+#pragma omp parallel for simd reduction(+ : bad) if (n > parallel_from)
+    for (int64_t i = 0; i < n; ++i) bad += (values[i] < 0) | (values[i] >= count);
+    if (!bad) return;
     for (int64_t i = 0; i < n; ++i)
         if (values[i] < 0 || values[i] >= count)
             refuse(std::string(name) + ": expected indices from 0 to " + std::to_string(count - 1) + " (rows of " + of +
@@ -176,29 +185,42 @@ void check_background(const SceneArrays<T>& scene, const Camera& camera) {
                std::to_string(b.shape(1)));
 }
 
+// What a pass did, by name: counts, and seconds.
+using Profile = std::map<std::string, double>;
+
 template <class T>
-void forward(const SceneArrays<T>& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed,
-             int threads, Out<T, 3> image, Out<T, 2> coverage) {
-    check_background(scene, camera);
-    check_image("image", image, camera, scene.background.shape(2));
+void check_forward_output(const SceneArrays<T>& scene, const Camera& camera, const Out<T, 2>& coverage,
+                          const Out<uint8_t, 1>& seen) {
     if (coverage.size() != size_t(camera.width) * camera.height) refuse("coverage: expected the size of the image");
-    const ForwardOptions options{spp, make_filter(filter), seed, threads};
-    nb::gil_scoped_release release;
-    const auto geometry = scene.geometry(false, threads);
-    render_forward(scene.view(), camera, geometry->caster(), options, image.data(), coverage.data());
+    if (seen.size() != scene.faces.shape(0)) refuse("seen: expected one number a face");
 }
 
 template <class T>
-std::tuple<int64_t, int64_t> backward(const SceneArrays<T>& scene, const Camera& camera, int64_t surface_samples,
-                                      int64_t edge_samples, const std::string& filter, uint64_t seed, int threads,
-                                      bool interior_geometry, bool boundary, Out<T, 3> adjoint, Out<T, 2> coverage,
-                                      std::optional<Out<double, 2>> verts, std::optional<Out<double, 2>> colors,
-                                      std::optional<Out<double, 2>> uvs, std::optional<Out<double, 2>> texels,
-                                      std::optional<Out<double, 3>> background,
-                                      std::optional<Out<double, 2>> world_to_camera, std::optional<Out<double, 2>> K) {
+Profile forward(const SceneArrays<T>& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed,
+                int threads, Out<T, 3> image, Out<T, 2> coverage, Out<uint8_t, 1> seen) {
+    check_background(scene, camera);
+    check_image("image", image, camera, scene.background.shape(2));
+    check_forward_output(scene, camera, coverage, seen);
+    const ForwardOptions options{spp, make_filter(filter), seed, threads};
+    nb::gil_scoped_release release;
+    Stopwatch watch;
+    const auto geometry = scene.geometry(false, threads);
+    const double update = watch.lap();
+    render_forward(scene.view(), camera, geometry->caster(), options,
+                   ForwardOutput<T>{image.data(), coverage.data(), seen.data()});
+    return {{"update", update}, {"forward", watch.lap()}};
+}
+
+template <class T>
+Profile backward(const SceneArrays<T>& scene, const Camera& camera, int64_t surface_samples, int64_t edge_samples,
+                 const std::string& filter, uint64_t seed, int threads, bool interior_geometry, bool boundary, bool dry,
+                 Out<T, 3> adjoint, Out<T, 2> coverage, Out<uint8_t, 1> seen, std::optional<Out<double, 2>> verts,
+                 std::optional<Out<double, 2>> colors, std::optional<Out<double, 2>> uvs,
+                 std::optional<Out<double, 2>> texels, std::optional<Out<double, 3>> background,
+                 std::optional<Out<double, 2>> world_to_camera, std::optional<Out<double, 2>> K) {
     check_background(scene, camera);
     check_image("adjoint", adjoint, camera, scene.background.shape(2));
-    if (coverage.size() != size_t(camera.width) * camera.height) refuse("coverage: expected the size of the image");
+    check_forward_output(scene, camera, coverage, seen);
     check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2));
     const auto data = [](auto& array, const auto& like, const char* name) -> double* {
         if (!array) return nullptr;
@@ -214,12 +236,26 @@ std::tuple<int64_t, int64_t> backward(const SceneArrays<T>& scene, const Camera&
     grad.world_to_camera = world_to_camera ? world_to_camera->data() : nullptr;
     grad.K = K ? K->data() : nullptr;
     const BackwardOptions options{surface_samples,   edge_samples, make_filter(filter), seed, threads,
-                                  interior_geometry, boundary,     scene.spacing};
+                                  interior_geometry, boundary,     scene.spacing,       dry};
     nb::gil_scoped_release release;
+    Stopwatch watch;
     const auto geometry = scene.geometry(grad.geometry() && boundary, threads);
-    const BackwardCounts counts =
-        render_backward(scene.view(), camera, *geometry, options, adjoint.data(), coverage.data(), grad);
-    return {counts.surface_samples, counts.edge_samples};
+    const double update = watch.lap();
+    const BackwardProfile p = render_backward(scene.view(), camera, *geometry, options, adjoint.data(),
+                                              ForwardView<T>{coverage.data(), seen.data()}, grad);
+    return {{"surface_samples", double(p.surface_samples)},
+            {"edge_samples", double(p.edge_samples)},
+            {"silhouettes", double(p.silhouettes)},
+            {"creases", double(p.creases)},
+            {"update", update},
+            {"view", p.view},
+            {"surface measure", p.measure},
+            {"surface rays", p.surface[0]},
+            {"surface scatter", p.surface[1]},
+            {"curves", p.curves},
+            {"edge rays", p.edge[0]},
+            {"edge scatter", p.edge[1]},
+            {"world", p.world}};
 }
 
 template <class T>
@@ -232,11 +268,37 @@ void bind_scene(nb::module_& m, const char* name) {
              "uvs"_a.noconvert(), "texels"_a.noconvert(), "textures"_a.noconvert(), "face_texture"_a.noconvert(),
              "background"_a.noconvert(), "spacing"_a)
         .def("forward", &forward<T>, "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a, "image"_a.noconvert(),
-             "coverage"_a.noconvert())
+             "coverage"_a.noconvert(), "seen"_a.noconvert())
+        .def(
+            "bare_loop",
+            [](const Scene& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed,
+               int threads) {
+                const ForwardOptions options{spp, make_filter(filter), seed, threads};
+                nb::gil_scoped_release release;
+                return bare_loop(camera, scene.geometry(false, threads)->caster(), options);
+            },
+            "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a)
+        .def(
+            "pixel_backward",
+            [](const Scene& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed, int threads,
+               Out<T, 3> adjoint, Out<double, 2> verts, std::optional<Out<double, 2>> colors) {
+                BackwardOptions options{-1, -1, make_filter(filter), seed, threads, true, false, scene.spacing, false};
+                options.pixel_spp = spp;
+                SceneGrad grad;
+                grad.verts = verts.data(), grad.colors = colors ? colors->data() : nullptr;
+                nb::gil_scoped_release release;
+                const std::vector<uint8_t> seen(scene.faces.shape(0), 1);
+                return render_backward(scene.view(), camera, *scene.geometry(false, threads), options, adjoint.data(),
+                                       ForwardView<T>{nullptr, seen.data()}, grad)
+                    .surface[0];
+            },
+            "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a, "adjoint"_a.noconvert(), "verts"_a.noconvert(),
+            "colors"_a = nb::none())
         .def("backward", &backward<T>, "camera"_a, "surface_samples"_a, "edge_samples"_a, "filter"_a, "seed"_a,
-             "threads"_a, "interior_geometry"_a, "boundary"_a, "adjoint"_a.noconvert(), "coverage"_a.noconvert(),
-             "verts"_a = nb::none(), "colors"_a = nb::none(), "uvs"_a = nb::none(), "texels"_a = nb::none(),
-             "background"_a = nb::none(), "world_to_camera"_a = nb::none(), "K"_a = nb::none())
+             "threads"_a, "interior_geometry"_a, "boundary"_a, "dry"_a, "adjoint"_a.noconvert(),
+             "coverage"_a.noconvert(), "seen"_a.noconvert(), "verts"_a = nb::none(), "colors"_a = nb::none(),
+             "uvs"_a = nb::none(), "texels"_a = nb::none(), "background"_a = nb::none(),
+             "world_to_camera"_a = nb::none(), "K"_a = nb::none())
         .def(
             "shade_at",
             [](const Scene& scene, const Camera& camera, In<int32_t, 1> faces, In<double, 2> points,

@@ -15,40 +15,51 @@ namespace edgegrad {
 
 namespace {
 
+// Default samples a pixel of curve; see interior.cpp.
+constexpr double samples_per_pixel = 24;
+
 template <int N, class T>
 class BoundaryChunk {
    public:
     BoundaryChunk(const BackwardView<T>& view, ChunkGrad& grad)
-        : view_(view), grad_(grad), C_(N ? N : view.scene.channels), adjoint_(RayPacket::size * C_), radiance_(C_) {}
+        : view_(view),
+          grad_(grad),
+          C_(N ? N : view.scene.channels),
+          rays_(view.frame),
+          adjoint_(RayBatch::size * C_),
+          radiance_(C_) {}
 
     // The point at the fraction s of the curve.
     void add(const Curve& curve, double s, double weight) {
-        const int lane = packet_.count;
+        const int i = rays_.count;
         const Vec2 x = curve.position(s);
-        if (!view_.adjoint.template at<N>(x, adjoint_.data() + lane * C_)) return;
-        lane_[lane] = {curve, x, curve.parameter(s), weight, pixel_ray(view_.camera, x)};
-        rejected_[lane] = view_.geometry.topology().faces(curve.edge);
-        view_.frame.set(packet_, lane, lane_[lane].ray);
-        if (++packet_.count == RayPacket::size) cast();
+        if (!view_.adjoint.template at<N>(x, adjoint_.data() + i * C_)) return;
+        if (curves_ == 0 || curve_[curves_ - 1].edge != curve.edge) curve_[curves_++] = curve;
+        const Vec2 n = normalised(view_.camera, x);
+        rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
+        lane_[i] = {curves_ - 1, x, curve.parameter(s), weight};
+        rejected_[i] = view_.geometry.topology().faces(curve.edge);
+        if (++rays_.count == RayBatch::size) cast();
     }
 
     void finish() {
-        if (packet_.count) cast();
+        cast();
         flush();
     }
 
    private:
     struct Lane {
-        Curve curve;
+        int curve;
         Vec2 x;
         double t, weight;
-        Ray ray;
     };
 
     void cast() {
-        view_.geometry.caster().cast(packet_, rejected_);
-        for (int i = 0; i < packet_.count; ++i) add_sample(lane_[i], packet_.face[i], adjoint_.data() + i * C_);
-        packet_.count = 0;
+        rays_.prepare();
+        view_.geometry.caster().cast(rays_, rejected_);
+        for (int i = 0; i < rays_.count; ++i)
+            add_sample(curve_[lane_[i].curve], lane_[i], rays_.n(i), rays_.face[i], adjoint_.data() + i * C_);
+        rays_.count = curves_ = 0;
     }
 
     // Ã · L, where `known` is next to the curve; else what the ray found, or the background.
@@ -62,16 +73,15 @@ class BoundaryChunk {
         return sum;
     }
 
-    void add_sample(const Lane& lane, int64_t behind, const double* adjoint) {
-        const Curve& curve = lane.curve;
+    void add_sample(const Curve& curve, const Lane& lane, Vec2 n, int64_t behind, const double* adjoint) {
         const Vec3 point = (1 - lane.t) * curve.a + lane.t * curve.b;
-        Barycentrics b{1.0 / 3, 1.0 / 3};
+        Barycentrics b;
         if (behind >= 0) {
             const int32_t* v = view_.scene.faces + 3 * behind;
             const auto& q = view_.vertices.q;
             const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
-            if (intersect(lane.ray, corner, b)) b = inside(b);
             if (hides(corner, point, curve)) return;
+            b = barycentrics_of_hit(face_map(view_.camera, corner), n);
         }
         const double jump = adjoint_radiance(lane, curve.minus, behind, b, adjoint) -
                             adjoint_radiance(lane, curve.plus, behind, b, adjoint);
@@ -110,7 +120,7 @@ class BoundaryChunk {
     // each, which matters only if they have copies of their own of the vertices.
     void flush() {
         if (current_.edge < 0) return;
-        const bool both = current_.minus.face >= 0 && current_.plus.face >= 0;
+        const bool both = current_.is_crease();
         for (const HalfEdge* h : {&current_.minus, &current_.plus}) {
             if (h->face < 0) continue;
             const Vec3 a = (both ? 0.5 : 1.0) * a_bar_, b = (both ? 0.5 : 1.0) * b_bar_;
@@ -124,9 +134,11 @@ class BoundaryChunk {
     ChunkGrad& grad_;
     const int C_;
 
-    RayPacket packet_{};
-    Lane lane_[RayPacket::size];
-    std::span<const int32_t> rejected_[RayPacket::size];
+    RayBatch rays_;
+    Lane lane_[RayBatch::size];
+    Curve curve_[RayBatch::size];  // of the lanes
+    int curves_ = 0;
+    std::span<const int32_t> rejected_[RayBatch::size];
     std::vector<double> adjoint_, radiance_;
 
     Curve current_;
@@ -136,9 +148,10 @@ class BoundaryChunk {
 }  // namespace
 
 template <int N, class T>
-int64_t add_boundary(const BackwardView<T>& view, Destination& to) {
+void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile& profile) {
     const BackwardOptions& o = view.options;
     const int64_t E = view.geometry.topology().n_edges(), F = view.scene.n_faces;
+    Stopwatch watch;
     std::vector<int8_t> facing(F);
 #pragma omp parallel for num_threads(o.threads) schedule(static)
     for (int64_t f = 0; f < F; ++f) {
@@ -146,47 +159,56 @@ int64_t add_boundary(const BackwardView<T>& view, Destination& to) {
         facing[f] = int8_t(view.camera.facing(view.vertices.q[v[0]], view.vertices.q[v[1]], view.vertices.q[v[2]]));
     }
 
+    // Attributes that are indexed like the vertices are the same on both sides of an edge, unless it joins copies.
+    const bool jumps = view.scene.corners != view.scene.faces || view.geometry.topology().welds();
+
     // Curves end to end, by their length in the image times how much the loss looks there.
     std::vector<double> measure(E);
     const int64_t block = 4096, blocks = (E + block - 1) / block;
     std::vector<double> length(blocks, 0.0);
-#pragma omp parallel for num_threads(o.threads) schedule(dynamic, 4)
+    int64_t silhouettes = 0, creases = 0;
+#pragma omp parallel for num_threads(o.threads) schedule(dynamic, 1) reduction(+ : silhouettes, creases)
     for (int64_t k = 0; k < blocks; ++k)
         for (int64_t e = k * block; e < std::min(E, (k + 1) * block); ++e) {
-            const Curve c = find_curve(view, facing.data(), e);
-            if (!(c.length > 0)) continue;
+            Curve c;
+            if (!find_curve(view, facing.data(), jumps, e, c)) continue;
+            ++(c.is_crease() ? creases : silhouettes);
             const double importance = view.importance.mean({std::min(c.x0.x, c.x1.x), std::min(c.x0.y, c.x1.y)},
                                                            {std::max(c.x0.x, c.x1.x), std::max(c.x0.y, c.x1.y)});
+            if (!(importance > 0)) continue;
             measure[e] = c.length * importance;
-            if (importance > 0 && std::isfinite(c.length)) length[k] += c.length;
+            if (std::isfinite(c.length)) length[k] += c.length;
         }
     double total = 0;
     for (const double l : length) total += l;
     Systematic systematic(measure, o.threads);
-    if (!(systematic.total() > 0)) return 0;
+    profile.silhouettes = silhouettes, profile.creases = creases;
+    profile.curves = watch.lap();
+    if (!(systematic.total() > 0)) return;
 
-    const int64_t n = o.edge_samples >= 0 ? o.edge_samples : int64_t(std::ceil(16 * total));
+    const int64_t n = o.edge_samples >= 0 ? o.edge_samples : int64_t(std::ceil(samples_per_pixel * total));
+    profile.edge_samples = n;
+    if (o.dry) return;
     systematic.draw(n, to_unit(hash(o.seed, 3)));
-    scatter_samples(n, o.threads, to, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    scatter_samples(n, o.threads, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         BoundaryChunk<N, T> chunk(view, grad);
         Curve curve;
         int64_t edge = systematic.primitive(systematic.position(first));
         for (int64_t i = first; i < last; ++i) {
             const double position = systematic.position(i);
             edge = systematic.primitive(position, edge);
-            if (curve.edge != edge) curve = find_curve(view, facing.data(), edge);
+            if (curve.edge != edge) find_curve(view, facing.data(), jumps, edge, curve);
             const double s = (position - systematic.begin_of(edge)) / systematic.measure_of(edge);
             chunk.add(curve, std::clamp(s, 0.0, 1.0), systematic.weight(edge));
         }
         chunk.finish();
     });
-    return n;
 }
 
 // clang-format off
 #define EDGEGRAD_INSTANTIATE(N) \
-    template int64_t add_boundary<N, float>(const BackwardView<float>&, Destination&); \
-    template int64_t add_boundary<N, double>(const BackwardView<double>&, Destination&);
+    template void add_boundary<N, float>(const BackwardView<float>&, Destination&, BackwardProfile&); \
+    template void add_boundary<N, double>(const BackwardView<double>&, Destination&, BackwardProfile&);
 EDGEGRAD_INSTANTIATE(0)
 EDGEGRAD_INSTANTIATE(1)
 EDGEGRAD_INSTANTIATE(3)

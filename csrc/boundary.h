@@ -11,8 +11,7 @@
 
 namespace edgegrad {
 
-// Adds to `to`. Returns the number of samples.
 template <int N, class T>
-int64_t add_boundary(const BackwardView<T>& view, Destination& to);
+void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile& profile);
 
 }  // namespace edgegrad

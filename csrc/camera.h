@@ -1,8 +1,9 @@
-// Cameras: pixel → ray and point → pixel, in camera coordinates q = R p + t; each with its _vjp.
+// Cameras: point → pixel and back, in camera coordinates q = R p + t; each with its _vjp.
 //
 // A camera is the affine map K of normalised image coordinates n, which are (X/Z, Y/Z) in perspective and (X, Y) in an
-// orthographic view. World coordinates come in only at the ends: vertices are transformed once, and the cotangents of q
-// are turned into those of p, R and t once, when all samples are done.
+// orthographic view. What is seen at n lies on a ray: in perspective from the eye in the direction (n.x, n.y, 1), in an
+// orthographic view from (n.x, n.y, 0) along +Z. World coordinates come in only at the ends: vertices are transformed
+// once, and the cotangents of q are turned into those of p, R and t once, when all samples are done.
 #pragma once
 
 #include <cstdint>
@@ -12,10 +13,6 @@
 
 namespace edgegrad {
 
-struct Ray {
-    Vec3 origin, direction;
-};
-
 struct Camera {
     Mat3 R;
     Vec3 t;
@@ -24,6 +21,7 @@ struct Camera {
     int width, height;
     Mat3 R_inverse;
     double k_det;
+    double k_inverse[4];  // of the 2 × 2 part of K, row by row
 
     // world_to_camera (4, 4) and K (3, 3), row by row.
     Camera(const double* world_to_camera, const double* K, bool perspective_, int width_, int height_)
@@ -34,6 +32,8 @@ struct Camera {
         for (int i = 0; i < 6; ++i) k[i] = K[i];
         R_inverse = inverse(R);
         k_det = k[0] * k[4] - k[1] * k[3];
+        k_inverse[0] = k[4] / k_det, k_inverse[1] = -k[1] / k_det;
+        k_inverse[2] = -k[3] / k_det, k_inverse[3] = k[0] / k_det;
     }
 
     Vec3 to_camera(Vec3 p) const { return R * p + t; }
@@ -69,19 +69,16 @@ inline void project_vjp(const Camera& c, Vec3 q, Vec2 bar, Vec3& q_bar, double k
     q_bar += Vec3{n_bar.x * w, n_bar.y * w, c.perspective ? -(n_bar.x * n.x + n_bar.y * n.y) * w : 0.0};
 }
 
-// The ray of everything seen at pixel position x. Perspective: from the eye, direction with Z = 1. Orthographic: along
-// +Z, the origin in the plane Z = 0.
-inline Ray pixel_ray(const Camera& c, Vec2 x) {
-    const double s = 1.0 / c.k_det, dx = x.x - c.k[2], dy = x.y - c.k[5];
-    const Vec2 n{s * (c.k[4] * dx - c.k[1] * dy), s * (c.k[0] * dy - c.k[3] * dx)};
-    return c.perspective ? Ray{{0, 0, 0}, {n.x, n.y, 1}} : Ray{{n.x, n.y, 0}, {0, 0, 1}};
+// Normalised image coordinates of a pixel position: n = A⁻¹ (x − c), with A the 2 × 2 part of K and c its last column.
+inline Vec2 normalised(const Camera& c, Vec2 x) {
+    const double dx = x.x - c.k[2], dy = x.y - c.k[5], *A = c.k_inverse;
+    return {A[0] * dx + A[1] * dy, A[2] * dx + A[3] * dy};
 }
 
-// n = A⁻¹ (x − c), so δn = −A⁻¹ (δA n + δc) with A the 2 × 2 part of K and c its last column.
-inline void pixel_ray_vjp(const Camera& c, const Ray& ray, const Ray& bar, double k_bar[6]) {
-    const Vec3 n = c.perspective ? ray.direction : ray.origin, n_bar = c.perspective ? bar.direction : bar.origin;
-    const double s = 1.0 / c.k_det;
-    const Vec2 m{s * (c.k[4] * n_bar.x - c.k[3] * n_bar.y), s * (c.k[0] * n_bar.y - c.k[1] * n_bar.x)};  // A⁻ᵀ n̄
+// δn = −A⁻¹ (δA n + δc). A pixel position is where one looks, and has no derivative.
+inline void normalised_vjp(const Camera& c, Vec2 n, Vec2 bar, double k_bar[6]) {
+    const double* A = c.k_inverse;
+    const Vec2 m{A[0] * bar.x + A[2] * bar.y, A[1] * bar.x + A[3] * bar.y};  // A⁻ᵀ n̄
     k_bar[0] -= m.x * n.x, k_bar[1] -= m.x * n.y, k_bar[2] -= m.x;
     k_bar[3] -= m.y * n.x, k_bar[4] -= m.y * n.y, k_bar[5] -= m.y;
 }

@@ -21,7 +21,9 @@ struct Curve {
     double t0 = 0, t1 = 0;  // its part within the view
     double w0 = 1, w1 = 1;  // denominators of the projection at t0 and t1
     Vec2 x0, x1;            // their pixel positions
-    double length = 0;      // px; zero: no curve
+    double length = 0;      // px
+
+    bool is_crease() const { return minus.face >= 0 && plus.face >= 0; }
 
     Vec2 tangent() const { return x1 - x0; }  // dx/ds, the same everywhere: a pinhole sees a straight line
 
@@ -72,45 +74,48 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
     return false;
 }
 
-// The curve of an edge; its length is zero when there is none. `facing` gives the orientation of each face in the
-// image.
+// A face that turns clockwise in the image (x right, y down) lies to the right of its sides, where the normal
+// (τ_y, −τ_x) does not point. One seen exactly edge-on covers nothing. > 0: the side of minus, < 0: of plus.
+inline int side_of(const HalfEdge& h, const int8_t* facing) { return h.backwards ? -facing[h.face] : facing[h.face]; }
+
+// The curve of an edge; false when there is none. `facing` gives the orientation of each face in the image; without
+// `jumps`, neighbouring faces are known to carry the same radiance at their edge.
 template <class T>
-Curve find_curve(const BackwardView<T>& view, const int8_t* facing, int64_t edge) {
-    Curve c;
+bool find_curve(const BackwardView<T>& view, const int8_t* facing, bool jumps, int64_t edge, Curve& c) {
     const auto halves = view.geometry.topology().half_edges(edge);
+    // Most edges have one face on each side; with no jump there is then nothing more to look at.
+    if (!jumps && halves.size() == 2 && side_of(halves[0], facing) * side_of(halves[1], facing) < 0) return false;
     const int32_t va = vertex(view.scene, halves[0], halves[0].first()),
                   vb = vertex(view.scene, halves[0], halves[0].second());
     const VertexView& p = view.vertices;
-    if (p.outcode[va] & p.outcode[vb]) return c;
+    if (p.outcode[va] & p.outcode[vb]) return false;
     c.a = p.q[va], c.b = p.q[vb];
 
     HalfEdge side[2];  // minus, plus
     side[0].face = side[1].face = -1;
     for (const HalfEdge& h : halves) {
-        // A face that turns clockwise in the image (x right, y down) lies to the right of its sides, where the normal
-        // (τ_y, −τ_x) does not point. One seen exactly edge-on covers nothing.
-        const int turn = h.backwards ? -facing[h.face] : facing[h.face];
+        const int turn = side_of(h, facing);
         if (turn == 0) continue;
         HalfEdge& seen = side[turn > 0 ? 0 : 1];
         if (seen.face < 0 || !in_front(view, seen, h, c.a, c.b)) seen = h;
     }
-    if (side[0].face < 0 && side[1].face < 0) return c;
-    if (side[0].face >= 0 && side[1].face >= 0 && !carries_jump(view.scene, side[0], side[1])) return c;
+    if (side[0].face < 0 && side[1].face < 0) return false;
+    if (side[0].face >= 0 && side[1].face >= 0 && !(jumps && carries_jump(view.scene, side[0], side[1]))) return false;
 
     if (!(p.outcode[va] | p.outcode[vb])) {
         c.t0 = 0, c.t1 = 1;
         c.x0 = p.x[va], c.x1 = p.x[vb];
         c.w0 = view.camera.depth_weight(c.a), c.w1 = view.camera.depth_weight(c.b);
     } else {
-        if (!view.volume.clip_segment(c.a, c.b, c.t0, c.t1)) return c;
+        if (!view.volume.clip_segment(c.a, c.b, c.t0, c.t1)) return false;
         const Vec3 q0 = (1 - c.t0) * c.a + c.t0 * c.b, q1 = (1 - c.t1) * c.a + c.t1 * c.b;
         c.w0 = view.camera.depth_weight(q0), c.w1 = view.camera.depth_weight(q1);
-        if (!(c.w0 > 0 && c.w1 > 0)) return c;  // ends in the eye itself
+        if (!(c.w0 > 0 && c.w1 > 0)) return false;  // ends in the eye itself
         c.x0 = project(view.camera, q0), c.x1 = project(view.camera, q1);
     }
     c.edge = edge, c.minus = side[0], c.plus = side[1];
     c.length = length(c.tangent());
-    return c;
+    return c.length > 0;
 }
 
 }  // namespace edgegrad

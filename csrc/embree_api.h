@@ -4,6 +4,8 @@
 
 #include <cstddef>
 
+#include "raycast.h"
+
 namespace edgegrad::embree {
 
 using Device = struct RTCDeviceTy*;
@@ -22,15 +24,6 @@ enum { ERROR_NONE = 0, ERROR_OUT_OF_MEMORY = 4 };
 constexpr unsigned INVALID_GEOMETRY_ID = ~0u;
 constexpr unsigned FEATURE_FLAG_ALL = ~0u;
 
-struct alignas(32) RayHit8 {
-    float org_x[8], org_y[8], org_z[8], tnear[8];
-    float dir_x[8], dir_y[8], dir_z[8], time[8];
-    float tfar[8];
-    unsigned mask[8], id[8], flags[8];
-    float Ng_x[8], Ng_y[8], Ng_z[8], u[8], v[8];
-    unsigned primID[8], geomID[8], instID[8], instPrimID[8];
-};
-
 struct RayQueryContext {
     unsigned instID[1], instPrimID[1];
 };
@@ -39,7 +32,7 @@ struct FilterArguments {
     int* valid;
     void* geometryUserPtr;
     RayQueryContext* context;
-    void* ray;  // structure of arrays of length N, in the order of RayHit8
+    void* ray;  // structure of arrays of length N, in the order of RayPacket
     void* hit;
     unsigned N;
 };
@@ -71,6 +64,6 @@ struct IntersectArguments {
     X(rtcSetGeometryEnableFilterFunctionFromArguments, void, (Geometry, bool))                               \
     X(rtcCommitGeometry, void, (Geometry))                                                                   \
     X(rtcAttachGeometry, unsigned, (Scene, Geometry))                                                        \
-    X(rtcIntersect8, void, (const int*, Scene, RayHit8*, IntersectArguments*))
+    X(rtcIntersect8, void, (const int*, Scene, RayPacket*, IntersectArguments*))
 
 }  // namespace edgegrad::embree

@@ -43,6 +43,14 @@ class Filter {
         return std::clamp(z * std::sqrt(2.0) * sigma, -1.5, 1.5);
     }
 
+    // The same for n numbers in place.
+    void sample(int n, double* u) const {
+        if (kind_ == FilterKind::box)
+            for (int i = 0; i < n; ++i) u[i] -= 0.5;
+        else
+            for (int i = 0; i < n; ++i) u[i] = sample(u[i]);
+    }
+
     bool is_box() const { return kind_ == FilterKind::box; }
 
    private:

@@ -1,5 +1,7 @@
 // The pixel loop. The samples of a pixel are drawn in proportion to the filter and cast together, eight a packet.
 
+#include <algorithm>
+#include <atomic>
 #include <vector>
 
 #include "render.h"
@@ -8,55 +10,147 @@
 
 namespace edgegrad {
 
+EDGEGRAD_VECTORIZED void PixelRays::append(int x, int y, int first, int n, RayBatch& rays) const {
+    double *n_x = rays.n_x + rays.count, *n_y = rays.n_y + rays.count;
+    lattice_.fill(hash(seed_, uint64_t(y) * camera_.width + x), first, n, n_x, n_y);
+    filter_.sample(n, n_x), filter_.sample(n, n_y);
+    // normalised(), with what the samples share in locals: the compiler cannot know that the arrays lie elsewhere.
+    const Vec2 n0 = normalised(camera_, {x + 0.5, y + 0.5});
+    const double a = camera_.k_inverse[0], b = camera_.k_inverse[1], c = camera_.k_inverse[2], d = camera_.k_inverse[3];
+    for (int i = 0; i < n; ++i) {
+        const double dx = n_x[i], dy = n_y[i];
+        n_x[i] = n0.x + (a * dx + b * dy), n_y[i] = n0.y + (c * dx + d * dy);
+    }
+    rays.count += n;
+}
+
 namespace {
+
+constexpr int tile = 16;
+
+// The pixels of one row of a tile.
+template <int N, class T>
+class PixelRow {
+   public:
+    PixelRow(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const RayFrame& frame,
+             const ForwardOptions& options, const std::vector<Vec3>& q, const ForwardOutput<T>& out)
+        : scene_(scene),
+          camera_(camera),
+          caster_(caster),
+          pixel_rays_(camera, options),
+          spp_(options.spp),
+          q_(q),
+          out_(out),
+          C_(N ? N : scene.channels),
+          rays_(frame),
+          sum_(tile * C_),
+          radiance_(C_) {}
+
+    void render(int x0, int x1, int y) {
+        std::fill(sum_.begin(), sum_.end(), 0.0);
+        std::fill(hits_, hits_ + tile, 0);
+        for (int x = x0; x < x1; ++x)
+            for (int done = 0; done < spp_;) {
+                const int n = std::min(spp_ - done, RayBatch::size - rays_.count);
+                pixel_rays_.append(x, y, done, n, rays_);
+                part_[parts_++] = {x - x0, n};
+                done += n;
+                if (rays_.count == RayBatch::size) trace();
+            }
+        trace();
+        for (int x = 0; x < x1 - x0; ++x) {
+            const int64_t pixel = int64_t(y) * camera_.width + x0 + x;
+            const double share = double(hits_[x]) / spp_;
+            const T* behind = scene_.background_at(pixel);
+            for (int c = 0; c < C_; ++c)
+                out_.image[pixel * C_ + c] = T(sum_[x * C_ + c] / spp_ + (1 - share) * behind[c]);
+            out_.coverage[pixel] = T(share);
+        }
+    }
+
+   private:
+    // What the samples on one face have in common. Some faces are kept, for those in a pixel take turns and come again
+    // in the next one.
+    struct alignas(N ? 256 : 8) Shaded {
+        int32_t face = -1;
+        bool textured = false;
+        FaceMap map;
+        AffineRadiance<N> radiance;
+    };
+    static constexpr unsigned n_kept = 64;
+
+    void trace() {
+        rays_.prepare();
+        caster_.cast(rays_);
+        int i = 0;
+        for (int p = 0; p < parts_; ++p) {
+            typename AffineRadiance<N>::Sum sum(C_);
+            int hits = 0;
+            for (const int end = i + part_[p].n; i < end; ++i) {
+                const int32_t face = rays_.face[i];
+                if (face < 0) continue;
+                ++hits;
+                Shaded& s = kept_[unsigned(face) % n_kept];
+                if (face != s.face) keep(s, face);
+                const Barycentrics b = barycentrics_of_hit(s.map, rays_.n(i));
+                if (s.textured) {
+                    shade<N>(scene_, face, b, radiance_.data());
+                    for (int c = 0; c < C_; ++c) sum[c] += radiance_[c];
+                } else {
+                    s.radiance.add_to(sum, b);
+                }
+            }
+            hits_[part_[p].column] += hits;
+            for (int c = 0; c < C_; ++c) sum_[part_[p].column * C_ + c] += sum[c];
+        }
+        rays_.count = parts_ = 0;
+    }
+
+    void keep(Shaded& s, int32_t face) {
+        s.face = face;
+        s.textured = is_textured(scene_, face);
+        const int32_t* v = scene_.faces + 3 * int64_t(face);
+        const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
+        s.map = face_map(camera_, corner);
+        if (!s.textured) s.radiance.set(scene_, face);
+        // Threads may write the same byte, always with the same value; reading first keeps its cache line shared.
+        std::atomic_ref<uint8_t> seen(out_.seen[face]);
+        if (!seen.load(std::memory_order_relaxed)) seen.store(1, std::memory_order_relaxed);
+    }
+
+    const SceneView<T>& scene_;
+    const Camera& camera_;
+    const RayCaster& caster_;
+    const PixelRays pixel_rays_;
+    const int spp_;
+    const std::vector<Vec3>& q_;
+    const ForwardOutput<T>& out_;
+    const int C_;
+
+    struct Part {
+        int column, n;
+    };
+    RayBatch rays_;
+    Part part_[RayBatch::size];  // of which pixels the rays are
+    int parts_ = 0;
+    Shaded kept_[n_kept];
+    int hits_[tile];
+    std::vector<double> sum_, radiance_;
+};
 
 template <int N, class T>
 void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ForwardOptions& o,
-                   const std::vector<Vec3>& q, T* image, T* coverage) {
-    const int C = N ? N : scene.channels, tile = 16;
+                   const std::vector<Vec3>& q, const ForwardOutput<T>& out) {
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + tile - 1) / tile;
     const RayFrame frame(caster, camera);
-
 #pragma omp parallel num_threads(o.threads)
     {
-        std::vector<double> sum(C), radiance(C);
-        RayPacket packet{};
-        Ray rays[RayPacket::size];
+        PixelRow<N, T> row(scene, camera, caster, frame, o, q, out);
 #pragma omp for schedule(dynamic, 1)
-        for (int t = 0; t < tiles_x * tiles_y; ++t) {
-            const int x0 = t % tiles_x * tile, y0 = t / tiles_x * tile;
+        for (int64_t t = 0; t < int64_t(tiles_x) * tiles_y; ++t) {
+            const int x0 = int(t % tiles_x) * tile, y0 = int(t / tiles_x) * tile;
             for (int y = y0; y < std::min(y0 + tile, camera.height); ++y)
-                for (int x = x0; x < std::min(x0 + tile, camera.width); ++x) {
-                    const int64_t pixel = int64_t(y) * camera.width + x;
-                    const ShiftedLattice lattice(hash(o.seed, uint64_t(pixel)), o.spp);
-                    std::fill(sum.begin(), sum.end(), 0.0);
-                    int hits = 0;
-                    for (int first = 0; first < o.spp; first += RayPacket::size) {
-                        packet.count = std::min(RayPacket::size, o.spp - first);
-                        for (int i = 0; i < packet.count; ++i) {
-                            const Vec2 u = lattice(first + i);
-                            rays[i] =
-                                pixel_ray(camera, {x + 0.5 + o.filter.sample(u.x), y + 0.5 + o.filter.sample(u.y)});
-                            frame.set(packet, i, rays[i]);
-                        }
-                        caster.cast(packet);
-                        for (int i = 0; i < packet.count; ++i) {
-                            const int64_t face = packet.face[i];
-                            if (face < 0) continue;
-                            ++hits;
-                            const int32_t* v = scene.faces + 3 * face;
-                            const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
-                            Barycentrics b;
-                            if (!intersect(rays[i], corner, b)) b = {1.0 / 3, 1.0 / 3};  // edge-on: any point will do
-                            shade<N>(scene, face, inside(b), radiance.data());
-                            for (int c = 0; c < C; ++c) sum[c] += radiance[c];
-                        }
-                    }
-                    const double share = double(hits) / o.spp;
-                    const T* behind = scene.background_at(pixel);
-                    for (int c = 0; c < C; ++c) image[pixel * C + c] = T(sum[c] / o.spp + (1 - share) * behind[c]);
-                    coverage[pixel] = T(share);
-                }
+                row.render(x0, std::min(x0 + tile, camera.width), y);
         }
     }
 }
@@ -65,14 +159,15 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
 
 template <class T>
 void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ForwardOptions& o,
-                    T* image, T* coverage) {
+                    const ForwardOutput<T>& out) {
     const std::vector<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, o.threads);
-    dispatch_channels(scene.channels, [&]<int N>() { render_pixels<N>(scene, camera, caster, o, q, image, coverage); });
+    std::fill(out.seen, out.seen + scene.n_faces, uint8_t(0));
+    dispatch_channels(scene.channels, [&]<int N>() { render_pixels<N>(scene, camera, caster, o, q, out); });
 }
 
-template void render_forward(const SceneView<float>&, const Camera&, const RayCaster&, const ForwardOptions&, float*,
-                             float*);
-template void render_forward(const SceneView<double>&, const Camera&, const RayCaster&, const ForwardOptions&, double*,
-                             double*);
+template void render_forward(const SceneView<float>&, const Camera&, const RayCaster&, const ForwardOptions&,
+                             const ForwardOutput<float>&);
+template void render_forward(const SceneView<double>&, const Camera&, const RayCaster&, const ForwardOptions&,
+                             const ForwardOutput<double>&);
 
 }  // namespace edgegrad

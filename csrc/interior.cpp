@@ -1,21 +1,34 @@
 // Surface samples: points on the triangles rather than pixels that happen to hit them.
 //
-// Triangles are laid end to end by the measure m = (area + longest side · 1 px) · (how much the loss looks there),
-// image units, clipped to the view. A point uniform in the image of its triangle then has the weight area · M / (n m).
-// At a grazing angle the integrand grows as 1 / area, and the product stays bounded.
+// Triangles are laid end to end by the measure m = (area + longest side · 1 px) · (how much the loss looks there), in
+// image units, clipped to the view; more where there is a texture, less where the forward pass saw nothing. A point
+// uniform in the image of its triangle then has the weight area · M / (n m). At a grazing angle the integrand grows as
+// 1 / area, and the product stays bounded.
 
 #include "interior.h"
 
 #include <algorithm>
+#include <atomic>
+#include <bit>
 #include <vector>
 
 #include "sampler.h"
 #include "shading/shade.h"
+#include "sierpinski.h"
 #include "systematic.h"
 
 namespace edgegrad {
 
 namespace {
+
+// What the measure of a triangle is lowered by if neither it nor a neighbour was seen: never to zero, for it may be
+// seen all the same.
+constexpr double hidden = 1.0 / 8;
+
+// Default samples a unit of (area + longest side · 1 px): where colours are interpolated, and where a texture may vary
+// from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
+// (docs/performance.md).
+constexpr double colored = 0.5, textured = 4;
 
 // The part of a triangle inside the view: a convex polygon in the image.
 struct VisiblePolygon {
@@ -25,12 +38,13 @@ struct VisiblePolygon {
     double longest = 0;  // px
     Vec2 low, high;
 
+    // False when there is none.
     template <class T>
-    VisiblePolygon(const BackwardView<T>& view, int64_t face) {
+    bool set(const BackwardView<T>& view, int64_t face) {
         const int32_t* v = view.scene.faces + 3 * face;
         const VertexView& p = view.vertices;
         const uint8_t c0 = p.outcode[v[0]], c1 = p.outcode[v[1]], c2 = p.outcode[v[2]];
-        if (c0 & c1 & c2) return;
+        if (c0 & c1 & c2) return false;
         if (!(c0 | c1 | c2)) {
             n = 3;
             for (int i = 0; i < 3; ++i) corner[i] = p.x[v[i]];
@@ -39,165 +53,201 @@ struct VisiblePolygon {
             n = view.volume.clip_triangle(polygon);
             for (int i = 0; i < n; ++i) {
                 // Only a triangle through the eye itself has a corner there; it has no image to sample.
-                if (!(view.camera.depth_weight(polygon[i]) > 0)) n = 0;
-                else corner[i] = project(view.camera, polygon[i]);
+                if (!(view.camera.depth_weight(polygon[i]) > 0)) return false;
+                corner[i] = project(view.camera, polygon[i]);
             }
+            if (n < 3) return false;
         }
-        if (n < 3) return;
+        area = 0;
         low = high = corner[0];
+        double longest_squared = 0;
         for (int i = 0; i < n; ++i) {
-            const Vec2 a = corner[i], b = corner[i + 1 < n ? i + 1 : 0];
-            longest = std::max(longest, length(b - a));
+            const Vec2 a = corner[i], b = corner[i + 1 < n ? i + 1 : 0], side = b - a;
+            longest_squared = std::max(longest_squared, side.x * side.x + side.y * side.y);
             low = {std::min(low.x, a.x), std::min(low.y, a.y)};
             high = {std::max(high.x, a.x), std::max(high.y, a.y)};
             if (i >= 2) area += 0.5 * std::fabs(wedge(corner[i - 1] - corner[0], a - corner[0]));
         }
-    }
-
-    // A point uniform over the polygon, from u uniform in the unit square: a triangle of the fan, then a point in it.
-    Vec2 sample(Vec2 u) const {
-        double pick = u.x * area;
-        for (int i = 2; i < n; ++i) {
-            const double a = 0.5 * std::fabs(wedge(corner[i - 1] - corner[0], corner[i] - corner[0]));
-            if (pick < a || i == n - 1) {
-                const double r = std::sqrt(std::min(1.0, a > 0 ? pick / a : 0.5));
-                return corner[0] + r * (corner[i - 1] - corner[0] + u.y * (corner[i] - corner[i - 1]));
-            }
-            pick -= a;
-        }
-        return corner[0];
+        longest = std::sqrt(longest_squared);
+        return area > 0;
     }
 };
 
-// The samples of one chunk that wait for their ray.
+// Points uniform over a polygon, along a curve that fills its triangles one after the other.
+class PolygonSampler {
+   public:
+    // About n points will be drawn.
+    void set(const VisiblePolygon& polygon, double n) { polygon_ = &polygon, n_ = n, triangle_ = 0, end_ = 0; }
+
+    // s in [0, 1) goes along the curve, u is a point of the unit square. Fast where s ascends.
+    Vec2 operator()(double s, Vec2 u) {
+        const Vec2* corner = polygon_->corner;
+        while (triangle_ < 2 || (s >= end_ && triangle_ + 1 < polygon_->n)) {
+            triangle_ = std::max(2, triangle_ + 1);
+            begin_ = end_;
+            const double area =
+                0.5 * std::fabs(wedge(corner[triangle_ - 1] - corner[0], corner[triangle_] - corner[0]));
+            share_ = area / polygon_->area, end_ = begin_ + share_;
+            // Two to four cells a point, so that each has one of its own.
+            const double cells = std::clamp(2 * n_ * share_, 1.0, double(1u << SierpinskiCurve::most_levels));
+            levels_ = std::bit_width(uint32_t(std::ceil(cells)) - 1);
+            curve_.set(corner[triangle_ - 1], corner[0], corner[triangle_], levels_);
+        }
+        const double t = share_ > 0 ? std::clamp((s - begin_) / share_, 0.0, 1 - 0x1p-53) : 0;
+        return curve_.point(uint32_t(t * (1u << levels_)), u);
+    }
+
+   private:
+    const VisiblePolygon* polygon_ = nullptr;
+    double n_ = 0, begin_ = 0, end_ = 0, share_ = 0;
+    int triangle_ = 0, levels_ = 0;
+    SierpinskiCurve curve_;
+};
+
+// The samples of one chunk.
 template <int N, class T>
 class InteriorChunk {
    public:
     InteriorChunk(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
         : view_(view),
-          geometry_(geometry),
-          want_rows_(to.colors || to.uvs),
-          want_texels_(to.texels),
-          grad_(grad),
+          grad_(view, geometry, to, grad),
           C_(N ? N : view.scene.channels),
-          weighted_(RayPacket::size * C_),
-          adjoint_(C_) {}
+          rays_(view.frame),
+          weighted_(RayBatch::size * C_) {}
 
     void add(int64_t face, Vec2 x, double weight) {
-        if (!view_.adjoint.template at<N>(x, adjoint_.data())) return;
-        const int lane = packet_.count++;
-        face_[lane] = face;
-        ray_[lane] = pixel_ray(view_.camera, x);
-        for (int c = 0; c < C_; ++c) weighted_[lane * C_ + c] = weight * adjoint_[c];
-        view_.frame.set(packet_, lane, ray_[lane]);
-        if (packet_.count == RayPacket::size) cast();
+        const int i = rays_.count;
+        double* weighted = weighted_.data() + i * C_;
+        if (!view_.adjoint.template at<N>(x, weighted)) return;
+        for (int c = 0; c < C_; ++c) weighted[c] *= weight;
+        const Vec2 n = normalised(view_.camera, x);
+        face_[i] = int32_t(face), rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
+        if (++rays_.count == RayBatch::size) cast();
     }
 
     void finish() {
-        if (packet_.count) cast();
-        flush();
+        cast();
+        grad_.flush();
     }
 
    private:
     void cast() {
-        view_.geometry.caster().cast(packet_);
-        for (int i = 0; i < packet_.count; ++i)
-            if (packet_.face[i] == face_[i]) add_visible(face_[i], ray_[i], weighted_.data() + i * C_);
-        packet_.count = 0;
-    }
-
-    void add_visible(int64_t face, const Ray& ray, const double* radiance_bar) {
-        if (face != current_) flush(), start(face);
-        Barycentrics b;
-        if (!intersect(ray, corner_, b)) return;
-        const Barycentrics b_bar = shade_vjp<N>(view_.scene, face, b, radiance_bar, want_texels_, rows_, grad_);
-        if (!geometry_) return;
-        Ray ray_bar;
-        intersect_vjp(ray, corner_, b, b_bar, corner_bar_, ray_bar);
-        pixel_ray_vjp(view_.camera, ray, ray_bar, grad_.k);
-    }
-
-    void start(int64_t face) {
-        current_ = face;
-        const int32_t* v = view_.scene.faces + 3 * face;
-        for (int i = 0; i < 3; ++i) corner_[i] = view_.vertices.q[v[i]], corner_bar_[i] = {};
-        rows_.reset(is_textured(view_.scene, face) ? 2 : C_);
-    }
-
-    // A run of samples on one face is written as three rows, not as three for each sample.
-    void flush() {
-        if (current_ < 0) return;
-        const int32_t *v = view_.scene.faces + 3 * current_, *row = view_.scene.corners + 3 * current_;
-        const bool textured = is_textured(view_.scene, current_);
-        for (int i = 0; i < 3; ++i) {
-            if (geometry_) grad_.q.add(v[i], &corner_bar_[i].x);
-            if (want_rows_)
-                (textured ? grad_.uvs : grad_.colors).add(row[i], rows_.value.data() + i * (textured ? 2 : C_));
+        rays_.prepare();
+        view_.geometry.caster().cast(rays_);
+        for (int i = 0; i < rays_.count; ++i) {
+            if (rays_.face[i] != face_[i]) continue;
+            if (grad_.face() != face_[i]) grad_.flush(), grad_.start(face_[i]);
+            grad_.add(rays_.n(i), weighted_.data() + i * C_);
         }
-        current_ = -1;
+        rays_.count = 0;
     }
 
     const BackwardView<T>& view_;
-    const bool geometry_, want_rows_, want_texels_;
-    ChunkGrad& grad_;
+    FaceGrad<N, T> grad_;
     const int C_;
-
-    RayPacket packet_{};
-    Ray ray_[RayPacket::size];
-    int64_t face_[RayPacket::size];
-    std::vector<double> weighted_, adjoint_;
-
-    int64_t current_ = -1;
-    Vec3 corner_[3], corner_bar_[3];
-    CornerGrad rows_;
+    RayBatch rays_;
+    int32_t face_[RayBatch::size];
+    std::vector<double> weighted_;
 };
+
+// What the gradient of a face will ask for once its rays are cast.
+template <class T>
+void prefetch(const BackwardView<T>& view, int64_t face) {
+#if defined(__GNUC__)
+    const int32_t *v = view.scene.faces + 3 * face, *row = view.scene.corners + 3 * face;
+    for (int i = 0; i < 3; ++i) {
+        __builtin_prefetch(&view.vertices.q[v[i]]);
+        if (!is_textured(view.scene, face))
+            __builtin_prefetch(view.scene.colors + int64_t(row[i]) * view.scene.channels);
+    }
+#endif
+}
+
+// Vertices near which the forward pass saw a face: those of faces that it hit, and of their neighbours, for a face
+// smaller than the distance of the image's samples is hit by chance.
+template <class T>
+std::vector<uint8_t> vertices_near_seen(const BackwardView<T>& view) {
+    const SceneView<T>& scene = view.scene;
+    std::vector<uint8_t> near(scene.n_verts, 0);
+    const auto mark = [&](auto test) {
+#pragma omp parallel for num_threads(view.options.threads) schedule(static)
+        for (int64_t f = 0; f < scene.n_faces; ++f)
+            if (const int32_t* v = scene.faces + 3 * f; test(f, v))
+                for (int i = 0; i < 3; ++i) std::atomic_ref(near[v[i]]).store(1, std::memory_order_relaxed);
+    };
+    mark([&](int64_t f, const int32_t*) { return view.seen[f]; });
+    const std::vector<uint8_t> hit = near;
+    mark([&](int64_t, const int32_t* v) { return hit[v[0]] | hit[v[1]] | hit[v[2]]; });
+    return near;
+}
 
 }  // namespace
 
 template <int N, class T>
-int64_t add_interior(const BackwardView<T>& view, bool geometry, Destination& to) {
+void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, BackwardProfile& profile) {
     const int64_t F = view.scene.n_faces;
     const BackwardOptions& o = view.options;
+    Stopwatch watch;
+    const std::vector<uint8_t> near_seen = vertices_near_seen(view);
     std::vector<double> measure(F);
     // The sum that chooses the number of samples is taken in blocks, as in Systematic, to be the same at any threads.
     const int64_t block = 4096, blocks = (F + block - 1) / block;
     std::vector<double> size(blocks, 0.0);
-#pragma omp parallel for num_threads(o.threads) schedule(dynamic, 4)
-    for (int64_t k = 0; k < blocks; ++k)
-        for (int64_t f = k * block; f < std::min(F, (k + 1) * block); ++f) {
-            const VisiblePolygon polygon(view, f);
-            if (!(polygon.area > 0)) continue;
-            const double m = polygon.area + polygon.longest,
-                         importance = view.importance.mean(polygon.low, polygon.high);
-            measure[f] = m * importance;
-            if (importance > 0 && std::isfinite(m)) size[k] += m;
-        }
+#pragma omp parallel num_threads(o.threads)
+    {
+        VisiblePolygon polygon;
+#pragma omp for schedule(dynamic, 1)
+        for (int64_t k = 0; k < blocks; ++k)
+            for (int64_t f = k * block; f < std::min(F, (k + 1) * block); ++f) {
+                if (!polygon.set(view, f)) continue;
+                const double importance = view.importance.mean(polygon.low, polygon.high);
+                if (!(importance > 0)) continue;
+                const int32_t* v = view.scene.faces + 3 * f;
+                const bool expected = near_seen[v[0]] | near_seen[v[1]] | near_seen[v[2]];
+                const double m = (polygon.area + polygon.longest) * (expected ? 1 : hidden) *
+                                 (is_textured(view.scene, f) ? textured : colored);
+                measure[f] = m * importance;
+                if (std::isfinite(m)) size[k] += m;
+            }
+    }
     double total = 0;
     for (const double s : size) total += s;
     Systematic systematic(measure, o.threads);
-    if (!(systematic.total() > 0)) return 0;
+    profile.measure = watch.lap();
+    if (!(systematic.total() > 0)) return;
 
     const int64_t n = o.surface_samples >= 0 ? o.surface_samples : int64_t(std::ceil(total));
+    profile.surface_samples = n;
+    if (o.dry) return;
     systematic.draw(n, to_unit(hash(o.seed, 1)));
     const ShiftedSequence sequence(hash(o.seed, 2));
-    scatter_samples(n, o.threads, to, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    scatter_samples(n, o.threads, to, profile.surface, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         InteriorChunk<N, T> chunk(view, geometry, to, grad);
-        int64_t face = systematic.primitive(systematic.position(first));
-        VisiblePolygon polygon(view, face);
+        VisiblePolygon polygon;
+        PolygonSampler sampler;
+        int64_t face = -1;
+        double weight = 0;
         for (int64_t i = first; i < last; ++i) {
-            const int64_t f = systematic.primitive(systematic.position(i), face);
-            if (f != face) face = f, polygon = VisiblePolygon(view, f);
-            chunk.add(face, polygon.sample(sequence(i)), polygon.area * systematic.weight(face));
+            const double position = systematic.position(i);
+            const int64_t f = face < 0 ? systematic.primitive(position) : systematic.primitive(position, face);
+            if (f != face) {
+                face = f;
+                polygon.set(view, f);
+                prefetch(view, f);
+                weight = polygon.area * systematic.weight(f);
+                sampler.set(polygon, 1 / systematic.weight(f));
+            }
+            const double s = (position - systematic.begin_of(face)) / systematic.measure_of(face);
+            chunk.add(face, sampler(s, sequence(i)), weight);
         }
         chunk.finish();
     });
-    return n;
 }
 
 // clang-format off
 #define EDGEGRAD_INSTANTIATE(N) \
-    template int64_t add_interior<N, float>(const BackwardView<float>&, bool, Destination&); \
-    template int64_t add_interior<N, double>(const BackwardView<double>&, bool, Destination&);
+    template void add_interior<N, float>(const BackwardView<float>&, bool, Destination&, BackwardProfile&); \
+    template void add_interior<N, double>(const BackwardView<double>&, bool, Destination&, BackwardProfile&);
 EDGEGRAD_INSTANTIATE(0)
 EDGEGRAD_INSTANTIATE(1)
 EDGEGRAD_INSTANTIATE(3)

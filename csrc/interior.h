@@ -4,6 +4,7 @@
 #include "importance.h"
 #include "render.h"
 #include "scatter.h"
+#include "shading/shade.h"
 
 namespace edgegrad {
 
@@ -19,10 +20,79 @@ struct BackwardView {
     const Importance& importance;
     const BackwardOptions& options;
     const RayFrame& frame;
+    const uint8_t* seen;  // (F,): whether the forward pass hit the face
 };
 
-// Adds to `to`; `geometry` says whether points and camera are wanted too. Returns the number of samples.
+// What a run of samples on one face finds. What they have in common is done once for the run: the face's map and its
+// derivative, and one row a corner for the scatter.
 template <int N, class T>
-int64_t add_interior(const BackwardView<T>& view, bool geometry, Destination& to);
+class FaceGrad {
+   public:
+    FaceGrad(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
+        : view_(view),
+          geometry_(geometry),
+          want_rows_(to.colors || to.uvs),
+          want_texels_(to.texels),
+          want_k_(to.want_k),
+          grad_(grad),
+          C_(N ? N : view.scene.channels) {}
+
+    int32_t face() const { return face_; }  // −1: none
+
+    void start(int32_t face) {
+        face_ = face;
+        textured_ = is_textured(view_.scene, face);
+        const int32_t* v = view_.scene.faces + 3 * int64_t(face);
+        for (int i = 0; i < 3; ++i) corner_[i] = view_.vertices.q[v[i]];
+        map_ = face_map(view_.camera, corner_), map_bar_ = {};
+        rows_.reset(textured_ ? 2 : C_);
+    }
+
+    // A sample seen at n, with the cotangent of its radiance.
+    void add(Vec2 n, const double* radiance_bar) {
+        Barycentrics b;
+        if (!barycentrics(map_, n, b)) return;
+        const Barycentrics b_bar = shade_vjp<N>(view_.scene, face_, b, radiance_bar, want_texels_, rows_, grad_);
+        if (!geometry_) return;
+        Vec2 n_bar;
+        barycentrics_vjp(map_, n, b, b_bar, map_bar_, n_bar);
+        if (want_k_) normalised_vjp(view_.camera, n, n_bar, grad_.k);
+    }
+
+    void flush() {
+        if (face_ < 0) return;
+        const int32_t *v = view_.scene.faces + 3 * int64_t(face_), *row = view_.scene.corners + 3 * int64_t(face_);
+        if (geometry_) {
+            Vec3 corner_bar[3];
+            face_map_vjp(view_.camera, corner_, map_bar_, corner_bar);
+            for (int i = 0; i < 3; ++i) grad_.q.add(v[i], &corner_bar[i].x);
+        }
+        if (want_rows_)
+            for (int i = 0; i < 3; ++i)
+                (textured_ ? grad_.uvs : grad_.colors).add(row[i], rows_.value.data() + i * (textured_ ? 2 : C_));
+        face_ = -1;
+    }
+
+   private:
+    const BackwardView<T>& view_;
+    const bool geometry_, want_rows_, want_texels_, want_k_;
+    ChunkGrad& grad_;
+    const int C_;
+
+    int32_t face_ = -1;
+    bool textured_ = false;
+    Vec3 corner_[3];
+    FaceMap map_, map_bar_;
+    CornerGrad rows_;
+};
+
+// Adds to `to`; `geometry` says whether points and camera are wanted too.
+template <int N, class T>
+void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, BackwardProfile& profile);
+
+// The same from `spp` samples a pixel, as other renderers take them; for the benchmarks. Returns the seconds it took.
+template <int N, class T>
+double add_interior_of_pixels(const BackwardView<T>& view, const ForwardOptions& options, const T* adjoint,
+                              bool geometry, Destination& to);
 
 }  // namespace edgegrad

@@ -31,11 +31,14 @@ namespace {
 using A2 = std::array<double, 2>;
 using A3 = std::array<double, 3>;
 using A6 = std::array<double, 6>;
+using A33 = std::array<A3, 3>;
 
 Vec2 vec(const A2& a) { return {a[0], a[1]}; }
 Vec3 vec(const A3& a) { return {a[0], a[1], a[2]}; }
+FaceMap map(const A33& m) { return {{vec(m[0]), vec(m[1]), vec(m[2])}}; }
 A2 array(Vec2 a) { return {a.x, a.y}; }
 A3 array(Vec3 a) { return {a.x, a.y, a.z}; }
+A33 array(const FaceMap& m) { return {array(m.column[0]), array(m.column[1]), array(m.column[2])}; }
 
 FilterKind kind(const std::string& name) {
     return name == "box" ? FilterKind::box : name == "tent" ? FilterKind::tent : FilterKind::gaussian;
@@ -53,13 +56,10 @@ void bind_pieces(nb::module_& m) {
         project_vjp(c, vec(q), vec(bar), q_bar, k_bar.data());
         return std::tuple(array(q_bar), k_bar);
     });
-    p.def("pixel_ray", [](const Camera& c, A2 x) {
-        const Ray r = pixel_ray(c, vec(x));
-        return std::tuple(array(r.origin), array(r.direction));
-    });
-    p.def("pixel_ray_vjp", [](const Camera& c, A2 x, A3 origin_bar, A3 direction_bar) {
+    p.def("normalised", [](const Camera& c, A2 x) { return array(normalised(c, vec(x))); });
+    p.def("normalised_vjp", [](const Camera& c, A2 x, A2 bar) {
         A6 k_bar{};
-        pixel_ray_vjp(c, pixel_ray(c, vec(x)), {vec(origin_bar), vec(direction_bar)}, k_bar.data());
+        normalised_vjp(c, normalised(c, vec(x)), vec(bar), k_bar.data());
         return k_bar;
     });
     p.def("cross", [](A3 a, A3 b) { return array(cross(vec(a), vec(b))); });
@@ -74,22 +74,29 @@ void bind_pieces(nb::module_& m) {
         dot_vjp(vec(a), vec(b), bar, a_bar, b_bar);
         return std::tuple(array(a_bar), array(b_bar));
     });
-    p.def("intersect", [](A3 origin, A3 direction, std::array<A3, 3> q) {
+    // A FaceMap by its columns.
+    p.def("face_map", [](const Camera& c, A33 q) {
         const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])};
+        return array(face_map(c, corner));
+    });
+    p.def("face_map_vjp", [](const Camera& c, A33 q, A33 bar) {
+        const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])};
+        Vec3 q_bar[3];
+        face_map_vjp(c, corner, map(bar), q_bar);
+        return A33{array(q_bar[0]), array(q_bar[1]), array(q_bar[2])};
+    });
+    p.def("barycentrics", [](A33 m, A2 n) {
         Barycentrics b;
-        const bool met = intersect({vec(origin), vec(direction)}, corner, b);
+        const bool met = barycentrics(map(m), vec(n), b);
         return std::tuple(met, A2{b.u, b.v});
     });
-    p.def("intersect_vjp", [](A3 origin, A3 direction, std::array<A3, 3> q, A2 bar) {
-        const Ray ray{vec(origin), vec(direction)};
-        const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])};
+    p.def("barycentrics_vjp", [](A33 m, A2 n, A2 bar) {
         Barycentrics b;
-        intersect(ray, corner, b);
-        Vec3 q_bar[3];
-        Ray ray_bar;
-        intersect_vjp(ray, corner, b, {bar[0], bar[1]}, q_bar, ray_bar);
-        return std::tuple(array(ray_bar.origin), array(ray_bar.direction),
-                          std::array<A3, 3>{array(q_bar[0]), array(q_bar[1]), array(q_bar[2])});
+        barycentrics(map(m), vec(n), b);
+        FaceMap m_bar;
+        Vec2 n_bar;
+        barycentrics_vjp(map(m), vec(n), b, {bar[0], bar[1]}, m_bar, n_bar);
+        return std::tuple(array(m_bar), array(n_bar));
     });
     p.def("inside", [](double u, double v) {
         const Barycentrics b = inside({u, v});
@@ -116,9 +123,12 @@ void bind_pieces(nb::module_& m) {
     p.def("filter_weight", [](const std::string& name, double d) { return Filter(kind(name)).weight(d); });
     p.def("filter_sample", [](const std::string& name, double u) { return Filter(kind(name)).sample(u); });
     p.def("lattice", [](uint64_t random, int n) {
-        const ShiftedLattice lattice(mix(random), n);
+        const ShiftedLattice lattice(n);
+        std::vector<double> x(n), y(n);
+        lattice.fill(mix(random), 0, 1, x.data(), y.data());
+        lattice.fill(mix(random), 1, n - 1, x.data() + 1, y.data() + 1);
         std::vector<A2> points;
-        for (int i = 0; i < n; ++i) points.push_back(array(lattice(i)));
+        for (int i = 0; i < n; ++i) points.push_back({x[i], y[i]});
         return points;
     });
     p.def("sequence", [](uint64_t random, int n) {
@@ -140,7 +150,7 @@ void bind_pieces(nb::module_& m) {
     using Image = nb::ndarray<const double, nb::numpy, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
     p.def("importance", [](Image adjoint, double radius, A2 low, A2 high) {
         const Importance importance(adjoint.data(), int(adjoint.shape(1)), int(adjoint.shape(0)), int(adjoint.shape(2)),
-                                    radius);
+                                    radius, 2);
         return importance.mean(vec(low), vec(high));
     });
 

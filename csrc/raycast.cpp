@@ -11,6 +11,7 @@
 #include <limits>
 #include <mutex>
 #include <new>
+#include <numeric>
 #include <stdexcept>
 
 #include "embree_api.h"
@@ -164,11 +165,64 @@ void RayCaster::update(const double* verts, int threads) {
 }
 
 RayFrame::RayFrame(const RayCaster& caster, const Camera& camera)
-    : rotation_(camera.R_inverse),
+    : axis_x_(camera.R_inverse * Vec3{1, 0, 0}),
+      axis_y_(camera.R_inverse * Vec3{0, 1, 0}),
+      axis_z_(camera.R_inverse * Vec3{0, 0, 1}),
       eye_((1 / caster.radius_) * (camera.R_inverse * -camera.t - caster.centre_)),
       inverse_radius_(1 / caster.radius_),
       perspective_(camera.perspective),
       far_(!camera.perspective || length(eye_) > 4) {}
+
+RayBatch::RayBatch(const RayFrame& frame) : frame_(frame) {
+    for (RayPacket& p : packet_) {
+        std::fill(p.origin_x, p.origin_x + p.size, float(frame.eye_.x));
+        std::fill(p.origin_y, p.origin_y + p.size, float(frame.eye_.y));
+        std::fill(p.origin_z, p.origin_z + p.size, float(frame.eye_.z));
+    }
+}
+
+EDGEGRAD_VECTORIZED void RayBatch::prepare() {
+    const Vec3 X = frame_.axis_x_, Y = frame_.axis_y_, Z = frame_.axis_z_;
+    for (int k = 0; k < count; k += RayPacket::size) {
+        RayPacket& p = packet_[k / RayPacket::size];
+        const double *x = n_x + k, *y = n_y + k;
+        for (int i = 0; i < p.size; ++i) p.t_far[i] = std::numeric_limits<float>::infinity();
+        for (int i = 0; i < p.size; ++i) p.geometry[i] = INVALID_GEOMETRY_ID;
+        if (!frame_.far_) {
+            for (int i = 0; i < p.size; ++i) p.direction_x[i] = float(x[i] * X.x + y[i] * Y.x + Z.x);
+            for (int i = 0; i < p.size; ++i) p.direction_y[i] = float(x[i] * X.y + y[i] * Y.y + Z.y);
+            for (int i = 0; i < p.size; ++i) p.direction_z[i] = float(x[i] * X.z + y[i] * Y.z + Z.z);
+            continue;
+        }
+        for (int i = 0; i < p.size; ++i) {
+            const Vec3 across = x[i] * X + y[i] * Y;
+            Vec3 o = frame_.eye_, d = Z;
+            if (frame_.perspective_) d += across;
+            else o += frame_.inverse_radius_ * across;
+            // Everything lies in the unit ball. Float positions of a far origin would be coarser than the scene, so the
+            // ray starts just before the ball, computed here in double; never behind the eye.
+            const double start = -dot(o, d) / dot(d, d) - 2;
+            o += (frame_.perspective_ && start < 0 ? 0 : start) * d;
+            p.origin_x[i] = float(o.x), p.origin_y[i] = float(o.y), p.origin_z[i] = float(o.z);
+            p.direction_x[i] = float(d.x), p.direction_y[i] = float(d.y), p.direction_z[i] = float(d.z);
+        }
+    }
+}
+
+EDGEGRAD_VECTORIZED void RayBatch::read_faces() {
+    for (int k = 0; k < count; k += RayPacket::size) {
+        const RayPacket& p = packet_[k / RayPacket::size];
+        for (int i = 0; i < p.size; ++i)
+            face[k + i] = p.geometry[i] == INVALID_GEOMETRY_ID ? -1 : int32_t(p.triangle[i]);
+    }
+}
+
+RayPacket::RayPacket() {
+    std::fill(mask, mask + size, ~0u);
+    std::fill(instance, instance + size, INVALID_GEOMETRY_ID);
+    std::fill(instance_primitive, instance_primitive + size, INVALID_GEOMETRY_ID);
+    std::iota(id, id + size, 0u);
+}
 
 namespace {
 
@@ -176,20 +230,6 @@ alignas(32) constexpr int valid_lanes[9][8] = {
     {0, 0, 0, 0, 0, 0, 0, 0},       {-1, 0, 0, 0, 0, 0, 0, 0},       {-1, -1, 0, 0, 0, 0, 0, 0},
     {-1, -1, -1, 0, 0, 0, 0, 0},    {-1, -1, -1, -1, 0, 0, 0, 0},    {-1, -1, -1, -1, -1, 0, 0, 0},
     {-1, -1, -1, -1, -1, -1, 0, 0}, {-1, -1, -1, -1, -1, -1, -1, 0}, {-1, -1, -1, -1, -1, -1, -1, -1}};
-
-void intersect8(Scene scene, RayPacket& p, IntersectArguments& arguments) {
-    RayHit8 r;
-    for (int i = 0; i < 8; ++i) {
-        r.org_x[i] = p.origin_x[i], r.org_y[i] = p.origin_y[i], r.org_z[i] = p.origin_z[i];
-        r.dir_x[i] = p.direction_x[i], r.dir_y[i] = p.direction_y[i], r.dir_z[i] = p.direction_z[i];
-        r.tnear[i] = 0, r.tfar[i] = std::numeric_limits<float>::infinity(), r.time[i] = 0;
-        r.mask[i] = ~0u, r.id[i] = i, r.flags[i] = 0;
-        r.geomID[i] = INVALID_GEOMETRY_ID, r.primID[i] = INVALID_GEOMETRY_ID;
-        r.instID[i] = INVALID_GEOMETRY_ID, r.instPrimID[i] = INVALID_GEOMETRY_ID;
-    }
-    rtc.rtcIntersect8(valid_lanes[p.count], scene, &r, &arguments);
-    for (int i = 0; i < 8; ++i) p.face[i] = r.geomID[i] == INVALID_GEOMETRY_ID ? -1 : int32_t(r.primID[i]);
-}
 
 struct RejectContext {
     RayQueryContext query;  // first, so that a pointer to it is a pointer to this
@@ -208,21 +248,35 @@ void reject(const FilterArguments* a) {
 
 }  // namespace
 
-void RayCaster::cast(RayPacket& packet) const {
+void RayCaster::intersect(RayBatch& batch) const {
     RayQueryContext context{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}};
     IntersectArguments arguments{RAY_QUERY_FLAG_COHERENT, FEATURE_FLAG_ALL, &context, nullptr, nullptr, 0};
-    intersect8(static_cast<Scene>(scene_), packet, arguments);
+    const int n = RayPacket::size;
+    for (int k = 0; k < batch.count; k += n)
+        rtc.rtcIntersect8(valid_lanes[std::min(n, batch.count - k)], static_cast<Scene>(scene_), &batch.packet_[k / n],
+                          &arguments);
 }
 
-void RayCaster::cast(RayPacket& packet, const std::span<const int32_t>* rejected) const {
-    RejectContext context{{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}}, rejected};
+void RayCaster::cast(RayBatch& batch) const {
+    intersect(batch);
+    batch.read_faces();
+}
+
+void RayCaster::cast(RayBatch& batch, const std::span<const int32_t>* rejected) const {
+    RejectContext context{{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}}, nullptr};
     IntersectArguments arguments{RAY_QUERY_FLAG_COHERENT | RAY_QUERY_FLAG_INVOKE_ARGUMENT_FILTER,
                                  FEATURE_FLAG_ALL,
                                  &context.query,
                                  reject,
                                  nullptr,
                                  0};
-    intersect8(static_cast<Scene>(scene_), packet, arguments);
+    const int n = RayPacket::size;
+    for (int k = 0; k < batch.count; k += n) {
+        context.rejected = rejected + k;
+        rtc.rtcIntersect8(valid_lanes[std::min(n, batch.count - k)], static_cast<Scene>(scene_), &batch.packet_[k / n],
+                          &arguments);
+    }
+    batch.read_faces();
 }
 
 }  // namespace edgegrad

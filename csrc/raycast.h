@@ -16,14 +16,21 @@ void open_embree(const std::string& path);
 // Version of the opened library, as 40400 for 4.4.0.
 int embree_version();
 
-// Eight rays. What they hit stands in `face`, −1 for nothing. Lanes from `count` on are not cast.
-struct RayPacket {
+// Eight rays and what they hit, in the layout of Embree's RTCRayHit8, so that nothing is copied to cast them.
+struct alignas(32) RayPacket {
     static constexpr int size = 8;
-    alignas(32) float origin_x[size], origin_y[size], origin_z[size];
-    alignas(32) float direction_x[size], direction_y[size], direction_z[size];
-    int32_t face[size];
-    int count = 0;
+
+    float origin_x[size] = {}, origin_y[size] = {}, origin_z[size] = {}, t_near[size] = {};
+    float direction_x[size] = {}, direction_y[size] = {}, direction_z[size] = {}, time[size] = {};
+    float t_far[size] = {};
+    unsigned mask[size] = {}, id[size] = {}, flags[size] = {};
+    float normal_x[size] = {}, normal_y[size] = {}, normal_z[size] = {}, u[size] = {}, v[size] = {};
+    unsigned triangle[size] = {}, geometry[size] = {}, instance[size] = {}, instance_primitive[size] = {};
+
+    RayPacket();
 };
+
+class RayBatch;
 
 class RayCaster {
    public:
@@ -36,14 +43,16 @@ class RayCaster {
     // New positions (V, 3), world units.
     void update(const double* verts, int threads);
 
-    // The nearest face along each ray.
-    void cast(RayPacket& packet) const;
+    // The nearest face along each ray of the batch.
+    void cast(RayBatch& batch) const;
 
-    // The same, blind to some faces: those in `rejected[lane]`.
-    void cast(RayPacket& packet, const std::span<const int32_t>* rejected) const;
+    // The same, blind to some faces: those in rejected[i] for ray i.
+    void cast(RayBatch& batch, const std::span<const int32_t>* rejected) const;
 
    private:
     friend class RayFrame;
+    friend double bare_loop(const Camera&, const RayCaster&, const struct ForwardOptions&);
+    void intersect(RayBatch& batch) const;
     Vec3 detail_centre(const double* verts, int threads) const;
 
     const int32_t* faces_;
@@ -61,27 +70,40 @@ class RayFrame {
    public:
     RayFrame(const RayCaster& caster, const Camera& camera);
 
-    // Puts a ray, given in camera coordinates, into a lane.
-    void set(RayPacket& packet, int lane, const Ray& ray) const {
-        Vec3 o = eye_;
-        const Vec3 d = rotation_ * ray.direction;
-        if (!perspective_) o += inverse_radius_ * (rotation_ * ray.origin);
-        if (far_) {
-            // Everything lies in the unit ball. Float positions of a far origin would be coarser than the scene, so the
-            // ray starts just before the ball, computed here in double; never behind the eye.
-            const double start = -dot(o, d) / dot(d, d) - 2;
-            o += (perspective_ && start < 0 ? 0 : start) * d;
-        }
-        packet.origin_x[lane] = float(o.x), packet.origin_y[lane] = float(o.y), packet.origin_z[lane] = float(o.z);
-        packet.direction_x[lane] = float(d.x), packet.direction_y[lane] = float(d.y),
-        packet.direction_z[lane] = float(d.z);
-    }
-
    private:
-    Mat3 rotation_;
+    friend class RayBatch;
+    Vec3 axis_x_, axis_y_, axis_z_;  // of the camera, in world coordinates times whatever scale they have
     Vec3 eye_;
     double inverse_radius_;
     bool perspective_, far_;
+};
+
+// Rays of a camera that wait to be cast together, by where they go in the image, and the faces that they hit. They are
+// all made before the first packet is cast: Embree loads whole vectors, and one that was just written piece by piece is
+// not there yet.
+class RayBatch {
+   public:
+    static constexpr int size = 64;
+    explicit RayBatch(const RayFrame& frame);
+
+    // Normalised image coordinates; the caller fills them from `count` on.
+    double n_x[size] = {}, n_y[size] = {};
+    int count = 0;
+
+    Vec2 n(int i) const { return {n_x[i], n_y[i]}; }
+
+    // Makes the rays.
+    void prepare();
+
+    // The face that each ray hit, −1 for nothing.
+    int32_t face[size];
+
+   private:
+    friend class RayCaster;
+    void read_faces();
+
+    const RayFrame& frame_;
+    RayPacket packet_[size / RayPacket::size];
 };
 
 }  // namespace edgegrad

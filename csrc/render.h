@@ -7,6 +7,7 @@
 #include "camera.h"
 #include "film.h"
 #include "geometry.h"
+#include "sampler.h"
 #include "scene.h"
 
 namespace edgegrad {
@@ -33,25 +34,64 @@ struct ForwardOptions {
     int threads;
 };
 
-// image (H, W, C) and coverage (H, W): the filtered share of each pixel where something is hit.
+// The rays of the forward pass: samples first … first + n − 1 of pixel (x, y), appended to a batch.
+class PixelRays {
+   public:
+    PixelRays(const Camera& camera, const ForwardOptions& o)
+        : camera_(camera), filter_(o.filter), seed_(o.seed), lattice_(o.spp) {}
+
+    void append(int x, int y, int first, int n, RayBatch& rays) const;
+
+   private:
+    const Camera& camera_;
+    Filter filter_;
+    uint64_t seed_;
+    ShiftedLattice lattice_;
+};
+
+// Where the forward pass writes.
+template <class T>
+struct ForwardOutput {
+    T* image;       // (H, W, C)
+    T* coverage;    // (H, W): the filtered share of each pixel where something is hit
+    uint8_t* seen;  // (F,): whether a sample hit the face
+};
+
 template <class T>
 void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                    const ForwardOptions& options, T* image, T* coverage);
+                    const ForwardOptions& options, const ForwardOutput<T>& out);
+
+// Seconds that the rays of the forward pass take when they are cast and nothing else is done; for the benchmarks.
+double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOptions& options);
 
 struct BackwardOptions {
-    int64_t surface_samples;  // in all; −1: one per unit of surface measure
-    int64_t edge_samples;     // in all; −1: 16 a pixel of curve
+    int64_t surface_samples;  // in all; −1: the default (interior.cpp)
+    int64_t edge_samples;     // in all; −1: the default (boundary.cpp)
     Filter filter;
     uint64_t seed;
     int threads;
     bool interior_geometry;  // whether the colours vary over faces, so that moving them shows inside
     bool boundary;
-    double spacing;  // relative spacing of the numbers in which the user gave the vertices
+    double spacing;     // relative spacing of the numbers in which the user gave the vertices
+    bool dry;           // only count the samples
+    int pixel_spp = 0;  // if not zero, the interior term from so many samples a pixel: a yardstick for the benchmarks
 };
 
-// What a backward pass did.
-struct BackwardCounts {
+// What a backward pass did, and the seconds that each part took.
+struct BackwardProfile {
     int64_t surface_samples = 0, edge_samples = 0;
+    int64_t silhouettes = 0, creases = 0;          // curves in view
+    double view = 0;                               // vertices in camera coordinates, where the loss looks
+    double measure = 0, curves = 0;                // triangles and curves laid end to end
+    double surface[2] = {0, 0}, edge[2] = {0, 0};  // samples with their rays; adding what they found
+    double world = 0;                              // from camera coordinates to the user's arrays
+};
+
+// What the backward pass takes from the forward pass: coverage (H, W), and whether a sample hit each face (F,).
+template <class T>
+struct ForwardView {
+    const T* coverage;
+    const uint8_t* seen;
 };
 
 // q = R p + t, backwards: p̄ = Rᵀ q̄, R̄ = Σ q̄ pᵀ, t̄ = Σ q̄, for q_bar (V, 3).
@@ -60,9 +100,9 @@ void add_world(const Camera& camera, const double* verts, const std::vector<doub
 
 // Adds the gradient to what `grad` points to, given the adjoint image ∂loss/∂I (H, W, C).
 template <class T>
-BackwardCounts render_backward(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry,
-                               const BackwardOptions& options, const T* adjoint, const T* coverage,
-                               const SceneGrad& grad);
+BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry,
+                                const BackwardOptions& options, const T* adjoint, const ForwardView<T>& forward,
+                                const SceneGrad& grad);
 
 // Radiance (N, C) at pixel positions (N, 2) on the given faces, and its derivative; for the tests.
 template <class T>

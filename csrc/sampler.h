@@ -1,6 +1,7 @@
 // Stateless sample points: a function of seed, stream and index, so that no thread keeps a generator.
 #pragma once
 
+#include <bit>
 #include <cstdint>
 
 #include "math.h"
@@ -18,18 +19,26 @@ inline uint64_t hash(uint64_t seed, uint64_t a, uint64_t b = 0) {
     return mix(mix(mix(seed + 0x9e3779b97f4a7c15ull) + a + 0x9e3779b97f4a7c15ull) + b + 0x9e3779b97f4a7c15ull);
 }
 
-// The middle of one of 2⁵³ equal cells of (0, 1).
-inline double to_unit(uint64_t bits) { return (double(bits >> 11) + 0.5) * 0x1p-53; }
+// The middle of one of 2⁵² equal cells of (0, 1): the bits as the fraction of a number between 1 and 2.
+inline double to_unit(uint64_t bits) {
+    return std::bit_cast<double>(bits >> 12 | 0x3ff0000000000000ull) - (1 - 0x1p-53);
+}
 
 // n points in the unit square: the golden-ratio lattice (i / n, i φ⁻¹) moved by a random shift (Cranley and Patterson
 // 1976), each point by itself uniform, so any mean over them is unbiased.
 class ShiftedLattice {
    public:
-    ShiftedLattice(uint64_t random, int n) : x_(random), y_(mix(random)), step_(~0ull / n) {}
-    Vec2 operator()(int i) const { return {to_unit(x_ + i * step_), to_unit(y_ + i * 0x9e3779b97f4a7c15ull)}; }
+    explicit ShiftedLattice(int n) : step_(~0ull / n) {}
+
+    // Points first … first + n − 1 of the lattice whose shift is given by a random number.
+    void fill(uint64_t random, int first, int n, double* x, double* y) const {
+        uint64_t a = random + first * step_, b = mix(random) + first * golden;
+        for (int i = 0; i < n; ++i, a += step_, b += golden) x[i] = to_unit(a), y[i] = to_unit(b);
+    }
 
    private:
-    uint64_t x_, y_, step_;
+    static constexpr uint64_t golden = 0x9e3779b97f4a7c15;
+    uint64_t step_;
 };
 
 // A sequence of points whose every run of consecutive ones is spread evenly: i (1/p, 1/p²) with p³ = p + 1 (Roberts

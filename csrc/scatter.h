@@ -1,52 +1,51 @@
 // The only writer of gradients: the same bits at any number of threads.
 //
-// Samples are worked on in chunks of fixed size. A chunk writes rows (index, values) into buffers of its own; then each
-// thread walks over all rows in order and adds those whose destination it owns. So each sum has one owner and one
-// order. Chunks are taken in waves, which bounds the memory.
+// Samples are worked on in chunks of fixed size. A chunk writes rows (index, values) into buffers of its own, one for
+// each owner of destinations; then each thread adds, chunk after chunk, the rows whose destination it owns. So each sum
+// has one owner and one order. Chunks are taken in waves, which bounds the memory; how many a wave has changes no
+// order.
 #pragma once
 
 #include <algorithm>
 #include <cstdint>
 #include <vector>
 
-#ifdef _OPENMP
-#include <omp.h>
-#endif
-
 #include "scene.h"
+#include "stopwatch.h"
 
 namespace edgegrad {
 
-inline int thread_index() {
-#ifdef _OPENMP
-    return omp_get_thread_num();
-#else
-    return 0;
-#endif
-}
-
 class RowBuffer {
    public:
-    void set_width(int width) { width_ = width; }
-    void clear() { index_.clear(), value_.clear(); }
-    void add(int64_t index, const double* values) {
-        index_.push_back(index);
-        value_.insert(value_.end(), values, values + width_);
+    void prepare(int width, int owners) { width_ = width, rows_.resize(owners); }
+    void clear() {
+        for (Rows& r : rows_) r.count = 0;
     }
-
-    // Adds the rows that this one of `owners` owns: runs of 32 rows in turn, which balances and keeps to cache lines.
-    void add_to(double* destination, int owner, int owners) const {
-        for (size_t r = 0; r < index_.size(); ++r) {
-            const int64_t i = index_[r];
-            if (owners > 1 && (i >> 5) % owners != owner) continue;
-            for (int c = 0; c < width_; ++c) destination[i * width_ + c] += value_[r * width_ + c];
+    void add(int64_t index, const double* values) {
+        // Runs of 32 destinations in turn, which balances and keeps owners apart in cache lines.
+        Rows& r = rows_[rows_.size() > 1 ? uint32_t(index >> 5) % uint32_t(rows_.size()) : 0];
+        if (r.count == r.index.size()) {
+            r.index.resize(std::max<size_t>(64, 2 * r.count));
+            r.value.resize(r.index.size() * width_);
         }
+        r.index[r.count] = index;
+        std::copy(values, values + width_, r.value.begin() + r.count * width_);
+        ++r.count;
+    }
+    void add_to(double* destination, int owner) const {
+        const Rows& r = rows_[owner];
+        for (size_t k = 0; k < r.count; ++k)
+            for (int c = 0; c < width_; ++c) destination[r.index[k] * width_ + c] += r.value[k * width_ + c];
     }
 
    private:
+    struct Rows {
+        size_t count = 0;
+        std::vector<int64_t> index;
+        std::vector<double> value;
+    };
     int width_ = 0;
-    std::vector<int64_t> index_;
-    std::vector<double> value_;
+    std::vector<Rows> rows_;  // one for each owner
 };
 
 // What the samples of one chunk give.
@@ -59,18 +58,22 @@ struct ChunkGrad {
 struct Destination {
     double *q = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr;
     double k[6] = {};
+    bool want_k = false;
     int channels = 1;
 };
 
-// Calls body(first, last, ChunkGrad&) for all samples 0 … n − 1, and adds what it wrote to `to`.
+// Calls body(first, last, ChunkGrad&) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
+// samples and of the adding.
 template <class Body>
-void scatter_samples(int64_t n, int threads, Destination& to, Body body) {
-    const int64_t chunk = 512, wave = 256;
+void scatter_samples(int64_t n, int threads, Destination& to, double (&seconds)[2], Body body) {
+    const int owners = std::max(1, threads);
+    const int64_t chunk = 512, wave = 16 * owners;
     std::vector<ChunkGrad> grads(std::min(wave, (n + chunk - 1) / chunk));
     for (ChunkGrad& g : grads) {
-        g.q.set_width(3), g.uvs.set_width(2);
-        g.colors.set_width(to.channels), g.texels.set_width(to.channels);
+        g.q.prepare(3, owners), g.uvs.prepare(2, owners);
+        g.colors.prepare(to.channels, owners), g.texels.prepare(to.channels, owners);
     }
+    Stopwatch watch;
     for (int64_t first = 0; first < n; first += chunk * wave) {
         const int64_t chunks = std::min(wave, (n - first + chunk - 1) / chunk);
 #pragma omp parallel num_threads(threads)
@@ -83,21 +86,21 @@ void scatter_samples(int64_t n, int threads, Destination& to, Body body) {
                 const int64_t begin = first + i * chunk;
                 body(begin, std::min(begin + chunk, n), g);
             }
-            const int owner = thread_index();
-#ifdef _OPENMP
-            const int owners = omp_get_num_threads();
-#else
-            const int owners = 1;
-#endif
-            for (int64_t i = 0; i < chunks; ++i) {
-                if (to.q) grads[i].q.add_to(to.q, owner, owners);
-                if (to.colors) grads[i].colors.add_to(to.colors, owner, owners);
-                if (to.uvs) grads[i].uvs.add_to(to.uvs, owner, owners);
-                if (to.texels) grads[i].texels.add_to(to.texels, owner, owners);
-            }
+#pragma omp master
+            seconds[0] += watch.lap();
+            // The system may give fewer threads than were asked for.
+#pragma omp for schedule(static, 1)
+            for (int owner = 0; owner < owners; ++owner)
+                for (int64_t i = 0; i < chunks; ++i) {
+                    if (to.q) grads[i].q.add_to(to.q, owner);
+                    if (to.colors) grads[i].colors.add_to(to.colors, owner);
+                    if (to.uvs) grads[i].uvs.add_to(to.uvs, owner);
+                    if (to.texels) grads[i].texels.add_to(to.texels, owner);
+                }
         }
         for (int64_t i = 0; i < chunks; ++i)
             for (int c = 0; c < 6; ++c) to.k[c] += grads[i].k[c];
+        seconds[1] += watch.lap();
     }
 }
 

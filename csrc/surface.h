@@ -1,4 +1,4 @@
-// A ray meets a triangle: perspective-correct barycentrics, with their _vjp.
+// Where a face is seen: perspective-correct barycentrics as a function of the place in the image, with their _vjp.
 #pragma once
 
 #include "camera.h"
@@ -13,34 +13,60 @@ struct Barycentrics {
     double operator[](int corner) const { return corner == 0 ? 1 - u - v : corner == 1 ? u : v; }
 };
 
-// Möller and Trumbore 1997. With s = o − q0, P = d × e2, Q = s × e1, det = e1 · P: u = s · P / det, v = d · Q / det.
+// The barycentrics of a face are a projective map of normalised image coordinates: with h = (n.x, n.y, 1),
+//
+//     (u w, v w, w) = M h.
+//
+// This is the test of Möller and Trumbore 1997, s = o − q0, u = s·(d × e2) / e1·(d × e2), v = d·(s × e1) / e1·(d × e2),
+// with the ray taken out of the products, so that what belongs to the face is computed once for all of its samples.
 // Written with edges, not with positions seen from the eye, it loses only distance / size of the spacing of doubles.
-// False where the triangle is seen exactly edge-on or has no area.
-inline bool intersect(const Ray& ray, const Vec3 q[3], Barycentrics& b) {
-    const Vec3 e1 = q[1] - q[0], e2 = q[2] - q[0], s = ray.origin - q[0];
-    const Vec3 P = cross(ray.direction, e2), Q = cross(s, e1);
-    const double inverse_det = 1.0 / dot(e1, P);
-    b.u = dot(s, P) * inverse_det;
-    b.v = dot(ray.direction, Q) * inverse_det;
-    return std::isfinite(b.u) && std::isfinite(b.v);
+struct FaceMap {
+    Vec3 column[3];  // of M
+
+    Vec3 times(Vec2 n) const { return n.x * column[0] + n.y * column[1] + column[2]; }
+};
+
+inline FaceMap face_map(const Camera& camera, const Vec3 q[3]) {
+    const Vec3 e1 = q[1] - q[0], e2 = q[2] - q[0], s = -q[0];
+    Vec3 U{-e2.y, e2.x, s.y * e2.x - s.x * e2.y}, V{e1.y, -e1.x, s.x * e1.y - s.y * e1.x},
+        D{0, 0, e2.x * e1.y - e2.y * e1.x};
+    // In perspective o = 0 and d = h; in an orthographic view, above, o = (n.x, n.y, 0) and d = (0, 0, 1).
+    if (camera.perspective) U = cross(e2, s), V = cross(s, e1), D = cross(e2, e1);
+    return {{{U.x, V.x, D.x}, {U.y, V.y, D.y}, {U.z, V.z, D.z}}};
 }
 
-inline void intersect_vjp(const Ray& ray, const Vec3 q[3], const Barycentrics& b, Barycentrics bar, Vec3 q_bar[3],
-                          Ray& ray_bar) {
-    const Vec3 e1 = q[1] - q[0], e2 = q[2] - q[0], s = ray.origin - q[0];
-    const Vec3 P = cross(ray.direction, e2), Q = cross(s, e1);
-    const double inverse_det = 1.0 / dot(e1, P);
-    const double u_bar = bar.u * inverse_det, v_bar = bar.v * inverse_det, det_bar = -(b.u * u_bar + b.v * v_bar);
-    Vec3 e1_bar, e2_bar, s_bar, P_bar, Q_bar;
-    dot_vjp(s, P, u_bar, s_bar, P_bar);
-    dot_vjp(ray.direction, Q, v_bar, ray_bar.direction, Q_bar);
-    dot_vjp(e1, P, det_bar, e1_bar, P_bar);
-    cross_vjp(ray.direction, e2, P_bar, ray_bar.direction, e2_bar);
-    cross_vjp(s, e1, Q_bar, s_bar, e1_bar);
-    ray_bar.origin += s_bar;
+inline void face_map_vjp(const Camera& camera, const Vec3 q[3], const FaceMap& bar, Vec3 q_bar[3]) {
+    const Vec3 e1 = q[1] - q[0], e2 = q[2] - q[0], s = -q[0], *c = bar.column;
+    const Vec3 U{c[0].x, c[1].x, c[2].x}, V{c[0].y, c[1].y, c[2].y}, D{c[0].z, c[1].z, c[2].z};
+    Vec3 e1_bar, e2_bar, s_bar;
+    if (camera.perspective) {
+        cross_vjp(e2, s, U, e2_bar, s_bar);
+        cross_vjp(s, e1, V, s_bar, e1_bar);
+        cross_vjp(e2, e1, D, e2_bar, e1_bar);
+    } else {
+        e2_bar = {U.y + s.y * U.z + e1.y * D.z, -U.x - s.x * U.z - e1.x * D.z, 0};
+        e1_bar = {-V.y - s.y * V.z - e2.y * D.z, V.x + s.x * V.z + e2.x * D.z, 0};
+        s_bar = {e1.y * V.z - e2.y * U.z, e2.x * U.z - e1.x * V.z, 0};
+    }
     q_bar[0] -= e1_bar + e2_bar + s_bar;
     q_bar[1] += e1_bar;
     q_bar[2] += e2_bar;
+}
+
+// False where the face is seen exactly edge-on or has no area.
+inline bool barycentrics(const FaceMap& m, Vec2 n, Barycentrics& b) {
+    const Vec3 p = m.times(n);
+    const double inverse = 1.0 / p.z;
+    b.u = p.x * inverse, b.v = p.y * inverse;
+    return std::isfinite(b.u + b.v);
+}
+
+// δu = (δ(u w) − u δw) / w, and the same for v.
+inline void barycentrics_vjp(const FaceMap& m, Vec2 n, Barycentrics b, Barycentrics bar, FaceMap& m_bar, Vec2& n_bar) {
+    const double inverse = 1.0 / m.times(n).z;
+    const Vec3 p_bar{bar.u * inverse, bar.v * inverse, -(b.u * bar.u + b.v * bar.v) * inverse};
+    m_bar.column[0] += n.x * p_bar, m_bar.column[1] += n.y * p_bar, m_bar.column[2] += p_bar;
+    n_bar += Vec2{dot(p_bar, m.column[0]), dot(p_bar, m.column[1])};
 }
 
 // Embree decides in float which triangle is hit, so the exact ray may pass just outside it. What was seen is the
@@ -51,6 +77,15 @@ inline Barycentrics inside(Barycentrics b) {
     const double sum = b.u + b.v;
     if (sum > 1) b.u /= sum, b.v /= sum;
     return b;
+}
+
+// Where a ray that hit the face was seen to hit it. Edge-on, any point will do.
+inline Barycentrics barycentrics_of_hit(const FaceMap& m, Vec2 n) {
+    Barycentrics b;
+    const bool met = barycentrics(m, n, b);
+    if (b.u >= 0 && b.v >= 0 && b.u + b.v <= 1) [[likely]]
+        return b;
+    return met ? inside(b) : Barycentrics{1.0 / 3, 1.0 / 3};
 }
 
 }  // namespace edgegrad

@@ -40,17 +40,17 @@ class Systematic {
     // Position of point i along the measure.
     double position(int64_t i) const { return (double(i) + shift_) * (total() / double(n_)); }
 
-    // The primitive at a position; walks on from `hint` when the positions ascend.
-    int64_t primitive(double position) const {
-        const auto it = std::upper_bound(end_.begin(), end_.end(), position);
-        if (it != end_.end()) return it - end_.begin();
-        // Rounding put the last point on the end: it belongs to the last primitive that has a measure.
-        return std::lower_bound(end_.begin(), end_.end(), total()) - end_.begin();
-    }
+    // The primitive at a position.
+    int64_t primitive(double position) const { return find(position, 0, end_.size()); }
+
+    // The same where positions ascend: gallops on from `hint`.
     int64_t primitive(double position, int64_t hint) const {
-        for (int64_t k = hint; k < hint + 8 && k < int64_t(end_.size()); ++k)
-            if (position < end_[k]) return k;
-        return primitive(position);
+        const int64_t n = end_.size();
+        for (int64_t step = 1, low = hint;; step *= 2) {
+            const int64_t high = std::min(low + step, n);
+            if (high == n || position < end_[high - 1]) return find(position, low, high);
+            low = high;
+        }
     }
 
     double begin_of(int64_t k) const { return k ? end_[k - 1] : 0; }
@@ -60,6 +60,13 @@ class Systematic {
     double weight(int64_t k) const { return total() / (double(n_) * measure_of(k)); }
 
    private:
+    int64_t find(double position, int64_t low, int64_t high) const {
+        const auto it = std::upper_bound(end_.begin() + low, end_.begin() + high, position);
+        if (it != end_.end()) return it - end_.begin();
+        // Rounding put the last point on the end: it belongs to the last primitive that has a measure.
+        return std::lower_bound(end_.begin(), end_.end(), total()) - end_.begin();
+    }
+
     std::vector<double>& end_;
     int64_t n_ = 1;
     double shift_ = 0.5;

@@ -28,6 +28,9 @@ class Topology {
     // Welds what coincides at these positions (V, 3). `spacing` is the relative spacing of the numbers the user gave.
     void weld(const double* verts, double spacing);
 
+    // Whether vertices were welded.
+    bool welds() const { return !welded_.empty(); }
+
     int64_t n_edges() const { return int64_t(offset_.size()) - 1; }
     std::span<const HalfEdge> half_edges(int64_t edge) const {
         return {half_edge_.data() + offset_[edge], half_edge_.data() + offset_[edge + 1]};

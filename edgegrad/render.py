@@ -6,7 +6,8 @@ the derivative of the expected image.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,20 +39,41 @@ def render(
     spp              samples a pixel of the image
     seed             the same seed gives the same bits, image and gradient, at any number of threads; cameras of a batch
                      get samples of their own
-    surface_samples  samples of the gradient inside faces, for each camera: an int in all, or None for one per unit of surface
-                     measure, (area + longest side · 1 px) summed over the triangles in view
-    edge_samples     samples of the gradient at edges, for each camera: an int in all, or None for 16 a pixel of curve
+    surface_samples  samples of the gradient inside faces, for each camera: an int in all, or None for ½ a unit of surface, (area +
+                     longest side · 1 px) summed over the triangles in view, 4 where they are textured and ⅛ as many where the
+                     image saw neither the triangle nor a neighbour
+    edge_samples     samples of the gradient at edges, for each camera: an int in all, or None for 24 a pixel of curve
     visibility       False leaves out what moves at silhouettes and other jumps; the gradient is then that of the shading alone
     filter           "box" (1 px wide), "tent" (2 px) or "gaussian" (σ ½ px, 3 px)
-    grad_seed        seed of the gradient's samples; derived from `seed` when None
+    grad_seed        seed of the gradient's samples; derived from `seed` when None. They also depend on the image by which faces it
+                     hit, which says where to put them
 
     Differentiable in every floating-point tensor of the scene and the camera. The image has the dtype of the colours and
     comes back on the scene's device. Raises TypeError or ValueError that names the argument.
     """
-    if isinstance(scene, Mesh):
-        scene = Scene([scene])
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene: expected a Scene or a Mesh, got {type(scene).__name__}")
+    arguments = render_arguments(
+        scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
+        filter=filter, grad_seed=grad_seed,
+    )  # fmt: skip
+    image, _, _ = _Render.apply(*arguments)
+    # Not image[0]: its derivative would copy the adjoint into zeros.
+    return (image if camera.batch is not None else image.squeeze(0)).to(as_scene(scene).meshes[0].verts.device)
+
+
+def render_arguments(
+    scene: Scene | Mesh,
+    camera: Camera,
+    spp: int = 16,
+    seed: int = 0,
+    *,
+    surface_samples: int | None = None,
+    edge_samples: int | None = None,
+    visibility: bool = True,
+    filter: str = "box",
+    grad_seed: int | None = None,
+) -> tuple[Any, ...]:
+    """The arguments of render(), checked, as those of the operators. Raises TypeError or ValueError."""
+    scene = as_scene(scene)
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
     spp = check_positive_int("spp", spp, most=1 << 20)
@@ -75,18 +97,29 @@ def render(
     world_to_camera = camera.world_to_camera.cpu().double().reshape(-1, 4, 4)
     K = camera.K.cpu().double().reshape(-1, 3, 3)
     B = max(world_to_camera.shape[0], K.shape[0])
-    # Whether the radiance varies over a face; if not, moving it changes nothing inside.
-    varies = any(m.colors is not None or m.corner_colors is not None or m.texture is not None for m in scene.meshes)
     # The spacing of the coarsest numbers among the vertices, to which copies of a point may differ.
     spacing = max(torch.finfo(mesh.verts.dtype).eps for mesh in scene.meshes)
-    image, _ = _Render.apply(
+    return (
         *flat,
         world_to_camera.expand(B, 4, 4).contiguous(),
         K.expand(B, 3, 3).contiguous(),
         camera.projection == "perspective", *camera.size, spp, filter, seed, spacing,
-        *counts, grad_seed, varies, visibility,
+        *counts, grad_seed, radiance_varies(scene), visibility,
     )  # fmt: skip
-    return (image if camera.batch is not None else image[0]).to(scene.meshes[0].verts.device)
+
+
+def as_scene(scene: Scene | Mesh) -> Scene:
+    """Raises TypeError."""
+    if isinstance(scene, Mesh):
+        return Scene([scene])
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: expected a Scene or a Mesh, got {type(scene).__name__}")
+    return scene
+
+
+def radiance_varies(scene: Scene) -> bool:
+    """Whether the radiance varies over a face; if not, moving it changes nothing inside."""
+    return any(m.colors is not None or m.corner_colors is not None or m.texture is not None for m in scene.meshes)
 
 
 def _check_seed(name: str, seed: object) -> int:
@@ -110,10 +143,10 @@ _SCENE = (
 _IMAGE = "bool perspective, int height, int width, int spp, str filter, int seed, float spacing"
 _GRADIENT = "int surface_samples, int edge_samples, int grad_seed, bool interior_geometry, bool boundary"
 
-torch.library.define("edgegrad::render", f"({_SCENE}, {_IMAGE}) -> (Tensor, Tensor)")
+torch.library.define("edgegrad::render", f"({_SCENE}, {_IMAGE}) -> (Tensor, Tensor, Tensor)")
 torch.library.define(
     "edgegrad::render_backward",
-    f"(Tensor adjoint, Tensor coverage, {_SCENE}, {_IMAGE}, {_GRADIENT}, bool[] wanted)"
+    f"(Tensor adjoint, Tensor coverage, Tensor seen, {_SCENE}, {_IMAGE}, {_GRADIENT}, bool[] wanted)"
     " -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)",
 )
 
@@ -131,37 +164,72 @@ def _kernel_camera(world_to_camera: Tensor, K: Tensor, perspective: bool, height
     )
 
 
-@torch.library.impl("edgegrad::render", "CPU")
-def _render_cpu(*args: Any) -> tuple[Tensor, Tensor]:
+Profile = dict[str, float]
+
+
+def forward_kernel(*args: Any) -> tuple[Tensor, Tensor, Tensor, list[Profile]]:
+    """image (B, H, W, C), coverage (B, H, W), seen (B, F), and what the kernel did for each camera."""
     flat, (world_to_camera, K) = Flat(*args[:9]), args[9:11]
-    perspective, height, width, spp, filter, seed, spacing = args[11:]
+    perspective, height, width, spp, filter, seed, spacing = args[11:18]
     scene = _kernel_scene(flat, spacing)
     B, C = world_to_camera.shape[0], flat.background.shape[-1]
     image = flat.colors.new_empty((B, height, width, C))
     coverage = flat.colors.new_empty((B, height, width))
+    seen = flat.faces.new_empty((B, flat.faces.shape[0]), dtype=torch.uint8)
+    profiles = []
     for b in range(B):
         camera = _kernel_camera(world_to_camera[b], K[b], perspective, height, width)
         camera_seed = seed if b == 0 else _derived_seed(seed, b + 1)
-        scene.forward(camera, spp, filter, camera_seed, torch.get_num_threads(), image[b].numpy(), coverage[b].numpy())
-    return image, coverage
+        outputs = image[b].numpy(), coverage[b].numpy(), seen[b].numpy()
+        profiles.append(scene.forward(camera, spp, filter, camera_seed, torch.get_num_threads(), *outputs))
+    return image, coverage, seen, profiles
+
+
+@torch.library.impl("edgegrad::render", "CPU")
+def _render_cpu(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
+    return forward_kernel(*args)[:3]
 
 
 @torch.library.register_fake("edgegrad::render")
-def _render_fake(*args: Any) -> tuple[Tensor, Tensor]:
+def _render_fake(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
     flat, world_to_camera, height, width = Flat(*args[:9]), args[9], args[12], args[13]
     B, C = world_to_camera.shape[0], flat.background.shape[-1]
-    return flat.colors.new_empty((B, height, width, C)), flat.colors.new_empty((B, height, width))
+    seen = flat.faces.new_empty((B, flat.faces.shape[0]), dtype=torch.uint8)
+    return flat.colors.new_empty((B, height, width, C)), flat.colors.new_empty((B, height, width)), seen
 
 
 # The differentiable arguments, in the order of the gradients that render_backward returns.
 _DIFFERENTIABLE = (0, 3, 4, 5, 8, 9, 10)  # verts, colors, uvs, texels, background, world_to_camera, K
 
 
-@torch.library.impl("edgegrad::render_backward", "CPU")
-def _render_backward_cpu(adjoint: Tensor, coverage: Tensor, *args: Any) -> tuple[Tensor, ...]:
+def requires_grad(arguments: Sequence[Any]) -> list[bool]:
+    """For each of `_DIFFERENTIABLE` whether a backward pass will be asked for it: not at all under torch.no_grad()."""
+    return [torch.is_grad_enabled() and arguments[i].requires_grad for i in _DIFFERENTIABLE]
+
+
+class Work(NamedTuple):
+    """Which terms the backward pass runs: what the kernel is told, and what plan() tells."""
+
+    motion: bool  # inside faces, of what moves them: vertices and camera
+    appearance: bool  # inside faces, of colours, textures and texture coordinates
+    boundary: bool  # at edges, of what moves them
+
+
+def backward_work(interior_geometry: bool, boundary: bool, wanted: Sequence[bool]) -> Work:
+    """From what render_backward is given."""
+    verts, colors, uvs, texels, _, world_to_camera, K = wanted
+    moves = verts or world_to_camera or K
+    return Work(moves and interior_geometry, colors or uvs or texels, moves and boundary)
+
+
+def backward_kernel(
+    adjoint: Tensor, coverage: Tensor, seen: Tensor, *args: Any, dry: bool = False
+) -> tuple[list[Tensor | None], list[Profile]]:
+    """The gradients of what is wanted, float64, and what the kernel did for each camera. `dry` only counts samples."""
     flat, (world_to_camera, K) = Flat(*args[:9]), args[9:11]
     perspective, height, width, _, filter, _, spacing = args[11:18]
     surface_samples, edge_samples, grad_seed, interior_geometry, boundary, wanted = args[18:]
+    work = backward_work(interior_geometry, boundary, wanted)
     scene = _kernel_scene(flat, spacing)
     # Sums are taken in double whatever the arrays hold.
     grads = [
@@ -172,22 +240,30 @@ def _render_backward_cpu(adjoint: Tensor, coverage: Tensor, *args: Any) -> tuple
     if background is not None and background.ndim == 1:
         background = background[None, None]
     adjoint = adjoint.detach().contiguous()
-    for b in range(world_to_camera.shape[0]):
+    profiles = [
         scene.backward(
             _kernel_camera(world_to_camera[b], K[b], perspective, height, width),
             surface_samples, edge_samples, filter, grad_seed if b == 0 else _derived_seed(grad_seed, b + 1),
-            torch.get_num_threads(), interior_geometry, boundary, adjoint[b].numpy(), coverage[b].numpy(),
-            verts, colors, uvs, texels, background,
+            torch.get_num_threads(), work.motion, work.boundary, dry, adjoint[b].numpy(), coverage[b].numpy(),
+            seen[b].numpy(), verts, colors, uvs, texels, background,
             None if gw2c is None else gw2c[b], None if gK is None else gK[b],
-        )  # fmt: skip
+        )
+        for b in range(world_to_camera.shape[0])
+    ]  # fmt: skip
+    return grads, profiles
+
+
+@torch.library.impl("edgegrad::render_backward", "CPU")
+def _render_backward_cpu(*args: Any) -> tuple[Tensor, ...]:
+    adjoint, _, _, *inputs = args
     return tuple(
-        adjoint.new_empty(0, dtype=torch.float32) if g is None else g.to(args[i].dtype)
-        for i, g in zip(_DIFFERENTIABLE, grads, strict=True)
+        adjoint.new_empty(0, dtype=torch.float32) if g is None else g.to(inputs[i].dtype)
+        for i, g in zip(_DIFFERENTIABLE, backward_kernel(*args)[0], strict=True)
     )
 
 
 @torch.library.register_fake("edgegrad::render_backward")
-def _render_backward_fake(adjoint: Tensor, coverage: Tensor, *args: Any) -> tuple[Tensor, ...]:
+def _render_backward_fake(adjoint: Tensor, coverage: Tensor, seen: Tensor, *args: Any) -> tuple[Tensor, ...]:
     return tuple(
         torch.empty_like(args[i]) if want else adjoint.new_empty(0, dtype=torch.float32)
         for i, want in zip(_DIFFERENTIABLE, args[-1], strict=True)
@@ -198,22 +274,22 @@ class _Render(torch.autograd.Function):
     """edgegrad::render, differentiated by edgegrad::render_backward."""
 
     @staticmethod
-    def forward(*args: Any) -> tuple[Tensor, Tensor]:
+    def forward(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
         return torch.ops.edgegrad.render(*args[:18])
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        _, coverage = output
-        ctx.mark_non_differentiable(coverage)
-        ctx.save_for_backward(coverage, *inputs[:11])
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
+        _, coverage, seen = output
+        ctx.mark_non_differentiable(coverage, seen)
+        ctx.save_for_backward(coverage, seen, *inputs[:11])
         ctx.options = inputs[11:]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        coverage, *tensors = ctx.saved_tensors
+        coverage, seen, *tensors = ctx.saved_tensors
         wanted = [ctx.needs_input_grad[i] for i in _DIFFERENTIABLE]
-        grads = torch.ops.edgegrad.render_backward(grad_outputs[0], coverage, *tensors, *ctx.options, wanted)
+        grads = torch.ops.edgegrad.render_backward(grad_outputs[0], coverage, seen, *tensors, *ctx.options, wanted)
         out: list[Tensor | None] = [None] * (len(tensors) + len(ctx.options))
         for i, want, grad in zip(_DIFFERENTIABLE, wanted, grads, strict=True):
             if want:

@@ -441,18 +441,21 @@ def test_kernel_refuses_arrays_that_do_not_fit(arrays, parts):
     check(lambda: kernel_scene(**arrays), ValueError, *parts)
 
 
+SEEN = np.ones(24, np.uint8)  # the faces of kernel_scene
+
+
 def kernel_camera(pose: torch.Tensor = POSE, intrinsics: torch.Tensor = K) -> object:
     return core.Camera(pose.contiguous().numpy(), intrinsics.contiguous().numpy(), True, 8, 8)
 
 
 def kernel_forward(channels: int = 3, height: int = 8, filter: str = "box") -> None:
     image, coverage = np.zeros((height, 8, channels), np.float32), np.zeros((height, 8), np.float32)
-    kernel_scene().forward(kernel_camera(), 1, filter, 0, 1, image, coverage)
+    kernel_scene().forward(kernel_camera(), 1, filter, 0, 1, image, coverage, SEEN)
 
 
 def kernel_backward(**gradients: np.ndarray) -> None:
     image, coverage = np.zeros((8, 8, 3), np.float32), np.zeros((8, 8), np.float32)
-    kernel_scene().backward(kernel_camera(), -1, -1, "box", 0, 1, True, True, image, coverage, **gradients)
+    kernel_scene().backward(kernel_camera(), -1, -1, "box", 0, 1, True, True, False, image, coverage, SEEN, **gradients)
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import torch
-from exact import exact_image, gauss_triangle
 from scenes import cube, front_camera, icosphere, occluded_triangle, one_triangle, random_slivers
 from torch import Tensor
 
 from edgegrad import reference
 from edgegrad.camera import Camera
 from edgegrad.mesh import PLAIN, Mesh
+from edgegrad.report.exact import exact_image, gauss_triangle
 from edgegrad.scene import Scene
 
 PROJECTIONS = ("perspective", "orthographic")

@@ -76,53 +76,67 @@ def test_project_vjp(perspective):
 
 
 @perspective
-def test_pixel_ray_vjp(perspective):
+def test_normalised_vjp(perspective):
     """In K; a pixel position is where one looks, and has no derivative."""
     x = np.array([11.3, 40.2])
 
     def forward(k):
-        return np.array(pieces.pixel_ray(kernel_camera(k, perspective), x))
+        return np.array(pieces.normalised(kernel_camera(k, perspective), x))
 
     def vjp(k, bar):
-        return [pieces.pixel_ray_vjp(kernel_camera(k, perspective), x, *bar)]
+        return [pieces.normalised_vjp(kernel_camera(k, perspective), x, bar)]
 
     check_vjp(forward, vjp, [K6])
 
 
+def seen_at(perspective: bool, n: np.ndarray, depth: float) -> np.ndarray:
+    """The point at a depth that is seen at normalised image coordinates."""
+    return np.array([*(depth * n if perspective else n), depth])
+
+
 @perspective
-def test_pixel_ray_and_project_are_inverse(perspective):
+def test_normalised_and_project_are_inverse(perspective):
     camera, x = kernel_camera(K6, perspective), np.array([11.3, 40.2])
-    origin, direction = map(np.array, pieces.pixel_ray(camera, x))
+    n = np.array(pieces.normalised(camera, x))
     for depth in (0.5, 3.0):
-        np.testing.assert_allclose(pieces.project(camera, origin + depth * direction), x, rtol=1e-13)
+        np.testing.assert_allclose(pieces.project(camera, seen_at(perspective, n, depth)), x, rtol=1e-13)
 
 
-RAY = np.array([0.2, -0.1, -0.3]), np.array([-0.05, 0.2, 1.0])  # through the triangle below
+N = np.array([0.03, -0.12])  # inside the image of the triangle below
 TRIANGLE = np.array([[-1.0, -0.8, 2.1], [1.2, -0.7, 2.9], [0.1, 1.3, 2.4]])
 
 
-def test_intersect_finds_the_point():
-    origin, direction = RAY
-    met, (u, v) = pieces.intersect(origin, direction, TRIANGLE)
+@perspective
+def test_barycentrics_are_those_of_the_point_on_the_ray(perspective):
+    met, (u, v) = pieces.barycentrics(pieces.face_map(kernel_camera(K6, perspective), TRIANGLE), N)
     point = (1 - u - v) * TRIANGLE[0] + u * TRIANGLE[1] + v * TRIANGLE[2]
     assert met and min(u, v, 1 - u - v) > 0
-    np.testing.assert_allclose(np.cross(point - origin, direction), 0, atol=1e-14)
+    np.testing.assert_allclose(point, seen_at(perspective, N, point[2]), atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    "triangle",
-    [TRIANGLE[[0, 0, 1]], TRIANGLE[[2, 2, 2]], np.stack([RAY[0], RAY[0] + RAY[1], RAY[0] + 2 * RAY[1]])],
-    ids=["segment", "point", "edge-on"],
-)
-def test_intersect_says_when_there_is_no_point(triangle):
-    assert not pieces.intersect(*RAY, triangle)[0]
+@perspective
+@pytest.mark.parametrize("degenerate", ["segment", "point", "edge-on"])
+def test_barycentrics_say_when_there_is_no_point(perspective, degenerate):
+    n = np.array([0.25, -0.125])
+    ray = np.stack([seen_at(perspective, n, depth) for depth in (1.0, 2.0, 4.0)])
+    triangle = {"segment": TRIANGLE[[0, 0, 1]], "point": TRIANGLE[[2, 2, 2]], "edge-on": ray}[degenerate]
+    assert not pieces.barycentrics(pieces.face_map(kernel_camera(K6, perspective), triangle), n)[0]
 
 
-def test_intersect_vjp():
-    def forward(origin, direction, triangle):
-        return np.array(pieces.intersect(origin, direction, triangle)[1])
+@perspective
+def test_face_map_vjp(perspective):
+    camera = kernel_camera(K6, perspective)
 
-    check_vjp(forward, pieces.intersect_vjp, [*RAY, TRIANGLE])
+    def forward(triangle):
+        return np.array(pieces.face_map(camera, triangle))
+
+    check_vjp(forward, lambda triangle, bar: [pieces.face_map_vjp(camera, triangle, bar)], [TRIANGLE])
+
+
+@perspective
+def test_barycentrics_vjp(perspective):
+    face_map = np.array(pieces.face_map(kernel_camera(K6, perspective), TRIANGLE))
+    check_vjp(lambda m, n: np.array(pieces.barycentrics(m, n)[1]), pieces.barycentrics_vjp, [face_map, N])
 
 
 def test_check_rejects_a_wrong_vjp():

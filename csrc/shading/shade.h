@@ -2,6 +2,10 @@
 // A new light or material is one more file here and one more line in shade and shade_vjp.
 #pragma once
 
+#include <array>
+#include <type_traits>
+#include <vector>
+
 #include "../scatter.h"
 #include "../scene.h"
 #include "../surface.h"
@@ -43,6 +47,34 @@ void shade(const SceneView<T>& scene, int64_t face, Barycentrics b, double* out)
     // With differences, a face of one colour has exactly that colour, and its derivatives are exactly zero.
     for (int c = 0; c < C; ++c) out[c] = c0[c] + b.u * (double(c1[c]) - c0[c]) + b.v * (double(c2[c]) - c0[c]);
 }
+
+// The radiance of a face without texture, affine in the barycentrics, kept for a run of points.
+template <int N>
+class AffineRadiance {
+   public:
+    // One number a channel; in pairs, which processors add at once.
+    struct Fixed : std::array<double, (N + 1) / 2 * 2> {
+        explicit Fixed(int) { this->fill(0); }
+    };
+    using Sum = std::conditional_t<N == 0, std::vector<double>, Fixed>;
+
+    template <class T>
+    void set(const SceneView<T>& scene, int64_t face) {
+        const int C = N ? N : scene.channels;
+        if constexpr (N == 0) value_.resize(C), d_u_.resize(C), d_v_.resize(C);
+        const int32_t* row = scene.corners + 3 * face;
+        const T *c0 = scene.colors + int64_t(row[0]) * C, *c1 = scene.colors + int64_t(row[1]) * C,
+                *c2 = scene.colors + int64_t(row[2]) * C;
+        for (int c = 0; c < C; ++c) value_[c] = c0[c], d_u_[c] = double(c1[c]) - c0[c], d_v_[c] = double(c2[c]) - c0[c];
+    }
+
+    void add_to(Sum& sum, Barycentrics b) const {
+        for (size_t c = 0; c < value_.size(); ++c) sum[c] += value_[c] + b.u * d_u_[c] + b.v * d_v_[c];
+    }
+
+   private:
+    Sum value_ = Sum(0), d_u_ = Sum(0), d_v_ = Sum(0);
+};
 
 // Cotangents of the three corners of one face (colours, or texture coordinates), summed over a run of samples.
 struct CornerGrad {

@@ -1,0 +1,43 @@
+// The yardstick of the benchmarks: the rays of the forward pass, made beforehand, cast and nothing else.
+
+#include <algorithm>
+#include <vector>
+
+#include "render.h"
+#include "stopwatch.h"
+
+namespace edgegrad {
+
+double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOptions& o) {
+    constexpr int tile = 16;
+    const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + tile - 1) / tile;
+    const RayFrame frame(caster, camera);
+    const PixelRays pixel_rays(camera, o);
+    double seconds = 0;
+#pragma omp parallel num_threads(o.threads) reduction(+ : seconds)
+    {
+        std::vector<RayBatch> batches;
+#pragma omp for schedule(dynamic, 1)
+        for (int64_t t = 0; t < int64_t(tiles_x) * tiles_y; ++t) {
+            const int x0 = int(t % tiles_x) * tile, y0 = int(t / tiles_x) * tile;
+            batches.clear();
+            for (int y = y0; y < std::min(y0 + tile, camera.height); ++y)
+                for (int x = x0; x < std::min(x0 + tile, camera.width); ++x) {
+                    for (int done = 0; done < o.spp;) {
+                        if (batches.empty() || batches.back().count == RayBatch::size) batches.emplace_back(frame);
+                        RayBatch& rays = batches.back();
+                        const int n = std::min(o.spp - done, RayBatch::size - rays.count);
+                        pixel_rays.append(x, y, done, n, rays);
+                        done += n;
+                    }
+                }
+            for (RayBatch& rays : batches) rays.prepare();
+            Stopwatch watch;
+            for (RayBatch& rays : batches) caster.intersect(rays);
+            seconds += watch.lap();
+        }
+    }
+    return seconds / std::max(1, o.threads);
+}
+
+}  // namespace edgegrad

@@ -1,0 +1,472 @@
+"""plan() and profile(): each term runs only where it is needed. What runs is told by the kernel, as render() calls it."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from scenes import cube, front_camera, icosphere, occluded_triangle, one_triangle, smooth_adjoint
+
+import edgegrad as eg
+from edgegrad._kernel import core
+from edgegrad.report.methods import default_samples
+from edgegrad.scene import flatten
+
+render_module = importlib.import_module("edgegrad.render")  # the package has a function of this name
+F64 = torch.float64
+CAMERA = front_camera(24)
+KINDS = ("verts", "colors", "uvs", "texture", "background", "world_to_camera", "K")
+PARTS = ("view", "surface measure", "surface rays", "surface scatter", "curves", "edge rays", "edge scatter")
+COUNTS = ("surface_samples", "edge_samples", "silhouettes", "creases")
+
+
+def one_colour() -> eg.Mesh:
+    box = cube()
+    return box.replace(face_colors=torch.full((12, 3), 0.4, dtype=F64))
+
+
+def creased() -> eg.Mesh:
+    return cube().replace(face_colors=torch.linspace(0, 1, 36, dtype=F64).reshape(12, 3))
+
+
+def textured() -> eg.Scene:
+    """A textured quad beside a box without texture."""
+    quad = torch.tensor([[-1.1, -0.9, 0.0], [0.9, -1.0, 0.1], [1.0, 0.8, 0.0], [-0.8, 1.0, 0.2]], dtype=F64)
+    uvs = torch.tensor([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9]], dtype=F64)
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    plane = eg.Mesh(quad, faces, texture=smooth_adjoint(7, 5, 3).sigmoid(), uvs=uvs, uv_faces=faces)
+    return eg.Scene([plane, cube(0.3)], torch.tensor([0.1, 0.2, 0.3], dtype=F64))
+
+
+def inside() -> eg.Mesh:
+    """A sphere around the camera: no edge of it is a silhouette."""
+    return icosphere(2).transformed(scale=100.0)
+
+
+def nowhere() -> eg.Mesh:
+    return cube().transformed(t=torch.tensor([0.0, 0.0, 1e3], dtype=F64))
+
+
+SCENES = {
+    "triangle": one_triangle,
+    "triangles": occluded_triangle,
+    "plain": lambda: cube().replace(colors=None),
+    "one colour": one_colour,
+    "creases": creased,
+    "texture": textured,
+    "inside": inside,
+    "nowhere": nowhere,
+}
+WANTED = [(kind,) for kind in KINDS] + [(), KINDS, ("verts", "colors"), ("background", "K")]
+
+
+def requiring(scene: eg.Scene | eg.Mesh, camera: eg.Camera, kinds: tuple[str, ...]) -> tuple[eg.Scene, eg.Camera]:
+    """The same with copies of the tensors of these kinds that require gradients."""
+    scene = eg.Scene([scene]) if isinstance(scene, eg.Mesh) else scene
+
+    def leaves(thing, *names):
+        have = {name: getattr(thing, name) for name in names if getattr(thing, name) is not None}
+        return thing.replace(**{name: value.clone().requires_grad_() for name, value in have.items()})
+
+    def look(kind):
+        return ("colors", "face_colors", "corner_colors") if kind == "colors" else (kind,)
+
+    meshes = [
+        leaves(mesh, *(name for kind in kinds if kind in KINDS[:4] for name in look(kind))) for mesh in scene.meshes
+    ]
+    scene = scene.replace(meshes=meshes)
+    scene = leaves(scene, "background") if "background" in kinds else scene
+    return scene, leaves(camera, *(kind for kind in kinds if kind in KINDS[5:]))
+
+
+@pytest.fixture
+def kernel(monkeypatch):
+    """What the kernel is given and says when render() and the backward pass call it."""
+    seen = SimpleNamespace(scenes=[], forward=[], backward=[], grads=None, adjoint=None, everything=False)
+    forward, backward, scene = render_module.forward_kernel, render_module.backward_kernel, render_module._kernel_scene
+
+    def watched_forward(*arguments):
+        result = forward(*arguments)
+        seen.forward += result[-1]
+        return result
+
+    def watched_backward(adjoint, coverage, faces, *arguments, **options):
+        faces, seen.adjoint = torch.ones_like(faces) if seen.everything else faces, adjoint
+        seen.grads, profiles = backward(adjoint, coverage, faces, *arguments, **options)
+        seen.backward += profiles
+        return seen.grads, profiles
+
+    def watched_scene(flat, spacing):
+        seen.scenes.append(flat)
+        return scene(flat, spacing)
+
+    monkeypatch.setattr(render_module, "forward_kernel", watched_forward)
+    monkeypatch.setattr(render_module, "backward_kernel", watched_backward)
+    monkeypatch.setattr(render_module, "_kernel_scene", watched_scene)
+    return seen
+
+
+def step(kernel, scene, camera=CAMERA, kinds=(), adjoint=None, **options) -> dict[str, float]:
+    """What the kernel did in the backward pass of render(), summed over the cameras; zeros if there was none."""
+    scene, camera = requiring(scene, camera, kinds)
+    kernel.scenes.clear(), kernel.forward.clear(), kernel.backward.clear()
+    image = eg.render(scene, camera, **{"spp": 4, **options})
+    if image.requires_grad:
+        image.backward(torch.ones_like(image) if adjoint is None else adjoint)
+    done = {name: 0.0 for name in (*COUNTS, *PARTS)}
+    for profile in kernel.backward:
+        done = {name: done[name] + profile[name] for name in done}
+    return done
+
+
+INTERIOR = ("surface_samples", "surface measure", "surface rays", "surface scatter")
+BOUNDARY = ("edge_samples", "silhouettes", "creases", "curves", "edge rays", "edge scatter")
+
+
+def ran(done: dict[str, float], names: tuple[str, ...]) -> set[str]:
+    return {name for name in names if done[name] != 0}
+
+
+# -- the plan says what happens ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_plan_is_what_the_kernel_does(name, kernel):
+    """On and off, and counts, for all that may require a gradient."""
+    kernel.everything = True
+    for kinds in WANTED:
+        for options in ({}, {"visibility": False}):
+            scene, camera = requiring(SCENES[name](), CAMERA, kinds)
+            planned = eg.plan(scene, camera, 4, **options)
+            done = step(kernel, SCENES[name](), kinds=kinds, **options)
+            case = (name, kinds, options, planned)
+            assert planned["interior"].samples == done["surface_samples"], case
+            assert planned["boundary"].samples == done["edge_samples"], case
+            for term, part in (
+                ("view", "view"), ("interior", "surface rays"), ("topology", "curves"), ("boundary", "edge rays"),
+                ("silhouettes", "silhouettes"), ("creases", "creases"),
+            ):  # fmt: skip
+                assert planned[term].on == (done[part] > 0), (term, *case)
+            wanted = [planned[f"{kind} gradient"].on for kind in KINDS]
+            assert wanted == ([g is not None for g in kernel.grads] if kernel.backward else [False] * 7), case
+            assert planned["kept for backward"].on == bool(kernel.backward), case
+            for term in planned.values():
+                assert term.on or (term.samples == 0 and term.bytes == 0 and term.why), case
+
+
+def test_samples_are_an_upper_bound(kernel):
+    """Where the loss does not look, or the image saw nothing, fewer are taken."""
+    scene, camera = requiring(icosphere(3), CAMERA, ("verts",))
+    planned = eg.plan(scene, camera, 1)
+    adjoint = torch.zeros(24, 24, 3, dtype=F64)
+    adjoint[:, :8] = 1.0
+    everything, some = (step(kernel, scene, kinds=("verts",), spp=1, adjoint=a) for a in (None, adjoint))
+    assert 0 < some["surface_samples"] < everything["surface_samples"] < planned["interior"].samples
+    assert 0 < some["edge_samples"] < everything["edge_samples"] == planned["boundary"].samples
+
+
+def test_options_reach_the_plan():
+    scene, camera = requiring(one_triangle(), CAMERA, ("verts",))
+    planned = eg.plan(scene, camera, 7, surface_samples=123, edge_samples=45, filter="gaussian", seed=3)
+    assert planned["image"].samples == 24 * 24 * 7
+    assert planned["interior"].samples == 123 and planned["boundary"].samples == 45
+    assert planned.samples == 24 * 24 * 7 + 123 + 45
+
+
+def test_batches_add_up(kernel):
+    kernel.everything = True
+    one = CAMERA.world_to_camera
+    batch = CAMERA.replace(world_to_camera=torch.stack([one, one, one]))
+    scene, camera = requiring(creased(), batch, ("verts", "world_to_camera"))
+    planned, single = eg.plan(scene, camera, 4), eg.plan(*requiring(creased(), CAMERA, ("verts", "K")), 4)
+    done = step(kernel, creased(), batch, ("verts", "world_to_camera"))
+    for term in ("image", "interior", "boundary"):
+        assert planned[term].samples == 3 * single[term].samples
+    assert planned["boundary"].samples == done["edge_samples"] and len(kernel.backward) == 3
+    assert "3 cameras" in planned["image"].why
+
+
+def test_no_grad(kernel):
+    scene, camera = requiring(textured(), CAMERA, KINDS)
+    with torch.no_grad():
+        planned = eg.plan(scene, camera)
+        assert not eg.render(scene, camera, spp=4).requires_grad
+    assert [name for name, term in planned.items() if term.on] == ["scene", "ray structure", "image", "textures"]
+    assert not kernel.backward
+
+
+# -- what a scene lacks, it does not pay for: a test for each row -----------------------------------------------------
+
+
+def test_scene_is_copied_only_if_it_must_be(kernel):
+    mesh = cube().replace(faces=cube().faces.int())
+    step(kernel, mesh)
+    assert kernel.scenes[0].verts.data_ptr() == mesh.verts.data_ptr()
+    assert kernel.scenes[0].faces.data_ptr() == mesh.faces.data_ptr() == kernel.scenes[0].corners.data_ptr()
+    assert eg.plan(mesh, CAMERA)["scene"].bytes == 24  # the black background, three doubles
+    assert not eg.plan(eg.Scene(mesh, torch.zeros(3, dtype=F64)), CAMERA)["scene"].on
+    step(kernel, mesh.to(torch.float32))
+    copied = kernel.scenes[0].verts.nbytes
+    assert kernel.scenes[0].verts.dtype == F64
+    assert eg.plan(mesh.to(torch.float32), CAMERA)["scene"].bytes == copied + 12
+
+
+def update(mesh, camera=CAMERA, kinds=(), **options) -> float:
+    """Seconds of the kernel for the ray structure in the forward pass, or for the edges in the backward pass."""
+    scene, camera = requiring(mesh, camera, kinds)
+    arguments = render_module.render_arguments(scene, camera, 1, **options)
+    image, coverage, seen, (forward,) = render_module.forward_kernel(*arguments)
+    if not kinds:
+        return forward["update"]
+    wanted = render_module.requires_grad(arguments)
+    return render_module.backward_kernel(torch.ones_like(image), coverage, seen, *arguments, wanted)[1][0]["update"]
+
+
+def test_ray_structure_is_rebuilt_only_when_vertices_moved():
+    """Told by seconds: to see that nothing moved takes a small part of a rebuild. The least of five, as others run too."""
+    mesh, moved = icosphere(5), icosphere(5).transformed(scale=1.01)
+    other_camera, other_colours = front_camera(16), mesh.replace(colors=mesh.verts)
+    built, kept, elsewhere = [], [], []
+    for _ in range(5):
+        core.clear_geometry()
+        built.append(update(mesh))
+        kept.append(max(update(mesh), update(mesh, other_camera), update(other_colours)))
+        elsewhere.append(update(moved))
+    assert min(kept) < 0.2 * min(elsewhere) and min(kept) < 0.2 * min(built)
+
+
+def test_topology_is_built_once_for_a_set_of_faces():
+    mesh, moved = icosphere(5), icosphere(5).transformed(scale=1.01)
+    built, again, without = [], [], []
+    for _ in range(5):
+        core.clear_geometry()
+        without.append(max(update(mesh, kinds=("colors",)), update(mesh, kinds=("verts",), visibility=False)))
+        built.append(update(mesh, kinds=("verts",)))
+        again.append(max(update(mesh, kinds=("verts",)), update(moved, kinds=("verts",))))
+    assert min(without) < 0.2 * min(built) and min(again) < 0.2 * min(built)
+
+
+def test_no_texture_code_without_a_texture(kernel):
+    """The kernel tells textured faces by a number a face; without textures it gets none, nor anything to look up."""
+    step(kernel, cube())
+    flat = kernel.scenes[0]
+    assert not any(t.numel() for t in (flat.texels, flat.uvs, flat.textures, flat.face_texture))
+    assert not eg.plan(cube(), CAMERA)["textures"].on
+    step(kernel, textured())
+    assert kernel.scenes[0].texels.numel() and kernel.scenes[0].face_texture.tolist()[:2] == [0, 0]
+    assert eg.plan(textured(), CAMERA)["textures"].on
+
+
+def test_nothing_but_the_plan_is_kept_for_the_backward_pass():
+    """Tensors that autograd saves: the inputs, coverage, and which faces were seen."""
+    scene, camera = requiring(cube(), CAMERA, ("verts",))
+    node = eg.render(scene, camera, spp=4).grad_fn
+    while not hasattr(node, "saved_tensors"):
+        node = node.next_functions[0][0]
+    coverage, seen, *inputs = node.saved_tensors
+    assert coverage.nbytes + seen.nbytes == eg.plan(scene, camera)["kept for backward"].bytes
+    flat = [*flatten(scene), camera.world_to_camera[None], camera.K[None]]
+    assert [tuple(t.shape) for t in inputs] == [tuple(t.shape) for t in flat]
+    assert eg.render(cube(), CAMERA, spp=4).grad_fn is None
+    assert eg.plan(cube(), CAMERA)["kept for backward"].bytes == 0
+
+
+def test_the_adjoint_is_not_copied(kernel):
+    adjoint = torch.ones(24, 24, 3, dtype=F64)
+    step(kernel, cube(), kinds=("verts",), adjoint=adjoint)
+    assert kernel.adjoint.data_ptr() == adjoint.data_ptr()
+
+
+def test_background_alone_runs_no_term(kernel):
+    done = step(kernel, textured(), kinds=("background",))
+    assert kernel.backward and not ran(done, tuple(done))
+    assert ran(step(kernel, textured(), kinds=("background", "verts")), ("view",))
+
+
+def test_no_interior_where_radiance_does_not_vary(kernel):
+    assert not ran(step(kernel, one_colour(), kinds=("verts", "world_to_camera", "K")), INTERIOR)
+    assert ran(step(kernel, one_colour(), kinds=("verts", "colors")), INTERIOR) == set(INTERIOR)
+    assert ran(step(kernel, cube(), kinds=("verts",)), INTERIOR) == set(INTERIOR)
+
+
+@pytest.mark.parametrize("kinds", [("colors",), ("uvs",), ("texture",), ("background",), KINDS[1:5]])
+def test_no_boundary_where_nothing_moves(kinds, kernel):
+    assert not ran(step(kernel, textured(), kinds=kinds), BOUNDARY)
+    assert not ran(step(kernel, textured(), kinds=KINDS, visibility=False), BOUNDARY)
+    for kind in ("verts", "world_to_camera", "K"):
+        assert ran(step(kernel, textured(), kinds=(*kinds, kind)), BOUNDARY) >= {"edge_samples", "edge rays", "curves"}
+
+
+def test_no_silhouettes_without_one_in_view(kernel):
+    done = step(kernel, inside(), kinds=("verts",))
+    assert not ran(done, ("silhouettes", "creases", "edge_samples", "edge rays", "edge scatter"))
+    assert ran(done, ("surface_samples",))
+    assert step(kernel, cube(), kinds=("verts",))["silhouettes"] > 0
+
+
+def test_no_creases_where_nothing_jumps(kernel):
+    assert step(kernel, cube(), kinds=("verts",))["creases"] == 0
+    assert step(kernel, one_colour(), kinds=("verts",))["creases"] == 0
+    assert step(kernel, creased(), kinds=("verts",))["creases"] > 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_only_what_is_required_is_differentiated(kind, kernel):
+    """What is not wanted has no array that the kernel could write to."""
+    step(kernel, textured(), kinds=(kind,))
+    assert [k for k, grad in zip(KINDS, kernel.grads, strict=True) if grad is not None] == [kind]
+    step(kernel, textured(), kinds=tuple(k for k in KINDS if k != kind))
+    assert [k for k, grad in zip(KINDS, kernel.grads, strict=True) if grad is None] == [kind]
+
+
+@pytest.mark.parametrize("kinds", [("verts",), ("texture",), KINDS])
+def test_no_samples_where_the_loss_does_not_look(kinds, kernel):
+    done = step(kernel, textured(), kinds=kinds, adjoint=torch.zeros(24, 24, 3, dtype=F64))
+    assert kernel.backward and not ran(done, ("surface_samples", "edge_samples", "surface rays", "edge rays"))
+
+
+# -- memory -----------------------------------------------------------------------------------------------------------
+
+MEASURE = """
+import re, sys
+import torch
+import edgegrad as eg
+from scenes import front_camera, icosphere
+subdivisions, size, colors = (int(argument) for argument in sys.argv[1:])
+
+def peak():
+    return 1024 * int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1])
+
+def step(mesh, camera):
+    mesh = mesh.replace(verts=mesh.verts.requires_grad_(), colors=mesh.colors.requires_grad_(bool(colors)))
+    eg.render(mesh, camera, spp=1).backward(torch.ones(*camera.size, 3, dtype=torch.float64))
+
+step(icosphere(1), front_camera(8))  # threads and libraries
+mesh, camera = icosphere(subdivisions), front_camera(size)
+open("/proc/self/clear_refs", "w").write("5")  # the peak from here on
+before = peak()
+step(mesh, camera)
+measured = peak() - before
+mesh = mesh.replace(verts=mesh.verts.detach().requires_grad_())
+print(measured, eg.plan(mesh, camera, 1).bytes)
+"""
+
+
+@pytest.mark.parametrize(
+    ("subdivisions", "size", "colors"),
+    [
+        pytest.param(6, 512, 1, id="faces and pixels"),
+        pytest.param(7, 64, 0, id="faces", marks=pytest.mark.slow),
+        pytest.param(3, 1024, 0, id="pixels", marks=pytest.mark.slow),
+    ],
+)
+def test_memory_is_about_as_planned(subdivisions, size, colors):
+    """Within a factor of 2. Each case has a process of its own, for one that has been larger before asks for nothing new."""
+    if not Path("/proc/self/clear_refs").exists():
+        pytest.skip("tells the peak of memory on Linux only")
+    arguments = [sys.executable, "-c", MEASURE, *map(str, (subdivisions, size, colors))]
+    said = subprocess.run(arguments, cwd=Path(__file__).parent, capture_output=True, text=True, check=True).stdout
+    measured, planned = map(int, said.split())
+    assert 0.5 * measured < planned < 2.0 * measured, said
+
+
+# -- the table, the data, errors --------------------------------------------------------------------------------------
+
+
+def test_plan_prints_as_a_table():
+    planned = eg.plan(*requiring(creased(), CAMERA, ("verts",)), 4)
+    lines = str(planned).splitlines()
+    assert len(lines) == 2 + len(planned) and max(map(len, lines)) < 100
+    columns = {
+        line.index(" on " if term.on else " off") for line, term in zip(lines[1:], planned.values(), strict=False)
+    }
+    assert len(columns) == 1  # aligned
+    assert f"{planned['boundary'].samples:,}" in str(planned) and "visibility=False" not in str(planned)
+    assert "visibility=False" in str(eg.plan(*requiring(creased(), CAMERA, ("verts",)), 4, visibility=False))
+    assert planned.bytes == sum(term.bytes for term in planned.values()) > 0
+    with pytest.raises(KeyError, match=r"boundary, silhouettes.*'shadows'"):
+        planned["shadows"]
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"scene": "cube"}, TypeError), ({"camera": None}, TypeError), ({"spp": 0}, ValueError),
+        ({"spp": 1.5}, TypeError), ({"seed": -1}, ValueError), ({"filter": "hat"}, ValueError),
+        ({"visibility": 1}, TypeError), ({"edge_samples": 0}, ValueError),
+        ({"scene": eg.Scene([cube()], torch.zeros(3, 3, 3))}, ValueError),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("function", [eg.plan, eg.profile])
+def test_errors_are_those_of_render(function, change, error):
+    arguments = {"scene": cube(), "camera": CAMERA, **change}
+    with pytest.raises(error) as expected:
+        eg.render(**arguments)
+    with pytest.raises(error) as got:
+        function(**arguments)
+    assert str(got.value) == str(expected.value)
+
+
+# -- profile() --------------------------------------------------------------------------------------------------------
+
+
+def test_profile():
+    scene, camera = requiring(creased(), CAMERA, ("verts", "colors"))
+    found = eg.profile(scene, camera, spp=4, repeats=3)
+    assert list(found)[:2] == ["update", "forward"] and list(found)[-1] == "python"
+    assert all(seconds > 0 for seconds in found.values()) and found.seconds == pytest.approx(sum(found.values()))
+    planned = eg.plan(scene, camera, 4)
+    assert found.samples["image_samples"] == planned["image"].samples
+    assert found.samples["edge_samples"] == planned["boundary"].samples
+    assert 0 < found.samples["surface_samples"] <= planned["interior"].samples
+    lines = str(found).splitlines()
+    assert len(lines) == len(found) + 3 and "█" in str(found) and "edge samples" in lines[-1]
+    with pytest.raises(KeyError, match=r"update, forward.*'shadows'"):
+        found["shadows"]
+
+
+def test_profile_of_what_requires_no_gradient_is_that_of_the_vertices():
+    vertices = eg.profile(requiring(cube(), CAMERA, ("verts",))[0], CAMERA, repeats=1).samples
+    assert eg.profile(cube(), CAMERA, repeats=1).samples == vertices
+    with torch.no_grad():
+        assert eg.profile(*requiring(cube(), CAMERA, ("colors",)), repeats=1).samples == vertices
+    assert eg.profile(*requiring(cube(), CAMERA, ("colors",)), repeats=1)["curves"] == 0
+
+
+def test_profile_rebuilds_for_every_repeat():
+    mesh = icosphere(5)
+    rebuilt = eg.profile(mesh, CAMERA, spp=1, repeats=3)["update"]
+    assert min(update(mesh) for _ in range(3)) < 0.3 * rebuilt
+
+
+def test_profile_of_an_adjoint_and_a_batch():
+    batch = CAMERA.replace(world_to_camera=torch.stack([CAMERA.world_to_camera] * 2))
+    adjoint = torch.zeros(24, 24, 3)
+    assert eg.profile(cube(), CAMERA, adjoint, repeats=1).samples["surface_samples"] == 0
+    adjoint[10:14, 10:14] = 1.0
+    one, two = (
+        eg.profile(cube(), camera, a, repeats=1).samples
+        for camera, a in ((CAMERA, adjoint), (batch, torch.stack([adjoint] * 2)))
+    )
+    assert one == {name: count // 2 for name, count in two.items()} | {"surface_samples": one["surface_samples"]}
+    assert (one["surface_samples"], one["edge_samples"]) == default_samples(cube(), CAMERA, adjoint)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"adjoint": torch.ones(3, 3, 3)}, ValueError, ("adjoint", "(24, 24, 3)", "(3, 3, 3)", "shape")),
+        ({"adjoint": torch.full((24, 24, 3), torch.nan)}, ValueError, ("adjoint", "finite", "nan")),
+        ({"adjoint": torch.ones(24, 24, 3, dtype=torch.int32)}, TypeError, ("adjoint", "float32", "int32")),
+        ({"repeats": 0}, ValueError, ("repeats", "from 1", "0")),
+    ],
+)
+def test_profile_errors(options, error, words):
+    with pytest.raises(error) as got:
+        eg.profile(cube(), CAMERA, **options)
+    assert all(word in str(got.value) for word in words), got.value

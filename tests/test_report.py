@@ -1,0 +1,236 @@
+"""`edgegrad report`: the command end to end on a small triangle, its references, and what it says when asked for nonsense."""
+
+from __future__ import annotations
+
+import importlib
+import json
+
+import pytest
+import torch
+from PIL import Image
+
+import edgegrad as eg
+from edgegrad import cli
+from edgegrad.report import references, scenes
+from edgegrad.report.error_time import error_time
+from edgegrad.report.methods import Edgegrad, FiniteDifferences, rigid
+from edgegrad.report.references import QUICK, exact, long_run
+
+module = importlib.import_module("edgegrad.report.error_time")  # the package has a function of this name
+OURS = ("edgegrad", "interior", "boundary", "finite-differences")
+ASKED = ("--scene", "triangle", "--methods", *OURS, "--size", "32", "--seeds", "2", "--quick")
+
+
+def run(*arguments):
+    return cli.main(["report", "error-time", *[str(argument) for argument in arguments]])
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    assert run(*ASKED, "--out", folder) == 0
+    return folder
+
+
+def document(folder):
+    return json.loads((folder / "error-time.json").read_text())
+
+
+def test_json(measured):
+    found = document(measured)
+    now = found["settings"]
+    assert now["size"] == 32 and now["seeds"] == [0, 1] and now["threads"] == torch.get_num_threads()
+    assert all(now[key] for key in ("processor", "torch", "edgegrad", "kernel", "embreex"))
+    assert found["scenes"]["triangle"]["reference"]["kind"] == "exact pixel integrals"
+    terms = found["scenes"]["triangle"]["terms"]
+    assert {"update", "forward", "edge rays", "python"} < set(terms) and all(seconds >= 0 for seconds in terms.values())
+    points = found["points"]
+    assert {point["method"] for point in points} == {*OURS, "finite-differences-vertices"}
+    assert len(points) == 3 * 5
+    for point in points:
+        assert point["seconds"] > 0 and len(point["seconds_of_seeds"]) == 2
+        for metric in point["metrics"].values():
+            assert 0 < min(metric["errors"]) <= metric["error"] <= max(metric["errors"])
+    # More samples, less error: 16 times as many from the first to the last.
+    whole = [point["metrics"]["vertex"]["error"] for point in points if point["method"] == "edgegrad"]
+    assert whole[-1] < 0.5 * whole[0] and whole[-1] < 0.05
+
+
+def test_table_and_figure(measured):
+    text = (measured / "error-time.md").read_text()
+    assert "one large triangle" in text and text.count("| edgegrad |") == 3 and "without" in text
+    assert Image.open(measured / "error-time.png").width > 1000
+    names = {"error-time.json", "error-time.md", "error-time.png", "reference-triangle.pt"}
+    assert {path.name for path in measured.iterdir()} == names
+
+
+def test_nothing_is_measured_twice(measured, monkeypatch, capsys):
+    def refuse(*arguments):
+        raise AssertionError("measured again")
+
+    monkeypatch.setattr(module._Run, "_point", refuse)
+    monkeypatch.setattr(references, "exact", refuse)
+    before = document(measured)
+    assert run(*ASKED, "--out", measured) == 0
+    assert document(measured) == before
+    assert "15 points are there" in capsys.readouterr().out
+
+
+def test_other_settings_do_not_mix(measured, capsys):
+    files = {path: path.read_bytes() for path in measured.iterdir()}
+    error_time(measured, ["triangle"], ["interior"], size=16, seeds=2, quick=True)
+    assert "of other settings (size); kept as error-time.previous.json" in capsys.readouterr().out
+    assert {point["method"] for point in document(measured)["points"]} == {"interior"}
+    for path, content in files.items():
+        path.write_bytes(content)
+    (measured / "error-time.previous.json").unlink()
+
+
+def test_ctrl_c_keeps_what_is_measured(tmp_path, monkeypatch, capsys):
+    whole = Edgegrad.gradient
+
+    def interrupted(self, budget, seed):
+        if self.part == "whole" and budget == 1 and seed == 1:
+            raise KeyboardInterrupt
+        return whole(self, budget, seed)
+
+    asked = ("--scene", "triangle", "--methods", "edgegrad", "--size", 32, "--seeds", 2, "--quick", "--out", tmp_path)
+    monkeypatch.setattr(Edgegrad, "gradient", interrupted)
+    assert run(*asked) == cli.INTERRUPTED
+    points = document(tmp_path)["points"]
+    assert [point["budget"] for point in points] == [0.25]
+    assert (tmp_path / "error-time.png").exists() and "| edgegrad |" in (tmp_path / "error-time.md").read_text()
+    monkeypatch.undo()
+    assert run(*asked) == 0
+    assert document(tmp_path)["points"][0] == points[0] and len(document(tmp_path)["points"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--scene", "cube"), ("scenes", "triangle, sphere", "'cube'")),
+        (("--methods", "magic"), ("methods", "finite-differences", "'magic'")),
+        (("--scene", "triangle", "--seeds", "1"), ("seeds", "at least 2", "1", "try 5")),
+        (("--scene", "triangle", "--mesh", "there.ply"), ("mesh", "scan", "triangle", "add scan")),
+        (("--scene", "scan", "--mesh", "there.ply"), ("there.ply", "no such file")),
+    ],
+)
+def test_errors(arguments, words, tmp_path, capsys):
+    assert run(*arguments, "--out", tmp_path) == 2
+    said = capsys.readouterr().err
+    assert all(word in said for word in words), said
+    assert not list(tmp_path.glob("error-time*"))
+
+
+def test_a_file_of_someone_else_is_not_overwritten(tmp_path, capsys):
+    (tmp_path / "error-time.json").write_text("[1, 2]")
+    assert run(*ASKED, "--out", tmp_path) == 2
+    assert "expected what an earlier run wrote" in capsys.readouterr().err
+    assert (tmp_path / "error-time.json").read_text() == "[1, 2]"
+
+
+@pytest.mark.parametrize("limit", ["0", "-1", "soon"])
+def test_limit(limit, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        run("--limit", limit, "--out", tmp_path)
+    assert "--limit" in capsys.readouterr().err
+
+
+def test_slow_points_are_left_out(tmp_path):
+    found, _ = error_time(tmp_path, ["triangle"], ["edgegrad"], size=16, seeds=2, limit=1e-9, quick=True)
+    assert len(found["points"]) == 1  # the first says that the others cost more
+
+
+def test_sweep_stops_where_the_next_point_would_cost_too_much():
+    assert module._expected([], 4) == 0
+    assert module._expected([(1, 2.0)], 4) == 2.0  # nothing is known of how it grows
+    assert module._expected([(1, 2.0), (4, 2.3)], 16) == pytest.approx(3.5)  # mostly a cost that does not grow
+
+
+def test_scan_is_left_out_without_a_mesh(tmp_path, monkeypatch, capsys):
+    def nothing(size, path):
+        raise ImportError("no pyvista")
+
+    monkeypatch.setitem(scenes.SCENES, "scan", nothing)
+    monkeypatch.setattr(scenes, "_scan", nothing)
+    assert run("--scene", "scan", "--quick", "--out", tmp_path) == 0
+    assert "scan: left out; give one with --mesh PATH" in capsys.readouterr().out
+
+
+# -- references -------------------------------------------------------------------------------------------------------
+
+
+def test_references_agree():
+    """Exact integrals and long runs know nothing of each other; each term within 5 standard errors of the runs."""
+    scene = scenes.build("triangle", 32)
+    a, b = exact(scene), long_run(scene, references.Effort(1 << 18, 1 << 16, 1.0, runs=4))
+    norm = float(a.metrics(scene)["vertex"].norm())
+    for part in references.PARTS:
+        for name, correct in a.metrics(scene, part).items():
+            error = b.error[part][name] * float(a.metrics(scene)[name].norm())
+            assert (b.metrics(scene, part)[name] - correct).norm() < 5.0 * error, (part, name)
+            assert error < 0.01 * norm
+
+
+def test_references_that_are_wrong_are_noticed():
+    """Finite differences tell a gradient without its boundary."""
+    scene = scenes.build("triangle", 128)
+    correct = exact(scene)
+    effort = references.Effort(check_spp=64, check_seeds=3)
+    assert not any(references.disagrees(entry) for entry in references.check(scene, correct, effort).values())
+    correct.boundary = torch.zeros_like(correct.boundary)
+    assert all(references.disagrees(entry) for entry in references.check(scene, correct, effort).values())
+
+
+def test_reference_is_kept(tmp_path, monkeypatch):
+    scene = scenes.build("triangle", 16)
+    first = references.reference(scene, tmp_path, QUICK)
+    monkeypatch.setattr(references, "exact", None)  # not called again
+    again = references.reference(scene, tmp_path, QUICK)
+    assert torch.equal(first.interior, again.interior) and first.check == again.check
+    (tmp_path / "reference-triangle.pt").write_bytes(b"nonsense")
+    monkeypatch.undo()
+    said = []
+    references.reference(scene, tmp_path, QUICK, said.append)
+    assert said == ["reference-triangle.pt cannot be read: it is computed again"]
+
+
+# -- scenes and methods -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [name for name in scenes.SCENES if name not in ("million", "scan")])
+def test_scenes(name):
+    scene = scenes.build(name, 32)
+    image = eg.render(scene.scene, scene.camera, spp=4)
+    assert image.shape == scene.adjoint.shape == (32, 32, 3) and image.dtype == torch.float32
+    background = (image == torch.tensor(scenes.BACKGROUND)).all(-1).double().mean()
+    assert (background == 0) if name == "quad" else (0.1 < background < 0.9)
+    assert scene.fingerprint == scenes.build(name, 32).fingerprint != scenes.build(name, 33).fingerprint
+
+
+def test_scan_of_the_user(tmp_path):
+    mesh = scenes.build("triangle").scene.meshes[0]
+    lines = [f"v {x} {y} {z}" for x, y, z in mesh.verts.tolist()]
+    (tmp_path / "mesh.obj").write_text("\n".join([*lines, "f 1 2 3", ""]))
+    scene = scenes.build("scan", 32, tmp_path / "mesh.obj")
+    assert scene.faces == 1 and scene.title == "mesh, 1 faces"
+
+
+def test_rigid_gradients_are_those_of_motions():
+    """Σ g and Σ (p − c) × g against autograd through the motion."""
+    scene = scenes.build("slivers", 16)
+    weights = torch.randn(scene.verts.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    shift, turn = (torch.zeros(3, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    arm = scene.verts - scene.center
+    moved = scene.center + arm + torch.linalg.cross(turn.expand_as(arm), arm) + shift
+    by_autograd = torch.autograd.grad((moved * weights).sum(), (shift, turn))
+    found = rigid(scene, weights)
+    torch.testing.assert_close((found["translation"], found["rotation"]), by_autograd)
+
+
+def test_finite_differences_turn_the_right_way():
+    """Its rotation moves the vertices to first order by ω × (p − c)."""
+    scene = scenes.build("slivers", 16)
+    arm, omega = scene.verts - scene.center, torch.tensor([1e-6, -2e-6, 3e-6], dtype=torch.float64)
+    moved = FiniteDifferences(scene)._turned(omega) - scene.verts
+    torch.testing.assert_close(moved, torch.linalg.cross(omega.expand_as(arm), arm), rtol=1e-4, atol=1e-10)
