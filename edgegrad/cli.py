@@ -1,4 +1,4 @@
-"""The command line: edgegrad fit-pose, render, demo."""
+"""The command line: edgegrad fit-pose, render, demo, report."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _fit_pose(args: argparse.Namespace) -> int:
         raise ValueError("--background: expected none with a mask (or an image with alpha), got both; leave one out")
     init = None if args.init is None else _pose(args.init)
     camera = _camera(args, scene, (picture.shape[0], picture.shape[1]), args.init)
-    _make_folder(args.out)
+    make_folder(args.out)
 
     saved = time.monotonic()
 
@@ -106,7 +106,7 @@ def _render(args: argparse.Namespace) -> int:
         scene = scene.transformed(pose.R, pose.t, pose.scale)
     if args.background is not None:
         scene = scene.replace(background=_background(args.background, torch.empty(*camera.size, 3)))
-    _make_folder(args.out.absolute().parent)
+    make_folder(args.out.absolute().parent)
     with torch.no_grad():
         write_image(args.out, render(scene, camera, spp=args.spp, seed=args.seed))
     print(f"wrote {args.out}")
@@ -118,7 +118,7 @@ def _demo(args: argparse.Namespace) -> int:
     from . import demo  # imports pyvista when it runs
 
     mesh, background = demo.airliner(), demo.earth()
-    _make_folder(args.out)
+    make_folder(args.out)
     print("Finding an airliner in a picture, from wrong poses. Errors in degrees and in percent of its size:\n")
     print("  run     start             fit               seconds")
     runs: list[demo.Run] = []
@@ -138,7 +138,7 @@ def _demo(args: argparse.Namespace) -> int:
 # -- files --------------------------------------------------------------------------------------------------------------
 
 
-def _make_folder(folder: Path) -> None:
+def make_folder(folder: Path) -> None:
     """Before the work rather than after it. Raises OSError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -228,7 +228,8 @@ def _camera(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | None
         if '"camera"' in text:  # else a pose alone, written by hand
             camera = PoseFit.from_json(text).camera
     if camera is None:
-        return _framing(args, scene, size or (512, 512))
+        fov, up = 40.0 if args.fov is None else args.fov, args.up or (0.0, 1.0, 0.0)
+        return framing(scene, size or (512, 512), fov, args.eye, args.target, up)
     if size is None:
         return camera
     (H, W), (h, w) = size, camera.size
@@ -240,20 +241,26 @@ def _camera(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | None
     return camera.resized(size)
 
 
-def _framing(args: argparse.Namespace, scene: Scene, size: tuple[int, int]) -> Camera:
-    """The whole mesh at the file's pose, seen from above its front right unless --eye says otherwise; +Y is up."""
+def framing(
+    scene: Scene,
+    size: tuple[int, int],
+    fov: float = 40.0,
+    eye: Sequence[float] | None = None,
+    target: Sequence[float] | None = None,
+    up: Sequence[float] = (0.0, 1.0, 0.0),
+) -> Camera:
+    """The whole scene, seen from (0.5, 0.4, 0.77) of the middle of its box as far as nothing else is said."""
     verts = torch.cat([mesh.verts for mesh in scene.meshes]).double()
     low, high = verts.aminmax(dim=0)
-    target = (low + high) / 2 if args.target is None else torch.tensor(args.target).double()
-    radius = float((verts - target).norm(dim=1).max())
-    fov = 40.0 if args.fov is None else args.fov
+    middle = (low + high) / 2 if target is None else torch.tensor(target).double()
+    radius = float((verts - middle).norm(dim=1).max())
     if not 0.0 < fov < 180.0:
         raise ValueError(f"--fov: expected degrees between 0 and 180, got {fov:g}")
     narrow = math.atan(math.tan(math.radians(fov) / 2) * min(1.0, size[1] / size[0]))  # half the smaller field of view
     direction = torch.tensor([0.5, 0.4, 0.77]).double()
     distance = 1.02 * max(radius, 1e-30) / math.sin(narrow)
-    eye = target + distance * direction / direction.norm() if args.eye is None else torch.tensor(args.eye).double()
-    return Camera.look_at(eye, target, torch.tensor(args.up or (0.0, 1.0, 0.0)).double(), fov, size)
+    place = middle + distance * direction / direction.norm() if eye is None else torch.tensor(eye).double()
+    return Camera.look_at(place, middle, torch.tensor(up).double(), fov, size)
 
 
 # -- arguments ----------------------------------------------------------------------------------------------------------
@@ -275,8 +282,8 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("--fit-scale", action="store_true", help="also find the scale; the distance then stays")
     fit.add_argument("--fit-focal", action="store_true", help="also find the focal length")
     fit.add_argument("--background", help="#rrggbb or an image; without it the median colour of the picture's border")
-    fit.add_argument("--size", type=_count, default=256, help="most pixels on the longer side (%(default)s)")
-    fit.add_argument("--steps", type=_count, default=40, help="most steps on each level of resolution (%(default)s)")
+    fit.add_argument("--size", type=count, default=256, help="most pixels on the longer side (%(default)s)")
+    fit.add_argument("--steps", type=count, default=40, help="most steps on each level of resolution (%(default)s)")
     fit.add_argument("--seed", type=_number, default=0)
     fit.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="for pose.json, fit.png, loss.png, fit.webp"
@@ -292,15 +299,19 @@ def _parser() -> argparse.ArgumentParser:
     draw.add_argument("--pose", type=Path, metavar="POSE.json", help="where to put the mesh, as fit-pose writes it")
     draw.add_argument("--background", help="#rrggbb or an image; black when left out")
     draw.add_argument("--size", type=_shape, metavar="WIDTHxHEIGHT", help="pixels (the camera's, or 512x512)")
-    draw.add_argument("--spp", type=_count, default=64, help="samples a pixel (%(default)s)")
+    draw.add_argument("--spp", type=count, default=64, help="samples a pixel (%(default)s)")
     draw.add_argument("--seed", type=_number, default=0)
     draw.set_defaults(run=_render)
 
     show = commands.add_parser("demo", help="find an airliner above the Earth", description=_demo.__doc__)
     show.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="(%(default)s)")
-    show.add_argument("--runs", type=_count, default=10, help="targets and starts to try (%(default)s)")
+    show.add_argument("--runs", type=count, default=10, help="targets and starts to try (%(default)s)")
     show.add_argument("--seed", type=_number, default=0)
     show.set_defaults(run=_demo)
+
+    from .report.command import add_report  # here, since it takes types of arguments from this module
+
+    add_report(commands)
     return parser
 
 
@@ -320,13 +331,13 @@ def _add_view(parser: argparse.ArgumentParser) -> None:
 
 def _shape(text: str) -> tuple[int, int]:
     """(height, width) from 640x480 or 512."""
-    numbers = [_count(number) for number in text.lower().split("x")]
+    numbers = [count(number) for number in text.lower().split("x")]
     if len(numbers) > 2:
         raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT or one number, got {text!r}")
     return numbers[-1], numbers[0]
 
 
-def _count(text: str) -> int:
+def count(text: str) -> int:
     return _number(text, least=1)
 
 

@@ -24,19 +24,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from edgegrad.camera import Camera
-from edgegrad.mesh import PLAIN, Mesh
-from edgegrad.scene import Scene
+from ..camera import Camera
+from ..mesh import PLAIN, Mesh
+from ..scene import Scene
 
 # Pixels. A point this close to a line counts as on it: above the rounding of coordinates (1e-14), far below anything
 # that matters to an area.
 ON_LINE = 1e-12
 
 
-def exact_image(scene: Scene, camera: Camera, order: int = 5) -> Tensor:
+def exact_image(scene: Scene, camera: Camera, order: int = 5, visibility: bool = True) -> Tensor:
     """Image (H, W, C) float64, differentiable in vertices, colours, background and camera.
 
-    order: of the Gauss rule that integrates the radiance over a triangle; not used where colours are constant.
+    order       of the Gauss rule that integrates the radiance over a triangle; not used where colours are constant
+    visibility  False holds the polygons still, which leaves the gradient inside faces, as in `render`
     """
     H, W = camera.size
     C = scene.channels
@@ -56,10 +57,11 @@ def exact_image(scene: Scene, camera: Camera, order: int = 5) -> Tensor:
     vertex = view.P.reshape(-1, 3)[torch.where(shared.any(-1), pieces.side - pieces.side % 3 + corner, 0)]
     meet = torch.where(shared.any(-1, keepdim=True), vertex, meet)
     xy = meet[..., :2] / meet[..., 2:]
+    xy = xy if visibility else xy.detach()
     assert bool(((xy - pieces.xy).abs() < 1e-6).all()), "exact_image: lines almost coincide; move the scene a little"
 
     # Triangles (T, 3, 2) that fan out from the first corner of each polygon.
-    n, k = torch.nonzero(torch.arange(2, xy.shape[1]) < pieces.count[:, None], as_tuple=True)
+    n, k = torch.nonzero(torch.arange(2, xy.shape[1]) < pieces.corners[:, None], as_tuple=True)
     triangle = torch.stack([xy[n, 0], xy[n, k + 1], xy[n, k + 2]], 1)
     area = 0.5 * _wedge(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
     face, pixel = pieces.face[n], pixel[n]
@@ -172,11 +174,11 @@ class Lines(NamedTuple):
 
 
 class Polygons(NamedTuple):
-    """N convex polygons of up to M corners; slots beyond `count` repeat the first corner. count 0: empty."""
+    """N convex polygons of up to M corners; slots beyond `corners` repeat the first one. corners 0: empty."""
 
     xy: Tensor  # (N, M, 2) pixels
     side: Tensor  # (N, M) the line of the side from corner k to k + 1
-    count: Tensor  # (N,)
+    corners: Tensor  # (N,) how many
     face: Tensor  # (N,) whose surface it is
 
     def take(self, rows: Tensor) -> Polygons:
@@ -189,7 +191,7 @@ class Polygons(NamedTuple):
     def before(self) -> Tensor:
         """(N, M) the line of the side that ends in corner k."""
         k = torch.arange(self.side.shape[1])
-        last = self.count[:, None] - 1
+        last = self.corners[:, None] - 1
         return self.side.gather(1, torch.where((k == 0) | (k > last), last.clamp(min=0), k - 1))
 
     def area(self) -> Tensor:
@@ -205,7 +207,7 @@ class Polygons(NamedTuple):
         """
         M = self.xy.shape[1]
         k = torch.arange(M)
-        after = torch.where(k + 1 < self.count[:, None], k + 1, 0)
+        after = torch.where(k + 1 < self.corners[:, None], k + 1, 0)
         normal = sign * lines.unit[line][:, None]
         d = (self.xy * normal[..., :2]).sum(-1) + normal[..., 2]
         # On the line by construction, whatever rounding says: a corner that the line's own side begins or ends in, and
@@ -219,7 +221,7 @@ class Polygons(NamedTuple):
         crossing = self.xy + (d / (d - d_after))[..., None] * (xy_after - self.xy)
 
         # Corner k, then the crossing between k and k + 1; those that are there move to the front.
-        used = k < self.count[:, None]
+        used = k < self.corners[:, None]
         there = torch.stack([used & (d >= 0), used & (d * d_after < 0)], 2).reshape(-1, 2 * M)
         xy = torch.stack([self.xy, crossing], 2).reshape(-1, 2 * M, 2)
         begins = [(d == 0) & (d_after < 0), d > 0]
@@ -238,7 +240,7 @@ def _join(parts: list[Polygons]) -> Polygons:
     M = max(p.xy.shape[1] for p in parts)
     padded = []
     for p in parts:
-        p = p.take(p.count > 0)
+        p = p.take(p.corners > 0)
         slots = torch.arange(M)
         slots = torch.where(slots < p.xy.shape[1], slots, 0)
         padded.append(p._replace(xy=p.xy[:, slots], side=p.side[:, slots]))
@@ -268,7 +270,7 @@ def visible_pieces(view: View, lines: Lines) -> Polygons:
         for i in range(3):
             beyond.append(inside.cut(lines, 3 * front + i, -1))
             inside = inside.cut(lines, 3 * front + i)
-        hidden = inside.count > 0
+        hidden = inside.corners > 0
         pieces = _join([pieces.take(~near), whole.take(~hidden), *(part.take(hidden) for part in beyond)])
     return pieces
 
@@ -285,7 +287,7 @@ def split_by_pixels(pieces: Polygons, lines: Lines, H: int, W: int) -> tuple[Pol
         cell = start[rows] + torch.arange(len(rows)) - (times.cumsum(0) - times)[rows]
         pieces, index = pieces.take(rows), [i[rows] for i in index] + [cell]
         pieces = pieces.cut(lines, first + cell).cut(lines, first + cell + 1, -1)
-        there = pieces.count > 0
+        there = pieces.corners > 0
         pieces, index = pieces.take(there), [i[there] for i in index]
         first += n + 1
     return pieces, index[1] * W + index[0]
@@ -312,7 +314,7 @@ def _occluders(faces: Polygons, view: View, lines: Lines) -> Tensor:
     common, other = faces.take(i), faces.face[j]
     for side in range(3):
         common = common.cut(lines, 3 * other + side)
-    meet = common.count > 0
+    meet = common.corners > 0
     common, other = common.take(meet), other[meet]
 
     # Which of the two is nearer, all over what they share. 1e-6 allows for faces seen almost end-on.

@@ -1,0 +1,62 @@
+"""`edgegrad report`: the arguments of the reports."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ..cli import INTERRUPTED, count, make_folder
+
+
+def add_report(commands: Any) -> None:
+    """Adds the command to the subparsers of `edgegrad`."""
+    report = commands.add_parser("report", help="measure the gradient", description="Measures the gradient.")
+    kinds = report.add_subparsers(dest="report", required=True, metavar="REPORT")
+
+    curve = kinds.add_parser("error-time", help="its error against the time it takes", description=_error_time.__doc__)
+    curve.add_argument(
+        "--scene", nargs="+", metavar="NAME", help="triangle, sphere, slivers, globe, quad, scan, million (all)"
+    )
+    curve.add_argument(
+        "--methods", nargs="+", metavar="NAME",
+        help="edgegrad, interior, boundary, finite-differences, direct_projective, prb_projective (all)",
+    )  # fmt: skip
+    curve.add_argument("--mesh", type=Path, metavar="PATH", help="what the scene scan shows; else the demo's airliner")
+    curve.add_argument("--size", type=count, default=256, help="pixels on a side of the image (%(default)s)")
+    curve.add_argument("--seeds", type=count, default=5, help="gradients a point (%(default)s)")
+    curve.add_argument(
+        "--limit", type=_seconds, default=10.0, metavar="SECONDS", help="most that a gradient may take (%(default)g)"
+    )
+    curve.add_argument("--quick", action="store_true", help="few points and a rough reference, to try it out")
+    curve.add_argument(
+        "--out", type=Path, default=Path("out/error-time"), metavar="DIR",
+        help="for error-time.png, .md, .json and references; a later run goes on from what is there (%(default)s)",
+    )  # fmt: skip
+    curve.set_defaults(run=_error_time)
+
+
+def _error_time(args: argparse.Namespace) -> int:
+    """Relative error of the gradient (per vertex, and of whole-object translation and rotation) against wall time, for a
+    sweep of samples: edgegrad, finite differences, and every other renderer that is installed. Ctrl-C keeps what is
+    measured; the same command goes on from there."""
+    from .error_time import error_time
+
+    make_folder(args.out)
+    document, interrupted = error_time(
+        args.out, args.scene, args.methods,
+        size=args.size, seeds=args.seeds, limit=args.limit, quick=args.quick, mesh=args.mesh,
+    )  # fmt: skip
+    if document["points"]:
+        print(f"wrote error-time.json, error-time.md, error-time.png in {args.out}")
+    return INTERRUPTED if interrupted else 0
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0.0 < seconds < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text!r}")
+    return seconds

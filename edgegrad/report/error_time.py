@@ -1,0 +1,295 @@
+"""The error of the gradient against the time it takes: every scene, method and number of samples, in one run.
+
+A point is one method at one number of samples: the relative error ‖g − g*‖ / ‖g*‖, root mean square over seeds, and the median
+seconds. Points are written as soon as they are measured; a later run with the same settings goes on from them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import statistics
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from .. import __version__
+from .._files import replacing
+from .._kernel import core
+from ..plan import profile
+from .methods import METHODS, Method, missing
+from .references import QUICK, Effort, Reference, disagrees, reference
+from .scenes import SCENES, ReportScene, build
+
+NAME = "error-time"
+METRICS = ("vertex", "translation", "rotation")
+WARM_UP = 1 << 20  # a seed that is not measured
+
+Document = dict[str, Any]
+
+
+def error_time(
+    out: Path,
+    scenes: Sequence[str] | None = None,
+    methods: Sequence[str] | None = None,
+    *,
+    size: int = 256,
+    seeds: int = 5,
+    limit: float = 10.0,
+    quick: bool = False,
+    mesh: Path | None = None,
+) -> tuple[Document, bool]:
+    """Measures and writes error-time.json, .md and .png in the folder `out`; (what is in the JSON, whether Ctrl-C ended it).
+
+    scenes, methods  names, all when None
+    size             pixels on a side of the image
+    seeds            gradients a point
+    limit            seconds a gradient may take; more samples than that are left out
+    quick            few points and a rough reference, to try it out
+    mesh             file of the scene "scan"
+
+    Raises ValueError for an unknown name or a file that an earlier run did not write.
+    """
+    scenes = _known("scenes", scenes, SCENES)
+    methods = _known("methods", methods, METHODS)
+    if seeds < 2:
+        raise ValueError(f"seeds: expected at least 2, for the spread, got {seeds}; try 5")
+    if mesh is not None and "scan" not in scenes:
+        raise ValueError(f"mesh: expected with the scene scan, got {', '.join(scenes)}; add scan")
+    run = _Run(out, size, seeds, limit, quick)
+    for name in methods:
+        if (lack := missing(name)) is not None:
+            run.say(f"{name}: left out; {lack}")
+    methods = [name for name in methods if missing(name) is None]
+
+    interrupted = False
+    with tqdm(total=len(scenes) * len(methods), unit="sweep", dynamic_ncols=True) as run.bar:
+        try:
+            for name in scenes:
+                run.measure_scene(name, methods, mesh if name == "scan" else None)
+        except KeyboardInterrupt:
+            interrupted = True
+    if run.document["points"]:
+        run.write()
+        run.publish()
+    return run.document, interrupted
+
+
+def _known(argument: str, names: Sequence[str] | None, known: Sequence[str] | dict[str, Any]) -> list[str]:
+    for name in names or ():
+        if name not in known:
+            raise ValueError(f"{argument}: expected some of {', '.join(known)}, got {name!r}")
+    return list(dict.fromkeys(known if names is None else names))
+
+
+class _Run:
+    """One run: its settings, its progress bar and its document."""
+
+    def __init__(self, out: Path, size: int, seeds: int, limit: float, quick: bool) -> None:
+        self.out, self.size, self.seeds, self.limit, self.quick = out, size, seeds, limit, quick
+        self.bar: tqdm | None = None
+        self.file = out / f"{NAME}.json"
+        self.document = self._resume(settings(size, seeds, quick))
+
+    def say(self, text: str) -> None:
+        tqdm.write(text)
+
+    def _resume(self, now: dict[str, Any]) -> Document:
+        fresh: Document = {"settings": now, "scenes": {}, "points": []}
+        if not self.file.exists():
+            return fresh
+        try:
+            before = json.loads(self.file.read_text(encoding="utf-8"))
+            old = dict(before["settings"])
+            known = len(before["points"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"{self.file}: expected what an earlier run wrote, got something else ({error!r}); "
+                "remove it or choose another folder"
+            ) from error
+        if old == now:
+            self.say(f"{self.file}: {known} points are there and not measured again")
+            return before
+        differ = sorted(key for key in old.keys() | now.keys() if old.get(key) != now.get(key))
+        aside = self.out / f"{NAME}.previous.json"
+        os.replace(self.file, aside)
+        self.say(f"{self.file}: of other settings ({', '.join(differ)}); kept as {aside.name}")
+        return fresh
+
+    def write(self) -> None:
+        with replacing(self.file) as temporary:
+            temporary.write_text(json.dumps(self.document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+    def publish(self) -> None:
+        """The table and the figure, of all points there are."""
+        from . import plots  # matplotlib takes a while to import
+
+        plots.write_table(self.out / f"{NAME}.md", self.document)
+        plots.draw(self.out / f"{NAME}.png", self.document)
+
+    def measure_scene(self, name: str, methods: Sequence[str], mesh: Path | None) -> None:
+        assert self.bar is not None
+        self.bar.set_description(f"{name}: building")
+        try:
+            scene = build(name, self.size, mesh)
+        except ImportError as error:
+            if name != "scan":
+                raise
+            self.say(f"\nscan: left out; give one with --mesh PATH ({error})")
+            self.bar.update(len(methods))
+            return
+        self.bar.set_description(f"{name}: reference")
+        correct = reference(scene, self.out, QUICK if self.quick else Effort(), self.say)
+        self._describe(scene, correct)
+        for method_name in methods:
+            try:
+                found = METHODS[method_name](scene)
+            except (ValueError, RuntimeError) as error:  # what a peer does not support
+                self.document["scenes"][name]["left_out"][method_name] = str(error)
+                self.say(f"  {method_name}: left out; {error}")
+                found = []
+            for method in found:
+                self._sweep(scene, correct, method)
+            self.bar.update()
+        self.publish()
+
+    def _describe(self, scene: ReportScene, correct: Reference) -> None:
+        entries = self.document["scenes"]
+        entry = entries.get(scene.name)
+        if entry is None or entry["fingerprint"] != scene.fingerprint:
+            points = self.document["points"]
+            self.document["points"] = [point for point in points if point["scene"] != scene.name]
+            entry = entries[scene.name] = {
+                "title": scene.title, "fingerprint": scene.fingerprint, "faces": scene.faces,
+                "vertices": len(scene.verts), "left_out": {}, "terms": cost_of_terms(scene),
+            }  # fmt: skip
+        entry["reference"] = {"kind": correct.kind, "error": correct.error, "check": correct.check}
+        self.say(f"\n{scene.name}: {scene.title}\n  reference: {correct.kind}{_errors_in_words(correct)}")
+        self.say(f"  {'method':28s}{'samples':>9s}{'vertex':>10s}{'translation':>13s}{'rotation':>10s}{'time':>11s}")
+
+    def _sweep(self, scene: ReportScene, correct: Reference, method: Method) -> None:
+        assert self.bar is not None
+        budgets = method.budgets[1:4] if self.quick else method.budgets
+        known = {
+            point["budget"]: point
+            for point in self.document["points"]
+            if (point["scene"], point["method"], point["version"]) == (scene.name, method.name, method.version)
+        }
+        costs: list[tuple[float, float]] = []
+        warm = False
+        for budget in budgets:
+            if _expected(costs, budget) > self.limit:
+                break
+            point = known.get(budget)
+            if point is None:
+                self.bar.set_description(f"{scene.name}: {method.name} {method.label(budget)}")
+                point = self._point(scene, correct, method, budget, warm)
+                warm = True
+                self.document["points"] = [p for p in self.document["points"] if not _same(p, point)] + [point]
+                self.write()
+            costs.append((budget, point["seconds"]))
+            self.say(_row(point))
+
+    def _point(
+        self, scene: ReportScene, correct: Reference, method: Method, budget: float, warm: bool
+    ) -> dict[str, Any]:
+        compiled = method.compile_seconds
+        if not warm:
+            method.gradient(budget, WARM_UP)
+        gradients = [method.gradient(budget, seed) for seed in range(self.seeds)]
+        target, whole = correct.metrics(scene, method.part), correct.metrics(scene)
+        metrics = {}
+        for name in METRICS:
+            estimates = [gradient.metrics()[name] for gradient in gradients if name in gradient.metrics()]
+            if not estimates:
+                continue
+            norm = float(whole[name].norm())
+            errors = [float((estimate - target[name]).norm()) / max(norm, 1e-300) for estimate in estimates]
+            rms = math.sqrt(sum(error * error for error in errors) / len(errors))
+            metrics[name] = {"error": _finite(rms), "errors": [_finite(error) for error in errors]}
+        seconds = [gradient.seconds for gradient in gradients]
+        return {
+            "scene": scene.name, "method": method.name, "part": method.part, "version": method.version,
+            "budget": budget, "label": method.label(budget), "metrics": metrics,
+            "seconds": statistics.median(seconds), "seconds_of_seeds": seconds,
+            "compile_seconds": method.compile_seconds - compiled, "measured": time.strftime("%Y-%m-%d %H:%M:%S"),
+        }  # fmt: skip
+
+
+def settings(size: int, seeds: int, quick: bool) -> dict[str, Any]:
+    """All that must agree for points to be compared."""
+    kernel = hashlib.sha256(Path(core.__file__).read_bytes()).hexdigest()[:12]
+    return {
+        "size": size, "seeds": list(range(seeds)), "quick": quick, "threads": torch.get_num_threads(),
+        "processor": _processor(), "cores": os.cpu_count(), "system": platform.system(),
+        "python": platform.python_version(), "torch": torch.__version__, "edgegrad": __version__, "kernel": kernel,
+        "embreex": importlib.metadata.version("embreex"),
+    }  # fmt: skip
+
+
+def cost_of_terms(scene: ReportScene) -> dict[str, float]:
+    """Median seconds of each part of a step, as edgegrad.profile measures them."""
+    return dict(profile(scene.scene, scene.camera, scene.adjoint))
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _expected(costs: list[tuple[float, float]], budget: float) -> float:
+    """Seconds of the next point, on the line through the last two (budget, seconds)."""
+    if not costs:
+        return 0.0
+    (x1, t1), (x0, t0) = costs[-1], costs[-2] if len(costs) > 1 else (costs[-1][0] - 1.0, costs[-1][1])
+    return t1 + max(0.0, (t1 - t0) / (x1 - x0)) * (budget - x1)
+
+
+def _same(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    return all(a[key] == b[key] for key in ("scene", "method", "budget"))
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _errors_in_words(correct: Reference) -> str:
+    if correct.error:
+        own = ", ".join(f"{name} {percent(error)}" for name, error in correct.error["whole"].items())
+        text = f"; its own error: {own}"
+    else:
+        text = "; without sampling error"
+    for name, check in correct.check.items():
+        text += f"\n  finite differences of {name}: {percent(check['difference'])} apart"
+        text += f", ± {percent(check['standard_error'])} by chance"
+        if disagrees(check):
+            text += "; THEY DISAGREE: do not trust the errors below"
+    return text
+
+
+def _row(point: dict[str, Any]) -> str:
+    name, label = point["method"], point["label"]
+    errors = [point["metrics"].get(metric) for metric in METRICS]
+    v, t, r = ("–" if error is None else percent(error["error"]) for error in errors)
+    compiled = f"  + {duration(point['compile_seconds'])} once" if point["compile_seconds"] else ""
+    return f"  {name:28s}{label:>9s}{v:>10s}{t:>13s}{r:>10s}{duration(point['seconds']):>11s}{compiled}"
+
+
+def percent(error: float | None) -> str:
+    """With two digits that count."""
+    return "not finite" if error is None else f"{float(f'{100.0 * error:.2g}'):g} %"
+
+
+def duration(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds >= 1.0 else f"{1e3 * seconds:.3g} ms"

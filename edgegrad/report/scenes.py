@@ -1,0 +1,251 @@
+"""The scenes of the reports, procedural but for the scan, and the pieces from which the tests build theirs."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..camera import Camera
+from ..io import load_scene
+from ..mesh import Mesh
+from ..scene import Scene
+
+BACKGROUND = (0.15, 0.25, 0.4)
+
+
+@dataclass(frozen=True, eq=False)
+class ReportScene:
+    """What a gradient is measured on: the loss is image · adjoint."""
+
+    name: str
+    title: str  # what it shows, in a few words
+    scene: Scene
+    camera: Camera
+    adjoint: Tensor  # (H, W, C) ∂loss/∂image
+
+    @property
+    def verts(self) -> Tensor:
+        """(V, 3) float64, of all meshes end to end."""
+        return torch.cat([mesh.verts.double() for mesh in self.scene.meshes])
+
+    @property
+    def faces(self) -> int:
+        return sum(len(mesh.faces) for mesh in self.scene.meshes)
+
+    @property
+    def center(self) -> Tensor:
+        """(3,) float64, the centroid of the vertices: what the object is turned about."""
+        return self.verts.mean(0)
+
+    def moved(self, verts: Tensor) -> Scene:
+        """The scene with other vertices (V, 3)."""
+        parts = verts.split([len(mesh.verts) for mesh in self.scene.meshes])
+        return self.scene.replace(
+            meshes=[mesh.replace(verts=part) for mesh, part in zip(self.scene.meshes, parts, strict=True)]
+        )
+
+    @property
+    def fingerprint(self) -> str:
+        """Tells scenes of one name apart, such as two scans or two sizes."""
+        digest = hashlib.sha256(repr((self.camera.size, self.camera.projection)).encode())
+        tensors = [self.camera.world_to_camera, self.camera.K, self.adjoint, self.scene.background]
+        for mesh in self.scene.meshes:
+            tensors += [getattr(mesh, field.name) for field in dataclasses.fields(mesh)]
+        for tensor in tensors:
+            digest.update(b"-" if tensor is None else tensor.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()[:16]
+
+
+def build(name: str, size: int = 256, mesh: Path | None = None) -> ReportScene:
+    """A scene by its name, in float32, before a camera of size × size pixels; `mesh` is the file of the scan.
+
+    Raises ValueError for another name or a mesh that cannot be framed, OSError and ImportError where the scan is not there.
+    """
+    if name not in SCENES:
+        raise ValueError(f"scene: expected one of {', '.join(SCENES)}, got {name!r}")
+    if name == "scan":
+        title, scene, camera = _scan(size, mesh)
+    else:
+        title, scene, camera = SCENES[name](size)
+    # As users have them: meshes in float32.
+    scene, camera = scene.to(torch.float32), camera.to(torch.float64)
+    return ReportScene(name, title, scene, camera, smooth_adjoint(size, size, scene.channels).float())
+
+
+# -- pieces that the tests use as well -------------------------------------------------------------------------------
+
+
+def front_camera(size: int | tuple[int, int] = 64, projection: str = "perspective") -> Camera:
+    """A camera 4 units from the origin, off every axis and tilted, that sees the ball of radius 1.2 around it."""
+    size = (size, size) if isinstance(size, int) else size
+    eye = 4.0 * torch.nn.functional.normalize(torch.tensor([0.31, 0.23, 1.0], dtype=torch.float64), dim=0)
+    target, up = torch.zeros_like(eye), torch.tensor([0.17, 1.0, 0.0], dtype=torch.float64)
+    if projection == "orthographic":
+        return Camera.orthographic(eye, target, up, height=2.4, size=size)
+    return Camera.look_at(eye, target, up, fov_y=36.0, size=size)
+
+
+def unproject(camera: Camera, pixels: Tensor, depth: Tensor) -> Tensor:
+    """World points (…, 3) at the pixel positions (…, 2) and the depths Z (…) of a camera."""
+    xy = torch.linalg.solve(camera.K[:2, :2], (pixels - camera.K[:2, 2])[..., None])[..., 0]
+    if camera.projection == "perspective":
+        xy = xy * depth[..., None]
+    R, t = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    return (torch.cat([xy, depth[..., None]], -1) - t) @ R
+
+
+def one_triangle() -> Scene:
+    """One large triangle with smooth colours on a coloured background, in float64."""
+    verts = torch.tensor([[-0.83, -0.61, 0.2], [0.87, -0.42, -0.3], [0.13, 0.79, 0.1]], dtype=torch.float64)
+    colors = torch.tensor([[0.9, 0.2, 0.1], [0.3, 0.8, 0.2], [0.1, 0.4, 1.0]], dtype=torch.float64)
+    return Scene([Mesh(verts, torch.tensor([[0, 1, 2]]), colors=colors)], background())
+
+
+def random_slivers(count: int, seed: int, camera: Camera) -> Mesh:
+    """Long thin triangles (half to nine tenths of the image, 1 to 3 % of it wide) that overlap heavily in the view of
+    `camera`, each at a depth of its own, so that no two meet, with a random colour for each."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(count, dtype=torch.float64, generator=generator)
+
+    H, W = camera.size
+    scale = min(H, W)
+    angle, length, width = uniform(0.0, 2.0 * math.pi), scale * uniform(0.5, 0.9), scale * uniform(0.01, 0.03)
+    along = 0.5 * length[:, None] * torch.stack([angle.cos(), angle.sin()], -1)
+    across = 0.5 * width[:, None] * torch.stack([-angle.sin(), angle.cos()], -1)
+    centre = torch.stack([0.5 * W + scale * uniform(-0.25, 0.25), 0.5 * H + scale * uniform(-0.25, 0.25)], -1)
+    pixels = torch.stack([centre - along - across, centre - along + across, centre + along], 1)
+    depth = 3.0 + 2.0 * (torch.randperm(count, generator=generator).double() + uniform(0.2, 0.8)) / count
+    verts = unproject(camera, pixels, depth[:, None].expand(-1, 3)).reshape(-1, 3)
+    colors = torch.rand((count, 3), dtype=torch.float64, generator=generator)
+    return Mesh(verts, torch.arange(3 * count).reshape(-1, 3), face_colors=colors)
+
+
+def smooth_colors(points: Tensor) -> Tensor:
+    """Colours (V, 3) in (0, 1) that vary slowly with the position (V, 3)."""
+    directions = torch.tensor([[2.1, 0.7, -1.3], [-0.9, 2.3, 1.1], [1.7, -1.9, 0.6]], dtype=points.dtype)
+    return 0.5 + 0.4 * torch.sin(points @ directions + torch.tensor([0.3, 1.1, 2.0], dtype=points.dtype))
+
+
+def smooth_adjoint(height: int, width: int, channels: int) -> Tensor:
+    """A smooth adjoint image (H, W, C), float64, of both signs, without symmetry."""
+    y = torch.linspace(0.0, 1.0, height, dtype=torch.float64)[:, None, None]
+    x = torch.linspace(0.0, 1.0, width, dtype=torch.float64)[None, :, None]
+    c = torch.arange(channels, dtype=torch.float64)
+    return torch.sin(5.0 * x + (2.0 + c) * y + c) + 0.5 * torch.cos(3.0 * y * (1.0 + 0.4 * c) - 2.0 * x) + 0.2
+
+
+def background() -> Tensor:
+    """(3,) float64."""
+    return torch.tensor(BACKGROUND, dtype=torch.float64)
+
+
+# -- the scenes, float64: (title, scene, camera) of a size in pixels --------------------------------------------------
+
+Built = tuple[str, Scene, Camera]
+
+
+def _triangle(size: int) -> Built:
+    return "one large triangle", one_triangle(), front_camera(size)
+
+
+def _sphere(size: int, subdivisions: int = 6) -> Built:
+    from trimesh.creation import icosphere
+
+    sphere = icosphere(subdivisions)
+    verts = torch.from_numpy(np.array(sphere.vertices))
+    faces = torch.from_numpy(np.array(sphere.faces, np.int32))
+    camera = Camera.look_at((0.9, 0.7, 3.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (size, size))
+    title = f"sphere of {len(faces):,} faces, smooth colours"
+    return title, Scene([Mesh(verts, faces, colors=smooth_colors(verts))], background()), camera
+
+
+def _slivers(size: int) -> Built:
+    camera = front_camera(size)
+    return "100 random slivers", Scene([random_slivers(100, 0, camera)], background()), camera
+
+
+def _globe(size: int, rows: int = 128) -> Built:
+    """A sphere by latitude and longitude, as files bring it: its vertices have copies along the seam of the texture."""
+    columns = 2 * rows
+    latitude = math.pi * torch.arange(rows + 1, dtype=torch.float64) / rows
+    longitude = 2.0 * math.pi * torch.arange(columns + 1, dtype=torch.float64) / columns
+    longitude[-1] = 0.0  # copies have the same position, to the last bit
+    ring, pole = latitude.sin()[:, None], latitude.cos()[:, None]
+    ring[-1] = 0.0
+    verts = torch.stack([ring * longitude.cos(), pole.expand(-1, columns + 1), -ring * longitude.sin()], -1)
+    u, v = torch.arange(columns + 1).double() / columns, 1.0 - torch.arange(rows + 1).double() / rows
+    uvs = torch.stack(torch.broadcast_tensors(u, v[:, None]), -1)
+    index = torch.arange(verts[..., 0].numel()).reshape(rows + 1, columns + 1)
+    a, b, c, d = (corner.reshape(-1) for corner in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    # A quad has two faces, at the poles one.
+    faces = torch.cat([torch.stack([a, b, c], 1)[: -columns or None], torch.stack([a, c, d], 1)[columns:]])
+    # The pattern goes around without a seam: whole waves in u.
+    h, w = 512, 1024
+    y, x = ((torch.arange(n).double() + 0.5) / n for n in (h, w))
+    mesh = Mesh(
+        verts.reshape(-1, 3), faces.int(), texture=pattern(x[None] * 2.0, y[:, None]),
+        uvs=uvs.reshape(-1, 2), uv_faces=faces.int(),
+    )  # fmt: skip
+    camera = Camera.look_at((0.9, 1.1, 3.2), (0.0, 0.0, 0.0), (0.1, 1.0, 0.0), 40.0, (size, size))
+    return f"globe of {len(faces):,} faces, fine texture", Scene([mesh], background()), camera
+
+
+def _quad(size: int) -> Built:
+    """Slanted, and wider than the picture, so that its edges are out of view."""
+    camera = front_camera(size)
+    corners = size * torch.tensor([[-0.11, -0.17], [1.13, -0.12], [1.21, 1.14], [-0.15, 1.19]], dtype=torch.float64)
+    verts = unproject(camera, corners, torch.tensor([3.6, 4.1, 4.4, 3.8], dtype=torch.float64))
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    uvs = torch.tensor([[0.02, 0.97], [0.96, 0.99], [0.98, 0.03], [0.01, 0.04]], dtype=torch.float64)
+    x = (torch.arange(256).double() + 0.5) / 256
+    mesh = Mesh(verts, faces, texture=pattern(x[None], x[:, None]), uvs=uvs, uv_faces=faces)
+    return "textured quad that fills the picture", Scene([mesh], background()), camera
+
+
+def _million(size: int) -> Built:
+    return _sphere(size, subdivisions=8)
+
+
+def _scan(size: int, path: Path | None) -> Built:
+    from ..cli import framing  # here, since the command line imports the reports
+
+    if path is None:
+        from ..demo import airliner
+
+        scene, title, up = Scene([airliner()], background()), "airliner", (0.0, 0.0, 1.0)
+    else:
+        scene, title, up = load_scene(path), Path(path).stem, (0.0, 1.0, 0.0)
+    count = sum(len(mesh.faces) for mesh in scene.meshes)
+    return f"{title}, {count:,} faces", scene, framing(scene, (size, size), up=up)
+
+
+def pattern(x: Tensor, y: Tensor) -> Tensor:
+    """A texture (h, w, 3) float64 of waves from 2 to 61 to the side, that repeats; x (1, w) and y (h, 1), sides of length 1."""
+    generator = torch.Generator().manual_seed(3)
+    color = torch.zeros((*torch.broadcast_shapes(x.shape, y.shape), 3), dtype=torch.float64)
+    for waves in (2, 5, 11, 23, 37, 61):
+        across, down = (int(n) for n in torch.randint(-waves, waves + 1, (2,), generator=generator))
+        phase = 2.0 * math.pi * torch.rand(3, dtype=torch.float64, generator=generator)
+        color += torch.sin(2.0 * math.pi * (across * x + down * y)[..., None] + phase) / waves**0.4
+    return 0.5 + 0.14 * color
+
+
+SCENES: dict[str, Callable[[int], Built] | Callable[..., Built]] = {
+    "triangle": _triangle,
+    "sphere": _sphere,
+    "slivers": _slivers,
+    "globe": _globe,
+    "quad": _quad,
+    "scan": _scan,
+    "million": _million,
+}
