@@ -146,9 +146,9 @@ struct SceneArrays {
                 int(background.shape(2))};
     }
 
-    std::shared_ptr<const Geometry> geometry(bool want_topology, int threads) const {
+    std::shared_ptr<const Geometry> geometry(bool want_topology, int threads, GeometryWork& work) const {
         return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, want_topology,
-                                threads);
+                                threads, work);
     }
 };
 
@@ -204,11 +204,12 @@ Profile forward(const SceneArrays<T>& scene, const Camera& camera, int spp, cons
     const ForwardOptions options{spp, make_filter(filter), seed, threads};
     nb::gil_scoped_release release;
     Stopwatch watch;
-    const auto geometry = scene.geometry(false, threads);
+    GeometryWork work;
+    const auto geometry = scene.geometry(false, threads, work);
     const double update = watch.lap();
     render_forward(scene.view(), camera, geometry->caster(), options,
                    ForwardOutput<T>{image.data(), coverage.data(), seen.data()});
-    return {{"update", update}, {"forward", watch.lap()}};
+    return {{"update", update}, {"forward", watch.lap()}, {"built rays", work.rays}};
 }
 
 template <class T>
@@ -239,7 +240,8 @@ Profile backward(const SceneArrays<T>& scene, const Camera& camera, int64_t surf
                                   interior_geometry, boundary,     scene.spacing,       dry};
     nb::gil_scoped_release release;
     Stopwatch watch;
-    const auto geometry = scene.geometry(grad.geometry() && boundary, threads);
+    GeometryWork work;
+    const auto geometry = scene.geometry(grad.geometry() && boundary, threads, work);
     const double update = watch.lap();
     const BackwardProfile p = render_backward(scene.view(), camera, *geometry, options, adjoint.data(),
                                               ForwardView<T>{coverage.data(), seen.data()}, grad);
@@ -247,6 +249,8 @@ Profile backward(const SceneArrays<T>& scene, const Camera& camera, int64_t surf
             {"edge_samples", double(p.edge_samples)},
             {"silhouettes", double(p.silhouettes)},
             {"creases", double(p.creases)},
+            {"built rays", work.rays},
+            {"built edges", work.edges},
             {"update", update},
             {"view", p.view},
             {"surface measure", p.measure},
@@ -275,7 +279,8 @@ void bind_scene(nb::module_& m, const char* name) {
                int threads) {
                 const ForwardOptions options{spp, make_filter(filter), seed, threads};
                 nb::gil_scoped_release release;
-                return bare_loop(camera, scene.geometry(false, threads)->caster(), options);
+                GeometryWork work;
+                return bare_loop(camera, scene.geometry(false, threads, work)->caster(), options);
             },
             "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a)
         .def(
@@ -288,8 +293,9 @@ void bind_scene(nb::module_& m, const char* name) {
                 grad.verts = verts.data(), grad.colors = colors ? colors->data() : nullptr;
                 nb::gil_scoped_release release;
                 const std::vector<uint8_t> seen(scene.faces.shape(0), 1);
-                return render_backward(scene.view(), camera, *scene.geometry(false, threads), options, adjoint.data(),
-                                       ForwardView<T>{nullptr, seen.data()}, grad)
+                GeometryWork work;
+                return render_backward(scene.view(), camera, *scene.geometry(false, threads, work), options,
+                                       adjoint.data(), ForwardView<T>{nullptr, seen.data()}, grad)
                     .surface[0];
             },
             "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a, "adjoint"_a.noconvert(), "verts"_a.noconvert(),

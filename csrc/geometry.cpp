@@ -24,7 +24,8 @@ bool same(const std::vector<T>& kept_values, const T* values, int64_t n) {
 }  // namespace
 
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
-                                                 int64_t n_verts, double spacing, bool want_topology, int threads) {
+                                                 int64_t n_verts, double spacing, bool want_topology, int threads,
+                                                 GeometryWork& work) {
     const std::lock_guard lock(mutex);
     auto found = kept.end();
     bool moved = true;
@@ -45,6 +46,7 @@ std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n
         geometry = std::make_shared<Geometry>(faces, n_faces, n_verts);
     }
     if (moved) {
+        work.rays = true;
         geometry->verts_.clear();  // should the update fail, these positions must not be taken for it
         geometry->caster_.update(verts, threads);
         geometry->verts_.assign(verts, verts + 3 * n_verts);
@@ -52,6 +54,7 @@ std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n
         geometry->welded_ = false;
     }
     if (want_topology && !geometry->welded_) {
+        work.edges = true;
         if (!geometry->topology_)
             geometry->topology_ = std::make_unique<Topology>(geometry->faces_.data(), n_faces, n_verts);
         geometry->topology_->weld(verts, spacing);

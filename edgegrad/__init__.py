@@ -9,6 +9,7 @@ _os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 from .camera import Camera
 from .io import load_camera, load_mesh, load_scene, read_image, save_camera, write_image
 from .mesh import Mesh
+from .plan import Plan, plan, profile
 from .render import render
 from .scene import Scene
 
@@ -17,10 +18,13 @@ __version__ = "0.1.0"
 __all__ = [
     "Camera",
     "Mesh",
+    "Plan",
     "Scene",
     "load_camera",
     "load_mesh",
     "load_scene",
+    "plan",
+    "profile",
     "read_image",
     "render",
     "save_camera",

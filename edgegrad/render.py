@@ -39,14 +39,14 @@ def render(
     spp              samples a pixel of the image
     seed             the same seed gives the same bits, image and gradient, at any number of threads; cameras of a batch
                      get samples of their own
-    surface_samples  samples of the gradient inside faces, for each camera: an int in all, or None for ½ a unit of surface, (area +
-                     longest side · 1 px) summed over the triangles in view, 4 where they are textured and ⅛ as many where the
-                     image saw neither the triangle nor a neighbour
+    surface_samples  samples of the gradient inside faces, for each camera: an int in all, or None for ½ a unit of surface,
+                     (area + longest side · 1 px) summed over the triangles in view; 4 where they are textured, and ⅛ as
+                     many where the image saw neither the triangle nor a neighbour
     edge_samples     samples of the gradient at edges, for each camera: an int in all, or None for 24 a pixel of curve
     visibility       False leaves out what moves at silhouettes and other jumps; the gradient is then that of the shading alone
     filter           "box" (1 px wide), "tent" (2 px) or "gaussian" (σ ½ px, 3 px)
-    grad_seed        seed of the gradient's samples; derived from `seed` when None. They also depend on the image by which faces it
-                     hit, which says where to put them
+    grad_seed        seed of the gradient's samples; derived from `seed` when None. They also depend on the image by which
+                     faces it hit, which says where to put them
 
     Differentiable in every floating-point tensor of the scene and the camera. The image has the dtype of the colours and
     comes back on the scene's device. Raises TypeError or ValueError that names the argument.

@@ -1,0 +1,362 @@
+"""plan(): what a render does and what it leaves out, before it runs. profile(): where its time goes."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
+from .camera import Camera
+from .mesh import Mesh
+from .render import (
+    _DIFFERENTIABLE,
+    as_scene,
+    backward_kernel,
+    backward_work,
+    forward_kernel,
+    render_arguments,
+    requires_grad,
+)
+from .scene import Flat, Scene
+
+# Of Embree's structure, a face, beyond the copies of faces and vertices: resident memory grew by 74.4 bytes a face between
+# spheres of 327,680 and 1,310,720 faces, of which 12 are the faces, 18 the vertices and 1 says which were seen.
+RAY_STRUCTURE_BYTES = 44
+# csrc/scatter.h: samples are worked on in chunks, and only so many chunks a thread are in memory at a time.
+CHUNK, CHUNKS_IN_FLIGHT = 512, 16
+
+# -- the plan ---------------------------------------------------------------------------------------------------------
+
+# What may require a gradient, in the order of render_backward.
+_NAMES = ("verts", "colors", "uvs", "texture", "background", "world_to_camera", "K")
+
+
+@dataclass(frozen=True)
+class Term:
+    """One part of a render and its backward pass."""
+
+    on: bool
+    why: str
+    samples: int = 0  # rays that it casts
+    bytes: int = 0  # of memory that it takes, estimated
+
+
+class Plan(Mapping[str, Term]):
+    """The terms of a render and its backward pass, by name: `plan["boundary"].on`. Prints as a table."""
+
+    def __init__(self, terms: Mapping[str, Term]) -> None:
+        self._terms = {
+            name: term if term.on else replace(term, samples=0, bytes=0)  # what is off takes nothing
+            for name, term in terms.items()
+        }
+
+    def __getitem__(self, name: str) -> Term:
+        try:
+            return self._terms[name]
+        except KeyError:
+            raise KeyError(f"term: expected one of {', '.join(self._terms)}, got {name!r}") from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._terms)
+
+    def __len__(self) -> int:
+        return len(self._terms)
+
+    @property
+    def samples(self) -> int:
+        """Rays in all."""
+        return sum(term.samples for term in self.values())
+
+    @property
+    def bytes(self) -> int:
+        """Estimated peak above the user's own tensors, the image and all gradients included."""
+        return sum(term.bytes for term in self.values())
+
+    def __str__(self) -> str:
+        rows = [
+            (name, "on" if term.on else "off", _count(term.samples), _size(term.bytes), term.why)
+            for name, term in self.items()
+        ]
+        total = ("in all", "", _count(self.samples), _size(self.bytes), "")
+        return _table([("term", "", "samples", "memory", "why"), *rows, total], "<<>><")
+
+    __repr__ = __str__
+
+
+def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **options: Any) -> Plan:
+    """What `render(scene, camera, spp, seed, …)` and its backward pass will do: each term, on or off, why, samples, memory.
+
+    Takes the arguments of render() and raises what it raises. Samples of the gradient are counted for a loss that looks
+    everywhere and an image that sees every face: where the adjoint is zero none are taken, and fewer on faces that no
+    sample of the image hits. Nothing is drawn; the ray structure and the edges are built, and render() then finds them.
+    """
+    scene = as_scene(scene)
+    arguments = render_arguments(scene, camera, spp, seed, **options)
+    wanted = requires_grad(arguments)
+    return Plan({**_image_terms(scene, arguments, any(wanted)), **_gradient_terms(arguments, wanted)})
+
+
+def _image_terms(scene: Scene, arguments: Sequence[Any], any_gradient: bool) -> dict[str, Term]:
+    flat, B = Flat(*arguments[:9]), len(arguments[9])
+    height, width, spp = arguments[12:15]
+    V, F, C, word = len(flat.verts), len(flat.faces), flat.background.shape[-1], flat.colors.element_size()
+    copied = _bytes_of_copies(scene, flat)
+    cameras = "" if B == 1 else f", {B} cameras"
+    textures = len(flat.textures)
+    return {
+        "scene": Term(
+            copied > 0,
+            "copied end to end, in the kernel's number types" if copied else "read where it is",
+            bytes=copied,
+        ),
+        "ray structure": Term(
+            True,
+            "built once, and again when vertices moved",
+            bytes=F * (RAY_STRUCTURE_BYTES + 12) + 36 * V,
+        ),
+        "image": Term(True, f"{spp} samples a pixel{cameras}", B * height * width * spp, B * height * width * C * word),
+        # Its memory is the user's own, or counted with the scene.
+        "textures": Term(textures > 0, f"{textures} to look up" if textures else "no mesh has one"),
+        "kept for backward": Term(
+            any_gradient,
+            "coverage, and which faces were seen" if any_gradient else "nothing requires a gradient",
+            bytes=B * (height * width * word + F),
+        ),
+    }
+
+
+def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[str, Term]:
+    flat, B = Flat(*arguments[:9]), len(arguments[9])
+    height, width = arguments[12:14]
+    varies, visibility = arguments[21:23]
+    V, F, C = len(flat.verts), len(flat.faces), flat.background.shape[-1]
+    E = 3 * F // 2  # edges of a closed mesh
+    image_bytes = B * height * width * C * flat.colors.element_size()
+    verts, colors, uvs, texture, _, world_to_camera, K = wanted
+    moves = verts or world_to_camera or K
+    work = backward_work(varies, visibility, wanted)
+
+    # The kernel counts them itself. It is asked whatever is wanted, for it also checks what render() leaves to it.
+    ones = flat.colors.new_ones((B, height, width, C))
+    seen = flat.faces.new_ones((B, F), dtype=torch.uint8)
+    _, profiles = backward_kernel(ones, ones[..., 0].contiguous(), seen, *arguments, wanted, dry=True)
+    surface, edge, silhouettes, creases = (
+        int(sum(profile[name] for profile in profiles))
+        for name in ("surface_samples", "edge_samples", "silhouettes", "creases")
+    )
+
+    # Why the terms are off, "" where nothing keeps them from running.
+    still = "" if moves else "neither verts nor the camera require a gradient"
+    no_boundary = still or ("" if visibility else "visibility=False")
+    no_interior = ""
+    if not (work.motion or work.appearance):
+        no_interior = "each face has one radiance, wherever it moves" if moves else "nothing asks for it"
+    reasons = [_NAMES[i] for i in (1, 2, 3) if wanted[i]]
+    reasons += ["radiance varies over faces that move"] if work.motion else []
+
+    # Rows of the scatter, an index and doubles: three corners for a run of samples on a face, four texels a sample.
+    face_row = 3 * 32 * work.motion + 3 * (8 + 8 * C) * colors + 3 * 24 * (uvs and not colors)
+    interior_rows = _rows_in_flight(surface, F) * face_row + _in_flight(surface) * 4 * (8 + 8 * C) * texture
+    boundary_rows = _rows_in_flight(edge, silhouettes + creases) * 4 * 32
+    terms = {
+        "view": Term(
+            any(work),
+            "where vertices are and where the loss looks" if any(work) else "nothing asks for it",
+            bytes=image_bytes + 8 * height * width + 41 * V + 24 * V * moves,
+        ),
+        "interior": Term(
+            surface > 0,
+            no_interior or (", ".join(reasons) if surface else "nothing in view"),
+            samples=surface,
+            bytes=8 * F + 2 * V + interior_rows,
+        ),
+        "topology": Term(work.boundary, no_boundary or "edges, found once for a set of faces", bytes=36 * F + 8 * E),
+        "boundary": Term(
+            edge > 0,
+            no_boundary or ("what moves shows where radiance jumps" if edge else "no jump in view"),
+            samples=edge,
+            bytes=F + 8 * E + boundary_rows,
+        ),
+        "silhouettes": Term(
+            silhouettes > 0, no_boundary or (f"{silhouettes:,} in view" if silhouettes else "none in view")
+        ),
+        "creases": Term(
+            creases > 0,
+            no_boundary or (f"{creases:,} in view" if creases else "nothing jumps between neighbours"),
+        ),
+    }
+    for name, i, want in zip(_NAMES, _DIFFERENTIABLE, wanted, strict=True):
+        why = "required; summed in double" if want else "not required"
+        terms[f"{name} gradient"] = Term(want, why, bytes=8 * arguments[i].numel())
+    return terms
+
+
+def _in_flight(samples: int) -> int:
+    """Samples that are in memory at a time."""
+    return min(samples, CHUNK * CHUNKS_IN_FLIGHT * torch.get_num_threads())
+
+
+def _rows_in_flight(samples: int, primitives: int) -> int:
+    """Runs of samples on one primitive: they come in order, so there are no more than primitives and ends of chunks."""
+    samples = _in_flight(samples)
+    return min(samples, primitives + -(-samples // CHUNK))
+
+
+def _bytes_of_copies(scene: Scene, flat: Flat) -> int:
+    """Of the flat arrays that are not the user's own tensors."""
+    tensors = [value for mesh in scene.meshes for value in vars(mesh).values() if value is not None]
+    tensors += [] if scene.background is None else [scene.background]
+    own = {tensor.untyped_storage().data_ptr() for tensor in tensors}
+    copies = {storage.data_ptr(): storage.nbytes() for storage in (tensor.untyped_storage() for tensor in flat)}
+    return sum(size for where, size in copies.items() if where not in own)
+
+
+# -- the profile ------------------------------------------------------------------------------------------------------
+
+# What the kernel measures, in the order of a step.
+_PARTS = (
+    "update", "forward", "view", "surface measure", "surface rays", "surface scatter", "curves", "edge rays",
+    "edge scatter", "world",
+)  # fmt: skip
+_BAR = 24  # characters of a bar of 100 %
+
+
+class Profile(Mapping[str, float]):
+    """Median seconds of each part of a step, by name, and `samples`, how many of each kind. Prints as a table.
+
+    update           the ray structure, and who meets at edges, for vertices that moved
+    forward          the image
+    view             vertices in the image, where the loss looks, and the background's gradient
+    surface …        triangles laid end to end; samples and their rays; adding what they found
+    curves, edge …   the same at edges
+    world            from camera coordinates to the user's arrays
+    python           all the rest: checks and copies of tensors
+    """
+
+    def __init__(self, seconds: Mapping[str, float], samples: Mapping[str, int]) -> None:
+        self._seconds, self.samples = dict(seconds), dict(samples)
+
+    def __getitem__(self, name: str) -> float:
+        try:
+            return self._seconds[name]
+        except KeyError:
+            raise KeyError(f"part: expected one of {', '.join(self._seconds)}, got {name!r}") from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._seconds)
+
+    def __len__(self) -> int:
+        return len(self._seconds)
+
+    @property
+    def seconds(self) -> float:
+        """Of the whole step."""
+        return sum(self.values())
+
+    def __str__(self) -> str:
+        rows = [("part", "ms", "share", "")]
+        for name, seconds in self.items():
+            share = seconds / self.seconds
+            rows.append((name, f"{1e3 * seconds:.2f}", f"{100 * share:.0f} %", "█" * round(_BAR * share)))
+        rows.append(("in all", f"{1e3 * self.seconds:.2f}", "", ""))
+        counts = ", ".join(f"{name.replace('_', ' ')} {count:,}" for name, count in self.samples.items())
+        return _table(rows, "<>><") + "\n" + counts
+
+    __repr__ = __str__
+
+
+def profile(
+    scene: Scene | Mesh,
+    camera: Camera,
+    adjoint: Tensor | None = None,
+    spp: int = 16,
+    seed: int = 0,
+    *,
+    repeats: int = 5,
+    **options: Any,
+) -> Profile:
+    """Where the time of a step goes: vertices that moved, an image, and the gradient of what requires one.
+
+    adjoint   (H, W, C) or (B, H, W, C), ∂loss/∂image; ones when None
+    repeats   steps of which the medians are taken
+
+    The other arguments are those of render(). If nothing requires a gradient, that of the vertices is taken. A batch of
+    cameras counts as one step. Autograd itself is not run, so what it costs is not here. Raises what render() raises.
+    """
+    scene, repeats = as_scene(scene), check_positive_int("repeats", repeats)
+    # What is kept between calls must not help: before each step the vertices are elsewhere, each time somewhere else.
+    arguments = render_arguments(scene, camera, spp, seed, **options)
+    spp_at = 14
+    wanted = requires_grad(arguments)
+    wanted = wanted if any(wanted) else [True] + [False] * 6
+    adjoint = _adjoint(adjoint, camera, arguments)
+
+    runs = []
+    for repeat in range(repeats):
+        elsewhere = arguments[0].detach() * (1.001 + 1e-6 * repeat)
+        forward_kernel(elsewhere, *arguments[1:spp_at], 1, *arguments[spp_at + 1 :])
+        begin = time.perf_counter()
+        step = render_arguments(scene, camera, spp, seed, **options)
+        _, coverage, seen, forward = forward_kernel(*step)
+        _, backward = backward_kernel(adjoint, coverage, seen, *step, wanted)
+        wall = time.perf_counter() - begin
+        done = _sum([*forward, *backward])
+        runs.append({**done, "python": wall - sum(done[part] for part in _PARTS)})
+    seconds = {part: statistics.median(run[part] for run in runs) for part in (*_PARTS, "python")}
+    samples = {
+        "image_samples": adjoint.shape[:-1].numel() * arguments[spp_at],
+        **{name: int(runs[-1][name]) for name in ("surface_samples", "edge_samples", "silhouettes", "creases")},
+    }
+    return Profile(seconds, samples)
+
+
+def _adjoint(adjoint: Tensor | None, camera: Camera, arguments: Sequence[Any]) -> Tensor:
+    """(B, H, W, C), as the kernel reads it. Raises TypeError or ValueError."""
+    flat, B = Flat(*arguments[:9]), len(arguments[9])
+    shape = (*camera.size, flat.background.shape[-1])
+    if adjoint is None:
+        return flat.colors.new_ones((B, *shape))
+    adjoint = as_tensor("adjoint", adjoint, floating=True).detach()
+    check_float("adjoint", adjoint)
+    fix = "it is the derivative of the loss by the image: give it the image's shape"
+    check_shape("adjoint", adjoint, shape if camera.batch is None else (B, *shape), fix=fix)
+    check_finite("adjoint", adjoint)
+    return adjoint.to(flat.colors).reshape(B, *shape).contiguous()
+
+
+def _sum(profiles: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    total: dict[str, float] = {}
+    for profile in profiles:
+        for name, value in profile.items():
+            total[name] = total.get(name, 0.0) + value
+    return total
+
+
+# -- text -------------------------------------------------------------------------------------------------------------
+
+
+def _table(rows: Sequence[Sequence[str]], align: str) -> str:
+    """Rows of text in columns, each aligned to the left (<) or to the right (>)."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    cells = [[f"{cell:{side}{w}s}" for cell, side, w in zip(row, align, widths, strict=True)] for row in rows]
+    return "\n".join("  ".join(row).rstrip() for row in cells)
+
+
+def _count(n: int) -> str:
+    return f"{n:,}" if n else ""
+
+
+def _size(size: int) -> str:
+    """With two or three digits, in powers of 1000."""
+    if size == 0:
+        return ""
+    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if size >= scale:
+            return f"{size / scale:.{0 if size >= 10 * scale else 1}f} {unit}"
+    return f"{size} B"
