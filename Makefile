@@ -22,6 +22,7 @@ test-slow: $(VENV)/.ready
 
 bench: $(VENV)/.ready
 	$(BIN)/python benchmarks/gradient_error.py
+	$(BIN)/python benchmarks/speed.py --out out/speed.json
 
 lint: $(VENV)/.ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[dev,demo,test]"

@@ -1,0 +1,120 @@
+"""What the benchmarks share: the sphere and its adjoint, passes of the kernel and steps of an optimisation with their seconds,
+and converged gradients to compare with."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad.render import Profile, _kernel_camera, _kernel_scene, render_arguments
+from edgegrad.scene import Flat
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from scenes import icosphere, smooth_adjoint
+
+
+def sphere(size: int | tuple[int, int], subdivisions: int = 6) -> tuple[eg.Mesh, eg.Camera, Tensor]:
+    """The icosphere (6: 81,920 faces) with smooth colours in float32, a camera (height, width), a smooth adjoint image."""
+    height, width = (size, size) if isinstance(size, int) else size
+    camera = eg.Camera.look_at((0.9, 0.7, 3.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (height, width))
+    return single(icosphere(subdivisions)), camera, smooth_adjoint(height, width, 3).float()
+
+
+def single(mesh: eg.Mesh) -> eg.Mesh:
+    """A mesh with colours of vertices in float32, as users have them."""
+    assert mesh.colors is not None
+    return mesh.replace(verts=mesh.verts.float(), colors=mesh.colors.float())
+
+
+class Kernel:
+    """A scene before a camera as the kernel takes it: its two passes, without the share of torch and Python."""
+
+    def __init__(self, scene: eg.Scene | eg.Mesh, camera: eg.Camera, adjoint: Tensor, spp: int = 16) -> None:
+        arguments = render_arguments(scene, camera, spp)
+        self.flat, self.spp = Flat(*arguments[:9]), spp
+        self.scene = _kernel_scene(self.flat, arguments[17])
+        self.camera = _kernel_camera(arguments[9][0], arguments[10][0], *arguments[11:14])
+        self.adjoint = adjoint.to(self.flat.colors.dtype).contiguous()
+        self.image = torch.empty_like(self.adjoint)
+        self.coverage = self.adjoint.new_empty(camera.size)
+        self.seen = torch.empty(len(self.flat.faces), dtype=torch.uint8)
+        textured = len(self.flat.textures) > 0
+        like = {
+            "verts": self.flat.verts,
+            "uvs" if textured else "colors": self.flat.uvs if textured else self.flat.colors,
+        }
+        like |= {"texels": self.flat.texels} if textured else {}
+        self.grads = {name: torch.zeros_like(t, dtype=torch.float64) for name, t in like.items()}
+        self.profile: Profile = {}  # of the last pass
+        self.forward()
+
+    def forward(self, threads: int | None = None) -> float:
+        """Seconds; writes `image`."""
+        outputs = self.image.numpy(), self.coverage.numpy(), self.seen.numpy()
+        begin = time.perf_counter()
+        self.profile = self.scene.forward(self.camera, self.spp, "box", 0, threads or torch.get_num_threads(), *outputs)
+        return time.perf_counter() - begin
+
+    def backward(
+        self,
+        surface_samples: int = -1,
+        edge_samples: int = -1,
+        seed: int = 0,
+        *,
+        interior: bool = True,
+        boundary: bool = True,
+        appearance: bool = False,
+        threads: int | None = None,
+    ) -> float:
+        """Seconds; writes `grads`: that of the vertices and, with `appearance`, those of what colours them."""
+        wanted = {name: grad.zero_().numpy() for name, grad in self.grads.items() if appearance or name == "verts"}
+        begin = time.perf_counter()
+        self.profile = self.scene.backward(
+            camera=self.camera, surface_samples=surface_samples, edge_samples=edge_samples, filter="box", seed=seed,
+            threads=threads or torch.get_num_threads(), interior_geometry=interior, boundary=boundary, dry=False,
+            adjoint=self.adjoint.numpy(), coverage=self.coverage.numpy(), seen=self.seen.numpy(), **wanted,
+        )  # fmt: skip
+        return time.perf_counter() - begin
+
+    def gradient(self, surface_samples: int, edge_samples: int, seed: int, **terms: Any) -> tuple[Tensor, float]:
+        """∂(image · adjoint)/∂verts (V, 3) and the seconds of the backward pass."""
+        seconds = self.backward(surface_samples, edge_samples, seed, **terms)
+        return self.grads["verts"].clone(), seconds
+
+    def default_samples(self) -> tuple[int, int]:
+        """On surfaces and at edges, which the kernel takes when it is not told."""
+        self.backward()
+        return int(self.profile["surface_samples"]), int(self.profile["edge_samples"])
+
+    def references(self) -> tuple[Tensor, Tensor]:
+        """Converged gradients (V, 3) of the two terms: 128 times the default surface samples, 512 times the edge samples."""
+        surface, edge = self.default_samples()
+        inside, _ = self.gradient(128 * surface, -1, 991, boundary=False)
+        edges, _ = self.gradient(-1, 512 * edge, 992, interior=False)
+        return inside, edges
+
+
+class Step:
+    """Steps of an optimisation as a user writes them: update after the vertices moved, image, backward."""
+
+    def __init__(self, mesh: eg.Mesh, camera: eg.Camera, adjoint: Tensor) -> None:
+        self.mesh, self.camera, self.adjoint = mesh, camera, adjoint
+        # Vertices elsewhere by a thousandth, so that a step cannot take what the kernel keeps of the last one.
+        self._elsewhere = mesh.replace(verts=mesh.verts * 1.001)
+
+    def __call__(self, spp: int = 16, **options: Any) -> tuple[Tensor, float]:
+        """∂(image · adjoint)/∂verts (V, 3) float64 and the seconds of all."""
+        with torch.no_grad():
+            eg.render(self._elsewhere, self.camera, spp=1)
+        begin = time.perf_counter()
+        verts = self.mesh.verts.detach().clone().requires_grad_()
+        eg.render(self.mesh.replace(verts=verts), self.camera, spp=spp, **options).backward(self.adjoint)
+        seconds = time.perf_counter() - begin
+        assert verts.grad is not None
+        return verts.grad.double(), seconds
