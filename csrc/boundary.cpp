@@ -57,8 +57,12 @@ class BoundaryChunk {
     void cast() {
         rays_.prepare();
         view_.geometry.caster().cast(rays_, rejected_);
-        for (int i = 0; i < rays_.count; ++i)
-            add_sample(curve_[lane_[i].curve], lane_[i], rays_.n(i), rays_.face[i], adjoint_.data() + i * C_);
+        for (int i = 0; i < rays_.count; ++i) {
+            const Vec2 n = rays_.n(i);
+            const int32_t behind = view_.geometry.caster().beyond_float(
+                view_.frame, n, rays_.face[i], rejected_[i], [&](int32_t face) { return meets(view_, face, n); });
+            add_sample(curve_[lane_[i].curve], lane_[i], n, behind, adjoint_.data() + i * C_);
+        }
         rays_.count = curves_ = 0;
     }
 

@@ -135,11 +135,17 @@ class InteriorChunk {
         rays_.prepare();
         view_.geometry.caster().cast(rays_);
         for (int i = 0; i < rays_.count; ++i) {
-            if (rays_.face[i] != face_[i]) continue;
+            if (!sees(i)) continue;
             if (grad_.face() != face_[i]) grad_.flush(), grad_.start(face_[i]);
             grad_.add(rays_.n(i), weighted_.data() + i * C_);
         }
         rays_.count = 0;
+    }
+
+    bool sees(int i) const {
+        if (rays_.face[i] == face_[i]) return true;
+        const auto decide = [&](int32_t face) { return face == face_[i] || meets(view_, face, rays_.n(i)); };
+        return view_.geometry.caster().beyond_float(view_.frame, rays_.n(i), rays_.face[i], {}, decide) == face_[i];
     }
 
     const BackwardView<T>& view_;

@@ -23,6 +23,16 @@ struct BackwardView {
     const uint8_t* seen;  // (F,): whether the forward pass hit the face
 };
 
+// Whether the ray at n meets a face, decided in double.
+template <class T>
+bool meets(const BackwardView<T>& view, int32_t face, Vec2 n) {
+    const int32_t* v = view.scene.faces + 3 * int64_t(face);
+    const auto& q = view.vertices.q;
+    const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
+    Barycentrics b;
+    return barycentrics(face_map(view.camera, corner), n, b) && b.u >= 0 && b.v >= 0 && b.u + b.v <= 1;
+}
+
 // What a run of samples on one face finds. What they have in common is done once for the run: the face's map and its
 // derivative, and one row a corner for the scatter.
 template <int N, class T>

@@ -31,6 +31,7 @@ struct alignas(32) RayPacket {
 };
 
 class RayBatch;
+class RayFrame;
 
 class RayCaster {
    public:
@@ -48,6 +49,13 @@ class RayCaster {
 
     // The same, blind to some faces: those in rejected[i] for ray i.
     void cast(RayBatch& batch, const std::span<const int32_t>* rejected) const;
+
+    // What one ray truly meets, where `face` is what the cast found. Embree decides in float, so near its rim a face
+    // may be hit that the ray misses: at a silhouette of a fine mesh that is a neighbour which is seen less wide than
+    // floats are apart. `meets(face)` decides in double; what it refuses is passed through.
+    template <class Meets>
+    int32_t beyond_float(const RayFrame& frame, Vec2 n, int32_t face, std::span<const int32_t> rejected,
+                         Meets meets) const;
 
    private:
     friend class RayFrame;
@@ -105,5 +113,22 @@ class RayBatch {
     const RayFrame& frame_;
     RayPacket packet_[size / RayPacket::size];
 };
+
+template <class Meets>
+int32_t RayCaster::beyond_float(const RayFrame& frame, Vec2 n, int32_t face, std::span<const int32_t> rejected,
+                                Meets meets) const {
+    if (face < 0 || meets(face)) return face;
+    std::vector<int32_t> blind(rejected.begin(), rejected.end());
+    RayBatch ray(frame);
+    ray.n_x[0] = n.x, ray.n_y[0] = n.y, ray.count = 1;
+    do {
+        blind.push_back(face);
+        const std::span<const int32_t> all = blind;
+        ray.prepare();
+        cast(ray, &all);
+        face = ray.face[0];
+    } while (face >= 0 && !meets(face));
+    return face;
+}
 
 }  // namespace edgegrad

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ._check import as_tensor, check_finite, check_float, check_shape
+from ._check import as_tensor, check_finite, check_float, check_shape, values_visible
 from .mesh import PLAIN, Mesh
 
 
@@ -100,12 +100,19 @@ class Flat(NamedTuple):
     background: Tensor  # (C,) or (H, W, C)
 
 
+def _fits_int32(index: Tensor) -> bool:
+    low, high = torch.aminmax(index)
+    return -(2**31) <= int(low) and int(high) < 2**31
+
+
 def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
     """Indices into `count` rows as indices into all rows, int32. What is out of range stays so, for the kernel to refuse: it
     must not wrap around, nor reach into the rows of another mesh, so unless the mesh is alone it becomes −1."""
     index = index.cpu()
     if alone:
-        index = index.clamp(-1, 2**31 - 1) if index.dtype == torch.int64 else index
+        # A look at the extremes costs less than a copy of a million indices.
+        if index.dtype == torch.int64 and (not values_visible() or not _fits_int32(index)):
+            index = index.clamp(-1, 2**31 - 1)
     else:
         index = torch.where((index >= 0) & (index < count), index + offset, -1)
     return index.to(torch.int32)
