@@ -1,6 +1,7 @@
 // The backward pass: the two terms, and what they found turned into the gradients of the user's arrays.
 
 #include <algorithm>
+#include <numeric>
 #include <vector>
 
 #include "boundary.h"
@@ -89,8 +90,9 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
     to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels;
     dispatch_channels(scene.channels, [&]<int N>() {
         if (o.pixel_spp) {
-            const ForwardOptions pixels{o.pixel_spp, o.filter, o.seed, o.threads};
-            profile.surface[0] = add_interior_of_pixels<N>(view, pixels, adjoint, interior_geometry, to);
+            std::vector<int64_t> pixels(int64_t(camera.width) * camera.height);
+            std::iota(pixels.begin(), pixels.end(), 0);
+            add_pixel_samples<N>(view, pixels, o.pixel_spp, o.seed, nullptr, interior_geometry, to, profile.surface);
         } else if (interior_geometry || grad.appearance()) {
             add_interior<N>(view, interior_geometry, to, profile);
         }

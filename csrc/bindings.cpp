@@ -294,9 +294,10 @@ void bind_scene(nb::module_& m, const char* name) {
                 nb::gil_scoped_release release;
                 const std::vector<uint8_t> seen(scene.faces.shape(0), 1);
                 GeometryWork work;
-                return render_backward(scene.view(), camera, *scene.geometry(false, threads, work), options,
-                                       adjoint.data(), ForwardView<T>{nullptr, seen.data()}, grad)
-                    .surface[0];
+                const BackwardProfile p =
+                    render_backward(scene.view(), camera, *scene.geometry(false, threads, work), options,
+                                    adjoint.data(), ForwardView<T>{nullptr, seen.data()}, grad);
+                return p.surface[0] + p.surface[1];
             },
             "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a, "adjoint"_a.noconvert(), "verts"_a.noconvert(),
             "colors"_a = nb::none())

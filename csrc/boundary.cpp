@@ -193,7 +193,7 @@ void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile&
     const int64_t n = o.edge_samples >= 0 ? o.edge_samples : int64_t(std::ceil(samples_per_pixel * total));
     profile.edge_samples = n;
     if (o.dry) return;
-    systematic.draw(n, to_unit(hash(o.seed, 3)));
+    systematic.draw(n, to_unit(hash(o.seed, 3, gradient_stream)));
     scatter_samples(n, o.threads, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         BoundaryChunk<N, T> chunk(view, grad);
         Curve curve;

@@ -66,6 +66,9 @@ class FilteredAdjoint {
     FilteredAdjoint(const T* adjoint, const SceneView<T>& scene, Filter filter, int width, int height)
         : A_(adjoint), scene_(scene), filter_(filter), width_(width), height_(height) {}
 
+    // A of a pixel, C numbers.
+    const T* of(int64_t pixel) const { return A_ + pixel * scene_.channels; }
+
     // Ã(x), C numbers; false where it is zero in all channels.
     template <int N>
     bool at(Vec2 x, double* out) const {

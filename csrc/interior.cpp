@@ -30,6 +30,42 @@ constexpr double hidden = 1.0 / 8;
 // (docs/performance.md).
 constexpr double colored = 0.5, textured = 4;
 
+// From this area in the image on, px², a triangle with a texture is left to samples of the pixels. Each triangle's
+// integral is estimated in exactly one way, chosen before any sample is drawn, so the sum stays unbiased.
+constexpr double large = 256;
+
+struct VisiblePolygon;
+
+// The pixels that large triangles may touch, by tiles.
+class PixelMask {
+   public:
+    PixelMask(const Camera& camera, double radius)
+        : width_(camera.width),
+          height_(camera.height),
+          radius_(radius),
+          columns_((camera.width + tile - 1) / tile),
+          marked_(size_t(columns_) * ((camera.height + tile - 1) / tile), 0) {}
+
+    void mark(const VisiblePolygon& polygon);
+
+    std::vector<int64_t> pixels() const {
+        std::vector<int64_t> out;
+        for (size_t t = 0; t < marked_.size(); ++t)
+            if (marked_[t])
+                for (int y = int(t) / columns_ * tile; y < std::min((int(t) / columns_ + 1) * tile, height_); ++y)
+                    for (int x = int(t) % columns_ * tile; x < std::min((int(t) % columns_ + 1) * tile, width_); ++x)
+                        out.push_back(int64_t(y) * width_ + x);
+        return out;
+    }
+
+   private:
+    static constexpr int tile = 16;
+    int width_, height_;
+    double radius_;
+    int columns_;
+    std::vector<uint8_t> marked_;
+};
+
 // The part of a triangle inside the view: a convex polygon in the image.
 struct VisiblePolygon {
     Vec2 corner[ViewVolume::most_corners];
@@ -72,6 +108,15 @@ struct VisiblePolygon {
         return area > 0;
     }
 };
+
+void PixelMask::mark(const VisiblePolygon& polygon) {
+    const auto index = [](double x, int most) { return int(std::clamp(std::floor(x), 0.0, double(most - 1))) / tile; };
+    const int i0 = index(polygon.low.x - radius_, width_), i1 = index(polygon.high.x + radius_, width_);
+    const int j0 = index(polygon.low.y - radius_, height_), j1 = index(polygon.high.y + radius_, height_);
+    for (int j = j0; j <= j1; ++j)
+        for (int i = i0; i <= i1; ++i)
+            std::atomic_ref(marked_[size_t(j) * columns_ + i]).store(1, std::memory_order_relaxed);
+}
 
 // Points uniform over a polygon, along a curve that fills its triangles one after the other.
 class PolygonSampler {
@@ -198,7 +243,10 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
     std::vector<double> measure(F);
     // The sum that chooses the number of samples is taken in blocks, as in Systematic, to be the same at any threads.
     const int64_t block = 4096, blocks = (F + block - 1) / block;
-    std::vector<double> size(blocks, 0.0);
+    std::vector<double> size(blocks, 0.0), size_of_large(blocks, 0.0);
+    const bool any_texture = view.scene.face_texture;
+    std::vector<uint8_t> is_large(any_texture ? F : 0, 0);
+    PixelMask mask(view.camera, o.filter.radius() - 0.5);
 #pragma omp parallel num_threads(o.threads)
     {
         VisiblePolygon polygon;
@@ -212,21 +260,38 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
                 const bool expected = near_seen[v[0]] | near_seen[v[1]] | near_seen[v[2]];
                 const double m = (polygon.area + polygon.longest) * (expected ? 1 : hidden) *
                                  (is_textured(view.scene, f) ? textured : colored);
+                if (is_textured(view.scene, f) && polygon.area >= large) {
+                    is_large[f] = 1;
+                    mask.mark(polygon);
+                    if (std::isfinite(m)) size_of_large[k] += m;
+                    continue;
+                }
                 measure[f] = m * importance;
                 if (std::isfinite(m)) size[k] += m;
             }
     }
-    double total = 0;
-    for (const double s : size) total += s;
+    double total = 0, total_of_large = 0;
+    for (int64_t k = 0; k < blocks; ++k) total += size[k], total_of_large += size_of_large[k];
+    // How often each is sampled: as the defaults, or in proportion to them.
+    const double wanted = o.surface_samples >= 0 ? double(o.surface_samples) / (total + total_of_large) : 1;
     Systematic systematic(measure, o.threads);
     profile.measure = watch.lap();
+
+    if (total_of_large > 0) {
+        const std::vector<int64_t> pixels = mask.pixels();
+        const int spp = int(std::clamp(std::round(wanted * total_of_large / double(pixels.size())), 1.0, 0x1p20));
+        profile.surface_samples = spp * int64_t(pixels.size());
+        if (!o.dry)
+            add_pixel_samples<N>(view, pixels, spp, hash(o.seed, 4, gradient_stream), is_large.data(), geometry, to,
+                                 profile.surface);
+    }
     if (!(systematic.total() > 0)) return;
 
-    const int64_t n = o.surface_samples >= 0 ? o.surface_samples : int64_t(std::ceil(total));
-    profile.surface_samples = n;
+    const int64_t n = o.surface_samples >= 0 ? std::max(1ll, std::llround(wanted * total)) : int64_t(std::ceil(total));
+    profile.surface_samples += n;
     if (o.dry) return;
-    systematic.draw(n, to_unit(hash(o.seed, 1)));
-    const ShiftedSequence sequence(hash(o.seed, 2));
+    systematic.draw(n, to_unit(hash(o.seed, 1, gradient_stream)));
+    const ShiftedSequence sequence(hash(o.seed, 2, gradient_stream));
     scatter_samples(n, o.threads, to, profile.surface, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         InteriorChunk<N, T> chunk(view, geometry, to, grad);
         VisiblePolygon polygon;

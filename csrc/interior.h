@@ -100,9 +100,9 @@ class FaceGrad {
 template <int N, class T>
 void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, BackwardProfile& profile);
 
-// The same from `spp` samples a pixel, as other renderers take them; for the benchmarks. Returns the seconds it took.
+// Adds what `spp` samples in each of some pixels find on the faces marked in `faces` (F,), or on all if it is null.
 template <int N, class T>
-double add_interior_of_pixels(const BackwardView<T>& view, const ForwardOptions& options, const T* adjoint,
-                              bool geometry, Destination& to);
+void add_pixel_samples(const BackwardView<T>& view, const std::vector<int64_t>& pixels, int spp, uint64_t seed,
+                       const uint8_t* faces, bool geometry, Destination& to, double (&seconds)[2]);
 
 }  // namespace edgegrad

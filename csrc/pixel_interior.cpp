@@ -1,7 +1,9 @@
-// The yardstick for interior.cpp: the interior term from the samples of the pixels, as other renderers take it.
+// The interior term from samples of the pixels: rays as in the forward pass, with a seed of their own, and the radiance
+// where they hit differentiated with the weight A / spp.
 //
-// The rays of the forward pass are cast again and the radiance where they hit is differentiated with the weight A /
-// spp. A face that is seen at a grazing angle, or that is smaller than a pixel, is hit by chance.
+// For a large triangle with a texture this beats surface samples: its rays are the most coherent there are, and those
+// of a pixel are spread evenly over it. For others it is poor: a triangle that is seen at a grazing angle, or is
+// smaller than a pixel, is hit by chance.
 
 #include <algorithm>
 #include <vector>
@@ -11,43 +13,45 @@
 namespace edgegrad {
 
 template <int N, class T>
-double add_interior_of_pixels(const BackwardView<T>& view, const ForwardOptions& o, const T* adjoint, bool geometry,
-                              Destination& to) {
+void add_pixel_samples(const BackwardView<T>& view, const std::vector<int64_t>& pixels, int spp, uint64_t seed,
+                       const uint8_t* faces, bool geometry, Destination& to, double (&seconds)[2]) {
     const int C = N ? N : view.scene.channels, width = view.camera.width;
-    const int64_t pixels = int64_t(width) * view.camera.height;
-    const PixelRays pixel_rays(view.camera, o);
-    double seconds[2] = {0, 0};
-    scatter_samples(pixels, o.threads, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        // Faces in a pixel take turns and come again in the next one: some runs are kept open.
-        std::vector<FaceGrad<N, T>> open(32, FaceGrad<N, T>(view, geometry, to, grad));
-        std::vector<double> bar(C);
-        RayBatch rays(view.frame);
-        for (int64_t pixel = first; pixel < last; ++pixel) {
-            for (int c = 0; c < C; ++c) bar[c] = double(adjoint[pixel * C + c]) / o.spp;
-            for (int done = 0; done < o.spp; done += RayBatch::size) {
-                rays.count = 0;
-                pixel_rays.append(int(pixel % width), int(pixel / width), done, std::min(o.spp - done, RayBatch::size),
-                                  rays);
-                rays.prepare();
-                view.geometry.caster().cast(rays);
-                for (int i = 0; i < rays.count; ++i) {
-                    const int32_t face = rays.face[i];
-                    if (face < 0) continue;
-                    FaceGrad<N, T>& run = open[unsigned(face) % open.size()];
-                    if (run.face() != face) run.flush(), run.start(face);
-                    run.add(rays.n(i), bar.data());
-                }
-            }
-        }
-        for (FaceGrad<N, T>& run : open) run.flush();
-    });
-    return seconds[0] + seconds[1];
+    const ForwardOptions options{spp, view.options.filter, seed, view.options.threads};
+    const PixelRays pixel_rays(view.camera, options);
+    scatter_samples(int64_t(pixels.size()), options.threads, to, seconds,
+                    [&](int64_t first, int64_t last, ChunkGrad& grad) {
+                        // Faces in a pixel take turns and come again in the next one: some runs are kept open.
+                        std::vector<FaceGrad<N, T>> open(32, FaceGrad<N, T>(view, geometry, to, grad));
+                        std::vector<double> bar(C);
+                        RayBatch rays(view.frame);
+                        for (int64_t p = first; p < last; ++p) {
+                            const int64_t pixel = pixels[p];
+                            const T* A = view.adjoint.of(pixel);
+                            if (std::all_of(A, A + C, [](T a) { return a == 0; })) continue;
+                            for (int c = 0; c < C; ++c) bar[c] = double(A[c]) / spp;
+                            for (int done = 0; done < spp; done += RayBatch::size) {
+                                rays.count = 0;
+                                pixel_rays.append(int(pixel % width), int(pixel / width), done,
+                                                  std::min(spp - done, RayBatch::size), rays);
+                                rays.prepare();
+                                view.geometry.caster().cast(rays);
+                                for (int i = 0; i < rays.count; ++i) {
+                                    const int32_t face = rays.face[i];
+                                    if (face < 0 || (faces && !faces[face])) continue;
+                                    FaceGrad<N, T>& run = open[unsigned(face) % open.size()];
+                                    if (run.face() != face) run.flush(), run.start(face);
+                                    run.add(rays.n(i), bar.data());
+                                }
+                            }
+                        }
+                        for (FaceGrad<N, T>& run : open) run.flush();
+                    });
 }
 
 // clang-format off
 #define EDGEGRAD_INSTANTIATE(N) \
-    template double add_interior_of_pixels<N, float>(const BackwardView<float>&, const ForwardOptions&, const float*, bool, Destination&); \
-    template double add_interior_of_pixels<N, double>(const BackwardView<double>&, const ForwardOptions&, const double*, bool, Destination&);
+    template void add_pixel_samples<N, float>(const BackwardView<float>&, const std::vector<int64_t>&, int, uint64_t, const uint8_t*, bool, Destination&, double (&)[2]); \
+    template void add_pixel_samples<N, double>(const BackwardView<double>&, const std::vector<int64_t>&, int, uint64_t, const uint8_t*, bool, Destination&, double (&)[2]);
 EDGEGRAD_INSTANTIATE(0)
 EDGEGRAD_INSTANTIATE(1)
 EDGEGRAD_INSTANTIATE(3)

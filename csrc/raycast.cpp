@@ -1,6 +1,7 @@
 #include "raycast.h"
 
 #ifdef _WIN32
+#define NOMINMAX
 #include <windows.h>
 #else
 #include <dlfcn.h>

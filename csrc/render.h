@@ -74,7 +74,7 @@ struct BackwardOptions {
     bool boundary;
     double spacing;     // relative spacing of the numbers in which the user gave the vertices
     bool dry;           // only count the samples
-    int pixel_spp = 0;  // if not zero, the interior term from so many samples a pixel: a yardstick for the benchmarks
+    int pixel_spp = 0;  // if not zero, all of the interior term from so many samples a pixel, for the benchmarks
 };
 
 // What a backward pass did, and the seconds that each part took.

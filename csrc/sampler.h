@@ -19,6 +19,9 @@ inline uint64_t hash(uint64_t seed, uint64_t a, uint64_t b = 0) {
     return mix(mix(mix(seed + 0x9e3779b97f4a7c15ull) + a + 0x9e3779b97f4a7c15ull) + b + 0x9e3779b97f4a7c15ull);
 }
 
+// Second argument of the hashes for the gradient's samples, so that they never meet those of a pixel of the image.
+constexpr uint64_t gradient_stream = 1;
+
 // The middle of one of 2⁵² equal cells of (0, 1): the bits as the fraction of a number between 1 and 2.
 inline double to_unit(uint64_t bits) {
     return std::bit_cast<double>(bits >> 12 | 0x3ff0000000000000ull) - (1 - 0x1p-53);

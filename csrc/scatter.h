@@ -25,7 +25,7 @@ class RowBuffer {
         // Runs of 32 destinations in turn, which balances and keeps owners apart in cache lines.
         Rows& r = rows_[rows_.size() > 1 ? uint32_t(index >> 5) % uint32_t(rows_.size()) : 0];
         if (r.count == r.index.size()) {
-            r.index.resize(std::max<size_t>(64, 2 * r.count));
+            r.index.resize(std::max<size_t>(16, 2 * r.count));
             r.value.resize(r.index.size() * width_);
         }
         r.index[r.count] = index;
@@ -66,8 +66,8 @@ struct Destination {
 // samples and of the adding.
 template <class Body>
 void scatter_samples(int64_t n, int threads, Destination& to, double (&seconds)[2], Body body) {
-    const int owners = std::max(1, threads);
-    const int64_t chunk = 512, wave = 16 * owners;
+    const int64_t chunk = 512, wave = 16 * std::max(1, threads);
+    const int owners = std::clamp(threads, 1, 16);  // more would only split the buffers further
     std::vector<ChunkGrad> grads(std::min(wave, (n + chunk - 1) / chunk));
     for (ChunkGrad& g : grads) {
         g.q.prepare(3, owners), g.uvs.prepare(2, owners);

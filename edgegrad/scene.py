@@ -102,7 +102,7 @@ class Flat(NamedTuple):
 
 def _fits_int32(index: Tensor) -> bool:
     low, high = torch.aminmax(index)
-    return -(2**31) <= int(low) and int(high) < 2**31
+    return int(low) >= -(2**31) and int(high) < 2**31
 
 
 def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:

@@ -50,7 +50,9 @@ def test_edge_that_crosses_the_camera_plane() -> None:
     camera = eg.Camera.look_at((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), 60.0, (48, 48)).to(F64)
     verts = torch.tensor([[-1.1, -0.9, 1.5], [0.35, -0.8, 1.2], [0.4, 0.9, -6.0]], dtype=F64)
     mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2]]), colors=smooth_colors(verts))
-    check_ratio(moving(mesh, camera, torch.tensor([0.9, 0.3, 0.2], dtype=F64)), 0.006, spp=2048, **SAMPLES)
+    # A step of 0.012 is 12 % off, of 0.006 2 %, of 0.003 0.5 %: the loss curves strongly there.
+    case = moving(mesh, camera, torch.tensor([0.9, 0.3, 0.2], dtype=F64))
+    check_ratio(case, 0.003, spp=8192, seeds=8, **SAMPLES)
 
     def vertex_behind(theta: Tensor):
         move = torch.zeros_like(verts)

@@ -76,14 +76,30 @@ def test_nothing_is_measured_twice(measured, monkeypatch, capsys):
     assert "15 points are there" in capsys.readouterr().out
 
 
-def test_other_settings_do_not_mix(measured, capsys):
+def test_other_settings_do_not_mix_and_keep_what_there_was(measured, capsys):
     files = {path: path.read_bytes() for path in measured.iterdir()}
-    error_time(measured, ["triangle"], ["interior"], size=16, seeds=2, quick=True)
-    assert "of other settings (size); kept as error-time.previous.json" in capsys.readouterr().out
-    assert {point["method"] for point in document(measured)["points"]} == {"interior"}
+    for size in (16, 20):
+        error_time(measured, ["triangle"], ["interior"], size=size, seeds=2, quick=True)
+        assert "of other settings (size); kept as error-time." in capsys.readouterr().out
+        assert {point["method"] for point in document(measured)["points"]} == {"interior"}
+    # The first settings again: their points come back.
+    assert run(*ASKED, "--out", measured) == 0
+    assert "15 points are there and not measured again" in capsys.readouterr().out
+    assert document(measured) == json.loads(files[measured / "error-time.json"])
+    for path in set(measured.iterdir()) - set(files):
+        path.unlink()
     for path, content in files.items():
         path.write_bytes(content)
-    (measured / "error-time.previous.json").unlink()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"settings": {}, "points": []}', '{"settings": {}, "scenes": {}, "points": [{}]}']
+)
+def test_a_file_of_something_else_is_refused(tmp_path, text, capsys):
+    (tmp_path / "error-time.json").write_text(text)
+    assert run("--scene", "triangle", "--quick", "--out", tmp_path) == 2
+    assert "expected what an earlier run wrote" in capsys.readouterr().err
+    assert (tmp_path / "error-time.json").read_text() == text
 
 
 def test_ctrl_c_keeps_what_is_measured(tmp_path, monkeypatch, capsys):
@@ -163,7 +179,7 @@ def test_scan_is_left_out_without_a_mesh(tmp_path, monkeypatch, capsys):
 def test_references_agree():
     """Exact integrals and long runs know nothing of each other; each term within 5 standard errors of the runs."""
     scene = scenes.build("triangle", 32)
-    a, b = exact(scene), long_run(scene, references.Effort(1 << 18, 1 << 16, 1.0, runs=4))
+    a, b = exact(scene), long_run(scene, references.Effort(1 << 18, 1 << 16, 1.0, runs=12))
     norm = float(a.metrics(scene)["vertex"].norm())
     for part in references.PARTS:
         for name, correct in a.metrics(scene, part).items():

@@ -103,26 +103,38 @@ class _Run:
         tqdm.write(text)
 
     def _resume(self, now: dict[str, Any]) -> Document:
-        fresh: Document = {"settings": now, "scenes": {}, "points": []}
-        if not self.file.exists():
-            return fresh
+        """What is there of these settings. What is there of others steps aside under a name of its own, until they come again."""
+        if self.file.exists():
+            before = self._read(self.file)
+            if before["settings"] == now:
+                self.say(f"{self.file}: {len(before['points'])} points are there and not measured again")
+                return before
+            old = before["settings"]
+            differ = sorted(key for key in old.keys() | now.keys() if old.get(key) != now.get(key))
+            os.replace(self.file, self._aside(old))
+            self.say(f"{self.file}: of other settings ({', '.join(differ)}); kept as {self._aside(old).name}")
+        if self._aside(now).exists():
+            before = self._read(self._aside(now))
+            self.say(f"{self._aside(now)}: {len(before['points'])} points are there and not measured again")
+            os.replace(self._aside(now), self.file)
+            return before
+        return {"settings": now, "scenes": {}, "points": []}
+
+    def _aside(self, settings: dict[str, Any]) -> Path:
+        key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+        return self.out / f"{NAME}.{key}.json"
+
+    def _read(self, file: Path) -> Document:
         try:
-            before = json.loads(self.file.read_text(encoding="utf-8"))
-            old = dict(before["settings"])
-            known = len(before["points"])
+            document = json.loads(file.read_text(encoding="utf-8"))
+            _ = dict(document["settings"]), dict(document["scenes"])
+            _ = [(point["scene"], point["method"], point["version"]) for point in document["points"]]
+            return document
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
-                f"{self.file}: expected what an earlier run wrote, got something else ({error!r}); "
+                f"{file}: expected what an earlier run wrote, got something else ({error!r}); "
                 "remove it or choose another folder"
             ) from error
-        if old == now:
-            self.say(f"{self.file}: {known} points are there and not measured again")
-            return before
-        differ = sorted(key for key in old.keys() | now.keys() if old.get(key) != now.get(key))
-        aside = self.out / f"{NAME}.previous.json"
-        os.replace(self.file, aside)
-        self.say(f"{self.file}: of other settings ({', '.join(differ)}); kept as {aside.name}")
-        return fresh
 
     def write(self) -> None:
         with replacing(self.file) as temporary:
