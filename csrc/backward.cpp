@@ -12,38 +12,35 @@ namespace edgegrad {
 
 namespace {
 
-constexpr int64_t block = 4096;  // fixed, so that sums are rounded alike at any number of threads
-
 // δI = (1 − coverage) δbackground, pixel by pixel: exact for the image that the forward pass made.
 template <class T>
-void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint, const T* coverage, int threads,
+void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint, const T* coverage, Team& team,
                     double* grad) {
     const int C = scene.channels;
     if (scene.background_is_image) {
-#pragma omp parallel for num_threads(threads) schedule(static)
-        for (int64_t p = 0; p < pixels; ++p)
-            for (int c = 0; c < C; ++c) grad[p * C + c] += (1 - double(coverage[p])) * adjoint[p * C + c];
+        team.each_block(pixels, [&](int64_t, int64_t first, int64_t last) {
+            for (int64_t p = first; p < last; ++p)
+                for (int c = 0; c < C; ++c) grad[p * C + c] += (1 - double(coverage[p])) * adjoint[p * C + c];
+        });
         return;
     }
-    const int64_t blocks = (pixels + block - 1) / block;
-    std::vector<double> sum(blocks * C, 0.0);
-#pragma omp parallel for num_threads(threads) schedule(static)
-    for (int64_t k = 0; k < blocks; ++k)
-        for (int64_t p = k * block; p < std::min(pixels, (k + 1) * block); ++p)
+    std::vector<double> sum(Team::blocks(pixels) * C, 0.0);
+    team.each_block(pixels, [&](int64_t k, int64_t first, int64_t last) {
+        for (int64_t p = first; p < last; ++p)
             for (int c = 0; c < C; ++c) sum[k * C + c] += (1 - double(coverage[p])) * adjoint[p * C + c];
-    for (int64_t k = 0; k < blocks; ++k)
+    });
+    for (int64_t k = 0; k < Team::blocks(pixels); ++k)
         for (int c = 0; c < C; ++c) grad[c] += sum[k * C + c];
 }
 
 }  // namespace
 
-void add_world(const Camera& camera, const double* verts, const std::vector<double>& q_bar, int threads,
+void add_world(const Camera& camera, const double* verts, const std::vector<double>& q_bar, Team& team,
                const SceneGrad& grad) {
-    const int64_t V = q_bar.size() / 3, blocks = (V + block - 1) / block;
+    const int64_t V = q_bar.size() / 3, blocks = Team::blocks(V);
     std::vector<double> sum(grad.world_to_camera ? 12 * blocks : 0, 0.0);
-#pragma omp parallel for num_threads(threads) schedule(static)
-    for (int64_t k = 0; k < blocks; ++k)
-        for (int64_t v = k * block; v < std::min(V, (k + 1) * block); ++v) {
+    team.each_block(V, [&](int64_t k, int64_t first, int64_t last) {
+        for (int64_t v = first; v < last; ++v) {
             const double *q = q_bar.data() + 3 * v, *p = verts + 3 * v;
             if (grad.verts) {
                 const Vec3 p_bar = transposed_times(camera.R, {q[0], q[1], q[2]});
@@ -55,6 +52,7 @@ void add_world(const Camera& camera, const double* verts, const std::vector<doub
                     sum[12 * k + 4 * i + 3] += q[i];
                 }
         }
+    });
     if (grad.world_to_camera)
         for (int64_t k = 0; k < blocks; ++k)
             for (int i = 0; i < 12; ++i) grad.world_to_camera[i] += sum[12 * k + i];
@@ -62,24 +60,23 @@ void add_world(const Camera& camera, const double* verts, const std::vector<doub
 
 template <class T>
 BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry,
-                                const BackwardOptions& o, const T* adjoint, const ForwardView<T>& forward,
+                                const BackwardOptions& o, Team& team, const T* adjoint, const ForwardView<T>& forward,
                                 const SceneGrad& grad) {
     BackwardProfile profile;
     Stopwatch watch;
     if (grad.background)
-        add_background(scene, int64_t(camera.width) * camera.height, adjoint, forward.coverage, o.threads,
-                       grad.background);
+        add_background(scene, int64_t(camera.width) * camera.height, adjoint, forward.coverage, team, grad.background);
 
     const bool interior_geometry = grad.geometry() && o.interior_geometry, boundary = grad.geometry() && o.boundary;
     if (!interior_geometry && !boundary && !grad.appearance()) return profile;
 
     const ViewVolume volume(camera, o.filter.radius() - 0.5);
-    const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, o.threads);
+    const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, team);
     const FilteredAdjoint<T> filtered(adjoint, scene, o.filter, camera.width, camera.height);
-    const Importance importance(adjoint, camera.width, camera.height, scene.channels, o.filter.radius() - 0.5,
-                                o.threads);
+    const Importance importance(adjoint, camera.width, camera.height, scene.channels, o.filter.radius() - 0.5, team);
     const RayFrame frame(geometry.caster(), camera);
-    const BackwardView<T> view{scene, camera, geometry, volume, vertices, filtered, importance, o, frame, forward.seen};
+    const BackwardView<T> view{scene,      camera, geometry, volume, vertices,    filtered,
+                               importance, o,      team,     frame,  forward.seen};
     profile.view = watch.lap();
 
     std::vector<double> q_bar(grad.geometry() ? 3 * scene.n_verts : 0, 0.0);
@@ -99,7 +96,7 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
         if (boundary) add_boundary<N>(view, to, profile);
     });
     watch.lap();
-    if (grad.geometry()) add_world(camera, scene.verts, q_bar, o.threads, grad);
+    if (grad.geometry()) add_world(camera, scene.verts, q_bar, team, grad);
     if (grad.K)
         for (int i = 0; i < 6; ++i) grad.K[i] += to.k[i];
     profile.world = watch.lap();
@@ -107,10 +104,10 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
 }
 
 template BackwardProfile render_backward(const SceneView<float>&, const Camera&, const Geometry&,
-                                         const BackwardOptions&, const float*, const ForwardView<float>&,
+                                         const BackwardOptions&, Team&, const float*, const ForwardView<float>&,
                                          const SceneGrad&);
 template BackwardProfile render_backward(const SceneView<double>&, const Camera&, const Geometry&,
-                                         const BackwardOptions&, const double*, const ForwardView<double>&,
+                                         const BackwardOptions&, Team&, const double*, const ForwardView<double>&,
                                          const SceneGrad&);
 
 }  // namespace edgegrad

@@ -1,6 +1,7 @@
 // The yardstick of the benchmarks: the rays of the forward pass, made beforehand, cast and nothing else.
 
 #include <algorithm>
+#include <numeric>
 #include <vector>
 
 #include "render.h"
@@ -8,17 +9,15 @@
 
 namespace edgegrad {
 
-double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOptions& o) {
+double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOptions& o, Team& team) {
     constexpr int tile = 16;
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + tile - 1) / tile;
     const RayFrame frame(caster, camera);
     const PixelRays pixel_rays(camera, o);
-    double seconds = 0;
-#pragma omp parallel num_threads(o.threads) reduction(+ : seconds)
-    {
-        std::vector<RayBatch> batches;
-#pragma omp for schedule(dynamic, 1)
-        for (int64_t t = 0; t < int64_t(tiles_x) * tiles_y; ++t) {
+    std::vector<double> seconds(int64_t(tiles_x) * tiles_y);
+    team.each_with(
+        seconds.size(), [] { return std::make_unique<std::vector<RayBatch>>(); },
+        [&](std::vector<RayBatch>& batches, int64_t t) {
             const int x0 = int(t % tiles_x) * tile, y0 = int(t / tiles_x) * tile;
             batches.clear();
             for (int y = y0; y < std::min(y0 + tile, camera.height); ++y)
@@ -34,10 +33,9 @@ double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOpt
             for (RayBatch& rays : batches) rays.prepare();
             Stopwatch watch;
             for (RayBatch& rays : batches) caster.intersect(rays);
-            seconds += watch.lap();
-        }
-    }
-    return seconds / std::max(1, o.threads);
+            seconds[t] = watch.lap();
+        });
+    return std::accumulate(seconds.begin(), seconds.end(), 0.0) / team.threads();
 }
 
 }  // namespace edgegrad

@@ -146,9 +146,9 @@ struct SceneArrays {
                 int(background.shape(2))};
     }
 
-    std::shared_ptr<const Geometry> geometry(bool want_topology, int threads, GeometryWork& work) const {
+    std::shared_ptr<const Geometry> geometry(bool want_topology, Team& team, GeometryWork& work) const {
         return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, want_topology,
-                                threads, work);
+                                team, work);
     }
 };
 
@@ -185,6 +185,24 @@ void check_background(const SceneArrays<T>& scene, const Camera& camera) {
                std::to_string(b.shape(1)));
 }
 
+// Whether a signal handler of Python raised, as that of Ctrl-C does.
+bool interrupted() {
+    nb::gil_scoped_acquire acquire;
+    return PyErr_CheckSignals() != 0;
+}
+
+// Calls f(team) without the interpreter's lock.
+template <class F>
+auto unlocked(int threads, F f) {
+    try {
+        nb::gil_scoped_release release;
+        Team team(threads, interrupted);
+        return f(team);
+    } catch (const Interrupted&) {
+        throw nb::python_error();  // that of the handler
+    }
+}
+
 // What a pass did, by name: counts, and seconds.
 using Profile = std::map<std::string, double>;
 
@@ -201,15 +219,16 @@ Profile forward(const SceneArrays<T>& scene, const Camera& camera, int spp, cons
     check_background(scene, camera);
     check_image("image", image, camera, scene.background.shape(2));
     check_forward_output(scene, camera, coverage, seen);
-    const ForwardOptions options{spp, make_filter(filter), seed, threads};
-    nb::gil_scoped_release release;
-    Stopwatch watch;
-    GeometryWork work;
-    const auto geometry = scene.geometry(false, threads, work);
-    const double update = watch.lap();
-    render_forward(scene.view(), camera, geometry->caster(), options,
-                   ForwardOutput<T>{image.data(), coverage.data(), seen.data()});
-    return {{"update", update}, {"forward", watch.lap()}, {"built rays", work.rays}};
+    const ForwardOptions options{spp, make_filter(filter), seed};
+    return unlocked(threads, [&](Team& team) -> Profile {
+        Stopwatch watch;
+        GeometryWork work;
+        const auto geometry = scene.geometry(false, team, work);
+        const double update = watch.lap();
+        render_forward(scene.view(), camera, geometry->caster(), options, team,
+                       ForwardOutput<T>{image.data(), coverage.data(), seen.data()});
+        return {{"update", update}, {"forward", watch.lap()}, {"built rays", work.rays}};
+    });
 }
 
 template <class T>
@@ -236,15 +255,17 @@ Profile backward(const SceneArrays<T>& scene, const Camera& camera, int64_t surf
     if (K && K->size() != 9) refuse("gradient of K: expected shape (3, 3)");
     grad.world_to_camera = world_to_camera ? world_to_camera->data() : nullptr;
     grad.K = K ? K->data() : nullptr;
-    const BackwardOptions options{surface_samples,   edge_samples, make_filter(filter), seed, threads,
+    const BackwardOptions options{surface_samples,   edge_samples, make_filter(filter), seed,
                                   interior_geometry, boundary,     scene.spacing,       dry};
-    nb::gil_scoped_release release;
-    Stopwatch watch;
     GeometryWork work;
-    const auto geometry = scene.geometry(grad.geometry() && boundary, threads, work);
-    const double update = watch.lap();
-    const BackwardProfile p = render_backward(scene.view(), camera, *geometry, options, adjoint.data(),
-                                              ForwardView<T>{coverage.data(), seen.data()}, grad);
+    double update = 0;
+    const BackwardProfile p = unlocked(threads, [&](Team& team) {
+        Stopwatch watch;
+        const auto geometry = scene.geometry(grad.geometry() && boundary, team, work);
+        update = watch.lap();
+        return render_backward(scene.view(), camera, *geometry, options, team, adjoint.data(),
+                               ForwardView<T>{coverage.data(), seen.data()}, grad);
+    });
     return {{"surface_samples", double(p.surface_samples)},
             {"edge_samples", double(p.edge_samples)},
             {"silhouettes", double(p.silhouettes)},
@@ -277,27 +298,30 @@ void bind_scene(nb::module_& m, const char* name) {
             "bare_loop",
             [](const Scene& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed,
                int threads) {
-                const ForwardOptions options{spp, make_filter(filter), seed, threads};
-                nb::gil_scoped_release release;
-                GeometryWork work;
-                return bare_loop(camera, scene.geometry(false, threads, work)->caster(), options);
+                const ForwardOptions options{spp, make_filter(filter), seed};
+                return unlocked(threads, [&](Team& team) {
+                    GeometryWork work;
+                    return bare_loop(camera, scene.geometry(false, team, work)->caster(), options, team);
+                });
             },
             "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a)
         .def(
             "pixel_backward",
             [](const Scene& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed, int threads,
                Out<T, 3> adjoint, Out<double, 2> verts, std::optional<Out<double, 2>> colors) {
-                BackwardOptions options{-1, -1, make_filter(filter), seed, threads, true, false, scene.spacing, false};
+                BackwardOptions options{-1, -1, make_filter(filter), seed, true, false, scene.spacing, false};
                 options.pixel_spp = spp;
                 SceneGrad grad;
                 grad.verts = verts.data(), grad.colors = colors ? colors->data() : nullptr;
-                nb::gil_scoped_release release;
-                const std::vector<uint8_t> seen(scene.faces.shape(0), 1);
-                GeometryWork work;
-                const BackwardProfile p =
-                    render_backward(scene.view(), camera, *scene.geometry(false, threads, work), options,
-                                    adjoint.data(), ForwardView<T>{nullptr, seen.data()}, grad);
-                return p.surface[0] + p.surface[1];
+                return unlocked(threads, [&](Team& team) {
+                    const std::vector<uint8_t> seen(scene.faces.shape(0), 1);
+                    GeometryWork work;
+                    const auto geometry = scene.geometry(false, team, work);
+                    const BackwardProfile p =
+                        render_backward(scene.view(), camera, *geometry, options, team, adjoint.data(),
+                                        ForwardView<T>{nullptr, seen.data()}, grad);
+                    return p.surface[0] + p.surface[1];
+                });
             },
             "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a, "adjoint"_a.noconvert(), "verts"_a.noconvert(),
             "colors"_a = nb::none())

@@ -157,36 +157,39 @@ void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile&
     const int64_t E = view.geometry.topology().n_edges(), F = view.scene.n_faces;
     Stopwatch watch;
     std::vector<int8_t> facing(F);
-#pragma omp parallel for num_threads(o.threads) schedule(static)
-    for (int64_t f = 0; f < F; ++f) {
-        const int32_t* v = view.scene.faces + 3 * f;
-        facing[f] = int8_t(view.camera.facing(view.vertices.q[v[0]], view.vertices.q[v[1]], view.vertices.q[v[2]]));
-    }
+    view.team.each_block(F, [&](int64_t, int64_t first, int64_t last) {
+        const auto& q = view.vertices.q;
+        for (int64_t f = first; f < last; ++f) {
+            const int32_t* v = view.scene.faces + 3 * f;
+            facing[f] = int8_t(view.camera.facing(q[v[0]], q[v[1]], q[v[2]]));
+        }
+    });
 
     // Attributes that are indexed like the vertices are the same on both sides of an edge, unless it joins copies.
     const bool jumps = view.scene.corners != view.scene.faces || view.geometry.topology().welds();
 
     // Curves end to end, by their length in the image times how much the loss looks there.
     std::vector<double> measure(E);
-    const int64_t block = 4096, blocks = (E + block - 1) / block;
-    std::vector<double> length(blocks, 0.0);
-    int64_t silhouettes = 0, creases = 0;
-#pragma omp parallel for num_threads(o.threads) schedule(dynamic, 1) reduction(+ : silhouettes, creases)
-    for (int64_t k = 0; k < blocks; ++k)
-        for (int64_t e = k * block; e < std::min(E, (k + 1) * block); ++e) {
+    struct Found {
+        double length = 0;
+        int64_t silhouettes = 0, creases = 0;
+    };
+    std::vector<Found> found(Team::blocks(E));
+    view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) {
+        for (int64_t e = first; e < last; ++e) {
             Curve c;
             if (!find_curve(view, facing.data(), jumps, e, c)) continue;
-            ++(c.is_crease() ? creases : silhouettes);
+            ++(c.is_crease() ? found[k].creases : found[k].silhouettes);
             const double importance = view.importance.mean({std::min(c.x0.x, c.x1.x), std::min(c.x0.y, c.x1.y)},
                                                            {std::max(c.x0.x, c.x1.x), std::max(c.x0.y, c.x1.y)});
             if (!(importance > 0)) continue;
             measure[e] = c.length * importance;
-            if (std::isfinite(c.length)) length[k] += c.length;
+            if (std::isfinite(c.length)) found[k].length += c.length;
         }
+    });
     double total = 0;
-    for (const double l : length) total += l;
-    Systematic systematic(measure, o.threads);
-    profile.silhouettes = silhouettes, profile.creases = creases;
+    for (const Found& f : found) total += f.length, profile.silhouettes += f.silhouettes, profile.creases += f.creases;
+    Systematic systematic(measure, view.team);
     profile.curves = watch.lap();
     if (!(systematic.total() > 0)) return;
 
@@ -194,7 +197,7 @@ void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile&
     profile.edge_samples = n;
     if (o.dry) return;
     systematic.draw(n, to_unit(hash(o.seed, 3, gradient_stream)));
-    scatter_samples(n, o.threads, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    scatter_samples(n, view.team, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         BoundaryChunk<N, T> chunk(view, grad);
         Curve curve;
         int64_t edge = systematic.primitive(systematic.position(first));

@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "math.h"
+#include "parallel.h"
 
 namespace edgegrad {
 
@@ -151,23 +152,26 @@ struct VertexView {
     std::vector<uint8_t> outcode;
 };
 
-inline std::vector<Vec3> camera_vertices(const Camera& camera, const double* verts, int64_t n, int threads) {
+inline std::vector<Vec3> camera_vertices(const Camera& camera, const double* verts, int64_t n, Team& team) {
     std::vector<Vec3> q(n);
-#pragma omp parallel for num_threads(threads) schedule(static)
-    for (int64_t v = 0; v < n; ++v) q[v] = camera.to_camera({verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]});
+    team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t v = first; v < last; ++v)
+            q[v] = camera.to_camera({verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]});
+    });
     return q;
 }
 
 inline VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n,
-                                int threads) {
-    VertexView view{camera_vertices(camera, verts, n, threads), std::vector<Vec2>(n), std::vector<uint8_t>(n)};
-#pragma omp parallel for num_threads(threads) schedule(static)
-    for (int64_t v = 0; v < n; ++v) {
-        const Vec3 q = view.q[v];
-        // At the eye itself every plane is met and the projection is undefined: call it outside all.
-        view.outcode[v] = camera.perspective && q.z <= 0 ? volume.outcode(q) | 16 : volume.outcode(q);
-        if (!view.outcode[v]) view.x[v] = project(camera, q);
-    }
+                                Team& team) {
+    VertexView view{camera_vertices(camera, verts, n, team), std::vector<Vec2>(n), std::vector<uint8_t>(n)};
+    team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t v = first; v < last; ++v) {
+            const Vec3 q = view.q[v];
+            // At the eye itself every plane is met and the projection is undefined: call it outside all.
+            view.outcode[v] = camera.perspective && q.z <= 0 ? volume.outcode(q) | 16 : volume.outcode(q);
+            if (!view.outcode[v]) view.x[v] = project(camera, q);
+        }
+    });
     return view;
 }
 

@@ -33,12 +33,13 @@ template <int N, class T>
 class PixelRow {
    public:
     PixelRow(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const RayFrame& frame,
-             const ForwardOptions& options, const std::vector<Vec3>& q, const ForwardOutput<T>& out)
+             const ForwardOptions& options, Team& team, const std::vector<Vec3>& q, const ForwardOutput<T>& out)
         : scene_(scene),
           camera_(camera),
           caster_(caster),
           pixel_rays_(camera, options),
           spp_(options.spp),
+          team_(team),
           q_(q),
           out_(out),
           C_(N ? N : scene.channels),
@@ -80,6 +81,7 @@ class PixelRow {
     static constexpr unsigned n_kept = 64;
 
     void trace() {
+        if (++traced_ % 256 == 0) team_.check();
         rays_.prepare();
         caster_.cast(rays_);
         int i = 0;
@@ -123,6 +125,7 @@ class PixelRow {
     const RayCaster& caster_;
     const PixelRays pixel_rays_;
     const int spp_;
+    Team& team_;
     const std::vector<Vec3>& q_;
     const ForwardOutput<T>& out_;
     const int C_;
@@ -133,6 +136,7 @@ class PixelRow {
     RayBatch rays_;
     Part part_[RayBatch::size];  // of which pixels the rays are
     int parts_ = 0;
+    unsigned traced_ = 0;
     Shaded kept_[n_kept];
     int hits_[tile];
     std::vector<double> sum_, radiance_;
@@ -140,34 +144,34 @@ class PixelRow {
 
 template <int N, class T>
 void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ForwardOptions& o,
-                   const std::vector<Vec3>& q, const ForwardOutput<T>& out) {
-    const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + tile - 1) / tile;
+                   Team& team, const std::vector<Vec3>& q, const ForwardOutput<T>& out) {
+    // Tiles are lower where a pixel has many samples, so that the threads end together.
+    const int rows = std::clamp((1 << 16) / o.spp, 1, tile);
+    const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + rows - 1) / rows;
     const RayFrame frame(caster, camera);
-#pragma omp parallel num_threads(o.threads)
-    {
-        PixelRow<N, T> row(scene, camera, caster, frame, o, q, out);
-#pragma omp for schedule(dynamic, 1)
-        for (int64_t t = 0; t < int64_t(tiles_x) * tiles_y; ++t) {
-            const int x0 = int(t % tiles_x) * tile, y0 = int(t / tiles_x) * tile;
-            for (int y = y0; y < std::min(y0 + tile, camera.height); ++y)
+    team.each_with(
+        int64_t(tiles_x) * tiles_y,
+        [&] { return std::make_unique<PixelRow<N, T>>(scene, camera, caster, frame, o, team, q, out); },
+        [&](PixelRow<N, T>& row, int64_t t) {
+            const int x0 = int(t % tiles_x) * tile, y0 = int(t / tiles_x) * rows;
+            for (int y = y0; y < std::min(y0 + rows, camera.height); ++y)
                 row.render(x0, std::min(x0 + tile, camera.width), y);
-        }
-    }
+        });
 }
 
 }  // namespace
 
 template <class T>
 void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ForwardOptions& o,
-                    const ForwardOutput<T>& out) {
-    const std::vector<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, o.threads);
+                    Team& team, const ForwardOutput<T>& out) {
+    const std::vector<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
     std::fill(out.seen, out.seen + scene.n_faces, uint8_t(0));
-    dispatch_channels(scene.channels, [&]<int N>() { render_pixels<N>(scene, camera, caster, o, q, out); });
+    dispatch_channels(scene.channels, [&]<int N>() { render_pixels<N>(scene, camera, caster, o, team, q, out); });
 }
 
-template void render_forward(const SceneView<float>&, const Camera&, const RayCaster&, const ForwardOptions&,
+template void render_forward(const SceneView<float>&, const Camera&, const RayCaster&, const ForwardOptions&, Team&,
                              const ForwardOutput<float>&);
-template void render_forward(const SceneView<double>&, const Camera&, const RayCaster&, const ForwardOptions&,
+template void render_forward(const SceneView<double>&, const Camera&, const RayCaster&, const ForwardOptions&, Team&,
                              const ForwardOutput<double>&);
 
 }  // namespace edgegrad

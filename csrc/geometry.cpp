@@ -24,7 +24,7 @@ bool same(const std::vector<T>& kept_values, const T* values, int64_t n) {
 }  // namespace
 
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
-                                                 int64_t n_verts, double spacing, bool want_topology, int threads,
+                                                 int64_t n_verts, double spacing, bool want_topology, Team& team,
                                                  GeometryWork& work) {
     const std::lock_guard lock(mutex);
     auto found = kept.end();
@@ -48,7 +48,7 @@ std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n
     if (moved) {
         work.rays = true;
         geometry->verts_.clear();  // should the update fail, these positions must not be taken for it
-        geometry->caster_.update(verts, threads);
+        geometry->caster_.update(verts, team);
         geometry->verts_.assign(verts, verts + 3 * n_verts);
         geometry->spacing_ = spacing;
         geometry->welded_ = false;

@@ -28,7 +28,7 @@ class Geometry {
 
    private:
     friend std::shared_ptr<const Geometry> acquire_geometry(const int32_t*, int64_t, const double*, int64_t, double,
-                                                            bool, int, GeometryWork&);
+                                                            bool, Team&, GeometryWork&);
 
     std::vector<int32_t> faces_;
     std::vector<double> verts_;
@@ -42,7 +42,7 @@ class Geometry {
 // again: as it is when the positions are the same, updated when they moved and nobody else uses it. What is compared is
 // the content of the arrays, so tensors may be copied, changed in place or freed without harm.
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
-                                                 int64_t n_verts, double spacing, bool want_topology, int threads,
+                                                 int64_t n_verts, double spacing, bool want_topology, Team& team,
                                                  GeometryWork& work);
 
 // Forgets all kept geometry that is not in use.

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "math.h"
+#include "parallel.h"
 
 namespace edgegrad {
 
@@ -17,43 +18,46 @@ namespace edgegrad {
 class Importance {
    public:
     template <class T>
-    Importance(const T* adjoint, int width, int height, int channels, double radius, int threads)
+    Importance(const T* adjoint, int width, int height, int channels, double radius, Team& team)
         : width_(width), height_(height), radius_(radius), table_(size_t(width + 1) * (height + 1), 0) {
         const auto size = [&](int64_t pixel) {
             double a = 0;
             for (int c = 0; c < channels; ++c) a += std::fabs(double(adjoint[pixel * channels + c]));
             return a;
         };
+        // Strips of rows, and of columns, that are worth a thread.
+        const int rows = std::max(1, (1 << 14) / width), strips = (height + rows - 1) / rows;
         std::vector<double> row_sum(height, 0.0);
         std::vector<int64_t> row_nonzero(height, 0);
-#pragma omp parallel for num_threads(threads) schedule(static)
-        for (int j = 0; j < height; ++j)
+        const auto each_row = [&](auto body) {
+            team.each(strips, [&](int64_t k) {
+                for (int j = int(k) * rows; j < std::min(height, (int(k) + 1) * rows); ++j) body(j);
+            });
+        };
+        each_row([&](int j) {
             for (int i = 0; i < width; ++i) {
                 const double a = size(int64_t(j) * width + i);
                 row_sum[j] += a, row_nonzero[j] += a > 0;
             }
+        });
         const double sum = std::accumulate(row_sum.begin(), row_sum.end(), 0.0);
         const int64_t nonzero = std::accumulate(row_nonzero.begin(), row_nonzero.end(), int64_t(0));
         const double scale = sum > 0 ? 8.0 * unit * nonzero / sum : 0;
-#pragma omp parallel num_threads(threads)
-        {
-#pragma omp for schedule(static)
-            for (int j = 0; j < height; ++j) {
-                int64_t row = 0;
-                for (int i = 0; i < width; ++i) {
-                    // The cap keeps the conversion defined; only an adjoint 2²⁰ times the mean meets it.
-                    const double a = size(int64_t(j) * width + i);
-                    if (a > 0) row += unit + int64_t(std::min(scale * a, 0x1p32));
-                    table_[index(i + 1, j + 1)] = row;
-                }
+        each_row([&](int j) {
+            int64_t row = 0;
+            for (int i = 0; i < width; ++i) {
+                // The cap keeps the conversion defined; only an adjoint 2²⁰ times the mean meets it.
+                const double a = size(int64_t(j) * width + i);
+                if (a > 0) row += unit + int64_t(std::min(scale * a, 0x1p32));
+                table_[index(i + 1, j + 1)] = row;
             }
-            const int strip = 64;  // columns
-#pragma omp for schedule(static)
-            for (int i0 = 1; i0 <= width; i0 += strip)
-                for (int j = 1; j <= height; ++j)
-                    for (int i = i0; i < std::min(i0 + strip, width + 1); ++i)
-                        table_[index(i, j)] += table_[index(i, j - 1)];
-        }
+        });
+        const int columns = std::max(64, std::min(width, (1 << 14) / height));
+        team.each((width + columns - 1) / columns, [&](int64_t k) {
+            const int first = 1 + int(k) * columns, last = std::min(first + columns, width + 1);
+            for (int j = 1; j <= height; ++j)
+                for (int i = first; i < last; ++i) table_[index(i, j)] += table_[index(i, j - 1)];
+        });
     }
 
     // Mean over the pixels that a filter of this radius reaches from the box [low, high]; 0 if no adjoint is there.

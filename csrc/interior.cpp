@@ -221,10 +221,11 @@ std::vector<uint8_t> vertices_near_seen(const BackwardView<T>& view) {
     const SceneView<T>& scene = view.scene;
     std::vector<uint8_t> near(scene.n_verts, 0);
     const auto mark = [&](auto test) {
-#pragma omp parallel for num_threads(view.options.threads) schedule(static)
-        for (int64_t f = 0; f < scene.n_faces; ++f)
-            if (const int32_t* v = scene.faces + 3 * f; test(f, v))
-                for (int i = 0; i < 3; ++i) std::atomic_ref(near[v[i]]).store(1, std::memory_order_relaxed);
+        view.team.each_block(scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+            for (int64_t f = first; f < last; ++f)
+                if (const int32_t* v = scene.faces + 3 * f; test(f, v))
+                    for (int i = 0; i < 3; ++i) std::atomic_ref(near[v[i]]).store(1, std::memory_order_relaxed);
+        });
     };
     mark([&](int64_t f, const int32_t*) { return view.seen[f]; });
     const std::vector<uint8_t> hit = near;
@@ -241,40 +242,36 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
     Stopwatch watch;
     const std::vector<uint8_t> near_seen = vertices_near_seen(view);
     std::vector<double> measure(F);
-    // The sum that chooses the number of samples is taken in blocks, as in Systematic, to be the same at any threads.
-    const int64_t block = 4096, blocks = (F + block - 1) / block;
+    const int64_t blocks = Team::blocks(F);
     std::vector<double> size(blocks, 0.0), size_of_large(blocks, 0.0);
     const bool any_texture = view.scene.face_texture;
     std::vector<uint8_t> is_large(any_texture ? F : 0, 0);
     PixelMask mask(view.camera, o.filter.radius() - 0.5);
-#pragma omp parallel num_threads(o.threads)
-    {
+    view.team.each_block(F, [&](int64_t k, int64_t first, int64_t last) {
         VisiblePolygon polygon;
-#pragma omp for schedule(dynamic, 1)
-        for (int64_t k = 0; k < blocks; ++k)
-            for (int64_t f = k * block; f < std::min(F, (k + 1) * block); ++f) {
-                if (!polygon.set(view, f)) continue;
-                const double importance = view.importance.mean(polygon.low, polygon.high);
-                if (!(importance > 0)) continue;
-                const int32_t* v = view.scene.faces + 3 * f;
-                const bool expected = near_seen[v[0]] | near_seen[v[1]] | near_seen[v[2]];
-                const double m = (polygon.area + polygon.longest) * (expected ? 1 : hidden) *
-                                 (is_textured(view.scene, f) ? textured : colored);
-                if (is_textured(view.scene, f) && polygon.area >= large) {
-                    is_large[f] = 1;
-                    mask.mark(polygon);
-                    if (std::isfinite(m)) size_of_large[k] += m;
-                    continue;
-                }
-                measure[f] = m * importance;
-                if (std::isfinite(m)) size[k] += m;
+        for (int64_t f = first; f < last; ++f) {
+            if (!polygon.set(view, f)) continue;
+            const double importance = view.importance.mean(polygon.low, polygon.high);
+            if (!(importance > 0)) continue;
+            const int32_t* v = view.scene.faces + 3 * f;
+            const bool expected = near_seen[v[0]] | near_seen[v[1]] | near_seen[v[2]];
+            const double m = (polygon.area + polygon.longest) * (expected ? 1 : hidden) *
+                             (is_textured(view.scene, f) ? textured : colored);
+            if (is_textured(view.scene, f) && polygon.area >= large) {
+                is_large[f] = 1;
+                mask.mark(polygon);
+                if (std::isfinite(m)) size_of_large[k] += m;
+                continue;
             }
-    }
+            measure[f] = m * importance;
+            if (std::isfinite(m)) size[k] += m;
+        }
+    });
     double total = 0, total_of_large = 0;
     for (int64_t k = 0; k < blocks; ++k) total += size[k], total_of_large += size_of_large[k];
     // How often each is sampled: as the defaults, or in proportion to them.
     const double wanted = o.surface_samples >= 0 ? double(o.surface_samples) / (total + total_of_large) : 1;
-    Systematic systematic(measure, o.threads);
+    Systematic systematic(measure, view.team);
     profile.measure = watch.lap();
 
     if (total_of_large > 0) {
@@ -292,7 +289,7 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
     if (o.dry) return;
     systematic.draw(n, to_unit(hash(o.seed, 1, gradient_stream)));
     const ShiftedSequence sequence(hash(o.seed, 2, gradient_stream));
-    scatter_samples(n, o.threads, to, profile.surface, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    scatter_samples(n, view.team, to, profile.surface, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         InteriorChunk<N, T> chunk(view, geometry, to, grad);
         VisiblePolygon polygon;
         PolygonSampler sampler;

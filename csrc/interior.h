@@ -19,6 +19,7 @@ struct BackwardView {
     const FilteredAdjoint<T>& adjoint;
     const Importance& importance;
     const BackwardOptions& options;
+    Team& team;
     const RayFrame& frame;
     const uint8_t* seen;  // (F,): whether the forward pass hit the face
 };
@@ -29,8 +30,7 @@ bool meets(const BackwardView<T>& view, int32_t face, Vec2 n) {
     const int32_t* v = view.scene.faces + 3 * int64_t(face);
     const auto& q = view.vertices.q;
     const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
-    Barycentrics b;
-    return barycentrics(face_map(view.camera, corner), n, b) && b.u >= 0 && b.v >= 0 && b.u + b.v <= 1;
+    return covers(face_map(view.camera, corner), n);
 }
 
 // What a run of samples on one face finds. What they have in common is done once for the run: the face's map and its

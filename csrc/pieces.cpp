@@ -138,7 +138,8 @@ void bind_pieces(nb::module_& m) {
         return points;
     });
     p.def("systematic", [](std::vector<double> measure, int64_t n, double shift) {
-        Systematic systematic(measure, 1);
+        Team team(1);
+        Systematic systematic(measure, team);
         systematic.draw(n, shift);
         std::vector<std::tuple<int64_t, double>> out;  // primitive, weight
         for (int64_t i = 0; i < n; ++i) {
@@ -149,8 +150,9 @@ void bind_pieces(nb::module_& m) {
     });
     using Image = nb::ndarray<const double, nb::numpy, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
     p.def("importance", [](Image adjoint, double radius, A2 low, A2 high) {
+        Team team(2);
         const Importance importance(adjoint.data(), int(adjoint.shape(1)), int(adjoint.shape(0)), int(adjoint.shape(2)),
-                                    radius, 2);
+                                    radius, team);
         return importance.mean(vec(low), vec(high));
     });
 

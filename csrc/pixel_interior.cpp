@@ -16,36 +16,36 @@ template <int N, class T>
 void add_pixel_samples(const BackwardView<T>& view, const std::vector<int64_t>& pixels, int spp, uint64_t seed,
                        const uint8_t* faces, bool geometry, Destination& to, double (&seconds)[2]) {
     const int C = N ? N : view.scene.channels, width = view.camera.width;
-    const ForwardOptions options{spp, view.options.filter, seed, view.options.threads};
+    const ForwardOptions options{spp, view.options.filter, seed};
     const PixelRays pixel_rays(view.camera, options);
-    scatter_samples(int64_t(pixels.size()), options.threads, to, seconds,
-                    [&](int64_t first, int64_t last, ChunkGrad& grad) {
-                        // Faces in a pixel take turns and come again in the next one: some runs are kept open.
-                        std::vector<FaceGrad<N, T>> open(32, FaceGrad<N, T>(view, geometry, to, grad));
-                        std::vector<double> bar(C);
-                        RayBatch rays(view.frame);
-                        for (int64_t p = first; p < last; ++p) {
-                            const int64_t pixel = pixels[p];
-                            const T* A = view.adjoint.of(pixel);
-                            if (std::all_of(A, A + C, [](T a) { return a == 0; })) continue;
-                            for (int c = 0; c < C; ++c) bar[c] = double(A[c]) / spp;
-                            for (int done = 0; done < spp; done += RayBatch::size) {
-                                rays.count = 0;
-                                pixel_rays.append(int(pixel % width), int(pixel / width), done,
-                                                  std::min(spp - done, RayBatch::size), rays);
-                                rays.prepare();
-                                view.geometry.caster().cast(rays);
-                                for (int i = 0; i < rays.count; ++i) {
-                                    const int32_t face = rays.face[i];
-                                    if (face < 0 || (faces && !faces[face])) continue;
-                                    FaceGrad<N, T>& run = open[unsigned(face) % open.size()];
-                                    if (run.face() != face) run.flush(), run.start(face);
-                                    run.add(rays.n(i), bar.data());
-                                }
-                            }
-                        }
-                        for (FaceGrad<N, T>& run : open) run.flush();
-                    });
+    scatter_samples(int64_t(pixels.size()), view.team, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+        // Faces in a pixel take turns and come again in the next one: some runs are kept open.
+        std::vector<FaceGrad<N, T>> open(32, FaceGrad<N, T>(view, geometry, to, grad));
+        std::vector<double> bar(C);
+        RayBatch rays(view.frame);
+        for (int64_t p = first; p < last; ++p) {
+            const int64_t pixel = pixels[p];
+            const T* A = view.adjoint.of(pixel);
+            if (std::all_of(A, A + C, [](T a) { return a == 0; })) continue;
+            for (int c = 0; c < C; ++c) bar[c] = double(A[c]) / spp;
+            view.team.check();
+            for (int done = 0; done < spp; done += RayBatch::size) {
+                rays.count = 0;
+                pixel_rays.append(int(pixel % width), int(pixel / width), done, std::min(spp - done, RayBatch::size),
+                                  rays);
+                rays.prepare();
+                view.geometry.caster().cast(rays);
+                for (int i = 0; i < rays.count; ++i) {
+                    const int32_t face = rays.face[i];
+                    if (face < 0 || (faces && !faces[face])) continue;
+                    FaceGrad<N, T>& run = open[unsigned(face) % open.size()];
+                    if (run.face() != face) run.flush(), run.start(face);
+                    run.add(rays.n(i), bar.data());
+                }
+            }
+        }
+        for (FaceGrad<N, T>& run : open) run.flush();
+    });
 }
 
 // clang-format off

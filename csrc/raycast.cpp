@@ -118,18 +118,16 @@ RayCaster::~RayCaster() {
 
 // Where the detail is: the mean of the faces' centroids weighted with 1 / (longest side)². Floats are as fine as their
 // distance to the origin is short, so a small object on a wide ground plane keeps its shape.
-Vec3 RayCaster::detail_centre(const double* verts, int threads) const {
-    // Blocks of fixed size, so that the sum is rounded alike at any number of threads.
-    const int64_t block = 4096, blocks = (n_faces_ + block - 1) / block;
+Vec3 RayCaster::detail_centre(const double* verts, Team& team) const {
+    const int64_t blocks = Team::blocks(n_faces_);
     const auto vertex = [&](int32_t v) {
         return Vec3{verts[3 * int64_t(v)], verts[3 * int64_t(v) + 1], verts[3 * int64_t(v) + 2]};
     };
     const Vec3 base = vertex(faces_[0]);
     std::vector<Vec3> sum(blocks);
     std::vector<double> weight(blocks, 0.0);
-#pragma omp parallel for num_threads(threads) schedule(static)
-    for (int64_t k = 0; k < blocks; ++k)
-        for (int64_t f = k * block; f < std::min(n_faces_, (k + 1) * block); ++f) {
+    team.each_block(n_faces_, [&](int64_t k, int64_t first, int64_t last) {
+        for (int64_t f = first; f < last; ++f) {
             const Vec3 a = vertex(faces_[3 * f]), b = vertex(faces_[3 * f + 1]), c = vertex(faces_[3 * f + 2]);
             const double side = std::max({dot(b - a, b - a), dot(c - b, c - b), dot(a - c, a - c)});
             const double w = 1 / side;
@@ -137,6 +135,7 @@ Vec3 RayCaster::detail_centre(const double* verts, int threads) const {
             weight[k] += w;
             sum[k] += (w / 3) * (a - base + (b - base) + (c - base));
         }
+    });
     Vec3 total;
     double total_weight = 0;
     for (int64_t k = 0; k < blocks; ++k) total += sum[k], total_weight += weight[k];
@@ -144,20 +143,23 @@ Vec3 RayCaster::detail_centre(const double* verts, int threads) const {
     return std::isfinite(centre.x + centre.y + centre.z) ? centre : base;
 }
 
-void RayCaster::update(const double* verts, int threads) {
-    centre_ = detail_centre(verts, threads);
-    double farthest = 0;
-#pragma omp parallel for num_threads(threads) reduction(max : farthest) schedule(static)
-    for (int64_t v = 0; v < n_verts_; ++v) {
-        const Vec3 p = Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]} - centre_;
-        farthest = std::max(farthest, dot(p, p));
-    }
-    radius_ = farthest > 0 ? std::sqrt(farthest) : 1;  // 1: a single point
-#pragma omp parallel for num_threads(threads) schedule(static)
-    for (int64_t v = 0; v < n_verts_; ++v) {
-        const Vec3 p = (1 / radius_) * (Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]} - centre_);
-        positions_[3 * v] = float(p.x), positions_[3 * v + 1] = float(p.y), positions_[3 * v + 2] = float(p.z);
-    }
+void RayCaster::update(const double* verts, Team& team) {
+    centre_ = detail_centre(verts, team);
+    std::vector<double> farthest(Team::blocks(n_verts_), 0.0);
+    team.each_block(n_verts_, [&](int64_t k, int64_t first, int64_t last) {
+        for (int64_t v = first; v < last; ++v) {
+            const Vec3 p = Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]} - centre_;
+            farthest[k] = std::max(farthest[k], dot(p, p));
+        }
+    });
+    radius_ = std::sqrt(*std::max_element(farthest.begin(), farthest.end()));
+    if (!(radius_ > 0)) radius_ = 1;  // a single point
+    team.each_block(n_verts_, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t v = first; v < last; ++v) {
+            const Vec3 p = (1 / radius_) * (Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]} - centre_);
+            positions_[3 * v] = float(p.x), positions_[3 * v + 1] = float(p.y), positions_[3 * v + 2] = float(p.z);
+        }
+    });
     if (committed_) rtc.rtcUpdateGeometryBuffer(static_cast<Geometry>(geometry_), BUFFER_TYPE_VERTEX, 0);
     rtc.rtcCommitGeometry(static_cast<Geometry>(geometry_));
     rtc.rtcCommitScene(static_cast<Scene>(scene_));
@@ -170,9 +172,16 @@ RayFrame::RayFrame(const RayCaster& caster, const Camera& camera)
       axis_y_(camera.R_inverse * Vec3{0, 1, 0}),
       axis_z_(camera.R_inverse * Vec3{0, 0, 1}),
       eye_((1 / caster.radius_) * (camera.R_inverse * -camera.t - caster.centre_)),
+      centre_(caster.centre_),
       inverse_radius_(1 / caster.radius_),
       perspective_(camera.perspective),
       far_(!camera.perspective || length(eye_) > 4) {}
+
+double RayFrame::error(Vec3 p) const {
+    // Positions are rounded as far from the centre as they are; rays where they start: see prepare().
+    const double start = far_ ? 2 : length(eye_), point = inverse_radius_ * length(p - centre_);
+    return 4 * std::numeric_limits<float>::epsilon() * (point + start) / inverse_radius_;
+}
 
 RayBatch::RayBatch(const RayFrame& frame) : frame_(frame) {
     for (RayPacket& p : packet_) {

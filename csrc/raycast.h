@@ -42,7 +42,7 @@ class RayCaster {
     RayCaster& operator=(const RayCaster&) = delete;
 
     // New positions (V, 3), world units.
-    void update(const double* verts, int threads);
+    void update(const double* verts, Team& team);
 
     // The nearest face along each ray of the batch.
     void cast(RayBatch& batch) const;
@@ -59,9 +59,9 @@ class RayCaster {
 
    private:
     friend class RayFrame;
-    friend double bare_loop(const Camera&, const RayCaster&, const struct ForwardOptions&);
+    friend double bare_loop(const Camera&, const RayCaster&, const struct ForwardOptions&, Team&);
     void intersect(RayBatch& batch) const;
-    Vec3 detail_centre(const double* verts, int threads) const;
+    Vec3 detail_centre(const double* verts, Team& team) const;
 
     const int32_t* faces_;
     int64_t n_faces_, n_verts_;
@@ -78,10 +78,13 @@ class RayFrame {
    public:
     RayFrame(const RayCaster& caster, const Camera& camera);
 
+    // World units by which a ray may miss a point p that it was aimed at: a few roundings of what Embree is given.
+    double error(Vec3 p) const;
+
    private:
     friend class RayBatch;
     Vec3 axis_x_, axis_y_, axis_z_;  // of the camera, in world coordinates times whatever scale they have
-    Vec3 eye_;
+    Vec3 eye_, centre_;
     double inverse_radius_;
     bool perspective_, far_;
 };

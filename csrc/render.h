@@ -31,7 +31,6 @@ struct ForwardOptions {
     int spp;  // samples a pixel
     Filter filter;
     uint64_t seed;
-    int threads;
 };
 
 // The rays of the forward pass: samples first … first + n − 1 of pixel (x, y), appended to a batch.
@@ -59,17 +58,16 @@ struct ForwardOutput {
 
 template <class T>
 void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                    const ForwardOptions& options, const ForwardOutput<T>& out);
+                    const ForwardOptions& options, Team& team, const ForwardOutput<T>& out);
 
 // Seconds that the rays of the forward pass take when they are cast and nothing else is done; for the benchmarks.
-double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOptions& options);
+double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOptions& options, Team& team);
 
 struct BackwardOptions {
     int64_t surface_samples;  // in all; −1: the default (interior.cpp)
     int64_t edge_samples;     // in all; −1: the default (boundary.cpp)
     Filter filter;
     uint64_t seed;
-    int threads;
     bool interior_geometry;  // whether the colours vary over faces, so that moving them shows inside
     bool boundary;
     double spacing;     // relative spacing of the numbers in which the user gave the vertices
@@ -95,14 +93,14 @@ struct ForwardView {
 };
 
 // q = R p + t, backwards: p̄ = Rᵀ q̄, R̄ = Σ q̄ pᵀ, t̄ = Σ q̄, for q_bar (V, 3).
-void add_world(const Camera& camera, const double* verts, const std::vector<double>& q_bar, int threads,
+void add_world(const Camera& camera, const double* verts, const std::vector<double>& q_bar, Team& team,
                const SceneGrad& grad);
 
 // Adds the gradient to what `grad` points to, given the adjoint image ∂loss/∂I (H, W, C).
 template <class T>
 BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry,
-                                const BackwardOptions& options, const T* adjoint, const ForwardView<T>& forward,
-                                const SceneGrad& grad);
+                                const BackwardOptions& options, Team& team, const T* adjoint,
+                                const ForwardView<T>& forward, const SceneGrad& grad);
 
 // Radiance (N, C) at pixel positions (N, 2) on the given faces, and its derivative; for the tests.
 template <class T>

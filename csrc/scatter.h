@@ -10,6 +10,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "parallel.h"
 #include "scene.h"
 #include "stopwatch.h"
 
@@ -65,9 +66,9 @@ struct Destination {
 // Calls body(first, last, ChunkGrad&) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
 // samples and of the adding.
 template <class Body>
-void scatter_samples(int64_t n, int threads, Destination& to, double (&seconds)[2], Body body) {
-    const int64_t chunk = 512, wave = 16 * std::max(1, threads);
-    const int owners = std::clamp(threads, 1, 16);  // more would only split the buffers further
+void scatter_samples(int64_t n, Team& team, Destination& to, double (&seconds)[2], Body body) {
+    const int64_t chunk = 512, wave = 16 * team.threads();
+    const int owners = std::min(team.threads(), 16);  // more would only split the buffers further
     std::vector<ChunkGrad> grads(std::min(wave, (n + chunk - 1) / chunk));
     for (ChunkGrad& g : grads) {
         g.q.prepare(3, owners), g.uvs.prepare(2, owners);
@@ -76,28 +77,34 @@ void scatter_samples(int64_t n, int threads, Destination& to, double (&seconds)[
     Stopwatch watch;
     for (int64_t first = 0; first < n; first += chunk * wave) {
         const int64_t chunks = std::min(wave, (n - first + chunk - 1) / chunk);
-#pragma omp parallel num_threads(threads)
+        // One region for both loops: waking threads twice a wave would be felt.
+#pragma omp parallel num_threads(team.threads_for(chunks))
         {
 #pragma omp for schedule(dynamic, 1)
-            for (int64_t i = 0; i < chunks; ++i) {
-                ChunkGrad& g = grads[i];
-                g.q.clear(), g.colors.clear(), g.uvs.clear(), g.texels.clear();
-                std::fill(g.k, g.k + 6, 0.0);
-                const int64_t begin = first + i * chunk;
-                body(begin, std::min(begin + chunk, n), g);
-            }
+            for (int64_t i = 0; i < chunks; ++i)
+                team.guard([&] {
+                    team.check();
+                    ChunkGrad& g = grads[i];
+                    g.q.clear(), g.colors.clear(), g.uvs.clear(), g.texels.clear();
+                    std::fill(g.k, g.k + 6, 0.0);
+                    const int64_t begin = first + i * chunk;
+                    body(begin, std::min(begin + chunk, n), g);
+                });
 #pragma omp master
             seconds[0] += watch.lap();
             // The system may give fewer threads than were asked for.
 #pragma omp for schedule(static, 1)
             for (int owner = 0; owner < owners; ++owner)
-                for (int64_t i = 0; i < chunks; ++i) {
-                    if (to.q) grads[i].q.add_to(to.q, owner);
-                    if (to.colors) grads[i].colors.add_to(to.colors, owner);
-                    if (to.uvs) grads[i].uvs.add_to(to.uvs, owner);
-                    if (to.texels) grads[i].texels.add_to(to.texels, owner);
-                }
+                team.guard([&] {
+                    for (int64_t i = 0; i < chunks; ++i) {
+                        if (to.q) grads[i].q.add_to(to.q, owner);
+                        if (to.colors) grads[i].colors.add_to(to.colors, owner);
+                        if (to.uvs) grads[i].uvs.add_to(to.uvs, owner);
+                        if (to.texels) grads[i].texels.add_to(to.texels, owner);
+                    }
+                });
         }
+        team.rethrow();
         for (int64_t i = 0; i < chunks; ++i)
             for (int c = 0; c < 6; ++c) to.k[c] += grads[i].k[c];
         seconds[1] += watch.lap();

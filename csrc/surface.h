@@ -1,6 +1,8 @@
 // Where a face is seen: perspective-correct barycentrics as a function of the place in the image, with their _vjp.
 #pragma once
 
+#include <limits>
+
 #include "camera.h"
 #include "math.h"
 
@@ -59,6 +61,18 @@ inline bool barycentrics(const FaceMap& m, Vec2 n, Barycentrics& b) {
     const double inverse = 1.0 / p.z;
     b.u = p.x * inverse, b.v = p.y * inverse;
     return std::isfinite(b.u + b.v);
+}
+
+// Whether the face covers n. One that doubles cannot tell from its rim does: between two faces that share an edge there
+// must be no gap, and each computes that edge in its own way.
+inline bool covers(const FaceMap& m, Vec2 n) {
+    const Vec3 p = m.times(n);
+    const double eps = 16 * std::numeric_limits<double>::epsilon(), x = eps * std::fabs(n.x), y = eps * std::fabs(n.y);
+    const auto error = [&](double Vec3::*row) {
+        return x * std::fabs(m.column[0].*row) + y * std::fabs(m.column[1].*row) + eps * std::fabs(m.column[2].*row);
+    };
+    const double eu = error(&Vec3::x), ev = error(&Vec3::y), ew = error(&Vec3::z), sign = p.z < 0 ? -1 : 1;
+    return std::fabs(p.z) > ew && sign * p.x >= -eu && sign * p.y >= -ev && sign * (p.z - p.x - p.y) >= -(eu + ev + ew);
 }
 
 // δu = (δ(u w) − u δw) / w, and the same for v.

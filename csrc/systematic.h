@@ -8,29 +8,30 @@
 #include <cstdint>
 #include <vector>
 
+#include "parallel.h"
+
 namespace edgegrad {
 
 class Systematic {
    public:
     // `measure` holds one number ≥ 0 for each primitive and is turned into its running sum.
-    Systematic(std::vector<double>& measure, int threads) : end_(measure) {
-        // Blocks of fixed size, so that the sums are rounded alike at any number of threads.
-        const int64_t n = end_.size(), block = 4096, blocks = (n + block - 1) / block;
+    Systematic(std::vector<double>& measure, Team& team) : end_(measure) {
+        const int64_t n = end_.size(), blocks = Team::blocks(n);
         std::vector<double> before(blocks + 1, 0.0);
-#pragma omp parallel for num_threads(threads) schedule(static)
-        for (int64_t k = 0; k < blocks; ++k) {
+        team.each_block(n, [&](int64_t k, int64_t first, int64_t last) {
             double sum = 0;
-            for (int64_t i = k * block; i < std::min(n, (k + 1) * block); ++i) {
+            for (int64_t i = first; i < last; ++i) {
                 // What overflows the range of doubles (coordinates beyond 1e150) cannot be sampled.
                 if (!std::isfinite(end_[i])) end_[i] = 0;
                 end_[i] = sum += end_[i];
             }
             before[k + 1] = sum;
-        }
+        });
         for (int64_t k = 0; k < blocks; ++k) before[k + 1] += before[k];
-#pragma omp parallel for num_threads(threads) schedule(static)
-        for (int64_t k = 1; k < blocks; ++k)
-            for (int64_t i = k * block; i < std::min(n, (k + 1) * block); ++i) end_[i] += before[k];
+        if (blocks == 1) return;
+        team.each_block(n, [&](int64_t k, int64_t first, int64_t last) {
+            for (int64_t i = first; i < last; ++i) end_[i] += before[k];
+        });
     }
 
     double total() const { return end_.empty() ? 0 : end_.back(); }

@@ -1,0 +1,103 @@
+// The only place that starts threads: how many a loop is worth, and what happens when one of them fails.
+//
+// An exception must not leave a region of OpenMP: the process would end. So bodies run under a guard, which keeps the
+// first exception, lets the others finish early, and hands it on when all have. The same way out serves whoever wants
+// to stop a long call: the thread that called the kernel asks from time to time.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+#include <exception>
+#include <memory>
+#include <mutex>
+#include <thread>
+
+namespace edgegrad {
+
+// Thrown where a call was asked to stop.
+struct Interrupted : std::exception {
+    const char* what() const noexcept override { return "interrupted"; }
+};
+
+// The threads of one call of the kernel.
+class Team {
+   public:
+    // `interrupted` is asked by the calling thread alone, at most 20 times a second; null: never.
+    explicit Team(int threads, bool (*interrupted)() = nullptr)
+        : threads_(std::max(1, threads)), interrupted_(interrupted), caller_(std::this_thread::get_id()) {}
+
+    int threads() const { return threads_; }
+
+    // As many as there are items to share. Waking a thread takes longer than a small item, so few items take one.
+    int threads_for(int64_t items) const { return int(std::clamp<int64_t>(items, 1, threads_)); }
+
+    // Runs f unless the call is failing already; keeps what it throws.
+    template <class F>
+    void guard(F f) noexcept {
+        if (failed_.load(std::memory_order_relaxed)) return;
+        try {
+            f();
+        } catch (...) {
+            const std::lock_guard lock(mutex_);
+            if (!failure_) failure_ = std::current_exception();
+            failed_.store(true, std::memory_order_relaxed);
+        }
+    }
+
+    // After a region: throws what one of its threads threw.
+    void rethrow() {
+        if (failed_) std::rethrow_exception(failure_);
+    }
+
+    // Within long work, under a guard: throws where the call is to stop.
+    void check() {
+        if (failed_.load(std::memory_order_relaxed)) throw Interrupted();
+        if (!interrupted_ || std::this_thread::get_id() != caller_) return;
+        const auto now = std::chrono::steady_clock::now();
+        if (now - asked_ < std::chrono::milliseconds(50)) return;
+        asked_ = now;
+        if (interrupted_()) throw Interrupted();
+    }
+
+    // body(i) for i = 0 … n − 1, in no order.
+    template <class Body>
+    void each(int64_t n, Body body) {
+        each_with(n, [] { return std::make_unique<char>(); }, [&](char&, int64_t i) { body(i); });
+    }
+
+    // body(state, i) for i = 0 … n − 1, in no order, with a state for each thread: make() gives a std::unique_ptr.
+    template <class Make, class Body>
+    void each_with(int64_t n, Make make, Body body) {
+        check();
+#pragma omp parallel num_threads(threads_for(n))
+        {
+            decltype(make()) state;
+            guard([&] { state = make(); });
+#pragma omp for schedule(dynamic, 1)
+            for (int64_t i = 0; i < n; ++i) guard([&] { check(), body(*state, i); });
+        }
+        rethrow();
+    }
+
+    // body(k, first, last) for the blocks k of 0 … n − 1. Their size is fixed, so that sums over them are rounded alike
+    // at any number of threads.
+    static constexpr int64_t block = 4096;
+    static int64_t blocks(int64_t n) { return (n + block - 1) / block; }
+    template <class Body>
+    void each_block(int64_t n, Body body) {
+        each(blocks(n), [&](int64_t k) { body(k, k * block, std::min(n, (k + 1) * block)); });
+    }
+
+   private:
+    const int threads_;
+    bool (*const interrupted_)();
+    const std::thread::id caller_;
+    std::chrono::steady_clock::time_point asked_ = std::chrono::steady_clock::now();
+    std::atomic<bool> failed_{false};
+    std::mutex mutex_;
+    std::exception_ptr failure_;
+};
+
+}  // namespace edgegrad
