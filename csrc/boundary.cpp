@@ -1,5 +1,18 @@
 // Curve samples. One ray for each: the radiance of an incident face is known exactly at the edge, so the ray through
 // the edge point, blind to the faces of that edge, finds what lies behind, or that something lies before.
+//
+// Where other curves lie on this one in the image (coincident.h), the ray runs along the rims of their faces, and which
+// of these it meets would be left to rounding. So it is blind to them too, and they are asked in double. One that lies
+// apart by more than the rounding of doubles covers the point or not. One that does not lie apart covers one side of
+// it:
+//
+//  - at the same depth (a box on a box), its faces and those of this curve are taken for the faces of one edge, of
+//  which
+//    each curve moves its share;
+//  - before or behind (the back edge of a box that is seen straight on), the image has a derivative for each direction
+//    of the motion only. Their mean is what is estimated, so that a motion that both share has its true derivative:
+//    half the samples see what lies before on one side of the curve and what lies behind on the other, half the
+//    reverse.
 
 #include "boundary.h"
 
@@ -7,6 +20,7 @@
 #include <limits>
 #include <vector>
 
+#include "coincident.h"
 #include "curve.h"
 #include "sampler.h"
 #include "systematic.h"
@@ -21,24 +35,29 @@ constexpr double samples_per_pixel = 24;
 template <int N, class T>
 class BoundaryChunk {
    public:
-    BoundaryChunk(const BackwardView<T>& view, ChunkGrad& grad)
+    BoundaryChunk(const BackwardView<T>& view, const CurveFinder<T>& finder, const CoincidentCurves& coincident,
+                  ChunkGrad& grad)
         : view_(view),
+          finder_(finder),
+          coincident_(coincident),
           grad_(grad),
           C_(N ? N : view.scene.channels),
           rays_(view.frame),
           adjoint_(RayBatch::size * C_),
           radiance_(C_) {}
 
-    // The point at the fraction s of the curve.
-    void add(const Curve& curve, double s, double weight) {
+    // The point at the fraction s of the curve. `flip` differs between half of the points of a curve and the others.
+    void add(const Curve& curve, double s, double weight, bool flip) {
         const int i = rays_.count;
         const Vec2 x = curve.position(s);
         if (!view_.adjoint.template at<N>(x, adjoint_.data() + i * C_)) return;
-        if (curves_ == 0 || curve_[curves_ - 1].edge != curve.edge) curve_[curves_++] = curve;
+        if (places_ == 0 || place_[places_ - 1].curve.edge != curve.edge) start(place_[places_++], curve);
+        const Place& place = place_[places_ - 1];
         const Vec2 n = normalised(view_.camera, x);
         rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
-        lane_[i] = {curves_ - 1, x, curve.parameter(s), weight};
-        rejected_[i] = view_.geometry.topology().faces(curve.edge);
+        lane_[i] = {places_ - 1, x, n, curve.parameter(s), weight, flip};
+        rejected_[i] =
+            place.others.empty() ? view_.geometry.topology().faces(curve.edge) : std::span<const int32_t>(place.blind);
         if (++rays_.count == RayBatch::size) cast();
     }
 
@@ -48,11 +67,45 @@ class BoundaryChunk {
     }
 
    private:
-    struct Lane {
-        int curve;
-        Vec2 x;
-        double t, weight;
+    // A curve, and those that lie on it.
+    struct Place {
+        Curve curve;
+        std::vector<Curve> others;
+        std::vector<int32_t> blind;  // faces of all of them
     };
+
+    struct Lane {
+        int place;
+        Vec2 x, n;
+        double t, weight;
+        bool flip;
+    };
+
+    // What lies at a point of the image, behind a curve: a face, or −1 for the background.
+    struct Surface {
+        int64_t face = -1;
+        Barycentrics b;
+        double depth = std::numeric_limits<double>::infinity();
+    };
+
+    // What is seen next to a curve: a face that ends there, or, with none, what lies behind.
+    struct Side {
+        HalfEdge face;
+        double t = 0;  // on its edge
+    };
+
+    void start(Place& place, const Curve& curve) {
+        place.curve = curve;
+        place.others.clear(), place.blind.clear();
+        if (coincident_.empty()) return;
+        const Topology& topology = view_.geometry.topology();
+        const auto blind_to = [&](int64_t edge) {
+            for (const int32_t f : topology.faces(edge)) place.blind.push_back(f);
+        };
+        for (const int64_t edge : coincident_.of(curve.edge))
+            if (Curve c; finder_.find(edge, c)) place.others.push_back(c), blind_to(edge);
+        if (!place.others.empty()) blind_to(curve.edge);
+    }
 
     void cast() {
         rays_.prepare();
@@ -61,35 +114,33 @@ class BoundaryChunk {
             const Vec2 n = rays_.n(i);
             const int32_t behind = view_.geometry.caster().beyond_float(
                 view_.frame, n, rays_.face[i], rejected_[i], [&](int32_t face) { return meets(view_, face, n); });
-            add_sample(curve_[lane_[i].curve], lane_[i], n, behind, adjoint_.data() + i * C_);
+            add_sample(place_[lane_[i].place], lane_[i], behind, adjoint_.data() + i * C_);
         }
-        rays_.count = curves_ = 0;
+        rays_.count = places_ = 0;
     }
 
-    // Ã · L, where `known` is next to the curve; else what the ray found, or the background.
-    double adjoint_radiance(const Lane& lane, const HalfEdge& known, int64_t behind, Barycentrics b,
-                            const double* adjoint) {
-        if (known.face < 0 && behind < 0) return view_.adjoint.template times_background<N>(lane.x);
-        if (known.face >= 0) shade<N>(view_.scene, known.face, at_edge(known, lane.t), radiance_.data());
-        else shade<N>(view_.scene, behind, b, radiance_.data());
+    // Ã · L of what is seen on one side.
+    double adjoint_radiance(const Lane& lane, const Side& side, const Surface& behind, const double* adjoint) {
+        if (side.face.face < 0 && behind.face < 0) return view_.adjoint.template times_background<N>(lane.x);
+        if (side.face.face >= 0) shade<N>(view_.scene, side.face.face, at_edge(side.face, side.t), radiance_.data());
+        else shade<N>(view_.scene, behind.face, behind.b, radiance_.data());
         double sum = 0;
         for (int c = 0; c < C_; ++c) sum += adjoint[c] * radiance_[c];
         return sum;
     }
 
-    void add_sample(const Curve& curve, const Lane& lane, Vec2 n, int64_t behind, const double* adjoint) {
+    void add_sample(const Place& place, const Lane& lane, int32_t hit, const double* adjoint) {
+        const Curve& curve = place.curve;
         const Vec3 point = (1 - lane.t) * curve.a + lane.t * curve.b;
-        Barycentrics b;
-        if (behind >= 0) {
-            const int32_t* v = view_.scene.faces + 3 * behind;
-            const auto& q = view_.vertices.q;
-            const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
-            if (hides(corner, point, curve)) return;
-            b = barycentrics_of_hit(face_map(view_.camera, corner), n);
-        }
-        const double jump = adjoint_radiance(lane, curve.minus, behind, b, adjoint) -
-                            adjoint_radiance(lane, curve.plus, behind, b, adjoint);
-        const double scale = lane.weight * jump;
+        Surface behind;
+        if (hit >= 0 && !lies_behind(hit, lane.n, point, curve, behind)) return;
+        Side side[2] = {{curve.minus, lane.t}, {curve.plus, lane.t}};
+        int share = 1;
+        for (const Curve& other : place.others)
+            if (!add_other(other, curve, lane, point, side, share, behind)) return;
+        const double jump =
+            adjoint_radiance(lane, side[0], behind, adjoint) - adjoint_radiance(lane, side[1], behind, adjoint);
+        const double scale = lane.weight * jump / share;
         const Vec2 tangent = curve.tangent();
         Vec3 point_bar;
         project_vjp(view_.camera, point, {scale * tangent.y, -scale * tangent.x}, point_bar, grad_.k);
@@ -97,6 +148,48 @@ class BoundaryChunk {
         if (current_.edge != curve.edge) flush(), current_ = curve, a_bar_ = b_bar_ = {};
         a_bar_ += (1 - lane.t) * point_bar;
         b_bar_ += lane.t * point_bar;
+    }
+
+    // False if a face that the ray meets hides the point; else `behind` is that face if it is the nearest so far.
+    bool lies_behind(int64_t face, Vec2 n, Vec3 point, const Curve& curve, Surface& behind) const {
+        const auto corner = corners_of(view_, face);
+        if (hides(corner.data(), point, curve)) return false;
+        if (const double depth = depth_of(view_, face, n); depth < behind.depth)
+            behind = {face, barycentrics_of_hit(face_map(view_.camera, corner.data()), n), depth};
+        return true;
+    }
+
+    // What a curve that lies on this one does to a sample of it. False if it hides the point.
+    bool add_other(const Curve& other, const Curve& curve, const Lane& lane, Vec3 point, Side (&side)[2], int& share,
+                   Surface& behind) const {
+        const Vec2 along = other.tangent(), from = lane.x - other.x0;
+        const double squared = along.x * along.x + along.y * along.y,
+                     s = (from.x * along.x + from.y * along.y) / squared;
+        const double apart = std::fabs(wedge(along, from)) / std::sqrt(squared);
+        if (!(apart <= std::max(curve.rounding, other.rounding))) {
+            const auto own = view_.geometry.topology().faces(curve.edge);
+            for (const int32_t f : view_.geometry.topology().faces(other.edge))
+                if (std::find(own.begin(), own.end(), f) == own.end() && meets(view_, f, lane.n) &&
+                    !lies_behind(f, lane.n, point, curve, behind))
+                    return false;
+            return true;
+        }
+        if (s < 0 || s > 1) return true;
+        const double t = other.parameter(s), depth = (1 - t) * other.a.z + t * other.b.z;
+        const bool opposite = along.x * curve.tangent().x + along.y * curve.tangent().y < 0;
+        const HalfEdge* half[2] = {opposite ? &other.plus : &other.minus, opposite ? &other.minus : &other.plus};
+        if (std::fabs(depth - point.z) <= contact(curve, std::max(std::fabs(depth), length(point)))) {
+            ++share;
+            for (int k = 0; k < 2; ++k)
+                if (half[k]->face >= 0 &&
+                    (side[k].face.face < 0 || !in_front(view_, side[k].face, *half[k], curve.a, curve.b)))
+                    side[k] = {*half[k], t};
+            return true;
+        }
+        if (depth < point.z) return half[lane.flip]->face < 0;
+        const HalfEdge& covers = *half[!lane.flip];
+        if (covers.face >= 0 && depth < behind.depth) behind = {covers.face, at_edge(covers, t), depth};
+        return true;
     }
 
     // Whether a face that the ray meets lies before the point: its plane has the point on one side and the viewer on
@@ -107,17 +200,21 @@ class BoundaryChunk {
         const Vec3 normal = cross(face[1] - face[0], face[2] - face[0]);
         const Vec3 to_viewer = view_.camera.perspective ? -face[0] : Vec3{0, 0, -1};
         const double viewer = dot(normal, to_viewer), behind = dot(normal, point - face[0]) * (viewer > 0 ? -1 : 1);
+        double size = 0;
+        for (int i = 0; i < 3; ++i)
+            size = std::max({size, std::fabs(face[i].x), std::fabs(face[i].y), std::fabs(face[i].z)});
+        return behind > contact(curve, size) * length(normal);
+    }
+
+    // World units by which what touches at the curve may lie apart, for the rounding of the input and of doubles.
+    double contact(const Curve& curve, double size) const {
         const HalfEdge& h = curve.minus.face >= 0 ? curve.minus : curve.plus;
-        double coordinate = 0, size = 0;
+        double coordinate = 0;
         for (const int corner : {h.first(), h.second()})
             for (int axis = 0; axis < 3; ++axis)
                 coordinate = std::max(coordinate,
                                       std::fabs(view_.scene.verts[3 * int64_t(vertex(view_.scene, h, corner)) + axis]));
-        for (int i = 0; i < 3; ++i)
-            size = std::max({size, std::fabs(face[i].x), std::fabs(face[i].y), std::fabs(face[i].z)});
-        const double rounding =
-            8 * view_.options.spacing * coordinate + 64 * std::numeric_limits<double>::epsilon() * size;
-        return behind > rounding * length(normal);
+        return 8 * view_.options.spacing * coordinate + 64 * std::numeric_limits<double>::epsilon() * size;
     }
 
     // The gradient goes to the vertices of the face that ends at the curve; where a face lies on either side, half to
@@ -135,13 +232,15 @@ class BoundaryChunk {
     }
 
     const BackwardView<T>& view_;
+    const CurveFinder<T>& finder_;
+    const CoincidentCurves& coincident_;
     ChunkGrad& grad_;
     const int C_;
 
     RayBatch rays_;
     Lane lane_[RayBatch::size];
-    Curve curve_[RayBatch::size];  // of the lanes
-    int curves_ = 0;
+    Place place_[RayBatch::size];  // of the lanes
+    int places_ = 0;
     std::span<const int32_t> rejected_[RayBatch::size];
     std::vector<double> adjoint_, radiance_;
 
@@ -149,46 +248,57 @@ class BoundaryChunk {
     Vec3 a_bar_, b_bar_;
 };
 
+// How far, in pixels, a ray may miss the points of a curve. A hundredth where it would be more: by then the image shows
+// floats, not faces.
+template <class T>
+double reach_of_rays(const BackwardView<T>& view, const Curve& c) {
+    double error = 0;
+    const HalfEdge& h = c.minus.face >= 0 ? c.minus : c.plus;
+    for (const int corner : {h.first(), h.second()}) {
+        const double* p = view.scene.verts + 3 * int64_t(vertex(view.scene, h, corner));
+        error = std::max(error, view.frame.error({p[0], p[1], p[2]}));
+    }
+    return std::max(c.rounding, std::min(view.camera.pixels_per_unit / std::min(c.w0, c.w1) * error, 0.01));
+}
+
 }  // namespace
 
 template <int N, class T>
 void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile& profile) {
     const BackwardOptions& o = view.options;
-    const int64_t E = view.geometry.topology().n_edges(), F = view.scene.n_faces;
+    const int64_t E = view.geometry.topology().n_edges();
     Stopwatch watch;
-    std::vector<int8_t> facing(F);
-    view.team.each_block(F, [&](int64_t, int64_t first, int64_t last) {
-        const auto& q = view.vertices.q;
-        for (int64_t f = first; f < last; ++f) {
-            const int32_t* v = view.scene.faces + 3 * f;
-            facing[f] = int8_t(view.camera.facing(q[v[0]], q[v[1]], q[v[2]]));
-        }
-    });
-
-    // Attributes that are indexed like the vertices are the same on both sides of an edge, unless it joins copies.
-    const bool jumps = view.scene.corners != view.scene.faces || view.geometry.topology().welds();
+    const CurveFinder<T> finder(view);
 
     // Curves end to end, by their length in the image times how much the loss looks there.
     std::vector<double> measure(E);
     struct Found {
         double length = 0;
         int64_t silhouettes = 0, creases = 0;
+        std::vector<ImageSegment> segments;
     };
     std::vector<Found> found(Team::blocks(E));
     view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) {
         for (int64_t e = first; e < last; ++e) {
             Curve c;
-            if (!find_curve(view, facing.data(), jumps, e, c)) continue;
+            if (!finder.find(e, c)) continue;
             ++(c.is_crease() ? found[k].creases : found[k].silhouettes);
             const double importance = view.importance.mean({std::min(c.x0.x, c.x1.x), std::min(c.x0.y, c.x1.y)},
                                                            {std::max(c.x0.x, c.x1.x), std::max(c.x0.y, c.x1.y)});
             if (!(importance > 0)) continue;
             measure[e] = c.length * importance;
-            if (std::isfinite(c.length)) found[k].length += c.length;
+            if (!std::isfinite(c.length)) continue;
+            found[k].length += c.length;
+            found[k].segments.push_back({e, c.x0, c.x1, reach_of_rays(view, c)});
         }
     });
     double total = 0;
-    for (const Found& f : found) total += f.length, profile.silhouettes += f.silhouettes, profile.creases += f.creases;
+    std::vector<ImageSegment> segments;
+    for (const Found& f : found) {
+        total += f.length, profile.silhouettes += f.silhouettes, profile.creases += f.creases;
+        segments.insert(segments.end(), f.segments.begin(), f.segments.end());
+    }
+    const CoincidentCurves coincident(segments, view.team);
     Systematic systematic(measure, view.team);
     profile.curves = watch.lap();
     if (!(systematic.total() > 0)) return;
@@ -198,15 +308,15 @@ void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile&
     if (o.dry) return;
     systematic.draw(n, to_unit(hash(o.seed, 3, gradient_stream)));
     scatter_samples(n, view.team, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        BoundaryChunk<N, T> chunk(view, grad);
+        BoundaryChunk<N, T> chunk(view, finder, coincident, grad);
         Curve curve;
         int64_t edge = systematic.primitive(systematic.position(first));
         for (int64_t i = first; i < last; ++i) {
             const double position = systematic.position(i);
             edge = systematic.primitive(position, edge);
-            if (curve.edge != edge) find_curve(view, facing.data(), jumps, edge, curve);
+            if (curve.edge != edge) finder.find(edge, curve);
             const double s = (position - systematic.begin_of(edge)) / systematic.measure_of(edge);
-            chunk.add(curve, std::clamp(s, 0.0, 1.0), systematic.weight(edge));
+            chunk.add(curve, std::clamp(s, 0.0, 1.0), systematic.weight(edge), i % 2);
         }
         chunk.finish();
     });

@@ -22,7 +22,8 @@ struct Camera {
     int width, height;
     Mat3 R_inverse;
     double k_det;
-    double k_inverse[4];  // of the 2 × 2 part of K, row by row
+    double k_inverse[4];     // of the 2 × 2 part of K, row by row
+    double pixels_per_unit;  // at most, of normalised image coordinates
 
     // world_to_camera (4, 4) and K (3, 3), row by row.
     Camera(const double* world_to_camera, const double* K, bool perspective_, int width_, int height_)
@@ -32,6 +33,7 @@ struct Camera {
         t = {world_to_camera[3], world_to_camera[7], world_to_camera[11]};
         for (int i = 0; i < 6; ++i) k[i] = K[i];
         R_inverse = inverse(R);
+        pixels_per_unit = std::fabs(k[0]) + std::fabs(k[1]) + std::fabs(k[3]) + std::fabs(k[4]);
         k_det = k[0] * k[4] - k[1] * k[3];
         k_inverse[0] = k[4] / k_det, k_inverse[1] = -k[1] / k_det;
         k_inverse[2] = -k[3] / k_det, k_inverse[3] = k[0] / k_det;
@@ -47,10 +49,13 @@ struct Camera {
 
     // Orientation of (q0, q1, q2) in the image, x to the right and y down: > 0 where (x1 − x0) ∧ (x2 − x0) > 0.
     // The triple product decides for triangles that reach behind the camera too, and it is one number for the three
-    // edges of a face, so that they never disagree.
+    // edges of a face, so that they never disagree. 0: seen edge-on, its plane holds the eye as far as doubles can
+    // tell.
     int facing(Vec3 q0, Vec3 q1, Vec3 q2) const {
-        const double s = dot(view_direction(q0), cross(q1 - q0, q2 - q0)) * k_det;
-        return (s > 0) - (s < 0);
+        const Vec3 view = view_direction(q0), e1 = q1 - q0, e2 = q2 - q0;
+        const double s = dot(view, cross(e1, e2));
+        if (std::fabs(s) <= rounding_of_triple_product(view, e1, e2)) return 0;
+        return s * k_det > 0 ? 1 : -1;
     }
 };
 

@@ -7,6 +7,8 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <limits>
+#include <vector>
 
 #include "interior.h"
 #include "shading/shade.h"
@@ -22,6 +24,7 @@ struct Curve {
     double w0 = 1, w1 = 1;  // denominators of the projection at t0 and t1
     Vec2 x0, x1;            // their pixel positions
     double length = 0;      // px
+    double rounding = 0;    // px, of the positions
 
     bool is_crease() const { return minus.face >= 0 && plus.face >= 0; }
 
@@ -76,46 +79,87 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
 
 // A face that turns clockwise in the image (x right, y down) lies to the right of its sides, where the normal
 // (τ_y, −τ_x) does not point. One seen exactly edge-on covers nothing. > 0: the side of minus, < 0: of plus.
-inline int side_of(const HalfEdge& h, const int8_t* facing) { return h.backwards ? -facing[h.face] : facing[h.face]; }
-
-// The curve of an edge; false when there is none. `facing` gives the orientation of each face in the image; without
-// `jumps`, neighbouring faces are known to carry the same radiance at their edge.
-template <class T>
-bool find_curve(const BackwardView<T>& view, const int8_t* facing, bool jumps, int64_t edge, Curve& c) {
-    const auto halves = view.geometry.topology().half_edges(edge);
-    // Most edges have one face on each side; with no jump there is then nothing more to look at.
-    if (!jumps && halves.size() == 2 && side_of(halves[0], facing) * side_of(halves[1], facing) < 0) return false;
-    const int32_t va = vertex(view.scene, halves[0], halves[0].first()),
-                  vb = vertex(view.scene, halves[0], halves[0].second());
-    const VertexView& p = view.vertices;
-    if (p.outcode[va] & p.outcode[vb]) return false;
-    c.a = p.q[va], c.b = p.q[vb];
-
-    HalfEdge side[2];  // minus, plus
-    side[0].face = side[1].face = -1;
-    for (const HalfEdge& h : halves) {
-        const int turn = side_of(h, facing);
-        if (turn == 0) continue;
-        HalfEdge& seen = side[turn > 0 ? 0 : 1];
-        if (seen.face < 0 || !in_front(view, seen, h, c.a, c.b)) seen = h;
-    }
-    if (side[0].face < 0 && side[1].face < 0) return false;
-    if (side[0].face >= 0 && side[1].face >= 0 && !(jumps && carries_jump(view.scene, side[0], side[1]))) return false;
-
-    if (!(p.outcode[va] | p.outcode[vb])) {
-        c.t0 = 0, c.t1 = 1;
-        c.x0 = p.x[va], c.x1 = p.x[vb];
-        c.w0 = view.camera.depth_weight(c.a), c.w1 = view.camera.depth_weight(c.b);
-    } else {
-        if (!view.volume.clip_segment(c.a, c.b, c.t0, c.t1)) return false;
-        const Vec3 q0 = (1 - c.t0) * c.a + c.t0 * c.b, q1 = (1 - c.t1) * c.a + c.t1 * c.b;
-        c.w0 = view.camera.depth_weight(q0), c.w1 = view.camera.depth_weight(q1);
-        if (!(c.w0 > 0 && c.w1 > 0)) return false;  // ends in the eye itself
-        c.x0 = project(view.camera, q0), c.x1 = project(view.camera, q1);
-    }
-    c.edge = edge, c.minus = side[0], c.plus = side[1];
-    c.length = length(c.tangent());
-    return c.length > 0;
+inline int side_of(const HalfEdge& h, const std::vector<int8_t>& facing) {
+    return h.backwards ? -facing[h.face] : facing[h.face];
 }
+
+// Finds the curves of one view.
+template <class T>
+class CurveFinder {
+   public:
+    explicit CurveFinder(const BackwardView<T>& view)
+        : view_(view),
+          facing_(view.scene.n_faces),
+          // Attributes that are indexed like the vertices are the same on both sides of an edge, unless it joins
+          // copies.
+          jumps_(view.scene.corners != view.scene.faces || view.geometry.topology().welds()) {
+        const int64_t blocks = Team::blocks(view.scene.n_verts);
+        std::vector<double> farthest(blocks, 0.0);
+        view.team.each_block(view.scene.n_verts, [&](int64_t k, int64_t first, int64_t last) {
+            for (int64_t i = 3 * first; i < 3 * last; ++i)
+                farthest[k] = std::max(farthest[k], std::fabs(view.scene.verts[i]));
+        });
+        const Vec3 t = view.camera.t;
+        coordinate_ = *std::max_element(farthest.begin(), farthest.end()) +
+                      std::max({std::fabs(t.x), std::fabs(t.y), std::fabs(t.z)});
+        view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+            const auto& q = view.vertices.q;
+            for (int64_t f = first; f < last; ++f) {
+                const int32_t* v = view.scene.faces + 3 * f;
+                facing_[f] = int8_t(view.camera.facing(q[v[0]], q[v[1]], q[v[2]]));
+            }
+        });
+    }
+
+    // The curve of an edge; false when there is none.
+    bool find(int64_t edge, Curve& c) const {
+        const auto halves = view_.geometry.topology().half_edges(edge);
+        // Most edges have one face on each side; with no jump there is then nothing more to look at.
+        if (!jumps_ && halves.size() == 2 && side_of(halves[0], facing_) * side_of(halves[1], facing_) < 0)
+            return false;
+        const int32_t va = vertex(view_.scene, halves[0], halves[0].first()),
+                      vb = vertex(view_.scene, halves[0], halves[0].second());
+        const VertexView& p = view_.vertices;
+        if (p.outcode[va] & p.outcode[vb]) return false;
+        c.a = p.q[va], c.b = p.q[vb];
+
+        HalfEdge side[2];  // minus, plus
+        side[0].face = side[1].face = -1;
+        for (const HalfEdge& h : halves) {
+            const int turn = side_of(h, facing_);
+            if (turn == 0) continue;
+            HalfEdge& seen = side[turn > 0 ? 0 : 1];
+            if (seen.face < 0 || !in_front(view_, seen, h, c.a, c.b)) seen = h;
+        }
+        if (side[0].face < 0 && side[1].face < 0) return false;
+        if (side[0].face >= 0 && side[1].face >= 0 && !(jumps_ && carries_jump(view_.scene, side[0], side[1])))
+            return false;
+
+        const Camera& camera = view_.camera;
+        if (!(p.outcode[va] | p.outcode[vb])) {
+            c.t0 = 0, c.t1 = 1;
+            c.x0 = p.x[va], c.x1 = p.x[vb];
+            c.w0 = camera.depth_weight(c.a), c.w1 = camera.depth_weight(c.b);
+        } else {
+            if (!view_.volume.clip_segment(c.a, c.b, c.t0, c.t1)) return false;
+            const Vec3 q0 = (1 - c.t0) * c.a + c.t0 * c.b, q1 = (1 - c.t1) * c.a + c.t1 * c.b;
+            c.w0 = camera.depth_weight(q0), c.w1 = camera.depth_weight(q1);
+            if (!(c.w0 > 0 && c.w1 > 0)) return false;  // ends in the eye itself
+            c.x0 = project(camera, q0), c.x1 = project(camera, q1);
+        }
+        c.edge = edge, c.minus = side[0], c.plus = side[1];
+        c.length = length(c.tangent());
+        const double pixels = std::fabs(camera.k[2]) + std::fabs(camera.k[5]) + length(c.x0) + length(c.x1);
+        c.rounding = 32 * std::numeric_limits<double>::epsilon() *
+                     (camera.pixels_per_unit / std::min(c.w0, c.w1) * coordinate_ + pixels);
+        return c.length > 0;
+    }
+
+   private:
+    const BackwardView<T>& view_;
+    std::vector<int8_t> facing_;  // orientation of each face in the image
+    double coordinate_ = 0;       // the largest there is, in the world and the camera
+    const bool jumps_;            // false: neighbouring faces are known to carry the same radiance at their edge
+};
 
 }  // namespace edgegrad

@@ -37,6 +37,7 @@ class PixelRow {
         : scene_(scene),
           camera_(camera),
           caster_(caster),
+          frame_(frame),
           pixel_rays_(camera, options),
           spp_(options.spp),
           team_(team),
@@ -74,7 +75,7 @@ class PixelRow {
     // in the next one.
     struct alignas(N ? 256 : 8) Shaded {
         int32_t face = -1;
-        bool textured = false;
+        bool textured = false, unseen = false;
         FaceMap map;
         AffineRadiance<N> radiance;
     };
@@ -89,11 +90,12 @@ class PixelRow {
             typename AffineRadiance<N>::Sum sum(C_);
             int hits = 0;
             for (const int end = i + part_[p].n; i < end; ++i) {
-                const int32_t face = rays_.face[i];
+                int32_t face = rays_.face[i];
                 if (face < 0) continue;
+                if (Shaded& s = kept_[unsigned(face) % n_kept]; face != s.face) keep(s, face);
+                if (kept_[unsigned(face) % n_kept].unseen && (face = beyond(face, i)) < 0) continue;
                 ++hits;
-                Shaded& s = kept_[unsigned(face) % n_kept];
-                if (face != s.face) keep(s, face);
+                const Shaded& s = kept_[unsigned(face) % n_kept];
                 const Barycentrics b = barycentrics_of_hit(s.map, rays_.n(i));
                 if (s.textured) {
                     shade<N>(scene_, face, b, radiance_.data());
@@ -108,12 +110,23 @@ class PixelRow {
         rays_.count = parts_ = 0;
     }
 
+    // What ray i meets behind a face that holds the eye.
+    int32_t beyond(int32_t face, int i) {
+        return caster_.beyond_float(frame_, rays_.n(i), face, {}, [&](int32_t f) {
+            Shaded& s = kept_[unsigned(f) % n_kept];
+            if (f != s.face) keep(s, f);
+            return !s.unseen;
+        });
+    }
+
     void keep(Shaded& s, int32_t face) {
         s.face = face;
         s.textured = is_textured(scene_, face);
         const int32_t* v = scene_.faces + 3 * int64_t(face);
         const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
         s.map = face_map(camera_, corner);
+        s.unseen = camera_.perspective && passes_through_eye(corner);
+        if (s.unseen) return;
         if (!s.textured) s.radiance.set(scene_, face);
         // Threads may write the same byte, always with the same value; reading first keeps its cache line shared.
         std::atomic_ref<uint8_t> seen(out_.seen[face]);
@@ -123,6 +136,7 @@ class PixelRow {
     const SceneView<T>& scene_;
     const Camera& camera_;
     const RayCaster& caster_;
+    const RayFrame& frame_;
     const PixelRays pixel_rays_;
     const int spp_;
     Team& team_;

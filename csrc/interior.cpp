@@ -85,6 +85,7 @@ struct VisiblePolygon {
             n = 3;
             for (int i = 0; i < 3; ++i) corner[i] = p.x[v[i]];
         } else {
+            if (view.camera.facing(p.q[v[0]], p.q[v[1]], p.q[v[2]]) == 0) return false;
             Vec3 polygon[ViewVolume::most_corners] = {p.q[v[0]], p.q[v[1]], p.q[v[2]]};
             n = view.volume.clip_triangle(polygon);
             for (int i = 0; i < n; ++i) {
@@ -187,10 +188,16 @@ class InteriorChunk {
         rays_.count = 0;
     }
 
+    // Whether nothing lies before the sample. Its ray may miss its own face, when that is thinner than floats are
+    // apart; then what counts is whether what it met instead lies behind, by more than floats can tell.
     bool sees(int i) const {
         if (rays_.face[i] == face_[i]) return true;
-        const auto decide = [&](int32_t face) { return face == face_[i] || meets(view_, face, rays_.n(i)); };
-        return view_.geometry.caster().beyond_float(view_.frame, rays_.n(i), rays_.face[i], {}, decide) == face_[i];
+        const Vec2 n = rays_.n(i);
+        const auto decide = [&](int32_t face) { return face == face_[i] || meets(view_, face, n); };
+        const int32_t met = view_.geometry.caster().beyond_float(view_.frame, n, rays_.face[i], {}, decide);
+        if (met < 0 || met == face_[i]) return true;
+        const double* p = view_.scene.verts + 3 * int64_t(view_.scene.faces[3 * int64_t(face_[i])]);
+        return depth_of(view_, met, n) > depth_of(view_, face_[i], n) + view_.frame.error({p[0], p[1], p[2]});
     }
 
     const BackwardView<T>& view_;

@@ -1,6 +1,8 @@
 // The interior term ∫ Ã · ∂L/∂Φ dx: what changes inside the faces.
 #pragma once
 
+#include <array>
+
 #include "importance.h"
 #include "render.h"
 #include "scatter.h"
@@ -24,13 +26,27 @@ struct BackwardView {
     const uint8_t* seen;  // (F,): whether the forward pass hit the face
 };
 
+template <class T>
+std::array<Vec3, 3> corners_of(const BackwardView<T>& view, int64_t face) {
+    const int32_t* v = view.scene.faces + 3 * face;
+    const auto& q = view.vertices.q;
+    return {q[v[0]], q[v[1]], q[v[2]]};
+}
+
 // Whether the ray at n meets a face, decided in double.
 template <class T>
-bool meets(const BackwardView<T>& view, int32_t face, Vec2 n) {
-    const int32_t* v = view.scene.faces + 3 * int64_t(face);
-    const auto& q = view.vertices.q;
-    const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
-    return covers(face_map(view.camera, corner), n);
+bool meets(const BackwardView<T>& view, int64_t face, Vec2 n) {
+    const auto corner = corners_of(view, face);
+    return covers(face_map(view.camera, corner.data()), n) &&
+           !(view.camera.perspective && passes_through_eye(corner.data()));
+}
+
+// The depth at which the ray at n meets a face.
+template <class T>
+double depth_of(const BackwardView<T>& view, int64_t face, Vec2 n) {
+    const auto corner = corners_of(view, face);
+    const Barycentrics b = barycentrics_of_hit(face_map(view.camera, corner.data()), n);
+    return b[0] * corner[0].z + b[1] * corner[1].z + b[2] * corner[2].z;
 }
 
 // What a run of samples on one face finds. What they have in common is done once for the run: the face's map and its

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cmath>
+#include <limits>
 
 // A function compiled twice, of which the processor takes what it can run: loops over arrays gain from AVX2.
 #if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__)
@@ -51,6 +52,12 @@ inline void cross_vjp(Vec3 a, Vec3 b, Vec3 bar, Vec3& a_bar, Vec3& b_bar) {
 }
 
 inline double length(Vec3 a) { return std::sqrt(dot(a, a)); }
+
+// Bound of the rounding error of a · (b × c).
+inline double rounding_of_triple_product(Vec3 a, Vec3 b, Vec3 c) {
+    const auto sum = [](Vec3 v) { return std::fabs(v.x) + std::fabs(v.y) + std::fabs(v.z); };
+    return 4 * std::numeric_limits<double>::epsilon() * sum(a) * sum(b) * sum(c);
+}
 
 struct Mat3 {
     Vec3 row[3];

@@ -63,12 +63,19 @@ inline bool barycentrics(const FaceMap& m, Vec2 n, Barycentrics& b) {
     return std::isfinite(b.u + b.v);
 }
 
+// Whether the plane of a face holds the eye of a perspective camera, as far as doubles can tell. It is then seen
+// edge-on and covers nothing, though every ray meets the plane, in the eye.
+inline bool passes_through_eye(const Vec3 q[3]) {
+    const Vec3 e1 = q[1] - q[0], e2 = q[2] - q[0];
+    return std::fabs(dot(q[0], cross(e1, e2))) <= rounding_of_triple_product(q[0], e1, e2);
+}
+
 // Whether the face covers n. One that doubles cannot tell from its rim does: between two faces that share an edge there
 // must be no gap, and each computes that edge in its own way.
 inline bool covers(const FaceMap& m, Vec2 n) {
     const Vec3 p = m.times(n);
     const double eps = 16 * std::numeric_limits<double>::epsilon(), x = eps * std::fabs(n.x), y = eps * std::fabs(n.y);
-    const auto error = [&](double Vec3::*row) {
+    const auto error = [&](double Vec3::* row) {
         return x * std::fabs(m.column[0].*row) + y * std::fabs(m.column[1].*row) + eps * std::fabs(m.column[2].*row);
     };
     const double eu = error(&Vec3::x), ev = error(&Vec3::y), ew = error(&Vec3::z), sign = p.z < 0 ? -1 : 1;

@@ -1,0 +1,125 @@
+"""Curves that lie on one another in the image: each side of such a line shows something else of each of them, and rays
+through it leave to rounding what they meet. Gradients against finite differences, as in test_pitfalls.py; where a motion
+parts what lies together, the image has a derivative for each direction only, and central differences are their mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from finite_differences import check_ratio
+from scenes import cube, front_camera, icosphere
+from torch import Tensor
+
+import edgegrad as eg
+
+F64 = torch.float64
+BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)
+ALONG = torch.tensor([0.7, 0.6, -0.2], dtype=F64)
+SAMPLES = {"surface_samples": 20_000, "edge_samples": 20_000}
+STRAIGHT = eg.Camera.look_at((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 35.0, (48, 48)).to(F64)
+FROM_ABOVE = eg.Camera.look_at((0.8, 1.2, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 35.0, (48, 48)).to(F64)
+VIEWS = {"orthographic": front_camera(48, "orthographic"), "straight": STRAIGHT, "above": FROM_ABOVE}
+
+
+def face_colored(mesh: eg.Mesh, seed: int = 0) -> eg.Mesh:
+    """A colour for each quad, that is each two faces."""
+    generator = torch.Generator().manual_seed(seed)
+    colors = torch.rand(len(mesh.faces) // 2, 3, generator=generator, dtype=F64)
+    return eg.Mesh(mesh.verts, mesh.faces, face_colors=colors.repeat_interleave(2, 0))
+
+
+def check(case: Callable[[Tensor], list[eg.Mesh]], view: str, step: float = 0.004, **options: object) -> None:
+    check_ratio(
+        lambda theta: (eg.Scene(case(theta), BACKGROUND), VIEWS[view]), step, spp=2048, **{**SAMPLES, **options}
+    )
+
+
+@pytest.mark.parametrize("moved", ["all", "scale", "front", "back"])
+@pytest.mark.parametrize("faces", [False, True], ids=["smooth", "face colours"])
+def test_box_seen_straight_on(faces: bool, moved: str) -> None:
+    """Its front and back rims fall on the same lines, and its sides on them too: 0 to 2.2 before."""
+    box = face_colored(cube(0.5)) if faces else cube(0.5)
+    front = (box.verts[:, 2:] > 0).double()
+    along = {"all": ALONG, "scale": box.verts, "front": ALONG * front, "back": ALONG * (1 - front)}[moved]
+    # Along ALONG some of these gradients nearly vanish, and would be lost in the noise of the differences.
+    aside = torch.tensor([0.4, -1.0, 0.0], dtype=F64) * (front if moved == "front" else 1.0) * (moved != "scale")
+    check(lambda theta: [box.replace(verts=box.verts + theta * (along + aside))], "orthographic")
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("copies", [2, 3])
+def test_meshes_in_the_same_place(copies: int, view: str) -> None:
+    sphere = icosphere(2).transformed(scale=0.7)
+    check(lambda theta: [sphere.transformed(t=theta * ALONG)] * copies, view, edge_samples=80_000)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("tilted", [False, True], ids=["flat", "tilted"])
+def test_t_junction(tilted: bool, view: str, dtype: torch.dtype) -> None:
+    """A long side of one face against two short ones, in one plane: −14 instead of −93 before."""
+    verts = torch.tensor(
+        [[-0.7, -0.6], [0.1, -0.6], [0.1, 0.6], [-0.7, 0.6], [0.1, -0.6], [0.8, -0.6], [0.8, 0.6], [0.1, 0.6], [0.1, 0.05]],
+        dtype=F64,
+    )  # fmt: skip
+    verts = torch.nn.functional.pad(verts, (0, 1))
+    if tilted:
+        turn = torch.tensor([[0.0, -0.3, 0.2], [0.3, 0.0, -0.4], [-0.2, 0.4, 0.0]], dtype=F64)
+        verts = verts @ torch.linalg.matrix_exp(turn).T
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [4, 5, 8], [5, 6, 8], [8, 6, 7]])
+    colors = torch.stack([0.4 * verts[:, 0] + 0.5, 0.3 * verts[:, 1] + 0.4, 0.2 * verts.sum(1) + 0.5], 1)
+    check(lambda theta: [eg.Mesh((verts + theta * ALONG).to(dtype), faces, colors=colors)], view)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_boxes_on_one_another(view: str) -> None:
+    """Flush, each face with a colour of its own: up to 20 % off before."""
+    boxes = [face_colored(cube(0.3), seed) for seed in range(3)]
+    size = torch.tensor([1.0, 0.7, 1.0], dtype=F64)
+    place = [torch.tensor([0.0, 0.42 * k - 0.42, 0.0], dtype=F64) for k in range(3)]
+    along = torch.tensor([0.9, 0.9, -0.2], dtype=F64)
+    check(
+        lambda theta: [b.replace(verts=b.verts * size + p + theta * along) for b, p in zip(boxes, place, strict=True)],
+        view,
+    )
+
+
+@pytest.mark.parametrize("moved", ["all", "first", "second", "third"])
+def test_boxes_behind_one_another(moved: str) -> None:
+    """Six rims on one line, at six depths."""
+    boxes = [face_colored(cube(0.25), seed) for seed in range(3)]
+    chosen = range(3) if moved == "all" else [["first", "second", "third"].index(moved)]
+
+    def case(theta: Tensor) -> list[eg.Mesh]:
+        place = [torch.tensor([0.0, 0.0, 0.8 * k - 0.8], dtype=F64) for k in range(3)]
+        return [
+            b.transformed(t=p + (theta * ALONG if k in chosen else 0.0))
+            for k, (b, p) in enumerate(zip(boxes, place, strict=True))
+        ]
+
+    check(case, "orthographic")
+
+
+def test_a_thin_strip_is_not_taken_for_one_line() -> None:
+    """Its two sides lie closer than a ray of floats can tell, and each moves the image by itself."""
+    width = 2e-6
+    verts = torch.tensor(
+        [[-0.6, -0.5, 0.0], [0.7, 0.4, 0.0], [0.7, 0.4 + width, 0.0], [-0.6, -0.5 + width, 0.0]], dtype=F64
+    )
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    camera = front_camera(48)
+    grads = []
+    for seed in range(4):
+        moving = verts.clone().requires_grad_()
+        scene = eg.Scene(eg.Mesh(moving, faces, face_colors=torch.ones(2, 1, dtype=F64)))
+        eg.render(scene, camera, spp=4, seed=seed, edge_samples=4000).sum().backward()
+        assert moving.grad is not None
+        grads.append(moving.grad)
+    # The sum of the image is the area of the strip in pixels: a parallelogram that its upper side widens.
+    points = verts.clone().requires_grad_()
+    x = camera.project(points)
+    area = 0.5 * (x * x.roll(-1, 0).flip(-1) * torch.tensor([1.0, -1.0], dtype=F64)).sum().abs()
+    (exact,) = torch.autograd.grad(area, points)
+    torch.testing.assert_close(torch.stack(grads).mean(0), exact, rtol=0.02, atol=0.02 * float(exact.abs().max()))
