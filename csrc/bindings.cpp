@@ -360,9 +360,12 @@ void bind_scene(nb::module_& m, const char* name) {
 
 NB_MODULE(_core, m) {
     m.doc() = "The edgegrad kernel. Use it through the edgegrad package.";
-    m.def("open_embree", &open_embree, "path"_a);
+    m.def("open_embree", &open_embree, "path"_a, nb::call_guard<nb::gil_scoped_release>());
     m.def("embree_version", &embree_version);
-    m.def("clear_geometry", &clear_geometry);
+    // Without the interpreter's lock, for which a thread that holds the kernel's may wait.
+    m.def("clear_geometry", &clear_geometry, nb::call_guard<nb::gil_scoped_release>());
+    m.def("before_fork", &before_fork, nb::call_guard<nb::gil_scoped_release>());
+    m.def("after_fork", &after_fork);
     nb::class_<Camera>(m, "Camera")
         .def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "perspective"_a, "width"_a,
              "height"_a);

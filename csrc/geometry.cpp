@@ -1,5 +1,9 @@
 #include "geometry.h"
 
+#if defined(__GNUC__) && !defined(__clang__)
+#include <omp.h>
+#endif
+
 #include <algorithm>
 #include <cstring>
 #include <list>
@@ -68,6 +72,21 @@ std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n
 void clear_geometry() {
     const std::lock_guard lock(mutex);
     kept.clear();
+}
+
+void before_fork() {
+    mutex.lock();
+    embree_mutex.lock();
+    // GNU's runtime starts new threads at the next parallel loop; others see to it themselves at fork(). Embree's
+    // threads need no care: nobody waits for them, for the one that builds can do all of the work.
+#if defined(__GNUC__) && !defined(__clang__)
+    omp_pause_resource_all(omp_pause_hard);
+#endif
+}
+
+void after_fork() {
+    embree_mutex.unlock();
+    mutex.unlock();
 }
 
 }  // namespace edgegrad

@@ -10,7 +10,6 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <mutex>
 #include <new>
 #include <numeric>
 #include <stdexcept>
@@ -66,9 +65,10 @@ void throw_on_error(const char* doing) {
 
 }  // namespace
 
+std::mutex embree_mutex;
+
 void open_embree(const std::string& path) {
-    static std::mutex mutex;
-    const std::lock_guard lock(mutex);
+    const std::lock_guard lock(embree_mutex);
     if (rtc.device) return;
     void* library = open_library(path);
     if (!library) throw std::runtime_error("cannot open " + path + ": " + open_error());
@@ -95,6 +95,7 @@ RayCaster::RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts)
       n_faces_(n_faces),
       n_verts_(n_verts),
       positions_(3 * size_t(n_verts) + 1, 0.f) {  // Embree reads 16 bytes a vertex
+    const std::lock_guard lock(embree_mutex);
     if (!rtc.device) throw std::runtime_error("Embree is not open");
     Geometry geometry = rtc.rtcNewGeometry(rtc.device, GEOMETRY_TYPE_TRIANGLE);
     rtc.rtcSetSharedGeometryBuffer(geometry, BUFFER_TYPE_INDEX, 0, FORMAT_UINT3, faces, 0, 12, n_faces);
@@ -112,6 +113,7 @@ RayCaster::RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts)
 }
 
 RayCaster::~RayCaster() {
+    const std::lock_guard lock(embree_mutex);
     rtc.rtcReleaseGeometry(static_cast<Geometry>(geometry_));
     rtc.rtcReleaseScene(static_cast<Scene>(scene_));
 }
@@ -160,6 +162,7 @@ void RayCaster::update(const double* verts, Team& team) {
             positions_[3 * v] = float(p.x), positions_[3 * v + 1] = float(p.y), positions_[3 * v + 2] = float(p.z);
         }
     });
+    const std::lock_guard lock(embree_mutex);
     if (committed_) rtc.rtcUpdateGeometryBuffer(static_cast<Geometry>(geometry_), BUFFER_TYPE_VERTEX, 0);
     rtc.rtcCommitGeometry(static_cast<Geometry>(geometry_));
     rtc.rtcCommitScene(static_cast<Scene>(scene_));

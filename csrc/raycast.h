@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <mutex>
 #include <span>
 #include <string>
 #include <vector>
@@ -12,6 +13,9 @@ namespace edgegrad {
 
 // Opens libembree4 and makes the device. Throws std::runtime_error when it is not there or not version 4.
 void open_embree(const std::string& path);
+
+// Held by whoever makes, builds or frees a ray structure, so that fork() can wait until nobody does: see before_fork().
+extern std::mutex embree_mutex;
 
 // Version of the opened library, as 40400 for 4.4.0.
 int embree_version();

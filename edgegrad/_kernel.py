@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import os
 
 import torch  # noqa: F401  first, so that the kernel shares torch's OpenMP runtime
 
@@ -38,3 +39,6 @@ def load():
 
 
 core = load()
+# Without this a worker of a DataLoader, or of multiprocessing, that is forked after its parent rendered waits for ever.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=core.before_fork, after_in_parent=core.after_fork, after_in_child=core.after_fork)

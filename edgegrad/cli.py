@@ -7,7 +7,6 @@ import errno
 import math
 import os
 import sys
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -27,7 +26,6 @@ from .render import render
 from .scene import Scene
 
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, as shells have it
-SAVE_EVERY = 1.0  # seconds between copies of the best pose so far
 
 
 class _Parser(argparse.ArgumentParser):
@@ -43,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("edgegrad: interrupted", file=sys.stderr)
         return INTERRUPTED
-    except (OSError, ValueError, TypeError, ImportError) as error:
+    except (OSError, ValueError, TypeError, ImportError, MemoryError) as error:
         print(f"edgegrad: error: {_one_line(error)}", file=sys.stderr)
         return 2
 
@@ -72,29 +70,33 @@ def _fit_pose(args: argparse.Namespace) -> int:
     camera = _camera(args, scene, (picture.shape[0], picture.shape[1]), args.init)
     make_folder(args.out)
 
-    saved = time.monotonic()
-
-    def save_sometimes(fit: PoseFit) -> None:
-        nonlocal saved
-        if time.monotonic() - saved >= SAVE_EVERY:
-            saved = time.monotonic()
-            with suppress(OSError):  # the last copy will say what is wrong
-                _write_pose(args.out, fit)
+    def save(fit: PoseFit) -> None:
+        # After each step, which takes far longer: whatever ends the process, the best pose so far is on disk.
+        with suppress(OSError):  # the last copy will say what is wrong
+            _write_pose(args.out, fit)
 
     fit = fit_pose(
         scene, picture, camera, mask, None if init is None else init.matrix,
         fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=_background(args.background, picture),
-        max_size=args.size, steps=args.steps, seed=args.seed, callback=save_sometimes,
+        max_size=args.size, steps=args.steps, seed=args.seed, callback=save,
     )  # fmt: skip
-    state = "interrupted" if fit.interrupted else "converged" if fit.converged else "not converged: try more --steps"
-    print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {state}")
-    print("mesh to world:")
-    for row in fit.matrix.tolist():
-        print("  " + "  ".join(f"{value:12.6f}" for value in row))
-    if args.fit_focal:
-        print(f"focal length: {float(fit.camera.K[0, 0]):.6g} px")
-    print(f"wrote {', '.join(_write_outputs(args.out, fit))} in {args.out}")
+    # Neither a full disk nor a closed terminal may lose the result: it is printed before the files are written, and they
+    # are written also when printing failed.
+    try:
+        _print_fit(fit, args.fit_focal)
+    finally:
+        written = _write_outputs(args.out, fit)
+    print(f"wrote {', '.join(written)} in {args.out}")
     return INTERRUPTED if fit.interrupted else 0
+
+
+def _print_fit(fit: PoseFit, focal: bool) -> None:
+    state = "interrupted" if fit.interrupted else "converged" if fit.converged else "not converged: try more --steps"
+    lines = [f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {state}", "mesh to world:"]
+    lines += ["  " + "  ".join(f"{value:12.6f}" for value in row) for row in fit.matrix.tolist()]
+    if focal:
+        lines.append(f"focal length: {float(fit.camera.K[0, 0]):.6g} px")
+    print("\n".join(lines), flush=True)
 
 
 def _render(args: argparse.Namespace) -> int:

@@ -11,30 +11,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from . import _memory as memory
 from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
 from .camera import Camera
 from .mesh import Mesh
 from .render import (
-    _DIFFERENTIABLE,
+    DIFFERENTIABLE,
+    DIFFERENTIABLE_NAMES,
     as_scene,
     backward_kernel,
     backward_work,
     forward_kernel,
+    image_room,
     render_arguments,
     requires_grad,
+    surface_rows,
 )
 from .scene import Flat, Scene
 
-# Of Embree's structure, a face, beyond the copies of faces and vertices: resident memory grew by 74.4 bytes a face between
-# spheres of 327,680 and 1,310,720 faces, of which 12 are the faces, 18 the vertices and 1 says which were seen.
-RAY_STRUCTURE_BYTES = 44
-# csrc/scatter.h: samples are worked on in chunks, and only so many chunks a thread are in memory at a time.
-CHUNK, CHUNKS_IN_FLIGHT = 512, 16
-
 # -- the plan ---------------------------------------------------------------------------------------------------------
-
-# What may require a gradient, in the order of render_backward.
-_NAMES = ("verts", "colors", "uvs", "texture", "background", "world_to_camera", "K")
 
 
 @dataclass(frozen=True)
@@ -80,10 +75,10 @@ class Plan(Mapping[str, Term]):
 
     def __str__(self) -> str:
         rows = [
-            (name, "on" if term.on else "off", _count(term.samples), _size(term.bytes), term.why)
+            (name, "on" if term.on else "off", _count(term.samples), memory.size(term.bytes), term.why)
             for name, term in self.items()
         ]
-        total = ("in all", "", _count(self.samples), _size(self.bytes), "")
+        total = ("in all", "", _count(self.samples), memory.size(self.bytes), "")
         return _table([("term", "", "samples", "memory", "why"), *rows, total], "<<>><")
 
     __repr__ = __str__
@@ -118,7 +113,7 @@ def _image_terms(scene: Scene, arguments: Sequence[Any], any_gradient: bool) -> 
         "ray structure": Term(
             True,
             "built once, and again when vertices moved",
-            bytes=F * (RAY_STRUCTURE_BYTES + 12) + 36 * V,
+            bytes=memory.ray_structure(F, V),
         ),
         "image": Term(True, f"{spp} samples a pixel{cameras}", B * height * width * spp, B * height * width * C * word),
         # Its memory is the user's own, or counted with the scene.
@@ -136,14 +131,14 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
     height, width = arguments[12:14]
     varies, visibility = arguments[21:23]
     V, F, C = len(flat.verts), len(flat.faces), flat.background.shape[-1]
-    E = 3 * F // 2  # edges of a closed mesh
     image_bytes = B * height * width * C * flat.colors.element_size()
-    verts, colors, uvs, texture, _, world_to_camera, K = wanted
+    verts, _, _, _, _, world_to_camera, K = wanted
     moves = verts or world_to_camera or K
     work = backward_work(varies, visibility, wanted)
 
     # The kernel counts them itself. It is asked whatever is wanted, for it also checks what render() leaves to it.
-    ones = flat.colors.new_ones((B, height, width, C))
+    with image_room(*arguments):
+        ones = flat.colors.new_ones((B, height, width, C))
     seen = flat.faces.new_ones((B, F), dtype=torch.uint8)
     _, profiles = backward_kernel(ones, ones[..., 0].contiguous(), seen, *arguments, wanted, dry=True)
     surface, edge, silhouettes, creases = (
@@ -157,31 +152,31 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
     no_interior = ""
     if not (work.motion or work.appearance):
         no_interior = "each face has one radiance, wherever it moves" if moves else "nothing asks for it"
-    reasons = [_NAMES[i] for i in (1, 2, 3) if wanted[i]]
+    reasons = [DIFFERENTIABLE_NAMES[i] for i in (1, 2, 3) if wanted[i]]
     reasons += ["radiance varies over faces that move"] if work.motion else []
 
-    # Rows of the scatter, an index and doubles: three corners for a run of samples on a face, four texels a sample.
-    face_row = 3 * 32 * work.motion + 3 * (8 + 8 * C) * colors + 3 * 24 * (uvs and not colors)
-    interior_rows = _rows_in_flight(surface, F) * face_row + _in_flight(surface) * 4 * (8 + 8 * C) * texture
-    boundary_rows = _rows_in_flight(edge, silhouettes + creases) * 4 * 32
+    interior_rows = surface_rows(surface, [*arguments, wanted])
+    boundary_rows = memory.rows(edge, silhouettes + creases, 4, 3, V)
     terms = {
         "view": Term(
             any(work),
             "where vertices are and where the loss looks" if any(work) else "nothing asks for it",
-            bytes=image_bytes + 8 * height * width + 41 * V + 24 * V * moves,
+            bytes=image_bytes + memory.view(height, width, V, moves),
         ),
         "interior": Term(
             surface > 0,
             no_interior or (", ".join(reasons) if surface else "nothing in view"),
             samples=surface,
-            bytes=8 * F + 2 * V + interior_rows,
+            bytes=memory.surface_measure(F, V, height * width, len(flat.textures) > 0) + interior_rows,
         ),
-        "topology": Term(work.boundary, no_boundary or "edges, found once for a set of faces", bytes=36 * F + 8 * E),
+        "topology": Term(
+            work.boundary, no_boundary or "edges, found once for a set of faces", bytes=memory.topology(F)
+        ),
         "boundary": Term(
             edge > 0,
             no_boundary or ("what moves shows where radiance jumps" if edge else "no jump in view"),
             samples=edge,
-            bytes=F + 8 * E + boundary_rows,
+            bytes=memory.edge_measure(F) + boundary_rows,
         ),
         "silhouettes": Term(
             silhouettes > 0, no_boundary or (f"{silhouettes:,} in view" if silhouettes else "none in view")
@@ -191,21 +186,10 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
             no_boundary or (f"{creases:,} in view" if creases else "nothing jumps between neighbours"),
         ),
     }
-    for name, i, want in zip(_NAMES, _DIFFERENTIABLE, wanted, strict=True):
+    for name, i, want in zip(DIFFERENTIABLE_NAMES, DIFFERENTIABLE, wanted, strict=True):
         why = "required; summed in double" if want else "not required"
         terms[f"{name} gradient"] = Term(want, why, bytes=8 * arguments[i].numel())
     return terms
-
-
-def _in_flight(samples: int) -> int:
-    """Samples that are in memory at a time."""
-    return min(samples, CHUNK * CHUNKS_IN_FLIGHT * torch.get_num_threads())
-
-
-def _rows_in_flight(samples: int, primitives: int) -> int:
-    """Runs of samples on one primitive: they come in order, so there are no more than primitives and ends of chunks."""
-    samples = _in_flight(samples)
-    return min(samples, primitives + -(-samples // CHUNK))
 
 
 def _bytes_of_copies(scene: Scene, flat: Flat) -> int:
@@ -350,13 +334,3 @@ def _table(rows: Sequence[Sequence[str]], align: str) -> str:
 
 def _count(n: int) -> str:
     return f"{n:,}" if n else ""
-
-
-def _size(size: int) -> str:
-    """With two or three digits, in powers of 1000."""
-    if size == 0:
-        return ""
-    for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if size >= scale:
-            return f"{size / scale:.{0 if size >= 10 * scale else 1}f} {unit}"
-    return f"{size} B"

@@ -7,12 +7,14 @@ the derivative of the expected image.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from . import _memory as memory
 from ._check import as_int, check_positive_int, check_shape
 from ._kernel import core
 from .camera import Camera
@@ -50,7 +52,8 @@ def render(
                      faces it hit, which says where to put them
 
     Differentiable in every floating-point tensor of the scene and the camera. The image has the dtype of the colours and
-    comes back on the scene's device. Raises TypeError or ValueError that names the argument.
+    comes back on the scene's device. Raises TypeError or ValueError that names the argument, and MemoryError, before it
+    allocates, with the figure and what to lower; so does its backward pass.
     """
     arguments = render_arguments(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
@@ -169,7 +172,12 @@ Profile = dict[str, float]
 
 
 def forward_kernel(*args: Any) -> tuple[Tensor, Tensor, Tensor, list[Profile]]:
-    """image (B, H, W, C), coverage (B, H, W), seen (B, F), and what the kernel did for each camera."""
+    """image (B, H, W, C), coverage (B, H, W), seen (B, F), and what the kernel did for each camera. Raises MemoryError."""
+    with image_room(*args):
+        return _forward_kernel(*args)
+
+
+def _forward_kernel(*args: Any) -> tuple[Tensor, Tensor, Tensor, list[Profile]]:
     flat, (world_to_camera, K) = Flat(*args[:9]), args[9:11]
     perspective, height, width, spp, filter, seed, spacing = args[11:18]
     scene = _kernel_scene(flat, spacing)
@@ -200,12 +208,13 @@ def _render_fake(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 
 # The differentiable arguments, in the order of the gradients that render_backward returns.
-_DIFFERENTIABLE = (0, 3, 4, 5, 8, 9, 10)  # verts, colors, uvs, texels, background, world_to_camera, K
+DIFFERENTIABLE = (0, 3, 4, 5, 8, 9, 10)
+DIFFERENTIABLE_NAMES = ("verts", "colors", "uvs", "texture", "background", "world_to_camera", "K")
 
 
 def requires_grad(arguments: Sequence[Any]) -> list[bool]:
-    """For each of `_DIFFERENTIABLE` whether a backward pass will be asked for it: not at all under torch.no_grad()."""
-    return [torch.is_grad_enabled() and arguments[i].requires_grad for i in _DIFFERENTIABLE]
+    """For each of `DIFFERENTIABLE` whether a backward pass will be asked for it: not at all under torch.no_grad()."""
+    return [torch.is_grad_enabled() and arguments[i].requires_grad for i in DIFFERENTIABLE]
 
 
 class Work(NamedTuple):
@@ -223,10 +232,78 @@ def backward_work(interior_geometry: bool, boundary: bool, wanted: Sequence[bool
     return Work(moves and interior_geometry, colors or uvs or texels, moves and boundary)
 
 
+def image_room(*args: Any) -> AbstractContextManager[None]:
+    """Raises MemoryError before its block if the image does not fit. Takes the arguments of the operator."""
+    flat, (B, height, width) = Flat(*args[:9]), (args[9].shape[0], *args[12:14])
+    V, F, C, word = flat.verts.shape[0], flat.faces.shape[0], flat.background.shape[-1], flat.colors.element_size()
+    needs = {
+        "image": B * height * width * C * word,
+        "coverage": B * height * width * word,
+        "faces seen": B * F,
+        "vertices in view": 24 * V,
+    }
+    return memory.room("render", needs, {"ray structure": memory.ray_structure(F, V)}, lambda: _lower(args))
+
+
+def gradient_room(adjoint: Tensor, *args: Any) -> AbstractContextManager[None]:
+    """Raises MemoryError before its block if the gradients do not fit. Takes the arguments of the operator."""
+    flat, (height, width), (surface_samples, edge_samples), wanted = Flat(*args[:9]), args[12:14], args[18:20], args[23]
+    work = backward_work(*args[21:])
+    V, F, many = flat.verts.shape[0], flat.faces.shape[0], 1 << 62
+    needs = {
+        # In double, and then in the tensor's own type.
+        f"{name} gradient": (8 + args[i].element_size() % 8) * args[i].numel() * want
+        for name, i, want in zip(DIFFERENTIABLE_NAMES, DIFFERENTIABLE, wanted, strict=True)
+    }
+    needs["gradient by the image"] = adjoint.numel() * adjoint.element_size() * (not adjoint.is_contiguous())
+    if any(work):
+        needs["view"] = memory.view(height, width, V, work.motion or work.boundary)
+    if work.motion or work.appearance:
+        needs["faces in view"] = memory.surface_measure(F, V, height * width, flat.textures.shape[0] > 0)
+        needs["surface samples"] = surface_rows(many if surface_samples < 0 else surface_samples, args)
+    if work.boundary:
+        needs["edges in view"] = memory.edge_measure(F)
+        needs["edge samples"] = memory.rows(many if edge_samples < 0 else edge_samples, memory.edges(F), 4, 3, V)
+    kept = {"ray structure": memory.ray_structure(F, V), "topology": memory.topology(F) * work.boundary}
+    return memory.room("backward pass", needs, kept, lambda: _lower(args) + ", or let fewer tensors require a gradient")
+
+
+def surface_rows(samples: int, args: Sequence[Any]) -> int:
+    """Bytes of what samples inside faces leave to be added up."""
+    flat, wanted = Flat(*args[:9]), args[23]
+    _, colors, uvs, texels, *_ = wanted
+    F, C = flat.faces.shape[0], flat.background.shape[-1]
+    total = memory.rows(samples, F, 3, 3, flat.verts.shape[0]) * backward_work(*args[21:]).motion
+    # A face has a texture or colours: a run of samples leaves rows of one kind.
+    if colors:
+        total += memory.rows(samples, F, 3, C, flat.colors.shape[0])
+    elif uvs:
+        total += memory.rows(samples, F, 3, 2, flat.uvs.shape[0])
+    return total + memory.rows(samples, None, 4, C, flat.texels.shape[0]) * texels
+
+
+def _lower(args: Sequence[Any]) -> str:
+    flat, (B, height, width) = Flat(*args[:9]), (len(args[9]), *args[12:14])
+    return (
+        f"the camera's size ({width} × {height} pixels), its batch ({B}), the channels ({flat.background.shape[-1]}) "
+        f"or the faces ({len(flat.faces):,})"
+    )
+
+
 def backward_kernel(
     adjoint: Tensor, coverage: Tensor, seen: Tensor, *args: Any, dry: bool = False
 ) -> tuple[list[Tensor | None], list[Profile]]:
-    """The gradients of what is wanted, float64, and what the kernel did for each camera. `dry` only counts samples."""
+    """The gradients of what is wanted, float64, and what the kernel did for each camera. `dry` only counts samples.
+
+    Raises MemoryError.
+    """
+    with gradient_room(adjoint, *args):
+        return _backward_kernel(adjoint, coverage, seen, *args, dry=dry)
+
+
+def _backward_kernel(
+    adjoint: Tensor, coverage: Tensor, seen: Tensor, *args: Any, dry: bool
+) -> tuple[list[Tensor | None], list[Profile]]:
     flat, (world_to_camera, K) = Flat(*args[:9]), args[9:11]
     perspective, height, width, _, filter, _, spacing = args[11:18]
     surface_samples, edge_samples, grad_seed, interior_geometry, boundary, wanted = args[18:]
@@ -235,7 +312,7 @@ def backward_kernel(
     # Sums are taken in double whatever the arrays hold.
     grads = [
         torch.zeros_like(args[i], dtype=torch.float64) if want else None
-        for i, want in zip(_DIFFERENTIABLE, wanted, strict=True)
+        for i, want in zip(DIFFERENTIABLE, wanted, strict=True)
     ]
     verts, colors, uvs, texels, background, gw2c, gK = (None if g is None else g.numpy() for g in grads)
     if background is not None and background.ndim == 1:
@@ -259,7 +336,7 @@ def _render_backward_cpu(*args: Any) -> tuple[Tensor, ...]:
     adjoint, _, _, *inputs = args
     return tuple(
         adjoint.new_empty(0, dtype=torch.float32) if g is None else g.to(inputs[i].dtype)
-        for i, g in zip(_DIFFERENTIABLE, backward_kernel(*args)[0], strict=True)
+        for i, g in zip(DIFFERENTIABLE, backward_kernel(*args)[0], strict=True)
     )
 
 
@@ -267,7 +344,7 @@ def _render_backward_cpu(*args: Any) -> tuple[Tensor, ...]:
 def _render_backward_fake(adjoint: Tensor, coverage: Tensor, seen: Tensor, *args: Any) -> tuple[Tensor, ...]:
     return tuple(
         torch.empty_like(args[i]) if want else adjoint.new_empty(0, dtype=torch.float32)
-        for i, want in zip(_DIFFERENTIABLE, args[-1], strict=True)
+        for i, want in zip(DIFFERENTIABLE, args[-1], strict=True)
     )
 
 
@@ -289,10 +366,10 @@ class _Render(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         coverage, seen, *tensors = ctx.saved_tensors
-        wanted = [ctx.needs_input_grad[i] for i in _DIFFERENTIABLE]
+        wanted = [ctx.needs_input_grad[i] for i in DIFFERENTIABLE]
         grads = torch.ops.edgegrad.render_backward(grad_outputs[0], coverage, seen, *tensors, *ctx.options, wanted)
         out: list[Tensor | None] = [None] * (len(tensors) + len(ctx.options))
-        for i, want, grad in zip(_DIFFERENTIABLE, wanted, grads, strict=True):
+        for i, want, grad in zip(DIFFERENTIABLE, wanted, grads, strict=True):
             if want:
                 out[i] = grad
         return tuple(out)

@@ -92,7 +92,6 @@ def test_an_interrupted_fit_is_written(files, capsys, monkeypatch):
             raise KeyboardInterrupt
 
     write = cli._write_pose
-    monkeypatch.setattr(cli, "SAVE_EVERY", 0.0)
     monkeypatch.setattr(cli, "_write_pose", write_pose)
     assert fit(files, "--init", files / "init.json", "--out", files / "out") == cli.INTERRUPTED
     found = PoseFit.from_json((files / "out" / "pose.json").read_text())
