@@ -8,10 +8,11 @@ import json
 import pytest
 import torch
 from PIL import Image
+from trimesh.creation import icosphere
 
 import edgegrad as eg
 from edgegrad import cli
-from edgegrad.report import references, scenes
+from edgegrad.report import mitsuba, references, scenes
 from edgegrad.report.error_time import error_time
 from edgegrad.report.methods import Edgegrad, FiniteDifferences, rigid
 from edgegrad.report.references import QUICK, exact, long_run
@@ -121,6 +122,33 @@ def test_ctrl_c_keeps_what_is_measured(tmp_path, monkeypatch, capsys):
     assert document(tmp_path)["points"][0] == points[0] and len(document(tmp_path)["points"]) == 3
 
 
+def test_ctrl_c_in_a_reference_keeps_its_runs(tmp_path, monkeypatch, capsys):
+    """The runs that are done are not done again, and end in the reference that one go would have given."""
+    asked = ("--scene", "quad", "--methods", "interior", "--size", 16, "--seeds", 2, "--quick", "--out", tmp_path)
+    gradient, runs = Edgegrad.gradient, []
+
+    def interrupted(self, budget, seed):
+        if seed >= references.SEED:
+            runs.append((self.part, seed - references.SEED))
+        if runs == [("interior", 0), ("interior", 1), ("boundary", 0)]:
+            raise KeyboardInterrupt
+        return gradient(self, budget, seed)
+
+    monkeypatch.setattr(Edgegrad, "gradient", interrupted)
+    assert run(*asked) == cli.INTERRUPTED
+    assert f"interrupted; the same command goes on from what is kept in {tmp_path}" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {f"reference-quad-interior-{k}.pt" for k in (0, 1)}
+    runs.clear()
+    assert run(*asked) == 0
+    assert runs == [("boundary", 0), ("boundary", 1)]
+    assert {path.name for path in tmp_path.glob("*.pt")} == {"reference-quad.pt"}
+
+    scene = scenes.build("quad", 16)
+    kept, at_once = references.reference(scene, tmp_path, QUICK), long_run(scene, QUICK)
+    torch.testing.assert_close((kept.interior, kept.boundary), (at_once.interior, at_once.boundary))
+    assert kept.error.keys() == at_once.error.keys() and kept.check.keys() == {"translation", "rotation"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -128,14 +156,18 @@ def test_ctrl_c_keeps_what_is_measured(tmp_path, monkeypatch, capsys):
         (("--methods", "magic"), ("methods", "finite-differences", "'magic'")),
         (("--scene", "triangle", "--seeds", "1"), ("seeds", "at least 2", "1", "try 5")),
         (("--scene", "triangle", "--mesh", "there.ply"), ("mesh", "scan", "triangle", "add scan")),
-        (("--scene", "scan", "--mesh", "there.ply"), ("there.ply", "no such file")),
+        (("--scene", "triangle", "--seeds", "1000000000000"), ("seeds", "from 1 to 1000")),
+        (("--scene", "triangle", "--size", "100000"), ("size", "from 1 to 4096", "100000")),
+        # Known to be wrong before the triangle is measured.
+        (("--scene", "triangle", "scan", "--mesh", "there.ply"), ("there.ply", "no such file")),
+        (("--scene", "triangle", "scan", "--mesh", __file__), ("test_report.py", ".obj", "'.py'")),
     ],
 )
 def test_errors(arguments, words, tmp_path, capsys):
-    assert run(*arguments, "--out", tmp_path) == 2
+    assert run(*arguments, "--quick", "--out", tmp_path) == 2
     said = capsys.readouterr().err
     assert all(word in said for word in words), said
-    assert not list(tmp_path.glob("error-time*"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_file_of_someone_else_is_not_overwritten(tmp_path, capsys):
@@ -250,3 +282,45 @@ def test_finite_differences_turn_the_right_way():
     arm, omega = scene.verts - scene.center, torch.tensor([1e-6, -2e-6, 3e-6], dtype=torch.float64)
     moved = FiniteDifferences(scene)._turned(omega) - scene.verts
     torch.testing.assert_close(moved, torch.linalg.cross(omega.expand_as(arm), arm), rtol=1e-4, atol=1e-10)
+
+
+# -- Mitsuba ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def open_ball():
+    """Plain, small, far from the origin and with a hole that shows its inside, as scans are: all of its gradient is at edges."""
+    ball = icosphere(3)
+    where = torch.tensor([3.0, -2.0, 1.0])
+    kept = ball.triangles_center[:, 1] < 0.7
+    mesh = eg.Mesh(where + 0.05 * torch.tensor(ball.vertices).float(), torch.tensor(ball.faces[kept]))
+    camera = eg.Camera.look_at(where + torch.tensor([0.05, 0.12, 0.18]), where, (0, 1, 0), 35.0, (64, 64))
+    scene = eg.Scene([mesh], scenes.background().float())
+    adjoint = scenes.smooth_adjoint(64, 64, 3).float()
+    return scenes.ReportScene("ball", "a ball with a hole", scene, camera.to(torch.float64), adjoint)
+
+
+def test_what_mitsuba_gets_is_the_same_view(open_ball):
+    scene, camera, scale = mitsuba._resized(open_ball.scene, open_ball.camera)
+    assert scene.meshes[0].verts.norm(dim=1).max() == pytest.approx(mitsuba.RADIUS)
+    assert scale == pytest.approx(mitsuba.RADIUS / 0.05, rel=0.2)
+    points = [
+        view.project(s.meshes[0].verts.double()) for s, view in ((scene, camera), (open_ball.scene, open_ball.camera))
+    ]
+    torch.testing.assert_close(*points, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", mitsuba.INTEGRATORS)
+def test_mitsuba_agrees_on_a_plain_open_mesh(open_ball, integrator):
+    """Within 5 standard errors, which are well below the gradient."""
+    pytest.importorskip("mitsuba")
+    if mitsuba.available() is None:
+        pytest.skip("Mitsuba finds no LLVM")
+    peer = mitsuba.Mitsuba(open_ball.scene, open_ball.camera, open_ball.adjoint, integrator)
+    ours = Edgegrad(open_ball).gradient(16, 0).metrics()
+    theirs = [rigid(open_ball, torch.cat(peer.gradient(256, seed)[0])) for seed in range(12)]
+    for name, correct in ours.items():
+        runs = [run[name] for run in theirs]
+        error = references.standard_error(runs)
+        assert error < 0.03 * correct.norm(), name
+        assert (torch.stack(runs).mean(0) - correct).norm() < 5.0 * error, name

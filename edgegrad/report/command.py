@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,8 @@ def _error_time(args: argparse.Namespace) -> int:
     )  # fmt: skip
     if document["points"]:
         print(f"wrote error-time.json, error-time.md, error-time.png in {args.out}")
+    if interrupted:
+        print(f"edgegrad: interrupted; the same command goes on from what is kept in {args.out}", file=sys.stderr)
     return INTERRUPTED if interrupted else 0
 
 

@@ -22,6 +22,7 @@ import torch
 from tqdm import tqdm
 
 from .. import __version__
+from .._check import check_positive_int
 from .._files import replacing
 from .._kernel import core
 from ..plan import profile
@@ -32,6 +33,7 @@ from .scenes import SCENES, ReportScene, build
 NAME = "error-time"
 METRICS = ("vertex", "translation", "rotation")
 WARM_UP = 1 << 20  # a seed that is not measured
+LARGEST = 4096  # pixels on a side: references and finite differences hold several such images in double
 
 Document = dict[str, Any]
 
@@ -56,14 +58,18 @@ def error_time(
     quick            few points and a rough reference, to try it out
     mesh             file of the scene "scan"
 
-    Raises ValueError for an unknown name or a file that an earlier run did not write.
+    Raises ValueError for an unknown name, a number out of range, a mesh that cannot be shown or a file that an earlier run did
+    not write, OSError for a mesh that is not there; all before anything is measured.
     """
     scenes = _known("scenes", scenes, SCENES)
     methods = _known("methods", methods, METHODS)
+    check_positive_int("size", size, most=LARGEST)
+    check_positive_int("seeds", seeds, most=1000)
     if seeds < 2:
         raise ValueError(f"seeds: expected at least 2, for the spread, got {seeds}; try 5")
     if mesh is not None and "scan" not in scenes:
         raise ValueError(f"mesh: expected with the scene scan, got {', '.join(scenes)}; add scan")
+    scan = None if mesh is None else build("scan", size, mesh)
     run = _Run(out, size, seeds, limit, quick)
     for name in methods:
         if (lack := missing(name)) is not None:
@@ -74,7 +80,7 @@ def error_time(
     with tqdm(total=len(scenes) * len(methods), unit="sweep", dynamic_ncols=True) as run.bar:
         try:
             for name in scenes:
-                run.measure_scene(name, methods, mesh if name == "scan" else None)
+                run.measure_scene(name, methods, scan if name == "scan" else None)
         except KeyboardInterrupt:
             interrupted = True
     if run.document["points"]:
@@ -147,11 +153,11 @@ class _Run:
         plots.write_table(self.out / f"{NAME}.md", self.document)
         plots.draw(self.out / f"{NAME}.png", self.document)
 
-    def measure_scene(self, name: str, methods: Sequence[str], mesh: Path | None) -> None:
+    def measure_scene(self, name: str, methods: Sequence[str], scene: ReportScene | None) -> None:
         assert self.bar is not None
         self.bar.set_description(f"{name}: building")
         try:
-            scene = build(name, self.size, mesh)
+            scene = scene or build(name, self.size)
         except ImportError as error:
             if name != "scan":
                 raise

@@ -14,12 +14,16 @@ from torch import Tensor
 
 from .._files import replacing
 from .exact import exact_image
-from .methods import Edgegrad, FiniteDifferences, rigid
+from .methods import Edgegrad, FiniteDifferences, Method, rigid
 from .scenes import ReportScene
 
 EXACT = ("triangle", "slivers")  # untextured, and few enough faces
 SEED = 1 << 40  # seeds of references are none that a method uses
 PARTS = ("whole", "interior", "boundary")
+Values = dict[str, Any]
+Keep = Callable[
+    [str, Callable[[], Values]], Values
+]  # what is in the file of a name, or else what the function computes
 
 
 @dataclass(frozen=True)
@@ -57,21 +61,46 @@ class Reference:
 def reference(
     scene: ReportScene, folder: Path, effort: Effort, say: Callable[[str], None] = lambda text: None
 ) -> Reference:
-    """From reference-NAME.pt in `folder` if it is there for the same scene and effort, else computed and written there."""
-    path = folder / f"reference-{scene.name}.pt"
+    """From reference-NAME.pt in `folder` if it is there for the same scene and effort, else computed and written there.
+
+    Each run on the way there has a file of its own until all are done: Ctrl-C loses one of them, not the others.
+    """
     key = f"{scene.fingerprint} {effort}"
-    if path.exists():
-        try:
-            stored: dict[str, Any] = torch.load(path, weights_only=True)
-            if stored.pop("key") == key:
-                return Reference(**stored)
-        except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError, AttributeError):
-            say(f"{path.name} cannot be read: it is computed again")
-    found = exact(scene) if scene.name in EXACT else long_run(scene, effort)
-    found.check = check(scene, found, effort)
-    with replacing(path) as temporary:
-        torch.save({"key": key, **vars(found)}, temporary)
+
+    def keep(name: str, compute: Callable[[], Values]) -> Values:
+        path = folder / f"reference-{scene.name}{name}.pt"
+        if path.exists():
+            try:
+                stored: Values = torch.load(path, weights_only=True)
+                if stored.pop("key") == key:
+                    return stored
+            except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError, AttributeError):
+                say(f"{path.name} cannot be read: it is computed again")
+        found = compute()
+        with replacing(path) as temporary:
+            torch.save({"key": key, **found}, temporary)
+        return found
+
+    def whole() -> Values:
+        found = exact(scene) if scene.name in EXACT else long_run(scene, effort, keep)
+        found.check = check(scene, found, effort, keep)
+        return vars(found)
+
+    found = Reference(**keep("", whole))
+    for path in folder.glob(f"reference-{scene.name}-*.pt"):  # of single runs
+        path.unlink()
     return found
+
+
+def _in_no_file(name: str, compute: Callable[[], Values]) -> Values:
+    return compute()
+
+
+def _runs(keep: Keep, name: str, method: Method, budget: float, count: int) -> list[dict[str, Tensor]]:
+    """The metrics of so many runs."""
+    return [
+        keep(f"-{name}-{run}", lambda run=run: method.gradient(budget, SEED + run).metrics()) for run in range(count)
+    ]
 
 
 def exact(scene: ReportScene) -> Reference:
@@ -94,7 +123,7 @@ def exact(scene: ReportScene) -> Reference:
     return Reference("exact pixel integrals", interior, whole - interior)
 
 
-def long_run(scene: ReportScene, effort: Effort) -> Reference:
+def long_run(scene: ReportScene, effort: Effort, keep: Keep = _in_no_file) -> Reference:
     """The mean of several long runs of each term; their spread gives the error of the mean."""
     runs: dict[str, list[Tensor]] = {}
     factors = {}
@@ -102,8 +131,7 @@ def long_run(scene: ReportScene, effort: Effort) -> Reference:
         method = Edgegrad(scene, part)
         default = method.samples[part == "boundary"]
         factors[part] = max(effort.factor, least / default) if default else 1.0
-        found = [method.gradient(factors[part], SEED + run).vertex for run in range(effort.runs)]
-        runs[part] = [vertex for vertex in found if vertex is not None]
+        runs[part] = [run["vertex"] for run in _runs(keep, part, method, factors[part], effort.runs)]
     runs["whole"] = [a + b for a, b in zip(runs["interior"], runs["boundary"], strict=True)]
     result = Reference(
         f"edgegrad, {effort.runs} runs at × {factors['interior']:.0f} default surface samples, "
@@ -119,10 +147,12 @@ def long_run(scene: ReportScene, effort: Effort) -> Reference:
     return result
 
 
-def check(scene: ReportScene, found: Reference, effort: Effort) -> dict[str, dict[str, float]]:
+def check(
+    scene: ReportScene, found: Reference, effort: Effort, keep: Keep = _in_no_file
+) -> dict[str, dict[str, float]]:
     """The distance of the reference to finite differences, which know nothing of how edgegrad differentiates."""
     method = FiniteDifferences(scene)
-    runs = [method.gradient(effort.check_spp, SEED + run).metrics() for run in range(effort.check_seeds)]
+    runs = _runs(keep, "check", method, effort.check_spp, effort.check_seeds)
     result = {}
     for name in ("translation", "rotation"):
         several, correct = [run[name] for run in runs], found.metrics(scene)[name]
