@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import os
 
 import torch  # noqa: F401  first, so that the kernel shares torch's OpenMP runtime
@@ -28,8 +29,17 @@ def embree_path() -> str:
 
 
 def load():
-    """The kernel module, with Embree open. Raises ImportError that says how to get what is missing."""
-    from . import _core  # pyright: ignore[reportAttributeAccessIssue]  the compiled module
+    """The kernel module, with Embree open. Raises ImportError that says how to get what is missing.
+
+    It is the one that was installed, or the file in the environment variable EDGEGRAD_KERNEL: a build with sanitizers.
+    """
+    if path := os.environ.get("EDGEGRAD_KERNEL"):
+        spec = importlib.util.spec_from_file_location("edgegrad._core", path)
+        assert spec is not None and spec.loader is not None, f"EDGEGRAD_KERNEL: expected a compiled module, got {path}"
+        _core = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(_core)
+    else:
+        from . import _core  # pyright: ignore[reportAttributeAccessIssue]  the compiled module
 
     try:
         _core.open_embree(embree_path())
