@@ -23,7 +23,7 @@ def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating:
     if isinstance(value, Tensor):
         if value.layout is not torch.strided:
             raise TypeError(f"{name}: expected a dense tensor, got one of layout {value.layout}; use .to_dense()")
-        return value
+        return value.resolve_neg()  # itself, unless it is a view that says only that its numbers are negated
     if _needs_gradient(value):
         raise TypeError(
             f"{name}: expected a tensor where gradients are required, got a sequence of them; use torch.stack"
@@ -102,7 +102,7 @@ def check_finite(name: str, tensor: Tensor, *, largest: float = LARGEST, smalles
             return
     else:
         flat = values.reshape(-1)
-        if smallest**2 < float(torch.dot(flat, flat)) < largest**2:
+        if smallest**2 * flat.numel() <= float(torch.dot(flat, flat)) <= largest**2:
             return
     size = values.abs()
     if bool((bad := ~torch.isfinite(values)).any()):

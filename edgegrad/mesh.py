@@ -47,7 +47,7 @@ class Mesh:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not isinstance(value, Tensor) and (value is not None or field.name in ("verts", "faces")):
+            if value is not None or field.name in ("verts", "faces"):
                 like = self.verts if field.name not in ("verts", "faces", "uv_faces") else None
                 object.__setattr__(
                     self, field.name, as_tensor(field.name, value, like=like, floating=field.name == "verts")
