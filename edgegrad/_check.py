@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -21,8 +22,10 @@ def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating:
     Raises TypeError when `value` is none of these, a sparse tensor, or a sequence of tensors whose gradients would be lost.
     """
     if isinstance(value, Tensor):
-        if value.layout is not torch.strided:
-            raise TypeError(f"{name}: expected a dense tensor, got one of layout {value.layout}; use .to_dense()")
+        if value.layout is not torch.strided or value.is_nested:
+            kind = "a nested one" if value.is_nested else f"one of layout {value.layout}"
+            raise TypeError(f"{name}: expected a dense tensor, got {kind}; use .to_dense() or pad it")
+        _check_real(name, value)
         return value.resolve_neg()  # itself, unless it is a view that says only that its numbers are negated
     if _needs_gradient(value):
         raise TypeError(
@@ -37,11 +40,18 @@ def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating:
             f"{name}: expected a tensor, array or nested sequence of numbers, got {type(value).__name__}; "
             f"convert it with torch.as_tensor ({error})"
         ) from None
+    _check_real(name, tensor)
     if not tensor.is_floating_point() and like is not None and like.is_floating_point():
         tensor = tensor.to(like.dtype)
     elif floating and not tensor.is_floating_point():
         tensor = tensor.to(torch.get_default_dtype())
     return tensor
+
+
+def _check_real(name: str, tensor: Tensor) -> None:
+    """A conversion would drop the imaginary part. Raises TypeError."""
+    if tensor.is_complex():
+        raise TypeError(f"{name}: expected real numbers, got {tensor.dtype}; take their .real")
 
 
 def _needs_gradient(value: object) -> bool:
@@ -86,6 +96,20 @@ def values_visible(*tensors: Tensor) -> bool:
     """Whether values may be looked at: not while torch.compile traces, where the kernel's own checks take over, and not
     those of meta tensors, which have none."""
     return not torch.compiler.is_compiling() and not any(tensor.is_meta for tensor in tensors)
+
+
+def check_not_meta(name: str, tensor: Tensor) -> None:
+    """A tensor that has values, on whatever device. Raises ValueError."""
+    if tensor.is_meta:
+        raise ValueError(f"{name}: expected numbers, got a meta tensor, which has none; make it on another device")
+
+
+def check_fields(kind: type, given: Iterable[str]) -> None:
+    """What `replace` is given are fields of the dataclass. Raises TypeError."""
+    known = sorted(field.name for field in dataclasses.fields(kind))
+    for name in given:
+        if name not in known:
+            raise TypeError(f"replace: expected one of {', '.join(known)}, got {name!r}")
 
 
 def check_finite(name: str, tensor: Tensor, *, largest: float = LARGEST, smallest: float = 0.0) -> None:

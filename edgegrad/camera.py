@@ -22,6 +22,7 @@ from ._check import (
     LARGEST,
     as_scalar,
     as_tensor,
+    check_fields,
     check_finite,
     check_float,
     check_int,
@@ -216,6 +217,7 @@ class Camera:
 
     def replace(self, **fields: Any) -> Camera:
         """This camera with some fields replaced."""
+        check_fields(Camera, fields)
         return dataclasses.replace(self, **fields)
 
     def project(self, points: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ._check import as_tensor, check_finite, check_shape
+from ._check import as_tensor, check_finite, check_not_meta, check_shape
 from ._files import PathLike, check_readable, check_suffix, replacing, require
 
 DISPLAY = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # 8 bit, sRGB
@@ -100,6 +100,7 @@ def write_image(path: PathLike, img: Tensor) -> None:
             f"img: expected linear radiance of a floating dtype, got {image.dtype}; "
             "for 8-bit sRGB values use srgb_to_linear(img / 255)"
         )
+    check_not_meta("img", image)
     check_shape("img", image, ("H", "W"), ("H", "W", "C"))
     image = image.cpu().float().reshape(*image.shape[:2], -1)
     check_finite("img", image)

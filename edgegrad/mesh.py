@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ._check import as_tensor, check_finite, check_float, check_indices, check_integer, check_shape
+from ._check import as_tensor, check_fields, check_finite, check_float, check_indices, check_integer, check_shape
 
 PLAIN = 0.7  # radiance of a mesh without colours, in every channel
 SMALLEST_MESH, LARGEST_UV = 1e-38, 1e9
@@ -101,10 +101,7 @@ class Mesh:
 
         Giving another kind of colour removes the one there was.
         """
-        known = {field.name for field in dataclasses.fields(self)}
-        for name in fields:
-            if name not in known:
-                raise TypeError(f"replace: expected one of {', '.join(sorted(known))}, got {name!r}")
+        check_fields(Mesh, fields)
         appearance = {"colors", "face_colors", "corner_colors", "texture"}
         if any(name in appearance and fields[name] is not None for name in fields):
             gone = appearance | (set() if fields.get("texture") is not None else {"uvs", "uv_faces"})

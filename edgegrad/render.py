@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ._check import as_int, check_finite, check_positive_int, check_shape
+from ._check import as_int, check_finite, check_not_meta, check_positive_int, check_shape
 from ._kernel import core
 from .camera import Camera
 from .mesh import Mesh
@@ -124,8 +124,8 @@ def _check_devices(scene: Scene, camera: Camera) -> None:
     """Tensors may lie on any device that holds numbers. Raises ValueError."""
     fields = [*(field for mesh in scene.meshes for field in vars(mesh).items()), ("background", scene.background)]
     for name, value in [*fields, *vars(camera).items()]:
-        if isinstance(value, Tensor) and value.is_meta:
-            raise ValueError(f"{name}: expected numbers, got a meta tensor, which has none; make it on another device")
+        if isinstance(value, Tensor):
+            check_not_meta(name, value)
 
 
 def radiance_varies(scene: Scene) -> bool:

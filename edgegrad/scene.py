@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ._check import MOST_ROWS, as_tensor, check_finite, check_float, check_shape, values_visible
+from ._check import MOST_ROWS, as_tensor, check_fields, check_finite, check_float, check_shape, values_visible
 from .mesh import PLAIN, Mesh
 
 
@@ -77,6 +77,7 @@ class Scene:
 
     def replace(self, **fields: Any) -> Scene:
         """This scene with some fields replaced."""
+        check_fields(Scene, fields)
         return dataclasses.replace(self, **fields)
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Scene:

@@ -387,11 +387,11 @@ VECTOR = ["text", None, [1.0, 2.0], [[1.0, 2.0, 3.0]], [0.0, NAN, 1.0], [INF, 0.
 MATRIX3 = ["text", None, torch.eye(4), torch.eye(2), torch.full((3, 3), NAN), torch.eye(3, dtype=torch.half), 1.0,
            torch.eye(3).to_sparse(), torch.eye(3).long()]  # fmt: skip
 ROTATION = [*MATRIX3, 2.0 * torch.eye(3), -torch.eye(3), torch.zeros(3, 3), torch.eye(3) + 0.1]
-ANGLE = [0.0, 180.0, -1.0, NAN, INF, "40", None, [1.0, 2.0], torch.ones(2), torch.eye(2)]
+ANGLE = [0.0, 180.0, 1j, [1j], torch.tensor(1j), -1.0, NAN, INF, "40", None, [1.0, 2.0], torch.ones(2), torch.eye(2)]
 SIZE = BAD_OPTIONS["size"]
 POSE4 = ["text", None, torch.eye(3), torch.full((4, 4), NAN), torch.eye(4).long(), torch.eye(4) * 2, torch.ones(4, 4),
          torch.diag(torch.tensor([1.0, 1, -1, 1])), torch.eye(4).to_sparse()]  # fmt: skip
-NUMBER = ["big", None, [1.0, 2.0], NAN, INF, torch.ones(3), 1j, object()]
+NUMBER = ["big", 1j, torch.tensor(1j), None, [1.0, 2.0], NAN, INF, torch.ones(3), 1j, object()]
 PIXELS = [1.5, "a", None, True, 2**40, -(2**70), torch.ones(2), [1]]
 PICTURE = ["text", None, torch.rand(3), torch.rand(7, 8, 3), torch.full((8, 8, 3), NAN), torch.ones(8, 8, 3).byte(),
            torch.rand(8, 8, 3, 1), torch.rand(8, 8, 3).to_sparse()]  # fmt: skip
@@ -509,6 +509,23 @@ def test_properties(name: str):
 def test_properties_at_length(name: str):
     """3,300 cases, others in each run."""
     run(name, CHECKS[name][3], derandomize=False)
+
+
+@pytest.mark.parametrize("thing", [GOOD_MESH, eg.Scene(GOOD_MESH), GOOD_CAMERA])
+def test_replace_knows_its_fields(thing: Any):
+    check_refused(lambda: thing.replace(vertices=1), {"replace"}, "")
+
+
+def test_other_kinds_of_tensors():
+    nested = torch.nested.nested_tensor([torch.rand(3, 3)])
+    check_refused(lambda: eg.Mesh(nested, torch.tensor([[0, 1, 2]])), {"verts"}, "nested")
+    for image in (torch.rand(4, 4).to("meta"), torch.rand(4, 4).to_sparse()):
+        check_refused(lambda image=image: eg.write_image("never.png", image), {"img"}, image.layout)
+    for count in (2**30, 2**40):  # of no memory, but more than 32 bits count
+        check_refused(lambda n=count: eg.Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]).expand(n, 3)), {"faces"}, count)
+        check_refused(lambda n=count: eg.Mesh(torch.zeros(1, 3).expand(4 * n, 3), [[0, 1, 2]]), {"faces"}, count)
+    many = [eg.Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]).expand(2**25, 3))] * 22
+    check_refused(lambda: eg.Scene(many), {"meshes"}, "together")
 
 
 def test_the_properties_can_fail():
