@@ -2,35 +2,62 @@
 
 from __future__ import annotations
 
+import dataclasses
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
+
+# Numbers beyond the range of float32, in float64: the kernel multiplies up to seven of them (a triple product of positions
+# by two focal lengths, by colour and adjoint), which must stay below 1e308.
+LARGEST = torch.finfo(torch.float32).max
+MOST_ROWS = 2**31 - 1  # of any array that is referred to by index: inside, indices have 32 bits
 
 
 def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating: bool = False) -> Tensor:
     """`value` as a tensor: tensors pass unchanged, numbers, sequences and NumPy arrays are converted, to the device of
     `like` and, if `like` is floating-point, to a floating-point dtype; with `floating` always to one.
 
-    Raises TypeError when `value` is none of these.
+    Raises TypeError when `value` is none of these, a sparse tensor, or a sequence of tensors whose gradients would be lost.
     """
     if isinstance(value, Tensor):
-        return value
+        if value.layout is not torch.strided or value.is_nested:
+            kind = "a nested one" if value.is_nested else f"one of layout {value.layout}"
+            raise TypeError(f"{name}: expected a dense tensor, got {kind}; use .to_dense() or pad it")
+        _check_real(name, value)
+        return value.resolve_neg()  # itself, unless it is a view that says only that its numbers are negated
+    if _needs_gradient(value):
+        raise TypeError(
+            f"{name}: expected a tensor where gradients are required, got a sequence of them; use torch.stack"
+        )
     try:
         tensor = torch.as_tensor(value, device=None if like is None else like.device)
         if like is not None and like.is_floating_point() and tensor.dtype != like.dtype and not hasattr(value, "dtype"):
             tensor = torch.as_tensor(value, dtype=like.dtype, device=like.device)  # numbers of Python are double
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise TypeError(
             f"{name}: expected a tensor, array or nested sequence of numbers, got {type(value).__name__}; "
             f"convert it with torch.as_tensor ({error})"
         ) from None
+    _check_real(name, tensor)
     if not tensor.is_floating_point() and like is not None and like.is_floating_point():
         tensor = tensor.to(like.dtype)
     elif floating and not tensor.is_floating_point():
         tensor = tensor.to(torch.get_default_dtype())
     return tensor
+
+
+def _check_real(name: str, tensor: Tensor) -> None:
+    """A conversion would drop the imaginary part. Raises TypeError."""
+    if tensor.is_complex():
+        raise TypeError(f"{name}: expected real numbers, got {tensor.dtype}; take their .real")
+
+
+def _needs_gradient(value: object) -> bool:
+    if isinstance(value, Tensor):
+        return value.requires_grad
+    return isinstance(value, (list, tuple)) and any(map(_needs_gradient, value))
 
 
 def shape_text(shape: Sequence[int | str]) -> str:
@@ -65,32 +92,66 @@ def check_integer(name: str, tensor: Tensor) -> None:
         raise TypeError(f"{name}: expected an integer dtype (int32 or int64), got {tensor.dtype}; use .long()")
 
 
-def values_visible() -> bool:
-    """Whether values may be looked at: not while torch.compile traces, where the kernel's own checks take over."""
-    return not torch.compiler.is_compiling()
+def values_visible(*tensors: Tensor) -> bool:
+    """Whether values may be looked at: not while torch.compile traces, where the kernel's own checks take over, and not
+    those of meta tensors, which have none."""
+    return not torch.compiler.is_compiling() and not any(tensor.is_meta for tensor in tensors)
 
 
-def check_finite(name: str, tensor: Tensor) -> None:
-    """No NaN, no infinity; names the first bad index. Raises ValueError."""
-    if not values_visible() or tensor.device.type == "meta":
+def check_not_meta(name: str, tensor: Tensor) -> None:
+    """A tensor that has values, on whatever device. Raises ValueError."""
+    if tensor.is_meta:
+        raise ValueError(f"{name}: expected numbers, got a meta tensor, which has none; make it on another device")
+
+
+def check_fields(kind: type, given: Iterable[str]) -> None:
+    """What `replace` is given are fields of the dataclass. Raises TypeError."""
+    known = sorted(field.name for field in dataclasses.fields(kind))
+    for name in given:
+        if name not in known:
+            raise TypeError(f"replace: expected one of {', '.join(known)}, got {name!r}")
+
+
+def check_finite(name: str, tensor: Tensor, *, largest: float = LARGEST, smallest: float = 0.0) -> None:
+    """No NaN, no infinity, and none larger than `largest`; names the first bad index. Not all, unless all are zero, are
+    smaller than `smallest`. Raises ValueError.
+    """
+    if not values_visible(tensor):
         return
-    # A sum is finite unless a term is not (or the sum overflows): one fast pass, then the exact answer.
-    if bool(torch.isfinite(tensor.detach().sum())):
+    values = tensor.detach()
+    # One fast pass that says yes to nearly everything, then the exact answer. A sum is finite unless a term is not (or the
+    # sum overflows); what a sum of squares reaches, no term exceeds.
+    if largest >= torch.finfo(values.dtype).max and not smallest:
+        if bool(torch.isfinite(values.sum())):
+            return
+    else:
+        flat = values.reshape(-1)
+        if smallest**2 * flat.numel() <= float(torch.dot(flat, flat)) <= largest**2:
+            return
+    size = values.abs()
+    if bool((bad := ~torch.isfinite(values)).any()):
+        expected, fix = "finite numbers", "look for a division by zero or a diverged optimisation step before this call"
+    elif bool((bad := size > largest).any()):
+        expected, fix = f"numbers up to {largest:.3g}", "choose other units, or look for a diverged optimisation step"
+    elif smallest and bool((bad := (size > 0) & (size.max() < smallest)).any()):
+        expected, fix = f"numbers of which some are above {smallest:.3g}, or all zero", "choose other units"
+    else:
         return
-    bad = ~torch.isfinite(tensor.detach())
-    if bool(bad.any()):
-        index = tuple(bad.nonzero()[0].tolist())
-        value = tensor.detach()[index].item()
-        where = ", ".join(str(i) for i in index)
-        raise ValueError(
-            f"{name}: expected finite numbers, got {value} at [{where}] ({int(bad.sum())} such values in all); "
-            "look for a division by zero or a diverged optimisation step before this call"
-        )
+    index = tuple(bad.nonzero()[0].tolist())
+    where = ", ".join(str(i) for i in index)
+    raise ValueError(
+        f"{name}: expected {expected}, got {values[index].item()} at [{where}] ({int(bad.sum())} such values in all); {fix}"
+    )
 
 
 def check_indices(name: str, tensor: Tensor, count: int, of: str) -> None:
     """All in [0, count). Raises ValueError."""
-    if not values_visible() or tensor.device.type == "meta" or tensor.numel() == 0:
+    if tensor.shape[0] > MOST_ROWS // 3 or count > MOST_ROWS:
+        raise ValueError(
+            f"{name}: expected at most {MOST_ROWS // 3} faces and {MOST_ROWS} rows of {of} (indices have 32 bits inside), "
+            f"got {tensor.shape[0]} and {count}; render the scene in parts"
+        )
+    if not values_visible(tensor) or tensor.numel() == 0:
         return
     low, high = (int(v) for v in torch.aminmax(tensor))
     if low < 0 or high >= count:
@@ -121,9 +182,14 @@ def as_scalar(name: str, value: object, *, like: Tensor) -> Tensor:
     return tensor.to(like).reshape(())
 
 
+def check_int(name: str, value: object, least: int, most: int) -> int:
+    """An int in [least, most]. Raises TypeError or ValueError."""
+    number = as_int(name, value)
+    if not least <= number <= most:
+        raise ValueError(f"{name}: expected an int from {least} to {most}, got {number}")
+    return number
+
+
 def check_positive_int(name: str, value: object, *, most: int = 2**31 - 1) -> int:
     """An int ≥ 1. Raises TypeError or ValueError."""
-    number = as_int(name, value)
-    if not 1 <= number <= most:
-        raise ValueError(f"{name}: expected an int from 1 to {most}, got {number}")
-    return number
+    return check_int(name, value, 1, most)

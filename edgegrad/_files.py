@@ -24,13 +24,18 @@ def require(module: str, package: str, purpose: str) -> ModuleType:
 def check_readable(path: PathLike, suffixes: Collection[str]) -> Path:
     """An existing, non-empty file whose name ends in one of `suffixes`.
 
-    Raises FileNotFoundError when nothing is there, ValueError when it is a directory, of another kind or empty.
+    Raises FileNotFoundError when nothing is there, PermissionError when it may not be read, ValueError when it is a directory
+    or a device, of another kind or empty.
     """
     file = check_suffix(path, suffixes)
     if file.is_dir():
         raise ValueError(f"{path}: expected a file, got a directory; name a file in it")
     if not file.exists():
         raise FileNotFoundError(f"{path}: expected a file, got no such file; look for it in {file.absolute().parent}")
+    if not file.is_file():
+        raise ValueError(f"{path}: expected a file, got a pipe or a device, which may never end; copy it to a file")
+    if not os.access(file, os.R_OK):
+        raise PermissionError(f"{path}: expected a file that may be read, got one without the permission; chmod it")
     if file.stat().st_size == 0:
         raise ValueError(f"{path}: expected data, got an empty file; export it again")
     return file

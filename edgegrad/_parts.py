@@ -6,6 +6,7 @@ import io
 import json
 import re
 import warnings
+import zipfile
 from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 from urllib.parse import unquote
@@ -17,6 +18,10 @@ from torch import Tensor
 from ._files import PathLike, check_readable, require
 from .image import srgb_to_linear
 
+MOST_ZEROS = 1 << 24  # rows that a glTF may ask for without holding them
+MOST_INSTANCES = 100_000  # of the parts of a 3MF: nested components multiply
+# What Pillow is let loose on. Not EPS, above all, for which it runs another program.
+TEXTURES = ("PNG", "JPEG", "MPO", "JPEG2000", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "DDS")
 MESHES = (".obj", ".gltf", ".glb", ".ply", ".stl", ".off", ".3mf")
 
 
@@ -79,6 +84,10 @@ class _Textures:
 
     def get(self, name: str, image: Any, factor: tuple[float, ...] = (1.0, 1.0, 1.0)) -> Tensor:
         """(h, w, 3) linear radiance from a Pillow image, row 0 on top, times a linear factor."""
+        if image.format not in TEXTURES:
+            raise Fault(
+                f"expected a {', '.join(TEXTURES)} image in the texture {name!r}, got {image.format}; convert it"
+            )
         key = (id(image), factor)
         if key not in self.known:
             try:
@@ -115,7 +124,10 @@ def read_parts(path: PathLike, materials: bool = True, split: bool = False, unwr
             # Without a texture, vertices must not be split at its seams: their colours would not follow.
             header = data.split(b"end_header")[0].lower()
             options["fix_texture"] = unwrap or (materials and b"texturefile" in header)
+        instances = _instances(data) if kind == "3mf" else None
         tree = _gltf_tree(data, kind) if kind in ("gltf", "glb") else None
+        if tree is not None:
+            data = _without_gloss(data, kind, tree)
         with warnings.catch_warnings():
             # Where a text stops being numbers, NumPy drops the rest and only warns.
             warnings.filterwarnings("error", message="string or file could not be read", category=DeprecationWarning)
@@ -126,6 +138,11 @@ def read_parts(path: PathLike, materials: bool = True, split: bool = False, unwr
                 raise Fault(f"expected texture coordinates for its texture {next(iter(folder.contents))!r}, got none")
         if kind == "obj" and "geometry" in loaded:
             loaded["geometry"] = dict(reversed(loaded["geometry"].items()))  # trimesh turns their order round
+        if instances is not None and instances != len(loaded["graph"]):
+            raise Fault(
+                f"expected {instances} instances of objects, and {len(loaded['graph'])} could be read: components are nested "
+                "too often, or refer to objects that are not there; export it flat"
+            )
         primitives = None if tree is None else _gltf_primitives(tree, loaded["geometry"])
         placed = [place for place in _place(loaded) if len(place[1].get("faces", ()))]  # the others: points and lines
         parts = []
@@ -161,12 +178,29 @@ def _place(loaded: dict[str, Any]) -> list[tuple[str, dict[str, Any], np.ndarray
     geometry, edges = loaded["geometry"], loaded.get("graph")
     if edges is None:
         return [(name, raw, np.eye(4)) for name, raw in geometry.items()]
-    graph = require("trimesh", "trimesh", "reading meshes").Scene(base_frame=loaded.get("base_frame", "world")).graph
-    for edge in edges:
-        graph.update(**edge)
+    # Node by node, from matrices that are known: trimesh looks for the way to each node anew, which takes minutes where
+    # thousands are nested.
+    to_matrix = require("trimesh.scene.transforms", "trimesh", "reading meshes").kwargs_to_matrix
+    parent = {edge["frame_to"]: edge for edge in edges}
+    if len(parent) < len(edges):
+        raise Fault("expected a tree of nodes, got some inside two others; export it again")
+    base = loaded.get("base_frame", "world")
+    world = {base: np.eye(4)}
+
+    def matrix(node: str) -> np.ndarray:
+        way = []
+        while node not in world:
+            if len(way) > len(parent) or node not in parent:
+                raise Fault("expected a tree of nodes, got some that no root leads to; export it again")
+            way.append(parent[node])
+            node = parent[node].get("frame_from", base)
+        for edge in reversed(way):
+            world[edge["frame_to"]] = world[edge.get("frame_from", base)] @ to_matrix(**edge)
+        return world[way[0]["frame_to"]] if way else world[node]
+
     order = {name: i for i, name in enumerate(geometry)}
     nodes = [(edge["geometry"], edge["frame_to"]) for edge in edges if edge.get("geometry") in order]
-    return [(name, geometry[name], graph[node][0]) for name, node in sorted(nodes, key=lambda n: order[n[0]])]
+    return [(name, geometry[name], matrix(node)) for name, node in sorted(nodes, key=lambda n: order[n[0]])]
 
 
 def _shape(name: str, raw: dict[str, Any], matrix: np.ndarray) -> tuple[Part, np.ndarray]:
@@ -249,9 +283,10 @@ def _check_folder(folder: _Folder) -> None:
         raise failure
     for name, content in folder.contents.items():
         if not name.strip().lower().endswith(".mtl"):
+            pillow = require("PIL.Image", "pillow", "reading textures")
             try:
-                require("PIL.Image", "pillow", "reading textures").open(io.BytesIO(content))
-            except OSError as error:
+                pillow.open(io.BytesIO(content))
+            except (OSError, pillow.DecompressionBombError) as error:
                 raise _no_image(name) from error
 
 
@@ -301,6 +336,71 @@ def _gltf_tree(data: bytes, kind: str) -> dict[str, Any]:
     if needed:
         raise Fault(f"expected plain glTF 2.0, got one that needs {', '.join(needed)}; export it without compression")
     return tree
+
+
+def _without_gloss(data: bytes, kind: str, tree: dict[str, Any]) -> bytes:
+    """The file as trimesh may see it: its materials without an extension for which it would decode images at once, before
+    their format was looked at. Raises Fault when the file asks for large arrays that it does not hold."""
+    zeros = sum(accessor["count"] for accessor in tree.get("accessors", []) if "bufferView" not in accessor)
+    if zeros > MOST_ZEROS:
+        raise Fault(f"expected accessors with data, got some without that would fill {zeros} rows; export it plain")
+    gloss = "KHR_materials_pbrSpecularGlossiness"
+    if not any(gloss in material.get("extensions", {}) for material in tree.get("materials", [])):
+        return data
+    plain = [
+        {**m, "extensions": {k: v for k, v in m.get("extensions", {}).items() if k != gloss}} for m in tree["materials"]
+    ]
+    text = json.dumps({**tree, "materials": plain}).encode()
+    if kind == "gltf":
+        return text
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + int.from_bytes(data[12:16], "little") :]
+    sizes = [(20 + len(text) + len(rest)).to_bytes(4, "little"), len(text).to_bytes(4, "little")]
+    return data[:8] + sizes[0] + sizes[1] + b"JSON" + text + rest
+
+
+def _instances(data: bytes) -> int:
+    """How many parts a 3MF places. trimesh gives up without a word where many components are nested, and leaves out those that
+    are not defined. Raises Fault, also for an archive that would fill the memory and for XML that names other files."""
+    etree = require("lxml.etree", "lxml", "reading 3MF")
+    safe = require("trimesh.exchange.common", "trimesh", "reading meshes").XML_PARSER_OPTIONS
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        size = sum(member.file_size for member in archive.infolist())  # no reader goes beyond
+        if size > max(100 * len(data), 64_000_000):
+            raise Fault(
+                f"expected an archive that grows up to 100 times, got {size} bytes in {len(data)}; export it again"
+            )
+        for member in archive.namelist():
+            if b"<!DOCTYPE" in archive.read(member).replace(b"\0", b""):  # without the zeros of UTF-16
+                raise Fault(
+                    f"expected XML without a DOCTYPE, which may name other files, got one in {member!r}; remove it"
+                )
+        name = next((name for name in archive.namelist() if "3d/3dmodel.model" in name.lower()), None)
+        if name is None:
+            raise Fault("expected a 3MF file, got an archive without 3D/3dmodel.model; export it again")
+        model = io.BytesIO(archive.read(name))
+    components: dict[str, list[str]] = {}
+    items: list[str] = []
+    for _, element in etree.iterparse(model, tag=("{*}object", "{*}build"), **safe):
+        if element.tag.endswith("object"):
+            components[element.get("id")] = [child.get("objectid") for child in element.iter("{*}component")]
+        else:
+            items += [child.get("objectid") for child in element.iter("{*}item")]
+        element.clear()
+    counts: dict[str, int] = {}
+
+    def leaves(index: str, above: tuple[str, ...]) -> int:
+        if index in above:
+            raise Fault(f"expected components inside one another, got object {index} inside itself; export it again")
+        if index not in counts:
+            inside = components.get(index, [])
+            counts[index] = sum(leaves(child, (*above, index)) for child in inside) if inside else 1
+        return counts[index]
+
+    count = sum(leaves(index, ()) for index in items)
+    if count > MOST_INSTANCES:
+        raise Fault(f"expected at most {MOST_INSTANCES} instances of objects, got {count}; export it flat")
+    return count
 
 
 def _gltf_primitives(tree: dict[str, Any], geometry: dict[str, Any]) -> dict[str, dict[str, Any]]:

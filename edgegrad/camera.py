@@ -18,7 +18,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ._check import as_scalar, as_tensor, check_finite, check_float, check_positive_int, check_shape, values_visible
+from ._check import (
+    LARGEST,
+    as_scalar,
+    as_tensor,
+    check_fields,
+    check_finite,
+    check_float,
+    check_int,
+    check_positive_int,
+    check_shape,
+    values_visible,
+)
 
 Vector = Tensor | Sequence[float]
 
@@ -32,7 +43,8 @@ class Camera:
     size             (H, W)                      image size in pixels
     projection       "perspective" or "orthographic"
 
-    All tensors are differentiable. Raises TypeError for a wrong type, ValueError for a wrong shape or value.
+    All tensors are differentiable. Numbers reach up to 3.4e38, the range of float32, also in float64, and so do those of
+    the inverse of K. Raises TypeError for a wrong type, ValueError for a wrong shape or value.
     """
 
     world_to_camera: Tensor
@@ -55,29 +67,26 @@ class Camera:
         object.__setattr__(self, "size", _size(self.size))
         if self.projection not in ("perspective", "orthographic"):
             raise ValueError(f'projection: expected "perspective" or "orthographic", got {self.projection!r}')
-        if values_visible():
-            self._check_values()
+        self._check_values()
 
     def _check_values(self) -> None:
-        check_finite("world_to_camera", self.world_to_camera)
-        check_finite("K", self.K)
-        M, K = self.world_to_camera.detach().double(), self.K.detach().double()
-        for name, matrix, last in (("world_to_camera", M, [0.0, 0.0, 0.0, 1.0]), ("K", K, [0.0, 0.0, 1.0])):
-            if not torch.equal(matrix[..., -1, :], matrix.new_tensor(last).expand_as(matrix[..., -1, :])):
-                got = matrix[..., -1, :].reshape(-1, len(last))[0].tolist()
-                raise ValueError(f"{name}: expected the last row {last}, got {got}; is it transposed?")
-        R = M[..., :3, :3]
-        # 1e-3: far above what float32 rounding leaves of a product of rotations (1e-6), far below a scale in the matrix.
-        error = (R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().max().item()
-        if error > 1e-3:
+        for name, matrix, last in (
+            ("world_to_camera", self.world_to_camera, [0.0, 0.0, 0.0, 1.0]),
+            ("K", self.K, [0.0, 0.0, 1.0]),
+        ):
+            _check_last_row(name, matrix, last)
+        _check_rotation("world_to_camera", self.world_to_camera[..., :3, :3])
+        if not values_visible(self.K):
+            return
+        A = self.K.detach().double()[..., :2, :2]
+        # The inverse of [[a, b], [c, d]] has the same numbers, over the determinant.
+        inverse = A.abs().amax((-2, -1)) / torch.linalg.det(A).abs()
+        if not bool((inverse <= LARGEST).all()):
             raise ValueError(
-                f"world_to_camera: expected a rotation in the upper 3 × 3, got one with |R Rᵀ − 1| up to {error:.3g}; "
-                "keep it orthogonal (for example optimise a rotation vector and use torch.linalg.matrix_exp)"
+                "K: expected focal lengths that are not zero, got a singular matrix"
+                + (f" (its inverse reaches {float(inverse.max()):.3g})" if bool(torch.isfinite(inverse).all()) else "")
+                + "; give a focal length in pixels to each axis"
             )
-        if bool((torch.linalg.det(R) < 0).any()):
-            raise ValueError("world_to_camera: expected a rotation, got a reflection (determinant −1); flip one axis")
-        if bool((torch.linalg.det(K[..., :2, :2]).abs() == 0).any()):
-            raise ValueError("K: expected focal lengths that are not zero, got a singular matrix")
 
     # -- how to make one ------------------------------------------------------------------------------------------
 
@@ -109,7 +118,7 @@ class Camera:
         """Orthographic camera that looks from `eye` towards `target` and shows `height` world units from top to bottom."""
         world_to_camera = _look_at(eye, target, up)
         height = as_scalar("height", height, like=world_to_camera)
-        if values_visible() and not 0.0 < float(height.detach()) < math.inf:
+        if values_visible(height) and not 0.0 < float(height.detach()) < math.inf:
             raise ValueError(f"height: expected world units above 0, got {float(height):g}")
         H, W = _size(size)
         scale = H / height
@@ -127,8 +136,11 @@ class Camera:
         K = as_tensor("K", K, like=R)
         check_shape("R", R, (3, 3))
         check_shape("K", K, (3, 3))
+        check_float("t", t)
         if t.numel() != 3:
             raise ValueError(f"t: expected 3 numbers, got shape {tuple(t.shape)}")
+        check_finite("t", t)
+        _check_rotation("R", R)
         half = torch.zeros_like(K)
         half[:2, 2] = 0.5
         return Camera(_rigid(R, t.reshape(3)), K + half, size)
@@ -146,6 +158,8 @@ class Camera:
         check_shape("camera_to_world", pose, (4, 4))
         if (fov_y is None) == (K is None):
             raise TypeError("from_opengl: expected one of fov_y and K, got " + ("both" if K is not None else "none"))
+        _check_last_row("camera_to_world", pose, [0.0, 0.0, 0.0, 1.0])
+        _check_rotation("camera_to_world", pose[:3, :3])
         flip = torch.tensor([1.0, -1.0, -1.0], dtype=pose.dtype, device=pose.device)
         R = (pose[:3, :3] * flip).mT
         t = -(R * pose[:3, 3]).sum(-1)
@@ -159,6 +173,8 @@ class Camera:
     @staticmethod
     def stack(cameras: Sequence[Camera]) -> Camera:
         """One batch from cameras of the same size and projection."""
+        if isinstance(cameras, Camera):
+            raise TypeError("cameras: expected a sequence of cameras, got one Camera; put it in a list")
         cameras = list(cameras)
         if not cameras:
             raise ValueError("cameras: expected at least one camera, got none")
@@ -187,10 +203,10 @@ class Camera:
         return self.K.shape[0] if self.K.dim() == 3 else None
 
     def crop(self, top: int, left: int, height: int, width: int) -> Camera:
-        """The camera of a part of the image, in pixels; it may reach beyond the image."""
+        """The camera of a part of the image, in pixels; it may reach beyond the image. Raises TypeError or ValueError."""
         shift = torch.zeros_like(self.K)
-        shift[..., 0, 2] = left
-        shift[..., 1, 2] = top
+        shift[..., 0, 2] = check_int("left", left, -(2**31), 2**31)
+        shift[..., 1, 2] = check_int("top", top, -(2**31), 2**31)
         return self.replace(K=self.K - shift, size=(height, width))
 
     def resized(self, size: tuple[int, int]) -> Camera:
@@ -201,10 +217,19 @@ class Camera:
 
     def replace(self, **fields: Any) -> Camera:
         """This camera with some fields replaced."""
+        check_fields(Camera, fields)
         return dataclasses.replace(self, **fields)
 
     def project(self, points: Tensor) -> Tensor:
-        """Pixel positions (…, 2) of world points (…, 3), differentiable; a single camera only."""
+        """Pixel positions (…, 2) of world points (…, 3), differentiable; a single camera only.
+
+        Not finite in the plane of a perspective camera. Raises TypeError or ValueError.
+        """
+        points = as_tensor("points", points, like=self.K)
+        check_float("points", points)
+        if points.dim() == 0 or points.shape[-1] != 3:
+            raise ValueError(f"points: expected shape (…, 3), got {tuple(points.shape)}")
+        check_finite("points", points)
         if self.batch is not None:
             raise ValueError(f"project: expected a single camera, got a batch of {self.batch}; call once for each")
         M, K = self.world_to_camera, self.K
@@ -219,6 +244,10 @@ class Camera:
             K=self.K.to(*args, **kwargs),
         )
 
+    def detach(self) -> Camera:
+        """The same camera, cut from the autograd graph."""
+        return self.replace(world_to_camera=self.world_to_camera.detach(), K=self.K.detach())
+
     def __repr__(self) -> str:
         many = "" if self.batch is None else f"{self.batch} × "
         return f"Camera({many}{self.projection}, {self.size[0]} × {self.size[1]} pixels, {self.world_to_camera.dtype})"
@@ -232,12 +261,48 @@ def _size(size: tuple[int, int]) -> tuple[int, int]:
     return check_positive_int("size", H, most=65536), check_positive_int("size", W, most=65536)
 
 
+def _check_last_row(name: str, matrix: Tensor, expected: list[float]) -> None:
+    """`matrix` (…, n, n) is finite and ends with the row `expected`. Raises ValueError."""
+    check_finite(name, matrix)
+    if not values_visible(matrix):
+        return
+    last = matrix.detach()[..., -1, :]
+    if not torch.equal(last, last.new_tensor(expected).expand_as(last)):
+        got = last.reshape(-1, len(expected))[0].tolist()
+        raise ValueError(f"{name}: expected the last row {expected}, got {got}; is it transposed?")
+
+
+def _check_rotation(name: str, matrix: Tensor) -> None:
+    """`matrix` (…, 3, 3) is a rotation. Raises ValueError."""
+    check_finite(name, matrix)
+    if not values_visible(matrix):
+        return
+    R = matrix.detach().double()
+    # 1e-3: far above what float32 rounding leaves of a product of rotations (1e-6), far below a scale in the matrix.
+    error = (R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs().max().item()
+    if error > 1e-3:
+        raise ValueError(
+            f"{name}: expected a rotation in the upper 3 × 3, got one with |R Rᵀ − 1| up to {error:.3g}; "
+            "keep it orthogonal (for example optimise a rotation vector and use torch.linalg.matrix_exp)"
+        )
+    if bool((torch.linalg.det(R) < 0).any()):
+        raise ValueError(f"{name}: expected a rotation, got a reflection (determinant −1); flip one axis")
+
+
 def _vector(name: str, value: Vector, like: Tensor | None = None) -> Tensor:
     tensor = as_tensor(name, value, like=like)
     if not tensor.is_floating_point():
         tensor = tensor.to(torch.get_default_dtype())
+    check_float(name, tensor)
     check_shape(name, tensor, (3,))
+    check_finite(name, tensor)
     return tensor
+
+
+def _direction(vector: Tensor) -> Tensor:
+    """A vector (3,) that is not zero, at length one. Scaled first, so that squares neither overflow nor vanish."""
+    vector = vector / vector.detach().abs().max()
+    return vector / vector.norm()
 
 
 def _rigid(R: Tensor, t: Tensor) -> Tensor:
@@ -246,28 +311,24 @@ def _rigid(R: Tensor, t: Tensor) -> Tensor:
 
 
 def _look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
-    tensors = [v for v in (eye, target, up) if isinstance(v, Tensor) and v.is_floating_point()]
-    like = max(tensors, key=lambda v: v.element_size()) if tensors else None
-    e, g, u = _vector("eye", eye, like), _vector("target", target, like), _vector("up", up, like)
-    if like is not None:
-        e, g, u = e.to(like), g.to(like), u.to(like)
-    forward = g - e
-    right = torch.linalg.cross(forward, u)
-    if values_visible():
-        for name, vector in (("eye", e), ("target", g), ("up", u)):
-            check_finite(name, vector)
-        length, height = (float(v.detach().norm()) for v in (forward, u))
-        if length == 0.0:
+    given = [v for v in (eye, target, up) if isinstance(v, Tensor) and v.dtype in (torch.float32, torch.float64)]
+    like = max(given, key=lambda v: v.element_size()) if given else None
+    vectors = _vector("eye", eye, like), _vector("target", target, like), _vector("up", up, like)
+    like = max(vectors, key=lambda v: v.element_size()) if like is None else like
+    # In double: in float32, distances of 1e±30 have no square, and a distant eye would round the directions.
+    e, g, u = (v.to(like).double() for v in vectors)
+    if values_visible(e, g, u):
+        if torch.equal(e, g):
             raise ValueError(f"target: expected a point apart from eye, got both at {e.tolist()}")
         # 1e-6 of the sine of the angle: below it float32 rounding alone decides where right is.
-        if float(right.detach().norm()) <= 1e-6 * length * height:
+        if not bool(u.any()) or float(torch.linalg.cross(_direction(g - e), _direction(u)).detach().norm()) <= 1e-6:
             raise ValueError(
                 f"up: expected a direction apart from the line of sight, got {u.tolist()}; try another axis"
             )
-    forward = forward / forward.norm()
-    right = right / right.norm()
+    forward = _direction(g - e)
+    right = _direction(torch.linalg.cross(forward, _direction(u)))
     R = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    return _rigid(R, -(R * e).sum(-1))
+    return _rigid(R, -(R * e).sum(-1)).to(like)
 
 
 def _intrinsics(fx: Tensor, fy: Tensor, cx: float, cy: float) -> Tensor:
@@ -280,6 +341,6 @@ def _intrinsics(fx: Tensor, fy: Tensor, cx: float, cy: float) -> Tensor:
 def _focal(fov_y: float | Tensor, height: int, like: Tensor) -> Tensor:
     """Focal length in pixels, differentiable, from the full vertical field of view in degrees."""
     degrees = as_scalar("fov_y", fov_y, like=like)
-    if values_visible() and not 0.0 < float(degrees.detach()) < 180.0:
+    if values_visible(degrees) and not 0.0 < float(degrees.detach()) < 180.0:
         raise ValueError(f"fov_y: expected degrees between 0 and 180, got {float(degrees):g}")
     return 0.5 * height / torch.tan(torch.deg2rad(degrees) * 0.5)

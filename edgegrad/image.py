@@ -6,11 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ._check import as_tensor, check_finite, check_shape
+from ._check import as_tensor, check_finite, check_not_meta, check_shape
 from ._files import PathLike, check_readable, check_suffix, replacing, require
 
 DISPLAY = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # 8 bit, sRGB
 RADIANCE = (".exr", ".hdr")  # floating point, linear
+MOST_NUMBERS = 1 << 30  # pixels times channels, four bytes each; a small file may announce more
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec. 709 primaries, which sRGB shares
 
 
@@ -32,12 +33,13 @@ def read_image(path: PathLike, channels: int | None = None) -> Tensor:
 
     Integer pixels (PNG, JPEG, BMP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1;
     floating-point pixels (EXR, HDR, float TIFF) are linear as they are. Alpha is the last channel, not gamma-corrected
-    and not multiplied into the colours (EXR files hold them multiplied; they stay so).
+    and not multiplied into the colours (EXR files hold them multiplied; they stay so). At most 2³⁰ pixels times channels.
 
     channels  None keeps what the file has. 1 gives the luminance and 3 the colours, both without alpha;
               4 adds an alpha of 1 where the file has none
 
-    Raises FileNotFoundError, TypeError, ValueError (another kind of file, damaged, colours that do not convert)
+    Raises FileNotFoundError, PermissionError, TypeError, ValueError (another kind of file, damaged, too large, colours that
+    do not convert)
     or ImportError without OpenImageIO.
     """
     if channels not in (None, 1, 3, 4):
@@ -47,6 +49,15 @@ def read_image(path: PathLike, channels: int | None = None) -> Tensor:
     hint = oiio.ImageSpec()
     hint["oiio:UnassociatedAlpha"] = 1
     stored = oiio.ImageBuf(str(file), 0, 0, hint)
+    spec = stored.spec()  # from the header alone
+    if (
+        spec.full_width * spec.full_height * spec.nchannels > MOST_NUMBERS
+        or spec.image_pixels() * spec.nchannels > MOST_NUMBERS
+    ):
+        raise ValueError(
+            f"{path}: expected at most {MOST_NUMBERS} pixels times channels, got {spec.full_height} × {spec.full_width} × "
+            f"{spec.nchannels}; make it smaller"
+        )
     upright = oiio.ImageBufAlgo.reorient(stored) if stored.read(0, 0, True, oiio.FLOAT) else None
     pixels = None if upright is None else upright.get_pixels(oiio.FLOAT, upright.roi_full)
     if pixels is None or (stored.file_format_name == "jpeg" and not _jpeg_ends(file.read_bytes())):
@@ -57,7 +68,10 @@ def read_image(path: PathLike, channels: int | None = None) -> Tensor:
     color = image if a < 0 else torch.cat([image[..., :a], image[..., a + 1 :]], -1)
     # Not OpenImageIO's own conversion: what it does depends on the OCIO configuration that it finds.
     if stored.nativespec().format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
-        color = srgb_to_linear(color.double()).float()
+        for rows in color.split(
+            max(1, (1 << 20) // color[0].numel())
+        ):  # in place: doubles of all would be twice the image
+            rows.copy_(srgb_to_linear(rows.double()))
     if channels is not None and color.shape[-1] not in (1, 3):
         raise ValueError(f"{path}: expected 1 or 3 colour channels, got {color.shape[-1]}; read it without channels=…")
     if channels == 1 and color.shape[-1] == 3:
@@ -86,6 +100,7 @@ def write_image(path: PathLike, img: Tensor) -> None:
             f"img: expected linear radiance of a floating dtype, got {image.dtype}; "
             "for 8-bit sRGB values use srgb_to_linear(img / 255)"
         )
+    check_not_meta("img", image)
     check_shape("img", image, ("H", "W"), ("H", "W", "C"))
     image = image.cpu().float().reshape(*image.shape[:2], -1)
     check_finite("img", image)

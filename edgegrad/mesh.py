@@ -9,9 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ._check import as_tensor, check_finite, check_float, check_indices, check_integer, check_shape
+from ._check import as_tensor, check_fields, check_finite, check_float, check_indices, check_integer, check_shape
 
 PLAIN = 0.7  # radiance of a mesh without colours, in every channel
+SMALLEST_MESH, LARGEST_UV = 1e-38, 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +29,10 @@ class Mesh:
     uvs            (T, 2) float   texture coordinates, v running up (as in OBJ), and
     uv_faces       (F, 3) int     indices into uvs, apart from `faces`, so that vertices stay welded at seams
 
-    Faces of zero area render nothing. Raises TypeError for a wrong type, ValueError for a wrong shape, a wrong index or a
-    value that is not finite.
+    Faces of zero area render nothing. Numbers reach up to 3.4e38, the range of float32, also in float64; uvs up to 1e9, for
+    beyond that a double does not tell the texels of a large texture apart; the largest of the verts lies above 1e-38, unless
+    all are zero. Raises TypeError for a wrong type, ValueError for a wrong shape, a wrong index or a value that is not
+    finite or out of this range.
     """
 
     verts: Tensor
@@ -44,7 +47,7 @@ class Mesh:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not isinstance(value, Tensor) and (value is not None or field.name in ("verts", "faces")):
+            if value is not None or field.name in ("verts", "faces"):
                 like = self.verts if field.name not in ("verts", "faces", "uv_faces") else None
                 object.__setattr__(
                     self, field.name, as_tensor(field.name, value, like=like, floating=field.name == "verts")
@@ -77,12 +80,12 @@ class Mesh:
             extra = "uvs" if self.uvs is not None else "uv_faces"
             raise ValueError(f"{extra}: expected None without a texture, got a tensor; pass texture=… or leave it out")
 
-        check_finite("verts", self.verts)
+        check_finite("verts", self.verts, smallest=SMALLEST_MESH if self.verts.dtype == torch.float64 else 0.0)
         check_indices("faces", self.faces, V, "verts")
         for kind in kinds:
             check_finite(kind, getattr(self, kind))
         if self.uvs is not None and self.uv_faces is not None:
-            check_finite("uvs", self.uvs)
+            check_finite("uvs", self.uvs, largest=LARGEST_UV)
             check_indices("uv_faces", self.uv_faces, self.uvs.shape[0], "uvs")
 
     @property
@@ -98,10 +101,7 @@ class Mesh:
 
         Giving another kind of colour removes the one there was.
         """
-        known = {field.name for field in dataclasses.fields(self)}
-        for name in fields:
-            if name not in known:
-                raise TypeError(f"replace: expected one of {', '.join(sorted(known))}, got {name!r}")
+        check_fields(Mesh, fields)
         appearance = {"colors", "face_colors", "corner_colors", "texture"}
         if any(name in appearance and fields[name] is not None for name in fields):
             gone = appearance | (set() if fields.get("texture") is not None else {"uvs", "uv_faces"})
@@ -112,15 +112,19 @@ class Mesh:
         """The mesh with vertices `scale · R v + t`, differentiable in all four.
 
         R (3, 3) any matrix, identity when None; t (3,) world units, zero when None; scale a number or 0-d tensor.
+        Raises TypeError or ValueError.
         """
         v = self.verts
         scale = as_tensor("scale", scale, like=v)
+        check_float("scale", scale)
         if scale.numel() != 1:
             raise ValueError(f"scale: expected one number, got shape {tuple(scale.shape)}; scale the verts yourself")
+        check_finite("scale", scale)
         if R is not None:
             R = as_tensor("R", R, like=v)
             check_float("R", R)
             check_shape("R", R, (3, 3))
+            check_finite("R", R)
             # Column by column rather than by a matrix product: each row is then rounded alike, so that copies of
             # one vertex stay equal and its edges stay welded.
             v = v[:, 0:1] * R[:, 0] + v[:, 1:2] * R[:, 1] + v[:, 2:3] * R[:, 2]
@@ -129,6 +133,7 @@ class Mesh:
             t = as_tensor("t", t, like=v)
             check_float("t", t)
             check_shape("t", t, (3,))
+            check_finite("t", t)
             v = v + t
         return self.replace(verts=v)
 

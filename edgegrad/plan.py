@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import statistics
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -23,6 +24,7 @@ from .render import (
     backward_work,
     forward_kernel,
     image_room,
+    render,
     render_arguments,
     requires_grad,
     surface_rows,
@@ -91,6 +93,7 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
     everywhere and an image that sees every face: where the adjoint is zero none are taken, and fewer on faces that no
     sample of the image hits. Nothing is drawn; the ray structure and the edges are built, and render() then finds them.
     """
+    _check_options("plan", options)
     scene = as_scene(scene)
     arguments = render_arguments(scene, camera, spp, seed, **options)
     wanted = requires_grad(arguments)
@@ -273,6 +276,7 @@ def profile(
     The other arguments are those of render(). If nothing requires a gradient, that of the vertices is taken. A batch of
     cameras counts as one step. Autograd itself is not run, so what it costs is not here. Raises what render() raises.
     """
+    _check_options("profile", options)
     scene, repeats = as_scene(scene), check_positive_int("repeats", repeats)
     # What is kept between calls must not help: before each step the vertices are elsewhere, each time somewhere else.
     arguments = render_arguments(scene, camera, spp, seed, **options)
@@ -298,6 +302,13 @@ def profile(
         **{name: int(runs[-1][name]) for name in ("surface_samples", "edge_samples", "silhouettes", "creases")},
     }
     return Profile(seconds, samples)
+
+
+def _check_options(function: str, options: Mapping[str, Any]) -> None:
+    """Only those of render(), which would name a function that the user did not call. Raises TypeError."""
+    known = [name for name, p in inspect.signature(render).parameters.items() if p.kind is p.KEYWORD_ONLY]
+    if unknown := [name for name in options if name not in known]:
+        raise TypeError(f"{function}: expected only the options {', '.join(known)}, got {unknown[0]!r}")
 
 
 def _adjoint(adjoint: Tensor | None, camera: Camera, arguments: Sequence[Any]) -> Tensor:

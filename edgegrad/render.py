@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from . import _memory as memory
-from ._check import as_int, check_positive_int, check_shape
+from ._check import as_int, check_finite, check_not_meta, check_positive_int, check_shape
 from ._kernel import core
 from .camera import Camera
 from .mesh import Mesh
@@ -94,6 +94,8 @@ def render_arguments(
     if scene.background is not None and scene.background.dim() == 3:
         check_shape("background", scene.background, (*camera.size, "C"), fix="give it the camera's size")
 
+    _check_devices(scene, camera)
+
     flat = flatten(scene)
     if torch.compiler.is_compiling():
         # Dynamo does not trace a function that is given one tensor twice; corners of vertex colours are the faces.
@@ -119,6 +121,14 @@ def as_scene(scene: Scene | Mesh) -> Scene:
     if not isinstance(scene, Scene):
         raise TypeError(f"scene: expected a Scene or a Mesh, got {type(scene).__name__}")
     return scene
+
+
+def _check_devices(scene: Scene, camera: Camera) -> None:
+    """Tensors may lie on any device that holds numbers. Raises ValueError."""
+    fields = [*(field for mesh in scene.meshes for field in vars(mesh).items()), ("background", scene.background)]
+    for name, value in [*fields, *vars(camera).items()]:
+        if isinstance(value, Tensor):
+            check_not_meta(name, value)
 
 
 def radiance_varies(scene: Scene) -> bool:
@@ -308,6 +318,7 @@ def _backward_kernel(
     perspective, height, width, _, filter, _, spacing = args[11:18]
     surface_samples, edge_samples, grad_seed, interior_geometry, boundary, wanted = args[18:]
     work = backward_work(interior_geometry, boundary, wanted)
+    check_finite("the gradient of the image", adjoint)
     scene = _kernel_scene(flat, spacing)
     # Sums are taken in double whatever the arrays hold.
     grads = [

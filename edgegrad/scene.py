@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ._check import as_tensor, check_finite, check_float, check_shape, values_visible
+from ._check import MOST_ROWS, as_tensor, check_fields, check_finite, check_float, check_shape, values_visible
 from .mesh import PLAIN, Mesh
 
 
@@ -47,6 +47,15 @@ class Scene:
                 f"meshes[{i}]: expected {C} channels like meshes[{first}], got {meshes[i].channels}; "
                 "give all colours and textures the same number of channels"
             )
+        corners = 3 * sum(mesh.faces.shape[0] for mesh in meshes)
+        rows = max(
+            corners, *(sum(len(t) for m in meshes if (t := getattr(m, n)) is not None) for n in ("verts", "uvs"))
+        )
+        if rows > MOST_ROWS:
+            raise ValueError(
+                f"meshes: expected at most {MOST_ROWS} vertices, texture coordinates and corners of faces in all, got {rows}; "
+                "render them in parts"
+            )
         devices = {mesh.verts.device for mesh in meshes}
         if len(devices) > 1:
             raise ValueError(f"meshes: expected one device, got {sorted(map(str, devices))}; move them with mesh.to(…)")
@@ -68,6 +77,7 @@ class Scene:
 
     def replace(self, **fields: Any) -> Scene:
         """This scene with some fields replaced."""
+        check_fields(Scene, fields)
         return dataclasses.replace(self, **fields)
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Scene:
@@ -78,6 +88,11 @@ class Scene:
         """All tensors moved to a device or dtype, as `torch.Tensor.to`."""
         background = None if self.background is None else self.background.to(*args, **kwargs)
         return Scene([mesh.to(*args, **kwargs) for mesh in self.meshes], background)
+
+    def detach(self) -> Scene:
+        """The same scene, cut from the autograd graph."""
+        background = None if self.background is None else self.background.detach()
+        return Scene([mesh.detach() for mesh in self.meshes], background)
 
     def __repr__(self) -> str:
         back = "black" if self.background is None else f"background {tuple(self.background.shape)}"

@@ -175,7 +175,7 @@ MESH = {
     "t not finite": (
         lambda: mesh().transformed(t=[0.0, NAN, 0.0]),
         V,
-        "verts: expected finite numbers, got nan at [0, 1]",
+        "t: expected finite numbers, got nan at [1]",
     ),
 }
 

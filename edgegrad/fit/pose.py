@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from .._check import check_positive_int
+from .._check import check_int, check_positive_int
 from ..camera import Camera
 from ..mesh import Mesh
 from ..scene import Scene
@@ -73,8 +73,16 @@ def fit_pose(
     began = time.perf_counter()
     for name, count in (("max_size", max_size), ("steps", steps), ("spp", spp)):
         check_positive_int(name, count)
+    check_int("seed", seed, 0, 2**32 - 1)
+    for name, flag in (("fit_scale", fit_scale), ("fit_focal", fit_focal)):
+        if not isinstance(flag, bool):
+            raise TypeError(f"{name}: expected True or False, got {type(flag).__name__} ({flag!r})")
+    if not isinstance(tolerance, (int, float)):
+        raise TypeError(f"tolerance: expected a number, got {type(tolerance).__name__} ({tolerance!r})")
     if not tolerance > 0.0:
         raise ValueError(f"tolerance: expected a number above 0, got {tolerance:g}")
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback: expected a function of a PoseFit, got {type(callback).__name__}")
     start = best = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
     task = PoseTask.of(mesh, target, camera, mask, background, start, fit_scale, fit_focal)
     levels = task.pyramid(start, max_size, spp)
