@@ -74,7 +74,15 @@ void clear_geometry() {
     kept.clear();
 }
 
+namespace {
+
+// Calls of before_fork() that this thread has open: Python registers them anew when the package is imported again.
+thread_local int forks = 0;
+
+}  // namespace
+
 void before_fork() {
+    if (forks++) return;
     mutex.lock();
     embree_mutex.lock();
     // GNU's runtime starts new threads at the next parallel loop; others see to it themselves at fork(). Embree's
@@ -85,6 +93,7 @@ void before_fork() {
 }
 
 void after_fork() {
+    if (--forks) return;
     embree_mutex.unlock();
     mutex.unlock();
 }

@@ -14,6 +14,8 @@ import torch
 
 from ._kernel import core
 
+clear_geometry = core.clear_geometry
+
 # Below, a render goes ahead: asking the system takes a fifth of a millisecond, as long as a small image.
 LOOK_FROM = 256 << 20
 
@@ -85,21 +87,20 @@ def available() -> int:
 
 
 def _left_in_groups(proc: Path = Path("/proc/self/cgroup"), mount: Path = Path("/sys/fs/cgroup")) -> Iterator[int]:
-    """Bytes that each control group, from this process's to the root, leaves. None where there are no such groups."""
+    """Bytes that each control group, from this process's to the root, leaves; nothing where there are none."""
     try:
         lines = proc.read_text().splitlines()
     except OSError:
         return
     for line in lines:  # number:controllers:path, in version 2 without controllers
         _, controllers, path = line.split(":", 2)
-        if controllers not in ("", "memory"):
-            continue
-        root, names = mount, ("memory.max", "memory.current", "inactive_file", "active_file")
-        if controllers:
+        if not controllers:
+            root, names = mount, ("memory.max", "memory.current", "inactive_file", "active_file")
+        elif "memory" in controllers.split(","):
             root = mount / "memory"
-            names = (
-                "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file", "total_active_file"
-            )  # fmt: skip
+            names = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file", "total_active_file"
+        else:
+            continue
         group = root / path.lstrip("/")
         for folder in (group, *group.parents):
             if folder.is_relative_to(root) and (left := _left_in(folder, *names)) is not None:
@@ -138,7 +139,7 @@ def room(what: str, needs: Mapping[str, int], kept: Mapping[str, int], lower: Ca
         return MemoryError(f"{what}: expected to need {limit}, got about {size(needed)} ({listed}); lower {lower()}")
 
     if needed >= LOOK_FROM and needed > available():
-        core.clear_geometry()  # what other calls left behind; then nothing of this one's is there either
+        clear_geometry()  # what other calls left behind; then nothing of this one's is there either
         if needed > (there := available()):
             raise error(f"at most the {size(there)} of memory that are free")
     try:

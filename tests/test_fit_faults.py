@@ -1,0 +1,215 @@
+"""fit-pose when things go wrong around it: killed, no room or rights to write, nowhere to print."""
+
+import errno
+import json
+import os
+import random
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import trimesh
+from test_fit import START, bracket, camera, picture
+
+from edgegrad import cli
+from edgegrad.fit import PoseFit
+from edgegrad.image import linear_to_srgb, write_image
+from edgegrad.io import save_camera
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="signals, limits and /dev/full of Linux")
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A folder with mesh.ply, target.png, camera.json and init.json."""
+    mesh, view = bracket(), camera(32)
+    colors = (linear_to_srgb(mesh.face_colors) * 255).round().byte().numpy()
+    trimesh.Trimesh(mesh.verts, mesh.faces, face_colors=colors, process=False).export(tmp_path / "mesh.ply")
+    write_image(tmp_path / "target.png", picture(view))
+    save_camera(tmp_path / "camera.json", view)
+    (tmp_path / "init.json").write_text(json.dumps({"mesh_to_world": START.tolist()}))
+    return tmp_path
+
+
+def arguments(files, out="out"):
+    names = {"--camera": "camera.json", "--init": "init.json", "--out": out}
+    paths = [text for name, file in names.items() for text in (name, str(files / file))]
+    return ["fit-pose", str(files / "mesh.ply"), str(files / "target.png"), *paths]
+
+
+class Forked:
+    """A child that runs `work()`, which gives its exit code; `out` is what it writes to file descriptors 1 and 2."""
+
+    def __init__(self, work):
+        read, write = os.pipe()
+        self.pid = os.fork()
+        if self.pid == 0:
+            code = 70
+            try:
+                os.dup2(write, 1), os.dup2(write, 2)
+                # Not pytest's, which keep what is written.
+                sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
+                code = work()
+                sys.stdout.flush(), sys.stderr.flush()
+            finally:
+                os._exit(code)
+        os.close(write)
+        self.out = os.fdopen(read)
+
+    def wait(self):
+        """The exit code, or minus the signal that ended it."""
+        with self.out:
+            return os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+
+
+# -- killed -----------------------------------------------------------------------------------------------------------
+
+
+def told_fit(*args, callback, **options):
+    """fit_pose that prints which pose is the best before it may be written: the file is at most one step behind."""
+
+    def tell(fit):
+        print(fit.to_json().replace("\n", " "), flush=True)
+        callback(fit)
+
+    options["progress"] = False
+    return FIT_POSE(*args, callback=tell, **options)
+
+
+FIT_POSE = cli.fit_pose
+
+
+@linux
+@pytest.mark.parametrize("kills", [5, pytest.param(60, marks=pytest.mark.slow)])
+def test_a_killed_fit_leaves_the_best_pose_so_far(files, kills, monkeypatch):
+    monkeypatch.setattr(cli, "fit_pose", told_fit)
+    chance = random.Random(kills)
+    for kill in range(kills):
+        out = f"out{kill}"
+        run = Forked(lambda out=out: cli.main(arguments(files, out)))
+        steps = chance.randint(0, 60) if kill else 0  # of about 80
+        told = [json.loads(run.out.readline()) for _ in range(steps)]
+        # From the next step's beginning to its end; the first step comes after reading the files.
+        time.sleep(chance.uniform(0.0, 0.02 if steps else 0.2))
+        os.kill(run.pid, signal.SIGKILL)
+        told += [json.loads(line) for line in run.out if line.endswith("\n")]
+        assert run.wait() == -signal.SIGKILL
+        file = files / out / "pose.json"
+        if len(told) > 1 or file.exists():
+            found = json.loads(file.read_text())
+            PoseFit.from_json(file.read_text())  # nothing is missing
+            assert found in told[-2:], (steps, found, told[-2:])
+
+
+def test_the_pose_on_disk_follows_the_search(files, monkeypatch):
+    poses = []
+
+    def watched(*args, callback, **options):
+        def watch(fit):
+            callback(fit)
+            text = (files / "out" / "pose.json").read_text()
+            assert text == fit.to_json() + "\n"
+            poses.append(PoseFit.from_json(text))
+
+        return FIT_POSE(*args, callback=watch, **options)
+
+    monkeypatch.setattr(cli, "fit_pose", watched)
+    assert cli.main(arguments(files)) == 0
+    assert [pose.steps for pose in poses] == list(range(1, len(poses) + 1))
+    assert len(poses) > 10 and len({str(pose.matrix) for pose in poses}) > 5
+
+
+# -- nowhere to write -------------------------------------------------------------------------------------------------
+
+
+def is_a_result(printed):
+    """Whether a pose stands there: four rows of four numbers, the last 0 0 0 1."""
+    lines = printed.splitlines()
+    at = lines.index("mesh to world:")
+    rows = [[float(number) for number in line.split()] for line in lines[at + 1 : at + 5]]
+    return rows[3] == [0.0, 0.0, 0.0, 1.0] and all(len(row) == 4 for row in rows) and "loss" in lines[at - 1]
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES])
+def test_a_fit_that_cannot_be_written_is_printed(files, code, monkeypatch, capsys):
+    """As on a full disk, where the rights are taken away meanwhile, and so on."""
+
+    def replace(source, target):
+        raise OSError(code, os.strerror(code), source, None, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    assert cli.main(arguments(files)) == 2
+    said = capsys.readouterr()
+    assert is_a_result(said.out)
+    last = said.err.splitlines()[-1]
+    assert f"{files / 'out' / 'pose.json'}: expected to write it" in last and os.strerror(code) in last
+    assert list((files / "out").iterdir()) == []  # nothing half done stays behind
+
+
+def test_a_folder_that_vanishes_during_the_fit(files, monkeypatch, capsys):
+    search = cli.fit_pose
+
+    def vanishing(*args, **options):
+        (files / "out").rmdir()
+        return search(*args, **options)
+
+    monkeypatch.setattr(cli, "fit_pose", vanishing)
+    assert cli.main(arguments(files)) == 2
+    said = capsys.readouterr()
+    assert is_a_result(said.out) and str(files / "out" / "pose.json") in said.err
+
+
+@pytest.mark.parametrize("out", ["mesh.ply", "mesh.ply/out"])
+def test_a_folder_that_cannot_be_made_is_named_before_the_fit(files, out, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "fit_pose", lambda *_, **__: pytest.fail("no fit should begin"))
+    assert cli.main(arguments(files, out)) == 2
+    said = capsys.readouterr()
+    assert f"--out: expected a folder to write to, got {files / out}" in said.err and said.out == ""
+
+
+def test_a_folder_without_permission_is_named_before_the_fit(files, monkeypatch, capsys):
+    """access() is what tells; root, as whom tests may run, may write anywhere."""
+    monkeypatch.setattr(cli, "fit_pose", lambda *_, **__: pytest.fail("no fit should begin"))
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != files / "out")
+    assert cli.main(arguments(files)) == 2
+    assert f"got {files / 'out'} (Permission denied)" in capsys.readouterr().err
+
+
+@linux
+@pytest.mark.parametrize(("limit", "file"), [(100, "pose.json"), (4096, "fit.png")])
+def test_a_file_that_cannot_grow(files, limit, file):
+    def fit():
+        # Python ignores SIGXFSZ, so writing fails as on a full disk.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        return cli.main(arguments(files))
+
+    run = Forked(fit)
+    said = run.out.read()
+    assert run.wait() == 2 and is_a_result(said), said
+    last = said.splitlines()[-1]
+    assert f"{files / 'out' / file}: expected to write it, got: File too large" in last, said
+    # What could be written is whole; what could not is not there.
+    left = sorted(path.name for path in (files / "out").iterdir())
+    assert left == ([] if file == "pose.json" else ["pose.json"])
+    if left:
+        assert PoseFit.from_json((files / "out" / "pose.json").read_text()).converged
+
+
+@linux
+def test_a_result_that_cannot_be_printed_is_written(files, monkeypatch, capsys):
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert cli.main(arguments(files)) == 2
+        monkeypatch.undo()
+        # Closing would fail again on what is still to be written.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())
+    assert "No space left on device" in capsys.readouterr().err.splitlines()[-1]
+    assert PoseFit.from_json((files / "out" / "pose.json").read_text()).converged
+    assert (files / "out" / "fit.png").exists()

@@ -1,0 +1,422 @@
+"""render() under load: many steps, many threads, forked and spawned processes, Ctrl-C, too little memory."""
+
+import hashlib
+import importlib
+import json
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+import torch
+from scenes import cube, front_camera, icosphere
+
+import edgegrad as eg
+from edgegrad import _memory
+
+TESTS = Path(__file__).parent
+posix = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals and processes as in POSIX")
+
+# What the scripts below share. `step(k)` tells the bits of an image and of its gradients; k moves the vertices.
+COMMON = """
+import hashlib, json, os, sys, threading, time
+import torch
+import edgegrad as eg
+from scenes import front_camera, icosphere
+
+SPHERE = icosphere(4)
+
+def step(k=0, size=48):
+    verts = (SPHERE.verts * (1.0 + 0.001 * k)).requires_grad_()
+    colors = SPHERE.colors.clone().requires_grad_()
+    image = eg.render(SPHERE.replace(verts=verts, colors=colors), front_camera(size), spp=4)
+    image.square().mean().backward()
+    return hashlib.sha256(b"".join(t.detach().numpy().tobytes() for t in (image, verts.grad, colors.grad))).hexdigest()
+"""
+
+
+def script(code, *arguments, timeout=120, folder=None):
+    """The last line that the code prints, as JSON; it runs in a process of its own, which must not hang."""
+    file = folder / "script.py"
+    file.write_text(textwrap.dedent(COMMON) + textwrap.dedent(code))
+    run = subprocess.run(
+        [sys.executable, str(file), *map(str, arguments)],
+        env={**psutil.Process().environ(), "PYTHONPATH": f"{TESTS}:{TESTS.parent}"},
+        capture_output=True, text=True, timeout=timeout,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+# -- many steps -------------------------------------------------------------------------------------------------------
+
+STEPS = """
+import psutil
+steps = int(sys.argv[1])
+
+def fit():
+    "Vertices of a sphere that follow their gradient: each step has geometry of its own."
+    verts = SPHERE.verts.clone().requires_grad_()
+    camera = front_camera(24)
+    for k in range(steps):
+        image = eg.render(SPHERE.replace(verts=verts), camera, spp=2, seed=k)
+        loss = (image - 0.3).square().mean()
+        (gradient,) = torch.autograd.grad(loss, verts)
+        with torch.no_grad():
+            verts -= 0.01 * gradient
+        if k == 100:
+            resident.append(psutil.Process().memory_info().rss)
+    resident.append(psutil.Process().memory_info().rss)
+    return hashlib.sha256(image.detach().numpy().tobytes() + gradient.numpy().tobytes()).hexdigest(), float(loss)
+
+SPHERE, resident = icosphere(2), []
+(first, loss), (again, _) = fit(), fit()
+print(json.dumps({"same": first == again, "grown": max(resident) - resident[0], "loss": loss}))
+"""
+
+
+@pytest.mark.parametrize("steps", [600, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_memory_stays_and_results_repeat_over_many_steps(steps, tmp_path):
+    """Twice so many steps, with the same bits at the end of each run, in 5 MB more than after the first 100."""
+    found = script(STEPS, steps, timeout=1200, folder=tmp_path)
+    assert found["same"] and 0 < found["loss"] < 1, found
+    assert found["grown"] < 5e6, found
+
+
+# -- threads of Python ------------------------------------------------------------------------------------------------
+
+
+def bits(mesh, seed=0):
+    """Of the image and the gradients by vertices and colours."""
+    verts, colors = (t.detach().clone().requires_grad_() for t in (mesh.verts, mesh.colors))
+    image = eg.render(mesh.replace(verts=verts, colors=colors), front_camera(40), spp=4, seed=seed)
+    image.square().mean().backward()
+    parts = (image, verts.grad, colors.grad)
+    return hashlib.sha256(b"".join(part.detach().numpy().tobytes() for part in parts)).hexdigest()
+
+
+def moved(mesh, k):
+    return mesh.replace(verts=mesh.verts * (1.0 + 0.01 * k) + 0.002 * k)
+
+
+def soup(mesh):
+    """Each face with corners of its own: they are welded anew wherever the vertices are."""
+    faces = torch.arange(mesh.faces.numel()).reshape(-1, 3)
+    return eg.Mesh(mesh.verts[mesh.faces].reshape(-1, 3), faces, colors=mesh.colors[mesh.faces].reshape(-1, 3))
+
+
+SPHERE = icosphere(3)
+SCENES = {
+    "different scenes": [icosphere(k) for k in (1, 2, 3, 4)] + [moved(cube(), k) for k in range(4)],
+    "one mesh": [SPHERE] * 8,
+    "one mesh that moves": [moved(SPHERE, k) for k in range(8)],
+    "edges that move": [moved(soup(icosphere(2)), k) for k in range(8)],
+}
+
+
+@pytest.mark.parametrize("case", SCENES)
+def test_the_same_bits_from_8_threads_as_alone(case):
+    meshes, repeats = SCENES[case], 4
+    alone = [bits(mesh, seed=k) for k, mesh in enumerate(meshes)]
+    assert len(set(alone)) == len(meshes)
+    found, begin = [[] for _ in meshes], threading.Barrier(len(meshes))
+
+    def work(k):
+        begin.wait()
+        for turn in range(repeats):  # each thread renders every scene that another one is at just then
+            i = (k + turn) % len(meshes)
+            found[k].append((i, bits(meshes[i], seed=i)))
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(len(meshes))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert all(len(results) == repeats for results in found)
+    assert all(result == alone[i] for results in found for i, result in results)
+
+
+# -- processes --------------------------------------------------------------------------------------------------------
+
+# Each child has a time limit of its own, far above what it needs: what it guards against is waiting for ever.
+PROCESSES = """
+import importlib, multiprocessing
+import edgegrad._kernel
+
+def child(threads):
+    if threads:
+        torch.set_num_threads(threads)
+    return [step(k) for k in (0, 1, 0)]
+
+def children(method, threads=0):
+    with multiprocessing.get_context(method).Pool(2) as pool:
+        return pool.map_async(child, [threads] * 2).get(timeout=60)
+
+class Rendered(torch.utils.data.Dataset):
+    def __len__(self):
+        return 6
+    def __getitem__(self, k):
+        return step(k % 2)
+
+def loaded():
+    loader = torch.utils.data.DataLoader(Rendered(), num_workers=2, timeout=60, multiprocessing_context="fork")
+    return [text for batch in loader for text in batch]
+"""
+
+FORK = (
+    PROCESSES
+    + """
+if __name__ == "__main__":
+    torch.set_num_threads(4)
+    importlib.reload(edgegrad._kernel)  # as where a notebook imports changed code anew: what fork() calls is there twice
+    before = children("fork")
+    expected = [step(k) for k in (0, 1, 0)]
+    found = {"before": before, "after": children("fork"), "two threads": children("fork", 2), "loader": loaded()}
+
+    # While other threads render: what they hold just then must not be missing in the child.
+    go_on, rounds = True, [0, 0]
+    def render(j):
+        k = 2
+        while go_on:
+            step(k, size=16)
+            k += 1
+            rounds[j] += 1
+    threads = [threading.Thread(target=render, args=(j,)) for j in range(2)]
+    for thread in threads:
+        thread.start()
+    meanwhile = [children("fork") for _ in range(int(sys.argv[1]))]
+    go_on = False
+    for thread in threads:
+        thread.join()
+    found |= {"meanwhile": meanwhile, "parent": [step(k) for k in (0, 1, 0)], "expected": expected, "rounds": rounds}
+    print(json.dumps(found))
+"""
+)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="fork() as on Linux")
+@pytest.mark.parametrize("forks", [4, pytest.param(40, marks=pytest.mark.slow)])
+def test_forked_children_render(forks, tmp_path):
+    """Before and after the parent rendered with several threads, with threads of their own, as workers of a DataLoader."""
+    found = script(FORK, forks, timeout=400, folder=tmp_path)
+    expected = found["expected"]
+    assert len(set(expected)) == 2 and expected[0] == expected[2]
+    for name in ("before", "after", "two threads"):
+        assert found[name] == [expected] * 2, name
+    assert found["loader"] == [expected[k % 2] for k in range(6)]
+    assert found["meanwhile"] == [[expected] * 2] * forks and all(found["rounds"])
+    assert found["parent"] == expected
+
+
+SPAWN = (
+    PROCESSES
+    + """
+if __name__ == "__main__":
+    torch.set_num_threads(4)
+    expected = [step(k) for k in (0, 1, 0)]
+    print(json.dumps({"expected": expected, "found": children(sys.argv[1])}))
+"""
+)
+
+
+@pytest.mark.parametrize(
+    "method", ["spawn", pytest.param("forkserver", marks=[pytest.mark.slow, posix])]
+)  # fmt: skip
+def test_spawned_children_render(method, tmp_path):
+    found = script(SPAWN, method, folder=tmp_path)
+    assert found["found"] == [found["expected"]] * 2
+
+
+# -- Ctrl-C -----------------------------------------------------------------------------------------------------------
+
+# Uninterrupted, each takes some 5 s on two cores.
+INTERRUPTED = """
+kind = sys.argv[1]
+before = step()
+mesh, camera = SPHERE.replace(verts=SPHERE.verts.clone().requires_grad_()), front_camera(512 if kind == "image" else 64)
+many = {"surface samples": {"surface_samples": 1 << 26}, "edge samples": {"edge_samples": 1 << 26}}.get(kind, {})
+image = None
+if kind != "image":
+    image = eg.render(mesh, camera, spp=1, **many).sum()
+print("ready", flush=True)
+interrupted = None
+try:
+    if image is None:
+        eg.render(mesh, camera, spp=1 << 10)
+    else:
+        image.backward()
+except KeyboardInterrupt:
+    interrupted = time.time()
+print(json.dumps({"interrupted": interrupted, "same": before == step(), "gradient": mesh.verts.grad is not None}))
+"""
+
+
+@posix
+@pytest.mark.parametrize("kind", ["image", "surface samples", "edge samples"])
+def test_ctrl_c_ends_a_long_render(kind, tmp_path):
+    """KeyboardInterrupt is there 0.3 s after the signal; 1 s here, for other work may have the machine's cores just then."""
+    file = tmp_path / "script.py"
+    file.write_text(COMMON + INTERRUPTED)
+    environment = {**psutil.Process().environ(), "PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
+    with subprocess.Popen(
+        [sys.executable, str(file), kind], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
+        assert run.stdout.readline() == "ready\n"
+        time.sleep(0.5)
+        assert run.poll() is None, "the render was over before it could be interrupted"
+        sent = time.time()
+        run.send_signal(signal.SIGINT)
+        try:
+            out, error = run.communicate(timeout=120)
+        finally:
+            run.kill()
+    assert run.returncode == 0, error
+    found = json.loads(out)
+    assert found["interrupted"] is not None, "the render was over before it was interrupted"
+    assert found["interrupted"] - sent < 1.0
+    assert found["same"] and not found["gradient"]
+
+
+# -- memory -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def free(monkeypatch):
+    """Sets how many bytes are free; renders of any size ask for it."""
+
+    def set_free(count):
+        monkeypatch.setattr(_memory, "LOOK_FROM", 0)
+        monkeypatch.setattr(_memory, "available", lambda: count)
+
+    return set_free
+
+
+def requiring(mesh, *names):
+    return mesh.replace(**{name: getattr(mesh, name).detach().clone().requires_grad_() for name in names})
+
+
+def test_an_image_larger_than_memory_is_refused():
+    """For real: 155 GB. Nothing is allocated, so it is refused at once."""
+    size, before, began = 65536, psutil.Process().memory_info().rss, time.perf_counter()
+    if psutil.virtual_memory().total > 100e9:
+        pytest.skip("this machine may have the memory")
+    message = r"render: .* at most the \d.* GB of memory that are free, got about 137 GB \(image 103 GB, coverage 34 GB"
+    with pytest.raises(MemoryError, match=message + r".*; lower the camera's size \(65536 × 65536 pixels\), its batch"):
+        eg.render(cube(), front_camera(size))
+    assert psutil.Process().memory_info().rss - before < 50e6 and time.perf_counter() - began < 1.0
+    with pytest.raises(MemoryError, match="image 103 GB"):
+        eg.plan(requiring(cube(), "verts"), front_camera(size))
+
+
+@pytest.mark.parametrize(
+    ("change", "largest"),
+    [
+        (lambda mesh, camera: (mesh, camera.resized((1000, 1000))), r"\(image 24 MB, coverage 8.0 MB"),
+        (lambda mesh, camera: (mesh.replace(colors=torch.rand(len(mesh.verts), 800)), camera), r"\(image "),
+        (lambda mesh, camera: (icosphere(7), camera), r"\(ray structure 24 MB"),
+    ],
+    ids=["size", "channels", "faces"],
+)
+def test_an_image_that_does_not_fit(change, largest, free):
+    mesh, camera = change(icosphere(1), front_camera(64))
+    expected = eg.render(mesh, camera, spp=1)
+    free(5_000_000)
+    with pytest.raises(MemoryError, match=r"render: .* 5\.0 MB .*" + largest + r".*; lower the camera's size"):
+        eg.render(mesh, camera, spp=1)
+    free(100_000_000)
+    assert torch.equal(eg.render(mesh, camera, spp=1), expected)
+
+
+@pytest.mark.parametrize("kind", ["verts", "colors", "texture", "background"])
+def test_a_backward_pass_that_does_not_fit(kind, free):
+    mesh, camera, background = icosphere(2), front_camera(32), None
+    if kind == "colors":
+        mesh = requiring(mesh.replace(colors=torch.rand(len(mesh.verts), 400)), "colors")
+    elif kind == "verts":
+        mesh = requiring(icosphere(6), "verts")
+    elif kind == "texture":
+        uvs = mesh.verts[:, :2] * 0.5 + 0.5
+        mesh = mesh.replace(colors=None, texture=torch.rand(600, 600, 3), uvs=uvs, uv_faces=mesh.faces)
+        mesh = requiring(mesh, "texture")
+    else:
+        background = torch.rand(700, 700, 3, dtype=torch.float64, requires_grad=True)
+        camera = front_camera(700)
+    image = eg.render(eg.Scene([mesh], background), camera, spp=1)
+    adjoint = torch.ones_like(image)
+    free(2_000_000)
+    with pytest.raises(MemoryError, match=r"backward pass: .*or let fewer tensors require a gradient"):
+        image.backward(adjoint, retain_graph=True)
+    given = background if background is not None else getattr(mesh, kind)
+    assert given.grad is None
+    free(200_000_000)
+    image.backward(adjoint)
+    assert given.grad is not None and bool(given.grad.abs().sum() > 0)
+
+
+def test_kept_geometry_makes_room(monkeypatch):
+    """Other meshes' ray structures are given up before a render is refused."""
+    counts = iter([1_000_000, 100_000_000])
+    monkeypatch.setattr(_memory, "LOOK_FROM", 0)
+    monkeypatch.setattr(_memory, "available", lambda: next(counts))
+    forgotten = []
+    monkeypatch.setattr(_memory, "clear_geometry", lambda: forgotten.append(True))
+    eg.render(icosphere(5), front_camera(32), spp=1)
+    assert forgotten == [True]
+
+
+def test_small_renders_do_not_ask(monkeypatch):
+    monkeypatch.setattr(_memory, "available", lambda: pytest.fail("asked for free memory"))
+    mesh = requiring(cube(), "verts", "colors")
+    eg.render(mesh, front_camera(64), spp=4).sum().backward()
+    assert mesh.verts.grad is not None
+
+
+@pytest.mark.parametrize(
+    "cause",
+    [MemoryError("std::bad_alloc"), RuntimeError("[…] DefaultCPUAllocator: can't allocate memory: you tried …")],
+)
+def test_a_failed_allocation_is_explained(cause, monkeypatch):
+    def fail(*_, **__):
+        raise cause
+
+    monkeypatch.setattr(importlib.import_module("edgegrad.render"), "_kernel_scene", fail)
+    with pytest.raises(MemoryError, match=r"render: expected .*than the system grants, got about .*; lower") as error:
+        eg.render(cube(), front_camera(16))
+    assert error.value.__cause__ is cause
+
+
+def test_other_errors_are_not_taken_for_memory(monkeypatch):
+    def fail(*_, **__):
+        raise RuntimeError("something else")
+
+    monkeypatch.setattr(importlib.import_module("edgegrad.render"), "_kernel_scene", fail)
+    with pytest.raises(RuntimeError, match=r"^something else$"):
+        eg.render(cube(), front_camera(16))
+
+
+def group(folder, limit, used, stat, names):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in zip(names, (limit, used, stat), strict=True):
+        (folder / name).write_text(str(text))
+
+
+def test_what_control_groups_leave(tmp_path):
+    """Every group up to the root counts, caches of files do not, and a group without a limit tells nothing."""
+    two = ("memory.max", "memory.current", "memory.stat")
+    group(tmp_path / "a" / "b", 5000, 1000, "anon 700\ninactive_file 200\nactive_file 100\n", two)
+    group(tmp_path / "a", "max", 9000, "inactive_file 0\n", two)
+    group(tmp_path, 9000, 8500, "inactive_file 100\n", two)
+    one = ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat")
+    group(tmp_path / "memory" / "c", 3000, 3500, "total_inactive_file 50\ninactive_file 3000\n", one)
+    proc = tmp_path / "cgroup"
+    proc.write_text("0::/a/b\n")
+    assert list(_memory._left_in_groups(proc, tmp_path)) == [4300, 600]
+    proc.write_text("9:cpu:/a/b\n4:hugetlb,memory:/c/gone\n")
+    assert list(_memory._left_in_groups(proc, tmp_path)) == [0]
+    assert list(_memory._left_in_groups(tmp_path / "none", tmp_path)) == []
+    assert 0 < _memory.available() <= psutil.virtual_memory().total
