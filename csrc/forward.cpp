@@ -85,6 +85,7 @@ class PixelRow {
         if (++traced_ % 256 == 0) team_.check();
         rays_.prepare();
         caster_.cast(rays_);
+        if (scene_.n_faces > in_cache) prefetch();
         int i = 0;
         for (int p = 0; p < parts_; ++p) {
             typename AffineRadiance<N>::Sum sum(C_);
@@ -108,6 +109,25 @@ class PixelRow {
             for (int c = 0; c < C_; ++c) sum_[part_[p].column * C_ + c] += sum[c];
         }
         rays_.count = parts_ = 0;
+    }
+
+    // Faces that are smaller than the distance of the samples are met once each, and their arrays are then waited for.
+    static constexpr int64_t in_cache = 1 << 18;
+    void prefetch() const {
+#if defined(__GNUC__)
+        for (int i = 0; i < rays_.count; ++i)
+            if (const int64_t face = rays_.face[i]; face >= 0) {
+                __builtin_prefetch(scene_.faces + 3 * face);
+                __builtin_prefetch(scene_.corners + 3 * face);
+            }
+        for (int i = 0; i < rays_.count; ++i)
+            if (const int64_t face = rays_.face[i]; face >= 0)
+                for (int k = 0; k < 3; ++k) {
+                    __builtin_prefetch(&q_[scene_.faces[3 * face + k]]);
+                    if (!is_textured(scene_, face))
+                        __builtin_prefetch(scene_.colors + int64_t(scene_.corners[3 * face + k]) * C_);
+                }
+#endif
     }
 
     // What ray i meets behind a face that holds the eye.

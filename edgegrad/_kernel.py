@@ -6,6 +6,8 @@ import importlib.metadata
 import importlib.util
 import os
 
+from typing import Any
+
 import torch  # noqa: F401  first, so that the kernel shares torch's OpenMP runtime
 
 HOW_TO_GET_EMBREE = (
@@ -28,7 +30,7 @@ def embree_path() -> str:
     )
 
 
-def load():
+def load() -> Any:
     """The kernel module, with Embree open. Raises ImportError that says how to get what is missing.
 
     It is the one that was installed, or the file in the environment variable EDGEGRAD_KERNEL: a build with sanitizers.
