@@ -8,6 +8,7 @@
 #include <nanobind/stl/string.h>
 
 #include <cmath>
+#include <cstdio>
 #include <map>
 #include <optional>
 #include <string>
@@ -36,19 +37,27 @@ std::string at(int64_t index, int64_t width) {
                       : "[" + std::to_string(index / width) + ", " + std::to_string(index % width) + "]";
 }
 
+std::string text(double number) {
+    char out[32];
+    std::snprintf(out, sizeof out, "%g", number);
+    return out;
+}
+
 constexpr int64_t parallel_from = 1 << 18;  // numbers; below, threads cost more than they save
 
 template <class T>
 void check_finite(const char* name, const T* values, int64_t n, int64_t width) {
-    // x · 0 is zero unless x is NaN or infinite; the sum is one fast pass.
-    T zero = 0;
+    // x · 0 is zero unless x is NaN or infinite; the sum is one fast pass. What leaves the range of floats is refused
+    // too: the squares and products of such numbers would leave that of doubles.
+    float zero = 0;
 #pragma omp parallel for simd reduction(+ : zero) if (n > parallel_from)
-    for (int64_t i = 0; i < n; ++i) zero += values[i] * T(0);
+    for (int64_t i = 0; i < n; ++i) zero += float(values[i]) * 0.f;
     if (zero == 0) return;
     for (int64_t i = 0; i < n; ++i)
-        if (!std::isfinite(values[i]))
-            refuse(std::string(name) + ": expected finite numbers, got " + std::to_string(values[i]) + " at " +
-                   at(i, width));
+        if (!std::isfinite(float(values[i])))
+            refuse(std::string(name) + ": expected " +
+                   (std::isfinite(values[i]) ? "numbers up to 3.4e38" : "finite numbers") + ", got " + text(values[i]) +
+                   " at " + at(i, width));
 }
 
 // `n` indices, in rows of three, of which the first is number `first`.

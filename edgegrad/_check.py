@@ -144,13 +144,17 @@ def check_finite(name: str, tensor: Tensor, *, largest: float = LARGEST, smalles
     )
 
 
-def check_indices(name: str, tensor: Tensor, count: int, of: str) -> None:
-    """All in [0, count). Raises ValueError."""
+def check_countable(name: str, tensor: Tensor, count: int, of: str) -> None:
+    """Indices into `count` rows that 32 bits can count. Raises ValueError."""
     if tensor.shape[0] > MOST_ROWS // 3 or count > MOST_ROWS:
         raise ValueError(
             f"{name}: expected at most {MOST_ROWS // 3} faces and {MOST_ROWS} rows of {of} (indices have 32 bits inside), "
             f"got {tensor.shape[0]} and {count}; render the scene in parts"
         )
+
+
+def check_indices(name: str, tensor: Tensor, count: int, of: str) -> None:
+    """All in [0, count). Raises ValueError."""
     if not values_visible(tensor) or tensor.numel() == 0:
         return
     low, high = (int(v) for v in torch.aminmax(tensor))

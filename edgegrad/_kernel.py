@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import os
-
 from typing import Any
 
 import torch  # noqa: F401  first, so that the kernel shares torch's OpenMP runtime

@@ -9,7 +9,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ._check import as_tensor, check_fields, check_finite, check_float, check_indices, check_integer, check_shape
+from ._check import (
+    as_tensor,
+    check_countable,
+    check_fields,
+    check_finite,
+    check_float,
+    check_indices,
+    check_integer,
+    check_shape,
+)
 
 PLAIN = 0.7  # radiance of a mesh without colours, in every channel
 SMALLEST_MESH, LARGEST_UV = 1e-38, 1e9
@@ -80,6 +89,10 @@ class Mesh:
             extra = "uvs" if self.uvs is not None else "uv_faces"
             raise ValueError(f"{extra}: expected None without a texture, got a tensor; pass texture=… or leave it out")
 
+        # First of all, for more rows than can be counted take as long to look at.
+        check_countable("faces", self.faces, V, "verts")
+        if self.uvs is not None and self.uv_faces is not None:
+            check_countable("uv_faces", self.uv_faces, self.uvs.shape[0], "uvs")
         check_finite("verts", self.verts, smallest=SMALLEST_MESH if self.verts.dtype == torch.float64 else 0.0)
         check_indices("faces", self.faces, V, "verts")
         for kind in kinds:

@@ -397,6 +397,12 @@ def test_change_in_place_after_the_checks(name, index, value, parts):
     check(spoilt(name, index, value), ValueError, *parts)
 
 
+def test_change_in_place_beyond_the_range_of_floats() -> None:
+    mesh = eg.Mesh(VERTS.double(), FACES)
+    mesh.verts[2, 1] = 1e200
+    check(lambda: render(mesh, camera()), ValueError, "verts: expected numbers up to 3.4e38, got 1", "at [2, 1]")
+
+
 @pytest.mark.parametrize("value", [NAN, INF])
 def test_adjoint_that_is_not_finite(value):
     verts = VERTS.clone().requires_grad_()
