@@ -18,7 +18,7 @@ from .scenes import background, front_camera, smooth_colors, sphere
 
 F64 = torch.float64
 STEPS = 500
-RISE = 3.0  # the loss may rise over one step by this factor, no more
+RISE = 5.0  # the loss may rise over one step by this factor, no more
 SMOOTHNESS = 20.0  # λ of I + λ L
 
 Say = Callable[[str], Any]

@@ -31,7 +31,7 @@ from .scenes import (
 
 F64 = torch.float64
 ALPHA = 0.01  # chance of any false alarm in a whole run, by Holm
-SEEDS, SINGLES = 256, 4096
+SEEDS, SINGLES = 256, 2048
 SAMPLES = {"surface_samples": 2_000, "edge_samples": 2_000, "spp": 16}
 SPP = (1, 4, 16, 64, 256)
 

@@ -30,6 +30,7 @@ class Problem:
     make       parts ↦ (scene, camera)
     exact      parts ↦ the image (H, W, C) without sampling, differentiable; None where only finite differences can tell
     steps      of those, one for each part
+    zero       of the adjoint's norm: what a reference may be by rounding that is zero
     reference  in words
     """
 
@@ -38,6 +39,7 @@ class Problem:
     exact: Callable[[Parts], Tensor] | None
     reference: str = "exact integrals"
     steps: dict[str, float] = field(default_factory=dict)
+    zero: float = 1e-9
     adjoint: Tensor | None = None  # (H, W, C), smooth_adjoint when None
     faint: bool = False  # the image's error is relative to all of it, not to what the scene adds to its background
     spp: int = 64

@@ -14,7 +14,6 @@ from ...reference import render as twin
 from ...render import render
 from .case import Case, Parts, Problem
 
-ROUNDING = 1e-9  # of the adjoint's norm: a reference below that is zero
 TOLERANCE = 0.02  # what may be missing, beyond four standard errors
 NOISE = 0.01  # a larger standard error is too much to tell
 RIGHT, LIMIT, WRONG, NOISY, RAISED = "right", "limit", "wrong", "too noisy to tell", "error raised"
@@ -90,10 +89,12 @@ def compare(problem: Problem, effort: Effort) -> dict[str, Any]:
                 grads[name].add(value)
         row = {
             "reference": problem.reference, "seeds": seeds, "steps": problem.steps,
-            "image": _relative(image.estimate(), Estimate(wanted_image, 0.0), contrast, 1.0),
+            "image": _relative(image.estimate(), Estimate(wanted_image, 0.0), contrast),
             "parts": {
-                name: _relative(grads[name].estimate(), wanted[name], float(wanted[name].mean.norm()), adjoint)
-                for name in problem.parts
+                name: _relative(
+                    run.estimate(), wanted[name], float(wanted[name].mean.norm()), problem.zero * adjoint, adjoint
+                )
+                for name, run in grads.items()
             },
         }  # fmt: skip
         noise = max(entry["noise"] for entry in (row["image"], *row["parts"].values()))
@@ -102,9 +103,9 @@ def compare(problem: Problem, effort: Effort) -> dict[str, Any]:
     return row
 
 
-def _relative(found: Estimate, wanted: Estimate, size: float, unit: float) -> dict[str, float]:
-    """Where the reference is zero but for rounding, errors are relative to `unit`."""
-    scale = size if size > ROUNDING * unit else unit
+def _relative(found: Estimate, wanted: Estimate, size: float, zero: float = 0.0, unit: float = 1.0) -> dict[str, float]:
+    """Errors relative to `size`, that of the reference; to `unit` where that is no more than `zero`."""
+    scale = size if size > zero else unit
     return {
         "error": float((found.mean - wanted.mean).norm()) / scale,
         "noise": (found.error**2 + wanted.error**2) ** 0.5 / scale,

@@ -35,13 +35,15 @@ def single(scene: Scene) -> Scene:
     return scene.to(torch.float32)
 
 
+@group.add("scale-1e-30", "a cube of 1e-30 units, float32", 1e-30)
 @group.add("scale-1e-6", "a cube of 1e-6 units, float32", 1e-6)
 @group.add("scale-1e-3", "a cube of 1e-3 units, float32", 1e-3)
 @group.add("scale-1e3", "a cube of 1e3 units, float32", 1e3)
 @group.add("scale-1e6", "a cube of 1e6 units, float32", 1e6)
+@group.add("scale-1e30", "a cube of 1e30 units, float32", 1e30)
 def scaled(unit: float) -> Problem:
     scene = single(Scene([tilted_cube().transformed(scale=unit)], background()))
-    return everything(scene, moved(front_camera(48), unit))
+    return everything(scene, moved(front_camera(48), unit), zero=0.0)
 
 
 @group.add("offset-1e3", "1e3 times its size from the origin, float32", 1e3, torch.float32)
@@ -114,9 +116,14 @@ def mixed() -> Problem:
 FLOAT_FRAME = "one frame of floats holds both: Embree sees their vertices where floats are"
 
 
-@group.add("two-details", "two spheres of 5,120 faces, 1.5e4 times their size apart", 2e4)
+@group.add("two-details", "two spheres of 5,120 faces, 1.5e4 times their size apart", 2e4, slow=True)
 @group.add(
-    "two-details-far", "two spheres of 5,120 faces, 1.5e5 times their size apart", 2e5, limit=FLOAT_FRAME, most=0.5
+    "two-details-far",
+    "two spheres of 5,120 faces, 1.5e5 times their size apart",
+    2e5,
+    limit=FLOAT_FRAME,
+    most=0.5,
+    slow=True,
 )
 def two_details(distance: float) -> Problem:
     near = sphere(4).transformed(scale=0.7)

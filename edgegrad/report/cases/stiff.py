@@ -36,7 +36,7 @@ def decades() -> Problem:
     )
 
 
-@group.add("speck", "a cube of 0.05 px, 1e6 units away, beside one that fills the image")
+@group.add("speck", "a cube of 0.05 px, 1e6 units away, beside one that fills the image", slow=True)
 def speck() -> Problem:
     near = tilted_cube(0.2).transformed(t=vector(0.1, 0.05, -1.0))
     far = tilted_cube(5e2).transformed(t=vector(-4e5, 3.6e5, -1e6))
