@@ -60,13 +60,8 @@ def near_corner() -> Problem:
     colors = smooth_colors(mesh.verts[mesh.faces].mean(1) * 3.0)
     mesh = Mesh(mesh.verts, mesh.faces, face_colors=colors)
     corner = torch.tensor([0.5, 0.5, 0.5], dtype=F64)
-    camera = Camera.look_at(
-        corner * (1.0 + 2e-3 / 3**0.5),
-        corner * 0.999 + torch.tensor([2e-4, -1e-4, 0.0]),
-        (0.1, 1.0, 0.0),
-        50.0,
-        (48, 48),
-    )
+    eye, target = corner * (1.0 + 2e-3 / 3**0.5), corner * 0.999 + torch.tensor([2e-4, -1e-4, 0.0])
+    camera = Camera.look_at(eye, target, (0.1, 1.0, 0.0), 50.0, (48, 48))
     return everything(single(Scene([mesh], background())), camera)
 
 

@@ -8,6 +8,7 @@ import torch
 
 from ...mesh import Mesh
 from ...scene import Scene
+from ..exact import exact_image
 from ..scenes import background, smooth_adjoint, smooth_colors
 from .camera import ORIGIN, upright, vector
 from .case import F64, Group, Problem, everything
@@ -15,22 +16,15 @@ from .geometry import CAMERA, of_faces, on_screen
 from .scale import tilted_cube
 
 group = Group("stiff")
+WARM = of_faces((0.9, 0.4, 0.2), (0.3, 0.8, 0.6), (0.5, 0.2, 0.9))
 TRIANGLE = torch.tensor([[-0.31, -0.26, 0.06], [0.33, -0.18, -0.05], [0.02, 0.34, 0.02]], dtype=F64)
 
 
 @group.add("decades-12", "vertex gradients 12 decades apart: a triangle at 1e-3 units before one at 1e9")
 def decades() -> Problem:
-    look = vector(0.0, 0.0, -1.0)
-    near = Mesh(
-        1e-3 * (TRIANGLE + look + vector(-0.12, -0.1, 0.0)),
-        torch.tensor([[0, 1, 2]]),
-        colors=smooth_colors(3 * TRIANGLE),
-    )
-    far = Mesh(
-        1e9 * (0.7 * TRIANGLE + look + vector(0.14, 0.12, 0.0)),
-        torch.tensor([[0, 1, 2]]),
-        colors=smooth_colors(5 * TRIANGLE),
-    )
+    face = torch.tensor([[0, 1, 2]])
+    near = Mesh(1e-3 * (TRIANGLE + vector(-0.12, -0.1, -1.0)), face, colors=smooth_colors(3 * TRIANGLE))
+    far = Mesh(1e9 * (0.7 * TRIANGLE + vector(0.14, 0.12, -1.0)), face, colors=smooth_colors(5 * TRIANGLE))
     return everything(
         Scene([near, far], background()), upright(ORIGIN), names=(" of the near", " of the far"), camera_too=False
     )
@@ -52,14 +46,7 @@ def _quadrants(colors: list[float]) -> Scene:
     meshes = []
     for (x, y), color in zip(middles, colors, strict=True):
         pixels = (corners + vector(x, y)).tolist()
-        meshes.append(
-            on_screen(
-                pixels,
-                [3.6, 4.1, 4.0],
-                [[0, 1, 2]],
-                colors=color * of_faces((0.9, 0.4, 0.2), (0.3, 0.8, 0.6), (0.5, 0.2, 0.9)),
-            )
-        )
+        meshes.append(on_screen(pixels, [3.6, 4.1, 4.0], [[0, 1, 2]], colors=color * WARM))
     return Scene(meshes, torch.zeros(3, dtype=F64))
 
 
@@ -93,24 +80,14 @@ def scaled_adjoint(level: float) -> Problem:
 @group.add("hiding-1e-3", "an edge 1e-3 px behind the one that hides it", -1e-3)
 def grazing(beyond: float) -> Problem:
     """At zero the gradient jumps; on both sides it must be that of the side."""
-    front = on_screen(
-        [[6.3, 21.2], [43.1, 27.4], [20.4, 44.1]],
-        [3.4, 3.6, 3.5],
-        [[0, 1, 2]],
-        colors=of_faces((0.9, 0.4, 0.2), (0.3, 0.8, 0.6), (0.5, 0.2, 0.9)),
-    )
+    front = on_screen([[6.3, 21.2], [43.1, 27.4], [20.4, 44.1]], [3.4, 3.6, 3.5], [[0, 1, 2]], colors=WARM)
     along = vector(43.1 - 6.3, 27.4 - 21.2) / math.hypot(43.1 - 6.3, 27.4 - 21.2)
     up = vector(along[1].item(), -along[0].item())
     start = vector(6.3, 21.2)
     pixels = torch.stack(
         [start + 4.0 * along + beyond * up, start + 31.0 * along + beyond * up, start + 15.0 * along - 12.0 * up]
     )
-    back = on_screen(
-        pixels.tolist(),
-        [4.4, 4.7, 4.5],
-        [[0, 1, 2]],
-        colors=of_faces((0.1, 0.7, 0.9), (0.8, 0.9, 0.1), (0.2, 0.2, 0.9)),
-    )
+    back = on_screen(pixels.tolist(), [4.4, 4.7, 4.5], [[0, 1, 2]], colors=1.0 - WARM)
     # Not the colours: of a strip as wide as that, no sample tells.
     return everything(Scene([front, back], background()), CAMERA, colors=False)
 
@@ -133,6 +110,9 @@ def wire(contrast: float) -> Problem:
 @group.add("one-pixel-loss", "a loss that looks at one pixel, on a silhouette")
 def one_pixel() -> Problem:
     scene = Scene([tilted_cube()], background())
+    white = tilted_cube().replace(colors=torch.ones((8, 1), dtype=F64))
+    coverage = exact_image(Scene([white]), CAMERA)[..., 0]
+    y, x = torch.nonzero((coverage > 0.4) & (coverage < 0.6))[0].tolist()
     adjoint = torch.zeros((48, 48, 3), dtype=F64)
-    adjoint[17, 17] = vector(1.0, -0.5, 0.3)
+    adjoint[y, x] = vector(1.0, -0.5, 0.3)
     return everything(scene, CAMERA, adjoint=adjoint)
