@@ -10,14 +10,15 @@ import torch
 from edgegrad.mesh import Mesh
 from edgegrad.report.methods import default_samples
 from edgegrad.report.scenes import (
-    background,
+    cube,
     front_camera,
+    occluded_triangle,
     one_triangle,
     random_slivers,
     smooth_adjoint,
     smooth_colors,
+    soup,
 )
-from edgegrad.scene import Scene
 
 __all__ = [
     "cube",
@@ -29,24 +30,8 @@ __all__ = [
     "random_slivers",
     "smooth_adjoint",
     "smooth_colors",
+    "soup",
 ]
-
-
-def occluded_triangle() -> Scene:
-    """A triangle with smooth colours, partly behind another one."""
-    behind = one_triangle().meshes[0]
-    verts = torch.tensor([[-0.31, -0.93, 0.9], [0.95, 0.17, 0.8], [-0.43, 0.57, 1.0]], dtype=torch.float64)
-    colors = torch.tensor([[0.2, 0.9, 0.7], [0.8, 0.1, 0.6], [0.6, 0.5, 0.05]], dtype=torch.float64)
-    return Scene([behind, Mesh(verts, torch.tensor([[0, 1, 2]]), colors=colors)], background())
-
-
-def cube(half: float = 0.6) -> Mesh:
-    """A cube of edge length 2 · half: 8 vertices, 12 faces, outward, with a colour for each vertex."""
-    x, y, z = (np.arange(8) >> 2) & 1, (np.arange(8) >> 1) & 1, np.arange(8) & 1
-    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    faces = [[q[0], q[i], q[i + 1]] for q in quads for i in (1, 2)]
-    verts = torch.from_numpy(half * (2.0 * np.stack([x, y, z], 1) - 1.0))
-    return Mesh(verts, torch.tensor(faces), colors=smooth_colors(verts))
 
 
 def icosphere(subdivisions: int = 3) -> Mesh:

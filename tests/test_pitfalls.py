@@ -7,7 +7,7 @@ from __future__ import annotations
 import pytest
 import torch
 from finite_differences import check_ratio, gradient, loss, rotation
-from scenes import cube, default_samples, front_camera, icosphere, smooth_adjoint, smooth_colors
+from scenes import cube, default_samples, front_camera, icosphere, smooth_adjoint, smooth_colors, soup
 from torch import Tensor
 
 import edgegrad as eg
@@ -21,13 +21,6 @@ SAMPLES = {"surface_samples": 20_000, "edge_samples": 20_000}
 
 def tilted_cube(half: float = 0.5) -> eg.Mesh:
     return cube(half).transformed(rotation((0.48, 0.6, 0.64), torch.tensor(0.6, dtype=F64)))
-
-
-def soup(mesh: eg.Mesh) -> eg.Mesh:
-    """Every face with vertices of its own."""
-    assert mesh.colors is not None
-    index = mesh.faces.reshape(-1)
-    return eg.Mesh(mesh.verts[index], torch.arange(len(index)).reshape(-1, 3), colors=mesh.colors[index])
 
 
 def moving(mesh: eg.Mesh, camera: eg.Camera, direction: Tensor = ALONG):

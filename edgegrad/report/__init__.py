@@ -1,6 +1,7 @@
-"""Reports: the error of the gradient against the time it takes, for edgegrad, finite differences and other renderers."""
+"""Reports: the error of the gradient against the time it takes, beside other renderers, and in extreme cases."""
 
 from .error_time import error_time
 from .scenes import SCENES, ReportScene, build
+from .stability import stability
 
-__all__ = ["SCENES", "ReportScene", "build", "error_time"]
+__all__ = ["SCENES", "ReportScene", "build", "error_time", "stability"]

@@ -36,6 +36,20 @@ def add_report(commands: Any) -> None:
     )  # fmt: skip
     curve.set_defaults(run=_error_time)
 
+    extreme = kinds.add_parser("stability", help="its error in extreme cases", description=_stability.__doc__)
+    extreme.add_argument(
+        "--case",
+        nargs="+",
+        metavar="NAME",
+        help="cases or groups of them, statistics, fits (all); a wrong name lists all",
+    )
+    extreme.add_argument("--quick", action="store_true", help="fewer seeds, to try it out")
+    extreme.add_argument(
+        "--out", type=Path, default=Path("out/stability"), metavar="DIR",
+        help="for stability.json, .md, .png and stability-fits.png (%(default)s)",
+    )  # fmt: skip
+    extreme.set_defaults(run=_stability)
+
 
 def _error_time(args: argparse.Namespace) -> int:
     """Relative error of the gradient (per vertex, and of whole-object translation and rotation) against wall time, for a
@@ -53,6 +67,21 @@ def _error_time(args: argparse.Namespace) -> int:
     if interrupted:
         print(f"edgegrad: interrupted; the same command goes on from what is kept in {args.out}", file=sys.stderr)
     return INTERRUPTED if interrupted else 0
+
+
+def _stability(args: argparse.Namespace) -> int:
+    """Error of image and gradient in extreme cases against independent references: scale, cameras, geometry, what coincides,
+    stiff scenes; whether the gradient is unbiased, and ill-conditioned fits. Ctrl-C keeps what is measured. The exit code is 1
+    if a case is wrong."""
+    from .stability import failures, stability
+
+    make_folder(args.out)
+    document, interrupted = stability(args.out, args.case, quick=args.quick)
+    if document["cases"] or document["sections"]:
+        print(f"wrote stability.json, stability.md and pictures in {args.out}")
+    if failed := failures(document):
+        print(f"{len(failed)} not right: {', '.join(failed)}")
+    return INTERRUPTED if interrupted else 1 if failed else 0
 
 
 def _seconds(text: str) -> float:

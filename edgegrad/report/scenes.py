@@ -109,6 +109,40 @@ def one_triangle() -> Scene:
     return Scene([Mesh(verts, torch.tensor([[0, 1, 2]]), colors=colors)], background())
 
 
+def occluded_triangle() -> Scene:
+    """A triangle with smooth colours, partly behind another one."""
+    behind = one_triangle().meshes[0]
+    verts = torch.tensor([[-0.31, -0.93, 0.9], [0.95, 0.17, 0.8], [-0.43, 0.57, 1.0]], dtype=torch.float64)
+    colors = torch.tensor([[0.2, 0.9, 0.7], [0.8, 0.1, 0.6], [0.6, 0.5, 0.05]], dtype=torch.float64)
+    return Scene([behind, Mesh(verts, torch.tensor([[0, 1, 2]]), colors=colors)], background())
+
+
+def cube(half: float = 0.6) -> Mesh:
+    """A cube of edge length 2 · half: 8 vertices, 12 faces, outward, with a colour for each vertex."""
+    x, y, z = (np.arange(8) >> 2) & 1, (np.arange(8) >> 1) & 1, np.arange(8) & 1
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    faces = [[q[0], q[i], q[i + 1]] for q in quads for i in (1, 2)]
+    verts = torch.from_numpy(half * (2.0 * np.stack([x, y, z], 1) - 1.0))
+    return Mesh(verts, torch.tensor(faces), colors=smooth_colors(verts))
+
+
+def sphere(subdivisions: int) -> Mesh:
+    """Unit sphere of 20 · 4^subdivisions faces, watertight, outward, with smooth colours."""
+    from trimesh.creation import icosphere
+
+    found = icosphere(subdivisions)
+    verts = torch.from_numpy(np.array(found.vertices))
+    return Mesh(verts, torch.from_numpy(np.array(found.faces, np.int32)), colors=smooth_colors(verts))
+
+
+def soup(mesh: Mesh) -> Mesh:
+    """Every face with vertices of its own."""
+    assert mesh.texture is None
+    index = mesh.faces.long().reshape(-1)
+    colors = None if mesh.colors is None else mesh.colors[index]
+    return mesh.replace(verts=mesh.verts[index], faces=torch.arange(len(index)).reshape(-1, 3), colors=colors)
+
+
 def random_slivers(count: int, seed: int, camera: Camera) -> Mesh:
     """Long thin triangles (half to nine tenths of the image, 1 to 3 % of it wide) that overlap heavily in the view of
     `camera`, each at a depth of its own, so that no two meet, with a random colour for each."""
@@ -159,14 +193,10 @@ def _triangle(size: int) -> Built:
 
 
 def _sphere(size: int, subdivisions: int = 6) -> Built:
-    from trimesh.creation import icosphere
-
-    sphere = icosphere(subdivisions)
-    verts = torch.from_numpy(np.array(sphere.vertices))
-    faces = torch.from_numpy(np.array(sphere.faces, np.int32))
+    mesh = sphere(subdivisions)
     camera = Camera.look_at((0.9, 0.7, 3.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (size, size))
-    title = f"sphere of {len(faces):,} faces, smooth colours"
-    return title, Scene([Mesh(verts, faces, colors=smooth_colors(verts))], background()), camera
+    title = f"sphere of {len(mesh.faces):,} faces, smooth colours"
+    return title, Scene([mesh], background()), camera
 
 
 def _slivers(size: int) -> Built:

@@ -1,0 +1,297 @@
+"""Extreme cases: image and gradient against independent references, and the report that measures them.
+
+The cases are those of `edgegrad report stability`. Here each must have its verdict from few seeds, and in `make test-slow`
+from as many as the report takes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+import math
+
+import pytest
+import torch
+from PIL import Image
+from scenes import cube, front_camera, one_triangle
+
+import edgegrad as eg
+from edgegrad import cli
+from edgegrad.report import fits, statistics
+from edgegrad.report.cases import CASES, measure
+from edgegrad.report.cases.case import Case, Problem, everything
+from edgegrad.report.cases.measure import LIMIT, NOISY, QUICK, RAISED, RIGHT, WRONG, Effort
+
+stability = importlib.import_module("edgegrad.report.stability")  # the package has a function of this name
+FAST = [name for name, case in CASES.items() if not case.slow]
+LIMITS = {name for name, case in CASES.items() if case.limit}
+
+
+def check(name: str, effort: Effort) -> None:
+    row = measure.measure(CASES[name], effort)
+    assert row["verdict"] == RIGHT or (row["verdict"] == LIMIT and name in LIMITS), row
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_case(name):
+    check(name, QUICK)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_case_at_full_accuracy(name):
+    check(name, Effort())
+
+
+# -- the references are checked ---------------------------------------------------------------------------------------
+
+# An edge of 5e-7 px, edges as near to each other, a contrast at which differences of the loss are rounding: no step is short
+# enough and long enough.
+TOO_FINE = {"tiny-edge", "emerging-1e-6", "hiding-1e-6", "wire-1e-9"}
+LARGE = {"two-details", "two-details-far", "copies-sphere"}  # a second and more for one image
+
+
+def own_differences(problem: Problem, name: str) -> float:
+    """How far the derivative of the exact image along its gradient is from its own central difference, relative."""
+    assert problem.exact is not None
+    image, grads = measure.exact(problem, problem.exact)
+    adjoint = problem.cotangent(image)
+    size = float(grads[name].norm())
+    if size < 1e-9 * float(adjoint.norm()):
+        return 0.0
+    off = []
+    for share in (1e-4, 1e-5):  # of the loss
+        h = share * float((adjoint * image).abs().sum()) / size
+        parts = {key: value.double() for key, value in problem.parts.items()}
+        with torch.no_grad():
+            high, low = (
+                float((problem.exact({**parts, name: parts[name] + sign * h * grads[name] / size}) * adjoint).sum())
+                for sign in (1.0, -1.0)
+            )
+        off.append(abs((high - low) / (2.0 * h) / size - 1.0))
+    return min(off)
+
+
+def references(names):
+    return [name for name in names if name not in TOO_FINE | LARGE and name != "through-each-other"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", references(CASES))
+def test_references_agree_with_their_own_differences(name):
+    problem = CASES[name].build()
+    for part in problem.parts:
+        try:
+            off = own_differences(problem, part)
+        except AssertionError as error:
+            assert "intersect" in str(error)  # moved one by one, vertices that touch go through each other
+            continue
+        assert off < 2e-3, (part, off)
+
+
+def test_a_clipped_scene_is_the_same():
+    """Clipped to the view, a scene before the camera has the same image and gradient as whole."""
+    camera = front_camera(32)
+    far = torch.tensor([[0.0, 0.0, 9.0], [0.1, 0.0, 9.0], [0.0, 0.1, 9.5]], dtype=torch.float64)  # behind the camera
+    behind = eg.Mesh(far, torch.tensor([[0, 1, 2]]), colors=torch.zeros((3, 3), dtype=torch.float64))
+    plain = everything(eg.Scene([cube(0.9)], torch.zeros(3, dtype=torch.float64)), camera)
+    clipped = everything(
+        eg.Scene([cube(0.9)], torch.zeros(3, dtype=torch.float64)), camera,
+        equal=lambda scene: scene.replace(meshes=[*scene.meshes, behind]),
+    )  # fmt: skip
+    assert plain.exact is not None and clipped.exact is not None
+    (image, grads), (image_2, grads_2) = (measure.exact(p, p.exact) for p in (plain, clipped))
+    torch.testing.assert_close(image_2, image)
+    torch.testing.assert_close(grads_2, grads)
+
+
+# -- the verdicts are checked -----------------------------------------------------------------------------------------
+
+
+def case_of(problem: Problem, **fields) -> Case:
+    return Case("test", "test", "nothing", lambda: problem, **fields)
+
+
+@pytest.fixture
+def triangle():
+    return everything(one_triangle(), front_camera(32))
+
+
+def test_a_wrong_gradient_is_rejected(triangle):
+    """The interior alone; and a gradient with a single part 3 % off."""
+    row = measure.measure(case_of(triangle), QUICK)
+    assert row["verdict"] == RIGHT
+    interior = dataclasses.replace(triangle, options={**triangle.options, "visibility": False})
+    assert measure.measure(case_of(interior), QUICK)["verdict"] == WRONG
+
+    def stretched(parts):
+        return triangle.make({**parts, "skew": 1.03 * parts["skew"] - 0.03 * parts["skew"].detach()})
+
+    row = measure.measure(case_of(dataclasses.replace(triangle, make=stretched)), QUICK)
+    assert (row["verdict"], row["worst"]) == (WRONG, "skew")
+
+
+def test_a_wrong_image_is_rejected(triangle):
+    def brighter(parts):
+        return triangle.exact(parts) * 1.0 + 0.03 * triangle.exact(parts).detach()
+
+    row = measure.measure(case_of(dataclasses.replace(triangle, exact=brighter)), QUICK)
+    assert (row["verdict"], row["worst"]) == (WRONG, "image")
+
+
+def test_noise_does_not_pass(triangle):
+    few = dataclasses.replace(triangle, options={"surface_samples": 3, "edge_samples": 3}, spp=1)
+    assert measure.measure(case_of(few), Effort(seeds=(4,)))["verdict"] == NOISY
+
+
+def test_nan_is_wrong(triangle):
+    def broken(parts):
+        image = triangle.exact(parts)
+        return image + torch.where(image > 0.5, math.nan, 0.0)
+
+    row = measure.measure(case_of(dataclasses.replace(triangle, exact=broken)), QUICK)
+    assert row["verdict"] == WRONG
+
+
+def test_a_limit_has_a_size(triangle):
+    interior = dataclasses.replace(triangle, options={**triangle.options, "visibility": False})
+    assert measure.measure(case_of(interior, limit="no boundary", most=3.0), QUICK)["verdict"] == LIMIT
+    assert measure.measure(case_of(interior, limit="no boundary", most=0.1), QUICK)["verdict"] == WRONG
+
+
+def test_what_is_raised_is_told(triangle):
+    def refuse(parts):
+        raise ValueError("verts: expected finite values")
+
+    row = measure.measure(case_of(dataclasses.replace(triangle, make=refuse)), QUICK)
+    assert row["verdict"] == RAISED and "verts: expected finite" in row["raised"]
+
+
+@pytest.mark.parametrize("visibility", [True, False])
+def test_finite_differences_tell(visibility):
+    """Of the renderer, without exact integrals: a triangle's shift, with and without its boundary term."""
+    scene, camera = one_triangle(), front_camera(32)
+    direction = torch.tensor([0.7, 0.6, -0.2], dtype=torch.float64)
+    problem = Problem(
+        {"shift": torch.zeros(1, dtype=torch.float64)},
+        lambda parts: (scene.transformed(t=parts["shift"] * direction), camera), None, "finite differences", {"shift": 0.01},
+        options={"surface_samples": 20_000, "edge_samples": 20_000, "visibility": visibility},
+    )  # fmt: skip
+    row = measure.measure(case_of(problem), QUICK)
+    assert row["verdict"] == (RIGHT if visibility else WRONG), row
+
+
+# -- statistics and fits ----------------------------------------------------------------------------------------------
+
+
+def test_holm():
+    p = torch.tensor([0.004, 0.03, 0.01, 0.9], dtype=torch.float64)
+    # 0.004 ≤ 0.05/4, 0.01 ≤ 0.05/3, 0.03 > 0.05/2: it stops there.
+    assert statistics.holm(p, 0.05).tolist() == [True, False, True, False]
+    # The largest p may lie below α, but not after one that stays.
+    assert statistics.holm(torch.tensor([0.04, 0.045]), 0.05).tolist() == [False, False]
+
+
+@pytest.mark.slow
+def test_unbiased():
+    found = statistics.unbiased()
+    assert found["rejected"] == 0 and found["components"] > 1000, found
+
+
+def test_a_bias_is_noticed(triangle):
+    """One of half a standard deviation of a single gradient, in the image of one part."""
+    z, deviation = statistics.components(triangle, 64)
+    assert z.abs().max() < 5.0
+    off = dataclasses.replace(triangle, exact=lambda parts: (1.0 + 2.0 * deviation) * triangle.exact(parts))
+    assert statistics.components(off, 64)[0].abs().max() > 8.0
+
+
+def test_tails_of_known_samples():
+    norms = torch.tensor([1.0, 1.0, 2.0, 4.0], dtype=torch.float64)
+    found = statistics._tail(norms, torch.tensor([8.0], dtype=torch.float64))
+    assert found is not None
+    assert (found["share"], found["times"], found["squares"]) == (0.5, 2.0, 16.0 / 22.0)
+    assert found["deviation"] == pytest.approx((22.0 / 4.0 - 4.0) ** 0.5 / 2.0)
+    assert statistics._tail(torch.zeros(4), torch.zeros(1)) is None
+
+
+@pytest.mark.slow
+def test_a_squared_loss_has_no_bias_in_the_gradient_for_what_moves():
+    rows = statistics.squared_loss(quick=True)["rows"]
+    for row in rows:
+        for name in (" behind", " in front"):
+            entry = row["vertices" + name]
+            assert entry["bias"] < 4.0 * entry["noise"] + 1e-3, row
+    # The loss itself has the variance of the image, which falls at least like 1/n.
+    assert rows[0]["loss"]["bias"] > 10.0 * rows[2]["loss"]["bias"]
+
+
+def test_smoothing_solves():
+    mesh = cube(1.0)
+    solve = fits._Smooth(mesh)
+    x = torch.randn((8, 3), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(solve(solve.times(x)), x)
+    ones = torch.ones((8, 3), dtype=torch.float64)
+    torch.testing.assert_close(solve.times(ones), ones)  # the Laplacian of a constant is zero
+
+
+@pytest.mark.slow
+def test_ill_conditioned_fits():
+    camera, adam, preconditioned = fits.measure()
+    for fit in (camera, adam, preconditioned):
+        assert len(fit["losses"]) == fits.STEPS and fit["finite"]
+        assert fit["rise"] < fits.RISE, fit["fit"]
+        assert fit["losses"][-1] < 0.2 * fit["losses"][0]
+        assert fit["error"][1] < fit["error"][0]
+    assert preconditioned["error"][1] < 0.5 * adam["error"][1]
+
+
+# -- the command ------------------------------------------------------------------------------------------------------
+
+
+def run(*arguments):
+    return cli.main(["report", "stability", *[str(argument) for argument in arguments]])
+
+
+def test_command(tmp_path, capsys):
+    assert run("--case", "crop", "coincident", "--quick", "--out", tmp_path) == 0
+    document = json.loads((tmp_path / "stability.json").read_text())
+    names = [row["name"] for row in document["cases"]]
+    assert names[0] == "crop" and {case.name for case in CASES.values() if case.group == "coincident"} == set(names[1:])
+    assert document["settings"]["quick"] and document["settings"]["kernel"]
+    text = (tmp_path / "stability.md").read_text()
+    assert all(f"| {name} |" in text for name in names)
+    assert Image.open(tmp_path / "stability.png").width > 500
+    assert "crop" in capsys.readouterr().out
+
+
+def test_exit_code_tells_of_a_wrong_case(tmp_path, monkeypatch, triangle, capsys):
+    interior = dataclasses.replace(triangle, options={**triangle.options, "visibility": False})
+    monkeypatch.setitem(CASES, "crop", dataclasses.replace(CASES["crop"], build=lambda: interior))
+    assert run("--case", "crop", "--quick", "--out", tmp_path) == 1
+    assert "1 not right: crop" in capsys.readouterr().out
+    assert "**wrong**" in (tmp_path / "stability.md").read_text()
+
+
+def test_ctrl_c_keeps_what_is_measured(tmp_path, monkeypatch):
+    def interrupt():
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(CASES, "orthographic", dataclasses.replace(CASES["orthographic"], build=interrupt))
+    assert run("--case", "crop", "orthographic", "--quick", "--out", tmp_path) == cli.INTERRUPTED
+    document = json.loads((tmp_path / "stability.json").read_text())
+    assert [row["name"] for row in document["cases"]] == ["crop"]
+    assert (tmp_path / "stability.md").exists() and (tmp_path / "stability.png").exists()
+
+
+def test_unknown_case(tmp_path, capsys):
+    assert run("--case", "cropp", "--out", tmp_path) == 2
+    said = capsys.readouterr().err
+    assert "case: expected one of" in said and "crop," in said and "'cropp'" in said
+
+
+def test_a_missing_package_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(stability.NEEDS, "fits", ["no_such_package"])
+    assert run("--case", "fits", "--out", tmp_path) == 2
+    assert "fits needs no_such_package; install with: pip install 'edgegrad[report]'" in capsys.readouterr().err
