@@ -156,8 +156,10 @@ struct SceneArrays {
     }
 
     std::shared_ptr<const Geometry> geometry(bool want_topology, Team& team, GeometryWork& work) const {
+        // Nobody is asked whether to go on: a lock is held, which a signal handler that renders would wait for.
+        Team quiet(team.threads());
         return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, want_topology,
-                                team, work);
+                                quiet, work);
     }
 };
 
@@ -200,12 +202,19 @@ bool interrupted() {
     return PyErr_CheckSignals() != 0;
 }
 
+// Handlers run in the main thread alone; in others asking would only wait for the lock.
+bool in_main_thread() {
+    const nb::object main = nb::module_::import_("threading").attr("main_thread")();
+    return nb::cast<unsigned long>(main.attr("ident")) == PyThread_get_thread_ident();
+}
+
 // Calls f(team) without the interpreter's lock.
 template <class F>
 auto unlocked(int threads, F f) {
+    const auto ask = in_main_thread() ? interrupted : nullptr;
     try {
         nb::gil_scoped_release release;
-        Team team(threads, interrupted);
+        Team team(threads, ask);
         return f(team);
     } catch (const Interrupted&) {
         throw nb::python_error();  // that of the handler
@@ -369,6 +378,7 @@ void bind_scene(nb::module_& m, const char* name) {
 
 NB_MODULE(_core, m) {
     m.doc() = "The edgegrad kernel. Use it through the edgegrad package.";
+    nb::set_leak_warnings(false);  // of a process that ends while a thread of it renders
     m.def("open_embree", &open_embree, "path"_a, nb::call_guard<nb::gil_scoped_release>());
     m.def("embree_version", &embree_version);
     // Without the interpreter's lock, for which a thread that holds the kernel's may wait.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import operator
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -104,9 +105,9 @@ def check_not_meta(name: str, tensor: Tensor) -> None:
         raise ValueError(f"{name}: expected numbers, got a meta tensor, which has none; make it on another device")
 
 
-def check_fields(kind: type, given: Iterable[str]) -> None:
+def check_fields(thing: Any, given: Iterable[str]) -> None:
     """What `replace` is given are fields of the dataclass. Raises TypeError."""
-    known = sorted(field.name for field in dataclasses.fields(kind))
+    known = sorted(field.name for field in dataclasses.fields(thing))
     for name in given:
         if name not in known:
             raise TypeError(f"replace: expected one of {', '.join(known)}, got {name!r}")

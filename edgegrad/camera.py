@@ -217,7 +217,7 @@ class Camera:
 
     def replace(self, **fields: Any) -> Camera:
         """This camera with some fields replaced."""
-        check_fields(Camera, fields)
+        check_fields(self, fields)
         return dataclasses.replace(self, **fields)
 
     def project(self, points: Tensor) -> Tensor:

@@ -114,7 +114,7 @@ class Mesh:
 
         Giving another kind of colour removes the one there was.
         """
-        check_fields(Mesh, fields)
+        check_fields(self, fields)
         appearance = {"colors", "face_colors", "corner_colors", "texture"}
         if any(name in appearance and fields[name] is not None for name in fields):
             gone = appearance | (set() if fields.get("texture") is not None else {"uvs", "uv_faces"})

@@ -77,7 +77,7 @@ class Scene:
 
     def replace(self, **fields: Any) -> Scene:
         """This scene with some fields replaced."""
-        check_fields(Scene, fields)
+        check_fields(self, fields)
         return dataclasses.replace(self, **fields)
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Scene:

@@ -282,6 +282,37 @@ def test_ctrl_c_ends_a_long_render(kind, tmp_path):
     assert found["same"] and not found["gradient"]
 
 
+HANDLER = """
+import signal
+
+rendered = []
+
+def render_too(*_):
+    with torch.enable_grad():  # it may come in the middle of a backward pass
+        rendered.append(step(size=16))
+
+alone = step(size=16), [step(k, size=256) for k in range(3)]
+signal.signal(signal.SIGALRM, render_too)
+signal.setitimer(signal.ITIMER_REAL, 0.02, 0.02)
+end = time.monotonic() + 2.0
+wrong = rounds = 0
+while time.monotonic() < end:
+    wrong += [step(k, size=256) for k in range(3)] != alone[1]
+    rounds += 1
+signal.setitimer(signal.ITIMER_REAL, 0.0)
+print(json.dumps({"rendered": len(rendered), "wrong": wrong + sum(r != alone[0] for r in rendered), "rounds": rounds}))
+"""
+
+
+@posix
+def test_a_signal_handler_that_renders(tmp_path):
+    """The kernel lets handlers run in the middle of a pass; one that renders must find no lock held by what it interrupts."""
+    found = script(HANDLER, folder=tmp_path)
+    assert found["rendered"] > 5
+    assert found["rounds"] > 0
+    assert found["wrong"] == 0
+
+
 # -- memory -----------------------------------------------------------------------------------------------------------
 
 
