@@ -8,7 +8,7 @@ SOURCES := pyproject.toml $(shell find csrc -name '*.cpp' -o -name '*.h' -o -nam
 # Threads that wait should not spin: see edgegrad/__init__.py.
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo test test-slow sanitize bench lint format clean
+.PHONY: demo test test-slow sanitize sanitize-threads bench lint format clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.ready
@@ -23,17 +23,42 @@ test-slow: $(VENV)/.ready
 # The tests of the kernel, with a kernel in which AddressSanitizer and UndefinedBehaviorSanitizer watch every access and
 # sum. Python itself is not built with them, so they are loaded before it; what it leaks at its end is not looked at.
 SANITIZE := build/sanitize
+# Files, pictures and whole fits call the kernel as the others do, only for longer.
+WITHOUT := bad_files cli fit fit_faults io notebooks report
+PRELOAD := $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so 2>/dev/null))
 sanitize: $(VENV)/.ready
-	$(BIN)/uv pip install --quiet --python $(BIN)/python "cmake>=3.26" ninja nanobind
+ifneq ($(words $(filter /%,$(PRELOAD))),3)
+	@echo "make sanitize: skipped, for $(CXX) has no libasan.so and libubsan.so, which come with g++ on Linux"
+else
+	$(BIN)/uv pip install --quiet --python $(BIN)/python "cmake>=3.26" ninja "nanobind>=3.1"
 	PATH=$(CURDIR)/$(BIN):$$PATH cmake -S csrc -B $(SANITIZE) -G Ninja -DCMAKE_BUILD_TYPE=Debug -DCMAKE_CXX_FLAGS_DEBUG=-O1 \
-	  -DEDGEGRAD_SANITIZE=address,undefined -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python \
-	  -Dnanobind_DIR=$$($(BIN)/python -m nanobind --cmake_dir)
+	  -DCMAKE_CXX_COMPILER=$(CXX) -DEDGEGRAD_SANITIZE=address,undefined,float-cast-overflow \
+	  -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -Dnanobind_DIR=$$($(BIN)/python -m nanobind --cmake_dir)
 	$(BIN)/ninja -C $(SANITIZE)
-	EDGEGRAD_KERNEL=$(CURDIR)/$(SANITIZE)/_core.abi3.so \
-	  LD_PRELOAD="$$($(CXX) -print-file-name=libasan.so) $$($(CXX) -print-file-name=libubsan.so) $$($(CXX) -print-file-name=libstdc++.so)" \
-	  ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1 UBSAN_OPTIONS=print_stacktrace=1:halt_on_error=1 \
-	  $(BIN)/python -m pytest -m "not slow" -n 2 -p no:faulthandler tests/test_pieces.py tests/test_pitfalls.py tests/test_coincident.py \
-	  tests/test_shading.py tests/test_estimators.py tests/test_plan.py tests/test_messages.py tests/test_torch.py
+	EDGEGRAD_KERNEL=$(CURDIR)/$(SANITIZE)/_core.abi3.so LD_PRELOAD="$(PRELOAD)" \
+	  ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1:detect_stack_use_after_return=1 \
+	  UBSAN_OPTIONS=print_stacktrace=1:halt_on_error=1 \
+	  $(BIN)/python -m pytest -m "not slow" -n 2 -p no:faulthandler $(WITHOUT:%=--ignore=tests/test_%.py)
+endif
+
+# The kernel without Python, from several threads, under ThreadSanitizer: with clang, for it sees the barriers of LLVM's
+# OpenMP runtime (through its tool Archer), and none of GNU's. First it must report a race that is there on purpose.
+CLANG := $(lastword $(sort $(wildcard /usr/bin/clang++ /usr/bin/clang++-[0-9]*)))
+ARCHER := $(if $(CLANG),$(filter /%,$(shell $(CLANG) -print-file-name=libarcher.so)))
+THREADS := build/threads
+sanitize-threads: $(VENV)/.ready
+ifeq ($(ARCHER),)
+	@echo "make sanitize-threads: skipped, for it needs clang++ and LLVM's OpenMP with Archer" \
+	  "(Debian: clang-19 llvm-19 libclang-rt-19-dev libomp-19-dev)"
+else
+	rm -rf $(THREADS) && mkdir -p $(THREADS)
+	printf '%s\n' $(filter-out csrc/bindings.cpp csrc/pieces.cpp,$(wildcard csrc/*.cpp)) csrc/checks/threads.cpp | \
+	  xargs -P 2 -I@ sh -c '$(CLANG) -std=c++20 -O1 -g -fopenmp -fsanitize=thread -ffp-contract=off -c @ -o $(THREADS)/$$(basename @).o'
+	$(CLANG) -fopenmp -fsanitize=thread $(THREADS)/*.o -o $(THREADS)/threads
+	embree=$$($(BIN)/python -c "from edgegrad._kernel import embree_path as path; print(path())") && \
+	export OMP_TOOL_LIBRARIES=$(ARCHER) TSAN_OPTIONS=ignore_noninstrumented_modules=1 && \
+	$(THREADS)/threads $$embree race 2>&1 | grep "WARNING: ThreadSanitizer: data race" && $(THREADS)/threads $$embree
+endif
 
 bench: $(VENV)/.ready
 	$(BIN)/python benchmarks/gradient_error.py

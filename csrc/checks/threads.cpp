@@ -1,0 +1,195 @@
+// The kernel without Python under ThreadSanitizer: two threads of the program render at once, each with four threads of
+// OpenMP, the same and different geometry, while vertices move and calls are interrupted.
+//
+//     threads PATH_OF_LIBEMBREE4 [race]
+//
+// Each image and gradient must have the bits that it has alone. With `race`, two threads add to one number, which must
+// be reported.
+
+#include <cstdio>
+#include <cstring>
+#include <numbers>
+#include <thread>
+#include <vector>
+
+#include "../render.h"
+
+using namespace edgegrad;
+
+namespace {
+
+constexpr int width = 96, height = 64, channels = 3, team_size = 4, rounds = 6;
+
+// The arrays of a scene: meshes with colours of vertices, and one with a texture, among them.
+template <class T>
+struct Scene {
+    std::vector<double> verts;
+    std::vector<int32_t> faces, corners, face_texture;
+    std::vector<T> colors, texels, background;
+    std::vector<double> uvs{0.1, 0.0, 1.2, 0.1, 1.1, 0.9, -0.1, 1.0};
+    std::vector<int64_t> textures{0, 16, 8};
+
+    Scene() : texels(16 * 8 * channels), background(width * height * channels) {
+        for (size_t i = 0; i < texels.size(); ++i) texels[i] = T(hash(i, 1, 1) % 256) / 255;
+        for (size_t i = 0; i < background.size(); ++i) background[i] = T(i % 7) / 7;
+    }
+
+    void add_vertex(Vec3 p) {
+        for (const double x : {p.x, p.y, p.z}) verts.push_back(x), colors.push_back(T(0.5 + 0.3 * std::sin(5 * x)));
+    }
+    // A row of `corners` is one of colors, that of the vertex, or of uvs.
+    void add_face(int32_t a, int32_t b, int32_t c, int32_t texture = -1, int32_t first = 0) {
+        for (const int32_t v : {a, b, c}) faces.push_back(v), corners.push_back(v - first);
+        face_texture.push_back(texture);
+    }
+
+    void add_sphere(Vec3 centre, double radius, int rows) {
+        const int32_t first = int32_t(verts.size() / 3), columns = 2 * rows;
+        for (int i = 0; i <= rows; ++i)
+            for (int j = 0; j < columns; ++j) {
+                const double theta = std::numbers::pi * i / rows, phi = 2 * std::numbers::pi * j / columns;
+                add_vertex(centre + radius * Vec3{std::sin(theta) * std::cos(phi), std::cos(theta),
+                                                  std::sin(theta) * std::sin(phi)});
+            }
+        for (int i = 0; i < rows; ++i)
+            for (int j = 0; j < columns; ++j) {
+                const int32_t a = first + i * columns + j, b = first + i * columns + (j + 1) % columns;
+                add_face(a, b, b + columns), add_face(a, b + columns, a + columns);
+            }
+    }
+
+    void add_box(Vec3 centre, double half) {
+        const int32_t first = int32_t(verts.size() / 3);
+        for (int i = 0; i < 8; ++i)
+            add_vertex(centre + half * Vec3{i & 1 ? 1. : -1., i & 2 ? 1. : -1., i & 4 ? 1. : -1.});
+        for (const auto& [a, b, c, d] :
+             {std::array{0, 1, 3, 2}, {4, 6, 7, 5}, {0, 4, 5, 1}, {2, 3, 7, 6}, {0, 2, 6, 4}, {1, 5, 7, 3}}) {
+            add_face(first + a, first + b, first + c), add_face(first + a, first + c, first + d);
+        }
+    }
+
+    void add_textured_quad(double z, double half) {
+        const int32_t first = int32_t(verts.size() / 3);
+        for (const auto& [x, y] : {std::array{-1., -1.}, {1., -1.}, {1., 1.}, {-1., 1.}})
+            add_vertex({x * half, y * half, z + 0.1 * x});
+        add_face(first, first + 1, first + 2, 0, first), add_face(first, first + 2, first + 3, 0, first);
+    }
+
+    SceneView<T> view() const {
+        return {verts.data(),
+                int64_t(verts.size() / 3),
+                faces.data(),
+                int64_t(faces.size() / 3),
+                corners.data(),
+                colors.data(),
+                int64_t(colors.size() / channels),
+                uvs.data(),
+                int64_t(uvs.size() / 2),
+                texels.data(),
+                int64_t(texels.size() / channels),
+                textures.data(),
+                face_texture.data(),
+                background.data(),
+                true,
+                channels};
+    }
+};
+
+Camera camera(bool perspective) {
+    const double pose[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 3, 0, 0, 0, 1};
+    const double f = perspective ? 70 : 25, K[9] = {f, 0, width / 2., 0, f, height / 2., 0, 0, 1};
+    return Camera(pose, K, perspective, width, height);
+}
+
+thread_local bool stop = false;
+
+// The image and all gradients, one after the other.
+template <class T>
+std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKind filter) {
+    Team team(team_size, [] { return stop; });
+    const SceneView<T> view = scene.view();
+    std::vector<T> image(width * height * channels), coverage(width * height);
+    std::vector<uint8_t> seen(view.n_faces);
+    GeometryWork work;
+    {
+        const auto geometry =
+            acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, 1e-7, false, team, work);
+        render_forward(view, camera, geometry->caster(), {8, Filter(filter), 1}, team,
+                       ForwardOutput<T>{image.data(), coverage.data(), seen.data()});
+    }
+    std::vector<double> verts(scene.verts.size()), colors(scene.colors.size()), uvs(scene.uvs.size()),
+        texels(scene.texels.size()), background(scene.background.size()), pose(16), K(9);
+    const SceneGrad grad{verts.data(),      colors.data(), uvs.data(), texels.data(),
+                         background.data(), pose.data(),   K.data()};
+    const auto geometry = acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, 1e-7, true, team, work);
+    const BackwardOptions options{-1, -1, Filter(filter), 2, true, true, 1e-7, false};
+    render_backward(view, camera, *geometry, options, team, image.data(), ForwardView<T>{coverage.data(), seen.data()},
+                    grad);
+    std::vector<double> all(image.begin(), image.end());
+    for (const auto* values : {&verts, &colors, &uvs, &texels, &background, &pose, &K})
+        all.insert(all.end(), values->begin(), values->end());
+    return all;
+}
+
+// Round k of either thread: another position every second round.
+template <class T>
+std::vector<double> round(Scene<T> scene, int k) {
+    for (size_t i = 0; i < scene.verts.size(); i += 3) scene.verts[i] += 0.05 * (k / 2);
+    return render(scene, camera(k % 2 == 0), FilterKind(k % 3));
+}
+
+// A call that ends early, as by Ctrl-C.
+template <class T>
+void interrupted_call(const Scene<T>& scene) {
+    stop = true;
+    try {
+        for (int k = 0; k < 1000; ++k) round(scene, k % 3);
+        std::puts("a call was not interrupted"), std::exit(1);
+    } catch (const Interrupted&) {
+    }
+    stop = false;
+}
+
+template <class T>
+bool same_bits_at_once(const Scene<T>& a, const Scene<T>& b) {
+    std::vector<std::vector<double>> alone[2], found[2];
+    for (int k = 0; k < rounds; ++k) alone[0].push_back(round(a, k)), alone[1].push_back(round(b, k));
+    const auto run = [&](int i) {
+        for (int k = 0; k < rounds; ++k) {
+            found[i].push_back(round(i ? b : a, k));
+            if (k % 3 == i) interrupted_call(i ? b : a);
+        }
+        clear_geometry();
+    };
+    std::thread first(run, 0), second(run, 1);
+    first.join(), second.join();
+    for (int i = 0; i < 2; ++i)
+        for (int k = 0; k < rounds; ++k)
+            if (std::memcmp(alone[i][k].data(), found[i][k].data(), alone[i][k].size() * sizeof(double)) != 0) {
+                std::printf("round %d of thread %d: other bits than alone\n", k, i);
+                return false;
+            }
+    return true;
+}
+
+template <class T>
+bool same_bits_at_once() {
+    Scene<T> scene, other;
+    scene.add_textured_quad(1.5, 1.6), scene.add_sphere({0.3, 0.1, 0}, 0.8, 40), scene.add_box({-0.6, -0.2, 0}, 0.5);
+    other.add_box({0.4, 0.3, -0.3}, 0.4), other.add_sphere({0, 0, 0.2}, 0.7, 70), other.add_textured_quad(0.5, 1.0);
+    return same_bits_at_once(scene, scene) && same_bits_at_once(scene, other);
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+    if (argc > 2 && std::strcmp(argv[2], "race") == 0) {
+        int sum = 0;
+#pragma omp parallel num_threads(team_size)
+        for (int i = 0; i < 1000; ++i) ++sum;
+        return std::printf("%d\n", sum) < 0;
+    }
+    if (argc != 2) return std::puts("usage: threads PATH_OF_LIBEMBREE4 [race]"), 2;
+    open_embree(argv[1]);
+    return same_bits_at_once<float>() && same_bits_at_once<double>() ? 0 : 1;
+}
