@@ -6,7 +6,10 @@
 // Each image and gradient must have the bits that it has alone. With `race`, two threads add to one number, which must
 // be reported.
 
+#include <array>
+#include <cmath>
 #include <cstdio>
+#include <cstdlib>
 #include <cstring>
 #include <numbers>
 #include <thread>
@@ -105,7 +108,7 @@ thread_local bool stop = false;
 
 // The image and all gradients, one after the other.
 template <class T>
-std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKind filter) {
+std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKind filter, int spp) {
     Team team(team_size, [] { return stop; });
     const SceneView<T> view = scene.view();
     std::vector<T> image(width * height * channels), coverage(width * height);
@@ -114,7 +117,7 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
     {
         const auto geometry =
             acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, 1e-7, false, team, work);
-        render_forward(view, camera, geometry->caster(), {8, Filter(filter), 1}, team,
+        render_forward(view, camera, geometry->caster(), {spp, Filter(filter), 1}, team,
                        ForwardOutput<T>{image.data(), coverage.data(), seen.data()});
     }
     std::vector<double> verts(scene.verts.size()), colors(scene.colors.size()), uvs(scene.uvs.size()),
@@ -135,15 +138,15 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
 template <class T>
 std::vector<double> round(Scene<T> scene, int k) {
     for (size_t i = 0; i < scene.verts.size(); i += 3) scene.verts[i] += 0.05 * (k / 2);
-    return render(scene, camera(k % 2 == 0), FilterKind(k % 3));
+    return render(scene, camera(k % 2 == 0), FilterKind(k % 3), 8);
 }
 
-// A call that ends early, as by Ctrl-C.
+// A call that ends early, as by Ctrl-C; uninterrupted it would take seconds.
 template <class T>
 void interrupted_call(const Scene<T>& scene) {
     stop = true;
     try {
-        for (int k = 0; k < 1000; ++k) round(scene, k % 3);
+        render(scene, camera(true), FilterKind::box, 1 << 12);
         std::puts("a call was not interrupted"), std::exit(1);
     } catch (const Interrupted&) {
     }
