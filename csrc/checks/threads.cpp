@@ -12,6 +12,7 @@
 #include <cstdlib>
 #include <cstring>
 #include <numbers>
+#include <numeric>
 #include <thread>
 #include <vector>
 
@@ -129,8 +130,11 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
     render_backward(view, camera, *geometry, options, team, image.data(), ForwardView<T>{coverage.data(), seen.data()},
                     grad);
     std::vector<double> all(image.begin(), image.end());
-    for (const auto* values : {&verts, &colors, &uvs, &texels, &background, &pose, &K})
+    for (const auto* values : {&verts, &colors, &uvs, &texels, &background, &pose, &K}) {
+        const double size = std::inner_product(values->begin(), values->end(), values->begin(), 0.0);
+        if (!(size > 0) || !std::isfinite(size)) std::puts("a gradient is zero or not finite"), std::exit(1);
         all.insert(all.end(), values->begin(), values->end());
+    }
     return all;
 }
 
