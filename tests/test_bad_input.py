@@ -109,7 +109,7 @@ def call(values: dict[str, Any], entry: str = "render") -> list[Tensor]:
 
 
 def put(tensor: Tensor, at: int, value: float) -> Tensor:
-    tensor = tensor.clone()
+    tensor = tensor.clone(memory_format=torch.contiguous_format)
     tensor.view(-1)[at % tensor.numel()] = value
     return tensor
 
