@@ -3,16 +3,15 @@
 //
 // Where other curves lie on this one in the image (coincident.h), the ray runs along the rims of their faces, and which
 // of these it meets would be left to rounding. So it is blind to them too, and they are asked in double. One that lies
-// apart by more than the rounding of doubles covers the point or not. One that does not lie apart covers one side of
-// it:
+// apart by more than the rounding of doubles covers the point or not. One that does not covers one side of it:
 //
 //  - at the same depth (a box on a box), its faces and those of this curve are taken for the faces of one edge, of
-//  which
-//    each curve moves its share;
-//  - before or behind (the back edge of a box that is seen straight on), the image has a derivative for each direction
-//    of the motion only. Their mean is what is estimated, so that a motion that both share has its true derivative:
-//    half the samples see what lies before on one side of the curve and what lies behind on the other, half the
-//    reverse.
+//    which each curve moves its share;
+//  - before or behind (the back edge of a box that is seen straight on), half the samples see what lies before on one
+//    side of the curve and what lies behind on the other, half the reverse.
+//
+// Along the order of depth the jumps then add up to what is seen on one side minus what is seen on the other, so that a
+// motion that all share has its true derivative. One that parts them has another derivative for each direction.
 
 #include "boundary.h"
 

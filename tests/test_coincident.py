@@ -44,7 +44,11 @@ def test_box_seen_straight_on(faces: bool, moved: str) -> None:
     """Its front and back rims fall on the same lines, and its sides on them too: 0 to 2.2 before."""
     box = face_colored(cube(0.5)) if faces else cube(0.5)
     turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=F64)
-    motion = {"along": ALONG.expand(8, 3), "scale": box.verts, "turn": box.verts @ turn + 0.3 * ALONG}[moved]
+    motion = {
+        "along": ALONG.expand(8, 3),
+        "scale": box.verts,
+        "turn": box.verts @ turn + torch.tensor([0.5, -0.7, 0.1], dtype=F64),
+    }[moved]
     check(lambda theta: [box.replace(verts=box.verts + theta * motion)], "orthographic")
 
 
