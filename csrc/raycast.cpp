@@ -63,13 +63,7 @@ void throw_on_error(const char* doing) {
         throw std::runtime_error(std::string("Embree failed while ") + doing + ", error " + std::to_string(error));
 }
 
-}  // namespace
-
-std::mutex embree_mutex;
-
-void open_embree(const std::string& path) {
-    const std::lock_guard lock(embree_mutex);
-    if (rtc.device) return;
+void open_device(const std::string& path) {
     void* library = open_library(path);
     if (!library) throw std::runtime_error("cannot open " + path + ": " + open_error());
     Library found;
@@ -86,6 +80,23 @@ void open_embree(const std::string& path) {
     if (found.rtcGetDeviceProperty(found.device, DEVICE_PROPERTY_VERSION_MAJOR) != 4)
         throw std::runtime_error("expected Embree 4.x, got version " + std::to_string(found.version) + " in " + path);
     rtc = found;
+}
+
+}  // namespace
+
+std::mutex embree_mutex;
+
+void open_embree(const std::string& path) {
+    {
+        const std::lock_guard lock(embree_mutex);
+        if (rtc.device) return;
+        open_device(path);
+    }
+    // The first scene starts Embree's threads: a millisecond that would be missed in the first render.
+    const int32_t face[3] = {0, 1, 2};
+    const double verts[9] = {0, 0, 0, 1, 0, 0, 0, 1, 0};
+    Team team(1);
+    RayCaster(face, 1, 3).update(verts, team);
 }
 
 int embree_version() { return rtc.version; }
