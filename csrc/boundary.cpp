@@ -103,7 +103,9 @@ class BoundaryChunk {
         };
         for (const int64_t edge : coincident_.of(curve.edge))
             if (Curve c; finder_.find(edge, c)) place.others.push_back(c), blind_to(edge);
-        if (!place.others.empty()) blind_to(curve.edge);
+        if (place.others.empty()) return;
+        blind_to(curve.edge);
+        std::sort(place.blind.begin(), place.blind.end());
     }
 
     void cast() {

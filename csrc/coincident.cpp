@@ -28,11 +28,17 @@ bool side_by_side(const ImageSegment& s, const ImageSegment& o) {
 }
 
 // Segments by the lines they lie on: buckets of direction, distance to the middle of a cell of the image, and cell.
-// What runs side by side shares a cell, and there lies within half a bucket.
+// What runs side by side shares a cell, and there lies within half a bucket. Cells are some segments wide, so that few
+// share one where a mesh is fine and many where it is coarse.
 class LineBuckets {
    public:
-    explicit LineBuckets(size_t segments)
-        : head_(std::bit_ceil(std::max<size_t>(64, 4 * segments)), -1), mask_(head_.size() - 1) {}
+    explicit LineBuckets(const std::vector<ImageSegment>& segments)
+        : head_(std::bit_ceil(std::max<size_t>(64, 4 * segments.size())), -1), mask_(head_.size() - 1) {
+        double total = 0, reach = 0;
+        for (const ImageSegment& s : segments) total += length(s.b - s.a), reach = std::max(reach, s.reach);
+        const double mean = total / double(std::max<size_t>(1, segments.size()));
+        cell_ = std::min(std::max({4 * mean, 8 * reach, 1e-6}), 16.0);  // a millionth: so that cells can be counted
+    }
 
     // Calls found(j) for every segment j added before that may run side by side with s, then adds s as number i.
     template <class Found>
@@ -40,7 +46,7 @@ class LineBuckets {
         Vec2 along = s.b - s.a;
         if (along.y < 0 || (along.y == 0 && along.x < 0)) along = -1 * along;
         const double angle = std::atan2(along.y, along.x);
-        const int parts = 1 + int(std::min(length(along) / cell, 0x1p20));
+        const int parts = 1 + int(std::min(length(along) / cell_, 0x1p20));
         int64_t last_i0 = INT64_MAX, last_j0 = 0, last_i1 = 0, last_j1 = 0;
         for (int k = 0; k < parts; ++k) {
             const Vec2 p = s.a + (double(k) / parts) * (s.b - s.a), q = s.a + (double(k + 1) / parts) * (s.b - s.a);
@@ -49,7 +55,7 @@ class LineBuckets {
             for (int64_t y = j0; y <= j1; ++y)
                 for (int64_t x = i0; x <= i1; ++x) {
                     if (x >= last_i0 && x <= last_i1 && y >= last_j0 && y <= last_j1) continue;
-                    const Vec2 middle{(double(x) + 0.5) * cell, (double(y) + 0.5) * cell};
+                    const Vec2 middle{(double(x) + 0.5) * cell_, (double(y) + 0.5) * cell_};
                     const double distance = wedge(along, s.a - middle) / length(along);
                     add(i, x, y, angle, distance, found);
                     // Directions wrap around, and the side of the line with them.
@@ -60,14 +66,14 @@ class LineBuckets {
     }
 
    private:
-    static constexpr double cell = 16, angle_step = 0.005, distance_step = 0.05;  // px, radians, px
+    static constexpr double angle_step = 0.005, distance_step = 0.05;  // radians, px
     struct Entry {
         uint64_t key;
         int64_t segment;
         int64_t next;
     };
 
-    static int64_t index(double x) { return int64_t(std::floor(x / cell)); }
+    int64_t index(double x) const { return int64_t(std::floor(x / cell_)); }
 
     template <class Found>
     void add(int64_t i, int64_t x, int64_t y, double angle, double distance, Found found) {
@@ -87,6 +93,7 @@ class LineBuckets {
         head_[own & mask_] = int64_t(entries_.size()) - 1;
     }
 
+    double cell_ = 16;  // px
     std::vector<int64_t> head_;
     size_t mask_;
     std::vector<Entry> entries_;
@@ -96,7 +103,7 @@ class LineBuckets {
 
 CoincidentCurves::CoincidentCurves(const std::vector<ImageSegment>& segments, Team& team) {
     std::vector<std::pair<int64_t, int64_t>> pairs;
-    LineBuckets buckets(segments.size());
+    LineBuckets buckets(segments);
     for (int64_t i = 0; i < int64_t(segments.size()); ++i) {
         if (i % 4096 == 0) team.check();
         buckets.add(i, segments[i], [&](int64_t j) {

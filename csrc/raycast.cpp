@@ -264,10 +264,15 @@ void reject(const FilterArguments* a) {
     const auto* context = reinterpret_cast<const RejectContext*>(a->context);
     const auto* id = static_cast<const unsigned*>(a->ray) + 10 * a->N;
     const auto* face = static_cast<const unsigned*>(a->hit) + 5 * a->N;
-    for (unsigned i = 0; i < a->N; ++i)
-        if (a->valid[i])
-            for (const int32_t f : context->rejected[id[i]])
-                if (f == int32_t(face[i])) a->valid[i] = 0;
+    for (unsigned i = 0; i < a->N; ++i) {
+        if (!a->valid[i]) continue;
+        const auto& rejected = context->rejected[id[i]];
+        const int32_t f = int32_t(face[i]);
+        // Most are the two faces of an edge; longer lists come sorted.
+        const bool found = rejected.size() > 16 ? std::binary_search(rejected.begin(), rejected.end(), f)
+                                                : std::find(rejected.begin(), rejected.end(), f) != rejected.end();
+        if (found) a->valid[i] = 0;
+    }
 }
 
 }  // namespace

@@ -1,6 +1,7 @@
 // The only door to Embree: opens the library, keeps a ray structure over triangles, casts packets of eight rays.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <mutex>
 #include <span>
@@ -51,7 +52,7 @@ class RayCaster {
     // The nearest face along each ray of the batch.
     void cast(RayBatch& batch) const;
 
-    // The same, blind to some faces: those in rejected[i] for ray i.
+    // The same, blind to some faces: those in rejected[i] for ray i, ascending if they are more than 16.
     void cast(RayBatch& batch, const std::span<const int32_t>* rejected) const;
 
     // What one ray truly meets, where `face` is what the cast found. Embree decides in float, so near its rim a face
@@ -129,7 +130,7 @@ int32_t RayCaster::beyond_float(const RayFrame& frame, Vec2 n, int32_t face, std
     RayBatch ray(frame);
     ray.n_x[0] = n.x, ray.n_y[0] = n.y, ray.count = 1;
     do {
-        blind.push_back(face);
+        blind.insert(std::upper_bound(blind.begin(), blind.end(), face), face);
         const std::span<const int32_t> all = blind;
         ray.prepare();
         cast(ray, &all);
