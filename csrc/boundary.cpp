@@ -53,8 +53,14 @@ class BoundaryChunk {
         if (places_ == 0 || place_[places_ - 1].curve.edge != curve.edge) start(place_[places_++], curve);
         const Place& place = place_[places_ - 1];
         const Vec2 n = normalised(view_.camera, x);
+        const double t = curve.parameter(s);
+        Lane& lane = lane_[i];
+        lane = {
+            places_ - 1, x, n, t, (1 - t) * curve.a + t * curve.b, weight, flip, {{curve.minus, t}, {curve.plus, t}},
+            {},          1};
+        for (const Curve& other : place.others)
+            if (!add_other(other, curve, lane)) return;
         rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
-        lane_[i] = {places_ - 1, x, n, curve.parameter(s), weight, flip};
         rejected_[i] =
             place.others.empty() ? view_.geometry.topology().faces(curve.edge) : std::span<const int32_t>(place.blind);
         if (++rays_.count == RayBatch::size) cast();
@@ -73,13 +79,6 @@ class BoundaryChunk {
         std::vector<int32_t> blind;  // faces of all of them
     };
 
-    struct Lane {
-        int place;
-        Vec2 x, n;
-        double t, weight;
-        bool flip;
-    };
-
     // What lies at a point of the image, behind a curve: a face, or −1 for the background.
     struct Surface {
         int64_t face = -1;
@@ -91,6 +90,19 @@ class BoundaryChunk {
     struct Side {
         HalfEdge face;
         double t = 0;  // on its edge
+    };
+
+    // A sample: the point t of a curve, seen at x.
+    struct Lane {
+        int place = 0;
+        Vec2 x, n;
+        double t = 0;
+        Vec3 point;
+        double weight = 0;
+        bool flip = false;
+        Side side[2];  // minus, plus
+        Surface behind;
+        int share = 1;  // curves that move together here
     };
 
     void start(Place& place, const Curve& curve) {
@@ -121,7 +133,8 @@ class BoundaryChunk {
     }
 
     // Ã · L of what is seen on one side.
-    double adjoint_radiance(const Lane& lane, const Side& side, const Surface& behind, const double* adjoint) {
+    double adjoint_radiance(const Lane& lane, const Side& side, const double* adjoint) {
+        const Surface& behind = lane.behind;
         if (side.face.face < 0 && behind.face < 0) return view_.adjoint.template times_background<N>(lane.x);
         if (side.face.face >= 0) shade<N>(view_.scene, side.face.face, at_edge(side.face, side.t), radiance_.data());
         else shade<N>(view_.scene, behind.face, behind.b, radiance_.data());
@@ -130,39 +143,32 @@ class BoundaryChunk {
         return sum;
     }
 
-    void add_sample(const Place& place, const Lane& lane, int32_t hit, const double* adjoint) {
+    void add_sample(const Place& place, Lane& lane, int32_t hit, const double* adjoint) {
         const Curve& curve = place.curve;
-        const Vec3 point = (1 - lane.t) * curve.a + lane.t * curve.b;
-        Surface behind;
-        if (hit >= 0 && !lies_behind(hit, lane.n, point, curve, behind)) return;
-        Side side[2] = {{curve.minus, lane.t}, {curve.plus, lane.t}};
-        int share = 1;
-        for (const Curve& other : place.others)
-            if (!add_other(other, curve, lane, point, side, share, behind)) return;
+        if (hit >= 0 && !lies_behind(hit, curve, lane)) return;
         const double jump =
-            adjoint_radiance(lane, side[0], behind, adjoint) - adjoint_radiance(lane, side[1], behind, adjoint);
-        const double scale = lane.weight * jump / share;
+            adjoint_radiance(lane, lane.side[0], adjoint) - adjoint_radiance(lane, lane.side[1], adjoint);
+        const double scale = lane.weight * jump / lane.share;
         const Vec2 tangent = curve.tangent();
         Vec3 point_bar;
-        project_vjp(view_.camera, point, {scale * tangent.y, -scale * tangent.x}, point_bar, grad_.k);
+        project_vjp(view_.camera, lane.point, {scale * tangent.y, -scale * tangent.x}, point_bar, grad_.k);
 
         if (current_.edge != curve.edge) flush(), current_ = curve, a_bar_ = b_bar_ = {};
         a_bar_ += (1 - lane.t) * point_bar;
         b_bar_ += lane.t * point_bar;
     }
 
-    // False if a face that the ray meets hides the point; else `behind` is that face if it is the nearest so far.
-    bool lies_behind(int64_t face, Vec2 n, Vec3 point, const Curve& curve, Surface& behind) const {
+    // False if a face that the ray meets hides the point; else it lies behind, and is kept if it is the nearest so far.
+    bool lies_behind(int64_t face, const Curve& curve, Lane& lane) const {
         const auto corner = corners_of(view_, face);
-        if (hides(corner.data(), point, curve)) return false;
-        if (const double depth = depth_of(view_, face, n); depth < behind.depth)
-            behind = {face, barycentrics_of_hit(face_map(view_.camera, corner.data()), n), depth};
+        if (hides(face, corner.data(), lane.point, curve)) return false;
+        if (const double depth = depth_of(view_, face, lane.n); depth < lane.behind.depth)
+            lane.behind = {face, barycentrics_of_hit(face_map(view_.camera, corner.data()), lane.n), depth};
         return true;
     }
 
     // What a curve that lies on this one does to a sample of it. False if it hides the point.
-    bool add_other(const Curve& other, const Curve& curve, const Lane& lane, Vec3 point, Side (&side)[2], int& share,
-                   Surface& behind) const {
+    bool add_other(const Curve& other, const Curve& curve, Lane& lane) const {
         const Vec2 along = other.tangent(), from = lane.x - other.x0;
         const double squared = along.x * along.x + along.y * along.y,
                      s = (from.x * along.x + from.y * along.y) / squared;
@@ -171,7 +177,7 @@ class BoundaryChunk {
             const auto own = view_.geometry.topology().faces(curve.edge);
             for (const int32_t f : view_.geometry.topology().faces(other.edge))
                 if (std::find(own.begin(), own.end(), f) == own.end() && meets(view_, f, lane.n) &&
-                    !lies_behind(f, lane.n, point, curve, behind))
+                    !lies_behind(f, curve, lane))
                     return false;
             return true;
         }
@@ -179,35 +185,47 @@ class BoundaryChunk {
         const double t = other.parameter(s), depth = (1 - t) * other.a.z + t * other.b.z;
         const bool opposite = along.x * curve.tangent().x + along.y * curve.tangent().y < 0;
         const HalfEdge* half[2] = {opposite ? &other.plus : &other.minus, opposite ? &other.minus : &other.plus};
-        if (std::fabs(depth - point.z) <= contact(curve, std::max(std::fabs(depth), length(point)))) {
-            ++share;
+        if (std::fabs(depth - lane.point.z) <= contact(curve, std::max(std::fabs(depth), length(lane.point)))) {
+            ++lane.share;
             for (int k = 0; k < 2; ++k)
-                if (half[k]->face >= 0 &&
-                    (side[k].face.face < 0 || !in_front(view_, side[k].face, *half[k], curve.a, curve.b)))
-                    side[k] = {*half[k], t};
+                if (Side& side = lane.side[k];
+                    half[k]->face >= 0 &&
+                    (side.face.face < 0 || !in_front(view_, side.face, *half[k], curve.a, curve.b)))
+                    side = {*half[k], t};
             return true;
         }
-        if (depth < point.z) return half[lane.flip]->face < 0;
+        if (depth < lane.point.z) return half[lane.flip]->face < 0;
         const HalfEdge& covers = *half[!lane.flip];
-        if (covers.face >= 0 && depth < behind.depth) behind = {covers.face, at_edge(covers, t), depth};
+        if (covers.face >= 0 && depth < lane.behind.depth) lane.behind = {covers.face, at_edge(covers, t), depth};
         return true;
     }
 
     // Whether a face that the ray meets lies before the point: its plane has the point on one side and the viewer on
     // the other. Surfaces that touch at the edge (a cube on the ground) are not before it, however flat the view: the
     // point may lie behind the plane by what the rounding of the input leaves, some spacings of the coordinates there,
-    // and by what doubles leave of a plane of that size, some of theirs.
-    bool hides(const Vec3 face[3], Vec3 point, const Curve& curve) const {
-        const Vec3 normal = cross(face[1] - face[0], face[2] - face[0]);
-        const Vec3 to_viewer = view_.camera.perspective ? -face[0] : Vec3{0, 0, -1};
-        const double viewer = dot(normal, to_viewer), behind = dot(normal, point - face[0]) * (viewer > 0 ? -1 : 1);
+    // and by what doubles leave of a plane of that size, some of theirs. Faces that share vertices with those of the
+    // edge (the front of a thin plate, for its back) are no other surface that touches: the input says how they lie.
+    bool hides(int64_t face, const Vec3 corner[3], Vec3 point, const Curve& curve) const {
+        const Vec3 normal = cross(corner[1] - corner[0], corner[2] - corner[0]);
+        const Vec3 to_viewer = view_.camera.perspective ? -corner[0] : Vec3{0, 0, -1};
+        const double viewer = dot(normal, to_viewer), behind = dot(normal, point - corner[0]) * (viewer > 0 ? -1 : 1);
         double size = 0;
         for (int i = 0; i < 3; ++i)
-            size = std::max({size, std::fabs(face[i].x), std::fabs(face[i].y), std::fabs(face[i].z)});
-        return behind > contact(curve, size) * length(normal);
+            size = std::max({size, std::fabs(corner[i].x), std::fabs(corner[i].y), std::fabs(corner[i].z)});
+        const double apart = behind / length(normal), rounding = rounding_of_doubles * size;
+        return apart > rounding && (apart > contact(curve, size) || shares_vertex(face, curve.edge));
+    }
+
+    bool shares_vertex(int64_t face, int64_t edge) const {
+        const int32_t* v = view_.scene.faces + 3 * face;
+        for (const int32_t f : view_.geometry.topology().faces(edge))
+            for (int i = 0; i < 3; ++i)
+                if (std::find(v, v + 3, view_.scene.faces[3 * int64_t(f) + i]) != v + 3) return true;
+        return false;
     }
 
     // World units by which what touches at the curve may lie apart, for the rounding of the input and of doubles.
+    static constexpr double rounding_of_doubles = 64 * std::numeric_limits<double>::epsilon();
     double contact(const Curve& curve, double size) const {
         const HalfEdge& h = curve.minus.face >= 0 ? curve.minus : curve.plus;
         double coordinate = 0;
@@ -215,7 +233,7 @@ class BoundaryChunk {
             for (int axis = 0; axis < 3; ++axis)
                 coordinate = std::max(coordinate,
                                       std::fabs(view_.scene.verts[3 * int64_t(vertex(view_.scene, h, corner)) + axis]));
-        return 8 * view_.options.spacing * coordinate + 64 * std::numeric_limits<double>::epsilon() * size;
+        return 8 * view_.options.spacing * coordinate + rounding_of_doubles * size;
     }
 
     // The gradient goes to the vertices of the face that ends at the curve; where a face lies on either side, half to

@@ -236,6 +236,9 @@ def test_spawned_children_render(method, tmp_path):
 
 # Uninterrupted, each takes some 5 s on two cores.
 INTERRUPTED = """
+import signal
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests with SIGINT ignored
 kind = sys.argv[1]
 before = step()
 mesh, camera = SPHERE.replace(verts=SPHERE.verts.clone().requires_grad_()), front_camera(512 if kind == "image" else 64)
