@@ -93,16 +93,19 @@ class PixelRow {
             for (const int end = i + part_[p].n; i < end; ++i) {
                 int32_t face = rays_.face[i];
                 if (face < 0) continue;
-                if (Shaded& s = kept_[unsigned(face) % n_kept]; face != s.face) keep(s, face);
-                if (kept_[unsigned(face) % n_kept].unseen && (face = beyond(face, i)) < 0) continue;
+                Shaded* s = &kept_[unsigned(face) % n_kept];
+                if (face != s->face) keep(*s, face);
+                if (s->unseen) [[unlikely]] {
+                    if ((face = beyond(face, i)) < 0) continue;
+                    s = &kept_[unsigned(face) % n_kept];
+                }
                 ++hits;
-                const Shaded& s = kept_[unsigned(face) % n_kept];
-                const Barycentrics b = barycentrics_of_hit(s.map, rays_.n(i));
-                if (s.textured) {
+                const Barycentrics b = barycentrics_of_hit(s->map, rays_.n(i));
+                if (s->textured) {
                     shade<N>(scene_, face, b, radiance_.data());
                     for (int c = 0; c < C_; ++c) sum[c] += radiance_[c];
                 } else {
-                    s.radiance.add_to(sum, b);
+                    s->radiance.add_to(sum, b);
                 }
             }
             hits_[part_[p].column] += hits;
