@@ -50,7 +50,11 @@ class BoundaryChunk {
         const int i = rays_.count;
         const Vec2 x = curve.position(s);
         if (!view_.adjoint.template at<N>(x, adjoint_.data() + i * C_)) return;
-        if (places_ == 0 || place_[places_ - 1].curve.edge != curve.edge) start(place_[places_++], curve);
+        if (places_ == 0 || place_[places_ - 1].curve.edge != curve.edge) {
+            // A place of which no sample waits, for all were hidden, is free again: so there are never more than lanes.
+            if (places_ > 0 && (i == 0 || lane_[i - 1].place != places_ - 1)) --places_;
+            start(place_[places_++], curve);
+        }
         const Place& place = place_[places_ - 1];
         const Vec2 n = normalised(view_.camera, x);
         const double t = curve.parameter(s);
