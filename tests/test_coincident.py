@@ -152,3 +152,23 @@ def test_thin_plate_far_from_the_origin() -> None:
         return eg.Scene(plate.replace(verts=verts.float()), BACKGROUND), camera
 
     check_ratio(case, 0.006, spp=2048, **SAMPLES)
+
+
+@pytest.mark.parametrize("flat", [False, True], ids=["deep", "flat"])
+def test_curves_of_which_no_sample_is_seen(flat: bool) -> None:
+    """The creases of a grid of coloured quads behind another: hundreds of curves in a row, each hidden by one before it,
+    between some that are seen. They once overran an array."""
+    n, size = 40, 0.05  # a pixel each, so that all lines are off the borders of pixels
+    i, j = torch.meshgrid(torch.arange(n + 1), torch.arange(n + 1), indexing="ij")
+    place = [size * (i - n / 2), size * (j - n / 2), 0.0 * i]
+    verts = torch.stack(place, -1).reshape(-1, 3).to(F64)
+    corner = ((n + 1) * i + j)[:-1, :-1].reshape(-1, 1)
+    faces = (corner + torch.tensor([0, 1, n + 2, 0, n + 2, n + 1])).reshape(-1, 3)
+    middle = verts[faces].mean(1).reshape(-1, 2, 3).mean(1).repeat_interleave(2, 0)
+    front, back = (eg.Mesh(verts, faces, face_colors=0.5 + 0.4 * sign * middle) for sign in (1.0, -1.0))
+    depth = torch.tensor([0.0, 0.0, 1e-3 if flat else 0.5], dtype=F64)
+    check(
+        lambda theta: [mesh.transformed(t=sign * depth + theta * ALONG) for mesh, sign in ((back, 1.0), (front, -1.0))],
+        "orthographic",
+        edge_samples=40_000,
+    )

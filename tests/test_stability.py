@@ -46,43 +46,39 @@ def test_case_at_full_accuracy(name):
 
 # -- the references are checked ---------------------------------------------------------------------------------------
 
-# An edge of 5e-7 px, edges as near to each other, a contrast at which differences of the loss are rounding: no step is short
-# enough and long enough. So it is for slivers 4e-5 px wide; and at 170° the step itself is 0.5 % off for skew.
-TOO_FINE = {
-    "tiny-edge",
-    "emerging-1e-6",
-    "hiding-1e-6",
-    "wire-1e-9",
-    "sliver-thin",
-    "sliver-thin-smooth",
-    "fov-170",
-} | {"speck", "hdr", "emerging-1e-3", "wire"}
 LARGE = {"two-details", "two-details-far", "copies-sphere"}  # a second and more for one image
 
 
-def own_differences(problem: Problem, name: str) -> float:
-    """How far the derivative of the exact image along its gradient is from its own central difference, relative."""
+def own_differences(problem: Problem, name: str) -> list[float]:
+    """How far the derivative of the exact image along its gradient is from its own central difference, relative, for
+    ever shorter steps. NaN where the step goes where there is no exact image: parts through each other, or out of view."""
     assert problem.exact is not None
     image, grads = measure.exact(problem, problem.exact)
     adjoint = problem.cotangent(image)
+    parts = {key: value.double() for key, value in problem.parts.items()}
     size = float(grads[name].norm())
     if size < 1e-9 * float(adjoint.norm()):
-        return 0.0
+        return [0.0, 0.0]
+    direction = grads[name] / size
+    loss, place = float((adjoint * image).abs().sum()), float(parts[name].abs().max())
     off = []
-    for share in (1e-4, 1e-5):  # of the loss
-        h = share * float((adjoint * image).abs().sum()) / size
-        parts = {key: value.double() for key, value in problem.parts.items()}
-        with torch.no_grad():
-            high, low = (
-                float((problem.exact({**parts, name: parts[name] + sign * h * grads[name] / size}) * adjoint).sum())
-                for sign in (1.0, -1.0)
-            )
-        off.append(abs((high - low) / (2.0 * h) / size - 1.0))
-    return min(off)
+    for share in (10.0**-k for k in range(4, 15)):
+        # A step that changes the loss by its share, and coordinates by no more than ten of it: other parts may be brighter.
+        h = min(share * loss / size, 10.0 * share * place / float(direction.abs().max()) if place > 0 else math.inf)
+        try:
+            with torch.no_grad():
+                high, low = (problem.exact({**parts, name: parts[name] + s * h * direction}) for s in (1.0, -1.0))
+            off.append(abs(float(((high - low) * adjoint).sum()) / (2.0 * h) / size - 1.0))
+        except (AssertionError, ValueError) as error:
+            assert "intersect" in str(error) or "expected at least one Mesh" in str(error)
+            off.append(math.nan)
+        if all(entry < 2e-3 for entry in off[-2:]) and len(off) > 1:
+            break
+    return off
 
 
 def references(names):
-    return [name for name in names if name not in TOO_FINE | LARGE and name != "through-each-other"]
+    return [name for name in names if name not in LARGE and name != "through-each-other"]
 
 
 @pytest.mark.slow
@@ -90,12 +86,9 @@ def references(names):
 def test_references_agree_with_their_own_differences(name):
     problem = CASES[name].build()
     for part in problem.parts:
-        try:
-            off = own_differences(problem, part)
-        except AssertionError as error:
-            assert "intersect" in str(error)  # moved one by one, vertices that touch go through each other
-            continue
-        assert off < 2e-3, (part, off)
+        off = own_differences(problem, part)
+        # Two steps, one a tenth of the other: what differences give there no longer depends on them.
+        assert all(entry < 2e-3 for entry in off[-2:]), (part, off)
 
 
 def test_a_clipped_scene_is_the_same():
