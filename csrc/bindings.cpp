@@ -379,8 +379,9 @@ void bind_scene(nb::module_& m, const char* name) {
 NB_MODULE(_core, m) {
     m.doc() = "The edgegrad kernel. Use it through the edgegrad package.";
     nb::set_leak_warnings(false);  // of a process that ends while a thread of it renders
-    m.def("open_embree", &open_embree, "path"_a, nb::call_guard<nb::gil_scoped_release>());
+    m.def("open_embree", &open_embree, "path"_a, "options"_a, nb::call_guard<nb::gil_scoped_release>());
     m.def("embree_version", &embree_version);
+    m.def("packet_width", &packet_width);
     // Without the interpreter's lock, for which a thread that holds the kernel's may wait.
     m.def("clear_geometry", &clear_geometry, nb::call_guard<nb::gil_scoped_release>());
     m.def("before_fork", &before_fork, nb::call_guard<nb::gil_scoped_release>());

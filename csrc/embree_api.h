@@ -12,7 +12,7 @@ using Device = struct RTCDeviceTy*;
 using Scene = struct RTCSceneTy*;
 using Geometry = struct RTCGeometryTy*;
 
-enum { DEVICE_PROPERTY_VERSION = 0, DEVICE_PROPERTY_VERSION_MAJOR = 1 };
+enum { DEVICE_PROPERTY_VERSION = 0, DEVICE_PROPERTY_VERSION_MAJOR = 1, DEVICE_PROPERTY_NATIVE_RAY16_SUPPORTED = 34 };
 enum { BUILD_QUALITY_LOW = 0 };
 enum { SCENE_FLAG_DYNAMIC = 1 << 0, SCENE_FLAG_ROBUST = 1 << 2, SCENE_FLAG_FILTER_FUNCTION_IN_ARGUMENTS = 1 << 3 };
 enum { GEOMETRY_TYPE_TRIANGLE = 0 };
@@ -64,6 +64,7 @@ struct IntersectArguments {
     X(rtcSetGeometryEnableFilterFunctionFromArguments, void, (Geometry, bool))                               \
     X(rtcCommitGeometry, void, (Geometry))                                                                   \
     X(rtcAttachGeometry, unsigned, (Scene, Geometry))                                                        \
-    X(rtcIntersect8, void, (const int*, Scene, RayPacket*, IntersectArguments*))
+    X(rtcIntersect8, void, (const int*, Scene, void*, IntersectArguments*))                                  \
+    X(rtcIntersect16, void, (const int*, Scene, void*, IntersectArguments*))
 
 }  // namespace edgegrad::embree

@@ -1,7 +1,8 @@
-// The pixel loop. The samples of a pixel are drawn in proportion to the filter and cast together, eight a packet.
+// The pixel loop. The samples of a pixel are drawn in proportion to the filter and cast together.
 
 #include <algorithm>
 #include <atomic>
+#include <bit>
 #include <vector>
 
 #include "render.h"
@@ -25,6 +26,34 @@ EDGEGRAD_VECTORIZED void PixelRays::append(int x, int y, int first, int n, RayBa
 }
 
 namespace {
+
+constexpr int lanes = 8;
+
+// Which of the lanes hit the face, as bits.
+inline unsigned on_face(const int32_t* hit, int32_t face) {
+    static constexpr unsigned bit[lanes] = {1, 2, 4, 8, 16, 32, 64, 128};
+    unsigned bits = 0;
+    EDGEGRAD_ROLLED for (int i = 0; i < lanes; ++i) bits |= hit[i] == face ? bit[i] : 0;
+    return bits;
+}
+
+// The sum of the barycentrics of all lanes that hit the face; false if one of them lies outside of it.
+EDGEGRAD_VECTORIZED bool add_barycentrics(const FaceMap& map, const double* x, const double* y, const int32_t* hit,
+                                          int32_t face, Barycentrics& sum) {
+    const Vec3 a = map.column[0], b = map.column[1], c = map.column[2];
+    double u[lanes], v[lanes];
+    int64_t outside = 0;
+    for (int i = 0; i < lanes; ++i) {
+        const double inverse = 1.0 / (x[i] * a.z + y[i] * b.z + c.z);
+        u[i] = (x[i] * a.x + y[i] * b.x + c.x) * inverse, v[i] = (x[i] * a.y + y[i] * b.y + c.y) * inverse;
+        const bool on = hit[i] == face;
+        outside |= int64_t(on) & ~int64_t((u[i] >= 0) & (v[i] >= 0) & (u[i] + v[i] <= 1));
+        u[i] = on ? u[i] : 0.0, v[i] = on ? v[i] : 0.0;
+    }
+    for (int i = 0; i < 4; ++i) u[i] += u[i + 4], v[i] += v[i + 4];
+    sum.u += (u[0] + u[2]) + (u[1] + u[3]), sum.v += (v[0] + v[2]) + (v[1] + v[3]);
+    return !outside;
+}
 
 constexpr int tile = 16;
 
@@ -90,28 +119,52 @@ class PixelRow {
         for (int p = 0; p < parts_; ++p) {
             typename AffineRadiance<N>::Sum sum(C_);
             int hits = 0;
-            for (const int end = i + part_[p].n; i < end; ++i) {
-                int32_t face = rays_.face[i];
-                if (face < 0) continue;
-                Shaded* s = &kept_[unsigned(face) % n_kept];
-                if (face != s->face) keep(*s, face);
-                if (s->unseen) [[unlikely]] {
-                    if ((face = beyond(face, i)) < 0) continue;
-                    s = &kept_[unsigned(face) % n_kept];
+            const int end = i + part_[p].n;
+            for (; i + lanes <= end; i += lanes)
+                for (unsigned left = (1u << lanes) - 1 - on_face(rays_.face + i, -1); left;) {
+                    const int first = std::countr_zero(left);
+                    const int32_t face = rays_.face[i + first];
+                    const unsigned same = on_face(rays_.face + i, face);
+                    left &= ~same;
+                    const Shaded& s = shaded(face);
+                    Barycentrics b;
+                    if ((same & (same - 1)) && !s.textured && !s.unseen &&
+                        add_barycentrics(s.map, rays_.n_x + i, rays_.n_y + i, rays_.face + i, face, b)) {
+                        const int n = std::popcount(same);
+                        s.radiance.add_to(sum, b, n);
+                        hits += n;
+                    } else {
+                        for (unsigned one = same; one; one &= one - 1) hits += add(i + std::countr_zero(one), sum);
+                    }
                 }
-                ++hits;
-                const Barycentrics b = barycentrics_of_hit(s->map, rays_.n(i));
-                if (s->textured) {
-                    shade<N>(scene_, face, b, radiance_.data());
-                    for (int c = 0; c < C_; ++c) sum[c] += radiance_[c];
-                } else {
-                    s->radiance.add_to(sum, b);
-                }
-            }
+            for (; i < end; ++i)
+                if (rays_.face[i] >= 0) hits += add(i, sum);
             hits_[part_[p].column] += hits;
             for (int c = 0; c < C_; ++c) sum_[part_[p].column * C_ + c] += sum[c];
         }
         rays_.count = parts_ = 0;
+    }
+
+    // Adds what ray i sees to the sum; whether it sees anything.
+    bool add(int i, typename AffineRadiance<N>::Sum& sum) {
+        int32_t face = rays_.face[i];
+        if (shaded(face).unseen) [[unlikely]]
+            if ((face = beyond(face, i)) < 0) return false;
+        const Shaded& s = shaded(face);
+        const Barycentrics b = barycentrics_of_hit(s.map, rays_.n(i));
+        if (s.textured) {
+            shade<N>(scene_, face, b, radiance_.data());
+            for (int c = 0; c < C_; ++c) sum[c] += radiance_[c];
+        } else {
+            s.radiance.add_to(sum, b, 1);
+        }
+        return true;
+    }
+
+    Shaded& shaded(int32_t face) {
+        Shaded& s = kept_[unsigned(face) % n_kept];
+        if (face != s.face) keep(s, face);
+        return s;
     }
 
     // Faces that are smaller than the distance of the samples are met once each, and their arrays are then waited for.
@@ -135,11 +188,7 @@ class PixelRow {
 
     // What ray i meets behind a face that holds the eye.
     int32_t beyond(int32_t face, int i) {
-        return caster_.beyond_float(frame_, rays_.n(i), face, {}, [&](int32_t f) {
-            Shaded& s = kept_[unsigned(f) % n_kept];
-            if (f != s.face) keep(s, f);
-            return !s.unseen;
-        });
+        return caster_.beyond_float(frame_, rays_.n(i), face, {}, [&](int32_t f) { return !shaded(f).unseen; });
     }
 
     void keep(Shaded& s, int32_t face) {

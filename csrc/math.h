@@ -12,6 +12,13 @@
 #define EDGEGRAD_VECTORIZED
 #endif
 
+// Before a short loop over arrays: not unrolled, it is turned into vectors as a whole.
+#if defined(__GNUC__)
+#define EDGEGRAD_ROLLED _Pragma("GCC unroll 1")
+#else
+#define EDGEGRAD_ROLLED
+#endif
+
 namespace edgegrad {
 
 struct Vec2 {

@@ -28,6 +28,7 @@ struct Library {
 #undef EDGEGRAD_DECLARE
     Device device = nullptr;
     int version = 0;
+    int packet_width = 8;
 } rtc;
 
 void* open_library(const std::string& path) {
@@ -63,7 +64,7 @@ void throw_on_error(const char* doing) {
         throw std::runtime_error(std::string("Embree failed while ") + doing + ", error " + std::to_string(error));
 }
 
-void open_device(const std::string& path) {
+void open_device(const std::string& path, const std::string& options) {
     void* library = open_library(path);
     if (!library) throw std::runtime_error("cannot open " + path + ": " + open_error());
     Library found;
@@ -72,13 +73,14 @@ void open_device(const std::string& path) {
     if (!found.name) throw std::runtime_error(path + " lacks " #name "; version 4.x is needed");
     EDGEGRAD_EMBREE_FUNCTIONS(EDGEGRAD_LOAD)
 #undef EDGEGRAD_LOAD
-    found.device = found.rtcNewDevice(nullptr);
+    found.device = found.rtcNewDevice(options.c_str());
     if (!found.device)
         throw std::runtime_error("Embree cannot make a device on this processor, error " +
                                  std::to_string(found.rtcGetDeviceError(nullptr)));
     found.version = int(found.rtcGetDeviceProperty(found.device, DEVICE_PROPERTY_VERSION));
     if (found.rtcGetDeviceProperty(found.device, DEVICE_PROPERTY_VERSION_MAJOR) != 4)
         throw std::runtime_error("expected Embree 4.x, got version " + std::to_string(found.version) + " in " + path);
+    if (found.rtcGetDeviceProperty(found.device, DEVICE_PROPERTY_NATIVE_RAY16_SUPPORTED)) found.packet_width = 16;
     rtc = found;
 }
 
@@ -86,11 +88,11 @@ void open_device(const std::string& path) {
 
 std::mutex embree_mutex;
 
-void open_embree(const std::string& path) {
+void open_embree(const std::string& path, const std::string& options) {
     {
         const std::lock_guard lock(embree_mutex);
         if (rtc.device) return;
-        open_device(path);
+        open_device(path, options);
     }
     // The first scene starts Embree's threads: a millisecond that would be missed in the first render.
     const int32_t face[3] = {0, 1, 2};
@@ -100,6 +102,8 @@ void open_embree(const std::string& path) {
 }
 
 int embree_version() { return rtc.version; }
+
+int packet_width() { return rtc.packet_width; }
 
 RayCaster::RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts)
     : faces_(faces),
@@ -197,28 +201,42 @@ double RayFrame::error(Vec3 p) const {
     return 4 * std::numeric_limits<float>::epsilon() * (point + start) / inverse_radius_;
 }
 
-RayBatch::RayBatch(const RayFrame& frame) : frame_(frame) {
-    for (RayPacket& p : packet_) {
-        std::fill(p.origin_x, p.origin_x + p.size, float(frame.eye_.x));
-        std::fill(p.origin_y, p.origin_y + p.size, float(frame.eye_.y));
-        std::fill(p.origin_z, p.origin_z + p.size, float(frame.eye_.z));
-    }
+template <int W>
+RayPacket<W>::RayPacket() {
+    std::fill(mask, mask + W, ~0u);
+    std::fill(instance, instance + W, INVALID_GEOMETRY_ID);
+    std::fill(instance_primitive, instance_primitive + W, INVALID_GEOMETRY_ID);
+    std::iota(id, id + W, 0u);
 }
 
-EDGEGRAD_VECTORIZED void RayBatch::prepare() {
+RayBatch::RayBatch(const RayFrame& frame) : frame_(frame) {
+    if (rtc.packet_width == 16) packets_.emplace<Packets<16>>();
+    std::visit(
+        [&](auto& packets) {
+            for (auto& p : packets) {
+                std::fill(std::begin(p.origin_x), std::end(p.origin_x), float(frame.eye_.x));
+                std::fill(std::begin(p.origin_y), std::end(p.origin_y), float(frame.eye_.y));
+                std::fill(std::begin(p.origin_z), std::end(p.origin_z), float(frame.eye_.z));
+            }
+        },
+        packets_);
+}
+
+template <int W>
+[[gnu::always_inline]] inline void RayBatch::prepare(Packets<W>& packets) const {
     const Vec3 X = frame_.axis_x_, Y = frame_.axis_y_, Z = frame_.axis_z_;
-    for (int k = 0; k < count; k += RayPacket::size) {
-        RayPacket& p = packet_[k / RayPacket::size];
+    for (int k = 0; k < count; k += W) {
+        RayPacket<W>& p = packets[k / W];
         const double *x = n_x + k, *y = n_y + k;
-        for (int i = 0; i < p.size; ++i) p.t_far[i] = std::numeric_limits<float>::infinity();
-        for (int i = 0; i < p.size; ++i) p.geometry[i] = INVALID_GEOMETRY_ID;
+        EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.t_far[i] = std::numeric_limits<float>::infinity();
+        EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.geometry[i] = INVALID_GEOMETRY_ID;
         if (!frame_.far_) {
-            for (int i = 0; i < p.size; ++i) p.direction_x[i] = float(x[i] * X.x + y[i] * Y.x + Z.x);
-            for (int i = 0; i < p.size; ++i) p.direction_y[i] = float(x[i] * X.y + y[i] * Y.y + Z.y);
-            for (int i = 0; i < p.size; ++i) p.direction_z[i] = float(x[i] * X.z + y[i] * Y.z + Z.z);
+            EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.direction_x[i] = float(x[i] * X.x + y[i] * Y.x + Z.x);
+            EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.direction_y[i] = float(x[i] * X.y + y[i] * Y.y + Z.y);
+            EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.direction_z[i] = float(x[i] * X.z + y[i] * Y.z + Z.z);
             continue;
         }
-        for (int i = 0; i < p.size; ++i) {
+        for (int i = 0; i < W; ++i) {
             const Vec3 across = x[i] * X + y[i] * Y;
             Vec3 o = frame_.eye_, d = Z;
             if (frame_.perspective_) d += across;
@@ -233,27 +251,35 @@ EDGEGRAD_VECTORIZED void RayBatch::prepare() {
     }
 }
 
-EDGEGRAD_VECTORIZED void RayBatch::read_faces() {
-    for (int k = 0; k < count; k += RayPacket::size) {
-        const RayPacket& p = packet_[k / RayPacket::size];
-        for (int i = 0; i < p.size; ++i)
-            face[k + i] = p.geometry[i] == INVALID_GEOMETRY_ID ? -1 : int32_t(p.triangle[i]);
+template <int W>
+[[gnu::always_inline]] inline void RayBatch::read_faces(const Packets<W>& packets) {
+    for (int k = 0; k < count; k += W) {
+        const RayPacket<W>& p = packets[k / W];
+        EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) face[k + i] =
+            p.geometry[i] == INVALID_GEOMETRY_ID ? -1 : int32_t(p.triangle[i]);
     }
 }
 
-RayPacket::RayPacket() {
-    std::fill(mask, mask + size, ~0u);
-    std::fill(instance, instance + size, INVALID_GEOMETRY_ID);
-    std::fill(instance_primitive, instance_primitive + size, INVALID_GEOMETRY_ID);
-    std::iota(id, id + size, 0u);
+EDGEGRAD_VECTORIZED void RayBatch::prepare() {
+    if (auto* wide = std::get_if<Packets<16>>(&packets_)) prepare<16>(*wide);
+    else prepare<8>(std::get<Packets<8>>(packets_));
+}
+
+EDGEGRAD_VECTORIZED void RayBatch::read_faces() {
+    if (auto* wide = std::get_if<Packets<16>>(&packets_)) read_faces<16>(*wide);
+    else read_faces<8>(std::get<Packets<8>>(packets_));
 }
 
 namespace {
 
-alignas(32) constexpr int valid_lanes[9][8] = {
-    {0, 0, 0, 0, 0, 0, 0, 0},       {-1, 0, 0, 0, 0, 0, 0, 0},       {-1, -1, 0, 0, 0, 0, 0, 0},
-    {-1, -1, -1, 0, 0, 0, 0, 0},    {-1, -1, -1, -1, 0, 0, 0, 0},    {-1, -1, -1, -1, -1, 0, 0, 0},
-    {-1, -1, -1, -1, -1, -1, 0, 0}, {-1, -1, -1, -1, -1, -1, -1, 0}, {-1, -1, -1, -1, -1, -1, -1, -1}};
+// valid_lanes.first[n]: the first n of 16 lanes are on. Embree wants them aligned as its vectors are.
+struct ValidLanes {
+    alignas(64) int first[17][16] = {};
+    constexpr ValidLanes() {
+        for (int n = 0; n <= 16; ++n)
+            for (int i = 0; i < n; ++i) first[n][i] = -1;
+    }
+} constexpr valid_lanes;
 
 struct RejectContext {
     RayQueryContext query;  // first, so that a pointer to it is a pointer to this
@@ -277,34 +303,23 @@ void reject(const FilterArguments* a) {
 
 }  // namespace
 
-void RayCaster::intersect(RayBatch& batch) const {
-    RayQueryContext context{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}};
-    IntersectArguments arguments{RAY_QUERY_FLAG_COHERENT, FEATURE_FLAG_ALL, &context, nullptr, nullptr, 0};
-    const int n = RayPacket::size;
-    for (int k = 0; k < batch.count; k += n)
-        rtc.rtcIntersect8(valid_lanes[std::min(n, batch.count - k)], static_cast<Scene>(scene_), &batch.packet_[k / n],
-                          &arguments);
-}
-
-void RayCaster::cast(RayBatch& batch) const {
-    intersect(batch);
-    batch.read_faces();
+void RayCaster::intersect(RayBatch& batch, const std::span<const int32_t>* rejected) const {
+    RejectContext context{{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}}, nullptr};
+    const int flags = RAY_QUERY_FLAG_COHERENT | (rejected ? RAY_QUERY_FLAG_INVOKE_ARGUMENT_FILTER : 0);
+    IntersectArguments arguments{flags, FEATURE_FLAG_ALL, &context.query, rejected ? reject : nullptr, nullptr, 0};
+    const auto each = [&](auto& packets, int width, auto intersect) {
+        for (int k = 0; k < batch.count; k += width) {
+            if (rejected) context.rejected = rejected + k;
+            intersect(valid_lanes.first[std::min(width, batch.count - k)], static_cast<Scene>(scene_),
+                      &packets[k / width], &arguments);
+        }
+    };
+    if (auto* wide = std::get_if<RayBatch::Packets<16>>(&batch.packets_)) each(*wide, 16, rtc.rtcIntersect16);
+    else each(std::get<RayBatch::Packets<8>>(batch.packets_), 8, rtc.rtcIntersect8);
 }
 
 void RayCaster::cast(RayBatch& batch, const std::span<const int32_t>* rejected) const {
-    RejectContext context{{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}}, nullptr};
-    IntersectArguments arguments{RAY_QUERY_FLAG_COHERENT | RAY_QUERY_FLAG_INVOKE_ARGUMENT_FILTER,
-                                 FEATURE_FLAG_ALL,
-                                 &context.query,
-                                 reject,
-                                 nullptr,
-                                 0};
-    const int n = RayPacket::size;
-    for (int k = 0; k < batch.count; k += n) {
-        context.rejected = rejected + k;
-        rtc.rtcIntersect8(valid_lanes[std::min(n, batch.count - k)], static_cast<Scene>(scene_), &batch.packet_[k / n],
-                          &arguments);
-    }
+    intersect(batch, rejected);
     batch.read_faces();
 }
 

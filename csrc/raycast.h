@@ -1,19 +1,22 @@
-// The only door to Embree: opens the library, keeps a ray structure over triangles, casts packets of eight rays.
+// The only door to Embree: opens the library, keeps a ray structure over triangles, casts packets of rays.
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cstdint>
 #include <mutex>
 #include <span>
 #include <string>
+#include <variant>
 #include <vector>
 
 #include "camera.h"
 
 namespace edgegrad {
 
-// Opens libembree4 and makes the device. Throws std::runtime_error when it is not there or not version 4.
-void open_embree(const std::string& path);
+// Opens libembree4 and makes the device, with options of Embree's own. Throws std::runtime_error when it is not there
+// or not version 4.
+void open_embree(const std::string& path, const std::string& options = "");
 
 // Held by whoever makes, builds or frees a ray structure, so that fork() can wait until nobody does: see before_fork().
 extern std::mutex embree_mutex;
@@ -21,16 +24,19 @@ extern std::mutex embree_mutex;
 // Version of the opened library, as 40400 for 4.4.0.
 int embree_version();
 
-// Eight rays and what they hit, in the layout of Embree's RTCRayHit8, so that nothing is copied to cast them.
-struct alignas(32) RayPacket {
-    static constexpr int size = 8;
+// Rays in a packet: 16 where the processor's vectors are that wide (AVX-512), else 8.
+int packet_width();
 
-    float origin_x[size] = {}, origin_y[size] = {}, origin_z[size] = {}, t_near[size] = {};
-    float direction_x[size] = {}, direction_y[size] = {}, direction_z[size] = {}, time[size] = {};
-    float t_far[size] = {};
-    unsigned mask[size] = {}, id[size] = {}, flags[size] = {};
-    float normal_x[size] = {}, normal_y[size] = {}, normal_z[size] = {}, u[size] = {}, v[size] = {};
-    unsigned triangle[size] = {}, geometry[size] = {}, instance[size] = {}, instance_primitive[size] = {};
+// W rays and what they hit, in the layout of Embree's RTCRayHit8 and RTCRayHit16, so that nothing is copied to cast
+// them.
+template <int W>
+struct alignas(4 * W) RayPacket {
+    float origin_x[W] = {}, origin_y[W] = {}, origin_z[W] = {}, t_near[W] = {};
+    float direction_x[W] = {}, direction_y[W] = {}, direction_z[W] = {}, time[W] = {};
+    float t_far[W] = {};
+    unsigned mask[W] = {}, id[W] = {}, flags[W] = {};
+    float normal_x[W] = {}, normal_y[W] = {}, normal_z[W] = {}, u[W] = {}, v[W] = {};
+    unsigned triangle[W] = {}, geometry[W] = {}, instance[W] = {}, instance_primitive[W] = {};
 
     RayPacket();
 };
@@ -49,11 +55,9 @@ class RayCaster {
     // New positions (V, 3), world units.
     void update(const double* verts, Team& team);
 
-    // The nearest face along each ray of the batch.
-    void cast(RayBatch& batch) const;
-
-    // The same, blind to some faces: those in rejected[i] for ray i, ascending if they are more than 16.
-    void cast(RayBatch& batch, const std::span<const int32_t>* rejected) const;
+    // The nearest face along each ray of the batch, where ray i is blind to the faces in rejected[i], if given. Those
+    // of a ray ascend if they are more than 16.
+    void cast(RayBatch& batch, const std::span<const int32_t>* rejected = nullptr) const;
 
     // What one ray truly meets, where `face` is what the cast found. Embree decides in float, so near its rim a face
     // may be hit that the ray misses: at a silhouette of a fine mesh that is a neighbour which is seen less wide than
@@ -65,7 +69,7 @@ class RayCaster {
    private:
     friend class RayFrame;
     friend double bare_loop(const Camera&, const RayCaster&, const struct ForwardOptions&, Team&);
-    void intersect(RayBatch& batch) const;
+    void intersect(RayBatch& batch, const std::span<const int32_t>* rejected = nullptr) const;
     Vec3 detail_centre(const double* verts, Team& team) const;
 
     const int32_t* faces_;
@@ -116,10 +120,16 @@ class RayBatch {
 
    private:
     friend class RayCaster;
+    template <int W>
+    using Packets = std::array<RayPacket<W>, size / W>;
+    template <int W>
+    void prepare(Packets<W>& packets) const;
+    template <int W>
+    void read_faces(const Packets<W>& packets);
     void read_faces();
 
     const RayFrame& frame_;
-    RayPacket packet_[size / RayPacket::size];
+    std::variant<Packets<8>, Packets<16>> packets_;  // as wide as packet_width()
 };
 
 template <class Meets>

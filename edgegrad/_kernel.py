@@ -32,7 +32,8 @@ def embree_path() -> str:
 def load() -> Any:
     """The kernel module, with Embree open. Raises ImportError that says how to get what is missing.
 
-    It is the one that was installed, or the file in the environment variable EDGEGRAD_KERNEL: a build with sanitizers.
+    Two environment variables serve its tests: EDGEGRAD_KERNEL, the file of another build of it, with sanitizers; and
+    EDGEGRAD_EMBREE, options of Embree's device, such as "max_isa=avx2" for what older processors run.
     """
     if path := os.environ.get("EDGEGRAD_KERNEL"):
         spec = importlib.util.spec_from_file_location("edgegrad._core", path)
@@ -43,7 +44,7 @@ def load() -> Any:
         from . import _core  # pyright: ignore[reportAttributeAccessIssue]  the compiled module
 
     try:
-        _core.open_embree(embree_path())
+        _core.open_embree(embree_path(), os.environ.get("EDGEGRAD_EMBREE", ""))
     except RuntimeError as error:
         raise ImportError(f"{HOW_TO_GET_EMBREE}; {error}") from None
     return _core

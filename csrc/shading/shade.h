@@ -68,8 +68,9 @@ class AffineRadiance {
         for (int c = 0; c < C; ++c) value_[c] = c0[c], d_u_[c] = double(c1[c]) - c0[c], d_v_[c] = double(c2[c]) - c0[c];
     }
 
-    void add_to(Sum& sum, Barycentrics b) const {
-        for (size_t c = 0; c < value_.size(); ++c) sum[c] += value_[c] + b.u * d_u_[c] + b.v * d_v_[c];
+    // Adds the radiance of n points, given the sum of their barycentrics.
+    void add_to(Sum& sum, Barycentrics b, int n) const {
+        for (size_t c = 0; c < value_.size(); ++c) sum[c] += n * value_[c] + b.u * d_u_[c] + b.v * d_v_[c];
     }
 
    private:

@@ -1,0 +1,57 @@
+"""What older processors run, here where newer ones do: rays in packets of 8, not 16, give the same image and gradient."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from scenes import cube, front_camera, icosphere
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad._kernel import core
+
+OPTIONS = ("max_isa=avx2", "max_isa=sse4.2")
+
+
+def results() -> dict[str, Tensor]:
+    """Images and gradients of some scenes, with samples that fill packets and that do not."""
+    views = {
+        "perspective": front_camera(40),
+        "far": eg.Camera.look_at((0.0, 20.0, -300.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 0.6, (40, 40)),
+        "orthographic": eg.Camera.orthographic((0.0, 0.4, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.4, (40, 40)),
+    }
+    found = {}
+    for name, camera in views.items():
+        for spp in (1, 3, 16, 67):
+            verts = [mesh.verts.clone().requires_grad_() for mesh in (icosphere(3), cube(0.6))]
+            ball, box = (mesh.replace(verts=v) for mesh, v in zip((icosphere(3), cube(0.6)), verts, strict=True))
+            scene = eg.Scene([ball, box.transformed(t=torch.tensor([0.3, 0.2, -0.9], dtype=torch.float64))])
+            image = eg.render(scene, camera, spp=spp, seed=spp)
+            image.square().sum().backward()
+            found[f"{name} {spp}"] = image.detach()
+            found |= {f"{name} {spp} verts {k}": v.grad for k, v in enumerate(verts)}
+    return found
+
+
+@pytest.mark.parametrize("options", OPTIONS)
+def test_narrow_packets(options: str, tmp_path: Path) -> None:
+    file = tmp_path / "results.pt"
+    environment = {**os.environ, "EDGEGRAD_EMBREE": options, "PYTHONPATH": str(Path(__file__).parent)}
+    program = (
+        "import sys, torch, test_processors as t\n"
+        "assert t.core.packet_width() == 8\n"
+        "torch.save(t.results(), sys.argv[1])"
+    )
+    subprocess.run([sys.executable, "-c", program, file], env=environment, check=True)
+    there = torch.load(file, weights_only=True)
+    assert core.packet_width() in (8, 16)
+    for name, here in results().items():
+        # The same rays hit the same faces; on a line between two, rounding may choose either.
+        torch.testing.assert_close(there[name], here, rtol=1e-3, atol=1e-3 * float(here.abs().max()), msg=name)
+        off = (there[name] - here).norm() / here.norm()
+        assert off < 1e-4, (name, off)
