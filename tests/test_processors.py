@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from edgegrad._kernel import core
 OPTIONS = ("max_isa=avx2", "max_isa=sse4.2")
 
 
+@cache
 def results() -> dict[str, Tensor]:
     """Images and gradients of some scenes, with samples that fill packets and that do not."""
     views = {
