@@ -28,7 +28,7 @@ def publish(out: Path, document: Document) -> None:
     rows = [row for row in document["cases"] if "parts" in row]
     if rows:
         with replacing(out / f"{NAME}.png") as temporary:
-            errors(rows).savefig(temporary)
+            errors(rows).savefig(temporary, bbox_inches="tight", pad_inches=0.15)
     if document["sections"].get("fits"):
         with replacing(out / f"{NAME}-fits.png") as temporary:
             losses(document["sections"]["fits"]).savefig(temporary)
