@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import re
 import warnings
 import zipfile
@@ -23,6 +24,10 @@ MOST_INSTANCES = 100_000  # of the parts of a 3MF: nested components multiply
 # What Pillow is let loose on. Not EPS, above all, for which it runs another program.
 TEXTURES = ("PNG", "JPEG", "MPO", "JPEG2000", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "DDS")
 MESHES = (".obj", ".gltf", ".glb", ".ply", ".stl", ".off", ".3mf")
+
+
+# What trimesh logs, tracebacks among it, becomes an error here; whoever sets up logging still gets it.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
 class Fault(Exception):

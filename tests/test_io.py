@@ -2,6 +2,7 @@
 
 import io
 import json
+import logging
 import os
 import struct
 import subprocess
@@ -370,6 +371,11 @@ def test_ply_texture(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"t\.ply: names 'skin\.png'"):
         load_mesh(tmp_path / "t.ply")
     assert load_mesh(tmp_path / "t.ply", materials=False).texture is None
+    (tmp_path / "skin.png").write_text("no image")
+    with pytest.raises(ValueError, match=r"t\.ply: expected an image in the texture 'skin\.png'"):
+        load_mesh(tmp_path / "t.ply")
+    # What trimesh logs about it, a traceback, does not reach the terminal unless logging is set up.
+    assert any(isinstance(handler, logging.NullHandler) for handler in logging.getLogger("trimesh").handlers)
     Image.fromarray(TEXELS).save(tmp_path / "skin.png")
     (tmp_path / "u.ply").write_bytes(ply(SQUARE, TRIANGLES, comment="comment TextureFile skin.png\n"))
     with pytest.raises(ValueError, match=r"u\.ply.*texture coordinates.*'skin\.png'"):
