@@ -7,8 +7,8 @@
 //
 //  - at the same depth (a box on a box), its faces and those of this curve are taken for the faces of one edge, of
 //    which each curve moves its share;
-//  - before or behind (the back edge of a box that is seen straight on), half the samples see what lies before on one
-//    side of the curve and what lies behind on the other, half the reverse.
+//  - before or behind (the back edge of a box that is seen straight on), the sample is the mean of two: one sees what
+//    lies before on one side of the curve and what lies behind on the other, one the reverse.
 //
 // Along the order of depth the jumps then add up to what is seen on one side minus what is seen on the other, so that a
 // motion that all share has its true derivative. One that parts them has another derivative for each direction.
@@ -45,8 +45,8 @@ class BoundaryChunk {
           adjoint_(RayBatch::size * C_),
           radiance_(C_) {}
 
-    // The point at the fraction s of the curve. `flip` differs between half of the points of a curve and the others.
-    void add(const Curve& curve, double s, double weight, bool flip) {
+    // The point at the fraction s of the curve.
+    void add(const Curve& curve, double s, double weight) {
         const int i = rays_.count;
         const Vec2 x = curve.position(s);
         if (!view_.adjoint.template at<N>(x, adjoint_.data() + i * C_)) return;
@@ -59,11 +59,16 @@ class BoundaryChunk {
         const Vec2 n = normalised(view_.camera, x);
         const double t = curve.parameter(s);
         Lane& lane = lane_[i];
-        lane = {
-            places_ - 1, x, n, t, (1 - t) * curve.a + t * curve.b, weight, flip, {{curve.minus, t}, {curve.plus, t}},
-            {},          1};
-        for (const Curve& other : place.others)
-            if (!add_other(other, curve, lane)) return;
+        lane = {.place = places_ - 1,
+                .x = x,
+                .n = n,
+                .t = t,
+                .point = (1 - t) * curve.a + t * curve.b,
+                .weight = weight,
+                .side = {{curve.minus, t}, {curve.plus, t}},
+                .views = place.others.empty() ? 1 : 2};
+        for (const Curve& other : place.others) add_other(other, curve, lane);
+        if (!lane.is_seen()) return;
         rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
         rejected_[i] =
             place.others.empty() ? view_.geometry.topology().faces(curve.edge) : std::span<const int32_t>(place.blind);
@@ -103,10 +108,13 @@ class BoundaryChunk {
         double t = 0;
         Vec3 point;
         double weight = 0;
-        bool flip = false;
-        Side side[2];  // minus, plus
-        Surface behind;
+        Side side[2];   // minus, plus
         int share = 1;  // curves that move together here
+        int views = 1;  // two where other curves lie before or behind, each of which covers one side of the point
+        bool hidden[2] = {};
+        Surface behind[2];
+
+        bool is_seen() const { return !hidden[0] || (views == 2 && !hidden[1]); }
     };
 
     void start(Place& place, const Curve& curve) {
@@ -137,8 +145,7 @@ class BoundaryChunk {
     }
 
     // Ã · L of what is seen on one side.
-    double adjoint_radiance(const Lane& lane, const Side& side, const double* adjoint) {
-        const Surface& behind = lane.behind;
+    double adjoint_radiance(const Lane& lane, const Side& side, const Surface& behind, const double* adjoint) {
         if (side.face.face < 0 && behind.face < 0) return view_.adjoint.template times_background<N>(lane.x);
         if (side.face.face >= 0) shade<N>(view_.scene, side.face.face, at_edge(side.face, side.t), radiance_.data());
         else shade<N>(view_.scene, behind.face, behind.b, radiance_.data());
@@ -150,9 +157,12 @@ class BoundaryChunk {
     void add_sample(const Place& place, Lane& lane, int32_t hit, const double* adjoint) {
         const Curve& curve = place.curve;
         if (hit >= 0 && !lies_behind(hit, curve, lane)) return;
-        const double jump =
-            adjoint_radiance(lane, lane.side[0], adjoint) - adjoint_radiance(lane, lane.side[1], adjoint);
-        const double scale = lane.weight * jump / lane.share;
+        double jump = 0;
+        for (int k = 0; k < lane.views; ++k)
+            if (!lane.hidden[k])
+                jump += adjoint_radiance(lane, lane.side[0], lane.behind[k], adjoint) -
+                        adjoint_radiance(lane, lane.side[1], lane.behind[k], adjoint);
+        const double scale = lane.weight * jump / (lane.views * lane.share);
         const Vec2 tangent = curve.tangent();
         Vec3 point_bar;
         project_vjp(view_.camera, lane.point, {scale * tangent.y, -scale * tangent.x}, point_bar, grad_.k);
@@ -166,13 +176,15 @@ class BoundaryChunk {
     bool lies_behind(int64_t face, const Curve& curve, Lane& lane) const {
         const auto corner = corners_of(view_, face);
         if (hides(face, corner.data(), lane.point, curve)) return false;
-        if (const double depth = depth_of(view_, face, lane.n); depth < lane.behind.depth)
-            lane.behind = {face, barycentrics_of_hit(face_map(view_.camera, corner.data()), lane.n), depth};
+        const double depth = depth_of(view_, face, lane.n);
+        for (int k = 0; k < lane.views; ++k)
+            if (depth < lane.behind[k].depth)
+                lane.behind[k] = {face, barycentrics_of_hit(face_map(view_.camera, corner.data()), lane.n), depth};
         return true;
     }
 
-    // What a curve that lies on this one does to a sample of it. False if it hides the point.
-    bool add_other(const Curve& other, const Curve& curve, Lane& lane) const {
+    // What a curve that lies on this one does to a sample of it.
+    void add_other(const Curve& other, const Curve& curve, Lane& lane) const {
         const Vec2 along = other.tangent(), from = lane.x - other.x0;
         const double squared = along.x * along.x + along.y * along.y,
                      s = (from.x * along.x + from.y * along.y) / squared;
@@ -182,10 +194,10 @@ class BoundaryChunk {
             for (const int32_t f : view_.geometry.topology().faces(other.edge))
                 if (std::find(own.begin(), own.end(), f) == own.end() && meets(view_, f, lane.n) &&
                     !lies_behind(f, curve, lane))
-                    return false;
-            return true;
+                    lane.hidden[0] = lane.hidden[1] = true;
+            return;
         }
-        if (s < 0 || s > 1) return true;
+        if (s < 0 || s > 1) return;
         const double t = other.parameter(s), depth = (1 - t) * other.a.z + t * other.b.z;
         const bool opposite = along.x * curve.tangent().x + along.y * curve.tangent().y < 0;
         const HalfEdge* half[2] = {opposite ? &other.plus : &other.minus, opposite ? &other.minus : &other.plus};
@@ -196,12 +208,12 @@ class BoundaryChunk {
                     half[k]->face >= 0 &&
                     (side.face.face < 0 || !in_front(view_, side.face, *half[k], curve.a, curve.b)))
                     side = {*half[k], t};
-            return true;
+            return;
         }
-        if (depth < lane.point.z) return half[lane.flip]->face < 0;
-        const HalfEdge& covers = *half[!lane.flip];
-        if (covers.face >= 0 && depth < lane.behind.depth) lane.behind = {covers.face, at_edge(covers, t), depth};
-        return true;
+        for (int k = 0; k < 2; ++k)
+            if (depth < lane.point.z) lane.hidden[k] |= half[k]->face >= 0;
+            else if (const HalfEdge& covers = *half[!k]; covers.face >= 0 && depth < lane.behind[k].depth)
+                lane.behind[k] = {covers.face, at_edge(covers, t), depth};
     }
 
     // Whether a face that the ray meets lies before the point: its plane has the point on one side and the viewer on
@@ -339,7 +351,7 @@ void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile&
             edge = systematic.primitive(position, edge);
             if (curve.edge != edge) finder.find(edge, curve);
             const double s = (position - systematic.begin_of(edge)) / systematic.measure_of(edge);
-            chunk.add(curve, std::clamp(s, 0.0, 1.0), systematic.weight(edge), i % 2);
+            chunk.add(curve, std::clamp(s, 0.0, 1.0), systematic.weight(edge));
         }
         chunk.finish();
     });

@@ -12,6 +12,7 @@ from scenes import cube, front_camera, icosphere
 from torch import Tensor
 
 import edgegrad as eg
+from edgegrad.report.exact import exact_image
 
 F64 = torch.float64
 BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)
@@ -172,3 +173,34 @@ def test_curves_of_which_no_sample_is_seen(flat: bool) -> None:
         "orthographic",
         edge_samples=40_000,
     )
+
+
+@pytest.mark.parametrize("edge_samples", [50, None])
+def test_few_samples_are_unbiased(edge_samples: int | None) -> None:
+    """Three sheets whose rims fall on the same lines. What a sample sees on either side once went by its place on the
+    curve, which seeds do not change: 2 to 6 % off at default samples, and nothing like the gradient at few."""
+    corners = torch.tensor([[-0.7, -0.6], [0.5, -0.6], [0.5, 0.7], [-0.7, 0.7]], dtype=F64)
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    adjoint = torch.randn((12, 12, 3), generator=torch.Generator().manual_seed(4), dtype=F64)
+    camera = eg.Camera.orthographic((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.3, (12, 12)).to(F64)
+
+    def scene(shift: Tensor) -> eg.Scene:
+        sheets = []
+        for k, color in enumerate(([0.2, 0.9, 0.4], [0.9, 0.1, 0.6], [0.5, 0.5, 0.0])):
+            verts = torch.nn.functional.pad(corners + shift, (0, 1), value=0.4 * k - 0.4)
+            sheets.append(eg.Mesh(verts, faces, face_colors=torch.tensor([color, color], dtype=F64)))
+        return eg.Scene(sheets, BACKGROUND)
+
+    def gradient(image: Callable[[Tensor], Tensor]) -> Tensor:
+        shift = torch.zeros(2, dtype=F64, requires_grad=True)
+        (image(shift) * adjoint).sum().backward()
+        assert shift.grad is not None
+        return shift.grad
+
+    exact = gradient(lambda shift: exact_image(scene(shift), camera))
+    found = []
+    for seed in range(100):
+        options = {"seed": seed, "edge_samples": edge_samples}
+        found.append(gradient(lambda shift, options=options: eg.render(scene(shift), camera, spp=1, **options)))
+    mean, error = torch.stack(found).mean(0), torch.stack(found).std(0) / len(found) ** 0.5
+    assert float(((mean - exact) / error).abs().max()) < 4.0, (mean, error, exact)

@@ -48,7 +48,9 @@ def measure(quick: bool = False, say: Say = lambda text: None) -> dict[str, Any]
 
 def scenes() -> dict[str, Callable[[], Problem]]:
     camera = front_camera(48)
-    chosen = ("soup", "fan-5", "inside", "camera-plane", "pixels", "orthographic")
+    chosen = (
+        "soup", "fan-5", "inside", "camera-plane", "pixels", "orthographic", "ortho-box-faces", "ortho-two-boxes", "stacked",
+    )  # fmt: skip
     return {
         "one triangle": lambda: everything(one_triangle(), camera),
         "occluded triangle": lambda: everything(occluded_triangle(), camera),
