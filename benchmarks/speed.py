@@ -159,20 +159,17 @@ def forward(bench: Bench) -> list[Row]:
         with torch.no_grad():
             eg.render(mesh, camera)
 
-    bare, inside, whole = bench.interleaved(
-        21,
-        lambda: kernel.scene.bare_loop(kernel.camera, 16, "box", 0, threads),
-        kernel.forward,
-        lambda: seconds_of(call),
-    )
+    widths = sorted({8, core.packet_width()})
+    loops = [lambda n=n: kernel.scene.bare_loop(kernel.camera, 16, "box", 0, n, threads) for n in widths]
+    *bare, inside, whole = bench.interleaved(21, *loops, kernel.forward, lambda: seconds_of(call))
     target: dict[str, Any] = {"must": 0.8, "aim": 0.95, "more_is_better": True}
-    note = f"{512 * 512 * 16 / statistics.median(bare) / 1e6:.1f} M rays/s in the bare loop, {milliseconds(bare)}"
-    return [
-        ratio_row("forward: rays/s over the bare packet loop, kernel", bare, inside, note=note, **target),
-        ratio_row(
-            "forward: rays/s over the bare packet loop, eg.render", bare, whole, note=milliseconds(whole), **target
-        ),
-    ]
+    rows = []
+    for width, loop in zip(widths, bare, strict=True):
+        what = f"forward: rays/s over the bare loop, packets of {width}"
+        note = f"{512 * 512 * 16 / statistics.median(loop) / 1e6:.1f} M rays/s in the bare loop, {milliseconds(loop)}"
+        rows.append(ratio_row(f"{what}, kernel", loop, inside, note=note, **target))
+        rows.append(ratio_row(f"{what}, eg.render", loop, whole, note=milliseconds(whole), **target))
+    return rows
 
 
 def backward(bench: Bench) -> list[Row]:

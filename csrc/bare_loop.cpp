@@ -9,7 +9,7 @@
 
 namespace edgegrad {
 
-double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOptions& o, Team& team) {
+double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOptions& o, int packet_width, Team& team) {
     constexpr int tile = 16;
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + tile - 1) / tile;
     const RayFrame frame(caster, camera);
@@ -23,7 +23,8 @@ double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOpt
             for (int y = y0; y < std::min(y0 + tile, camera.height); ++y)
                 for (int x = x0; x < std::min(x0 + tile, camera.width); ++x) {
                     for (int done = 0; done < o.spp;) {
-                        if (batches.empty() || batches.back().count == RayBatch::size) batches.emplace_back(frame);
+                        if (batches.empty() || batches.back().count == RayBatch::size)
+                            batches.emplace_back(frame, packet_width);
                         RayBatch& rays = batches.back();
                         const int n = std::min(o.spp - done, RayBatch::size - rays.count);
                         pixel_rays.append(x, y, done, n, rays);

@@ -315,14 +315,14 @@ void bind_scene(nb::module_& m, const char* name) {
         .def(
             "bare_loop",
             [](const Scene& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed,
-               int threads) {
+               int packet_width, int threads) {
                 const ForwardOptions options{spp, make_filter(filter), seed};
                 return unlocked(threads, [&](Team& team) {
                     GeometryWork work;
-                    return bare_loop(camera, scene.geometry(false, team, work)->caster(), options, team);
+                    return bare_loop(camera, scene.geometry(false, team, work)->caster(), options, packet_width, team);
                 });
             },
-            "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a)
+            "camera"_a, "spp"_a, "filter"_a, "seed"_a, "packet_width"_a, "threads"_a)
         .def(
             "pixel_backward",
             [](const Scene& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed, int threads,

@@ -209,8 +209,8 @@ RayPacket<W>::RayPacket() {
     std::iota(id, id + W, 0u);
 }
 
-RayBatch::RayBatch(const RayFrame& frame) : frame_(frame) {
-    if (rtc.packet_width == 16) packets_.emplace<Packets<16>>();
+RayBatch::RayBatch(const RayFrame& frame, int width) : frame_(frame) {
+    if (width == 16) packets_.emplace<Packets<16>>();
     std::visit(
         [&](auto& packets) {
             for (auto& p : packets) {

@@ -68,7 +68,7 @@ class RayCaster {
 
    private:
     friend class RayFrame;
-    friend double bare_loop(const Camera&, const RayCaster&, const struct ForwardOptions&, Team&);
+    friend double bare_loop(const Camera&, const RayCaster&, const struct ForwardOptions&, int, Team&);
     void intersect(RayBatch& batch, const std::span<const int32_t>* rejected = nullptr) const;
     Vec3 detail_centre(const double* verts, Team& team) const;
 
@@ -104,7 +104,7 @@ class RayFrame {
 class RayBatch {
    public:
     static constexpr int size = 64;
-    explicit RayBatch(const RayFrame& frame);
+    explicit RayBatch(const RayFrame& frame, int width = packet_width());
 
     // Normalised image coordinates; the caller fills them from `count` on.
     double n_x[size] = {}, n_y[size] = {};
@@ -129,7 +129,7 @@ class RayBatch {
     void read_faces();
 
     const RayFrame& frame_;
-    std::variant<Packets<8>, Packets<16>> packets_;  // as wide as packet_width()
+    std::variant<Packets<8>, Packets<16>> packets_;
 };
 
 template <class Meets>

@@ -61,7 +61,8 @@ void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCa
                     const ForwardOptions& options, Team& team, const ForwardOutput<T>& out);
 
 // Seconds that the rays of the forward pass take when they are cast and nothing else is done; for the benchmarks.
-double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOptions& options, Team& team);
+double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOptions& options, int packet_width,
+                 Team& team);
 
 struct BackwardOptions {
     int64_t surface_samples;  // in all; −1: the default (interior.cpp)
