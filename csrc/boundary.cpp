@@ -67,8 +67,10 @@ class BoundaryChunk {
                 .weight = weight,
                 .side = {{curve.minus, t}, {curve.plus, t}},
                 .views = place.others.empty() ? 1 : 2};
-        for (const Curve& other : place.others) add_other(other, curve, lane);
-        if (!lane.is_seen()) return;
+        for (const Curve& other : place.others) {
+            add_other(other, curve, lane);
+            if (!lane.is_seen()) return;
+        }
         rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
         rejected_[i] =
             place.others.empty() ? view_.geometry.topology().faces(curve.edge) : std::span<const int32_t>(place.blind);
