@@ -131,6 +131,7 @@ def spoil_float(draw: st.DrawFn, case: Case) -> None:
         or tensor.is_meta
         or not tensor.is_floating_point()
         or tensor.numel() == 0
+        or tensor.ndim == 0
     ):
         return  # spoilt already
     number = st.sampled_from([NAN, INF, -INF] + [1e39, -1e100, 1e300] * (tensor.dtype == F64))
