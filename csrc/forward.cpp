@@ -37,7 +37,8 @@ inline unsigned on_face(const int32_t* hit, int32_t face) {
     return bits;
 }
 
-// The sum of the barycentrics of all lanes that hit the face; false if one of them lies outside of it.
+// The sum of the barycentrics of all lanes that hit the face; false if one of them lies outside of it. All lanes are
+// worked on, without branches, so that they fill vectors; and summed in one order, however wide these are.
 EDGEGRAD_VECTORIZED bool add_barycentrics(const FaceMap& map, const double* x, const double* y, const int32_t* hit,
                                           int32_t face, Barycentrics& sum) {
     const Vec3 a = map.column[0], b = map.column[1], c = map.column[2];

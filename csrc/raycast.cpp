@@ -222,6 +222,7 @@ RayBatch::RayBatch(const RayFrame& frame, int width) : frame_(frame) {
         packets_);
 }
 
+// Always inlined, so that they are compiled for each of the processors that prepare() and read_faces() below are for.
 template <int W>
 [[gnu::always_inline]] inline void RayBatch::prepare(Packets<W>& packets) const {
     const Vec3 X = frame_.axis_x_, Y = frame_.axis_y_, Z = frame_.axis_z_;

@@ -53,7 +53,5 @@ def test_narrow_packets(options: str, tmp_path: Path) -> None:
     there = torch.load(file, weights_only=True)
     assert core.packet_width() in (8, 16)
     for name, here in results().items():
-        # The same rays hit the same faces; on a line between two, rounding may choose either.
-        torch.testing.assert_close(there[name], here, rtol=1e-3, atol=1e-3 * float(here.abs().max()), msg=name)
-        off = (there[name] - here).norm() / here.norm()
-        assert off < 1e-4, (name, off)
+        # The same rays hit the same faces, and all else is done in double by the same code.
+        torch.testing.assert_close(there[name], here, rtol=1e-12, atol=1e-12 * float(here.abs().max()), msg=name)
