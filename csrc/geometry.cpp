@@ -86,7 +86,8 @@ void before_fork() {
     mutex.lock();
     embree_mutex.lock();
     // GNU's runtime starts new threads at the next parallel loop; others see to it themselves at fork(). Embree's
-    // threads need no care: nobody waits for them, for the one that builds can do all of the work.
+    // threads are not missed in the child, where the one that builds can do all of the work.
+    let_embree_sleep();
 #if defined(__GNUC__) && !defined(__clang__)
     omp_pause_resource_all(omp_pause_hard);
 #endif

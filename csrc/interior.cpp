@@ -34,6 +34,10 @@ constexpr double colored = 0.5, textured = 4;
 // integral is estimated in exactly one way, chosen before any sample is drawn, so the sum stays unbiased.
 constexpr double large = 256;
 
+// A face with a control is sampled the less the better that is likely to be: the adjoint changes little, and the face
+// is not wide, px. From `widest` on its corners say little.
+constexpr double least = 1.0 / 16, wide = 32, widest = 64;
+
 struct VisiblePolygon;
 
 // The pixels that large triangles may touch, by tiles.
@@ -137,37 +141,44 @@ class PolygonSampler {
             // Two to four cells a point, so that each has one of its own.
             const double cells = std::clamp(2 * n_ * share_, 1.0, double(1u << SierpinskiCurve::most_levels));
             levels_ = std::bit_width(uint32_t(std::ceil(cells)) - 1);
-            curve_.set(corner[triangle_ - 1], corner[0], corner[triangle_], levels_);
+            curve_.set({1, 0}, {0, 0}, {0, 1}, levels_);
         }
         const double t = share_ > 0 ? std::clamp((s - begin_) / share_, 0.0, 1 - 0x1p-53) : 0;
-        return curve_.point(uint32_t(t * (1u << levels_)), u);
+        const Vec2 p = curve_.point(uint32_t(t * (1u << levels_)), u);
+        lambda_ = {p.x, p.y};
+        return corner[0] + p.x * (corner[triangle_ - 1] - corner[0]) + p.y * (corner[triangle_] - corner[0]);
     }
+
+    // Where the last point lies in its triangle.
+    Barycentrics lambda() const { return lambda_; }
 
    private:
     const VisiblePolygon* polygon_ = nullptr;
     double n_ = 0, begin_ = 0, end_ = 0, share_ = 0;
     int triangle_ = 0, levels_ = 0;
     SierpinskiCurve curve_;
+    Barycentrics lambda_;
 };
 
 // The samples of one chunk.
 template <int N, class T>
 class InteriorChunk {
    public:
-    InteriorChunk(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
+    InteriorChunk(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad, const T* adjoint)
         : view_(view),
-          grad_(view, geometry, to, grad),
+          grad_(view, geometry, to, grad, adjoint),
           C_(N ? N : view.scene.channels),
           rays_(view.frame),
           weighted_(RayBatch::size * C_) {}
 
-    void add(int64_t face, Vec2 x, double weight) {
+    // A sample at x, with barycentrics λ in the image, that stands for a share of the face's area.
+    void add(int64_t face, Vec2 x, Barycentrics lambda, double share, double area, bool controlled) {
         const int i = rays_.count;
         double* weighted = weighted_.data() + i * C_;
-        if (!view_.adjoint.template at<N>(x, weighted)) return;
-        for (int c = 0; c < C_; ++c) weighted[c] *= weight;
+        if (!view_.adjoint.template at<N>(x, weighted) && !controlled) return;
+        for (int c = 0; c < C_; ++c) weighted[c] *= share * area;
         const Vec2 n = normalised(view_.camera, x);
-        face_[i] = int32_t(face), rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
+        sample_[i] = {int32_t(face), controlled, lambda, share}, rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
         if (++rays_.count == RayBatch::size) cast();
     }
 
@@ -181,9 +192,12 @@ class InteriorChunk {
         rays_.prepare();
         view_.geometry.caster().cast(rays_);
         for (int i = 0; i < rays_.count; ++i) {
-            if (!sees(i)) continue;
-            if (grad_.face() != face_[i]) grad_.flush(), grad_.start(face_[i]);
-            grad_.add(rays_.n(i), weighted_.data() + i * C_);
+            const Sample& s = sample_[i];
+            const bool seen = sees(i);
+            if (!seen && !s.controlled) continue;
+            if (grad_.face() != s.face) grad_.flush(), grad_.start(s.face, s.controlled);
+            if (seen) grad_.add(rays_.n(i), weighted_.data() + i * C_);
+            if (s.controlled) grad_.control().subtract(s.lambda, s.share);
         }
         rays_.count = 0;
     }
@@ -191,20 +205,27 @@ class InteriorChunk {
     // Whether nothing lies before the sample. Its ray may miss its own face, when that is thinner than floats are
     // apart; then what counts is whether what it met instead lies behind, by more than floats can tell.
     bool sees(int i) const {
-        if (rays_.face[i] == face_[i]) return true;
+        const int32_t own = sample_[i].face;
+        if (rays_.face[i] == own) return true;
         const Vec2 n = rays_.n(i);
-        const auto decide = [&](int32_t face) { return face == face_[i] || meets(view_, face, n); };
+        const auto decide = [&](int32_t face) { return face == own || meets(view_, face, n); };
         const int32_t met = view_.geometry.caster().beyond_float(view_.frame, n, rays_.face[i], {}, decide);
-        if (met < 0 || met == face_[i]) return true;
-        const double* p = view_.scene.verts + 3 * int64_t(view_.scene.faces[3 * int64_t(face_[i])]);
-        return depth_of(view_, met, n) > depth_of(view_, face_[i], n) + view_.frame.error({p[0], p[1], p[2]});
+        if (met < 0 || met == own) return true;
+        const double* p = view_.scene.verts + 3 * int64_t(view_.scene.faces[3 * int64_t(own)]);
+        return depth_of(view_, met, n) > depth_of(view_, own, n) + view_.frame.error({p[0], p[1], p[2]});
     }
 
+    struct Sample {
+        int32_t face;
+        bool controlled;
+        Barycentrics lambda;
+        double share;
+    };
     const BackwardView<T>& view_;
     FaceGrad<N, T> grad_;
     const int C_;
     RayBatch rays_;
-    int32_t face_[RayBatch::size];
+    Sample sample_[RayBatch::size];
     std::vector<double> weighted_;
 };
 
@@ -221,23 +242,71 @@ void prefetch(const BackwardView<T>& view, int64_t face) {
 #endif
 }
 
-// Vertices near which the forward pass saw a face: those of faces that it hit, and of their neighbours, for a face
-// smaller than the distance of the image's samples is hit by chance.
+// Vertices near which the forward pass hit a face. A face smaller than the distance of the image's samples is hit by
+// chance, so it is asked together with its neighbours.
+struct Sight {
+    std::vector<uint8_t> hit;   // those of faces that were hit
+    std::vector<uint8_t> near;  // those of faces with such a vertex
+
+    template <class T>
+    explicit Sight(const BackwardView<T>& view) : hit(view.scene.n_verts, 0) {
+        const auto mark = [&](std::vector<uint8_t>& marked, auto test) {
+            view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+                for (int64_t f = first; f < last; ++f)
+                    if (const int32_t* v = view.scene.faces + 3 * f; test(f, v))
+                        for (int i = 0; i < 3; ++i)
+                            std::atomic_ref(marked[v[i]]).store(1, std::memory_order_relaxed);
+            });
+        };
+        mark(hit, [&](int64_t f, const int32_t*) { return view.seen[f]; });
+        near = hit;
+        mark(near, [&](int64_t, const int32_t* v) { return hit[v[0]] | hit[v[1]] | hit[v[2]]; });
+    }
+
+    // Whether a part of the face may have been seen, and whether all of it may.
+    bool partly(const int32_t* v) const { return near[v[0]] | near[v[1]] | near[v[2]]; }
+    bool whole(const int32_t* v) const { return hit[v[0]] & hit[v[1]] & hit[v[2]]; }
+};
+
+// Whether a face may have a control: one without texture, all of it inside the view, and so small that its corners say
+// what is between them. A face that comes near the eye is not affine in the image.
 template <class T>
-std::vector<uint8_t> vertices_near_seen(const BackwardView<T>& view) {
-    const SceneView<T>& scene = view.scene;
-    std::vector<uint8_t> near(scene.n_verts, 0);
-    const auto mark = [&](auto test) {
-        view.team.each_block(scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
-            for (int64_t f = first; f < last; ++f)
-                if (const int32_t* v = scene.faces + 3 * f; test(f, v))
-                    for (int i = 0; i < 3; ++i) std::atomic_ref(near[v[i]]).store(1, std::memory_order_relaxed);
-        });
-    };
-    mark([&](int64_t f, const int32_t*) { return view.seen[f]; });
-    const std::vector<uint8_t> hit = near;
-    mark([&](int64_t, const int32_t* v) { return hit[v[0]] | hit[v[1]] | hit[v[2]]; });
-    return near;
+bool may_be_controlled(const BackwardView<T>& view, int64_t face, const VisiblePolygon& polygon, const Sight& sight) {
+    const int32_t* v = view.scene.faces + 3 * face;
+    const VertexView& p = view.vertices;
+    if (!sight.whole(v) || polygon.longest > widest || is_textured(view.scene, face)) return false;
+    if (p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) return false;
+    const auto [near, far] = std::minmax({p.q[v[0]].z, p.q[v[1]].z, p.q[v[2]].z});
+    return !view.camera.perspective || far < 2 * near;
+}
+
+// How much the adjoint changes over a face, from one corner to the others, relative to its size.
+template <class T>
+double variation(const T* adjoint, const int32_t* v, int channels) {
+    const T *a = adjoint + int64_t(v[0]) * channels, *b = adjoint + int64_t(v[1]) * channels,
+            *c = adjoint + int64_t(v[2]) * channels;
+    double size = 0, change = 0;
+    for (int k = 0; k < channels; ++k) {
+        size += std::fabs(double(a[k])) + std::fabs(double(b[k])) + std::fabs(double(c[k]));
+        change += std::fabs(double(b[k]) - a[k]) + std::fabs(double(c[k]) - a[k]);
+    }
+    return size > 0 ? change / size : 1;
+}
+
+// Ã at the vertices that may be those of a face with a control, (V, C).
+template <int N, class T>
+std::vector<T> adjoint_at_vertices(const BackwardView<T>& view, const Sight& sight) {
+    const int C = N ? N : view.scene.channels;
+    std::vector<T> adjoint(view.scene.n_verts * C);
+    view.team.each_block(view.scene.n_verts, [&](int64_t, int64_t first, int64_t last) {
+        std::vector<double> A(C);
+        for (int64_t v = first; v < last; ++v) {
+            if (!sight.hit[v] || view.vertices.outcode[v]) continue;
+            view.adjoint.template at<N>(view.vertices.x[v], A.data());
+            for (int c = 0; c < C; ++c) adjoint[v * C + c] = T(A[c]);
+        }
+    });
+    return adjoint;
 }
 
 }  // namespace
@@ -245,37 +314,47 @@ std::vector<uint8_t> vertices_near_seen(const BackwardView<T>& view) {
 template <int N, class T>
 void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, BackwardProfile& profile) {
     const int64_t F = view.scene.n_faces;
+    const int C = N ? N : view.scene.channels;
     const BackwardOptions& o = view.options;
     Stopwatch watch;
-    const std::vector<uint8_t> near_seen = vertices_near_seen(view);
+    const Sight sight(view);
+    const std::vector<T> adjoint = adjoint_at_vertices<N>(view, sight);
     std::vector<double> measure(F);
-    const int64_t blocks = Team::blocks(F);
-    std::vector<double> size(blocks, 0.0), size_of_large(blocks, 0.0);
+    const int64_t chunks = (F + scatter_chunk - 1) / scatter_chunk;
+    std::vector<double> size(chunks, 0.0), size_of_large(chunks, 0.0);
     const bool any_texture = view.scene.face_texture;
-    std::vector<uint8_t> is_large(any_texture ? F : 0, 0);
+    std::vector<uint8_t> is_large(any_texture ? F : 0, 0), is_controlled(F, 0);
     PixelMask mask(view.camera, o.filter.radius() - 0.5);
-    view.team.each_block(F, [&](int64_t k, int64_t first, int64_t last) {
+    double seconds[2] = {};
+    scatter_samples(F, view.team, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+        const int64_t k = first / scatter_chunk;
+        FaceGrad<N, T> whole(view, geometry, to, grad, adjoint.data());
         VisiblePolygon polygon;
         for (int64_t f = first; f < last; ++f) {
             if (!polygon.set(view, f)) continue;
             const double importance = view.importance.mean(polygon.low, polygon.high);
             if (!(importance > 0)) continue;
             const int32_t* v = view.scene.faces + 3 * f;
-            const bool expected = near_seen[v[0]] | near_seen[v[1]] | near_seen[v[2]];
-            const double m = (polygon.area + polygon.longest) * (expected ? 1 : hidden) *
-                             (is_textured(view.scene, f) ? textured : colored);
+            double m = (polygon.area + polygon.longest) * (sight.partly(v) ? 1 : hidden) *
+                       (is_textured(view.scene, f) ? textured : colored);
+            if (!std::isfinite(m)) continue;  // coordinates beyond 1e150 cannot be sampled
             if (is_textured(view.scene, f) && polygon.area >= large) {
                 is_large[f] = 1;
                 mask.mark(polygon);
-                if (std::isfinite(m)) size_of_large[k] += m;
+                size_of_large[k] += m;
                 continue;
             }
+            if (!o.dry && may_be_controlled(view, f, polygon, sight)) {
+                is_controlled[f] = 1;
+                whole.start(int32_t(f), true), whole.control().add_integral(), whole.flush();
+                m *= std::clamp(std::max(2 * variation(adjoint.data(), v, C), polygon.longest / wide), least, 1.0);
+            }
             measure[f] = m * importance;
-            if (std::isfinite(m)) size[k] += m;
+            size[k] += m;
         }
     });
     double total = 0, total_of_large = 0;
-    for (int64_t k = 0; k < blocks; ++k) total += size[k], total_of_large += size_of_large[k];
+    for (int64_t k = 0; k < chunks; ++k) total += size[k], total_of_large += size_of_large[k];
     // How often each is sampled: as the defaults, or in proportion to them.
     const double wanted = o.surface_samples >= 0 ? double(o.surface_samples) / (total + total_of_large) : 1;
     Systematic systematic(measure, view.team);
@@ -297,11 +376,11 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
     systematic.draw(n, to_unit(hash(o.seed, 1, gradient_stream)));
     const ShiftedSequence sequence(hash(o.seed, 2, gradient_stream));
     scatter_samples(n, view.team, to, profile.surface, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        InteriorChunk<N, T> chunk(view, geometry, to, grad);
+        InteriorChunk<N, T> chunk(view, geometry, to, grad, adjoint.data());
         VisiblePolygon polygon;
         PolygonSampler sampler;
         int64_t face = -1;
-        double weight = 0;
+        double share = 0;
         for (int64_t i = first; i < last; ++i) {
             const double position = systematic.position(i);
             const int64_t f = face < 0 ? systematic.primitive(position) : systematic.primitive(position, face);
@@ -309,11 +388,12 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
                 face = f;
                 polygon.set(view, f);
                 prefetch(view, f);
-                weight = polygon.area * systematic.weight(f);
-                sampler.set(polygon, 1 / systematic.weight(f));
+                share = systematic.weight(f);
+                sampler.set(polygon, 1 / share);
             }
             const double s = (position - systematic.begin_of(face)) / systematic.measure_of(face);
-            chunk.add(face, sampler(s, sequence(i)), weight);
+            const Vec2 x = sampler(s, sequence(i));
+            chunk.add(face, x, sampler.lambda(), share, polygon.area, is_controlled[face]);
         }
         chunk.finish();
     });

@@ -3,6 +3,7 @@
 
 #include <array>
 
+#include "control.h"
 #include "importance.h"
 #include "render.h"
 #include "scatter.h"
@@ -49,33 +50,40 @@ double depth_of(const BackwardView<T>& view, int64_t face, Vec2 n) {
     return b[0] * corner[0].z + b[1] * corner[1].z + b[2] * corner[2].z;
 }
 
-// What a run of samples on one face finds. What they have in common is done once for the run: the face's map and its
-// derivative, and one row a corner for the scatter.
+// What a run of samples on one face finds, and what is said of the face without samples. What they have in common is
+// done once for the run: the face's map and its derivative, and one row a corner for the scatter.
 template <int N, class T>
 class FaceGrad {
    public:
-    FaceGrad(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
+    // `adjoint`: Ã at the vertices, for the control.
+    FaceGrad(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad,
+             const T* adjoint = nullptr)
         : view_(view),
           geometry_(geometry),
           want_rows_(to.colors || to.uvs),
           want_texels_(to.texels),
           want_k_(to.want_k),
           grad_(grad),
-          C_(N ? N : view.scene.channels) {}
+          C_(N ? N : view.scene.channels),
+          control_(view.scene, view.camera, view.vertices, adjoint) {}
 
     int32_t face() const { return face_; }  // −1: none
 
-    void start(int32_t face) {
-        face_ = face;
+    void start(int32_t face, bool controlled = false) {
+        face_ = face, controlled_ = controlled, seen_ = false;
         textured_ = is_textured(view_.scene, face);
-        const int32_t* v = view_.scene.faces + 3 * int64_t(face);
-        for (int i = 0; i < 3; ++i) corner_[i] = view_.vertices.q[v[i]];
-        map_ = face_map(view_.camera, corner_), map_bar_ = {};
         rows_.reset(textured_ ? 2 : C_);
+        if (controlled) control_.start(face);
     }
 
     // A sample seen at n, with the cotangent of its radiance.
     void add(Vec2 n, const double* radiance_bar) {
+        if (!seen_) {
+            const int32_t* v = view_.scene.faces + 3 * int64_t(face_);
+            for (int i = 0; i < 3; ++i) corner_[i] = view_.vertices.q[v[i]];
+            map_ = face_map(view_.camera, corner_), map_bar_ = {};
+            seen_ = true;
+        }
         Barycentrics b;
         if (!barycentrics(map_, n, b)) return;
         const Barycentrics b_bar = shade_vjp<N>(view_.scene, face_, b, radiance_bar, want_texels_, rows_, grad_);
@@ -85,17 +93,22 @@ class FaceGrad {
         if (want_k_) normalised_vjp(view_.camera, n, n_bar, grad_.k);
     }
 
+    Control<N, T>& control() { return control_; }
+
     void flush() {
         if (face_ < 0) return;
         const int32_t *v = view_.scene.faces + 3 * int64_t(face_), *row = view_.scene.corners + 3 * int64_t(face_);
         if (geometry_) {
             Vec3 corner_bar[3];
-            face_map_vjp(view_.camera, corner_, map_bar_, corner_bar);
+            if (seen_) face_map_vjp(view_.camera, corner_, map_bar_, corner_bar);
+            if (controlled_) control_.add_to_corners(corner_bar, grad_.k);
             for (int i = 0; i < 3; ++i) grad_.q.add(v[i], &corner_bar[i].x);
         }
-        if (want_rows_)
+        if (want_rows_) {
+            if (controlled_) control_.add_to_colors(rows_.value.data());
             for (int i = 0; i < 3; ++i)
                 (textured_ ? grad_.uvs : grad_.colors).add(row[i], rows_.value.data() + i * (textured_ ? 2 : C_));
+        }
         face_ = -1;
     }
 
@@ -106,10 +119,11 @@ class FaceGrad {
     const int C_;
 
     int32_t face_ = -1;
-    bool textured_ = false;
+    bool textured_ = false, controlled_ = false, seen_ = false;
     Vec3 corner_[3];
     FaceMap map_, map_bar_;
     CornerGrad rows_;
+    Control<N, T> control_;
 };
 
 // Adds to `to`; `geometry` says whether points and camera are wanted too.

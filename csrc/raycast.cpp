@@ -8,11 +8,13 @@
 #endif
 
 #include <algorithm>
+#include <chrono>
 #include <cmath>
 #include <limits>
 #include <new>
 #include <numeric>
 #include <stdexcept>
+#include <thread>
 
 #include "embree_api.h"
 
@@ -87,6 +89,17 @@ void open_device(const std::string& path, const std::string& options) {
 }  // namespace
 
 std::mutex embree_mutex;
+
+namespace {
+
+std::chrono::steady_clock::time_point last_build;  // guarded by embree_mutex
+
+}  // namespace
+
+// A build is over when its work is done, not when the threads that helped have gone: on their way they take locks of
+// TBB, and a child that is forked just then would wait for these for ever. Nothing tells when they sleep; they look for
+// more work for much less than a millisecond, so what counts is how long a busy machine may keep one from running.
+void let_embree_sleep() { std::this_thread::sleep_until(last_build + std::chrono::milliseconds(20)); }
 
 void open_embree(const std::string& path, const std::string& options) {
     {
@@ -181,6 +194,7 @@ void RayCaster::update(const double* verts, Team& team) {
     if (committed_) rtc.rtcUpdateGeometryBuffer(static_cast<Geometry>(geometry_), BUFFER_TYPE_VERTEX, 0);
     rtc.rtcCommitGeometry(static_cast<Geometry>(geometry_));
     rtc.rtcCommitScene(static_cast<Scene>(scene_));
+    last_build = std::chrono::steady_clock::now();
     throw_on_error("building the ray structure");
     committed_ = true;
 }

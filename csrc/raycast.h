@@ -21,6 +21,9 @@ void open_embree(const std::string& path, const std::string& options = "");
 // Held by whoever makes, builds or frees a ray structure, so that fork() can wait until nobody does: see before_fork().
 extern std::mutex embree_mutex;
 
+// Waits, with embree_mutex held, until Embree's threads sleep after the last build.
+void let_embree_sleep();
+
 // Version of the opened library, as 40400 for 4.4.0.
 int embree_version();
 

@@ -63,11 +63,14 @@ struct Destination {
     int channels = 1;
 };
 
+// Samples in a chunk.
+constexpr int64_t scatter_chunk = 512;
+
 // Calls body(first, last, ChunkGrad&) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
 // samples and of the adding.
 template <class Body>
 void scatter_samples(int64_t n, Team& team, Destination& to, double (&seconds)[2], Body body) {
-    const int64_t chunk = 512, wave = 16 * team.threads();
+    const int64_t chunk = scatter_chunk, wave = 16 * team.threads();
     const int owners = std::min(team.threads(), 16);  // more would only split the buffers further
     std::vector<ChunkGrad> grads(std::min(wave, (n + chunk - 1) / chunk));
     for (ChunkGrad& g : grads) {

@@ -1,0 +1,101 @@
+// A control variate for the interior term: what a small face that is seen whole would give if everything on it were
+// affine in the image.
+//
+// Let λ_i be the barycentrics of a point within the image of the face, x_i and c_i the places and the colours of its
+// corners, and A_i the filtered adjoint there. If radiance and adjoint were L(x) = Σ λ_i c_i and Ã(x) = Σ λ_i A_i, then
+// with
+//
+//     T_i = ∫ λ_i Ã dx = area / 12 · (A_i + Σ_j A_j)        (C numbers)
+//
+// the interior term of the face would be T_i for the colour c_i, and −∇L · T_i for the place x_i, with ∇L constant.
+// λ_i(x) Ã(x) at a sample, in place of the integral, says what the control is at that sample. The integral plus the sum
+// over samples of (what is seen − the control) has the same mean as the sum over samples of what is seen, whatever the
+// control is worth; and where it is good, which is where a face is small and nothing hides it, what is left to chance
+// is a small part of the whole, and few samples do.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "camera.h"
+#include "scene.h"
+#include "surface.h"
+
+namespace edgegrad {
+
+template <int N, class T>
+class Control {
+   public:
+    // `adjoint`: Ã at the vertices, (V, C).
+    Control(const SceneView<T>& scene, const Camera& camera, const VertexView& vertices, const T* adjoint)
+        : scene_(scene),
+          camera_(camera),
+          vertices_(vertices),
+          adjoint_(adjoint),
+          C_(N ? N : scene.channels),
+          A_(3 * C_),
+          T_(3 * C_) {}
+
+    // Of a face that lies inside the view.
+    void start(int64_t face) {
+        v_ = scene_.faces + 3 * face, row_ = scene_.corners + 3 * face;
+        for (int i = 0; i < 3; ++i)
+            for (int c = 0; c < C_; ++c) A_[i * C_ + c] = adjoint_[int64_t(v_[i]) * C_ + c];
+        std::fill(T_.begin(), T_.end(), 0.0);
+    }
+
+    void add_integral() {
+        for (int c = 0; c < C_; ++c) {
+            const double all = A_[c] + A_[C_ + c] + A_[2 * C_ + c];
+            for (int i = 0; i < 3; ++i) T_[i * C_ + c] += (A_[i * C_ + c] + all) / 12;
+        }
+    }
+
+    // Takes away the control at a sample that stands for so large a share of the face's area.
+    void subtract(Barycentrics lambda, double share) {
+        for (int c = 0; c < C_; ++c) {
+            const double A = lambda[0] * A_[c] + lambda[1] * A_[C_ + c] + lambda[2] * A_[2 * C_ + c];
+            for (int i = 0; i < 3; ++i) T_[i * C_ + c] -= share * lambda[i] * A;
+        }
+    }
+
+    // Adds to the cotangents of the corners in camera coordinates and of K.
+    //
+    //     ∇L = ((c_1 − c_0) (x_2 − x_0)⊥ − (c_2 − c_0) (x_1 − x_0)⊥) / ((x_1 − x_0) ∧ (x_2 − x_0))
+    //
+    // is multiplied with the area before it is divided by it, so that a thin face is no trouble.
+    void add_to_corners(Vec3 corner_bar[3], double k_bar[6]) const {
+        const Vec2 x0 = vertices_.x[v_[0]], e1 = vertices_.x[v_[1]] - x0, e2 = vertices_.x[v_[2]] - x0;
+        const double half = wedge(e1, e2) < 0 ? -0.5 : 0.5;
+        const auto color = [&](int i) { return scene_.colors + int64_t(row_[i]) * C_; };
+        const T *c0 = color(0), *c1 = color(1), *c2 = color(2);
+        Vec2 x_bar[3];
+        for (int c = 0; c < C_; ++c) {
+            const double d1 = half * (double(c1[c]) - c0[c]), d2 = half * (double(c2[c]) - c0[c]);
+            const Vec2 gradient{d1 * e2.y - d2 * e1.y, d2 * e1.x - d1 * e2.x};  // times the area
+            for (int i = 0; i < 3; ++i) x_bar[i] += -T_[i * C_ + c] * gradient;
+        }
+        for (int i = 0; i < 3; ++i) project_vjp(camera_, vertices_.q[v_[i]], x_bar[i], corner_bar[i], k_bar);
+    }
+
+    // Adds to those of the colours, (3, C).
+    void add_to_colors(double* color_bar) const {
+        const Vec2 x0 = vertices_.x[v_[0]];
+        const double area = 0.5 * std::fabs(wedge(vertices_.x[v_[1]] - x0, vertices_.x[v_[2]] - x0));
+        for (int k = 0; k < 3 * C_; ++k) color_bar[k] += area * T_[k];
+    }
+
+   private:
+    const SceneView<T>& scene_;
+    const Camera& camera_;
+    const VertexView& vertices_;
+    const T* adjoint_;
+    const int C_;
+
+    const int32_t *v_ = nullptr, *row_ = nullptr;
+    std::vector<double> A_, T_;  // (3, C); T over the area
+};
+
+}  // namespace edgegrad
