@@ -7,6 +7,7 @@ SOURCES := pyproject.toml $(shell find csrc -name '*.cpp' -o -name '*.h' -o -nam
 
 # Threads that wait should not spin: see edgegrad/__init__.py.
 export OMP_WAIT_POLICY ?= passive
+export GOMP_SPINCOUNT ?= 3000
 
 .PHONY: demo test test-slow sanitize sanitize-threads bench lint format clean
 .DELETE_ON_ERROR:

@@ -35,7 +35,7 @@ void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint,
 
 }  // namespace
 
-void add_world(const Camera& camera, const double* verts, const std::vector<double>& q_bar, Team& team,
+void add_world(const Camera& camera, const double* verts, const Array<double>& q_bar, Team& team,
                const SceneGrad& grad) {
     const int64_t V = q_bar.size() / 3, blocks = Team::blocks(V);
     std::vector<double> sum(grad.world_to_camera ? 12 * blocks : 0, 0.0);
@@ -79,7 +79,7 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
                                importance, o,      team,     frame,  forward.seen};
     profile.view = watch.lap();
 
-    std::vector<double> q_bar(grad.geometry() ? 3 * scene.n_verts : 0, 0.0);
+    Array<double> q_bar = zeros(grad.geometry() ? 3 * scene.n_verts : 0, team);
     Destination to;
     to.channels = scene.channels;
     to.want_k = grad.K;

@@ -308,7 +308,7 @@ void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile&
     const CurveFinder<T> finder(view);
 
     // Curves end to end, by their length in the image times how much the loss looks there.
-    std::vector<double> measure(E);
+    Array<double> measure(E);
     struct Found {
         double length = 0;
         int64_t silhouettes = 0, creases = 0;
@@ -318,6 +318,7 @@ void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile&
     view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) {
         for (int64_t e = first; e < last; ++e) {
             Curve c;
+            measure[e] = 0;
             if (!finder.find(e, c)) continue;
             ++(c.is_crease() ? found[k].creases : found[k].silhouettes);
             const double importance = view.importance.mean({std::min(c.x0.x, c.x1.x), std::min(c.x0.y, c.x1.y)},

@@ -7,8 +7,8 @@
 #pragma once
 
 #include <cstdint>
-#include <vector>
 
+#include "array.h"
 #include "math.h"
 #include "parallel.h"
 
@@ -152,13 +152,13 @@ struct ViewVolume {
 // Everything about the vertices that one camera needs: camera coordinates, pixel position, and on which side of the
 // view volume. The pixel position holds only where the outcode is zero.
 struct VertexView {
-    std::vector<Vec3> q;
-    std::vector<Vec2> x;
-    std::vector<uint8_t> outcode;
+    Array<Vec3> q;
+    Array<Vec2> x;
+    Array<uint8_t> outcode;
 };
 
-inline std::vector<Vec3> camera_vertices(const Camera& camera, const double* verts, int64_t n, Team& team) {
-    std::vector<Vec3> q(n);
+inline Array<Vec3> camera_vertices(const Camera& camera, const double* verts, int64_t n, Team& team) {
+    Array<Vec3> q(n);
     team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v)
             q[v] = camera.to_camera({verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]});
@@ -168,7 +168,7 @@ inline std::vector<Vec3> camera_vertices(const Camera& camera, const double* ver
 
 inline VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n,
                                 Team& team) {
-    VertexView view{camera_vertices(camera, verts, n, team), std::vector<Vec2>(n), std::vector<uint8_t>(n)};
+    VertexView view{camera_vertices(camera, verts, n, team), Array<Vec2>(n), Array<uint8_t>(n)};
     team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
             const Vec3 q = view.q[v];

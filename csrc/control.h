@@ -20,6 +20,7 @@
 #include <vector>
 
 #include "camera.h"
+#include "scatter.h"
 #include "scene.h"
 #include "surface.h"
 
@@ -29,14 +30,8 @@ template <int N, class T>
 class Control {
    public:
     // `adjoint`: Ã at the vertices, (V, C).
-    Control(const SceneView<T>& scene, const Camera& camera, const VertexView& vertices, const T* adjoint)
-        : scene_(scene),
-          camera_(camera),
-          vertices_(vertices),
-          adjoint_(adjoint),
-          C_(N ? N : scene.channels),
-          A_(3 * C_),
-          T_(3 * C_) {}
+    Control(const SceneView<T>& scene, const VertexView& vertices, const T* adjoint)
+        : scene_(scene), vertices_(vertices), adjoint_(adjoint), C_(N ? N : scene.channels), A_(3 * C_), T_(3 * C_) {}
 
     // Of a face that lies inside the view.
     void start(int64_t face) {
@@ -61,35 +56,41 @@ class Control {
         }
     }
 
-    // Adds to the cotangents of the corners in camera coordinates and of K.
+    // Adds to the cotangents of the places of the corners.
     //
     //     ∇L = ((c_1 − c_0) (x_2 − x_0)⊥ − (c_2 − c_0) (x_1 − x_0)⊥) / ((x_1 − x_0) ∧ (x_2 − x_0))
     //
     // is multiplied with the area before it is divided by it, so that a thin face is no trouble.
-    void add_to_corners(Vec3 corner_bar[3], double k_bar[6]) const {
+    void add_to_places(Vec2 x_bar[3]) const {
         const Vec2 x0 = vertices_.x[v_[0]], e1 = vertices_.x[v_[1]] - x0, e2 = vertices_.x[v_[2]] - x0;
         const double half = wedge(e1, e2) < 0 ? -0.5 : 0.5;
         const auto color = [&](int i) { return scene_.colors + int64_t(row_[i]) * C_; };
         const T *c0 = color(0), *c1 = color(1), *c2 = color(2);
-        Vec2 x_bar[3];
         for (int c = 0; c < C_; ++c) {
             const double d1 = half * (double(c1[c]) - c0[c]), d2 = half * (double(c2[c]) - c0[c]);
             const Vec2 gradient{d1 * e2.y - d2 * e1.y, d2 * e1.x - d1 * e2.x};  // times the area
             for (int i = 0; i < 3; ++i) x_bar[i] += -T_[i * C_ + c] * gradient;
         }
-        for (int i = 0; i < 3; ++i) project_vjp(camera_, vertices_.q[v_[i]], x_bar[i], corner_bar[i], k_bar);
     }
 
-    // Adds to those of the colours, (3, C).
+    // Adds to those of the colours: (3, C), or a row for each.
     void add_to_colors(double* color_bar) const {
-        const Vec2 x0 = vertices_.x[v_[0]];
-        const double area = 0.5 * std::fabs(wedge(vertices_.x[v_[1]] - x0, vertices_.x[v_[2]] - x0));
-        for (int k = 0; k < 3 * C_; ++k) color_bar[k] += area * T_[k];
+        const double a = area();
+        for (int k = 0; k < 3 * C_; ++k) color_bar[k] += a * T_[k];
+    }
+    void add_to_colors(RowBuffer& rows) {
+        const double a = area();
+        for (double& t : T_) t *= a;
+        for (int i = 0; i < 3; ++i) rows.add(row_[i], T_.data() + i * C_);
     }
 
    private:
+    double area() const {
+        const Vec2 x0 = vertices_.x[v_[0]];
+        return 0.5 * std::fabs(wedge(vertices_.x[v_[1]] - x0, vertices_.x[v_[2]] - x0));
+    }
+
     const SceneView<T>& scene_;
-    const Camera& camera_;
     const VertexView& vertices_;
     const T* adjoint_;
     const int C_;

@@ -79,7 +79,7 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
 
 // A face that turns clockwise in the image (x right, y down) lies to the right of its sides, where the normal
 // (τ_y, −τ_x) does not point. One seen exactly edge-on covers nothing. > 0: the side of minus, < 0: of plus.
-inline int side_of(const HalfEdge& h, const std::vector<int8_t>& facing) {
+inline int side_of(const HalfEdge& h, const Array<int8_t>& facing) {
     return h.backwards ? -facing[h.face] : facing[h.face];
 }
 
@@ -157,9 +157,9 @@ class CurveFinder {
 
    private:
     const BackwardView<T>& view_;
-    std::vector<int8_t> facing_;  // orientation of each face in the image
-    double coordinate_ = 0;       // the largest there is, in the world and the camera
-    const bool jumps_;            // false: neighbouring faces are known to carry the same radiance at their edge
+    Array<int8_t> facing_;   // orientation of each face in the image
+    double coordinate_ = 0;  // the largest there is, in the world and the camera
+    const bool jumps_;       // false: neighbouring faces are known to carry the same radiance at their edge
 };
 
 }  // namespace edgegrad

@@ -63,7 +63,7 @@ template <int N, class T>
 class PixelRow {
    public:
     PixelRow(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const RayFrame& frame,
-             const ForwardOptions& options, Team& team, const std::vector<Vec3>& q, const ForwardOutput<T>& out)
+             const ForwardOptions& options, Team& team, const Array<Vec3>& q, const ForwardOutput<T>& out)
         : scene_(scene),
           camera_(camera),
           caster_(caster),
@@ -115,7 +115,7 @@ class PixelRow {
         if (++traced_ % 256 == 0) team_.check();
         rays_.prepare();
         caster_.cast(rays_);
-        if (scene_.n_faces > in_cache) prefetch();
+        if (scene_.n_faces > in_cache) prefetch_faces();
         int i = 0;
         for (int p = 0; p < parts_; ++p) {
             typename AffineRadiance<N>::Sum sum(C_);
@@ -170,21 +170,19 @@ class PixelRow {
 
     // Faces that are smaller than the distance of the samples are met once each, and their arrays are then waited for.
     static constexpr int64_t in_cache = 1 << 18;
-    void prefetch() const {
-#if defined(__GNUC__)
+    void prefetch_faces() const {
         for (int i = 0; i < rays_.count; ++i)
             if (const int64_t face = rays_.face[i]; face >= 0) {
-                __builtin_prefetch(scene_.faces + 3 * face);
-                __builtin_prefetch(scene_.corners + 3 * face);
+                prefetch(scene_.faces + 3 * face);
+                prefetch(scene_.corners + 3 * face);
             }
         for (int i = 0; i < rays_.count; ++i)
             if (const int64_t face = rays_.face[i]; face >= 0)
                 for (int k = 0; k < 3; ++k) {
-                    __builtin_prefetch(&q_[scene_.faces[3 * face + k]]);
+                    prefetch(&q_[scene_.faces[3 * face + k]]);
                     if (!is_textured(scene_, face))
-                        __builtin_prefetch(scene_.colors + int64_t(scene_.corners[3 * face + k]) * C_);
+                        prefetch(scene_.colors + int64_t(scene_.corners[3 * face + k]) * C_);
                 }
-#endif
     }
 
     // What ray i meets behind a face that holds the eye.
@@ -213,7 +211,7 @@ class PixelRow {
     const PixelRays pixel_rays_;
     const int spp_;
     Team& team_;
-    const std::vector<Vec3>& q_;
+    const Array<Vec3>& q_;
     const ForwardOutput<T>& out_;
     const int C_;
 
@@ -231,7 +229,7 @@ class PixelRow {
 
 template <int N, class T>
 void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ForwardOptions& o,
-                   Team& team, const std::vector<Vec3>& q, const ForwardOutput<T>& out) {
+                   Team& team, const Array<Vec3>& q, const ForwardOutput<T>& out) {
     // Tiles are lower where a pixel has many samples, so that the threads end together.
     const int rows = std::clamp((1 << 16) / o.spp, 1, tile);
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + rows - 1) / rows;
@@ -251,7 +249,7 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
 template <class T>
 void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ForwardOptions& o,
                     Team& team, const ForwardOutput<T>& out) {
-    const std::vector<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
+    const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
     std::fill(out.seen, out.seen + scene.n_faces, uint8_t(0));
     dispatch_channels(scene.channels, [&]<int N>() { render_pixels<N>(scene, camera, caster, o, team, q, out); });
 }

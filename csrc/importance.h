@@ -7,6 +7,7 @@
 #include <numeric>
 #include <vector>
 
+#include "array.h"
 #include "math.h"
 #include "parallel.h"
 
@@ -19,7 +20,7 @@ class Importance {
    public:
     template <class T>
     Importance(const T* adjoint, int width, int height, int channels, double radius, Team& team)
-        : width_(width), height_(height), radius_(radius), table_(size_t(width + 1) * (height + 1), 0) {
+        : width_(width), height_(height), radius_(radius), table_(int64_t(width + 1) * (height + 1)) {
         const auto size = [&](int64_t pixel) {
             double a = 0;
             for (int c = 0; c < channels; ++c) a += std::fabs(double(adjoint[pixel * channels + c]));
@@ -44,7 +45,7 @@ class Importance {
         const int64_t nonzero = std::accumulate(row_nonzero.begin(), row_nonzero.end(), int64_t(0));
         const double scale = sum > 0 ? 8.0 * unit * nonzero / sum : 0;
         each_row([&](int j) {
-            int64_t row = 0;
+            int64_t row = table_[index(0, j + 1)] = 0;
             for (int i = 0; i < width; ++i) {
                 // The cap keeps the conversion defined; only an adjoint 2²⁰ times the mean meets it.
                 const double a = size(int64_t(j) * width + i);
@@ -52,6 +53,7 @@ class Importance {
                 table_[index(i + 1, j + 1)] = row;
             }
         });
+        std::fill(table_.begin(), table_.begin() + width + 1, 0);
         const int columns = std::max(64, std::min(width, (1 << 14) / height));
         team.each((width + columns - 1) / columns, [&](int64_t k) {
             const int first = 1 + int(k) * columns, last = std::min(first + columns, width + 1);
@@ -78,7 +80,7 @@ class Importance {
 
     int width_, height_;
     double radius_;
-    std::vector<int64_t> table_;
+    Array<int64_t> table_;
 };
 
 }  // namespace edgegrad

@@ -12,9 +12,9 @@
 #include <bit>
 #include <vector>
 
+#include "polygon.h"
 #include "sampler.h"
 #include "shading/shade.h"
-#include "sierpinski.h"
 #include "systematic.h"
 
 namespace edgegrad {
@@ -38,8 +38,6 @@ constexpr double large = 256;
 // is not wide, px. From `widest` on its corners say little.
 constexpr double least = 1.0 / 16, wide = 32, widest = 64;
 
-struct VisiblePolygon;
-
 // The pixels that large triangles may touch, by tiles.
 class PixelMask {
    public:
@@ -50,7 +48,16 @@ class PixelMask {
           columns_((camera.width + tile - 1) / tile),
           marked_(size_t(columns_) * ((camera.height + tile - 1) / tile), 0) {}
 
-    void mark(const VisiblePolygon& polygon);
+    void mark(const VisiblePolygon& polygon) {
+        const auto index = [](double x, int most) {
+            return int(std::clamp(std::floor(x), 0.0, double(most - 1))) / tile;
+        };
+        const int i0 = index(polygon.low.x - radius_, width_), i1 = index(polygon.high.x + radius_, width_);
+        const int j0 = index(polygon.low.y - radius_, height_), j1 = index(polygon.high.y + radius_, height_);
+        for (int j = j0; j <= j1; ++j)
+            for (int i = i0; i <= i1; ++i)
+                std::atomic_ref(marked_[size_t(j) * columns_ + i]).store(1, std::memory_order_relaxed);
+    }
 
     std::vector<int64_t> pixels() const {
         std::vector<int64_t> out;
@@ -68,96 +75,6 @@ class PixelMask {
     double radius_;
     int columns_;
     std::vector<uint8_t> marked_;
-};
-
-// The part of a triangle inside the view: a convex polygon in the image.
-struct VisiblePolygon {
-    Vec2 corner[ViewVolume::most_corners];
-    int n = 0;
-    double area = 0;     // px²
-    double longest = 0;  // px
-    Vec2 low, high;
-
-    // False when there is none.
-    template <class T>
-    bool set(const BackwardView<T>& view, int64_t face) {
-        const int32_t* v = view.scene.faces + 3 * face;
-        const VertexView& p = view.vertices;
-        const uint8_t c0 = p.outcode[v[0]], c1 = p.outcode[v[1]], c2 = p.outcode[v[2]];
-        if (c0 & c1 & c2) return false;
-        if (!(c0 | c1 | c2)) {
-            n = 3;
-            for (int i = 0; i < 3; ++i) corner[i] = p.x[v[i]];
-        } else {
-            if (view.camera.facing(p.q[v[0]], p.q[v[1]], p.q[v[2]]) == 0) return false;
-            Vec3 polygon[ViewVolume::most_corners] = {p.q[v[0]], p.q[v[1]], p.q[v[2]]};
-            n = view.volume.clip_triangle(polygon);
-            for (int i = 0; i < n; ++i) {
-                // Only a triangle through the eye itself has a corner there; it has no image to sample.
-                if (!(view.camera.depth_weight(polygon[i]) > 0)) return false;
-                corner[i] = project(view.camera, polygon[i]);
-            }
-            if (n < 3) return false;
-        }
-        area = 0;
-        low = high = corner[0];
-        double longest_squared = 0;
-        for (int i = 0; i < n; ++i) {
-            const Vec2 a = corner[i], b = corner[i + 1 < n ? i + 1 : 0], side = b - a;
-            longest_squared = std::max(longest_squared, side.x * side.x + side.y * side.y);
-            low = {std::min(low.x, a.x), std::min(low.y, a.y)};
-            high = {std::max(high.x, a.x), std::max(high.y, a.y)};
-            if (i >= 2) area += 0.5 * std::fabs(wedge(corner[i - 1] - corner[0], a - corner[0]));
-        }
-        longest = std::sqrt(longest_squared);
-        return area > 0;
-    }
-};
-
-void PixelMask::mark(const VisiblePolygon& polygon) {
-    const auto index = [](double x, int most) { return int(std::clamp(std::floor(x), 0.0, double(most - 1))) / tile; };
-    const int i0 = index(polygon.low.x - radius_, width_), i1 = index(polygon.high.x + radius_, width_);
-    const int j0 = index(polygon.low.y - radius_, height_), j1 = index(polygon.high.y + radius_, height_);
-    for (int j = j0; j <= j1; ++j)
-        for (int i = i0; i <= i1; ++i)
-            std::atomic_ref(marked_[size_t(j) * columns_ + i]).store(1, std::memory_order_relaxed);
-}
-
-// Points uniform over a polygon, along a curve that fills its triangles one after the other.
-class PolygonSampler {
-   public:
-    // About n points will be drawn.
-    void set(const VisiblePolygon& polygon, double n) { polygon_ = &polygon, n_ = n, triangle_ = 0, end_ = 0; }
-
-    // s in [0, 1) goes along the curve, u is a point of the unit square. Fast where s ascends.
-    Vec2 operator()(double s, Vec2 u) {
-        const Vec2* corner = polygon_->corner;
-        while (triangle_ < 2 || (s >= end_ && triangle_ + 1 < polygon_->n)) {
-            triangle_ = std::max(2, triangle_ + 1);
-            begin_ = end_;
-            const double area =
-                0.5 * std::fabs(wedge(corner[triangle_ - 1] - corner[0], corner[triangle_] - corner[0]));
-            share_ = area / polygon_->area, end_ = begin_ + share_;
-            // Two to four cells a point, so that each has one of its own.
-            const double cells = std::clamp(2 * n_ * share_, 1.0, double(1u << SierpinskiCurve::most_levels));
-            levels_ = std::bit_width(uint32_t(std::ceil(cells)) - 1);
-            curve_.set({1, 0}, {0, 0}, {0, 1}, levels_);
-        }
-        const double t = share_ > 0 ? std::clamp((s - begin_) / share_, 0.0, 1 - 0x1p-53) : 0;
-        const Vec2 p = curve_.point(uint32_t(t * (1u << levels_)), u);
-        lambda_ = {p.x, p.y};
-        return corner[0] + p.x * (corner[triangle_ - 1] - corner[0]) + p.y * (corner[triangle_] - corner[0]);
-    }
-
-    // Where the last point lies in its triangle.
-    Barycentrics lambda() const { return lambda_; }
-
-   private:
-    const VisiblePolygon* polygon_ = nullptr;
-    double n_ = 0, begin_ = 0, end_ = 0, share_ = 0;
-    int triangle_ = 0, levels_ = 0;
-    SierpinskiCurve curve_;
-    Barycentrics lambda_;
 };
 
 // The samples of one chunk.
@@ -231,15 +148,12 @@ class InteriorChunk {
 
 // What the gradient of a face will ask for once its rays are cast.
 template <class T>
-void prefetch(const BackwardView<T>& view, int64_t face) {
-#if defined(__GNUC__)
+void prefetch_face(const BackwardView<T>& view, int64_t face) {
     const int32_t *v = view.scene.faces + 3 * face, *row = view.scene.corners + 3 * face;
     for (int i = 0; i < 3; ++i) {
-        __builtin_prefetch(&view.vertices.q[v[i]]);
-        if (!is_textured(view.scene, face))
-            __builtin_prefetch(view.scene.colors + int64_t(row[i]) * view.scene.channels);
+        prefetch(&view.vertices.q[v[i]]);
+        if (!is_textured(view.scene, face)) prefetch(view.scene.colors + int64_t(row[i]) * view.scene.channels);
     }
-#endif
 }
 
 // Vertices near which the forward pass hit a face. A face smaller than the distance of the image's samples is hit by
@@ -254,8 +168,7 @@ struct Sight {
             view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
                 for (int64_t f = first; f < last; ++f)
                     if (const int32_t* v = view.scene.faces + 3 * f; test(f, v))
-                        for (int i = 0; i < 3; ++i)
-                            std::atomic_ref(marked[v[i]]).store(1, std::memory_order_relaxed);
+                        for (int i = 0; i < 3; ++i) std::atomic_ref(marked[v[i]]).store(1, std::memory_order_relaxed);
             });
         };
         mark(hit, [&](int64_t f, const int32_t*) { return view.seen[f]; });
@@ -295,9 +208,9 @@ double variation(const T* adjoint, const int32_t* v, int channels) {
 
 // Ã at the vertices that may be those of a face with a control, (V, C).
 template <int N, class T>
-std::vector<T> adjoint_at_vertices(const BackwardView<T>& view, const Sight& sight) {
+Array<T> adjoint_at_vertices(const BackwardView<T>& view, const Sight& sight) {
     const int C = N ? N : view.scene.channels;
-    std::vector<T> adjoint(view.scene.n_verts * C);
+    Array<T> adjoint(view.scene.n_verts * C);
     view.team.each_block(view.scene.n_verts, [&](int64_t, int64_t first, int64_t last) {
         std::vector<double> A(C);
         for (int64_t v = first; v < last; ++v) {
@@ -309,6 +222,53 @@ std::vector<T> adjoint_at_vertices(const BackwardView<T>& view, const Sight& sig
     return adjoint;
 }
 
+// Turns cotangents of places in the image (V, 2) into those of camera coordinates and of K.
+template <class T>
+void add_places(const BackwardView<T>& view, const Array<double>& x_bar, Destination& to) {
+    const int64_t V = view.scene.n_verts, blocks = Team::blocks(V);
+    std::vector<double> k_bar(6 * blocks, 0.0);
+    view.team.each_block(V, [&](int64_t k, int64_t first, int64_t last) {
+        for (int64_t v = first; v < last; ++v) {
+            const Vec2 x{x_bar[2 * v], x_bar[2 * v + 1]};
+            if (x.x == 0 && x.y == 0) continue;
+            Vec3 q;
+            project_vjp(view.camera, view.vertices.q[v], x, q, k_bar.data() + 6 * k);
+            to.q[3 * v] += q.x, to.q[3 * v + 1] += q.y, to.q[3 * v + 2] += q.z;
+        }
+    });
+    for (int64_t i = 0; i < 6 * blocks; ++i) to.k[i % 6] += k_bar[i];
+}
+
+// Adds what n samples find on the faces, which are laid end to end.
+template <int N, class T>
+void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systematic& systematic,
+                         const Array<uint8_t>& is_controlled, const Array<T>& adjoint, bool geometry, Destination& to,
+                         double (&seconds)[2]) {
+    const ShiftedSequence sequence(hash(view.options.seed, 2, gradient_stream));
+    scatter_samples(n, view.team, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+        InteriorChunk<N, T> chunk(view, geometry, to, grad, adjoint.data());
+        VisiblePolygon polygon;
+        PolygonSampler sampler;
+        int64_t face = -1;
+        double share = 0;
+        for (int64_t i = first; i < last; ++i) {
+            const double position = systematic.position(i);
+            const int64_t f = face < 0 ? systematic.primitive(position) : systematic.primitive(position, face);
+            if (f != face) {
+                face = f;
+                polygon.set(view.camera, view.volume, view.vertices, view.scene.faces + 3 * f);
+                prefetch_face(view, f);
+                share = systematic.weight(f);
+                sampler.set(polygon, 1 / share);
+            }
+            const double s = (position - systematic.begin_of(face)) / systematic.measure_of(face);
+            const Vec2 x = sampler(s, sequence(i));
+            chunk.add(face, x, sampler.lambda(), share, polygon.area, is_controlled[face]);
+        }
+        chunk.finish();
+    });
+}
+
 }  // namespace
 
 template <int N, class T>
@@ -318,23 +278,35 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
     const BackwardOptions& o = view.options;
     Stopwatch watch;
     const Sight sight(view);
-    const std::vector<T> adjoint = adjoint_at_vertices<N>(view, sight);
-    std::vector<double> measure(F);
+    const Array<T> adjoint = adjoint_at_vertices<N>(view, sight);
+    Array<double> measure(F);
     const int64_t chunks = (F + scatter_chunk - 1) / scatter_chunk;
     std::vector<double> size(chunks, 0.0), size_of_large(chunks, 0.0);
     const bool any_texture = view.scene.face_texture;
-    std::vector<uint8_t> is_large(any_texture ? F : 0, 0), is_controlled(F, 0);
+    std::vector<uint8_t> is_large(any_texture ? F : 0, 0);
+    Array<uint8_t> is_controlled(F);
     PixelMask mask(view.camera, o.filter.radius() - 0.5);
+    // What the controls are of all of their faces, summed by the places of vertices in the image.
+    Array<double> x_bar = zeros(geometry ? 2 * view.scene.n_verts : 0, view.team);
+    Destination whole;
+    whole.x = geometry ? x_bar.data() : nullptr, whole.colors = to.colors, whole.channels = to.channels;
     double seconds[2] = {};
-    scatter_samples(F, view.team, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    scatter_samples(F, view.team, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         const int64_t k = first / scatter_chunk;
-        FaceGrad<N, T> whole(view, geometry, to, grad, adjoint.data());
+        Control<N, T> control(view.scene, view.vertices, adjoint.data());
         VisiblePolygon polygon;
         for (int64_t f = first; f < last; ++f) {
-            if (!polygon.set(view, f)) continue;
+            const int32_t* v = view.scene.faces + 3 * f;
+            measure[f] = 0, is_controlled[f] = 0;
+            if (constexpr int ahead = 16; f + ahead < last)
+                for (int i = 0; i < 3; ++i) {
+                    const int32_t w = v[3 * ahead + i];
+                    prefetch(&view.vertices.x[w]), prefetch(&view.vertices.q[w]), prefetch(&view.vertices.outcode[w]);
+                    prefetch(&sight.near[w]), prefetch(&sight.hit[w]), prefetch(&adjoint[int64_t(w) * C]);
+                }
+            if (!polygon.set(view.camera, view.volume, view.vertices, v)) continue;
             const double importance = view.importance.mean(polygon.low, polygon.high);
             if (!(importance > 0)) continue;
-            const int32_t* v = view.scene.faces + 3 * f;
             double m = (polygon.area + polygon.longest) * (sight.partly(v) ? 1 : hidden) *
                        (is_textured(view.scene, f) ? textured : colored);
             if (!std::isfinite(m)) continue;  // coordinates beyond 1e150 cannot be sampled
@@ -346,13 +318,20 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
             }
             if (!o.dry && may_be_controlled(view, f, polygon, sight)) {
                 is_controlled[f] = 1;
-                whole.start(int32_t(f), true), whole.control().add_integral(), whole.flush();
+                control.start(f), control.add_integral();
+                if (geometry) {
+                    Vec2 places[3];
+                    control.add_to_places(places);
+                    for (int i = 0; i < 3; ++i) grad.x.add(v[i], &places[i].x);
+                }
+                if (to.colors) control.add_to_colors(grad.colors);
                 m *= std::clamp(std::max(2 * variation(adjoint.data(), v, C), polygon.longest / wide), least, 1.0);
             }
             measure[f] = m * importance;
             size[k] += m;
         }
     });
+    if (geometry) add_places(view, x_bar, to);
     double total = 0, total_of_large = 0;
     for (int64_t k = 0; k < chunks; ++k) total += size[k], total_of_large += size_of_large[k];
     // How often each is sampled: as the defaults, or in proportion to them.
@@ -374,29 +353,7 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
     profile.surface_samples += n;
     if (o.dry) return;
     systematic.draw(n, to_unit(hash(o.seed, 1, gradient_stream)));
-    const ShiftedSequence sequence(hash(o.seed, 2, gradient_stream));
-    scatter_samples(n, view.team, to, profile.surface, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        InteriorChunk<N, T> chunk(view, geometry, to, grad, adjoint.data());
-        VisiblePolygon polygon;
-        PolygonSampler sampler;
-        int64_t face = -1;
-        double share = 0;
-        for (int64_t i = first; i < last; ++i) {
-            const double position = systematic.position(i);
-            const int64_t f = face < 0 ? systematic.primitive(position) : systematic.primitive(position, face);
-            if (f != face) {
-                face = f;
-                polygon.set(view, f);
-                prefetch(view, f);
-                share = systematic.weight(f);
-                sampler.set(polygon, 1 / share);
-            }
-            const double s = (position - systematic.begin_of(face)) / systematic.measure_of(face);
-            const Vec2 x = sampler(s, sequence(i));
-            chunk.add(face, x, sampler.lambda(), share, polygon.area, is_controlled[face]);
-        }
-        chunk.finish();
-    });
+    add_surface_samples<N>(view, n, systematic, is_controlled, adjoint, geometry, to, profile.surface);
 }
 
 // clang-format off

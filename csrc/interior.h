@@ -50,8 +50,8 @@ double depth_of(const BackwardView<T>& view, int64_t face, Vec2 n) {
     return b[0] * corner[0].z + b[1] * corner[1].z + b[2] * corner[2].z;
 }
 
-// What a run of samples on one face finds, and what is said of the face without samples. What they have in common is
-// done once for the run: the face's map and its derivative, and one row a corner for the scatter.
+// What a run of samples on one face finds. What they have in common is done once for the run: the face's map and its
+// derivative, and one row a corner for the scatter.
 template <int N, class T>
 class FaceGrad {
    public:
@@ -65,7 +65,7 @@ class FaceGrad {
           want_k_(to.want_k),
           grad_(grad),
           C_(N ? N : view.scene.channels),
-          control_(view.scene, view.camera, view.vertices, adjoint) {}
+          control_(view.scene, view.vertices, adjoint) {}
 
     int32_t face() const { return face_; }  // −1: none
 
@@ -101,7 +101,12 @@ class FaceGrad {
         if (geometry_) {
             Vec3 corner_bar[3];
             if (seen_) face_map_vjp(view_.camera, corner_, map_bar_, corner_bar);
-            if (controlled_) control_.add_to_corners(corner_bar, grad_.k);
+            if (controlled_) {
+                Vec2 x_bar[3];
+                control_.add_to_places(x_bar);
+                for (int i = 0; i < 3; ++i)
+                    project_vjp(view_.camera, view_.vertices.q[v[i]], x_bar[i], corner_bar[i], grad_.k);
+            }
             for (int i = 0; i < 3; ++i) grad_.q.add(v[i], &corner_bar[i].x);
         }
         if (want_rows_) {

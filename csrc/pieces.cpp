@@ -139,7 +139,9 @@ void bind_pieces(nb::module_& m) {
     });
     p.def("systematic", [](std::vector<double> measure, int64_t n, double shift) {
         Team team(1);
-        Systematic systematic(measure, team);
+        Array<double> ends(measure.size());
+        std::copy(measure.begin(), measure.end(), ends.begin());
+        Systematic systematic(ends, team);
         systematic.draw(n, shift);
         std::vector<std::tuple<int64_t, double>> out;  // primitive, weight
         for (int64_t i = 0; i < n; ++i) {

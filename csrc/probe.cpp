@@ -11,7 +11,7 @@ template <class T>
 void shade_at(const SceneView<T>& scene, const Camera& camera, int64_t n, const int32_t* faces, const double* points,
               double* radiance) {
     Team team(1);
-    const std::vector<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
+    const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
     for (int64_t i = 0; i < n; ++i) {
         const int32_t* v = scene.faces + 3 * int64_t(faces[i]);
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
@@ -25,7 +25,7 @@ template <class T>
 void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, const int32_t* faces,
                   const double* points, const double* radiance_bar, const SceneGrad& grad) {
     Team team(1);
-    const std::vector<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
+    const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
     ChunkGrad chunk;
     chunk.q.prepare(3, 1), chunk.uvs.prepare(2, 1);
     chunk.colors.prepare(scene.channels, 1), chunk.texels.prepare(scene.channels, 1);
@@ -53,7 +53,7 @@ void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, co
                 .add(row[j], rows.value.data() + j * width);
         }
     }
-    std::vector<double> q_bar(3 * scene.n_verts, 0.0);
+    Array<double> q_bar = zeros(3 * scene.n_verts, team);
     chunk.q.add_to(q_bar.data(), 0), chunk.colors.add_to(grad.colors, 0);
     chunk.uvs.add_to(grad.uvs, 0), chunk.texels.add_to(grad.texels, 0);
     add_world(camera, scene.verts, q_bar, team, grad);

@@ -94,7 +94,7 @@ struct ForwardView {
 };
 
 // q = R p + t, backwards: p̄ = Rᵀ q̄, R̄ = Σ q̄ pᵀ, t̄ = Σ q̄, for q_bar (V, 3).
-void add_world(const Camera& camera, const double* verts, const std::vector<double>& q_bar, Team& team,
+void add_world(const Camera& camera, const double* verts, const Array<double>& q_bar, Team& team,
                const SceneGrad& grad);
 
 // Adds the gradient to what `grad` points to, given the adjoint image ∂loss/∂I (H, W, C).

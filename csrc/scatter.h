@@ -21,10 +21,20 @@ class RowBuffer {
     void prepare(int width, int owners) { width_ = width, rows_.resize(owners); }
     void clear() {
         for (Rows& r : rows_) r.count = 0;
+        for (Recent& r : recent_) r.index = -1;
     }
     void add(int64_t index, const double* values) {
         // Runs of 32 destinations in turn, which balances and keeps owners apart in cache lines.
         Rows& r = rows_[rows_.size() > 1 ? uint32_t(index >> 5) % uint32_t(rows_.size()) : 0];
+        // Neighbours in a mesh come soon after one another and share destinations: most rows are added to one that is
+        // there. Which are does not depend on the owners.
+        Recent& recent = recent_[uint64_t(index) % n_recent];
+        if (recent.index == index) {
+            double* row = r.value.data() + recent.row * width_;
+            for (int c = 0; c < width_; ++c) row[c] += values[c];
+            return;
+        }
+        recent = {index, r.count};
         if (r.count == r.index.size()) {
             r.index.resize(std::max<size_t>(16, 2 * r.count));
             r.value.resize(r.index.size() * width_);
@@ -45,19 +55,25 @@ class RowBuffer {
         std::vector<int64_t> index;
         std::vector<double> value;
     };
+    struct Recent {
+        int64_t index = -1;
+        size_t row = 0;  // among those of its owner
+    };
+    static constexpr int n_recent = 256;
     int width_ = 0;
     std::vector<Rows> rows_;  // one for each owner
+    Recent recent_[n_recent];
 };
 
 // What the samples of one chunk give.
 struct ChunkGrad {
-    RowBuffer q, colors, uvs, texels;  // q: vertices in camera coordinates
-    double k[6] = {};                  // the upper rows of K
+    RowBuffer q, x, colors, uvs, texels;  // vertices: q in camera coordinates, x in the image
+    double k[6] = {};                     // the upper rows of K
 };
 
 // Where it goes; null where none is wanted.
 struct Destination {
-    double *q = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr;
+    double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr;
     double k[6] = {};
     bool want_k = false;
     int channels = 1;
@@ -74,7 +90,7 @@ void scatter_samples(int64_t n, Team& team, Destination& to, double (&seconds)[2
     const int owners = std::min(team.threads(), 16);  // more would only split the buffers further
     std::vector<ChunkGrad> grads(std::min(wave, (n + chunk - 1) / chunk));
     for (ChunkGrad& g : grads) {
-        g.q.prepare(3, owners), g.uvs.prepare(2, owners);
+        g.q.prepare(3, owners), g.x.prepare(2, owners), g.uvs.prepare(2, owners);
         g.colors.prepare(to.channels, owners), g.texels.prepare(to.channels, owners);
     }
     Stopwatch watch;
@@ -88,7 +104,7 @@ void scatter_samples(int64_t n, Team& team, Destination& to, double (&seconds)[2
                 team.guard([&] {
                     team.check();
                     ChunkGrad& g = grads[i];
-                    g.q.clear(), g.colors.clear(), g.uvs.clear(), g.texels.clear();
+                    g.q.clear(), g.x.clear(), g.colors.clear(), g.uvs.clear(), g.texels.clear();
                     std::fill(g.k, g.k + 6, 0.0);
                     const int64_t begin = first + i * chunk;
                     body(begin, std::min(begin + chunk, n), g);
@@ -101,6 +117,7 @@ void scatter_samples(int64_t n, Team& team, Destination& to, double (&seconds)[2
                 team.guard([&] {
                     for (int64_t i = 0; i < chunks; ++i) {
                         if (to.q) grads[i].q.add_to(to.q, owner);
+                        if (to.x) grads[i].x.add_to(to.x, owner);
                         if (to.colors) grads[i].colors.add_to(to.colors, owner);
                         if (to.uvs) grads[i].uvs.add_to(to.uvs, owner);
                         if (to.texels) grads[i].texels.add_to(to.texels, owner);

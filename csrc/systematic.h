@@ -6,8 +6,8 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <vector>
 
+#include "array.h"
 #include "parallel.h"
 
 namespace edgegrad {
@@ -15,7 +15,7 @@ namespace edgegrad {
 class Systematic {
    public:
     // `measure` holds one number ≥ 0 for each primitive and is turned into its running sum.
-    Systematic(std::vector<double>& measure, Team& team) : end_(measure) {
+    Systematic(Array<double>& measure, Team& team) : end_(measure) {
         const int64_t n = end_.size(), blocks = Team::blocks(n);
         std::vector<double> before(blocks + 1, 0.0);
         team.each_block(n, [&](int64_t k, int64_t first, int64_t last) {
@@ -68,7 +68,7 @@ class Systematic {
         return std::lower_bound(end_.begin(), end_.end(), total()) - end_.begin();
     }
 
-    std::vector<double>& end_;
+    Array<double>& end_;
     int64_t n_ = 1;
     double shift_ = 0.5;
 };

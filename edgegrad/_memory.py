@@ -25,7 +25,7 @@ RAY_STRUCTURE_BYTES = 44
 # csrc/scatter.h: samples are worked on in chunks, and only so many chunks a thread are in memory at a time. A chunk keeps
 # rows apart by their owners, with room for some rows each as soon as there is one; runs of indices have the same owner.
 CHUNK, CHUNKS_IN_FLIGHT, MOST_OWNERS, FEWEST_ROWS, RUN = 512, 16, 16, 16, 32
-OWNER_BYTES = 56  # of an owner's empty buffer
+OWNER_BYTES, RECENT_BYTES = 56, 4096  # of an owner's empty buffer; of what a buffer knows of its last rows
 
 
 # -- needs ------------------------------------------------------------------------------------------------------------
@@ -51,9 +51,12 @@ def view(height: int, width: int, verts: int, moves: bool) -> int:
     return 8 * height * width + 41 * verts + 24 * verts * moves
 
 
-def surface_measure(faces: int, verts: int, pixels: int, textured: bool) -> int:
-    """Bytes for the faces laid end to end, and the pixels that large textured ones are left to."""
-    return 8 * faces + 2 * verts + (faces + 8 * pixels) * textured
+def surface_measure(faces: int, verts: int, pixels: int, textured: bool, radiance: int, moves: bool) -> int:
+    """Bytes for the faces laid end to end, the pixels that large textured ones are left to, and what the controls need.
+
+    radiance  bytes of the channels of one number of the image
+    """
+    return 9 * faces + (2 + radiance + 16 * moves) * verts + (faces + 8 * pixels) * textured
 
 
 def edge_measure(faces: int) -> int:
@@ -73,7 +76,7 @@ def rows(samples: int, primitives: int | None, each: int, width: int, destinatio
         runs = min(samples, primitives + chunks)
     owners = min(threads, MOST_OWNERS)
     least = chunks * min(owners, -(-destinations // RUN)) * FEWEST_ROWS
-    return max(each * runs, least) * (8 + 8 * width) + chunks * owners * OWNER_BYTES
+    return max(each * runs, least) * (8 + 8 * width) + chunks * (owners * OWNER_BYTES + RECENT_BYTES)
 
 
 # -- what there is ----------------------------------------------------------------------------------------------------

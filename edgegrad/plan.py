@@ -170,7 +170,10 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
             surface > 0,
             no_interior or (", ".join(reasons) if surface else "nothing in view"),
             samples=surface,
-            bytes=memory.surface_measure(F, V, height * width, len(flat.textures) > 0) + interior_rows,
+            bytes=interior_rows
+            + memory.surface_measure(
+                F, V, height * width, len(flat.textures) > 0, C * flat.colors.element_size(), work.motion
+            ),
         ),
         "topology": Term(
             work.boundary, no_boundary or "edges, found once for a set of faces", bytes=memory.topology(F)

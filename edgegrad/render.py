@@ -259,7 +259,7 @@ def gradient_room(adjoint: Tensor, *args: Any) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the gradients do not fit. Takes the arguments of the operator."""
     flat, (height, width), (surface_samples, edge_samples), wanted = Flat(*args[:9]), args[12:14], args[18:20], args[23]
     work = backward_work(*args[21:])
-    V, F, many = flat.verts.shape[0], flat.faces.shape[0], 1 << 62
+    V, F, C, many = flat.verts.shape[0], flat.faces.shape[0], flat.background.shape[-1], 1 << 62
     needs = {
         # In double, and then in the tensor's own type.
         f"{name} gradient": (8 + args[i].element_size() % 8) * args[i].numel() * want
@@ -269,7 +269,9 @@ def gradient_room(adjoint: Tensor, *args: Any) -> AbstractContextManager[None]:
     if any(work):
         needs["view"] = memory.view(height, width, V, work.motion or work.boundary)
     if work.motion or work.appearance:
-        needs["faces in view"] = memory.surface_measure(F, V, height * width, flat.textures.shape[0] > 0)
+        needs["faces in view"] = memory.surface_measure(
+            F, V, height * width, flat.textures.shape[0] > 0, C * flat.colors.element_size(), work.motion
+        )
         needs["surface samples"] = surface_rows(many if surface_samples < 0 else surface_samples, args)
     if work.boundary:
         needs["edges in view"] = memory.edge_measure(F)

@@ -88,7 +88,7 @@ def default_samples(scene: Scene | Mesh, camera: Camera, adjoint: Tensor) -> tup
     _, coverage, seen, _ = forward_kernel(*arguments)
     wanted = [True] + [False] * 6  # the vertices alone
     adjoint = adjoint.to(coverage.dtype)[None]
-    _, (profile,) = backward_kernel(adjoint, coverage, seen, *arguments, wanted, dry=True)
+    _, (profile,) = backward_kernel(adjoint, coverage, seen, *arguments, wanted)
     return int(profile["surface_samples"]), int(profile["edge_samples"])
 
 
