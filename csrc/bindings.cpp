@@ -63,10 +63,10 @@ void check_finite(const char* name, const T* values, int64_t n, int64_t width) {
 // `n` indices, in rows of three, of which the first is number `first`.
 void check_indices(const char* name, const int32_t* values, int64_t n, int64_t count, const char* of,
                    int64_t first = 0) {
-    int64_t bad = 0;
-#pragma omp parallel for simd reduction(+ : bad) if (n > parallel_from)
-    for (int64_t i = 0; i < n; ++i) bad += (values[i] < 0) | (values[i] >= count);
-    if (!bad) return;
+    int32_t least = 0, most = -1;
+#pragma omp parallel for simd reduction(min : least) reduction(max : most) if (n > parallel_from)
+    for (int64_t i = 0; i < n; ++i) least = std::min(least, values[i]), most = std::max(most, values[i]);
+    if (least >= 0 && most < count) return;
     for (int64_t i = 0; i < n; ++i)
         if (values[i] < 0 || values[i] >= count)
             refuse(std::string(name) + ": expected indices from 0 to " + std::to_string(count - 1) + " (rows of " + of +
@@ -118,6 +118,8 @@ struct SceneArrays {
         check_indices("faces", faces.data(), faces.size(), verts.shape(0), "verts");
         const bool textured = textures.shape(0) > 0;
         if (!textured) {
+            // Colours of vertices are indexed by the faces.
+            if (corners.data() == faces.data() && colors.shape(0) >= verts.shape(0)) return;
             check_indices("colors", corners.data(), corners.size(), colors.shape(0), "colors");
             return;
         }

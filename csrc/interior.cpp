@@ -3,7 +3,8 @@
 // Triangles are laid end to end by the measure m = (area + longest side · 1 px) · (how much the loss looks there), in
 // image units, clipped to the view; more where there is a texture, less where the forward pass saw nothing. A point
 // uniform in the image of its triangle then has the weight area · M / (n m). At a grazing angle the integrand grows as
-// 1 / area, and the product stays bounded.
+// 1 / area, and the product stays bounded. Where a triangle has a control (control.h), samples find only what differs
+// from it, and fewer do.
 
 #include "interior.h"
 
