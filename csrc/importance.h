@@ -43,7 +43,8 @@ class Importance {
         });
         const double sum = std::accumulate(row_sum.begin(), row_sum.end(), 0.0);
         const int64_t nonzero = std::accumulate(row_nonzero.begin(), row_nonzero.end(), int64_t(0));
-        const double scale = sum > 0 ? 8.0 * unit * nonzero / sum : 0;
+        per_adjoint_ = sum > 0 ? 8.0 * nonzero / sum : 0;
+        const double scale = unit * per_adjoint_;
         each_row([&](int j) {
             int64_t row = table_[index(0, j + 1)] = 0;
             for (int i = 0; i < width; ++i) {
@@ -73,13 +74,16 @@ class Importance {
         return double(sum) / (double(unit) * (i1 - i0) * double(j1 - j0));
     }
 
+    // Of a pixel whose adjoint has this size.
+    double of(double size) const { return size > 0 ? 1 + per_adjoint_ * size : 0; }
+
    private:
     static constexpr int64_t unit = 1 << 8;
     static int clamp(double x, int most) { return x > 0 ? (x < most ? int(x) : most) : 0; }
     size_t index(int i, int j) const { return size_t(j) * (width_ + 1) + i; }
 
     int width_, height_;
-    double radius_;
+    double radius_, per_adjoint_ = 0;
     Array<int64_t> table_;
 };
 

@@ -162,24 +162,32 @@ void prefetch_face(const BackwardView<T>& view, int64_t face) {
 struct Sight {
     std::vector<uint8_t> hit;   // those of faces that were hit
     std::vector<uint8_t> near;  // those of faces with such a vertex
+    std::vector<uint8_t> rim;   // those of faces with such a vertex and another
 
     template <class T>
-    explicit Sight(const BackwardView<T>& view) : hit(view.scene.n_verts, 0) {
-        const auto mark = [&](std::vector<uint8_t>& marked, auto test) {
+    explicit Sight(const BackwardView<T>& view) : hit(view.scene.n_verts, 0), rim(view.scene.n_verts, 0) {
+        const auto each_face = [&](auto body) {
             view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
-                for (int64_t f = first; f < last; ++f)
-                    if (const int32_t* v = view.scene.faces + 3 * f; test(f, v))
-                        for (int i = 0; i < 3; ++i) std::atomic_ref(marked[v[i]]).store(1, std::memory_order_relaxed);
+                for (int64_t f = first; f < last; ++f) body(f, view.scene.faces + 3 * f);
             });
         };
-        mark(hit, [&](int64_t f, const int32_t*) { return view.seen[f]; });
+        const auto mark = [](std::vector<uint8_t>& marked, const int32_t* v) {
+            for (int i = 0; i < 3; ++i) std::atomic_ref(marked[v[i]]).store(1, std::memory_order_relaxed);
+        };
+        each_face([&](int64_t f, const int32_t* v) {
+            if (view.seen[f]) mark(hit, v);
+        });
         near = hit;
-        mark(near, [&](int64_t, const int32_t* v) { return hit[v[0]] | hit[v[1]] | hit[v[2]]; });
+        each_face([&](int64_t, const int32_t* v) {
+            const int n = hit[v[0]] + hit[v[1]] + hit[v[2]];
+            if (n == 1 || n == 2) mark(near, v), mark(rim, v);
+        });
     }
 
-    // Whether a part of the face may have been seen, and whether all of it may.
+    // Whether a part of the face may have been seen; whether all of it may; whether nothing hidden lies beside it.
     bool partly(const int32_t* v) const { return near[v[0]] | near[v[1]] | near[v[2]]; }
     bool whole(const int32_t* v) const { return hit[v[0]] & hit[v[1]] & hit[v[2]]; }
+    bool clear(const int32_t* v) const { return !(rim[v[0]] | rim[v[1]] | rim[v[2]]); }
 };
 
 // Whether a face may have a control: one without texture, all of it inside the view, and so small that its corners say
@@ -194,17 +202,30 @@ bool may_be_controlled(const BackwardView<T>& view, int64_t face, const VisibleP
     return !view.camera.perspective || far < 2 * near;
 }
 
-// How much the adjoint changes over a face, from one corner to the others, relative to its size.
-template <class T>
-double variation(const T* adjoint, const int32_t* v, int channels) {
-    const T *a = adjoint + int64_t(v[0]) * channels, *b = adjoint + int64_t(v[1]) * channels,
-            *c = adjoint + int64_t(v[2]) * channels;
-    double size = 0, change = 0;
-    for (int k = 0; k < channels; ++k) {
-        size += std::fabs(double(a[k])) + std::fabs(double(b[k])) + std::fabs(double(c[k]));
-        change += std::fabs(double(b[k]) - a[k]) + std::fabs(double(c[k]) - a[k]);
+// How much the adjoint changes over a face relative to its size: from one corner to the others, to the pixels at the
+// middles of the sides and of the face, and to the mean of its box. Corners alone may agree by chance, as the signs of
+// an L1 loss do.
+template <int N, class T>
+double variation(const BackwardView<T>& view, const Array<T>& adjoint, const int32_t* v, double importance) {
+    const int C = N ? N : view.scene.channels;
+    const T *a = &adjoint[int64_t(v[0]) * C], *b = &adjoint[int64_t(v[1]) * C], *c = &adjoint[int64_t(v[2]) * C];
+    const Vec2 x0 = view.vertices.x[v[0]], x1 = view.vertices.x[v[1]], x2 = view.vertices.x[v[2]];
+    const Vec2 inside[4] = {0.5 * (x0 + x1), 0.5 * (x1 + x2), 0.5 * (x2 + x0), (1.0 / 3) * (x0 + x1 + x2)};
+    const T* pixel[4];
+    for (int i = 0; i < 4; ++i) {
+        const int x = std::clamp(int(inside[i].x), 0, view.camera.width - 1);
+        const int y = std::clamp(int(inside[i].y), 0, view.camera.height - 1);
+        pixel[i] = view.adjoint.of(int64_t(y) * view.camera.width + x);
     }
-    return size > 0 ? change / size : 1;
+    double size = 0, change = 0, apart = 0;
+    for (int k = 0; k < C; ++k) {
+        const double A[3] = {double(a[k]), double(b[k]), double(c[k])}, mean = (A[0] + A[1] + A[2]) / 3;
+        size += std::fabs(A[0]) + std::fabs(A[1]) + std::fabs(A[2]);
+        change += std::fabs(A[1] - A[0]) + std::fabs(A[2] - A[0]);
+        for (const T* p : pixel) apart += std::fabs(p[k] - mean);
+    }
+    if (!(size > 0)) return 1;
+    return std::max({change / size, apart / size, std::fabs(1 - view.importance.of(size / 3) / importance)});
 }
 
 // Ã at the vertices that may be those of a face with a control, (V, C).
@@ -326,7 +347,9 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
                     for (int i = 0; i < 3; ++i) grad.x.add(v[i], &places[i].x);
                 }
                 if (to.colors) control.add_to_colors(grad.colors);
-                m *= std::clamp(std::max(2 * variation(adjoint.data(), v, C), polygon.longest / wide), least, 1.0);
+                if (sight.clear(v) && polygon.longest < wide)
+                    m *= std::clamp(std::max(2 * variation<N>(view, adjoint, v, importance), polygon.longest / wide),
+                                    least, 1.0);
             }
             measure[f] = m * importance;
             size[k] += m;

@@ -101,11 +101,11 @@ def test_any_number_of_samples_estimates_the_same(name: str, rough: bool, filter
         adjoint = torch.randn(48, 48, 3, generator=torch.Generator().manual_seed(3), dtype=F64)
     gradient = Gradient(SCENES[name](), adjoint)
     few = torch.stack([gradient(seed, spp=1, surface_samples=400, filter=filter) for seed in range(60)])
-    many = torch.stack([gradient(100 + seed, spp=16, surface_samples=60_000, filter=filter) for seed in range(8)])
+    many = torch.stack([gradient(100 + seed, spp=16, surface_samples=15_000, filter=filter) for seed in range(30)])
     error = (few.var(0) / len(few) + many.var(0) / len(many)).sqrt()
     scale = many.mean(0).abs().max()
     z = (few.mean(0) - many.mean(0)) / (error + 1e-9 * scale)
-    assert z.abs().max() < 4.5, z
+    assert z.abs().max() < 5, z
 
 
 def test_a_smooth_loss_needs_few_samples() -> None:
@@ -125,12 +125,26 @@ def test_a_smooth_loss_needs_few_samples() -> None:
     assert error < 0.045 * true.norm()
 
 
-def test_a_rough_loss_gets_its_samples() -> None:
-    """Where neighbouring pixels have nothing to do with one another, corners say little of what is between them."""
-    mesh, camera = icosphere(4), front_camera(96)
-    rough = torch.randn(96, 96, 3, generator=torch.Generator().manual_seed(3), dtype=F64)
-    smooth, many = (default_samples(mesh, camera, a)[0] for a in (smooth_adjoint(96, 96, 3), rough))
-    assert many > 1.8 * smooth
+@pytest.mark.parametrize("signs", [False, True])
+def test_a_rough_loss_gets_its_samples(signs: bool) -> None:
+    """Where neighbouring pixels have nothing to do with one another, corners say little of what is between them, and less
+    where they agree by chance, as the signs of an L1 loss do: then a face was sampled a sixteenth as often, error × 3."""
+    mesh, camera = icosphere(4), front_camera(64)
+    assert mesh.colors is not None
+    mesh = mesh.replace(colors=mesh.colors[:, :1])
+    rough = torch.randn(64, 64, 1, generator=torch.Generator().manual_seed(3), dtype=F64)
+    rough = rough.sign() if signs else rough
+    smooth, many = (default_samples(mesh, camera, a)[0] for a in (smooth_adjoint(64, 64, 1), rough))
+    assert many > 1.6 * smooth
+
+    def interior(seed: int, **options: int) -> Tensor:
+        verts = mesh.verts.clone().requires_grad_()
+        image = eg.render(mesh.replace(verts=verts), camera, seed=seed, visibility=False, **options)
+        return torch.autograd.grad(image, verts, rough)[0]
+
+    true = interior(9, surface_samples=200_000)
+    error = torch.stack([(interior(seed) - true).norm() for seed in range(8)]).square().mean().sqrt()
+    assert error < 1.5 * true.norm()  # 1.1 without a control; rough is rough
 
 
 def test_hardly_any_samples() -> None:
