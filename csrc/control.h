@@ -10,8 +10,9 @@
 // the interior term of the face would be T_i for the colour c_i, and −∇L · T_i for the place x_i, with ∇L constant.
 // λ_i(x) Ã(x) at a sample, in place of the integral, says what the control is at that sample. The integral plus the sum
 // over samples of (what is seen − the control) has the same mean as the sum over samples of what is seen, whatever the
-// control is worth; and where it is good, which is where a face is small and nothing hides it, what is left to chance
-// is a small part of the whole, and few samples do.
+// control is worth; and where it is good, which is where a face is small, nothing hides it and the adjoint is nearly
+// affine on it, what is left to chance is a small part of the whole, and few samples do. A hidden face that is taken
+// for a seen one adds noise of mean zero where there was none.
 #pragma once
 
 #include <algorithm>
