@@ -43,16 +43,34 @@ std::string text(double number) {
     return out;
 }
 
-constexpr int64_t parallel_from = 1 << 18;  // numbers; below, threads cost more than they save
+// Looks at blocks of numbers, in parallel where threads save more than they cost: whether all pass.
+template <class T, class Pass>
+bool all_pass(const T* values, int64_t n, Pass pass) {
+    constexpr int64_t block = 4096, parallel_from = 1 << 18;
+    bool all = true;
+#pragma omp parallel for reduction(&& : all) if (n > parallel_from)
+    for (int64_t k = 0; k < n; k += block) all = all && pass(values + k, std::min(block, n - k));
+    return all;
+}
+
+// x · 0 is zero unless x is NaN or infinite. Several sums, for one would wait for each addition.
+constexpr int sums = 16;
+template <class T>
+EDGEGRAD_VECTORIZED bool are_finite(const T* values, int64_t n) {
+    float zero[sums] = {};
+    int64_t i = 0;
+    for (; i + sums <= n; i += sums)
+        for (int k = 0; k < sums; ++k) zero[k] += float(values[i + k]) * 0.f;
+    for (; i < n; ++i) zero[0] += float(values[i]) * 0.f;
+    for (int k = 1; k < sums; ++k) zero[0] += zero[k];
+    return zero[0] == 0;
+}
 
 template <class T>
 void check_finite(const char* name, const T* values, int64_t n, int64_t width) {
-    // x · 0 is zero unless x is NaN or infinite; the sum is one fast pass. What leaves the range of floats is refused
-    // too: the squares and products of such numbers would leave that of doubles.
-    float zero = 0;
-#pragma omp parallel for simd reduction(+ : zero) if (n > parallel_from)
-    for (int64_t i = 0; i < n; ++i) zero += float(values[i]) * 0.f;
-    if (zero == 0) return;
+    // What leaves the range of floats is refused too: the squares and products of such numbers would leave that of
+    // doubles.
+    if (all_pass(values, n, are_finite<T>)) return;
     for (int64_t i = 0; i < n; ++i)
         if (!std::isfinite(float(values[i])))
             refuse(std::string(name) + ": expected " +
@@ -60,13 +78,17 @@ void check_finite(const char* name, const T* values, int64_t n, int64_t width) {
                    " at " + at(i, width));
 }
 
+// Of indices taken for unsigned, so that those below zero are great.
+EDGEGRAD_VECTORIZED uint32_t greatest(const int32_t* values, int64_t n) {
+    uint32_t most = 0;
+    for (int64_t i = 0; i < n; ++i) most = std::max(most, uint32_t(values[i]));
+    return most;
+}
+
 // `n` indices, in rows of three, of which the first is number `first`.
 void check_indices(const char* name, const int32_t* values, int64_t n, int64_t count, const char* of,
                    int64_t first = 0) {
-    int32_t least = 0, most = -1;
-#pragma omp parallel for simd reduction(min : least) reduction(max : most) if (n > parallel_from)
-    for (int64_t i = 0; i < n; ++i) least = std::min(least, values[i]), most = std::max(most, values[i]);
-    if (least >= 0 && most < count) return;
+    if (all_pass(values, n, [=](const int32_t* v, int64_t m) { return greatest(v, m) < uint64_t(count); })) return;
     for (int64_t i = 0; i < n; ++i)
         if (values[i] < 0 || values[i] >= count)
             refuse(std::string(name) + ": expected indices from 0 to " + std::to_string(count - 1) + " (rows of " + of +

@@ -139,8 +139,11 @@ class BoundaryChunk {
         view_.geometry.caster().cast(rays_, rejected_);
         for (int i = 0; i < rays_.count; ++i) {
             const Vec2 n = rays_.n(i);
-            const int32_t behind = view_.geometry.caster().beyond_float(
-                view_.frame, n, rays_.face[i], rejected_[i], [&](int32_t face) { return meets(view_, face, n); });
+            const auto decide = [&](int32_t face) {
+                return lies_far_before(view_, face, lane_[i].point.z) || meets(view_, face, n);
+            };
+            const int32_t behind =
+                view_.geometry.caster().beyond_float(view_.frame, n, rays_.face[i], rejected_[i], decide);
             add_sample(place_[lane_[i].place], lane_[i], behind, adjoint_.data() + i * C_);
         }
         rays_.count = places_ = 0;
@@ -262,8 +265,8 @@ class BoundaryChunk {
         for (const HalfEdge* h : {&current_.minus, &current_.plus}) {
             if (h->face < 0) continue;
             const Vec3 a = (both ? 0.5 : 1.0) * a_bar_, b = (both ? 0.5 : 1.0) * b_bar_;
-            grad_.q.add(vertex(view_.scene, *h, h->first()), &a.x);
-            grad_.q.add(vertex(view_.scene, *h, h->second()), &b.x);
+            grad_.q.add<3>(vertex(view_.scene, *h, h->first()), &a.x);
+            grad_.q.add<3>(vertex(view_.scene, *h, h->second()), &b.x);
         }
         current_.edge = -1;
     }

@@ -57,6 +57,11 @@ struct Camera {
         if (std::fabs(s) <= rounding_of_triple_product(view, e1, e2)) return 0;
         return s * k_det > 0 ? 1 : -1;
     }
+
+    // From which side (q0, q1, q2) is seen: 1 or 2. Seen edge-on, either will do for those who ask.
+    uint8_t side(Vec3 q0, Vec3 q1, Vec3 q2) const {
+        return dot(view_direction(q0), cross(q1 - q0, q2 - q0)) > 0 ? 1 : 2;
+    }
 };
 
 // Pixel position of q.

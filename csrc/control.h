@@ -16,8 +16,10 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstdint>
+#include <type_traits>
 #include <vector>
 
 #include "camera.h"
@@ -32,28 +34,33 @@ class Control {
    public:
     // `adjoint`: Ã at the vertices, (V, C).
     Control(const SceneView<T>& scene, const VertexView& vertices, const T* adjoint)
-        : scene_(scene), vertices_(vertices), adjoint_(adjoint), C_(N ? N : scene.channels), A_(3 * C_), T_(3 * C_) {}
+        : scene_(scene), vertices_(vertices), adjoint_(adjoint), C_(N ? N : scene.channels) {
+        if constexpr (N == 0) A_.resize(3 * C_), T_.resize(3 * C_);
+    }
 
     // Of a face that lies inside the view.
     void start(int64_t face) {
+        const int C = channels();
         v_ = scene_.faces + 3 * face, row_ = scene_.corners + 3 * face;
         for (int i = 0; i < 3; ++i)
-            for (int c = 0; c < C_; ++c) A_[i * C_ + c] = adjoint_[int64_t(v_[i]) * C_ + c];
+            for (int c = 0; c < C; ++c) A_[i * C + c] = adjoint_[int64_t(v_[i]) * C + c];
         std::fill(T_.begin(), T_.end(), 0.0);
     }
 
     void add_integral() {
-        for (int c = 0; c < C_; ++c) {
-            const double all = A_[c] + A_[C_ + c] + A_[2 * C_ + c];
-            for (int i = 0; i < 3; ++i) T_[i * C_ + c] += (A_[i * C_ + c] + all) / 12;
+        const int C = channels();
+        for (int c = 0; c < C; ++c) {
+            const double all = A_[c] + A_[C + c] + A_[2 * C + c];
+            for (int i = 0; i < 3; ++i) T_[i * C + c] += (A_[i * C + c] + all) / 12;
         }
     }
 
     // Takes away the control at a sample that stands for so large a share of the face's area.
     void subtract(Barycentrics lambda, double share) {
-        for (int c = 0; c < C_; ++c) {
-            const double A = lambda[0] * A_[c] + lambda[1] * A_[C_ + c] + lambda[2] * A_[2 * C_ + c];
-            for (int i = 0; i < 3; ++i) T_[i * C_ + c] -= share * lambda[i] * A;
+        const int C = channels();
+        for (int c = 0; c < C; ++c) {
+            const double A = lambda[0] * A_[c] + lambda[1] * A_[C + c] + lambda[2] * A_[2 * C + c];
+            for (int i = 0; i < 3; ++i) T_[i * C + c] -= share * lambda[i] * A;
         }
     }
 
@@ -63,29 +70,38 @@ class Control {
     //
     // is multiplied with the area before it is divided by it, so that a thin face is no trouble.
     void add_to_places(Vec2 x_bar[3]) const {
+        const int C = channels();
         const Vec2 x0 = vertices_.x[v_[0]], e1 = vertices_.x[v_[1]] - x0, e2 = vertices_.x[v_[2]] - x0;
         const double half = wedge(e1, e2) < 0 ? -0.5 : 0.5;
-        const auto color = [&](int i) { return scene_.colors + int64_t(row_[i]) * C_; };
+        const auto color = [&](int i) { return scene_.colors + int64_t(row_[i]) * C; };
         const T *c0 = color(0), *c1 = color(1), *c2 = color(2);
-        for (int c = 0; c < C_; ++c) {
+        for (int c = 0; c < C; ++c) {
             const double d1 = half * (double(c1[c]) - c0[c]), d2 = half * (double(c2[c]) - c0[c]);
             const Vec2 gradient{d1 * e2.y - d2 * e1.y, d2 * e1.x - d1 * e2.x};  // times the area
-            for (int i = 0; i < 3; ++i) x_bar[i] += -T_[i * C_ + c] * gradient;
+            for (int i = 0; i < 3; ++i) x_bar[i] += -T_[i * C + c] * gradient;
         }
+    }
+
+    void add_to_places(RowBuffer& rows) const {
+        Vec2 x_bar[3];
+        add_to_places(x_bar);
+        for (int i = 0; i < 3; ++i) rows.add<2>(v_[i], &x_bar[i].x);
     }
 
     // Adds to those of the colours: (3, C), or a row for each.
     void add_to_colors(double* color_bar) const {
+        const int C = channels();
         const double a = area();
-        for (int k = 0; k < 3 * C_; ++k) color_bar[k] += a * T_[k];
+        for (int k = 0; k < 3 * C; ++k) color_bar[k] += a * T_[k];
     }
     void add_to_colors(RowBuffer& rows) {
         const double a = area();
         for (double& t : T_) t *= a;
-        for (int i = 0; i < 3; ++i) rows.add(row_[i], T_.data() + i * C_);
+        for (int i = 0; i < 3; ++i) rows.add<N>(row_[i], T_.data() + i * channels());
     }
 
    private:
+    int channels() const { return N ? N : C_; }
     double area() const {
         const Vec2 x0 = vertices_.x[v_[0]];
         return 0.5 * std::fabs(wedge(vertices_.x[v_[1]] - x0, vertices_.x[v_[2]] - x0));
@@ -97,7 +113,8 @@ class Control {
     const int C_;
 
     const int32_t *v_ = nullptr, *row_ = nullptr;
-    std::vector<double> A_, T_;  // (3, C); T over the area
+    using Numbers = std::conditional_t<N == 0, std::vector<double>, std::array<double, 3 * N>>;
+    Numbers A_{}, T_{};  // (3, C); T over the area
 };
 
 }  // namespace edgegrad

@@ -201,7 +201,8 @@ class PixelRow {
         if (!s.textured) s.radiance.set(scene_, face);
         // Threads may write the same byte, always with the same value; reading first keeps its cache line shared.
         std::atomic_ref<uint8_t> seen(out_.seen[face]);
-        if (!seen.load(std::memory_order_relaxed)) seen.store(1, std::memory_order_relaxed);
+        if (!seen.load(std::memory_order_relaxed))
+            seen.store(camera_.side(corner[0], corner[1], corner[2]), std::memory_order_relaxed);
     }
 
     const SceneView<T>& scene_;

@@ -22,9 +22,10 @@ namespace edgegrad {
 
 namespace {
 
-// What the measure of a triangle is lowered by if neither it nor a neighbour was seen: never to zero, for it may be
-// seen all the same.
-constexpr double hidden = 1.0 / 8;
+// What the measure of a triangle is lowered by if neither it nor a neighbour was seen, and what by if, besides, no
+// triangle was seen from the side that it turns to the viewer, as on the far side of closed meshes: never to zero, for
+// it may be seen all the same.
+constexpr double hidden = 1.0 / 8, turned_away = 1.0 / 64;
 
 // Default samples a unit of (area + longest side · 1 px): where colours are interpolated, and where a texture may vary
 // from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
@@ -126,11 +127,14 @@ class InteriorChunk {
         const int32_t own = sample_[i].face;
         if (rays_.face[i] == own) return true;
         const Vec2 n = rays_.n(i);
-        const auto decide = [&](int32_t face) { return face == own || meets(view_, face, n); };
+        const double depth = depth_of(view_, own, n);
+        const auto far_before = [&](int32_t face) { return lies_far_before(view_, face, depth); };
+        const auto decide = [&](int32_t face) { return face == own || far_before(face) || meets(view_, face, n); };
         const int32_t met = view_.geometry.caster().beyond_float(view_.frame, n, rays_.face[i], {}, decide);
         if (met < 0 || met == own) return true;
+        if (far_before(met)) return false;
         const double* p = view_.scene.verts + 3 * int64_t(view_.scene.faces[3 * int64_t(own)]);
-        return depth_of(view_, met, n) > depth_of(view_, own, n) + view_.frame.error({p[0], p[1], p[2]});
+        return depth_of(view_, met, n) > depth + view_.frame.error({p[0], p[1], p[2]});
     }
 
     struct Sample {
@@ -157,30 +161,36 @@ void prefetch_face(const BackwardView<T>& view, int64_t face) {
     }
 }
 
-// Vertices near which the forward pass hit a face. A face smaller than the distance of the image's samples is hit by
-// chance, so it is asked together with its neighbours.
+// What the forward pass saw: near which vertices it hit a face, for one smaller than the distance of the image's
+// samples is hit by chance, so it is asked together with its neighbours; and from which sides it saw faces.
 struct Sight {
     std::vector<uint8_t> hit;   // those of faces that were hit
     std::vector<uint8_t> near;  // those of faces with such a vertex
     std::vector<uint8_t> rim;   // those of faces with such a vertex and another
+    double lowered[2];          // what the measure of a hidden face is lowered by, for the sides 1 and 2
 
     template <class T>
     explicit Sight(const BackwardView<T>& view) : hit(view.scene.n_verts, 0), rim(view.scene.n_verts, 0) {
-        const auto each_face = [&](auto body) {
-            view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
-                for (int64_t f = first; f < last; ++f) body(f, view.scene.faces + 3 * f);
-            });
-        };
         const auto mark = [](std::vector<uint8_t>& marked, const int32_t* v) {
             for (int i = 0; i < 3; ++i) std::atomic_ref(marked[v[i]]).store(1, std::memory_order_relaxed);
         };
-        each_face([&](int64_t f, const int32_t* v) {
-            if (view.seen[f]) mark(hit, v);
+        std::atomic<int64_t> faces[2] = {};  // seen from the sides 1 and 2
+        view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+            int64_t n[2] = {};
+            for (int64_t f = first; f < last; ++f)
+                if (view.seen[f]) mark(hit, view.scene.faces + 3 * f), ++n[view.seen[f] == 2];
+            faces[0] += n[0], faces[1] += n[1];
         });
+        const double all = double(faces[0] + faces[1]);
+        for (int i = 0; i < 2; ++i)
+            lowered[i] = all > 0 ? std::clamp(16 * hidden * double(faces[i]) / all, turned_away, hidden) : hidden;
         near = hit;
-        each_face([&](int64_t, const int32_t* v) {
-            const int n = hit[v[0]] + hit[v[1]] + hit[v[2]];
-            if (n == 1 || n == 2) mark(near, v), mark(rim, v);
+        view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+            for (int64_t f = first; f < last; ++f) {
+                const int32_t* v = view.scene.faces + 3 * f;
+                const int n = hit[v[0]] + hit[v[1]] + hit[v[2]];
+                if (n == 1 || n == 2) mark(near, v), mark(rim, v);
+            }
         });
     }
 
@@ -316,43 +326,55 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
     scatter_samples(F, view.team, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         const int64_t k = first / scatter_chunk;
         Control<N, T> control(view.scene, view.vertices, adjoint.data());
-        VisiblePolygon polygon;
-        for (int64_t f = first; f < last; ++f) {
-            const int32_t* v = view.scene.faces + 3 * f;
-            measure[f] = 0, is_controlled[f] = 0;
-            if (constexpr int ahead = 16; f + ahead < last)
-                for (int i = 0; i < 3; ++i) {
-                    const int32_t w = v[3 * ahead + i];
-                    prefetch(&view.vertices.x[w]), prefetch(&view.vertices.q[w]), prefetch(&view.vertices.outcode[w]);
-                    prefetch(&sight.near[w]), prefetch(&sight.hit[w]), prefetch(&adjoint[int64_t(w) * C]);
-                }
-            if (!polygon.set(view.camera, view.volume, view.vertices, v)) continue;
-            const double importance = view.importance.mean(polygon.low, polygon.high);
-            if (!(importance > 0)) continue;
-            double m = (polygon.area + polygon.longest) * (sight.partly(v) ? 1 : hidden) *
-                       (is_textured(view.scene, f) ? textured : colored);
-            if (!std::isfinite(m)) continue;  // coordinates beyond 1e150 cannot be sampled
-            if (is_textured(view.scene, f) && polygon.area >= large) {
-                is_large[f] = 1;
-                mask.mark(polygon);
-                size_of_large[k] += m;
-                continue;
+        // In groups, so that what one face asks of memory is on its way while others are worked on.
+        constexpr int group = 8, ahead = 16;
+        VisiblePolygon polygons[group];
+        Importance::Region regions[group];
+        for (int64_t g = first; g < last; g += group) {
+            const int64_t end = std::min(g + group, last);
+            for (int64_t f = g; f < end; ++f) {
+                const int32_t* v = view.scene.faces + 3 * f;
+                if (f + ahead < last)
+                    for (int i = 0; i < 3; ++i) {
+                        const int32_t w = v[3 * ahead + i];
+                        prefetch(&view.vertices.x[w]), prefetch(&view.vertices.q[w]);
+                        prefetch(&view.vertices.outcode[w]), prefetch(&adjoint[int64_t(w) * C]);
+                        prefetch(&sight.near[w]), prefetch(&sight.hit[w]);
+                    }
+                VisiblePolygon& polygon = polygons[f - g];
+                regions[f - g] = polygon.set(view.camera, view.volume, view.vertices, v)
+                                     ? view.importance.region(polygon.low, polygon.high)
+                                     : Importance::Region{};
+                view.importance.prefetch(regions[f - g]);
             }
-            if (!o.dry && may_be_controlled(view, f, polygon, sight)) {
-                is_controlled[f] = 1;
-                control.start(f), control.add_integral();
-                if (geometry) {
-                    Vec2 places[3];
-                    control.add_to_places(places);
-                    for (int i = 0; i < 3; ++i) grad.x.add(v[i], &places[i].x);
+            for (int64_t f = g; f < end; ++f) {
+                const int32_t* v = view.scene.faces + 3 * f;
+                const VisiblePolygon& polygon = polygons[f - g];
+                measure[f] = 0, is_controlled[f] = 0;
+                const double importance = view.importance.mean(regions[f - g]);
+                if (!(importance > 0)) continue;
+                double m = (polygon.area + polygon.longest) * (is_textured(view.scene, f) ? textured : colored);
+                if (!sight.partly(v)) m *= sight.lowered[side_of(view, f) - 1];
+                if (!std::isfinite(m)) continue;  // coordinates beyond 1e150 cannot be sampled
+                if (is_textured(view.scene, f) && polygon.area >= large) {
+                    is_large[f] = 1;
+                    mask.mark(polygon);
+                    size_of_large[k] += m;
+                    continue;
                 }
-                if (to.colors) control.add_to_colors(grad.colors);
-                if (sight.clear(v) && polygon.longest < wide)
-                    m *= std::clamp(std::max(2 * variation<N>(view, adjoint, v, importance), polygon.longest / wide),
-                                    least, 1.0);
+                if (!o.dry && may_be_controlled(view, f, polygon, sight)) {
+                    is_controlled[f] = 1;
+                    control.start(f), control.add_integral();
+                    if (geometry) control.add_to_places(grad.x);
+                    if (to.colors) control.add_to_colors(grad.colors);
+                    if (sight.clear(v) && polygon.longest < wide)
+                        m *=
+                            std::clamp(std::max(2 * variation<N>(view, adjoint, v, importance), polygon.longest / wide),
+                                       least, 1.0);
+                }
+                measure[f] = m * importance;
+                size[k] += m;
             }
-            measure[f] = m * importance;
-            size[k] += m;
         }
     });
     if (geometry) add_places(view, x_bar, to);

@@ -1,6 +1,7 @@
 // The interior term ∫ Ã · ∂L/∂Φ dx: what changes inside the faces.
 #pragma once
 
+#include <algorithm>
 #include <array>
 
 #include "control.h"
@@ -34,6 +35,12 @@ std::array<Vec3, 3> corners_of(const BackwardView<T>& view, int64_t face) {
     return {q[v[0]], q[v[1]], q[v[2]]};
 }
 
+template <class T>
+uint8_t side_of(const BackwardView<T>& view, int64_t face) {
+    const auto q = corners_of(view, face);
+    return view.camera.side(q[0], q[1], q[2]);
+}
+
 // Whether the ray at n meets a face, decided in double.
 template <class T>
 bool meets(const BackwardView<T>& view, int64_t face, Vec2 n) {
@@ -48,6 +55,16 @@ double depth_of(const BackwardView<T>& view, int64_t face, Vec2 n) {
     const auto corner = corners_of(view, face);
     const Barycentrics b = barycentrics_of_hit(face_map(view.camera, corner.data()), n);
     return b[0] * corner[0].z + b[1] * corner[1].z + b[2] * corner[2].z;
+}
+
+// Whether a face lies before a depth by several times its size. If a ray misses it after all, by what floats cannot
+// tell, then because it meets a neighbour; and one that passed through the face might slip past that neighbour too.
+template <class T>
+bool lies_far_before(const BackwardView<T>& view, int64_t face, double depth) {
+    const auto q = corners_of(view, face);
+    const double gap = depth - std::max({q[0].z, q[1].z, q[2].z});
+    const Vec3 a = q[1] - q[0], b = q[2] - q[1], c = q[0] - q[2];
+    return gap > 0 && gap * gap > 16 * std::max({dot(a, a), dot(b, b), dot(c, c)});
 }
 
 // What a run of samples on one face finds. What they have in common is done once for the run: the face's map and its
@@ -107,7 +124,7 @@ class FaceGrad {
                 for (int i = 0; i < 3; ++i)
                     project_vjp(view_.camera, view_.vertices.q[v[i]], x_bar[i], corner_bar[i], grad_.k);
             }
-            for (int i = 0; i < 3; ++i) grad_.q.add(v[i], &corner_bar[i].x);
+            for (int i = 0; i < 3; ++i) grad_.q.template add<3>(v[i], &corner_bar[i].x);
         }
         if (want_rows_) {
             if (controlled_) control_.add_to_colors(rows_.value.data());

@@ -157,14 +157,19 @@ Vec3 RayCaster::detail_centre(const double* verts, Team& team) const {
     std::vector<Vec3> sum(blocks);
     std::vector<double> weight(blocks, 0.0);
     team.each_block(n_faces_, [&](int64_t k, int64_t first, int64_t last) {
+        Vec3 block_sum;
+        double block_weight = 0;
         for (int64_t f = first; f < last; ++f) {
+            if (constexpr int ahead = 16; f + ahead < last)
+                for (int i = 0; i < 3; ++i) prefetch(verts + 3 * int64_t(faces_[3 * (f + ahead) + i]));
             const Vec3 a = vertex(faces_[3 * f]), b = vertex(faces_[3 * f + 1]), c = vertex(faces_[3 * f + 2]);
             const double side = std::max({dot(b - a, b - a), dot(c - b, c - b), dot(a - c, a - c)});
-            const double w = 1 / side;
-            if (!std::isfinite(w)) continue;  // a single point
-            weight[k] += w;
-            sum[k] += (w / 3) * (a - base + (b - base) + (c - base));
+            double w = 1 / side;
+            if (!(w <= std::numeric_limits<double>::max())) w = 0;  // a single point
+            block_weight += w;
+            block_sum += w * (a - base + (b - base) + (c - base));
         }
+        sum[k] = (1.0 / 3) * block_sum, weight[k] = block_weight;
     });
     Vec3 total;
     double total_weight = 0;

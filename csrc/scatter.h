@@ -23,30 +23,34 @@ class RowBuffer {
         for (Rows& r : rows_) r.count = 0;
         for (Recent& r : recent_) r.index = -1;
     }
+    // W: the width at compile time, or 0.
+    template <int W = 0>
     void add(int64_t index, const double* values) {
-        // Runs of 32 destinations in turn, which balances and keeps owners apart in cache lines.
-        Rows& r = rows_[rows_.size() > 1 ? uint32_t(index >> 5) % uint32_t(rows_.size()) : 0];
+        const int width = W ? W : width_;
         // Neighbours in a mesh come soon after one another and share destinations: most rows are added to one that is
         // there. Which are does not depend on the owners.
         Recent& recent = recent_[uint64_t(index) % n_recent];
         if (recent.index == index) {
-            double* row = r.value.data() + recent.row * width_;
-            for (int c = 0; c < width_; ++c) row[c] += values[c];
+            double* row = rows_[recent.owner].value.data() + size_t(recent.row) * width;
+            for (int c = 0; c < width; ++c) row[c] += values[c];
             return;
         }
-        recent = {index, r.count};
+        // Runs of 32 destinations in turn, which balances and keeps owners apart in cache lines.
+        const uint32_t owner = rows_.size() > 1 ? uint32_t(index >> 5) % uint32_t(rows_.size()) : 0;
+        Rows& r = rows_[owner];
+        recent = {index, owner, uint32_t(r.count)};
         if (r.count == r.index.size()) {
             r.index.resize(std::max<size_t>(16, 2 * r.count));
-            r.value.resize(r.index.size() * width_);
+            r.value.resize(r.index.size() * width);
         }
         r.index[r.count] = index;
-        std::copy(values, values + width_, r.value.begin() + r.count * width_);
+        std::copy(values, values + width, r.value.begin() + r.count * width);
         ++r.count;
     }
     void add_to(double* destination, int owner) const {
-        const Rows& r = rows_[owner];
-        for (size_t k = 0; k < r.count; ++k)
-            for (int c = 0; c < width_; ++c) destination[r.index[k] * width_ + c] += r.value[k * width_ + c];
+        if (width_ == 2) add_to<2>(destination, rows_[owner]);
+        else if (width_ == 3) add_to<3>(destination, rows_[owner]);
+        else add_to<0>(destination, rows_[owner]);
     }
 
    private:
@@ -57,8 +61,14 @@ class RowBuffer {
     };
     struct Recent {
         int64_t index = -1;
-        size_t row = 0;  // among those of its owner
+        uint32_t owner = 0, row = 0;
     };
+    template <int W>
+    void add_to(double* destination, const Rows& r) const {
+        const int width = W ? W : width_;
+        for (size_t k = 0; k < r.count; ++k)
+            for (int c = 0; c < width; ++c) destination[r.index[k] * width + c] += r.value[k * width + c];
+    }
     static constexpr int n_recent = 256;
     int width_ = 0;
     std::vector<Rows> rows_;  // one for each owner
