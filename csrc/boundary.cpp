@@ -180,7 +180,7 @@ class BoundaryChunk {
     // False if a face that the ray meets hides the point; else it lies behind, and is kept if it is the nearest so far.
     bool lies_behind(int64_t face, const Curve& curve, Lane& lane) const {
         const auto corner = corners_of(view_, face);
-        if (hides(face, corner.data(), lane.point, curve)) return false;
+        if (lies_far_before(view_, face, lane.point.z) || hides(face, corner.data(), lane.point, curve)) return false;
         const double depth = depth_of(view_, face, lane.n);
         for (int k = 0; k < lane.views; ++k)
             if (depth < lane.behind[k].depth)

@@ -26,6 +26,20 @@ def bars(n: int = 40) -> eg.Mesh:
     return eg.Mesh(verts, torch.arange(3 * n).reshape(-1, 3), colors=colors)
 
 
+def turned_away() -> eg.Mesh:
+    """Small triangles before everything else, seen from the side from which no other face is: chance tells which the image
+    hits, and what it misses gets few samples."""
+    random = torch.Generator().manual_seed(2)
+    centre = 8 + 32 * torch.rand(60, 1, 2, generator=random, dtype=F64)
+    corners = (centre + torch.tensor([[0.0, 0.0], [0.5, 0.1], [0.2, 0.4]], dtype=F64)).reshape(-1, 2)
+    verts = unproject(CAMERA, corners, torch.full((180,), 2.5, dtype=F64))
+    return eg.Mesh(verts, torch.arange(180).reshape(-1, 3), colors=random_colors(180))
+
+
+def random_colors(n: int) -> Tensor:
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(1), dtype=F64)
+
+
 def apart(mesh: eg.Mesh) -> eg.Mesh:
     """Each face with vertices of its own: none has neighbours that tell whether it was seen."""
     assert mesh.colors is not None
@@ -45,15 +59,16 @@ def steep() -> eg.Mesh:
     a, b, c, d = k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]
     faces = torch.cat([torch.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
     verts = unproject(CAMERA, pixels, depth)
-    return eg.Mesh(verts, faces, colors=torch.rand(n * n, 3, generator=torch.Generator().manual_seed(1), dtype=F64))
+    return eg.Mesh(verts, faces, colors=random_colors(n * n))
 
 
 SCENES = {
     "sphere": lambda: [icosphere(3)],
     "behind bars": lambda: [icosphere(3), bars()],
     "faces apart": lambda: [apart(icosphere(3)), bars(10)],
+    "turned away": lambda: [icosphere(3), turned_away()],
     "steep": lambda: [steep()],
-    "one colour a face": lambda: [icosphere(2).replace(colors=None, face_colors=torch.rand(320, 3, dtype=F64))],
+    "one colour a face": lambda: [icosphere(2).replace(colors=None, face_colors=random_colors(320))],
 }
 
 
