@@ -6,10 +6,15 @@
 #else
 #include <dlfcn.h>
 #endif
+#ifdef __linux__
+#include <sys/prctl.h>
+#endif
 
 #include <algorithm>
 #include <chrono>
 #include <cmath>
+#include <filesystem>
+#include <fstream>
 #include <limits>
 #include <new>
 #include <numeric>
@@ -94,12 +99,50 @@ namespace {
 
 std::chrono::steady_clock::time_point last_build;  // guarded by embree_mutex
 
+#if defined(__linux__)
+constexpr char worker_name[] = "embree";
+
+// While it lives, threads that this one starts have a name by which they are known: they inherit it.
+class NamedWorkers {
+   public:
+    NamedWorkers() { prctl(PR_GET_NAME, own_), prctl(PR_SET_NAME, worker_name); }
+    ~NamedWorkers() { prctl(PR_SET_NAME, own_); }
+
+   private:
+    char own_[16] = {};
+};
+
+// Whether one of these threads runs, or waits for a processor.
+bool a_worker_is_awake() {
+    std::error_code error;
+    for (const auto& task : std::filesystem::directory_iterator("/proc/self/task", error)) {
+        std::string line;  // number (name) state …
+        std::getline(std::ifstream(task.path() / "stat"), line);
+        const size_t name = line.find('('), state = line.rfind(')') + 2;
+        if (name == std::string::npos || state >= line.size()) continue;
+        if (line.substr(name + 1, state - name - 3) == worker_name && line[state] != 'S') return true;
+    }
+    return false;
+}
+#else
+struct NamedWorkers {};
+bool a_worker_is_awake() { return false; }
+#endif
+
 }  // namespace
 
 // A build is over when its work is done, not when the threads that helped have gone: on their way they take locks of
-// TBB, and a child that is forked just then would wait for these for ever. Nothing tells when they sleep; they look for
-// more work for much less than a millisecond, so what counts is how long a busy machine may keep one from running.
-void let_embree_sleep() { std::this_thread::sleep_until(last_build + std::chrono::milliseconds(20)); }
+// TBB, and a child that is forked just then would wait for these for ever. They look for more work for much less than a
+// millisecond, but a busy machine may keep one from running for long. Linux tells; elsewhere, and for threads that
+// another user of TBB started, all one can do is wait a while. Twice asleep, for the last one awake may have woken one
+// that was looked at before.
+void let_embree_sleep() {
+    using std::chrono::milliseconds;
+    std::this_thread::sleep_until(last_build + milliseconds(20));
+    const auto give_up = std::chrono::steady_clock::now() + milliseconds(5000);
+    for (int asleep = 0; asleep < 2 && std::chrono::steady_clock::now() < give_up; ++asleep)
+        if (a_worker_is_awake()) asleep = -1, std::this_thread::sleep_for(milliseconds(1));
+}
 
 void open_embree(const std::string& path, const std::string& options) {
     {
@@ -197,8 +240,11 @@ void RayCaster::update(const double* verts, Team& team) {
     });
     const std::lock_guard lock(embree_mutex);
     if (committed_) rtc.rtcUpdateGeometryBuffer(static_cast<Geometry>(geometry_), BUFFER_TYPE_VERTEX, 0);
-    rtc.rtcCommitGeometry(static_cast<Geometry>(geometry_));
-    rtc.rtcCommitScene(static_cast<Scene>(scene_));
+    {
+        [[maybe_unused]] const NamedWorkers named;
+        rtc.rtcCommitGeometry(static_cast<Geometry>(geometry_));
+        rtc.rtcCommitScene(static_cast<Scene>(scene_));
+    }
     last_build = std::chrono::steady_clock::now();
     throw_on_error("building the ray structure");
     committed_ = true;
