@@ -180,11 +180,11 @@ struct SceneArrays {
                 int(background.shape(2))};
     }
 
-    std::shared_ptr<const Geometry> geometry(bool want_topology, Team& team, GeometryWork& work) const {
+    std::shared_ptr<const Geometry> geometry(GeometryWanted wanted, Team& team, GeometryWork& work) const {
         // Nobody is asked whether to go on: a lock is held, which a signal handler that renders would wait for.
         Team quiet(team.threads());
-        return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, want_topology,
-                                quiet, work);
+        return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, wanted, quiet,
+                                work);
     }
 };
 
@@ -266,7 +266,7 @@ Profile forward(const SceneArrays<T>& scene, const Camera& camera, int spp, cons
     return unlocked(threads, [&](Team& team) -> Profile {
         Stopwatch watch;
         GeometryWork work;
-        const auto geometry = scene.geometry(false, team, work);
+        const auto geometry = scene.geometry({}, team, work);
         const double update = watch.lap();
         render_forward(scene.view(), camera, geometry->caster(), options, team,
                        ForwardOutput<T>{image.data(), coverage.data(), seen.data()});
@@ -304,7 +304,8 @@ Profile backward(const SceneArrays<T>& scene, const Camera& camera, int64_t surf
     double update = 0;
     const BackwardProfile p = unlocked(threads, [&](Team& team) {
         Stopwatch watch;
-        const auto geometry = scene.geometry(grad.geometry() && boundary, team, work);
+        const bool interior = (grad.geometry() && interior_geometry) || grad.appearance();
+        const auto geometry = scene.geometry({grad.geometry() && boundary, interior}, team, work);
         update = watch.lap();
         return render_backward(scene.view(), camera, *geometry, options, team, adjoint.data(),
                                ForwardView<T>{coverage.data(), seen.data()}, grad);
@@ -344,7 +345,7 @@ void bind_scene(nb::module_& m, const char* name) {
                 const ForwardOptions options{spp, make_filter(filter), seed};
                 return unlocked(threads, [&](Team& team) {
                     GeometryWork work;
-                    return bare_loop(camera, scene.geometry(false, team, work)->caster(), options, packet_width, team);
+                    return bare_loop(camera, scene.geometry({}, team, work)->caster(), options, packet_width, team);
                 });
             },
             "camera"_a, "spp"_a, "filter"_a, "seed"_a, "packet_width"_a, "threads"_a)
@@ -359,7 +360,7 @@ void bind_scene(nb::module_& m, const char* name) {
                 return unlocked(threads, [&](Team& team) {
                     const std::vector<uint8_t> seen(scene.faces.shape(0), 1);
                     GeometryWork work;
-                    const auto geometry = scene.geometry(false, team, work);
+                    const auto geometry = scene.geometry({}, team, work);
                     const BackwardProfile p =
                         render_backward(scene.view(), camera, *geometry, options, team, adjoint.data(),
                                         ForwardView<T>{nullptr, seen.data()}, grad);

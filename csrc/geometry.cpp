@@ -28,7 +28,7 @@ bool same(const std::vector<T>& kept_values, const T* values, int64_t n) {
 }  // namespace
 
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
-                                                 int64_t n_verts, double spacing, bool want_topology, Team& team,
+                                                 int64_t n_verts, double spacing, GeometryWanted wanted, Team& team,
                                                  GeometryWork& work) {
     const std::lock_guard lock(mutex);
     auto found = kept.end();
@@ -57,13 +57,15 @@ std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n
         geometry->spacing_ = spacing;
         geometry->welded_ = false;
     }
-    if (want_topology && !geometry->welded_) {
+    if (wanted.topology && !geometry->welded_) {
         work.edges = true;
         if (!geometry->topology_)
             geometry->topology_ = std::make_unique<Topology>(geometry->faces_.data(), n_faces, n_verts);
         geometry->topology_->weld(verts, spacing);
         geometry->welded_ = true;
     }
+    if (wanted.parts && !geometry->parts_)
+        geometry->parts_ = std::make_unique<Parts>(geometry->faces_.data(), n_faces, n_verts);
     kept.push_front(geometry);
     while (kept.size() > most_kept) kept.pop_back();
     return geometry;

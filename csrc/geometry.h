@@ -10,7 +10,12 @@
 
 namespace edgegrad {
 
-// What acquire_geometry had to do.
+// What acquire_geometry is to have ready besides the ray structure.
+struct GeometryWanted {
+    bool topology = false, parts = false;
+};
+
+// What it had to do.
 struct GeometryWork {
     bool rays = false;   // built or updated the ray structure
     bool edges = false;  // found or welded the edges
@@ -26,23 +31,27 @@ class Geometry {
     // same geometry: acquire_geometry does it.
     const Topology& topology() const { return *topology_; }
 
+    // The same holds for these.
+    const Parts& parts() const { return *parts_; }
+
    private:
     friend std::shared_ptr<const Geometry> acquire_geometry(const int32_t*, int64_t, const double*, int64_t, double,
-                                                            bool, Team&, GeometryWork&);
+                                                            GeometryWanted, Team&, GeometryWork&);
 
     std::vector<int32_t> faces_;
     std::vector<double> verts_;
     RayCaster caster_;
     std::unique_ptr<Topology> topology_;
+    std::unique_ptr<Parts> parts_;
     double spacing_ = 0;   // of the numbers in which the user gave the positions: decides what is welded
     bool welded_ = false;  // at the current positions
 };
 
-// The geometry of these faces at these positions, with its topology if wanted. One that is still in memory is used
+// The geometry of these faces at these positions, with what is wanted. One that is still in memory is used
 // again: as it is when the positions are the same, updated when they moved and nobody else uses it. What is compared is
 // the content of the arrays, so tensors may be copied, changed in place or freed without harm.
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
-                                                 int64_t n_verts, double spacing, bool want_topology, Team& team,
+                                                 int64_t n_verts, double spacing, GeometryWanted wanted, Team& team,
                                                  GeometryWork& work);
 
 // Forgets all kept geometry that is not in use.

@@ -22,10 +22,12 @@ namespace edgegrad {
 
 namespace {
 
-// What the measure of a triangle is lowered by if neither it nor a neighbour was seen, and what by if, besides, no
-// triangle was seen from the side that it turns to the viewer, as on the far side of closed meshes: never to zero, for
-// it may be seen all the same.
-constexpr double hidden = 1.0 / 8, turned_away = 1.0 / 64;
+// What the measure of a triangle is lowered by if neither it nor a neighbour was seen, and what by if, besides, the
+// part of the surface to which it belongs was seen from the other side alone, as a closed mesh is: never to zero, for
+// it may be seen all the same. A side counts in full from a share of `some` of the faces that were seen of the part, if
+// these are at least `enough` to tell.
+constexpr double hidden = 1.0 / 8, turned_away = 1.0 / 64, some = 1.0 / 16;
+constexpr int enough = 64;
 
 // Default samples a unit of (area + longest side · 1 px): where colours are interpolated, and where a texture may vary
 // from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
@@ -162,28 +164,36 @@ void prefetch_face(const BackwardView<T>& view, int64_t face) {
 }
 
 // What the forward pass saw: near which vertices it hit a face, for one smaller than the distance of the image's
-// samples is hit by chance, so it is asked together with its neighbours; and from which sides it saw faces.
+// samples is hit by chance, so it is asked together with its neighbours; and from which side it saw the surface.
 struct Sight {
     std::vector<uint8_t> hit;   // those of faces that were hit
     std::vector<uint8_t> near;  // those of faces with such a vertex
     std::vector<uint8_t> rim;   // those of faces with such a vertex and another
-    double lowered[2];          // what the measure of a hidden face is lowered by, for the sides 1 and 2
+    std::vector<int32_t> seen;  // faces that were hit, by part and side
 
     template <class T>
-    explicit Sight(const BackwardView<T>& view) : hit(view.scene.n_verts, 0), rim(view.scene.n_verts, 0) {
+    explicit Sight(const BackwardView<T>& view)
+        : hit(view.scene.n_verts, 0), rim(view.scene.n_verts, 0), seen(2 * view.geometry.parts().size(), 0) {
         const auto mark = [](std::vector<uint8_t>& marked, const int32_t* v) {
             for (int i = 0; i < 3; ++i) std::atomic_ref(marked[v[i]]).store(1, std::memory_order_relaxed);
         };
-        std::atomic<int64_t> faces[2] = {};  // seen from the sides 1 and 2
         view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
-            int64_t n[2] = {};
-            for (int64_t f = first; f < last; ++f)
-                if (view.seen[f]) mark(hit, view.scene.faces + 3 * f), ++n[view.seen[f] == 2];
-            faces[0] += n[0], faces[1] += n[1];
+            // Neighbours mostly count for the same, and threads that all add to one number wait for each other.
+            int64_t counter = 0;
+            int32_t n = 0;
+            const auto count = [&] {
+                if (n) std::atomic_ref(seen[counter]).fetch_add(n, std::memory_order_relaxed);
+            };
+            for (int64_t f = first; f < last; ++f) {
+                if (!view.seen[f]) continue;
+                const int32_t* v = view.scene.faces + 3 * f;
+                mark(hit, v);
+                const int64_t own = 2 * int64_t(view.geometry.parts().of(v[0])) + (view.seen[f] == 2);
+                if (own != counter) count(), counter = own, n = 0;
+                ++n;
+            }
+            count();
         });
-        const double all = double(faces[0] + faces[1]);
-        for (int i = 0; i < 2; ++i)
-            lowered[i] = all > 0 ? std::clamp(16 * hidden * double(faces[i]) / all, turned_away, hidden) : hidden;
         near = hit;
         view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
             for (int64_t f = first; f < last; ++f) {
@@ -192,6 +202,15 @@ struct Sight {
                 if (n == 1 || n == 2) mark(near, v), mark(rim, v);
             }
         });
+    }
+
+    // What the measure of a hidden face is lowered by.
+    template <class T>
+    double lowered(const BackwardView<T>& view, int64_t face) const {
+        const int32_t* n = &seen[2 * int64_t(view.geometry.parts().of(view.scene.faces[3 * face]))];
+        if (n[0] + n[1] < enough) return hidden;
+        const double share = double(n[side_of(view, face) - 1]) / (n[0] + n[1]);
+        return std::clamp(share / some * hidden, turned_away, hidden);
     }
 
     // Whether a part of the face may have been seen; whether all of it may; whether nothing hidden lies beside it.
@@ -354,7 +373,7 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
                 const double importance = view.importance.mean(regions[f - g]);
                 if (!(importance > 0)) continue;
                 double m = (polygon.area + polygon.longest) * (is_textured(view.scene, f) ? textured : colored);
-                if (!sight.partly(v)) m *= sight.lowered[side_of(view, f) - 1];
+                if (!sight.partly(v)) m *= sight.lowered(view, f);
                 if (!std::isfinite(m)) continue;  // coordinates beyond 1e150 cannot be sampled
                 if (is_textured(view.scene, f) && polygon.area >= large) {
                     is_large[f] = 1;

@@ -25,7 +25,7 @@ struct BackwardView {
     const BackwardOptions& options;
     Team& team;
     const RayFrame& frame;
-    const uint8_t* seen;  // (F,): whether the forward pass hit the face
+    const uint8_t* seen;  // (F,): 0, or the side from which the forward pass hit the face
 };
 
 template <class T>
@@ -57,8 +57,9 @@ double depth_of(const BackwardView<T>& view, int64_t face, Vec2 n) {
     return b[0] * corner[0].z + b[1] * corner[1].z + b[2] * corner[2].z;
 }
 
-// Whether a face lies before a depth by several times its size. If a ray misses it after all, by what floats cannot
-// tell, then because it meets a neighbour; and one that passed through the face might slip past that neighbour too.
+// Whether a face lies before a depth by several times its size. If a ray that float says to meet it misses it after
+// all, then mostly because it meets a neighbour, and one that passed through the face might slip past that neighbour
+// too; so there float decides, as it did for the image.
 template <class T>
 bool lies_far_before(const BackwardView<T>& view, int64_t face, double depth) {
     const auto q = corners_of(view, face);

@@ -53,7 +53,7 @@ template <class T>
 struct ForwardOutput {
     T* image;       // (H, W, C)
     T* coverage;    // (H, W): the filtered share of each pixel where something is hit
-    uint8_t* seen;  // (F,): whether a sample hit the face
+    uint8_t* seen;  // (F,): 0, or the side, 1 or 2, from which a sample hit the face
 };
 
 template <class T>

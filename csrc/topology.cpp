@@ -6,6 +6,21 @@
 
 namespace edgegrad {
 
+Parts::Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts) : part_(n_verts) {
+    // Disjoint sets, each named after its first vertex.
+    std::vector<int32_t> up(n_verts);
+    std::iota(up.begin(), up.end(), 0);
+    const auto first_of = [&](int32_t v) {
+        while (up[v] != v) v = up[v] = up[up[v]];
+        return v;
+    };
+    for (int64_t i = 0; i < 3 * n_faces; ++i) {
+        const int32_t a = first_of(faces[i]), b = first_of(faces[i - i % 3]);
+        up[std::max(a, b)] = std::min(a, b);
+    }
+    for (int64_t v = 0; v < n_verts; ++v) part_[v] = up[v] == v ? size_++ : part_[up[v]];
+}
+
 Topology::Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts)
     : faces_(faces), n_faces_(n_faces), n_verts_(n_verts) {
     build();

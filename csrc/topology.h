@@ -21,6 +21,20 @@ struct HalfEdge {
     int second() const { return backwards ? corner : (corner + 1) % 3; }  // … and at its end
 };
 
+// Which faces hang together: those that share a vertex by index, and all that share one with them.
+class Parts {
+   public:
+    Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts);
+
+    int64_t size() const { return size_; }
+    // The part of a face, by one of its vertices.
+    int32_t of(int32_t vertex) const { return part_[vertex]; }
+
+   private:
+    std::vector<int32_t> part_;
+    int32_t size_ = 0;
+};
+
 class Topology {
    public:
     Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts);

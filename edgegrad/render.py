@@ -43,8 +43,8 @@ def render(
                      get samples of their own
     surface_samples  samples of the gradient inside faces, for each camera: an int in all, or None for ½ a unit of surface,
                      (area + longest side · 1 px) summed over the triangles in view; 4 where they are textured, ⅛ as many
-                     where the image saw neither the triangle nor a neighbour (1/64 if it saw none from that side, as the
-                     far side of a closed mesh), and down to 1/16 where triangles are small and the loss changes little
+                     where the image saw neither the triangle nor a neighbour (1/64 if it saw what hangs together with it
+                     from the other side alone, as a closed mesh), and down to 1/16 where triangles are small and the loss changes little
                      over them. Large textured triangles take whole samples a pixel, at least one
     edge_samples     samples of the gradient at edges, for each camera: an int in all, or None for 24 a pixel of curve
     visibility       False leaves out what moves at silhouettes and other jumps; the gradient is then that of the shading alone
@@ -183,7 +183,8 @@ Profile = dict[str, float]
 
 
 def forward_kernel(*args: Any) -> tuple[Tensor, Tensor, Tensor, list[Profile]]:
-    """image (B, H, W, C), coverage (B, H, W), seen (B, F), and what the kernel did for each camera. Raises MemoryError."""
+    """image (B, H, W, C), coverage (B, H, W), the side (B, F) from which a face was seen or 0, and what the kernel did for each
+    camera. Raises MemoryError."""
     with image_room(*args):
         return _forward_kernel(*args)
 
