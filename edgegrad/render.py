@@ -44,8 +44,8 @@ def render(
     surface_samples  samples of the gradient inside faces, for each camera: an int in all, or None for ½ a unit of surface,
                      (area + longest side · 1 px) summed over the triangles in view; 4 where they are textured, ⅛ as many
                      where the image saw neither the triangle nor a neighbour (1/64 if it saw what hangs together with it
-                     from the other side alone, as a closed mesh), and down to 1/16 where triangles are small and the loss changes little
-                     over them. Large textured triangles take whole samples a pixel, at least one
+                     from the other side alone, as a closed mesh), and down to 1/16 where triangles are small and the loss
+                     changes little over them. Large textured triangles take whole samples a pixel, at least one
     edge_samples     samples of the gradient at edges, for each camera: an int in all, or None for 24 a pixel of curve
     visibility       False leaves out what moves at silhouettes and other jumps; the gradient is then that of the shading alone
     filter           "box" (1 px wide), "tent" (2 px) or "gaussian" (σ ½ px, 3 px)

@@ -125,7 +125,8 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
         texels(scene.texels.size()), background(scene.background.size()), pose(16), K(9);
     const SceneGrad grad{verts.data(),      colors.data(), uvs.data(), texels.data(),
                          background.data(), pose.data(),   K.data()};
-    const auto geometry = acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, 1e-7, {true, true}, team, work);
+    const auto geometry =
+        acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, 1e-7, {true, true}, team, work);
     const BackwardOptions options{-1, -1, Filter(filter), 2, true, true, 1e-7, false};
     render_backward(view, camera, *geometry, options, team, image.data(), ForwardView<T>{coverage.data(), seen.data()},
                     grad);
