@@ -3,6 +3,7 @@
 import hashlib
 import importlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -211,6 +212,23 @@ def test_forked_children_render(forks, tmp_path):
     assert found["loader"] == [expected[k % 2] for k in range(6)]
     assert found["meanwhile"] == [[expected] * 2] * forks and all(found["rounds"])
     assert found["parent"] == expected
+
+
+NAMES = """
+from pathlib import Path
+
+for k in range(3):
+    eg.render(icosphere(5).transformed(scale=1.0 + k), front_camera(8), spp=1)
+tasks = sorted(int(task) for task in os.listdir("/proc/self/task"))
+print(json.dumps([Path(f"/proc/self/task/{task}/comm").read_text().strip() for task in tasks]))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux") or os.cpu_count() == 1, reason="names of threads as on Linux")
+def test_threads_of_a_build_are_known_by_name(tmp_path):
+    """fork() waits until those of this name sleep. The thread that builds keeps its own."""
+    names = script(NAMES, folder=tmp_path)
+    assert names[0] != "embree" and "embree" in names[1:], names
 
 
 FORK_WHILE_BUILDING = """
