@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <atomic>
 #include <bit>
+#include <cmath>
+#include <limits>
 #include <vector>
 
 #include "render.h"
@@ -97,6 +99,16 @@ class PixelRow {
             for (int c = 0; c < C_; ++c)
                 out_.image[pixel * C_ + c] = T(sum_[x * C_ + c] / spp_ + (1 - share) * behind[c]);
             out_.coverage[pixel] = T(share);
+        }
+    }
+
+    // The same where no ray can hit anything.
+    void leave_out(int x0, int x1, int y) {
+        for (int x = x0; x < x1; ++x) {
+            const int64_t pixel = int64_t(y) * camera_.width + x;
+            const T* behind = scene_.background_at(pixel);
+            std::copy(behind, behind + C_, out_.image + pixel * C_);
+            out_.coverage[pixel] = 0;
         }
     }
 
@@ -228,6 +240,41 @@ class PixelRow {
     std::vector<double> sum_, radiance_;
 };
 
+// The pixels whose samples may hit something, half open: those in a box around all vertices, if these lie before the
+// eye. With a pixel more on each side, for Embree sees positions rounded to floats.
+struct PixelBox {
+    int x0, y0, x1, y1;
+
+    bool meets(int from, int to, int y) const { return from < x1 && to > x0 && y0 <= y && y < y1; }
+};
+
+PixelBox reachable_pixels(const Camera& camera, const Array<Vec3>& q, double radius, Team& team) {
+    constexpr double all = std::numeric_limits<double>::infinity();
+    const int64_t blocks = Team::blocks(q.size());
+    std::vector<Vec2> low(blocks, {all, all}), high(blocks, {-all, -all});
+    team.each_block(q.size(), [&](int64_t k, int64_t first, int64_t last) {
+        Vec2 l = low[k], h = high[k];
+        for (int64_t v = first; v < last; ++v) {
+            const Vec2 x = project(camera, q[v]);
+            if (camera.depth_weight(q[v]) > 0 && std::isfinite(x.x + x.y)) {
+                l = {std::min(l.x, x.x), std::min(l.y, x.y)};
+                h = {std::max(h.x, x.x), std::max(h.y, x.y)};
+            } else {
+                l = {-all, -all}, h = {all, all};
+            }
+        }
+        low[k] = l, high[k] = h;
+    });
+    for (int64_t k = 1; k < blocks; ++k) {
+        low[0] = {std::min(low[0].x, low[k].x), std::min(low[0].y, low[k].y)};
+        high[0] = {std::max(high[0].x, high[k].x), std::max(high[0].y, high[k].y)};
+    }
+    const auto first = [&](double x, int size) { return int(std::clamp(x - radius - 1, 0.0, double(size))); };
+    const auto end = [&](double x, int size) { return int(std::clamp(x + radius + 2, 0.0, double(size))); };
+    return {first(low[0].x, camera.width), first(low[0].y, camera.height), end(high[0].x, camera.width),
+            end(high[0].y, camera.height)};
+}
+
 template <int N, class T>
 void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ForwardOptions& o,
                    Team& team, const Array<Vec3>& q, const ForwardOutput<T>& out) {
@@ -235,13 +282,16 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
     const int rows = std::clamp((1 << 16) / o.spp, 1, tile);
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + rows - 1) / rows;
     const RayFrame frame(caster, camera);
+    const PixelBox box = reachable_pixels(camera, q, o.filter.radius() - 0.5, team);
     team.each_with(
         int64_t(tiles_x) * tiles_y,
         [&] { return std::make_unique<PixelRow<N, T>>(scene, camera, caster, frame, o, team, q, out); },
         [&](PixelRow<N, T>& row, int64_t t) {
-            const int x0 = int(t % tiles_x) * tile, y0 = int(t / tiles_x) * rows;
-            for (int y = y0; y < std::min(y0 + rows, camera.height); ++y)
-                row.render(x0, std::min(x0 + tile, camera.width), y);
+            const int x0 = int(t % tiles_x) * tile, x1 = std::min(x0 + tile, camera.width);
+            const int y0 = int(t / tiles_x) * rows, y1 = std::min(y0 + rows, camera.height);
+            for (int y = y0; y < y1; ++y)
+                if (box.meets(x0, x1, y)) row.render(x0, x1, y);
+                else row.leave_out(x0, x1, y);
         });
 }
 

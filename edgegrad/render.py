@@ -322,7 +322,6 @@ def _backward_kernel(
     perspective, height, width, _, filter, _, spacing = args[11:18]
     surface_samples, edge_samples, grad_seed, interior_geometry, boundary, wanted = args[18:]
     work = backward_work(interior_geometry, boundary, wanted)
-    check_finite("the gradient of the image", adjoint)
     scene = _kernel_scene(flat, spacing)
     # Sums are taken in double whatever the arrays hold.
     grads = [
@@ -333,16 +332,20 @@ def _backward_kernel(
     if background is not None and background.ndim == 1:
         background = background[None, None]
     adjoint = adjoint.detach().contiguous()
-    profiles = [
-        scene.backward(
-            _kernel_camera(world_to_camera[b], K[b], perspective, height, width),
-            surface_samples, edge_samples, filter, grad_seed if b == 0 else _derived_seed(grad_seed, b + 1),
-            torch.get_num_threads(), work.motion, work.boundary, dry, adjoint[b].numpy(), coverage[b].numpy(),
-            seen[b].numpy(), verts, colors, uvs, texels, background,
-            None if gw2c is None else gw2c[b], None if gK is None else gK[b],
-        )
-        for b in range(world_to_camera.shape[0])
-    ]  # fmt: skip
+    try:
+        profiles = [
+            scene.backward(
+                _kernel_camera(world_to_camera[b], K[b], perspective, height, width),
+                surface_samples, edge_samples, filter, grad_seed if b == 0 else _derived_seed(grad_seed, b + 1),
+                torch.get_num_threads(), work.motion, work.boundary, dry, adjoint[b].numpy(), coverage[b].numpy(),
+                seen[b].numpy(), verts, colors, uvs, texels, background,
+                None if gw2c is None else gw2c[b], None if gK is None else gK[b],
+            )
+            for b in range(world_to_camera.shape[0])
+        ]  # fmt: skip
+    except ValueError:
+        check_finite("the gradient of the image", adjoint)  # as the kernel does, but this knows the place in the batch
+        raise
     return grads, profiles
 
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from scenes import front_camera, smooth_colors
+from scenes import cube, front_camera, smooth_colors
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 import edgegrad as eg
 from edgegrad import reference
-from edgegrad.render import _kernel_camera, _kernel_scene
+from edgegrad.render import FILTERS, _kernel_camera, _kernel_scene
 from edgegrad.scene import Flat, flatten
 
 F64 = torch.float64
@@ -221,3 +221,30 @@ def test_equals_the_twin(look, view):
         a, b = (torch.zeros_like(leaves[name]) if g is None else g for g in (a, b))
         atol = 1e-9 * max(1.0, float(b.abs().max()))
         torch.testing.assert_close(a[rows], b[rows], rtol=0, atol=atol, msg=lambda text, name=name: f"{name}: {text}")
+
+
+@pytest.mark.parametrize("filter", FILTERS)
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+def test_pixels_that_nothing_can_reach(projection: str, filter: str) -> None:
+    """No ray is cast far from a bar across the picture. Vertices of no face, no farther away than its ends, widen the box in
+    which rays are cast; they change no bit."""
+    bar = cube()
+    bar = bar.replace(verts=bar.verts / bar.verts.abs().amax(0) * torch.tensor([1.0, 0.04, 0.04], dtype=F64))
+    assert bar.colors is not None
+    more = torch.tensor([[0.0, 0.9, 0.0], [0.0, -0.9, 0.0], [0.0, 0.0, 0.9]], dtype=F64)
+    wide = bar.replace(verts=torch.cat([bar.verts, more]), colors=torch.cat([bar.colors, bar.colors[:3]]))
+    camera = eg.Camera.look_at((0.4, 0.3, 2.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 60.0, (64, 80))
+    if projection == "orthographic":
+        half = torch.tensor([[0.5, 0.5, 1.0], [0.5, 0.5, 1.0], [1.0, 1.0, 1.0]], dtype=F64)
+        camera = camera.replace(projection=projection, K=camera.K * half)
+    background = torch.rand(64, 80, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
+    found = []
+    for mesh in (bar, wide):
+        behind = background.clone().requires_grad_()
+        image = eg.render(eg.Scene([mesh], behind), camera, 5, filter=filter)
+        image.sum().backward()
+        found.append((image.detach(), behind.grad))
+    (image, coverage), (wide_image, wide_coverage) = found
+    assert torch.equal(image, wide_image) and torch.equal(coverage, wide_coverage)
+    seen = (image != background).any(-1)
+    assert seen.any() and torch.equal(image[:8], background[:8]) and torch.equal(image[-8:], background[-8:])
