@@ -64,7 +64,7 @@ class RayCaster {
 
     // What one ray truly meets, where `face` is what the cast found. Embree decides in float, so near its rim a face
     // may be hit that the ray misses: at a silhouette of a fine mesh that is a neighbour which is seen less wide than
-    // floats are apart. `meets(face)` decides, in double; what it refuses is passed through.
+    // floats are apart. `meets(face)` decides, in double where that matters; what it refuses is passed through.
     template <class Meets>
     int32_t beyond_float(const RayFrame& frame, Vec2 n, int32_t face, std::span<const int32_t> rejected,
                          Meets meets) const;

@@ -52,7 +52,8 @@ def view(height: int, width: int, verts: int, moves: bool) -> int:
 
 
 def surface_measure(faces: int, verts: int, pixels: int, textured: bool, radiance: int, moves: bool) -> int:
-    """Bytes for the faces laid end to end, the pixels that large textured ones are left to, and what the controls need.
+    """Bytes for the faces laid end to end, which of them hang together, the pixels that large textured ones are left to, and what
+    the controls need.
 
     radiance  bytes of the channels of one number of the image
     """

@@ -120,7 +120,7 @@ def test_any_number_of_samples_estimates_the_same(name: str, rough: bool, filter
     error = (few.var(0) / len(few) + many.var(0) / len(many)).sqrt()
     scale = many.mean(0).abs().max()
     z = (few.mean(0) - many.mean(0)) / (error + 1e-9 * scale)
-    assert z.abs().max() < 5, z
+    assert z.abs().max() < 4.5, z
 
 
 def test_a_smooth_loss_needs_few_samples() -> None:
@@ -150,7 +150,7 @@ def test_a_rough_loss_gets_its_samples(signs: bool) -> None:
     rough = torch.randn(64, 64, 1, generator=torch.Generator().manual_seed(3), dtype=F64)
     rough = rough.sign() if signs else rough
     smooth, many = (default_samples(mesh, camera, a)[0] for a in (smooth_adjoint(64, 64, 1), rough))
-    assert many > 1.6 * smooth
+    assert many > 1.8 * smooth
 
     def interior(seed: int, **options: int) -> Tensor:
         verts = mesh.verts.clone().requires_grad_()

@@ -245,7 +245,9 @@ def test_ill_conditioned_fits():
         assert fit["rise"] < fits.RISE, fit["fit"]
         assert fit["losses"][-1] < 0.2 * fit["losses"][0]
     assert camera["error"][1] < camera["error"][0]
-    # Plain Adam moves each vertex by itself, and what the image does not say leaves the mean distance to chance.
+    # Plain Adam moves each vertex by itself, and what the image does not say leaves the mean distance to chance: it gets
+    # nowhere, in either direction.
+    assert adam["error"][1] < 1.02 * adam["error"][0]
     assert preconditioned["error"][1] < 0.5 * adam["error"][1]
 
 
