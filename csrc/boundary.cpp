@@ -28,7 +28,7 @@ namespace edgegrad {
 
 namespace {
 
-// Default samples a pixel of curve; see interior.cpp.
+// Default samples a pixel of curve; see surface_measure.cpp.
 constexpr double samples_per_pixel = 24;
 
 template <int N, class T>

@@ -23,12 +23,12 @@
 #include <vector>
 
 #include "camera.h"
-#include "scatter.h"
 #include "scene.h"
 #include "surface.h"
 
 namespace edgegrad {
 
+// What samples take away from the control of one face. Its integral is FaceLanes::integrate's.
 template <int N, class T>
 class Control {
    public:
@@ -45,14 +45,6 @@ class Control {
         for (int i = 0; i < 3; ++i)
             for (int c = 0; c < C; ++c) A_[i * C + c] = adjoint_[int64_t(v_[i]) * C + c];
         std::fill(T_.begin(), T_.end(), 0.0);
-    }
-
-    void add_integral() {
-        const int C = channels();
-        for (int c = 0; c < C; ++c) {
-            const double all = A_[c] + A_[C + c] + A_[2 * C + c];
-            for (int i = 0; i < 3; ++i) T_[i * C + c] += (A_[i * C + c] + all) / 12;
-        }
     }
 
     // Takes away the control at a sample that stands for so large a share of the face's area.
@@ -82,22 +74,11 @@ class Control {
         }
     }
 
-    void add_to_places(RowBuffer& rows) const {
-        Vec2 x_bar[3];
-        add_to_places(x_bar);
-        for (int i = 0; i < 3; ++i) rows.add<2>(v_[i], &x_bar[i].x);
-    }
-
     // Adds to those of the colours: (3, C), or a row for each.
     void add_to_colors(double* color_bar) const {
         const int C = channels();
         const double a = area();
         for (int k = 0; k < 3 * C; ++k) color_bar[k] += a * T_[k];
-    }
-    void add_to_colors(RowBuffer& rows) {
-        const double a = area();
-        for (double& t : T_) t *= a;
-        for (int i = 0; i < 3; ++i) rows.add<N>(row_[i], T_.data() + i * channels());
     }
 
    private:

@@ -63,29 +63,25 @@ class Importance {
         });
     }
 
-    // The pixels that a filter of this radius reaches from a box, as entries of the table.
-    struct Region {
-        size_t corner[4] = {};
-        double pixels = 0;
-    };
-    Region region(Vec2 low, Vec2 high) const {
-        const int i0 = clamp(std::floor(low.x - radius_), width_), i1 = clamp(std::floor(high.x + radius_) + 1, width_);
-        const int j0 = clamp(std::floor(low.y - radius_), height_),
-                  j1 = clamp(std::floor(high.y + radius_) + 1, height_);
-        const double pixels = i0 >= i1 || j0 >= j1 ? 0.0 : double(i1 - i0) * double(j1 - j0);
-        return {{index(i1, j1), index(i0, j1), index(i1, j0), index(i0, j0)}, pixels};
+    // Mean over the pixels i0 … i1 − 1, j0 … j1 − 1 of an image; 0 if no adjoint is there.
+    double mean(int i0, int i1, int j0, int j1) const {
+        if (i0 >= i1 || j0 >= j1) return 0;
+        const int64_t *above = &table_[index(0, j0)], *to = &table_[index(0, j1)];
+        return double(to[i1] - to[i0] - above[i1] + above[i0]) / (double(unit) * (double(i1 - i0) * double(j1 - j0)));
     }
-    void prefetch(const Region& r) const {
-        for (const size_t corner : r.corner) edgegrad::prefetch(&table_[corner]);
+    // Asks for what that will read.
+    void prefetch(int i0, int i1, int j0, int j1) const {
+        for (const int j : {j0, j1})
+            for (const int i : {i0, i1}) edgegrad::prefetch(&table_[index(i, j)]);
     }
 
-    // Mean over the pixels of a region; 0 if no adjoint is there.
-    double mean(const Region& r) const {
-        if (!(r.pixels > 0)) return 0;
-        const int64_t sum = table_[r.corner[0]] - table_[r.corner[1]] - table_[r.corner[2]] + table_[r.corner[3]];
-        return double(sum) / (double(unit) * r.pixels);
+    // Mean over the pixels that the filter reaches from a box.
+    double mean(Vec2 low, Vec2 high) const {
+        return mean(clamp(std::floor(low.x - radius_), width_), clamp(std::floor(high.x + radius_) + 1, width_),
+                    clamp(std::floor(low.y - radius_), height_), clamp(std::floor(high.y + radius_) + 1, height_));
     }
-    double mean(Vec2 low, Vec2 high) const { return mean(region(low, high)); }
+
+    double radius() const { return radius_; }  // of the filter, less ½
 
     // Of a pixel whose adjoint has this size.
     double of(double size) const { return size > 0 ? 1 + per_adjoint_ * size : 0; }

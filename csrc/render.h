@@ -65,7 +65,7 @@ double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOpt
                  Team& team);
 
 struct BackwardOptions {
-    int64_t surface_samples;  // in all; −1: the default (interior.cpp)
+    int64_t surface_samples;  // in all; −1: the default (surface_measure.cpp)
     int64_t edge_samples;     // in all; −1: the default (boundary.cpp)
     Filter filter;
     uint64_t seed;

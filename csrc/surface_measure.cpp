@@ -1,0 +1,402 @@
+#include "surface_measure.h"
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+
+#include "face_lanes.h"
+#include "polygon.h"
+
+namespace edgegrad {
+
+namespace {
+
+// What the measure of a triangle is lowered by if neither it nor a neighbour was seen, and what by if, besides, the
+// part of the surface to which it belongs was seen from the other side alone, as a closed mesh is: never to zero, for
+// it may be seen all the same. A side counts in full from a share of `some` of the faces that were seen of the part, if
+// these are at least `enough` to tell.
+constexpr double hidden = 1.0 / 8, turned_away = 1.0 / 64, some = 1.0 / 16;
+constexpr int enough = 64;
+
+// Default samples a unit of (area + longest side · 1 px): where colours are interpolated, and where a texture may vary
+// from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
+// (docs/performance.md).
+constexpr double colored = 0.5, textured = 4;
+
+// From this area in the image on, px², a triangle with a texture is left to samples of the pixels. Each triangle's
+// integral is estimated in exactly one way, chosen before any sample is drawn, so the sum stays unbiased.
+constexpr double large = 256;
+
+// A face with a control is sampled the less the better that is likely to be: the adjoint changes little, and the face
+// is not wide, px. From `widest` on its corners say little.
+constexpr double least = 1.0 / 16, wide = 32, widest = 64;
+
+// The pixels that large triangles may touch, by tiles.
+class PixelMask {
+   public:
+    PixelMask(const Camera& camera, double radius)
+        : width_(camera.width),
+          height_(camera.height),
+          radius_(radius),
+          columns_((camera.width + tile - 1) / tile),
+          marked_(size_t(columns_) * ((camera.height + tile - 1) / tile), 0) {}
+
+    // A box in the image.
+    void mark(Vec2 low, Vec2 high) {
+        const auto index = [](double x, int most) {
+            return int(std::clamp(std::floor(x), 0.0, double(most - 1))) / tile;
+        };
+        const int i0 = index(low.x - radius_, width_), i1 = index(high.x + radius_, width_);
+        const int j0 = index(low.y - radius_, height_), j1 = index(high.y + radius_, height_);
+        for (int j = j0; j <= j1; ++j)
+            for (int i = i0; i <= i1; ++i)
+                std::atomic_ref(marked_[size_t(j) * columns_ + i]).store(1, std::memory_order_relaxed);
+    }
+
+    std::vector<int64_t> pixels() const {
+        std::vector<int64_t> out;
+        for (size_t t = 0; t < marked_.size(); ++t)
+            if (marked_[t])
+                for (int y = int(t) / columns_ * tile; y < std::min((int(t) / columns_ + 1) * tile, height_); ++y)
+                    for (int x = int(t) % columns_ * tile; x < std::min((int(t) % columns_ + 1) * tile, width_); ++x)
+                        out.push_back(int64_t(y) * width_ + x);
+        return out;
+    }
+
+   private:
+    static constexpr int tile = 16;
+    int width_, height_;
+    double radius_;
+    int columns_;
+    std::vector<uint8_t> marked_;
+};
+
+// What the forward pass saw: near which vertices it hit a face, for one smaller than the distance of the image's
+// samples is hit by chance, so it is asked together with its neighbours; and from which side it saw the surface.
+class Sight {
+   public:
+    template <class T>
+    explicit Sight(const BackwardView<T>& view)
+        : parts_(view.geometry.parts()), at_(view.scene.n_verts, 0), seen_(2 * parts_.size(), 0) {
+        const auto mark = [&](const int32_t* v, uint8_t bit) {
+            for (int i = 0; i < 3; ++i) {
+                const std::atomic_ref at(at_[v[i]]);
+                if (!(at.load(std::memory_order_relaxed) & bit)) at.fetch_or(bit, std::memory_order_relaxed);
+            }
+        };
+        view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+            // Neighbours mostly count for the same, and threads that all add to one number wait for each other.
+            int64_t counter = 0;
+            int32_t n = 0;
+            const auto count = [&] {
+                if (n) std::atomic_ref(seen_[counter]).fetch_add(n, std::memory_order_relaxed);
+            };
+            for (int64_t f = first; f < last; ++f) {
+                if (!view.seen[f]) continue;
+                const int32_t* v = view.scene.faces + 3 * f;
+                mark(v, hit);
+                const int64_t own = 2 * int64_t(parts_.of(v[0])) + (view.seen[f] == 2);
+                if (own != counter) count(), counter = own, n = 0;
+                ++n;
+            }
+            count();
+        });
+        view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+            for (int64_t f = first; f < last; ++f) {
+                const int32_t* v = view.scene.faces + 3 * f;
+                const auto is_hit = [&](int i) {
+                    return std::atomic_ref(at_[v[i]]).load(std::memory_order_relaxed) & hit;
+                };
+                const int n = is_hit(0) + is_hit(1) + is_hit(2);
+                if (n == 1 || n == 2) mark(v, rim);
+            }
+        });
+    }
+
+    // Whether a face with this vertex was hit.
+    bool of(int64_t vertex) const { return at_[vertex] & hit; }
+
+    // What the corners of a face say together: whether a part of it may have been seen, for it has a corner of a face
+    // that was hit, or one beside such; whether all of it may; whether nothing hidden lies beside it.
+    struct Face {
+        bool partly, whole, clear;
+    };
+    Face of(const int32_t* v) const {
+        const uint8_t a = at_[v[0]], b = at_[v[1]], c = at_[v[2]];
+        return {(a | b | c) != 0, (a & b & c & hit) != 0, !((a | b | c) & rim)};
+    }
+
+    // What the measure of a hidden face with this vertex is lowered by; `side`: from which it would be seen, 1 or 2.
+    double lowered(int32_t vertex, int side) const {
+        const int32_t* n = &seen_[2 * int64_t(parts_.of(vertex))];
+        if (n[0] + n[1] < enough) return hidden;
+        const double share = double(n[side - 1]) / (n[0] + n[1]);
+        return std::clamp(share / some * hidden, turned_away, hidden);
+    }
+
+    void prefetch(int32_t vertex) const { edgegrad::prefetch(&at_[vertex]); }
+
+   private:
+    // Of a vertex: of a face that was hit; of a face that has such vertices and others.
+    static constexpr uint8_t hit = 1, rim = 2;
+    const Parts& parts_;
+    std::vector<uint8_t> at_;
+    std::vector<int32_t> seen_;  // faces that were hit, by part and side
+};
+
+// Ã at the vertices that may be those of a face with a control, (V, C).
+template <int N, class T>
+Array<T> adjoint_at_vertices(const BackwardView<T>& view, const Sight& sight) {
+    const int C = N ? N : view.scene.channels;
+    Array<T> adjoint(view.scene.n_verts * C);
+    view.team.each_block(view.scene.n_verts, [&](int64_t, int64_t first, int64_t last) {
+        std::vector<double> A(C);
+        for (int64_t v = first; v < last; ++v) {
+            if (!sight.of(v) || view.vertices.outcode[v]) continue;
+            view.adjoint.template at<N>(view.vertices.x[v], A.data());
+            for (int c = 0; c < C; ++c) adjoint[v * C + c] = T(A[c]);
+        }
+    });
+    return adjoint;
+}
+
+// Turns cotangents of places in the image (V, 2) into those of camera coordinates and of K.
+template <class T>
+void add_places(const BackwardView<T>& view, const Array<double>& x_bar, Destination& to) {
+    const int64_t V = view.scene.n_verts, blocks = Team::blocks(V);
+    std::vector<double> k_bar(6 * blocks, 0.0);
+    view.team.each_block(V, [&](int64_t k, int64_t first, int64_t last) {
+        for (int64_t v = first; v < last; ++v) {
+            const Vec2 x{x_bar[2 * v], x_bar[2 * v + 1]};
+            if (x.x == 0 && x.y == 0) continue;
+            Vec3 q;
+            project_vjp(view.camera, view.vertices.q[v], x, q, k_bar.data() + 6 * k);
+            to.q[3 * v] += q.x, to.q[3 * v + 1] += q.y, to.q[3 * v + 2] += q.z;
+        }
+    });
+    for (int64_t i = 0; i < 6 * blocks; ++i) to.k[i % 6] += k_bar[i];
+}
+
+// Looks at the faces of one chunk.
+template <int N, class T>
+class MeasuredChunk {
+   public:
+    MeasuredChunk(const BackwardView<T>& view, const Sight& sight, bool geometry, const Destination& to,
+                  SurfaceMeasure<T>& out, PixelMask& mask, ChunkGrad& grad)
+        : view_(view),
+          sight_(sight),
+          want_places_(geometry),
+          want_colors_(to.colors),
+          out_(out),
+          mask_(mask),
+          grad_(grad),
+          C_(N ? N : view.scene.channels),
+          lanes_(C_),
+          colors_(C_) {}
+
+    double total() const { return total_; }
+    double of_large() const { return of_large_; }
+
+    void add(int64_t first, int64_t last) {
+        for (int64_t g = first; g < last; g += FaceLanes::size) {
+            lanes_.count = 0;
+            for (int64_t f = g; f < std::min(g + FaceLanes::size, last); ++f) gather(f, f + ahead < last);
+            look();
+        }
+    }
+
+   private:
+    // Of a face inside the view to the lanes; others are looked at at once.
+    void gather(int64_t f, bool more) {
+        const int32_t* v = view_.scene.faces + 3 * f;
+        const VertexView& p = view_.vertices;
+        if (more)
+            for (int i = 0; i < 3; ++i) {
+                const int32_t w = v[3 * ahead + i];
+                prefetch(&p.x[w]), prefetch(&p.outcode[w]), sight_.prefetch(w);
+                prefetch(&p.q[w]), prefetch(&out_.adjoint[int64_t(w) * C_]);
+            }
+        out_.of_face[f] = 0, out_.is_controlled[f] = 0;
+        if (p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) {
+            if (!polygon_.set(view_.camera, view_.volume, p, v)) return;
+            const double importance = view_.importance.mean(polygon_.low, polygon_.high);
+            const Sight::Face seen = sight_.of(v);
+            const double m =
+                default_samples(f, polygon_.area, polygon_.longest, seen, [&] { return side_of(view_, f); });
+            if (importance > 0) lay_out(f, m, importance, polygon_.area, polygon_.low, polygon_.high);
+            return;
+        }
+        const int i = lanes_.count++;
+        lanes_.face[i] = f;
+        for (int k = 0; k < 3; ++k) {
+            const Vec2 x = p.x[v[k]];
+            lanes_.x[k][i] = x.x, lanes_.y[k][i] = x.y, lanes_.z[k][i] = p.q[v[k]].z;
+        }
+    }
+
+    // Of a hidden face, `side()` says from which it would be seen.
+    template <class Side>
+    double default_samples(int64_t f, double area, double longest, Sight::Face seen, Side side) const {
+        const double m = (area + longest) * (is_textured(view_.scene, f) ? textured : colored);
+        return seen.partly ? m : m * sight_.lowered(view_.scene.faces[3 * f], side());
+    }
+
+    // A face without a control.
+    void lay_out(int64_t f, double m, double importance, double area, Vec2 low, Vec2 high) {
+        if (!std::isfinite(m)) return;  // coordinates beyond 1e150 cannot be sampled
+        if (is_textured(view_.scene, f) && area >= large) {
+            out_.is_large[f] = 1;
+            mask_.mark(low, high);
+            of_large_ += m;
+        } else {
+            out_.of_face[f] = m * importance;
+            total_ += m;
+        }
+    }
+
+    // At the faces in the lanes.
+    void look() {
+        FaceLanes& l = lanes_;
+        if (!l.count) return;
+        l.bound(view_.camera.width, view_.camera.height, view_.importance.radius());
+        for (int i = 0; i < l.count; ++i) view_.importance.prefetch(l.i0[i], l.i1[i], l.j0[i], l.j1[i]);
+        for (int i = 0; i < l.count; ++i) importance_[i] = view_.importance.mean(l.i0[i], l.i1[i], l.j0[i], l.j1[i]);
+        bool any = false;
+        for (int i = 0; i < l.count; ++i) {
+            const int64_t f = l.face[i];
+            const double area = 0.5 * std::fabs(l.wedge[i]);
+            controlled_[i] = false;
+            if (!(area > 0) || !(importance_[i] > 0)) continue;
+            const Sight::Face seen = sight_.of(view_.scene.faces + 3 * f);
+            samples_[i] = default_samples(f, area, l.longest[i], seen,
+                                          [&] { return (l.wedge[i] > 0) == (view_.camera.k_det > 0) ? 1 : 2; });
+            // One without texture and so small that its corners say what is between them. A face that comes near the
+            // eye is not affine in the image.
+            if (seen.whole && l.longest[i] <= widest && !view_.options.dry && !is_textured(view_.scene, f) &&
+                (!view_.camera.perspective || l.depths[i] < 2)) {
+                controlled_[i] = any = true;
+                clear_[i] = seen.clear;
+                gather_control(i);
+            } else {
+                const auto [x0, x1] = std::minmax({l.x[0][i], l.x[1][i], l.x[2][i]});
+                const auto [y0, y1] = std::minmax({l.y[0][i], l.y[1][i], l.y[2][i]});
+                lay_out(f, samples_[i], importance_[i], area, {x0, y0}, {x1, y1});
+            }
+        }
+        if (any) add_controls();
+    }
+
+    void gather_control(int i) {
+        const int C = N ? N : C_;
+        const int64_t f = lanes_.face[i];
+        const int32_t *v = view_.scene.faces + 3 * f, *row = view_.scene.corners + 3 * f;
+        constexpr int next = FaceLanes::size;
+        double *adjoint = lanes_.adjoint.data() + i, *color = lanes_.color.data() + i;
+        for (int k = 0; k < 3; ++k) {
+            const T* A = &out_.adjoint[int64_t(v[k]) * C];
+            for (int c = 0; c < C; ++c) adjoint[(7 * c + k) * next] = A[c];
+        }
+        for (int k = 0; k < 4; ++k) {
+            const T* A = view_.adjoint.of(lanes_.inside[k][i]);
+            for (int c = 0; c < C; ++c) adjoint[(7 * c + 3 + k) * next] = A[c];
+        }
+        const auto color_of = [&](int k) { return view_.scene.colors + int64_t(row[k]) * C; };
+        const T *c0 = color_of(0), *c1 = color_of(1), *c2 = color_of(2);
+        for (int c = 0; c < C; ++c) {
+            color[2 * c * next] = double(c1[c]) - c0[c];
+            color[(2 * c + 1) * next] = double(c2[c]) - c0[c];
+        }
+    }
+
+    void add_controls() {
+        const int C = N ? N : C_;
+        FaceLanes& l = lanes_;
+        l.integrate();
+        for (int i = 0; i < l.count; ++i) {
+            if (!controlled_[i]) continue;
+            const int64_t f = l.face[i];
+            const int32_t *v = view_.scene.faces + 3 * f, *row = view_.scene.corners + 3 * f;
+            if (want_places_)
+                for (int k = 0; k < 3; ++k) {
+                    const Vec2 x_bar{l.x_bar[k][i], l.y_bar[k][i]};
+                    grad_.x.template add<2>(v[k], &x_bar.x);
+                }
+            if (want_colors_)
+                for (int k = 0; k < 3; ++k) {
+                    for (int c = 0; c < C; ++c)
+                        colors_[c] = 0.5 * std::fabs(l.wedge[i]) * l.T[(3 * c + k) * FaceLanes::size + i];
+                    grad_.colors.template add<N>(row[k], colors_.data());
+                }
+            double m = samples_[i];
+            if (clear_[i] && l.longest[i] < wide)
+                m *= std::clamp(std::max(2 * variation(i), l.longest[i] / wide), least, 1.0);
+            out_.is_controlled[f] = 1, out_.of_face[f] = m * importance_[i];
+            total_ += m;
+        }
+    }
+
+    // How much the adjoint changes over a face relative to its size: from one corner to the others, to the pixels at
+    // the middles of the sides and of the face, and to the mean of its box. Corners alone may agree by chance, as the
+    // signs of an L1 loss do.
+    double variation(int i) const {
+        const FaceLanes& l = lanes_;
+        if (!(l.sum[i] > 0)) return 1;
+        return std::max({l.change[i] / l.sum[i], l.apart[i] / l.sum[i],
+                         std::fabs(1 - view_.importance.of(l.sum[i] / 3) / importance_[i])});
+    }
+
+    // What is asked of memory for a face so far ahead is there when it is wanted.
+    static constexpr int ahead = 16;
+    const BackwardView<T>& view_;
+    const Sight& sight_;
+    const bool want_places_, want_colors_;
+    SurfaceMeasure<T>& out_;
+    PixelMask& mask_;
+    ChunkGrad& grad_;
+    const int C_;
+    double total_ = 0, of_large_ = 0;
+    VisiblePolygon polygon_;
+    FaceLanes lanes_;
+    double importance_[FaceLanes::size], samples_[FaceLanes::size];
+    bool controlled_[FaceLanes::size], clear_[FaceLanes::size];
+    std::vector<double> colors_;
+};
+
+}  // namespace
+
+template <int N, class T>
+SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Destination& to) {
+    const int64_t F = view.scene.n_faces, chunks = (F + scatter_chunk - 1) / scatter_chunk;
+    const Sight sight(view);
+    SurfaceMeasure<T> out{Array<double>(F), Array<uint8_t>(F), adjoint_at_vertices<N>(view, sight), {}, {}};
+    if (view.scene.face_texture) out.is_large.assign(F, 0);
+    PixelMask mask(view.camera, view.options.filter.radius() - 0.5);
+    // What the controls are of all of their faces, summed by the places of vertices in the image.
+    Array<double> x_bar = zeros(geometry ? 2 * view.scene.n_verts : 0, view.team);
+    Destination whole;
+    whole.x = geometry ? x_bar.data() : nullptr, whole.colors = to.colors, whole.channels = to.channels;
+    std::vector<double> total(chunks), of_large(chunks);
+    double seconds[2] = {};
+    scatter_samples(F, view.team, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+        MeasuredChunk<N, T> chunk(view, sight, geometry, to, out, mask, grad);
+        chunk.add(first, last);
+        total[first / scatter_chunk] = chunk.total(), of_large[first / scatter_chunk] = chunk.of_large();
+    });
+    if (geometry) add_places(view, x_bar, to);
+    for (int64_t k = 0; k < chunks; ++k) out.total += total[k], out.of_large += of_large[k];
+    if (out.of_large > 0) out.pixels = mask.pixels();
+    return out;
+}
+
+// clang-format off
+#define EDGEGRAD_INSTANTIATE(N) \
+    template SurfaceMeasure<float> measure_surface<N>(const BackwardView<float>&, bool, Destination&); \
+    template SurfaceMeasure<double> measure_surface<N>(const BackwardView<double>&, bool, Destination&);
+EDGEGRAD_INSTANTIATE(0)
+EDGEGRAD_INSTANTIATE(1)
+EDGEGRAD_INSTANTIATE(3)
+EDGEGRAD_INSTANTIATE(4)
+#undef EDGEGRAD_INSTANTIATE
+// clang-format on
+
+}  // namespace edgegrad
