@@ -75,13 +75,13 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
     const FilteredAdjoint<T> filtered(adjoint, scene, o.filter, camera.width, camera.height);
     const Importance importance(adjoint, camera.width, camera.height, scene.channels, o.filter.radius() - 0.5, team);
     const RayFrame frame(geometry.caster(), camera);
-    const BackwardView<T> view{scene,      camera, geometry, volume, vertices,    filtered,
-                               importance, o,      team,     frame,  forward.seen};
+    Scatter scatter(team, scene.channels);
+    const BackwardView<T> view{scene,      camera, geometry, volume,  vertices, filtered,
+                               importance, o,      team,     scatter, frame,    forward.seen};
     profile.view = watch.lap();
 
     Array<double> q_bar = zeros(grad.geometry() ? 3 * scene.n_verts : 0, team);
     Destination to;
-    to.channels = scene.channels;
     to.want_k = grad.K;
     to.q = grad.geometry() ? q_bar.data() : nullptr;
     to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels;

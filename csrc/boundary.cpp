@@ -348,7 +348,7 @@ void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile&
     profile.edge_samples = n;
     if (o.dry) return;
     systematic.draw(n, to_unit(hash(o.seed, 3, gradient_stream)));
-    scatter_samples(n, view.team, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         BoundaryChunk<N, T> chunk(view, finder, coincident, grad);
         Curve curve;
         int64_t edge = systematic.primitive(systematic.position(first));

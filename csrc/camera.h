@@ -162,21 +162,25 @@ struct VertexView {
     Array<uint8_t> outcode;
 };
 
+// Vertex v of `verts` (V, 3) in camera coordinates.
+inline Vec3 camera_vertex(const Camera& camera, const double* verts, int64_t v) {
+    return camera.to_camera({verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]});
+}
+
 inline Array<Vec3> camera_vertices(const Camera& camera, const double* verts, int64_t n, Team& team) {
     Array<Vec3> q(n);
     team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t v = first; v < last; ++v)
-            q[v] = camera.to_camera({verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]});
+        for (int64_t v = first; v < last; ++v) q[v] = camera_vertex(camera, verts, v);
     });
     return q;
 }
 
 inline VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n,
                                 Team& team) {
-    VertexView view{camera_vertices(camera, verts, n, team), Array<Vec2>(n), Array<uint8_t>(n)};
+    VertexView view{Array<Vec3>(n), Array<Vec2>(n), Array<uint8_t>(n)};
     team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
-            const Vec3 q = view.q[v];
+            const Vec3 q = view.q[v] = camera_vertex(camera, verts, v);
             // At the eye itself every plane is met and the projection is undefined: call it outside all.
             view.outcode[v] = camera.perspective && q.z <= 0 ? volume.outcode(q) | 16 : volume.outcode(q);
             if (!view.outcode[v]) view.x[v] = project(camera, q);

@@ -107,7 +107,7 @@ template <int N, class T>
 void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systematic& systematic,
                          const SurfaceMeasure<T>& surface, bool geometry, Destination& to, double (&seconds)[2]) {
     const ShiftedSequence sequence(hash(view.options.seed, 2, gradient_stream));
-    scatter_samples(n, view.team, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         InteriorChunk<N, T> chunk(view, geometry, to, grad, surface.adjoint.data());
         VisiblePolygon polygon;
         PolygonSampler sampler;

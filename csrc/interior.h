@@ -24,6 +24,7 @@ struct BackwardView {
     const Importance& importance;
     const BackwardOptions& options;
     Team& team;
+    Scatter& scatter;
     const RayFrame& frame;
     const uint8_t* seen;  // (F,): 0, or the side from which the forward pass hit the face
 };
@@ -78,7 +79,8 @@ class FaceGrad {
              const T* adjoint = nullptr)
         : view_(view),
           geometry_(geometry),
-          want_rows_(to.colors || to.uvs),
+          want_colors_(to.colors),
+          want_uvs_(to.uvs),
           want_texels_(to.texels),
           want_k_(to.want_k),
           grad_(grad),
@@ -127,7 +129,7 @@ class FaceGrad {
             }
             for (int i = 0; i < 3; ++i) grad_.q.template add<3>(v[i], &corner_bar[i].x);
         }
-        if (want_rows_) {
+        if (textured_ ? want_uvs_ : want_colors_) {
             if (controlled_) control_.add_to_colors(rows_.value.data());
             for (int i = 0; i < 3; ++i)
                 (textured_ ? grad_.uvs : grad_.colors).add(row[i], rows_.value.data() + i * (textured_ ? 2 : C_));
@@ -137,7 +139,7 @@ class FaceGrad {
 
    private:
     const BackwardView<T>& view_;
-    const bool geometry_, want_rows_, want_texels_, want_k_;
+    const bool geometry_, want_colors_, want_uvs_, want_texels_, want_k_;
     ChunkGrad& grad_;
     const int C_;
 

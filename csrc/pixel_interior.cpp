@@ -18,7 +18,7 @@ void add_pixel_samples(const BackwardView<T>& view, const std::vector<int64_t>& 
     const int C = N ? N : view.scene.channels, width = view.camera.width;
     const ForwardOptions options{spp, view.options.filter, seed};
     const PixelRays pixel_rays(view.camera, options);
-    scatter_samples(int64_t(pixels.size()), view.team, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    view.scatter.add(int64_t(pixels.size()), to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         // Faces in a pixel take turns and come again in the next one: some runs are kept open.
         std::vector<FaceGrad<N, T>> open(32, FaceGrad<N, T>(view, geometry, to, grad));
         std::vector<double> bar(C);

@@ -18,10 +18,13 @@ namespace edgegrad {
 
 class RowBuffer {
    public:
-    void prepare(int width, int owners) { width_ = width, rows_.resize(owners); }
+    void prepare(int width, int owners) {
+        if (recent_.empty()) width_ = width, rows_.resize(owners), recent_.resize(n_recent);
+    }
     void clear() {
-        for (Rows& r : rows_) r.count = 0;
-        for (Recent& r : recent_) r.index = -1;
+        bool any = false;
+        for (Rows& r : rows_) any |= r.count > 0, r.count = 0;
+        if (any) std::fill(recent_.begin(), recent_.end(), Recent());
     }
     // W: the width at compile time, or 0.
     template <int W = 0>
@@ -72,7 +75,7 @@ class RowBuffer {
     static constexpr int n_recent = 256;
     int width_ = 0;
     std::vector<Rows> rows_;  // one for each owner
-    Recent recent_[n_recent];
+    std::vector<Recent> recent_;
 };
 
 // What the samples of one chunk give.
@@ -86,59 +89,77 @@ struct Destination {
     double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr;
     double k[6] = {};
     bool want_k = false;
-    int channels = 1;
 };
 
 // Samples in a chunk.
 constexpr int64_t scatter_chunk = 512;
 
-// Calls body(first, last, ChunkGrad&) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
-// samples and of the adding.
-template <class Body>
-void scatter_samples(int64_t n, Team& team, Destination& to, double (&seconds)[2], Body body) {
-    const int64_t chunk = scatter_chunk, wave = 16 * team.threads();
-    const int owners = std::min(team.threads(), 16);  // more would only split the buffers further
-    std::vector<ChunkGrad> grads(std::min(wave, (n + chunk - 1) / chunk));
-    for (ChunkGrad& g : grads) {
-        g.q.prepare(3, owners), g.x.prepare(2, owners), g.uvs.prepare(2, owners);
-        g.colors.prepare(to.channels, owners), g.texels.prepare(to.channels, owners);
-    }
-    Stopwatch watch;
-    for (int64_t first = 0; first < n; first += chunk * wave) {
-        const int64_t chunks = std::min(wave, (n - first + chunk - 1) / chunk);
-        // One region for both loops: waking threads twice a wave would be felt.
-#pragma omp parallel num_threads(team.threads_for(chunks))
-        {
+// For one backward pass, whose parts use the same buffers one after the other.
+class Scatter {
+   public:
+    // `channels`: of colours and texels.
+    Scatter(Team& team, int channels) : team_(team), channels_(channels) {}
+
+    // Calls body(first, last, ChunkGrad&) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
+    // samples and of the adding.
+    template <class Body>
+    void add(int64_t n, Destination& to, double (&seconds)[2], Body body) {
+        const int64_t chunk = scatter_chunk, wave = 16 * team_.threads();
+        const int owners = std::min(team_.threads(), 16);  // more would only split the buffers further
+        if (const int64_t most = std::min(wave, (n + chunk - 1) / chunk); int64_t(grads_.size()) < most)
+            grads_.resize(most);
+        Stopwatch watch;
+        for (int64_t first = 0; first < n; first += chunk * wave) {
+            const int64_t chunks = std::min(wave, (n - first + chunk - 1) / chunk);
+            // One region for both loops: waking threads twice a wave would be felt.
+#pragma omp parallel num_threads(team_.threads_for(chunks))
+            {
 #pragma omp for schedule(dynamic, 1)
-            for (int64_t i = 0; i < chunks; ++i)
-                team.guard([&] {
-                    team.check();
-                    ChunkGrad& g = grads[i];
-                    g.q.clear(), g.x.clear(), g.colors.clear(), g.uvs.clear(), g.texels.clear();
-                    std::fill(g.k, g.k + 6, 0.0);
-                    const int64_t begin = first + i * chunk;
-                    body(begin, std::min(begin + chunk, n), g);
-                });
+                for (int64_t i = 0; i < chunks; ++i)
+                    team_.guard([&] {
+                        team_.check();
+                        ChunkGrad& g = grads_[i];
+                        prepare(g, to, owners);
+                        const int64_t begin = first + i * chunk;
+                        body(begin, std::min(begin + chunk, n), g);
+                    });
 #pragma omp master
-            seconds[0] += watch.lap();
-            // The system may give fewer threads than were asked for.
+                seconds[0] += watch.lap();
+                // The system may give fewer threads than were asked for.
 #pragma omp for schedule(static, 1)
-            for (int owner = 0; owner < owners; ++owner)
-                team.guard([&] {
-                    for (int64_t i = 0; i < chunks; ++i) {
-                        if (to.q) grads[i].q.add_to(to.q, owner);
-                        if (to.x) grads[i].x.add_to(to.x, owner);
-                        if (to.colors) grads[i].colors.add_to(to.colors, owner);
-                        if (to.uvs) grads[i].uvs.add_to(to.uvs, owner);
-                        if (to.texels) grads[i].texels.add_to(to.texels, owner);
-                    }
-                });
+                for (int owner = 0; owner < owners; ++owner)
+                    team_.guard([&] {
+                        for (int64_t i = 0; i < chunks; ++i) {
+                            if (to.q) grads_[i].q.add_to(to.q, owner);
+                            if (to.x) grads_[i].x.add_to(to.x, owner);
+                            if (to.colors) grads_[i].colors.add_to(to.colors, owner);
+                            if (to.uvs) grads_[i].uvs.add_to(to.uvs, owner);
+                            if (to.texels) grads_[i].texels.add_to(to.texels, owner);
+                        }
+                    });
+            }
+            team_.rethrow();
+            for (int64_t i = 0; i < chunks; ++i)
+                for (int c = 0; c < 6; ++c) to.k[c] += grads_[i].k[c];
+            seconds[1] += watch.lap();
         }
-        team.rethrow();
-        for (int64_t i = 0; i < chunks; ++i)
-            for (int c = 0; c < 6; ++c) to.k[c] += grads[i].k[c];
-        seconds[1] += watch.lap();
     }
-}
+
+   private:
+    // Empties a chunk's buffers, and makes those that are wanted.
+    void prepare(ChunkGrad& g, const Destination& to, int owners) const {
+        const auto empty = [&](RowBuffer& rows, bool wanted, int width) {
+            if (wanted) rows.prepare(width, owners);
+            rows.clear();
+        };
+        empty(g.q, to.q, 3), empty(g.x, to.x, 2), empty(g.uvs, to.uvs, 2);
+        empty(g.colors, to.colors, channels_), empty(g.texels, to.texels, channels_);
+        std::fill(g.k, g.k + 6, 0.0);
+    }
+
+    Team& team_;
+    const int channels_;
+    std::vector<ChunkGrad> grads_;
+};
 
 }  // namespace edgegrad

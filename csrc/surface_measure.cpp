@@ -77,7 +77,8 @@ class Sight {
    public:
     template <class T>
     explicit Sight(const BackwardView<T>& view)
-        : parts_(view.geometry.parts()), at_(view.scene.n_verts, 0), seen_(2 * parts_.size(), 0) {
+        : parts_(view.geometry.parts()), at_(view.scene.n_verts, 0), lowered_(2 * parts_.size()) {
+        std::vector<int32_t> seen(2 * parts_.size(), 0);  // faces that were hit, by part and side
         const auto mark = [&](const int32_t* v, uint8_t bit) {
             for (int i = 0; i < 3; ++i) {
                 const std::atomic_ref at(at_[v[i]]);
@@ -89,7 +90,7 @@ class Sight {
             int64_t counter = 0;
             int32_t n = 0;
             const auto count = [&] {
-                if (n) std::atomic_ref(seen_[counter]).fetch_add(n, std::memory_order_relaxed);
+                if (n) std::atomic_ref(seen[counter]).fetch_add(n, std::memory_order_relaxed);
             };
             for (int64_t f = first; f < last; ++f) {
                 if (!view.seen[f]) continue;
@@ -111,6 +112,12 @@ class Sight {
                 if (n == 1 || n == 2) mark(v, rim);
             }
         });
+        view.team.each_block(parts_.size(), [&](int64_t, int64_t first, int64_t last) {
+            for (int64_t k = 2 * first; k < 2 * last; ++k) {
+                const double all = double(seen[k]) + seen[k ^ 1];
+                lowered_[k] = all < enough ? hidden : std::clamp(seen[k] / all / some * hidden, turned_away, hidden);
+            }
+        });
     }
 
     // Whether a face with this vertex was hit.
@@ -128,10 +135,8 @@ class Sight {
 
     // What the measure of a hidden face with this vertex is lowered by; `side`: from which it would be seen, 1 or 2.
     double lowered(int32_t vertex, int side) const {
-        const int32_t* n = &seen_[2 * int64_t(parts_.of(vertex))];
-        if (n[0] + n[1] < enough) return hidden;
-        const double share = double(n[side - 1]) / (n[0] + n[1]);
-        return std::clamp(share / some * hidden, turned_away, hidden);
+        const int64_t part = parts_.size() > 1 ? parts_.of(vertex) : 0;
+        return lowered_[2 * part + side - 1];
     }
 
     void prefetch(int32_t vertex) const { edgegrad::prefetch(&at_[vertex]); }
@@ -141,7 +146,7 @@ class Sight {
     static constexpr uint8_t hit = 1, rim = 2;
     const Parts& parts_;
     std::vector<uint8_t> at_;
-    std::vector<int32_t> seen_;  // faces that were hit, by part and side
+    std::vector<double> lowered_;  // by part and side
 };
 
 // Ã at the vertices that may be those of a face with a control, (V, C).
@@ -374,10 +379,10 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, De
     // What the controls are of all of their faces, summed by the places of vertices in the image.
     Array<double> x_bar = zeros(geometry ? 2 * view.scene.n_verts : 0, view.team);
     Destination whole;
-    whole.x = geometry ? x_bar.data() : nullptr, whole.colors = to.colors, whole.channels = to.channels;
+    whole.x = geometry ? x_bar.data() : nullptr, whole.colors = to.colors;
     std::vector<double> total(chunks), of_large(chunks);
     double seconds[2] = {};
-    scatter_samples(F, view.team, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+    view.scatter.add(F, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         MeasuredChunk<N, T> chunk(view, sight, geometry, to, out, mask, grad);
         chunk.add(first, last);
         total[first / scatter_chunk] = chunk.total(), of_large[first / scatter_chunk] = chunk.of_large();

@@ -57,7 +57,7 @@ def surface_measure(faces: int, verts: int, pixels: int, textured: bool, radianc
 
     radiance  bytes of the channels of one number of the image
     """
-    return 9 * faces + (14 + radiance + 16 * moves) * verts + (faces + 8 * pixels) * textured
+    return 9 * faces + (17 + radiance + 16 * moves) * verts + (faces + 8 * pixels) * textured
 
 
 def edge_measure(faces: int) -> int:

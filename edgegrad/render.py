@@ -274,6 +274,7 @@ def gradient_room(adjoint: Tensor, *args: Any) -> AbstractContextManager[None]:
         needs["faces in view"] = memory.surface_measure(
             F, V, height * width, flat.textures.shape[0] > 0, C * flat.colors.element_size(), work.motion
         )
+        needs["controls"] = memory.rows(F, F, 3, 2, V) * work.motion
         needs["surface samples"] = surface_rows(many if surface_samples < 0 else surface_samples, args)
     if work.boundary:
         needs["edges in view"] = memory.edge_measure(F)
