@@ -240,40 +240,65 @@ class PixelRow {
     std::vector<double> sum_, radiance_;
 };
 
-// The pixels whose samples may hit something, half open: those in a box around all vertices, if these lie before the
-// eye. With a pixel more on each side, for Embree sees positions rounded to floats.
-struct PixelBox {
-    int x0, y0, x1, y1;
-
-    bool meets(int from, int to, int y) const { return from < x1 && to > x0 && y0 <= y && y < y1; }
-};
-
-PixelBox reachable_pixels(const Camera& camera, const Array<Vec3>& q, double radius, Team& team) {
-    constexpr double all = std::numeric_limits<double>::infinity();
-    const int64_t blocks = Team::blocks(q.size());
-    std::vector<Vec2> low(blocks, {all, all}), high(blocks, {-all, -all});
-    team.each_block(q.size(), [&](int64_t k, int64_t first, int64_t last) {
-        Vec2 l = low[k], h = high[k];
-        for (int64_t v = first; v < last; ++v) {
-            const Vec2 x = project(camera, q[v]);
-            if (camera.depth_weight(q[v]) > 0 && std::isfinite(x.x + x.y)) {
-                l = {std::min(l.x, x.x), std::min(l.y, x.y)};
-                h = {std::max(h.x, x.x), std::max(h.y, x.y)};
-            } else {
-                l = {-all, -all}, h = {all, all};
+// The pixels whose samples may hit something: those in an octagon around the images of all vertices, if these lie
+// before the eye. With a pixel more on each side, for Embree sees positions rounded to floats.
+class ReachablePixels {
+   public:
+    ReachablePixels(const Camera& camera, const Array<Vec3>& q, double radius, Team& team)
+        : width_(camera.width), margin_(radius + 1) {
+        std::vector<Bounds> of_block(Team::blocks(q.size()));
+        team.each_block(q.size(), [&](int64_t k, int64_t first, int64_t last) {
+            Bounds b;
+            for (int64_t v = first; v < last; ++v) {
+                const Vec2 x = project(camera, q[v]);
+                const double far = std::max(std::fabs(x.x), std::fabs(x.y));
+                if (!(camera.depth_weight(q[v]) > 0) || !std::isfinite(far)) {
+                    b = Bounds::everything();
+                    break;
+                }
+                b.add(0, x.x), b.add(1, x.y);
+                // Of what lies far outside, floats do not say where its sides pass the picture.
+                if (far < 1e5) b.add(2, x.x + x.y), b.add(3, x.x - x.y);
+                else b.low[2] = b.low[3] = -infinite, b.high[2] = b.high[3] = infinite;
             }
-        }
-        low[k] = l, high[k] = h;
-    });
-    for (int64_t k = 1; k < blocks; ++k) {
-        low[0] = {std::min(low[0].x, low[k].x), std::min(low[0].y, low[k].y)};
-        high[0] = {std::max(high[0].x, high[k].x), std::max(high[0].y, high[k].y)};
+            of_block[k] = b;
+        });
+        for (const Bounds& b : of_block)
+            for (int k = 0; k < 4; ++k) bounds_.add(k, b.low[k]), bounds_.add(k, b.high[k]);
     }
-    const auto first = [&](double x, int size) { return int(std::clamp(x - radius - 1, 0.0, double(size))); };
-    const auto end = [&](double x, int size) { return int(std::clamp(x + radius + 2, 0.0, double(size))); };
-    return {first(low[0].x, camera.width), first(low[0].y, camera.height), end(high[0].x, camera.width),
-            end(high[0].y, camera.height)};
-}
+
+    // In row y, half open.
+    struct Range {
+        int first, end;
+    };
+    Range row(int y) const {
+        const Bounds& b = bounds_;
+        const double low = y - margin_, high = y + 1 + margin_;
+        if (b.high[1] < low || b.low[1] > high) return {0, 0};
+        const double from = std::max({b.low[0], b.low[2] - high, b.low[3] + low});
+        const double to = std::min({b.high[0], b.high[2] - low, b.high[3] + high});
+        const auto pixel = [&](double x) { return int(std::clamp(x, 0.0, double(width_))); };
+        return {pixel(from - margin_), pixel(to + margin_ + 1)};
+    }
+
+   private:
+    static constexpr double infinite = std::numeric_limits<double>::infinity();
+    // Of x, y, x + y and x − y, px.
+    struct Bounds {
+        double low[4], high[4];
+
+        Bounds() { std::fill(low, low + 4, infinite), std::fill(high, high + 4, -infinite); }
+        static Bounds everything() {
+            Bounds b;
+            std::fill(b.low, b.low + 4, -infinite), std::fill(b.high, b.high + 4, infinite);
+            return b;
+        }
+        void add(int k, double x) { low[k] = std::min(low[k], x), high[k] = std::max(high[k], x); }
+    };
+    int width_;
+    double margin_;
+    Bounds bounds_;
+};
 
 template <int N, class T>
 void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ForwardOptions& o,
@@ -282,16 +307,18 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
     const int rows = std::clamp((1 << 16) / o.spp, 1, tile);
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + rows - 1) / rows;
     const RayFrame frame(caster, camera);
-    const PixelBox box = reachable_pixels(camera, q, o.filter.radius() - 0.5, team);
+    const ReachablePixels reachable(camera, q, o.filter.radius() - 0.5, team);
     team.each_with(
         int64_t(tiles_x) * tiles_y,
         [&] { return std::make_unique<PixelRow<N, T>>(scene, camera, caster, frame, o, team, q, out); },
         [&](PixelRow<N, T>& row, int64_t t) {
             const int x0 = int(t % tiles_x) * tile, x1 = std::min(x0 + tile, camera.width);
             const int y0 = int(t / tiles_x) * rows, y1 = std::min(y0 + rows, camera.height);
-            for (int y = y0; y < y1; ++y)
-                if (box.meets(x0, x1, y)) row.render(x0, x1, y);
-                else row.leave_out(x0, x1, y);
+            for (int y = y0; y < y1; ++y) {
+                const auto [first, end] = reachable.row(y);
+                const int from = std::clamp(first, x0, x1), to = std::clamp(end, from, x1);
+                row.leave_out(x0, from, y), row.render(from, to, y), row.leave_out(to, x1, y);
+            }
         });
 }
 
