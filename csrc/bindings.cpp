@@ -13,6 +13,7 @@
 #include <map>
 #include <optional>
 #include <string>
+#include <type_traits>
 
 #include "render.h"
 #include "stopwatch.h"
@@ -79,17 +80,29 @@ void check_finite(const char* name, const T* values, int64_t n, int64_t width) {
                    " at " + at(i, width));
 }
 
-// Of indices taken for unsigned, so that those below zero are great.
-EDGEGRAD_VECTORIZED uint32_t greatest(const int32_t* values, int64_t n) {
-    uint32_t most = 0;
-    for (int64_t i = 0; i < n; ++i) most = std::max(most, uint32_t(values[i]));
-    return most;
+// Whether all are from 0 to count − 1: else one of v and count − 1 − v has its sign bit set.
+template <class T>
+EDGEGRAD_VECTORIZED bool are_below(const T* values, int64_t n, T count) {
+    using U = std::make_unsigned_t<T>;
+    U signs = 0;
+    for (int64_t i = 0; i < n; ++i) signs |= U(values[i]) | (U(count) - 1 - U(values[i]));
+    return T(signs) >= 0;
+}
+
+template <class T>
+bool all_below(nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu> array, T count) {
+    return all_pass(array.data(), array.size(), [=](const T* v, int64_t n) { return are_below(v, n, count); });
+}
+
+template <class T>
+bool all_finite(nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu> array) {
+    return all_pass(array.data(), array.size(), are_finite<T>);
 }
 
 // `n` indices, in rows of three, of which the first is number `first`.
 void check_indices(const char* name, const int32_t* values, int64_t n, int64_t count, const char* of,
                    int64_t first = 0) {
-    if (all_pass(values, n, [=](const int32_t* v, int64_t m) { return greatest(v, m) < uint64_t(count); })) return;
+    if (all_pass(values, n, [=](const int32_t* v, int64_t m) { return are_below(v, m, int32_t(count)); })) return;
     for (int64_t i = 0; i < n; ++i)
         if (values[i] < 0 || values[i] >= count)
             refuse(std::string(name) + ": expected indices from 0 to " + std::to_string(count - 1) + " (rows of " + of +
@@ -409,6 +422,10 @@ NB_MODULE(_core, m) {
     m.def("embree_version", &embree_version);
     m.def("packet_width", &packet_width);
     // Without the interpreter's lock, for which a thread that holds the kernel's may wait.
+    m.def("all_finite", &all_finite<float>, "array"_a.noconvert());
+    m.def("all_finite", &all_finite<double>, "array"_a.noconvert());
+    m.def("all_below", &all_below<int32_t>, "array"_a.noconvert(), "count"_a);
+    m.def("all_below", &all_below<int64_t>, "array"_a.noconvert(), "count"_a);
     m.def("clear_geometry", &clear_geometry, nb::call_guard<nb::gil_scoped_release>());
     m.def("before_fork", &before_fork, nb::call_guard<nb::gil_scoped_release>());
     m.def("after_fork", &after_fork);

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from ._kernel import core
 
 # Numbers beyond the range of float32, in float64: the kernel multiplies up to seven of them (a triple product of positions
 # by two focal lengths, by colour and adjoint), which must stay below 1e308.
@@ -113,6 +115,23 @@ def check_fields(thing: Any, given: Iterable[str]) -> None:
             raise TypeError(f"replace: expected one of {', '.join(known)}, got {name!r}")
 
 
+def _ask_kernel(question: Callable[..., bool], tensor: Tensor, *more: Any) -> bool:
+    """Whether the kernel says yes of the numbers of a tensor. No where these are no array in memory: on another device,
+    strided, or seen through a transform of torch.func. Torch would wake all threads for what one does faster."""
+    try:
+        return question(tensor.numpy(), *more)
+    except (RuntimeError, TypeError):
+        return False
+
+
+def all_below(index: Tensor, count: int) -> bool:
+    """Whether all indices are in [0, count)."""
+    if _ask_kernel(core.all_below, index, count):
+        return True
+    low, high = (int(v) for v in torch.aminmax(index))
+    return low >= 0 and high < count
+
+
 def check_finite(name: str, tensor: Tensor, *, largest: float = LARGEST, smallest: float = 0.0) -> None:
     """No NaN, no infinity, and none larger than `largest`; names the first bad index. Not all, unless all are zero, are
     smaller than `smallest`. Raises ValueError.
@@ -122,6 +141,8 @@ def check_finite(name: str, tensor: Tensor, *, largest: float = LARGEST, smalles
     values = tensor.detach()
     # One fast pass that says yes to nearly everything, then the exact answer. A sum is finite unless a term is not (or the
     # sum overflows); what a sum of squares reaches, no term exceeds.
+    if largest == LARGEST and not smallest and _ask_kernel(core.all_finite, values):
+        return
     if largest >= torch.finfo(values.dtype).max and not smallest:
         if bool(torch.isfinite(values.sum())):
             return
@@ -158,8 +179,8 @@ def check_indices(name: str, tensor: Tensor, count: int, of: str) -> None:
     """All in [0, count). Raises ValueError."""
     if not values_visible(tensor) or tensor.numel() == 0:
         return
-    low, high = (int(v) for v in torch.aminmax(tensor))
-    if low < 0 or high >= count:
+    if not all_below(tensor, count):
+        low, high = (int(v) for v in torch.aminmax(tensor))
         value = low if low < 0 else high
         index = tuple((tensor == value).nonzero()[0].tolist())
         where = ", ".join(str(i) for i in index)

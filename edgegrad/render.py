@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -324,9 +325,9 @@ def _backward_kernel(
     surface_samples, edge_samples, grad_seed, interior_geometry, boundary, wanted = args[18:]
     work = backward_work(interior_geometry, boundary, wanted)
     scene = _kernel_scene(flat, spacing)
-    # Sums are taken in double whatever the arrays hold.
+    # Sums are taken in double whatever the arrays hold. NumPy has its zeros from the system, torch would wake all threads.
     grads = [
-        torch.zeros_like(args[i], dtype=torch.float64) if want else None
+        torch.from_numpy(np.zeros(args[i].shape)) if want else None
         for i, want in zip(DIFFERENTIABLE, wanted, strict=True)
     ]
     verts, colors, uvs, texels, background, gw2c, gK = (None if g is None else g.numpy() for g in grads)

@@ -10,7 +10,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ._check import MOST_ROWS, as_tensor, check_fields, check_finite, check_float, check_shape, values_visible
+from ._check import (
+    MOST_ROWS,
+    all_below,
+    as_tensor,
+    check_fields,
+    check_finite,
+    check_float,
+    check_shape,
+    values_visible,
+)
 from .mesh import PLAIN, Mesh
 
 
@@ -115,18 +124,13 @@ class Flat(NamedTuple):
     background: Tensor  # (C,) or (H, W, C)
 
 
-def _fits_int32(index: Tensor) -> bool:
-    low, high = torch.aminmax(index)
-    return int(low) >= -(2**31) and int(high) < 2**31
-
-
 def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
     """Indices into `count` rows as indices into all rows, int32. What is out of range stays so, for the kernel to refuse: it
     must not wrap around, nor reach into the rows of another mesh, so unless the mesh is alone it becomes −1."""
     index = index.cpu()
     if alone:
         # A look at the extremes costs less than a copy of a million indices.
-        if index.dtype == torch.int64 and (not values_visible() or not _fits_int32(index)):
+        if index.dtype == torch.int64 and (not values_visible() or not all_below(index, 2**31)):
             index = index.clamp(-1, 2**31 - 1)
     else:
         index = torch.where((index >= 0) & (index < count), index + offset, -1)
