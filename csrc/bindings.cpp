@@ -10,6 +10,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
+#include <limits>
 #include <map>
 #include <optional>
 #include <string>
@@ -55,26 +56,28 @@ bool all_pass(const T* values, int64_t n, Pass pass) {
     return all;
 }
 
-// x · 0 is zero unless x is NaN or infinite. Several sums, for one would wait for each addition.
-constexpr int sums = 16;
+// What leaves the range of floats is refused too: the squares and products of such numbers would leave that of doubles.
+template <class T>
+constexpr T largest = T(std::numeric_limits<float>::max());
+
+// Whether all are numbers up to the largest. Several counts, for one would wait for each addition.
+constexpr int counts = 16;
 template <class T>
 EDGEGRAD_VECTORIZED bool are_finite(const T* values, int64_t n) {
-    float zero[sums] = {};
+    T bad[counts] = {};
     int64_t i = 0;
-    for (; i + sums <= n; i += sums)
-        for (int k = 0; k < sums; ++k) zero[k] += float(values[i + k]) * 0.f;
-    for (; i < n; ++i) zero[0] += float(values[i]) * 0.f;
-    for (int k = 1; k < sums; ++k) zero[0] += zero[k];
-    return zero[0] == 0;
+    for (; i + counts <= n; i += counts)
+        for (int k = 0; k < counts; ++k) bad[k] += std::fabs(values[i + k]) <= largest<T> ? T(0) : T(1);
+    for (; i < n; ++i) bad[0] += std::fabs(values[i]) <= largest<T> ? T(0) : T(1);
+    for (int k = 1; k < counts; ++k) bad[0] += bad[k];
+    return bad[0] == 0;
 }
 
 template <class T>
 void check_finite(const char* name, const T* values, int64_t n, int64_t width) {
-    // What leaves the range of floats is refused too: the squares and products of such numbers would leave that of
-    // doubles.
     if (all_pass(values, n, are_finite<T>)) return;
     for (int64_t i = 0; i < n; ++i)
-        if (!std::isfinite(float(values[i])))
+        if (!(std::fabs(values[i]) <= largest<T>))
             refuse(std::string(name) + ": expected " +
                    (std::isfinite(values[i]) ? "numbers up to 3.4e38" : "finite numbers") + ", got " + text(values[i]) +
                    " at " + at(i, width));

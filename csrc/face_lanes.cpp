@@ -9,8 +9,8 @@ namespace {
 
 constexpr int lanes = FaceLanes::size;
 
-// The greatest whole number up to x, within 0 … most.
-inline int32_t whole(double x, double most) { return int32_t(std::min(std::max(x, 0.0), most)); }
+// The greatest whole number up to x, within 0 … most; 0 for NaN.
+inline int32_t whole(double x, double most) { return int32_t(std::min(std::max(0.0, x), most)); }
 
 EDGEGRAD_VECTORIZED void bound_lanes(FaceLanes& f, int width, int height, double radius) {
     const double w = width, h = height;
@@ -32,14 +32,16 @@ EDGEGRAD_VECTORIZED void bound_lanes(FaceLanes& f, int width, int height, double
     EDGEGRAD_ROLLED
     for (int i = 0; i < lanes; ++i)
         f.j0[i] = whole(low(f.y, i) - radius, h), f.j1[i] = whole(high(f.y, i) + radius + 1, h);
-    const auto pixel = [&](double x, double y) { return whole(y, h - 1) * width + whole(x, w - 1); };
-    EDGEGRAD_ROLLED
-    for (int i = 0; i < lanes; ++i) {
-        const double x0 = f.x[0][i], x1 = f.x[1][i], x2 = f.x[2][i], y0 = f.y[0][i], y1 = f.y[1][i], y2 = f.y[2][i];
-        f.inside[0][i] = pixel(0.5 * (x0 + x1), 0.5 * (y0 + y1));
-        f.inside[1][i] = pixel(0.5 * (x1 + x2), 0.5 * (y1 + y2));
-        f.inside[2][i] = pixel(0.5 * (x2 + x0), 0.5 * (y2 + y0));
-        f.inside[3][i] = pixel((1.0 / 3) * (x0 + x1 + x2), (1.0 / 3) * (y0 + y1 + y2));
+    for (int axis = 0; axis < 2; ++axis) {
+        const auto& a = axis ? f.y : f.x;
+        const double most = (axis ? h : w) - 1;
+        int32_t (&to)[4][lanes] = f.inside[axis];
+        EDGEGRAD_ROLLED
+        for (int i = 0; i < lanes; ++i) {
+            to[0][i] = whole(0.5 * (a[0][i] + a[1][i]), most), to[1][i] = whole(0.5 * (a[1][i] + a[2][i]), most);
+            to[2][i] = whole(0.5 * (a[2][i] + a[0][i]), most);
+            to[3][i] = whole((1.0 / 3) * (a[0][i] + a[1][i] + a[2][i]), most);
+        }
     }
 }
 

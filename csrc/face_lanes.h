@@ -22,10 +22,10 @@ struct FaceLanes {
     double x[3][size] = {}, y[3][size] = {}, z[3][size] = {};
 
     // By bound(): twice the signed area, px²; the longest side, px; the greatest depth over the least; the pixels
-    // i0 … i1 − 1, j0 … j1 − 1 that a filter of this radius reaches from the box of the face; and the pixels at the
-    // middles of the sides and of the face.
+    // i0 … i1 − 1, j0 … j1 − 1 that a filter of this radius reaches from the box of the face; and x and y of the pixels
+    // at the middles of the sides and of the face.
     double wedge[size], longest[size], depths[size];
-    int32_t i0[size], i1[size], j0[size], j1[size], inside[4][size];
+    int32_t i0[size], i1[size], j0[size], j1[size], inside[2][4][size];
     void bound(int width, int height, double radius);
 
     // Given for the controls (control.h), as far as there is one: the adjoint at the corners and in the pixels inside,

@@ -5,6 +5,7 @@
 #include <bit>
 #include <cmath>
 #include <limits>
+#include <numeric>
 #include <vector>
 
 #include "render.h"
@@ -306,6 +307,9 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
     // Tiles are lower where a pixel has many samples, so that the threads end together.
     const int rows = std::clamp((1 << 16) / o.spp, 1, tile);
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + rows - 1) / rows;
+    // So many pixels fill batches of rays. Only whole ones are left out: which rays lie in a packet decides which of
+    // two faces at one depth wins, and how sums are rounded.
+    const int unit = std::min(tile, RayBatch::size / std::gcd(RayBatch::size, o.spp));
     const RayFrame frame(caster, camera);
     const ReachablePixels reachable(camera, q, o.filter.radius() - 0.5, team);
     team.each_with(
@@ -316,7 +320,8 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
             const int y0 = int(t / tiles_x) * rows, y1 = std::min(y0 + rows, camera.height);
             for (int y = y0; y < y1; ++y) {
                 const auto [first, end] = reachable.row(y);
-                const int from = std::clamp(first, x0, x1), to = std::clamp(end, from, x1);
+                const int from = x0 + (std::clamp(first, x0, x1) - x0) / unit * unit;
+                const int to = std::min(x1, x0 + (std::clamp(end, from, x1) - x0 + unit - 1) / unit * unit);
                 row.leave_out(x0, from, y), row.render(from, to, y), row.leave_out(to, x1, y);
             }
         });

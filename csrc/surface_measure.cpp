@@ -302,7 +302,8 @@ class MeasuredChunk {
             for (int c = 0; c < C; ++c) adjoint[(7 * c + k) * next] = A[c];
         }
         for (int k = 0; k < 4; ++k) {
-            const T* A = view_.adjoint.of(lanes_.inside[k][i]);
+            const T* A =
+                view_.adjoint.of(int64_t(lanes_.inside[1][k][i]) * view_.camera.width + lanes_.inside[0][k][i]);
             for (int c = 0; c < C; ++c) adjoint[(7 * c + 3 + k) * next] = A[c];
         }
         const auto color_of = [&](int k) { return view_.scene.colors + int64_t(row[k]) * C; };

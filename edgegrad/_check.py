@@ -117,9 +117,10 @@ def check_fields(thing: Any, given: Iterable[str]) -> None:
 
 def _ask_kernel(question: Callable[..., bool], tensor: Tensor, *more: Any) -> bool:
     """Whether the kernel says yes of the numbers of a tensor. No where these are no array in memory: on another device,
-    strided, or seen through a transform of torch.func. Torch would wake all threads for what one does faster."""
+    strided, seen through a transform of torch.func, or without storage. Torch would wake all threads for what one does
+    faster."""
     try:
-        return question(tensor.numpy(), *more)
+        return tensor.data_ptr() != 0 and question(tensor.numpy(), *more)
     except (RuntimeError, TypeError):
         return False
 
@@ -132,12 +133,23 @@ def all_below(index: Tensor, count: int) -> bool:
     return low >= 0 and high < count
 
 
+def check_storage(name: str, tensor: Tensor) -> None:
+    """Torch would read the numbers of a tensor whose memory was given back, and end the process. Raises ValueError."""
+    try:
+        gone = tensor.numel() > 0 and tensor.untyped_storage().nbytes() == 0
+    except (RuntimeError, NotImplementedError):  # seen through a transform, which holds the numbers
+        return
+    if gone:
+        raise ValueError(f"{name}: expected numbers, got a tensor whose storage was resized to zero; keep its memory")
+
+
 def check_finite(name: str, tensor: Tensor, *, largest: float = LARGEST, smallest: float = 0.0) -> None:
     """No NaN, no infinity, and none larger than `largest`; names the first bad index. Not all, unless all are zero, are
     smaller than `smallest`. Raises ValueError.
     """
     if not values_visible(tensor):
         return
+    check_storage(name, tensor)
     values = tensor.detach()
     # One fast pass that says yes to nearly everything, then the exact answer. A sum is finite unless a term is not (or the
     # sum overflows); what a sum of squares reaches, no term exceeds.
@@ -179,6 +191,7 @@ def check_indices(name: str, tensor: Tensor, count: int, of: str) -> None:
     """All in [0, count). Raises ValueError."""
     if not values_visible(tensor) or tensor.numel() == 0:
         return
+    check_storage(name, tensor)
     if not all_below(tensor, count):
         low, high = (int(v) for v in torch.aminmax(tensor))
         value = low if low < 0 else high

@@ -131,8 +131,9 @@ def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
     if alone:
         # A look at the extremes costs less than a copy of a million indices.
         if index.dtype == torch.int64 and (not values_visible() or not all_below(index, 2**31)):
-            index = index.clamp(-1, 2**31 - 1)
+            index = index.clamp(-(2**31), 2**31 - 1)
     else:
+        index = index.long()  # in fewer bits the sum could wrap around too
         index = torch.where((index >= 0) & (index < count), index + offset, -1)
     return index.to(torch.int32)
 

@@ -42,6 +42,14 @@ def test_extreme_numbers_are_finite(dtype: torch.dtype) -> None:
     check_finite("extreme", extreme)
 
 
+def test_a_double_just_beyond_floats_is_too_large() -> None:
+    beyond = torch.tensor([torch.finfo(torch.float32).max], dtype=torch.float64) * (1 + 1e-15)
+    assert torch.isfinite(beyond.float()).all()  # rounded to float it is one
+    assert not core.all_finite(beyond.numpy())
+    with pytest.raises(ValueError, match=r"beyond: expected numbers up to 3\.4"):
+        check_finite("beyond", beyond)
+
+
 @pytest.mark.parametrize("dtype", [torch.int32, torch.int64])
 @pytest.mark.parametrize("n", SIZES)
 def test_one_index_out_of_range(n: int, dtype: torch.dtype) -> None:
@@ -72,6 +80,45 @@ def test_strided_numbers_are_looked_at() -> None:
     for strided, at in ((numbers[:, 1::2], "5, 0"), (numbers.T, "1, 5")):
         with pytest.raises(ValueError, match=rf"odd: expected finite numbers, got nan at \[{at}\]"):
             check_finite("odd", strided)
+
+
+@pytest.mark.parametrize("name", ["verts", "faces", "colors"])
+def test_tensors_without_storage_are_refused(name: str) -> None:
+    """Torch reads them all the same."""
+    tensors = {"verts": torch.eye(3), "faces": torch.tensor([[0, 1, 2]]), "colors": torch.eye(3)}
+    tensors[name].untyped_storage().resize_(0)
+    with pytest.raises(ValueError, match=f"{name}: expected numbers, got a tensor whose storage was resized to zero"):
+        eg.Mesh(**tensors)
+
+
+def test_numbers_that_a_transform_hides_are_not_accepted() -> None:
+    """Torch makes an array of whatever memory holds."""
+
+    def colored(colors: torch.Tensor) -> torch.Tensor:
+        mesh = eg.Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]), colors=colors)
+        assert mesh.colors is not None
+        return mesh.colors * 1
+
+    with pytest.raises((RuntimeError, ValueError)):
+        torch.func.functionalize(colored)(torch.full((3, 3), float("nan")))
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.int32])
+def test_indices_of_few_bits_in_a_scene_of_many_vertices(dtype: torch.dtype) -> None:
+    """Indices into all meshes are greater than those into one."""
+    many = torch.zeros(300 if dtype == torch.uint8 else 40000, 3)
+    first = eg.Mesh(torch.cat([cube().verts.float(), many]), cube().faces.to(dtype))
+    second = eg.Mesh(cube().verts.float() + 2.5, cube().faces.to(dtype))
+    camera = eg.Camera.look_at((4, 5, 9), (1, 1, 1), size=(16, 16))
+    wide = [mesh.replace(faces=mesh.faces.long()) for mesh in (first, second)]
+    assert torch.equal(eg.render(eg.Scene([first, second]), camera), eg.render(eg.Scene(wide), camera))
+
+
+def test_an_index_changed_in_place_is_named_as_it_is() -> None:
+    mesh = cube()
+    mesh.faces[2, 1] = -5
+    with pytest.raises(ValueError, match=r"faces: expected indices .*, got -5 at \[2, 1\]"):
+        eg.render(mesh, eg.Camera.look_at((3, 2, 4), (0, 0, 0), size=(8, 8)))
 
 
 def test_numbers_within_a_transform_are_looked_at() -> None:
