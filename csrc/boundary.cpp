@@ -367,10 +367,7 @@ void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile&
 #define EDGEGRAD_INSTANTIATE(N) \
     template void add_boundary<N, float>(const BackwardView<float>&, Destination&, BackwardProfile&); \
     template void add_boundary<N, double>(const BackwardView<double>&, Destination&, BackwardProfile&);
-EDGEGRAD_INSTANTIATE(0)
-EDGEGRAD_INSTANTIATE(1)
-EDGEGRAD_INSTANTIATE(3)
-EDGEGRAD_INSTANTIATE(4)
+EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
 #undef EDGEGRAD_INSTANTIATE
 // clang-format on
 

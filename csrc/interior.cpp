@@ -165,10 +165,7 @@ void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, B
 #define EDGEGRAD_INSTANTIATE(N) \
     template void add_interior<N, float>(const BackwardView<float>&, bool, Destination&, BackwardProfile&); \
     template void add_interior<N, double>(const BackwardView<double>&, bool, Destination&, BackwardProfile&);
-EDGEGRAD_INSTANTIATE(0)
-EDGEGRAD_INSTANTIATE(1)
-EDGEGRAD_INSTANTIATE(3)
-EDGEGRAD_INSTANTIATE(4)
+EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
 #undef EDGEGRAD_INSTANTIATE
 // clang-format on
 

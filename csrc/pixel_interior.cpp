@@ -52,10 +52,7 @@ void add_pixel_samples(const BackwardView<T>& view, const std::vector<int64_t>& 
 #define EDGEGRAD_INSTANTIATE(N) \
     template void add_pixel_samples<N, float>(const BackwardView<float>&, const std::vector<int64_t>&, int, uint64_t, const uint8_t*, bool, Destination&, double (&)[2]); \
     template void add_pixel_samples<N, double>(const BackwardView<double>&, const std::vector<int64_t>&, int, uint64_t, const uint8_t*, bool, Destination&, double (&)[2]);
-EDGEGRAD_INSTANTIATE(0)
-EDGEGRAD_INSTANTIATE(1)
-EDGEGRAD_INSTANTIATE(3)
-EDGEGRAD_INSTANTIATE(4)
+EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
 #undef EDGEGRAD_INSTANTIATE
 // clang-format on
 

@@ -27,6 +27,9 @@ void dispatch_channels(int channels, F f) {
     }
 }
 
+// Of those numbers, for explicit instantiations.
+#define EDGEGRAD_FOR_CHANNELS(X) X(0) X(1) X(3) X(4)
+
 struct ForwardOptions {
     int spp;  // samples a pixel
     Filter filter;

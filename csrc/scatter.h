@@ -94,7 +94,7 @@ struct Destination {
 // Samples in a chunk.
 constexpr int64_t scatter_chunk = 512;
 
-// For one backward pass, whose parts use the same buffers one after the other.
+// The buffers of one backward pass, whose parts use them one after the other.
 class Scatter {
    public:
     // `channels`: of colours and texels.

@@ -211,7 +211,8 @@ class MeasuredChunk {
     }
 
    private:
-    // Of a face inside the view to the lanes; others are looked at at once.
+    // Puts a face that lies inside the view into the lanes, where all are looked at together; any other is laid out
+    // here.
     void gather(int64_t f, bool more) {
         const int32_t* v = view_.scene.faces + 3 * f;
         const VertexView& p = view_.vertices;
@@ -259,7 +260,7 @@ class MeasuredChunk {
         }
     }
 
-    // At the faces in the lanes.
+    // Lays out the faces in the lanes.
     void look() {
         FaceLanes& l = lanes_;
         if (!l.count) return;
@@ -398,10 +399,7 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, De
 #define EDGEGRAD_INSTANTIATE(N) \
     template SurfaceMeasure<float> measure_surface<N>(const BackwardView<float>&, bool, Destination&); \
     template SurfaceMeasure<double> measure_surface<N>(const BackwardView<double>&, bool, Destination&);
-EDGEGRAD_INSTANTIATE(0)
-EDGEGRAD_INSTANTIATE(1)
-EDGEGRAD_INSTANTIATE(3)
-EDGEGRAD_INSTANTIATE(4)
+EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
 #undef EDGEGRAD_INSTANTIATE
 // clang-format on
 
