@@ -2,11 +2,17 @@
 
 #include <algorithm>
 #include <numeric>
+#include <optional>
 #include <vector>
 
 #include "boundary.h"
+#include "budget.h"
+#include "curve.h"
+#include "curve_measure.h"
 #include "interior.h"
 #include "render.h"
+#include "surface_measure.h"
+#include "vertex_image.h"
 
 namespace edgegrad {
 
@@ -74,10 +80,31 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
     const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, team);
     const FilteredAdjoint<T> filtered(adjoint, scene, o.filter, camera.width, camera.height);
     const Importance importance(adjoint, camera.width, camera.height, scene.channels, o.filter.radius() - 0.5, team);
+    const OcclusionHint occlusion(forward.farthest, camera.width, camera.height, team);
     const RayFrame frame(geometry.caster(), camera);
     Scatter scatter(team, scene.channels);
-    const BackwardView<T> view{scene,      camera, geometry, volume,  vertices, filtered,
-                               importance, o,      team,     scatter, frame,    forward.seen};
+    // What the controls need, of faces and of creases.
+    const bool interior = interior_geometry || grad.appearance();
+    const bool creases = boundary && may_jump(scene, geometry.topology());
+    std::optional<ImageHits> hits;
+    if (!o.pixel_spp && (interior || creases)) hits.emplace(scene, geometry.parts(), forward.seen, team);
+    const Array<T> vertex_adjoint =
+        hits ? adjoint_at_vertices(filtered, vertices, *hits, scene.channels, team) : Array<T>(0);
+    const BackwardView<T> view{.scene = scene,
+                               .camera = camera,
+                               .geometry = geometry,
+                               .volume = volume,
+                               .vertices = vertices,
+                               .adjoint = filtered,
+                               .importance = importance,
+                               .options = o,
+                               .team = team,
+                               .scatter = scatter,
+                               .frame = frame,
+                               .occlusion = occlusion,
+                               .hits = hits ? &*hits : nullptr,
+                               .seen = forward.seen,
+                               .vertex_adjoint = vertex_adjoint};
     profile.view = watch.lap();
 
     Array<double> q_bar = zeros(grad.geometry() ? 3 * scene.n_verts : 0, team);
@@ -90,10 +117,30 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
             std::vector<int64_t> pixels(int64_t(camera.width) * camera.height);
             std::iota(pixels.begin(), pixels.end(), 0);
             add_pixel_samples<N>(view, pixels, o.pixel_spp, o.seed, nullptr, interior_geometry, to, profile.surface);
-        } else if (interior_geometry || grad.appearance()) {
-            add_interior<N>(view, interior_geometry, to, profile);
+            return;
         }
-        if (boundary) add_boundary<N>(view, to, profile);
+        // Both terms are measured before samples are drawn, since they share a budget.
+        watch.lap();
+        std::optional<SurfaceMeasure<T>> surface;
+        if (interior) surface.emplace(measure_surface<N>(view, interior_geometry, to));
+        profile.measure = watch.lap();
+        std::optional<Curves<T>> curves;
+        if (boundary) curves.emplace(measure_curves<N>(view));
+        const SampleCounts wanted{surface ? surface->wanted(o.surface_samples) : 0,
+                                  curves ? curves->wanted(o.edge_samples) : 0};
+        const SampleBudget budget(forward.coverage, int64_t(camera.width) * camera.height, o.spp, team);
+        const SampleCounts share = budget.share(wanted);
+        if (curves) profile.silhouettes = curves->silhouettes, profile.creases = curves->creases;
+        if (surface) profile.surface_wanted = surface->pixel_samples() + wanted.surface;
+        profile.edge_wanted = wanted.edge;
+        profile.curves = watch.lap();
+        if (surface)
+            add_interior<N>(view, *surface, o.surface_samples >= 0 ? wanted.surface : share.surface, interior_geometry,
+                            to, profile);
+        if (curves) {
+            add_boundary<N>(view, *curves, o.edge_samples >= 0 ? wanted.edge : share.edge, to, profile);
+            if (!curves->x_bar.empty()) add_places(view, curves->x_bar, to);
+        }
     });
     watch.lap();
     if (grad.geometry()) add_world(camera, scene.verts, q_bar, team, grad);

@@ -267,17 +267,18 @@ using Profile = std::map<std::string, double>;
 
 template <class T>
 void check_forward_output(const SceneArrays<T>& scene, const Camera& camera, const Out<T, 2>& coverage,
-                          const Out<uint8_t, 1>& seen) {
+                          const Out<float, 2>& farthest, const Out<uint8_t, 1>& seen) {
     if (coverage.size() != size_t(camera.width) * camera.height) refuse("coverage: expected the size of the image");
+    if (farthest.size() != coverage.size()) refuse("farthest: expected the size of the image");
     if (seen.size() != scene.faces.shape(0)) refuse("seen: expected one number a face");
 }
 
 template <class T>
 Profile forward(const SceneArrays<T>& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed,
-                int threads, Out<T, 3> image, Out<T, 2> coverage, Out<uint8_t, 1> seen) {
+                int threads, Out<T, 3> image, Out<T, 2> coverage, Out<float, 2> farthest, Out<uint8_t, 1> seen) {
     check_background(scene, camera);
     check_image("image", image, camera, scene.background.shape(2));
-    check_forward_output(scene, camera, coverage, seen);
+    check_forward_output(scene, camera, coverage, farthest, seen);
     const ForwardOptions options{spp, make_filter(filter), seed};
     return unlocked(threads, [&](Team& team) -> Profile {
         Stopwatch watch;
@@ -285,21 +286,22 @@ Profile forward(const SceneArrays<T>& scene, const Camera& camera, int spp, cons
         const auto geometry = scene.geometry({}, team, work);
         const double update = watch.lap();
         render_forward(scene.view(), camera, geometry->caster(), options, team,
-                       ForwardOutput<T>{image.data(), coverage.data(), seen.data()});
+                       ForwardOutput<T>{image.data(), coverage.data(), farthest.data(), seen.data()});
         return {{"update", update}, {"forward", watch.lap()}, {"built rays", work.rays}};
     });
 }
 
 template <class T>
-Profile backward(const SceneArrays<T>& scene, const Camera& camera, int64_t surface_samples, int64_t edge_samples,
-                 const std::string& filter, uint64_t seed, int threads, bool interior_geometry, bool boundary, bool dry,
-                 Out<T, 3> adjoint, Out<T, 2> coverage, Out<uint8_t, 1> seen, std::optional<Out<double, 2>> verts,
-                 std::optional<Out<double, 2>> colors, std::optional<Out<double, 2>> uvs,
-                 std::optional<Out<double, 2>> texels, std::optional<Out<double, 3>> background,
-                 std::optional<Out<double, 2>> world_to_camera, std::optional<Out<double, 2>> K) {
+Profile backward(const SceneArrays<T>& scene, const Camera& camera, int spp, int64_t surface_samples,
+                 int64_t edge_samples, const std::string& filter, uint64_t seed, int threads, bool interior_geometry,
+                 bool boundary, bool dry, Out<T, 3> adjoint, Out<T, 2> coverage, Out<float, 2> farthest,
+                 Out<uint8_t, 1> seen, std::optional<Out<double, 2>> verts, std::optional<Out<double, 2>> colors,
+                 std::optional<Out<double, 2>> uvs, std::optional<Out<double, 2>> texels,
+                 std::optional<Out<double, 3>> background, std::optional<Out<double, 2>> world_to_camera,
+                 std::optional<Out<double, 2>> K) {
     check_background(scene, camera);
     check_image("adjoint", adjoint, camera, scene.background.shape(2));
-    check_forward_output(scene, camera, coverage, seen);
+    check_forward_output(scene, camera, coverage, farthest, seen);
     check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2));
     const auto data = [](auto& array, const auto& like, const char* name) -> double* {
         if (!array) return nullptr;
@@ -314,20 +316,30 @@ Profile backward(const SceneArrays<T>& scene, const Camera& camera, int64_t surf
     if (K && K->size() != 9) refuse("gradient of K: expected shape (3, 3)");
     grad.world_to_camera = world_to_camera ? world_to_camera->data() : nullptr;
     grad.K = K ? K->data() : nullptr;
-    const BackwardOptions options{surface_samples,   edge_samples, make_filter(filter), seed,
-                                  interior_geometry, boundary,     scene.spacing,       dry};
+    const BackwardOptions options{.spp = spp,
+                                  .surface_samples = surface_samples,
+                                  .edge_samples = edge_samples,
+                                  .filter = make_filter(filter),
+                                  .seed = seed,
+                                  .interior_geometry = interior_geometry,
+                                  .boundary = boundary,
+                                  .spacing = scene.spacing,
+                                  .dry = dry};
     GeometryWork work;
     double update = 0;
     const BackwardProfile p = unlocked(threads, [&](Team& team) {
         Stopwatch watch;
         const bool interior = (grad.geometry() && interior_geometry) || grad.appearance();
-        const auto geometry = scene.geometry({grad.geometry() && boundary, interior}, team, work);
+        const auto geometry =
+            scene.geometry({grad.geometry() && boundary, interior || (grad.geometry() && boundary)}, team, work);
         update = watch.lap();
         return render_backward(scene.view(), camera, *geometry, options, team, adjoint.data(),
-                               ForwardView<T>{coverage.data(), seen.data()}, grad);
+                               ForwardView<T>{coverage.data(), farthest.data(), seen.data()}, grad);
     });
     return {{"surface_samples", double(p.surface_samples)},
             {"edge_samples", double(p.edge_samples)},
+            {"surface_wanted", double(p.surface_wanted)},
+            {"edge_wanted", double(p.edge_wanted)},
             {"silhouettes", double(p.silhouettes)},
             {"creases", double(p.creases)},
             {"built rays", work.rays},
@@ -353,7 +365,7 @@ void bind_scene(nb::module_& m, const char* name) {
              "uvs"_a.noconvert(), "texels"_a.noconvert(), "textures"_a.noconvert(), "face_texture"_a.noconvert(),
              "background"_a.noconvert(), "spacing"_a)
         .def("forward", &forward<T>, "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a, "image"_a.noconvert(),
-             "coverage"_a.noconvert(), "seen"_a.noconvert())
+             "coverage"_a.noconvert(), "farthest"_a.noconvert(), "seen"_a.noconvert())
         .def(
             "bare_loop",
             [](const Scene& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed,
@@ -369,7 +381,7 @@ void bind_scene(nb::module_& m, const char* name) {
             "pixel_backward",
             [](const Scene& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed, int threads,
                Out<T, 3> adjoint, Out<double, 2> verts, std::optional<Out<double, 2>> colors) {
-                BackwardOptions options{-1, -1, make_filter(filter), seed, true, false, scene.spacing, false};
+                BackwardOptions options{spp, -1, -1, make_filter(filter), seed, true, false, scene.spacing, false};
                 options.pixel_spp = spp;
                 SceneGrad grad;
                 grad.verts = verts.data(), grad.colors = colors ? colors->data() : nullptr;
@@ -379,16 +391,16 @@ void bind_scene(nb::module_& m, const char* name) {
                     const auto geometry = scene.geometry({}, team, work);
                     const BackwardProfile p =
                         render_backward(scene.view(), camera, *geometry, options, team, adjoint.data(),
-                                        ForwardView<T>{nullptr, seen.data()}, grad);
+                                        ForwardView<T>{nullptr, nullptr, seen.data()}, grad);
                     return p.surface[0] + p.surface[1];
                 });
             },
             "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a, "adjoint"_a.noconvert(), "verts"_a.noconvert(),
             "colors"_a = nb::none())
-        .def("backward", &backward<T>, "camera"_a, "surface_samples"_a, "edge_samples"_a, "filter"_a, "seed"_a,
+        .def("backward", &backward<T>, "camera"_a, "spp"_a, "surface_samples"_a, "edge_samples"_a, "filter"_a, "seed"_a,
              "threads"_a, "interior_geometry"_a, "boundary"_a, "dry"_a, "adjoint"_a.noconvert(),
-             "coverage"_a.noconvert(), "seen"_a.noconvert(), "verts"_a = nb::none(), "colors"_a = nb::none(),
-             "uvs"_a = nb::none(), "texels"_a = nb::none(), "background"_a = nb::none(),
+             "coverage"_a.noconvert(), "farthest"_a.noconvert(), "seen"_a.noconvert(), "verts"_a = nb::none(),
+             "colors"_a = nb::none(), "uvs"_a = nb::none(), "texels"_a = nb::none(), "background"_a = nb::none(),
              "world_to_camera"_a = nb::none(), "K"_a = nb::none())
         .def(
             "shade_at",

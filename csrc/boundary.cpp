@@ -20,16 +20,15 @@
 #include <vector>
 
 #include "coincident.h"
+#include "crease_control.h"
 #include "curve.h"
+#include "curve_measure.h"
 #include "sampler.h"
 #include "systematic.h"
 
 namespace edgegrad {
 
 namespace {
-
-// Default samples a pixel of curve; see surface_measure.cpp.
-constexpr double samples_per_pixel = 24;
 
 template <int N, class T>
 class BoundaryChunk {
@@ -288,85 +287,48 @@ class BoundaryChunk {
     Vec3 a_bar_, b_bar_;
 };
 
-// How far, in pixels, a ray may miss the points of a curve. A hundredth where it would be more: by then the image shows
-// floats, not faces.
-template <class T>
-double reach_of_rays(const BackwardView<T>& view, const Curve& c) {
-    double error = 0;
-    const HalfEdge& h = c.minus.face >= 0 ? c.minus : c.plus;
-    for (const int corner : {h.first(), h.second()}) {
-        const double* p = view.scene.verts + 3 * int64_t(vertex(view.scene, h, corner));
-        error = std::max(error, view.frame.error({p[0], p[1], p[2]}));
-    }
-    return std::max(c.rounding, std::min(view.camera.pixels_per_unit / std::min(c.w0, c.w1) * error, 0.01));
-}
-
 }  // namespace
 
 template <int N, class T>
-void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile& profile) {
-    const BackwardOptions& o = view.options;
-    const int64_t E = view.geometry.topology().n_edges();
-    Stopwatch watch;
-    const CurveFinder<T> finder(view);
-
-    // Curves end to end, by their length in the image times how much the loss looks there.
-    Array<double> measure(E);
-    struct Found {
-        double length = 0;
-        int64_t silhouettes = 0, creases = 0;
-        std::vector<ImageSegment> segments;
-    };
-    std::vector<Found> found(Team::blocks(E));
-    view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) {
-        for (int64_t e = first; e < last; ++e) {
-            Curve c;
-            measure[e] = 0;
-            if (!finder.find(e, c)) continue;
-            ++(c.is_crease() ? found[k].creases : found[k].silhouettes);
-            const double importance = view.importance.mean({std::min(c.x0.x, c.x1.x), std::min(c.x0.y, c.x1.y)},
-                                                           {std::max(c.x0.x, c.x1.x), std::max(c.x0.y, c.x1.y)});
-            if (!(importance > 0)) continue;
-            measure[e] = c.length * importance;
-            if (!std::isfinite(c.length)) continue;
-            found[k].length += c.length;
-            found[k].segments.push_back({e, c.x0, c.x1, reach_of_rays(view, c)});
-        }
-    });
-    double total = 0;
-    std::vector<ImageSegment> segments;
-    for (const Found& f : found) {
-        total += f.length, profile.silhouettes += f.silhouettes, profile.creases += f.creases;
-        segments.insert(segments.end(), f.segments.begin(), f.segments.end());
-    }
-    const CoincidentCurves coincident(segments, view.team);
-    Systematic systematic(measure, view.team);
-    profile.curves = watch.lap();
-    if (!(systematic.total() > 0)) return;
-
-    const int64_t n = o.edge_samples >= 0 ? o.edge_samples : int64_t(std::ceil(samples_per_pixel * total));
+void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, Destination& to,
+                  BackwardProfile& profile) {
     profile.edge_samples = n;
-    if (o.dry) return;
-    systematic.draw(n, to_unit(hash(o.seed, 3, gradient_stream)));
+    if (n == 0 || view.options.dry) return;
+    const CurveFinder<T>& finder = curves.finder;
+    const CoincidentCurves coincident(curves.segments, view.team);
+    Systematic systematic(curves.of_edge, view.team);
+    systematic.draw(n, to_unit(hash(view.options.seed, 3, gradient_stream)));
+    const bool controls = !curves.x_bar.empty();
+    if (controls) to.x = curves.x_bar.data();
     view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         BoundaryChunk<N, T> chunk(view, finder, coincident, grad);
+        CreaseControl<N, T> control(view);
         Curve curve;
+        bool controlled = false;
         int64_t edge = systematic.primitive(systematic.position(first));
         for (int64_t i = first; i < last; ++i) {
             const double position = systematic.position(i);
             edge = systematic.primitive(position, edge);
-            if (curve.edge != edge) finder.find(edge, curve);
-            const double s = (position - systematic.begin_of(edge)) / systematic.measure_of(edge);
-            chunk.add(curve, std::clamp(s, 0.0, 1.0), systematic.weight(edge));
+            if (curve.edge != edge) {
+                if (controlled) control.flush(grad.x);
+                finder.find(edge, curve);
+                controlled = controls && control.set(curve);
+            }
+            const double weight = systematic.weight(edge);
+            const double s = std::clamp((position - systematic.begin_of(edge)) / systematic.measure_of(edge), 0.0, 1.0);
+            if (controlled) control.subtract(s, weight);
+            chunk.add(curve, s, weight);
         }
+        if (controlled) control.flush(grad.x);
         chunk.finish();
     });
+    to.x = nullptr;
 }
 
 // clang-format off
 #define EDGEGRAD_INSTANTIATE(N) \
-    template void add_boundary<N, float>(const BackwardView<float>&, Destination&, BackwardProfile&); \
-    template void add_boundary<N, double>(const BackwardView<double>&, Destination&, BackwardProfile&);
+    template void add_boundary<N, float>(const BackwardView<float>&, Curves<float>&, int64_t, Destination&, BackwardProfile&); \
+    template void add_boundary<N, double>(const BackwardView<double>&, Curves<double>&, int64_t, Destination&, BackwardProfile&);
 EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
 #undef EDGEGRAD_INSTANTIATE
 // clang-format on

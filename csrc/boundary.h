@@ -11,7 +11,11 @@
 
 namespace edgegrad {
 
+template <class T>
+struct Curves;
+
+// Adds what n samples find on the measured curves.
 template <int N, class T>
-void add_boundary(const BackwardView<T>& view, Destination& to, BackwardProfile& profile);
+void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, Destination& to, BackwardProfile& profile);
 
 }  // namespace edgegrad

@@ -77,6 +77,13 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
     return false;
 }
 
+// Whether neighbouring faces may differ in radiance at their common edge. Attributes that are indexed like the vertices
+// are the same on both sides of an edge, unless it joins copies.
+template <class T>
+bool may_jump(const SceneView<T>& scene, const Topology& topology) {
+    return scene.corners != scene.faces || topology.welds();
+}
+
 // A face that turns clockwise in the image (x right, y down) lies to the right of its sides, where the normal
 // (τ_y, −τ_x) does not point. One seen exactly edge-on covers nothing. > 0: the side of minus, < 0: of plus.
 inline int side_of(const HalfEdge& h, const Array<int8_t>& facing) {
@@ -88,11 +95,7 @@ template <class T>
 class CurveFinder {
    public:
     explicit CurveFinder(const BackwardView<T>& view)
-        : view_(view),
-          facing_(view.scene.n_faces),
-          // Attributes that are indexed like the vertices are the same on both sides of an edge, unless it joins
-          // copies.
-          jumps_(view.scene.corners != view.scene.faces || view.geometry.topology().welds()) {
+        : view_(view), facing_(view.scene.n_faces), jumps_(may_jump(view.scene, view.geometry.topology())) {
         const int64_t blocks = Team::blocks(view.scene.n_verts);
         std::vector<double> farthest(blocks, 0.0);
         view.team.each_block(view.scene.n_verts, [&](int64_t k, int64_t first, int64_t last) {
@@ -110,6 +113,8 @@ class CurveFinder {
             }
         });
     }
+
+    bool finds_creases() const { return jumps_; }
 
     // The curve of an edge; false when there is none.
     bool find(int64_t edge, Curve& c) const {

@@ -8,6 +8,7 @@
 #include <numeric>
 #include <vector>
 
+#include "depth_bound.h"
 #include "render.h"
 #include "sampler.h"
 #include "shading/shade.h"
@@ -77,6 +78,8 @@ class PixelRow {
           q_(q),
           out_(out),
           C_(N ? N : scene.channels),
+          reach_{options.filter.radius() * (std::fabs(camera.k_inverse[0]) + std::fabs(camera.k_inverse[1])),
+                 options.filter.radius() * (std::fabs(camera.k_inverse[2]) + std::fabs(camera.k_inverse[3]))},
           rays_(frame),
           sum_(tile * C_),
           radiance_(C_) {}
@@ -84,6 +87,8 @@ class PixelRow {
     void render(int x0, int x1, int y) {
         std::fill(sum_.begin(), sum_.end(), 0.0);
         std::fill(hits_, hits_ + tile, 0);
+        std::fill(farthest_, farthest_ + tile, -std::numeric_limits<double>::infinity());
+        x0_ = x0, y_ = y;
         for (int x = x0; x < x1; ++x)
             for (int done = 0; done < spp_;) {
                 const int n = std::min(spp_ - done, RayBatch::size - rays_.count);
@@ -100,6 +105,7 @@ class PixelRow {
             for (int c = 0; c < C_; ++c)
                 out_.image[pixel * C_ + c] = T(sum_[x * C_ + c] / spp_ + (1 - share) * behind[c]);
             out_.coverage[pixel] = T(share);
+            out_.farthest[pixel] = hits_[x] == spp_ ? rounded_up(farthest_[x]) : std::numeric_limits<float>::infinity();
         }
     }
 
@@ -110,6 +116,7 @@ class PixelRow {
             const T* behind = scene_.background_at(pixel);
             std::copy(behind, behind + C_, out_.image + pixel * C_);
             out_.coverage[pixel] = 0;
+            out_.farthest[pixel] = std::numeric_limits<float>::infinity();
         }
     }
 
@@ -120,6 +127,7 @@ class PixelRow {
         int32_t face = -1;
         bool textured = false, unseen = false;
         FaceMap map;
+        DepthBound depth;
         AffineRadiance<N> radiance;
     };
     static constexpr unsigned n_kept = 64;
@@ -147,24 +155,33 @@ class PixelRow {
                         const int n = std::popcount(same);
                         s.radiance.add_to(sum, b, n);
                         hits += n;
+                        note_depth(s, part_[p].column);
                     } else {
-                        for (unsigned one = same; one; one &= one - 1) hits += add(i + std::countr_zero(one), sum);
+                        for (unsigned one = same; one; one &= one - 1)
+                            hits += add(i + std::countr_zero(one), part_[p].column, sum);
                     }
                 }
             for (; i < end; ++i)
-                if (rays_.face[i] >= 0) hits += add(i, sum);
+                if (rays_.face[i] >= 0) hits += add(i, part_[p].column, sum);
             hits_[part_[p].column] += hits;
             for (int c = 0; c < C_; ++c) sum_[part_[p].column * C_ + c] += sum[c];
         }
         rays_.count = parts_ = 0;
     }
 
-    // Adds what ray i sees to the sum; whether it sees anything.
-    bool add(int i, typename AffineRadiance<N>::Sum& sum) {
+    // The farthest depth that is hit in a pixel.
+    void note_depth(const Shaded& s, int column) {
+        const Vec2 middle = normalised(camera_, {x0_ + column + 0.5, y_ + 0.5});
+        farthest_[column] = std::max(farthest_[column], s.depth.within(middle, reach_));
+    }
+
+    // Adds what ray i, of a pixel in this column, sees to the sum; whether it sees anything.
+    bool add(int i, int column, typename AffineRadiance<N>::Sum& sum) {
         int32_t face = rays_.face[i];
         if (shaded(face).unseen) [[unlikely]]
             if ((face = beyond(face, i)) < 0) return false;
         const Shaded& s = shaded(face);
+        note_depth(s, column);
         const Barycentrics b = barycentrics_of_hit(s.map, rays_.n(i));
         if (s.textured) {
             shade<N>(scene_, face, b, radiance_.data());
@@ -211,6 +228,7 @@ class PixelRow {
         s.map = face_map(camera_, corner);
         s.unseen = camera_.perspective && passes_through_eye(corner);
         if (s.unseen) return;
+        s.depth.set(camera_, corner, s.map);
         if (!s.textured) s.radiance.set(scene_, face);
         // Threads may write the same byte, always with the same value; reading first keeps its cache line shared.
         std::atomic_ref<uint8_t> seen(out_.seen[face]);
@@ -228,6 +246,7 @@ class PixelRow {
     const Array<Vec3>& q_;
     const ForwardOutput<T>& out_;
     const int C_;
+    const Vec2 reach_;  // of the filter around a pixel, in normalised image coordinates
 
     struct Part {
         int column, n;
@@ -237,7 +256,9 @@ class PixelRow {
     int parts_ = 0;
     unsigned traced_ = 0;
     Shaded kept_[n_kept];
+    int x0_ = 0, y_ = 0;  // the first pixel of the row
     int hits_[tile];
+    double farthest_[tile];
     std::vector<double> sum_, radiance_;
 };
 

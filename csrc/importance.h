@@ -28,7 +28,7 @@ class Importance {
         };
         // Strips of rows, and of columns, that are worth a thread.
         const int rows = std::max(1, (1 << 14) / width), strips = (height + rows - 1) / rows;
-        std::vector<double> row_sum(height, 0.0);
+        std::vector<double> row_sum(height, 0.0), row_change(height, 0.0);
         std::vector<int64_t> row_nonzero(height, 0);
         const auto each_row = [&](auto body) {
             team.each(strips, [&](int64_t k) {
@@ -40,9 +40,13 @@ class Importance {
                 const double a = size(int64_t(j) * width + i);
                 row_sum[j] += a, row_nonzero[j] += a > 0;
             }
+            const T* row = adjoint + int64_t(j) * width * channels;
+            for (int k = channels; k < width * channels; ++k)
+                row_change[j] += std::fabs(double(row[k]) - row[k - channels]);
         });
         const double sum = std::accumulate(row_sum.begin(), row_sum.end(), 0.0);
         const int64_t nonzero = std::accumulate(row_nonzero.begin(), row_nonzero.end(), int64_t(0));
+        roughness_ = sum > 0 ? std::accumulate(row_change.begin(), row_change.end(), 0.0) / sum : 0;
         per_adjoint_ = sum > 0 ? 8.0 * nonzero / sum : 0;
         const double scale = unit * per_adjoint_;
         each_row([&](int j) {
@@ -83,6 +87,9 @@ class Importance {
 
     double radius() const { return radius_; }  // of the filter, less ½
 
+    // Mean difference of neighbouring pixels over the mean size: small for a smooth adjoint, √2 for white noise.
+    double roughness() const { return roughness_; }
+
     // Of a pixel whose adjoint has this size.
     double of(double size) const { return size > 0 ? 1 + per_adjoint_ * size : 0; }
 
@@ -92,7 +99,7 @@ class Importance {
     size_t index(int i, int j) const { return size_t(j) * (width_ + 1) + i; }
 
     int width_, height_;
-    double radius_, per_adjoint_ = 0;
+    double radius_, per_adjoint_ = 0, roughness_ = 0;
     Array<int64_t> table_;
 };
 

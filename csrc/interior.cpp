@@ -24,9 +24,9 @@ namespace {
 template <int N, class T>
 class InteriorChunk {
    public:
-    InteriorChunk(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad, const T* adjoint)
+    InteriorChunk(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
         : view_(view),
-          grad_(view, geometry, to, grad, adjoint),
+          grad_(view, geometry, to, grad),
           C_(N ? N : view.scene.channels),
           rays_(view.frame),
           weighted_(RayBatch::size * C_) {}
@@ -108,7 +108,7 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
                          const SurfaceMeasure<T>& surface, bool geometry, Destination& to, double (&seconds)[2]) {
     const ShiftedSequence sequence(hash(view.options.seed, 2, gradient_stream));
     view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        InteriorChunk<N, T> chunk(view, geometry, to, grad, surface.adjoint.data());
+        InteriorChunk<N, T> chunk(view, geometry, to, grad);
         VisiblePolygon polygon;
         PolygonSampler sampler;
         int64_t face = -1;
@@ -134,37 +134,24 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
 }  // namespace
 
 template <int N, class T>
-void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, BackwardProfile& profile) {
+void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64_t n, bool geometry, Destination& to,
+                  BackwardProfile& profile) {
     const BackwardOptions& o = view.options;
-    Stopwatch watch;
-    SurfaceMeasure<T> surface = measure_surface<N>(view, geometry, to);
-    // How often each is sampled: as the defaults, or in proportion to them.
-    const double wanted = o.surface_samples >= 0 ? double(o.surface_samples) / (surface.total + surface.of_large) : 1;
-    Systematic systematic(surface.of_face, view.team);
-    profile.measure = watch.lap();
-
-    if (surface.of_large > 0) {
-        const int64_t pixels = int64_t(surface.pixels.size());
-        const int spp = int(std::clamp(std::round(wanted * surface.of_large / double(pixels)), 1.0, 0x1p20));
-        profile.surface_samples = spp * pixels;
-        if (!o.dry)
-            add_pixel_samples<N>(view, surface.pixels, spp, hash(o.seed, 4, gradient_stream), surface.is_large.data(),
-                                 geometry, to, profile.surface);
-    }
-    if (!(systematic.total() > 0)) return;
-
-    const int64_t n = o.surface_samples >= 0 ? std::max(1ll, std::llround(wanted * surface.total))
-                                             : int64_t(std::ceil(surface.total));
-    profile.surface_samples += n;
+    profile.surface_samples = surface.pixel_samples() + n;
     if (o.dry) return;
+    if (surface.pixel_samples() > 0)
+        add_pixel_samples<N>(view, surface.pixels, surface.pixel_spp, hash(o.seed, 4, gradient_stream),
+                             surface.is_large.data(), geometry, to, profile.surface);
+    if (n == 0) return;
+    Systematic systematic(surface.of_face, view.team);
     systematic.draw(n, to_unit(hash(o.seed, 1, gradient_stream)));
     add_surface_samples<N>(view, n, systematic, surface, geometry, to, profile.surface);
 }
 
 // clang-format off
 #define EDGEGRAD_INSTANTIATE(N) \
-    template void add_interior<N, float>(const BackwardView<float>&, bool, Destination&, BackwardProfile&); \
-    template void add_interior<N, double>(const BackwardView<double>&, bool, Destination&, BackwardProfile&);
+    template void add_interior<N, float>(const BackwardView<float>&, SurfaceMeasure<float>&, int64_t, bool, Destination&, BackwardProfile&); \
+    template void add_interior<N, double>(const BackwardView<double>&, SurfaceMeasure<double>&, int64_t, bool, Destination&, BackwardProfile&);
 EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
 #undef EDGEGRAD_INSTANTIATE
 // clang-format on

@@ -5,7 +5,9 @@
 #include <array>
 
 #include "control.h"
+#include "image_hits.h"
 #include "importance.h"
+#include "occlusion.h"
 #include "render.h"
 #include "scatter.h"
 #include "shading/shade.h"
@@ -26,7 +28,10 @@ struct BackwardView {
     Team& team;
     Scatter& scatter;
     const RayFrame& frame;
-    const uint8_t* seen;  // (F,): 0, or the side from which the forward pass hit the face
+    const OcclusionHint& occlusion;
+    const ImageHits* hits;           // null where neither term asks
+    const uint8_t* seen;             // (F,): 0, or the side from which the forward pass hit the face
+    const Array<T>& vertex_adjoint;  // (V, C): Ã at the vertices of faces that were hit (vertex_image.h)
 };
 
 template <class T>
@@ -74,9 +79,7 @@ bool lies_far_before(const BackwardView<T>& view, int64_t face, double depth) {
 template <int N, class T>
 class FaceGrad {
    public:
-    // `adjoint`: Ã at the vertices, for the control.
-    FaceGrad(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad,
-             const T* adjoint = nullptr)
+    FaceGrad(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
         : view_(view),
           geometry_(geometry),
           want_colors_(to.colors),
@@ -85,7 +88,7 @@ class FaceGrad {
           want_k_(to.want_k),
           grad_(grad),
           C_(N ? N : view.scene.channels),
-          control_(view.scene, view.vertices, adjoint) {}
+          control_(view.scene, view.vertices, view.vertex_adjoint.data()) {}
 
     int32_t face() const { return face_; }  // −1: none
 
@@ -151,9 +154,14 @@ class FaceGrad {
     Control<N, T> control_;
 };
 
-// Adds to `to`; `geometry` says whether points and camera are wanted too.
+template <class T>
+struct SurfaceMeasure;
+
+// Adds what n samples find on the measured surface, and those of the pixels; `geometry` says whether points and camera
+// are wanted too.
 template <int N, class T>
-void add_interior(const BackwardView<T>& view, bool geometry, Destination& to, BackwardProfile& profile);
+void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64_t n, bool geometry, Destination& to,
+                  BackwardProfile& profile);
 
 // Adds what `spp` samples in each of some pixels find on the faces marked in `faces` (F,), or on all if it is null.
 template <int N, class T>

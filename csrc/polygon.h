@@ -5,6 +5,7 @@
 #include <bit>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 
 #include "camera.h"
 #include "sierpinski.h"
@@ -18,6 +19,7 @@ struct VisiblePolygon {
     int n = 0;
     double area = 0;     // px²
     double longest = 0;  // px
+    double nearest = 0;  // depth
     Vec2 low, high;
 
     // Of the face with the vertices v; false when there is none.
@@ -27,11 +29,14 @@ struct VisiblePolygon {
         if (!(c0 | c1 | c2)) {
             n = 3;
             for (int i = 0; i < 3; ++i) corner[i] = p.x[v[i]];
+            nearest = std::min({p.q[v[0]].z, p.q[v[1]].z, p.q[v[2]].z});
         } else {
             if (camera.facing(p.q[v[0]], p.q[v[1]], p.q[v[2]]) == 0) return false;
             Vec3 polygon[ViewVolume::most_corners] = {p.q[v[0]], p.q[v[1]], p.q[v[2]]};
             n = volume.clip_triangle(polygon);
+            nearest = std::numeric_limits<double>::infinity();
             for (int i = 0; i < n; ++i) {
+                nearest = std::min(nearest, polygon[i].z);
                 // Only a triangle through the eye itself has a corner there; it has no image to sample.
                 if (!(camera.depth_weight(polygon[i]) > 0)) return false;
                 corner[i] = project(camera, polygon[i]);

@@ -54,9 +54,10 @@ class PixelRays {
 // Where the forward pass writes.
 template <class T>
 struct ForwardOutput {
-    T* image;       // (H, W, C)
-    T* coverage;    // (H, W): the filtered share of each pixel where something is hit
-    uint8_t* seen;  // (F,): 0, or the side, 1 or 2, from which a sample hit the face
+    T* image;         // (H, W, C)
+    T* coverage;      // (H, W): the filtered share of each pixel where something is hit
+    float* farthest;  // (H, W): no sample hit anything beyond this depth; infinite where one hit nothing
+    uint8_t* seen;    // (F,): 0, or the side, 1 or 2, from which a sample hit the face
 };
 
 template <class T>
@@ -68,6 +69,7 @@ double bare_loop(const Camera& camera, const RayCaster& caster, const ForwardOpt
                  Team& team);
 
 struct BackwardOptions {
+    int spp;                  // of the image that was made
     int64_t surface_samples;  // in all; −1: the default (surface_measure.cpp)
     int64_t edge_samples;     // in all; −1: the default (boundary.cpp)
     Filter filter;
@@ -82,6 +84,7 @@ struct BackwardOptions {
 // What a backward pass did, and the seconds that each part took.
 struct BackwardProfile {
     int64_t surface_samples = 0, edge_samples = 0;
+    int64_t surface_wanted = 0, edge_wanted = 0;   // default samples before the budget (budget.h)
     int64_t silhouettes = 0, creases = 0;          // curves in view
     double view = 0;                               // vertices in camera coordinates, where the loss looks
     double measure = 0, curves = 0;                // triangles and curves laid end to end
@@ -89,10 +92,11 @@ struct BackwardProfile {
     double world = 0;                              // from camera coordinates to the user's arrays
 };
 
-// What the backward pass takes from the forward pass: coverage (H, W), and whether a sample hit each face (F,).
+// What the backward pass takes from the forward pass; see ForwardOutput.
 template <class T>
 struct ForwardView {
     const T* coverage;
+    const float* farthest;
     const uint8_t* seen;
 };
 

@@ -6,24 +6,32 @@
 
 #include "face_lanes.h"
 #include "polygon.h"
+#include "vertex_image.h"
 
 namespace edgegrad {
 
 namespace {
 
-// What the measure of a triangle is lowered by if neither it nor a neighbour was seen, and what by if, besides, the
-// part of the surface to which it belongs was seen from the other side alone, as a closed mesh is: never to zero, for
-// it may be seen all the same. A side counts in full from a share of `some` of the faces that were seen of the part, if
-// these are at least `enough` to tell.
-constexpr double hidden = 1.0 / 8, turned_away = 1.0 / 64, some = 1.0 / 16;
-constexpr int enough = 64;
+// What the measure of a triangle is multiplied by if the image hit neither it nor a neighbour; if, besides, it hit the
+// part of the surface to which it belongs from the other side alone, as a closed mesh; and if it lies behind what the
+// image hit (occlusion.h). Never zero, for it may be visible all the same. A side counts in full from a share of `some`
+// of the hits on its part.
+constexpr double missed = 1.0 / 8, turned_away = 1.0 / 64, occluded = 1.0 / 64, some = 1.0 / 16;
 
 // Default samples a unit of (area + longest side · 1 px): where colours are interpolated, and where a texture may vary
 // from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
 // (docs/performance.md).
 constexpr double colored = 0.5, textured = 4;
 
-// From this area in the image on, px², a triangle with a texture is left to samples of the pixels. Each triangle's
+// Where the adjoint is as rough as noise it changes from pixel to pixel within a face: up to so many times more samples
+// are taken, on faces that are several pixels long.
+constexpr double most = 4;
+double more_if_rough(double rough, double longest) {
+    return std::clamp(rough, 1.0, std::clamp(longest / 2, 1.0, most));
+}
+
+// From this area in the image on, px², a triangle with a texture, or under a rough adjoint, is left to samples of the
+// pixels. Each triangle's
 // integral is estimated in exactly one way, chosen before any sample is drawn, so the sum stays unbiased.
 constexpr double large = 256;
 
@@ -71,131 +79,20 @@ class PixelMask {
     std::vector<uint8_t> marked_;
 };
 
-// What the forward pass saw: near which vertices it hit a face, for one smaller than the distance of the image's
-// samples is hit by chance, so it is asked together with its neighbours; and from which side it saw the surface.
-class Sight {
-   public:
-    template <class T>
-    explicit Sight(const BackwardView<T>& view)
-        : parts_(view.geometry.parts()), at_(view.scene.n_verts, 0), lowered_(2 * parts_.size()) {
-        std::vector<int32_t> seen(2 * parts_.size(), 0);  // faces that were hit, by part and side
-        const auto mark = [&](const int32_t* v, uint8_t bit) {
-            for (int i = 0; i < 3; ++i) {
-                const std::atomic_ref at(at_[v[i]]);
-                if (!(at.load(std::memory_order_relaxed) & bit)) at.fetch_or(bit, std::memory_order_relaxed);
-            }
-        };
-        view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
-            // Neighbours mostly count for the same, and threads that all add to one number wait for each other.
-            int64_t counter = 0;
-            int32_t n = 0;
-            const auto count = [&] {
-                if (n) std::atomic_ref(seen[counter]).fetch_add(n, std::memory_order_relaxed);
-            };
-            for (int64_t f = first; f < last; ++f) {
-                if (!view.seen[f]) continue;
-                const int32_t* v = view.scene.faces + 3 * f;
-                mark(v, hit);
-                const int64_t own = 2 * int64_t(parts_.of(v[0])) + (view.seen[f] == 2);
-                if (own != counter) count(), counter = own, n = 0;
-                ++n;
-            }
-            count();
-        });
-        view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
-            for (int64_t f = first; f < last; ++f) {
-                const int32_t* v = view.scene.faces + 3 * f;
-                const auto is_hit = [&](int i) {
-                    return std::atomic_ref(at_[v[i]]).load(std::memory_order_relaxed) & hit;
-                };
-                const int n = is_hit(0) + is_hit(1) + is_hit(2);
-                if (n == 1 || n == 2) mark(v, rim);
-            }
-        });
-        view.team.each_block(parts_.size(), [&](int64_t, int64_t first, int64_t last) {
-            for (int64_t k = 2 * first; k < 2 * last; ++k) {
-                const double all = double(seen[k]) + seen[k ^ 1];
-                lowered_[k] = all < enough ? hidden : std::clamp(seen[k] / all / some * hidden, turned_away, hidden);
-            }
-        });
-    }
-
-    // Whether a face with this vertex was hit.
-    bool of(int64_t vertex) const { return at_[vertex] & hit; }
-
-    // What the corners of a face say together: whether a part of it may have been seen, for it has a corner of a face
-    // that was hit, or one beside such; whether all of it may; whether nothing hidden lies beside it.
-    struct Face {
-        bool partly, whole, clear;
-    };
-    Face of(const int32_t* v) const {
-        const uint8_t a = at_[v[0]], b = at_[v[1]], c = at_[v[2]];
-        return {(a | b | c) != 0, (a & b & c & hit) != 0, !((a | b | c) & rim)};
-    }
-
-    // What the measure of a hidden face with this vertex is lowered by; `side`: from which it would be seen, 1 or 2.
-    double lowered(int32_t vertex, int side) const {
-        const int64_t part = parts_.size() > 1 ? parts_.of(vertex) : 0;
-        return lowered_[2 * part + side - 1];
-    }
-
-    void prefetch(int32_t vertex) const { edgegrad::prefetch(&at_[vertex]); }
-
-   private:
-    // Of a vertex: of a face that was hit; of a face that has such vertices and others.
-    static constexpr uint8_t hit = 1, rim = 2;
-    const Parts& parts_;
-    std::vector<uint8_t> at_;
-    std::vector<double> lowered_;  // by part and side
-};
-
-// Ã at the vertices that may be those of a face with a control, (V, C).
-template <int N, class T>
-Array<T> adjoint_at_vertices(const BackwardView<T>& view, const Sight& sight) {
-    const int C = N ? N : view.scene.channels;
-    Array<T> adjoint(view.scene.n_verts * C);
-    view.team.each_block(view.scene.n_verts, [&](int64_t, int64_t first, int64_t last) {
-        std::vector<double> A(C);
-        for (int64_t v = first; v < last; ++v) {
-            if (!sight.of(v) || view.vertices.outcode[v]) continue;
-            view.adjoint.template at<N>(view.vertices.x[v], A.data());
-            for (int c = 0; c < C; ++c) adjoint[v * C + c] = T(A[c]);
-        }
-    });
-    return adjoint;
-}
-
-// Turns cotangents of places in the image (V, 2) into those of camera coordinates and of K.
-template <class T>
-void add_places(const BackwardView<T>& view, const Array<double>& x_bar, Destination& to) {
-    const int64_t V = view.scene.n_verts, blocks = Team::blocks(V);
-    std::vector<double> k_bar(6 * blocks, 0.0);
-    view.team.each_block(V, [&](int64_t k, int64_t first, int64_t last) {
-        for (int64_t v = first; v < last; ++v) {
-            const Vec2 x{x_bar[2 * v], x_bar[2 * v + 1]};
-            if (x.x == 0 && x.y == 0) continue;
-            Vec3 q;
-            project_vjp(view.camera, view.vertices.q[v], x, q, k_bar.data() + 6 * k);
-            to.q[3 * v] += q.x, to.q[3 * v + 1] += q.y, to.q[3 * v + 2] += q.z;
-        }
-    });
-    for (int64_t i = 0; i < 6 * blocks; ++i) to.k[i % 6] += k_bar[i];
-}
-
 // Looks at the faces of one chunk.
 template <int N, class T>
 class MeasuredChunk {
    public:
-    MeasuredChunk(const BackwardView<T>& view, const Sight& sight, bool geometry, const Destination& to,
-                  SurfaceMeasure<T>& out, PixelMask& mask, ChunkGrad& grad)
+    MeasuredChunk(const BackwardView<T>& view, bool geometry, const Destination& to, SurfaceMeasure<T>& out,
+                  PixelMask& mask, ChunkGrad& grad)
         : view_(view),
-          sight_(sight),
           want_places_(geometry),
           want_colors_(to.colors),
           out_(out),
           mask_(mask),
           grad_(grad),
           C_(N ? N : view.scene.channels),
+          rough_(2 * view.importance.roughness() * view.importance.roughness()),
           lanes_(C_),
           colors_(C_) {}
 
@@ -219,17 +116,16 @@ class MeasuredChunk {
         if (more)
             for (int i = 0; i < 3; ++i) {
                 const int32_t w = v[3 * ahead + i];
-                prefetch(&p.x[w]), prefetch(&p.outcode[w]), sight_.prefetch(w);
-                prefetch(&p.q[w]), prefetch(&out_.adjoint[int64_t(w) * C_]);
+                prefetch(&p.x[w]), prefetch(&p.outcode[w]), view_.hits->prefetch(w);
+                prefetch(&p.q[w]), prefetch(&view_.vertex_adjoint[int64_t(w) * C_]);
             }
         out_.of_face[f] = 0, out_.is_controlled[f] = 0;
         if (p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) {
             if (!polygon_.set(view_.camera, view_.volume, p, v)) return;
             const double importance = view_.importance.mean(polygon_.low, polygon_.high);
-            const Sight::Face seen = sight_.of(v);
-            const double m =
-                default_samples(f, polygon_.area, polygon_.longest, seen, [&] { return side_of(view_, f); });
-            if (importance > 0) lay_out(f, m, importance, polygon_.area, polygon_.low, polygon_.high);
+            const Extent extent{polygon_.area, polygon_.longest, polygon_.low, polygon_.high, polygon_.nearest};
+            const double m = default_samples(f, extent, view_.hits->of(v), [&] { return side_of(view_, f); });
+            if (importance > 0) lay_out(f, m, importance, extent);
             return;
         }
         const int i = lanes_.count++;
@@ -240,19 +136,32 @@ class MeasuredChunk {
         }
     }
 
-    // Of a hidden face, `side()` says from which it would be seen.
+    // What there is of a face in the image.
+    struct Extent {
+        double area, longest;  // px², px
+        Vec2 low, high;        // its box
+        double nearest;        // depth
+    };
+
+    // `side()` says from which side the face would be visible.
     template <class Side>
-    double default_samples(int64_t f, double area, double longest, Sight::Face seen, Side side) const {
-        const double m = (area + longest) * (is_textured(view_.scene, f) ? textured : colored);
-        return seen.partly ? m : m * sight_.lowered(view_.scene.faces[3 * f], side());
+    double default_samples(int64_t f, const Extent& e, ImageHits::Face hits, Side side) const {
+        const double m = (e.area + e.longest) * (is_textured(view_.scene, f) ? textured : colored);
+        const bool behind = !view_.seen[f] && view_.occlusion.hides(e.low, e.high, e.nearest);
+        if (hits.partly) return behind ? m * missed : m;
+        if (behind) return m * occluded;
+        const double share = view_.hits->share_of_side(view_.scene.faces[3 * f], side());
+        return m * std::clamp(share / some * missed, turned_away, missed);
     }
 
     // A face without a control.
-    void lay_out(int64_t f, double m, double importance, double area, Vec2 low, Vec2 high) {
+    void lay_out(int64_t f, double m, double importance, const Extent& e) {
         if (!std::isfinite(m)) return;  // coordinates beyond 1e150 cannot be sampled
-        if (is_textured(view_.scene, f) && area >= large) {
+        const bool textured = is_textured(view_.scene, f);
+        if (!textured) m *= more_if_rough(rough_, e.longest);
+        if ((textured || rough_ > 1) && e.area >= large) {
             out_.is_large[f] = 1;
-            mask_.mark(low, high);
+            mask_.mark(e.low, e.high);
             of_large_ += m;
         } else {
             out_.of_face[f] = m * importance;
@@ -273,9 +182,12 @@ class MeasuredChunk {
             const double area = 0.5 * std::fabs(l.wedge[i]);
             controlled_[i] = false;
             if (!(area > 0) || !(importance_[i] > 0)) continue;
-            const Sight::Face seen = sight_.of(view_.scene.faces + 3 * f);
-            samples_[i] = default_samples(f, area, l.longest[i], seen,
-                                          [&] { return (l.wedge[i] > 0) == (view_.camera.k_det > 0) ? 1 : 2; });
+            const ImageHits::Face seen = view_.hits->of(view_.scene.faces + 3 * f);
+            const auto [x0, x1] = std::minmax({l.x[0][i], l.x[1][i], l.x[2][i]});
+            const auto [y0, y1] = std::minmax({l.y[0][i], l.y[1][i], l.y[2][i]});
+            const Extent extent{area, l.longest[i], {x0, y0}, {x1, y1}, std::min({l.z[0][i], l.z[1][i], l.z[2][i]})};
+            samples_[i] =
+                default_samples(f, extent, seen, [&] { return (l.wedge[i] > 0) == (view_.camera.k_det > 0) ? 1 : 2; });
             // One without texture and so small that its corners say what is between them. A face that comes near the
             // eye is not affine in the image.
             if (seen.whole && l.longest[i] <= widest && !view_.options.dry && !is_textured(view_.scene, f) &&
@@ -284,9 +196,7 @@ class MeasuredChunk {
                 clear_[i] = seen.clear;
                 gather_control(i);
             } else {
-                const auto [x0, x1] = std::minmax({l.x[0][i], l.x[1][i], l.x[2][i]});
-                const auto [y0, y1] = std::minmax({l.y[0][i], l.y[1][i], l.y[2][i]});
-                lay_out(f, samples_[i], importance_[i], area, {x0, y0}, {x1, y1});
+                lay_out(f, samples_[i], importance_[i], extent);
             }
         }
         if (any) add_controls();
@@ -299,7 +209,7 @@ class MeasuredChunk {
         constexpr int next = FaceLanes::size;
         double *adjoint = lanes_.adjoint.data() + i, *color = lanes_.color.data() + i;
         for (int k = 0; k < 3; ++k) {
-            const T* A = &out_.adjoint[int64_t(v[k]) * C];
+            const T* A = &view_.vertex_adjoint[int64_t(v[k]) * C];
             for (int c = 0; c < C; ++c) adjoint[(7 * c + k) * next] = A[c];
         }
         for (int k = 0; k < 4; ++k) {
@@ -335,8 +245,9 @@ class MeasuredChunk {
                     grad_.colors.template add<N>(row[k], colors_.data());
                 }
             double m = samples_[i];
-            if (clear_[i] && l.longest[i] < wide)
-                m *= std::clamp(std::max(2 * variation(i), l.longest[i] / wide), least, 1.0);
+            const double rough = 2 * variation(i);
+            if (rough > 1) m *= more_if_rough(rough * rough, l.longest[i]);
+            else if (clear_[i] && l.longest[i] < wide) m *= std::max({rough, l.longest[i] / wide, least});
             out_.is_controlled[f] = 1, out_.of_face[f] = m * importance_[i];
             total_ += m;
         }
@@ -355,12 +266,12 @@ class MeasuredChunk {
     // What is asked of memory for a face so far ahead is there when it is wanted.
     static constexpr int ahead = 16;
     const BackwardView<T>& view_;
-    const Sight& sight_;
     const bool want_places_, want_colors_;
     SurfaceMeasure<T>& out_;
     PixelMask& mask_;
     ChunkGrad& grad_;
     const int C_;
+    const double rough_;  // of faces without a control
     double total_ = 0, of_large_ = 0;
     VisiblePolygon polygon_;
     FaceLanes lanes_;
@@ -373,10 +284,10 @@ class MeasuredChunk {
 
 template <int N, class T>
 SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Destination& to) {
+    const BackwardOptions& o = view.options;
     const int64_t F = view.scene.n_faces, chunks = (F + scatter_chunk - 1) / scatter_chunk;
-    const Sight sight(view);
-    SurfaceMeasure<T> out{Array<double>(F), Array<uint8_t>(F), adjoint_at_vertices<N>(view, sight), {}, {}};
-    if (view.scene.face_texture) out.is_large.assign(F, 0);
+    SurfaceMeasure<T> out{Array<double>(F), Array<uint8_t>(F), {}, {}};
+    if (view.scene.face_texture || 2 * std::pow(view.importance.roughness(), 2) > 1) out.is_large.assign(F, 0);
     PixelMask mask(view.camera, view.options.filter.radius() - 0.5);
     // What the controls are of all of their faces, summed by the places of vertices in the image.
     Array<double> x_bar = zeros(geometry ? 2 * view.scene.n_verts : 0, view.team);
@@ -385,13 +296,16 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, De
     std::vector<double> total(chunks), of_large(chunks);
     double seconds[2] = {};
     view.scatter.add(F, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        MeasuredChunk<N, T> chunk(view, sight, geometry, to, out, mask, grad);
+        MeasuredChunk<N, T> chunk(view, geometry, to, out, mask, grad);
         chunk.add(first, last);
         total[first / scatter_chunk] = chunk.total(), of_large[first / scatter_chunk] = chunk.of_large();
     });
     if (geometry) add_places(view, x_bar, to);
     for (int64_t k = 0; k < chunks; ++k) out.total += total[k], out.of_large += of_large[k];
     if (out.of_large > 0) out.pixels = mask.pixels();
+    if (!out.pixels.empty())
+        out.pixel_spp = int(std::clamp(
+            std::round(out.scale(o.surface_samples) * out.of_large / double(out.pixels.size())), 1.0, 0x1p20));
     return out;
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import statistics
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,6 +20,7 @@ from .mesh import Mesh
 from .render import (
     DIFFERENTIABLE,
     DIFFERENTIABLE_NAMES,
+    View,
     as_scene,
     backward_kernel,
     backward_work,
@@ -123,8 +125,8 @@ def _image_terms(scene: Scene, arguments: Sequence[Any], any_gradient: bool) -> 
         "textures": Term(textures > 0, f"{textures} to look up" if textures else "no mesh has one"),
         "kept for backward": Term(
             any_gradient,
-            "coverage, and which faces were seen" if any_gradient else "nothing requires a gradient",
-            bytes=B * (height * width * word + F),
+            "coverage, depths, and which faces were seen" if any_gradient else "nothing requires a gradient",
+            bytes=B * (height * width * (word + 4) + F),
         ),
     }
 
@@ -142,11 +144,15 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
     # The kernel counts them itself. It is asked whatever is wanted, for it also checks what render() leaves to it.
     with image_room(*arguments):
         ones = flat.colors.new_ones((B, height, width, C))
-    seen = flat.faces.new_ones((B, F), dtype=torch.uint8)
-    _, profiles = backward_kernel(ones, ones[..., 0].contiguous(), seen, *arguments, wanted, dry=True)
+    view = View(
+        ones[..., 0].contiguous(),
+        ones.new_full((B, height, width), math.inf, dtype=torch.float32),
+        flat.faces.new_ones((B, F), dtype=torch.uint8),
+    )
+    _, profiles = backward_kernel(ones, view, *arguments, wanted, dry=True)
+    counts = {name: int(sum(profile[name] for profile in profiles)) for name in _COUNTS}
     surface, edge, silhouettes, creases = (
-        int(sum(profile[name] for profile in profiles))
-        for name in ("surface_samples", "edge_samples", "silhouettes", "creases")
+        counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases")
     )
 
     # Why the terms are off, "" where nothing keeps them from running.
@@ -168,7 +174,8 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
         ),
         "interior": Term(
             surface > 0,
-            no_interior or (", ".join(reasons) if surface else "nothing in view"),
+            no_interior
+            or (", ".join(reasons) + _bound(surface, counts["surface_wanted"]) if surface else "nothing in view"),
             samples=surface,
             bytes=interior_rows
             + memory.surface_measure(
@@ -180,7 +187,12 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
         ),
         "boundary": Term(
             edge > 0,
-            no_boundary or ("what moves shows where radiance jumps" if edge else "no jump in view"),
+            no_boundary
+            or (
+                "what moves shows where radiance jumps" + _bound(edge, counts["edge_wanted"])
+                if edge
+                else "no jump in view"
+            ),
             samples=edge,
             bytes=memory.edge_measure(F) + boundary_rows,
         ),
@@ -196,6 +208,15 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
         why = "required; summed in double" if want else "not required"
         terms[f"{name} gradient"] = Term(want, why, bytes=8 * arguments[i].numel())
     return terms
+
+
+# What the kernel counts.
+_COUNTS = ("surface_samples", "edge_samples", "surface_wanted", "edge_wanted", "silhouettes", "creases")
+
+
+def _bound(samples: int, wanted: int) -> str:
+    """What plan() says where the budget cut the default samples: they take no longer than the image."""
+    return f"; {wanted:,} by default, cut to take no longer than the image" if 0 < samples < wanted else ""
 
 
 def _bytes_of_copies(scene: Scene, flat: Flat) -> int:
@@ -294,8 +315,8 @@ def profile(
         forward_kernel(elsewhere, *arguments[1:spp_at], 1, *arguments[spp_at + 1 :])
         begin = time.perf_counter()
         step = render_arguments(scene, camera, spp, seed, **options)
-        _, coverage, seen, forward = forward_kernel(*step)
-        _, backward = backward_kernel(adjoint, coverage, seen, *step, wanted)
+        _, view, forward = forward_kernel(*step)
+        _, backward = backward_kernel(adjoint, view, *step, wanted)
         wall = time.perf_counter() - begin
         done = _sum([*forward, *backward])
         runs.append({**done, "python": wall - sum(done[part] for part in _PARTS)})

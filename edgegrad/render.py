@@ -61,7 +61,7 @@ def render(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
         filter=filter, grad_seed=grad_seed,
     )  # fmt: skip
-    image, _, _ = _Render.apply(*arguments)
+    image, *_ = _Render.apply(*arguments)
     # Not image[0]: its derivative would copy the adjoint into zeros.
     return (image if camera.batch is not None else image.squeeze(0)).to(as_scene(scene).meshes[0].verts.device)
 
@@ -159,10 +159,10 @@ _SCENE = (
 _IMAGE = "bool perspective, int height, int width, int spp, str filter, int seed, float spacing"
 _GRADIENT = "int surface_samples, int edge_samples, int grad_seed, bool interior_geometry, bool boundary"
 
-torch.library.define("edgegrad::render", f"({_SCENE}, {_IMAGE}) -> (Tensor, Tensor, Tensor)")
+torch.library.define("edgegrad::render", f"({_SCENE}, {_IMAGE}) -> (Tensor, Tensor, Tensor, Tensor)")
 torch.library.define(
     "edgegrad::render_backward",
-    f"(Tensor adjoint, Tensor coverage, Tensor seen, {_SCENE}, {_IMAGE}, {_GRADIENT}, bool[] wanted)"
+    f"(Tensor adjoint, Tensor coverage, Tensor farthest, Tensor seen, {_SCENE}, {_IMAGE}, {_GRADIENT}, bool[] wanted)"
     " -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)",
 )
 
@@ -183,41 +183,57 @@ def _kernel_camera(world_to_camera: Tensor, K: Tensor, perspective: bool, height
 Profile = dict[str, float]
 
 
-def forward_kernel(*args: Any) -> tuple[Tensor, Tensor, Tensor, list[Profile]]:
-    """image (B, H, W, C), coverage (B, H, W), the side (B, F) from which a face was seen or 0, and what the kernel did for each
-    camera. Raises MemoryError."""
+class View(NamedTuple):
+    """What the image pass leaves to the backward pass, for B cameras."""
+
+    coverage: Tensor  # (B, H, W): the filtered share of a pixel where something is hit
+    farthest: (
+        Tensor  # (B, H, W) float32: no sample of a pixel hit anything beyond this depth; infinite if one hit nothing
+    )
+    seen: Tensor  # (B, F) uint8: 0, or the side, 1 or 2, from which a face was hit
+
+
+def forward_kernel(*args: Any) -> tuple[Tensor, View, list[Profile]]:
+    """image (B, H, W, C), what the backward pass takes from it, and what the kernel did for each camera. Raises MemoryError."""
     with image_room(*args):
         return _forward_kernel(*args)
 
 
-def _forward_kernel(*args: Any) -> tuple[Tensor, Tensor, Tensor, list[Profile]]:
+def _forward_kernel(*args: Any) -> tuple[Tensor, View, list[Profile]]:
     flat, (world_to_camera, K) = Flat(*args[:9]), args[9:11]
     perspective, height, width, spp, filter, seed, spacing = args[11:18]
     scene = _kernel_scene(flat, spacing)
     B, C = world_to_camera.shape[0], flat.background.shape[-1]
     image = flat.colors.new_empty((B, height, width, C))
-    coverage = flat.colors.new_empty((B, height, width))
-    seen = flat.faces.new_empty((B, flat.faces.shape[0]), dtype=torch.uint8)
+    view = _empty_view(flat, B, height, width)
     profiles = []
     for b in range(B):
         camera = _kernel_camera(world_to_camera[b], K[b], perspective, height, width)
         camera_seed = seed if b == 0 else _derived_seed(seed, b + 1)
-        outputs = image[b].numpy(), coverage[b].numpy(), seen[b].numpy()
+        outputs = image[b].numpy(), *(part[b].numpy() for part in view)
         profiles.append(scene.forward(camera, spp, filter, camera_seed, torch.get_num_threads(), *outputs))
-    return image, coverage, seen, profiles
+    return image, view, profiles
+
+
+def _empty_view(flat: Flat, B: int, height: int, width: int) -> View:
+    return View(
+        flat.colors.new_empty((B, height, width)),
+        flat.colors.new_empty((B, height, width), dtype=torch.float32),
+        flat.faces.new_empty((B, flat.faces.shape[0]), dtype=torch.uint8),
+    )
 
 
 @torch.library.impl("edgegrad::render", "CPU")
-def _render_cpu(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
-    return forward_kernel(*args)[:3]
+def _render_cpu(*args: Any) -> tuple[Tensor, ...]:
+    image, view, _ = forward_kernel(*args)
+    return image, *view
 
 
 @torch.library.register_fake("edgegrad::render")
-def _render_fake(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
+def _render_fake(*args: Any) -> tuple[Tensor, ...]:
     flat, world_to_camera, height, width = Flat(*args[:9]), args[9], args[12], args[13]
     B, C = world_to_camera.shape[0], flat.background.shape[-1]
-    seen = flat.faces.new_empty((B, flat.faces.shape[0]), dtype=torch.uint8)
-    return flat.colors.new_empty((B, height, width, C)), flat.colors.new_empty((B, height, width)), seen
+    return flat.colors.new_empty((B, height, width, C)), *_empty_view(flat, B, height, width)
 
 
 # The differentiable arguments, in the order of the gradients that render_backward returns.
@@ -252,6 +268,7 @@ def image_room(*args: Any) -> AbstractContextManager[None]:
     needs = {
         "image": B * height * width * C * word,
         "coverage": B * height * width * word,
+        "depths": B * height * width * 4,
         "faces seen": B * F,
         "vertices in view": 24 * V,
     }
@@ -307,21 +324,19 @@ def _lower(args: Sequence[Any]) -> str:
 
 
 def backward_kernel(
-    adjoint: Tensor, coverage: Tensor, seen: Tensor, *args: Any, dry: bool = False
+    adjoint: Tensor, view: View, *args: Any, dry: bool = False
 ) -> tuple[list[Tensor | None], list[Profile]]:
     """The gradients of what is wanted, float64, and what the kernel did for each camera. `dry` only counts samples.
 
     Raises MemoryError.
     """
     with gradient_room(adjoint, *args):
-        return _backward_kernel(adjoint, coverage, seen, *args, dry=dry)
+        return _backward_kernel(adjoint, view, *args, dry=dry)
 
 
-def _backward_kernel(
-    adjoint: Tensor, coverage: Tensor, seen: Tensor, *args: Any, dry: bool
-) -> tuple[list[Tensor | None], list[Profile]]:
+def _backward_kernel(adjoint: Tensor, view: View, *args: Any, dry: bool) -> tuple[list[Tensor | None], list[Profile]]:
     flat, (world_to_camera, K) = Flat(*args[:9]), args[9:11]
-    perspective, height, width, _, filter, _, spacing = args[11:18]
+    perspective, height, width, spp, filter, _, spacing = args[11:18]
     surface_samples, edge_samples, grad_seed, interior_geometry, boundary, wanted = args[18:]
     work = backward_work(interior_geometry, boundary, wanted)
     scene = _kernel_scene(flat, spacing)
@@ -338,9 +353,9 @@ def _backward_kernel(
         profiles = [
             scene.backward(
                 _kernel_camera(world_to_camera[b], K[b], perspective, height, width),
-                surface_samples, edge_samples, filter, grad_seed if b == 0 else _derived_seed(grad_seed, b + 1),
-                torch.get_num_threads(), work.motion, work.boundary, dry, adjoint[b].numpy(), coverage[b].numpy(),
-                seen[b].numpy(), verts, colors, uvs, texels, background,
+                spp, surface_samples, edge_samples, filter, grad_seed if b == 0 else _derived_seed(grad_seed, b + 1),
+                torch.get_num_threads(), work.motion, work.boundary, dry, adjoint[b].numpy(),
+                *(part[b].numpy() for part in view), verts, colors, uvs, texels, background,
                 None if gw2c is None else gw2c[b], None if gK is None else gK[b],
             )
             for b in range(world_to_camera.shape[0])
@@ -353,15 +368,19 @@ def _backward_kernel(
 
 @torch.library.impl("edgegrad::render_backward", "CPU")
 def _render_backward_cpu(*args: Any) -> tuple[Tensor, ...]:
-    adjoint, _, _, *inputs = args
+    adjoint, coverage, farthest, seen, *inputs = args
     return tuple(
         adjoint.new_empty(0, dtype=torch.float32) if g is None else g.to(inputs[i].dtype)
-        for i, g in zip(DIFFERENTIABLE, backward_kernel(*args)[0], strict=True)
+        for i, g in zip(
+            DIFFERENTIABLE, backward_kernel(adjoint, View(coverage, farthest, seen), *inputs)[0], strict=True
+        )
     )
 
 
 @torch.library.register_fake("edgegrad::render_backward")
-def _render_backward_fake(adjoint: Tensor, coverage: Tensor, seen: Tensor, *args: Any) -> tuple[Tensor, ...]:
+def _render_backward_fake(
+    adjoint: Tensor, coverage: Tensor, farthest: Tensor, seen: Tensor, *args: Any
+) -> tuple[Tensor, ...]:
     return tuple(
         torch.empty_like(args[i]) if want else adjoint.new_empty(0, dtype=torch.float32)
         for i, want in zip(DIFFERENTIABLE, args[-1], strict=True)
@@ -372,22 +391,24 @@ class _Render(torch.autograd.Function):
     """edgegrad::render, differentiated by edgegrad::render_backward."""
 
     @staticmethod
-    def forward(*args: Any) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(*args: Any) -> tuple[Tensor, ...]:
         return torch.ops.edgegrad.render(*args[:18])
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor, Tensor]) -> None:
-        _, coverage, seen = output
-        ctx.mark_non_differentiable(coverage, seen)
-        ctx.save_for_backward(coverage, seen, *inputs[:11])
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        _, *view = output
+        ctx.mark_non_differentiable(*view)
+        ctx.save_for_backward(*view, *inputs[:11])
         ctx.options = inputs[11:]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        coverage, seen, *tensors = ctx.saved_tensors
+        coverage, farthest, seen, *tensors = ctx.saved_tensors
         wanted = [ctx.needs_input_grad[i] for i in DIFFERENTIABLE]
-        grads = torch.ops.edgegrad.render_backward(grad_outputs[0], coverage, seen, *tensors, *ctx.options, wanted)
+        grads = torch.ops.edgegrad.render_backward(
+            grad_outputs[0], coverage, farthest, seen, *tensors, *ctx.options, wanted
+        )
         out: list[Tensor | None] = [None] * (len(tensors) + len(ctx.options))
         for i, want, grad in zip(DIFFERENTIABLE, wanted, grads, strict=True):
             if want:

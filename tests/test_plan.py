@@ -94,9 +94,11 @@ def kernel(monkeypatch):
         seen.forward += result[-1]
         return result
 
-    def watched_backward(adjoint, coverage, faces, *arguments, **options):
-        faces, seen.adjoint = torch.ones_like(faces) if seen.everything else faces, adjoint
-        seen.grads, profiles = backward(adjoint, coverage, faces, *arguments, **options)
+    def watched_backward(adjoint, view, *arguments, **options):
+        if seen.everything:
+            view = view._replace(farthest=torch.full_like(view.farthest, torch.inf), seen=torch.ones_like(view.seen))
+        seen.adjoint = adjoint
+        seen.grads, profiles = backward(adjoint, view, *arguments, **options)
         seen.backward += profiles
         return seen.grads, profiles
 
@@ -221,11 +223,11 @@ def built(mesh, camera=CAMERA, kinds=(), **options) -> tuple[bool, bool]:
     """Whether the kernel built the ray structure in the forward pass, and found the edges in the backward pass."""
     scene, camera = requiring(mesh, camera, kinds)
     arguments = render_module.render_arguments(scene, camera, 1, **options)
-    image, coverage, seen, (forward,) = render_module.forward_kernel(*arguments)
+    image, view, (forward,) = render_module.forward_kernel(*arguments)
     if not kinds:
         return bool(forward["built rays"]), False
     wanted = render_module.requires_grad(arguments)
-    backward = render_module.backward_kernel(torch.ones_like(image), coverage, seen, *arguments, wanted)[1][0]
+    backward = render_module.backward_kernel(torch.ones_like(image), view, *arguments, wanted)[1][0]
     assert not backward["built rays"]
     return bool(forward["built rays"]), bool(backward["built edges"])
 
@@ -264,13 +266,13 @@ def test_no_texture_code_without_a_texture(kernel):
 
 
 def test_nothing_but_the_plan_is_kept_for_the_backward_pass():
-    """Tensors that autograd saves: the inputs, coverage, and which faces were seen."""
+    """Tensors that autograd saves: the inputs, coverage, depths, and which faces were seen."""
     scene, camera = requiring(cube(), CAMERA, ("verts",))
     node = eg.render(scene, camera, spp=4).grad_fn
     while not hasattr(node, "saved_tensors"):
         node = node.next_functions[0][0]
-    coverage, seen, *inputs = node.saved_tensors
-    assert coverage.nbytes + seen.nbytes == eg.plan(scene, camera)["kept for backward"].bytes
+    coverage, farthest, seen, *inputs = node.saved_tensors
+    assert coverage.nbytes + farthest.nbytes + seen.nbytes == eg.plan(scene, camera)["kept for backward"].bytes
     flat = [*flatten(scene), camera.world_to_camera[None], camera.K[None]]
     assert [tuple(t.shape) for t in inputs] == [tuple(t.shape) for t in flat]
     assert eg.render(cube(), CAMERA, spp=4).grad_fn is None

@@ -619,9 +619,11 @@ def sample_counts(surface: int, edge: int, adjoint: Tensor, boundary: bool = Tru
     """What the kernel says it drew for the triangle's vertices."""
     scene = _kernel_scene(flatten(TRIANGLE), spacing=2.0**-52)
     camera = _kernel_camera(CAMERA.world_to_camera, CAMERA.K, True, SIZE, SIZE)
-    coverage, seen = torch.zeros(SIZE, SIZE, dtype=F64), torch.ones(1, dtype=torch.uint8)
-    arrays = adjoint.contiguous().numpy(), coverage.numpy(), seen.numpy(), torch.zeros(3, 3, dtype=F64).numpy()
-    profile = scene.backward(camera, surface, edge, "box", 0, 2, True, boundary, False, *arrays)
+    # All pixels covered by many samples, so that no budget binds; nothing is occluded.
+    coverage, farthest = torch.ones(SIZE, SIZE, dtype=F64), torch.full((SIZE, SIZE), torch.inf)
+    view = coverage.numpy(), farthest.numpy(), torch.ones(1, dtype=torch.uint8).numpy()
+    arrays = adjoint.contiguous().numpy(), *view, torch.zeros(3, 3, dtype=F64).numpy()
+    profile = scene.backward(camera, 1 << 20, surface, edge, "box", 0, 2, True, boundary, False, *arrays)
     return profile["surface_samples"], profile["edge_samples"]
 
 

@@ -85,10 +85,10 @@ def differentiate(scene: ReportScene, **options: object) -> tuple[Tensor, float,
 def default_samples(scene: Scene | Mesh, camera: Camera, adjoint: Tensor) -> tuple[int, int]:
     """How many surface and edge samples the kernel takes when it is not told, for the gradient of the vertices."""
     arguments = render_arguments(scene, camera, FORWARD_SPP)
-    _, coverage, seen, _ = forward_kernel(*arguments)
+    _, view, _ = forward_kernel(*arguments)
     wanted = [True] + [False] * 6  # the vertices alone
-    adjoint = adjoint.to(coverage.dtype)[None]
-    _, (profile,) = backward_kernel(adjoint, coverage, seen, *arguments, wanted)
+    adjoint = adjoint.to(view.coverage.dtype)[None]
+    _, (profile,) = backward_kernel(adjoint, view, *arguments, wanted)
     return int(profile["surface_samples"]), int(profile["edge_samples"])
 
 

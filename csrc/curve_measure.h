@@ -1,0 +1,36 @@
+// How densely each curve is sampled, and what the boundary term knows of creases without a sample.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "coincident.h"
+#include "curve.h"
+#include "interior.h"
+
+namespace edgegrad {
+
+// Curves are laid end to end by length · (mean |Ã| near them) · (how large the jump is, as far as it is known), less
+// where they are most likely occluded or where a control (crease_control.h) says nearly all.
+struct CurvesFound {
+    double pixels = 0;                     // the measure without the adjoint, which default samples go by
+    int64_t silhouettes = 0, creases = 0;  // in view
+    std::vector<ImageSegment> segments;    // those where the loss looks
+};
+template <class T>
+struct Curves : CurvesFound {
+    CurveFinder<T> finder;
+    Array<double> of_edge;  // (E,) the measure
+    Array<double> x_bar;    // (V, 2) what controls add to the cotangents of places in the image; empty: there are none
+
+    explicit Curves(const BackwardView<T>& view);
+
+    // Samples: so many as are given, if not −1, or the defaults.
+    int64_t wanted(int64_t given) const;
+};
+
+// Finds and measures all curves, and begins x_bar with the integrals of the controls.
+template <int N, class T>
+Curves<T> measure_curves(const BackwardView<T>& view);
+
+}  // namespace edgegrad
