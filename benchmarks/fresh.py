@@ -30,7 +30,7 @@ def first_render(name: str) -> dict[str, float]:
     import edgegrad as eg
 
     if name == "cube":
-        from scenes import cube, front_camera
+        from edgegrad.report.scenes import cube, front_camera
 
         mesh, camera = single(cube()), front_camera(64)
     else:
@@ -51,9 +51,9 @@ def first_render(name: str) -> dict[str, float]:
 def memory(height: int = 1080, width: int = 1920, spp: int = 64) -> dict[str, float]:
     """Bytes of the peak of an image and its gradients (vertices and colours) above scene, image, adjoint and gradients."""
     from common import single, sphere
-    from scenes import cube, front_camera
 
     import edgegrad as eg
+    from edgegrad.report.scenes import cube, front_camera
 
     mesh, camera, adjoint = sphere((height, width))
     # Code, threads and what torch keeps of a first backward pass are not this image's.

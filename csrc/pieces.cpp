@@ -17,6 +17,7 @@
 #include "importance.h"
 #include "sampler.h"
 #include "shading/texture.h"
+#include "sobol.h"
 #include "surface.h"
 #include "systematic.h"
 #include "topology.h"
@@ -137,6 +138,17 @@ void bind_pieces(nb::module_& m) {
         for (int i = 0; i < n; ++i) points.push_back(array(sequence(i)));
         return points;
     });
+    p.def(
+        "sobol",
+        [](uint64_t random, int n, uint64_t first) {
+            std::vector<double> x(n), y(n);
+            ScrambledSobol(mix(random)).fill(first, n, x.data(), y.data());
+            std::vector<A2> points;
+            for (int i = 0; i < n; ++i) points.push_back({x[i], y[i]});
+            return points;
+        },
+        "random"_a, "n"_a, "first"_a = 0);
+    p.def("z_order", &z_order);
     p.def("systematic", [](std::vector<double> measure, int64_t n, double shift) {
         Team team(1);
         Array<double> ends(measure.size());

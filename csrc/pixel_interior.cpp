@@ -1,14 +1,15 @@
-// The interior term from samples of the pixels: rays as in the forward pass, with a seed of their own, and the radiance
-// where they hit differentiated with the weight A / spp.
+// The interior term from samples of the pixels: rays through them, and the radiance where they hit differentiated with
+// the weight A / spp.
 //
 // For a large triangle with a texture this beats surface samples: its rays are the most coherent there are, and those
-// of a pixel are spread evenly over it. For others it is poor: a triangle that is seen at a grazing angle, or is
-// smaller than a pixel, is hit by chance.
+// of a pixel and of its neighbours are spread evenly over it (sobol.h). For others it is poor: a triangle that is seen
+// at a grazing angle, or is smaller than a pixel, is hit by chance.
 
 #include <algorithm>
 #include <vector>
 
 #include "interior.h"
+#include "sobol.h"
 
 namespace edgegrad {
 
@@ -16,8 +17,7 @@ template <int N, class T>
 void add_pixel_samples(const BackwardView<T>& view, const std::vector<int64_t>& pixels, int spp, uint64_t seed,
                        const uint8_t* faces, bool geometry, Destination& to, double (&seconds)[2]) {
     const int C = N ? N : view.scene.channels, width = view.camera.width;
-    const ForwardOptions options{spp, view.options.filter, seed};
-    const PixelRays pixel_rays(view.camera, options);
+    const ScrambledSobol sobol(seed);
     view.scatter.add(int64_t(pixels.size()), to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         // Faces in a pixel take turns and come again in the next one: some runs are kept open.
         std::vector<FaceGrad<N, T>> open(32, FaceGrad<N, T>(view, geometry, to, grad));
@@ -29,10 +29,12 @@ void add_pixel_samples(const BackwardView<T>& view, const std::vector<int64_t>& 
             if (std::all_of(A, A + C, [](T a) { return a == 0; })) continue;
             for (int c = 0; c < C; ++c) bar[c] = double(A[c]) / spp;
             view.team.check();
+            const int x = int(pixel % width), y = int(pixel / width);
+            const uint64_t place = z_order(x, y) * spp;
             for (int done = 0; done < spp; done += RayBatch::size) {
-                rays.count = 0;
-                pixel_rays.append(int(pixel % width), int(pixel / width), done, std::min(spp - done, RayBatch::size),
-                                  rays);
+                rays.count = std::min(spp - done, RayBatch::size);
+                sobol.fill(place + done, rays.count, rays.n_x, rays.n_y);
+                place_in_pixel(view.camera, view.options.filter, x, y, rays.count, rays.n_x, rays.n_y);
                 rays.prepare();
                 view.geometry.caster().cast(rays);
                 for (int i = 0; i < rays.count; ++i) {

@@ -36,6 +36,9 @@ struct ForwardOptions {
     uint64_t seed;
 };
 
+// Of points of the unit square, in place: where rays through pixel (x, y) go, drawn in proportion to the filter.
+void place_in_pixel(const Camera& camera, const Filter& filter, int x, int y, int n, double* n_x, double* n_y);
+
 // The rays of the forward pass: samples first … first + n − 1 of pixel (x, y), appended to a batch.
 class PixelRays {
    public:

@@ -267,7 +267,9 @@ def test_filter_sample_agrees_with_its_weight(name):
 # -- sample points ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("points", [pieces.lattice, pieces.sequence], ids=["lattice", "sequence"])
+@pytest.mark.parametrize(
+    "points", [pieces.lattice, pieces.sequence, pieces.sobol], ids=["lattice", "sequence", "sobol"]
+)
 class TestPoints:
     def test_lie_in_the_unit_square(self, points):
         for n, seed in itertools.product([1, 2, 7, 64, 1000], [0, 1, 2**63 - 1]):
@@ -307,8 +309,40 @@ def test_lattice_is_regular_along_x():
     np.testing.assert_allclose(np.diff(x), 1 / 16, atol=1e-12)
 
 
+@pytest.mark.parametrize("first", [0, 64, 3 * 2**20, 2**32 - 64])
+@pytest.mark.parametrize("m", [1, 2, 4, 6])
+def test_runs_of_sobol_fill_boxes(m, first):
+    """2^m points from a multiple of 2^m on: one in each of the boxes of any shape 2^−a × 2^(a−m)."""
+    for seed in (1, 2, 77):
+        x = np.array(pieces.sobol(seed, 2**m, first))
+        for a in range(m + 1):
+            box = np.floor(x * [2**a, 2 ** (m - a)]).astype(int)
+            assert len({tuple(b) for b in box}) == 2**m
+
+
+def test_scrambles_are_independent():
+    """Two points in different halves of the square, over 4,000 scrambles: any two places within their halves are as likely."""
+    x = np.array([pieces.sobol(seed, 2) for seed in range(4000)])
+    assert ((x[:, 0] < 0.5) != (x[:, 1] < 0.5)).all()
+    folded = 2 * x % 1 < 0.5  # in which quarter of its half
+    for i, j in itertools.combinations(range(4), 2):
+        both = np.mean(folded.reshape(-1, 4)[:, i] == folded.reshape(-1, 4)[:, j])
+        assert abs(both - 0.5) < 4 * 0.5 / np.sqrt(4000)
+
+
+def test_z_order_counts_blocks():
+    """Squares of 2^k pixels have consecutive numbers; far pixels do not overflow."""
+    found = np.array([[pieces.z_order(x, y) for x in range(16)] for y in range(16)])
+    for k in range(5):
+        blocks = found.reshape(16 >> k, 1 << k, 16 >> k, 1 << k).transpose(0, 2, 1, 3).reshape(-1, 4**k)
+        assert (np.sort(blocks, 1) == blocks.min(1, keepdims=True) + np.arange(4**k)).all()
+        assert (blocks.min(1) % 4**k == 0).all()
+    assert pieces.z_order(2**31 - 1, 0) == int("01" * 31, 2)
+    assert pieces.z_order(0, 2**31 - 1) == 2 * int("01" * 31, 2)
+
+
 def test_shifts_differ():
-    for points in (pieces.lattice, pieces.sequence):
+    for points in (pieces.lattice, pieces.sequence, pieces.sobol):
         assert len({x for seed in range(1, 101) for x in points(seed, 1)[0]}) == 200
 
 

@@ -17,7 +17,10 @@ def add_report(commands: Any) -> None:
 
     curve = kinds.add_parser("error-time", help="its error against the time it takes", description=_error_time.__doc__)
     curve.add_argument(
-        "--scene", nargs="+", metavar="NAME", help="triangle, sphere, slivers, globe, quad, scan, million (all)"
+        "--scene",
+        nargs="+",
+        metavar="NAME",
+        help="triangle, sphere, tangled, flat-colors, noise, slivers, globe, quad, scan, million (all)",
     )
     curve.add_argument(
         "--methods", nargs="+", metavar="NAME",

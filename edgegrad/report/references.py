@@ -28,17 +28,18 @@ Keep = Callable[
 
 @dataclass(frozen=True)
 class Effort:
-    """How long the long runs are: so many samples, but no fewer than `factor` times the default."""
+    """How long the long runs are: so many samples, but no fewer than `factor` times the default, and no more than `most`."""
 
     surface_samples: int = 1 << 25
     edge_samples: int = 1 << 22
     factor: float = 64.0
+    most: int = 1 << 25
     runs: int = 4
     check_spp: int = 256  # of the finite differences
     check_seeds: int = 4
 
 
-QUICK = Effort(1 << 16, 1 << 14, 4.0, runs=2, check_spp=16, check_seeds=2)
+QUICK = Effort(1 << 16, 1 << 14, 4.0, 1 << 21, runs=2, check_spp=16, check_seeds=2)
 
 
 @dataclass
@@ -130,7 +131,7 @@ def long_run(scene: ReportScene, effort: Effort, keep: Keep = _in_no_file) -> Re
     for part, least in (("interior", effort.surface_samples), ("boundary", effort.edge_samples)):
         method = Edgegrad(scene, part)
         default = method.samples[part == "boundary"]
-        factors[part] = max(effort.factor, least / default) if default else 1.0
+        factors[part] = min(max(effort.factor, least / default), effort.most / default) if default else 1.0
         runs[part] = [run["vertex"] for run in _runs(keep, part, method, factors[part], effort.runs)]
     runs["whole"] = [a + b for a, b in zip(runs["interior"], runs["boundary"], strict=True)]
     result = Reference(

@@ -64,8 +64,9 @@ class ReportScene:
         return digest.hexdigest()[:16]
 
 
-def build(name: str, size: int = 256, mesh: Path | None = None) -> ReportScene:
-    """A scene by its name, in float32, before a camera of size × size pixels; `mesh` is the file of the scan.
+def build(name: str, size: int = 256, mesh: Path | None = None, **variant: float) -> ReportScene:
+    """A scene by its name, in float32, before a camera of size × size pixels; `mesh` is the file of the scan. A variant is
+    what else the function of the scene takes, such as subdivisions=3.
 
     Raises ValueError for another name or a mesh that cannot be framed, OSError and ImportError where the scan is not there.
     """
@@ -74,10 +75,11 @@ def build(name: str, size: int = 256, mesh: Path | None = None) -> ReportScene:
     if name == "scan":
         title, scene, camera = _scan(size, mesh)
     else:
-        title, scene, camera = SCENES[name](size)
+        title, scene, camera = SCENES[name](size, **variant)
     # As users have them: meshes in float32.
     scene, camera = scene.to(torch.float32), camera.to(torch.float64)
-    return ReportScene(name, title, scene, camera, smooth_adjoint(size, size, scene.channels).float())
+    adjoint = noise_adjoint if name == "noise" else smooth_adjoint
+    return ReportScene(name, title, scene, camera, adjoint(size, size, scene.channels).float())
 
 
 # -- pieces that the tests use as well -------------------------------------------------------------------------------
@@ -126,13 +128,30 @@ def cube(half: float = 0.6) -> Mesh:
     return Mesh(verts, torch.tensor(faces), colors=smooth_colors(verts))
 
 
-def sphere(subdivisions: int) -> Mesh:
-    """Unit sphere of 20 · 4^subdivisions faces, watertight, outward, with smooth colours."""
-    from trimesh.creation import icosphere
-
-    found = icosphere(subdivisions)
-    verts = torch.from_numpy(np.array(found.vertices))
-    return Mesh(verts, torch.from_numpy(np.array(found.faces, np.int32)), colors=smooth_colors(verts))
+def sphere(subdivisions: int = 3) -> Mesh:
+    """Unit sphere of 20 · 4^subdivisions faces (3: 1,280; 6: 81,920), watertight, outward, with smooth colours: an icosphere."""
+    phi = (1.0 + math.sqrt(5.0)) / 2.0
+    # Corners (0, ±1, ±φ) and its rotations of coordinates: three rectangles, one in each plane.
+    rectangle = np.array([[-1, phi, 0], [1, phi, 0], [-1, -phi, 0], [1, -phi, 0]])
+    verts = np.concatenate([np.roll(rectangle, shift, axis=1) for shift in range(3)])
+    # fmt: off
+    faces = np.array([
+        [0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11],  # around corner 0
+        [1, 5, 9], [5, 11, 4], [11, 10, 2], [10, 7, 6], [7, 1, 8],  # next to those
+        [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8], [3, 8, 9],  # around corner 3
+        [4, 9, 5], [2, 4, 11], [6, 2, 10], [8, 6, 7], [9, 8, 1],  # next to those
+    ])
+    # fmt: on
+    for _ in range(subdivisions):
+        # Each edge is listed by both its faces; `middle` numbers the edges once, after the vertices.
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        _, first, middle = np.unique(edges[:, 0] * len(verts) + edges[:, 1], return_index=True, return_inverse=True)
+        a, b, c = faces.T
+        ab, bc, ca = (middle.reshape(-1, 3) + len(verts)).T
+        verts = np.concatenate([verts, verts[edges[first]].mean(1)])
+        faces = np.stack([a, ab, ca, b, bc, ab, c, ca, bc, ab, bc, ca], 1).reshape(-1, 3)
+    verts_tensor = torch.from_numpy(verts / np.linalg.norm(verts, axis=1, keepdims=True))
+    return Mesh(verts_tensor, torch.from_numpy(faces), colors=smooth_colors(verts_tensor))
 
 
 def soup(mesh: Mesh) -> Mesh:
@@ -178,6 +197,11 @@ def smooth_adjoint(height: int, width: int, channels: int) -> Tensor:
     return torch.sin(5.0 * x + (2.0 + c) * y + c) + 0.5 * torch.cos(3.0 * y * (1.0 + 0.4 * c) - 2.0 * x) + 0.2
 
 
+def noise_adjoint(height: int, width: int, channels: int) -> Tensor:
+    """White noise (H, W, C), float64: what an L1 loss, or a photograph's noise, leaves near the optimum."""
+    return torch.randn((height, width, channels), dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+
 def background() -> Tensor:
     """(3,) float64."""
     return torch.tensor(BACKGROUND, dtype=torch.float64)
@@ -197,6 +221,28 @@ def _sphere(size: int, subdivisions: int = 6) -> Built:
     camera = Camera.look_at((0.9, 0.7, 3.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (size, size))
     title = f"sphere of {len(mesh.faces):,} faces, smooth colours"
     return title, Scene([mesh], background()), camera
+
+
+def _tangled(size: int, noise: float = 0.03, subdivisions: int = 5) -> Built:
+    """As the first steps of a plain shape fit leave it: each vertex moved by normal noise, as a share of the radius."""
+    title, scene, camera = _sphere(size, subdivisions)
+    (mesh,) = scene.meshes
+    shift = torch.randn(mesh.verts.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    title = f"tangled sphere of {len(mesh.faces):,} faces, {100 * noise:g} % noise"
+    return title, scene.replace(meshes=[mesh.replace(verts=mesh.verts + noise * shift)]), camera
+
+
+def _flat_colors(size: int, subdivisions: int = 6) -> Built:
+    _, scene, camera = _sphere(size, subdivisions)
+    (mesh,) = scene.meshes
+    colors = torch.rand((len(mesh.faces), 3), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    title = f"sphere of {len(mesh.faces):,} faces, a colour each"
+    return title, scene.replace(meshes=[mesh.replace(colors=None, face_colors=colors)]), camera
+
+
+def _noise(size: int, subdivisions: int = 6) -> Built:
+    title, scene, camera = _sphere(size, subdivisions)
+    return f"{title}, adjoint of white noise", scene, camera
 
 
 def _slivers(size: int) -> Built:
@@ -270,9 +316,12 @@ def pattern(x: Tensor, y: Tensor) -> Tensor:
     return 0.5 + 0.14 * color
 
 
-SCENES: dict[str, Callable[[int], Built] | Callable[..., Built]] = {
+SCENES: dict[str, Callable[..., Built]] = {
     "triangle": _triangle,
     "sphere": _sphere,
+    "tangled": _tangled,
+    "flat-colors": _flat_colors,
+    "noise": _noise,
     "slivers": _slivers,
     "globe": _globe,
     "quad": _quad,

@@ -211,3 +211,55 @@ def standing() -> Problem:
     box = flat(cube(0.25)).transformed(t=vector(0.1, 0.0, 0.05))
     turn = rotation(vector(0.35, 0.5, 0.1))
     return rigid(Scene([plate.transformed(turn), box.transformed(turn)], background()), CAMERA, turn=True)
+
+
+CELL = 0.5  # of lattices: a power of two, so that cubes that touch do so to the last bit
+Cells = list[tuple[int, int, int]]
+
+
+def _cells(x: int, y: int, z: int) -> Cells:
+    return [(i, j, k) for i in range(x) for j in range(y) for k in range(z)]
+
+
+def _lattice(cells: Cells, colors: bool) -> Scene:
+    """Cubes that touch, each a mesh of its own, around the origin. Sides that touch have unlike colours: what is hidden
+    must not show in the gradient."""
+    index = torch.tensor(cells, dtype=F64)
+    places = CELL * (index - 0.5 * index.amax(0))
+    generator = torch.Generator().manual_seed(0)
+    meshes = []
+    for place in places:
+        sides = torch.rand((6, 3), dtype=F64, generator=generator)
+        box = one_color(cube(0.5 * CELL).transformed(t=place).transformed(t=IN_PLACE))
+        meshes.append(box.replace(face_colors=sides.repeat_interleave(2, 0)) if colors else box)
+    return Scene(meshes, background())
+
+
+def isometric(size: int = 48, height: float = 2.4) -> Camera:
+    return Camera.orthographic((4.0, 4.0, 4.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), height=height, size=(size, size))
+
+
+def in_side_planes(size: int = 48) -> Camera:
+    """Perspective; the eye lies where sides of a lattice of even counts meet: in the planes x and y of IN_PLACE."""
+    x, y, _ = IN_PLACE.tolist()
+    return upright(vector(x, y, 4.0), size, 1.3 * size)
+
+
+@group.add("lattice-behind", "two cubes that touch, one behind the other, straight on", _cells(1, 1, 2), along_axes())
+@group.add("lattice-behind-plain", "the same in one colour", _cells(1, 1, 2), along_axes(), False)
+@group.add("lattice-straight", "2 × 2 × 2 cubes that touch, straight on", _cells(2, 2, 2), along_axes())
+@group.add(
+    "lattice-steps",
+    "3 × 2 × 2 cubes less three, straight on",
+    sorted({*_cells(3, 2, 2)} - {(0, 0, 1), (2, 1, 1), (1, 1, 1)}),
+    along_axes(),
+)
+@group.add("lattice-isometric", "2 × 2 × 2 cubes that touch, isometric", _cells(2, 2, 2), isometric())
+@group.add("lattice-isometric-dent", "the same without the cube in front", _cells(2, 2, 2)[:-1], isometric())
+@group.add(
+    "lattice-perspective", "2 × 2 × 2 cubes that touch, the eye in their side planes", _cells(2, 2, 2), in_side_planes()
+)
+@group.add("lattice-plate", "a cube on a plate of 3 × 3, from above", [*_cells(3, 3, 1), (1, 1, 1)], along_axes())
+def lattice(cells: Cells, camera: Camera, colors: bool = True) -> Problem:
+    """Moved as a whole: a cube moved alone has a derivative for each direction."""
+    return rigid(_lattice(cells, colors), camera, centre=IN_PLACE)

@@ -224,3 +224,33 @@ def through_each_other() -> Problem:
 
     steps = dict.fromkeys(parts, 0.008)
     return Problem(parts, make, None, "finite differences", steps)
+
+
+def _noise(count: int) -> Tensor:
+    return torch.randn((count, 3), dtype=F64, generator=torch.Generator().manual_seed(0))
+
+
+@group.add("spikes", "a sphere of 1,280 faces whose vertices are moved in and out by normal noise of 10 %")
+def spikes() -> Problem:
+    ball = sphere(3).transformed(scale=0.9)
+    verts = ball.verts * (1.0 + 0.1 * _noise(len(ball.verts))[:, :1])
+    return everything(Scene([ball.replace(verts=verts)], background()), CAMERA)
+
+
+@group.add(
+    "tangled",
+    "a sphere of 1,280 faces whose vertices are moved anywhere by normal noise of 10 %",
+    limit=THROUGH,
+    most=0.1,
+    slow=True,
+)
+def tangled() -> Problem:
+    """As the first steps of a plain shape fit leave it. Moved as a whole; against finite differences."""
+    ball = sphere(3).transformed(scale=0.9)
+    verts = ball.verts + 0.09 * _noise(len(ball.verts))
+    parts = {"shift": torch.zeros(3, dtype=F64), "growth": torch.zeros(1, dtype=F64)}
+
+    def make(parts: Parts) -> tuple[Scene, Camera]:
+        return Scene([ball.replace(verts=verts * (1.0 + parts["growth"]) + parts["shift"])], background()), CAMERA
+
+    return Problem(parts, make, None, "finite differences", dict.fromkeys(parts, 0.004))
