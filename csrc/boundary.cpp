@@ -128,14 +128,60 @@ class BoundaryChunk {
         view_.geometry.caster().cast(rays_, rejected_);
         for (int i = 0; i < rays_.count; ++i) {
             const Vec2 n = rays_.n(i);
-            const auto decide = [&](int32_t face) {
-                return lies_far_before(view_, face, lane_[i].point.z) || meets(view_, face, n);
-            };
-            const int32_t behind =
-                view_.geometry.caster().beyond_float(view_.frame, n, rays_.face[i], rejected_[i], decide);
+            const int32_t behind = beyond_float(lane_[i], n, rays_.face[i], rejected_[i]);
             add_sample(place_[lane_[i].place].own.curve, lane_[i], behind, adjoint_.data() + i * C_);
         }
         rays_.count = places_ = 0;
+    }
+
+    // The face that a ray truly meets, where `face` is what the cast found. Float and double may place the ray on
+    // different sides of an edge between two faces that it runs through, and where that edge lies on the curve in the
+    // image (the diagonal of a box's front, before an edge of its back) they do so again and again. Then float misses
+    // the neighbour that double would meet; so beside the ray that passes through the refused face goes another that is
+    // moved off that face by as much as floats may err.
+    int32_t beyond_float(const Lane& lane, Vec2 n, int32_t face, std::span<const int32_t> rejected) const {
+        const auto decide = [&](int32_t f) {
+            return lies_far_before(view_, f, lane.point.z) || meets(view_, f, n);
+        };
+        if (face < 0 || decide(face)) return face;
+        std::vector<int32_t> blind(rejected.begin(), rejected.end());
+        RayBatch rays(view_.frame);
+        int32_t nearest = -1;
+        double depth = std::numeric_limits<double>::infinity();
+        while (face >= 0 && !decide(face)) {
+            const Vec2 beside = moved_off(face, n);
+            rays.n_x[0] = n.x, rays.n_y[0] = n.y, rays.n_x[1] = beside.x, rays.n_y[1] = beside.y, rays.count = 2;
+            blind.insert(std::upper_bound(blind.begin(), blind.end(), face), face);
+            const std::span<const int32_t> all[2] = {blind, blind};
+            rays.prepare();
+            view_.geometry.caster().cast(rays, all);
+            face = rays.face[0];
+            if (const int32_t other = rays.face[1]; other >= 0 && decide(other))
+                if (const double z = depth_of(view_, other, n); z < depth) nearest = other, depth = z;
+        }
+        return face >= 0 && depth_of(view_, face, n) < depth ? face : nearest;
+    }
+
+    // n, moved away from a face that does not cover it, across the side that it lies beyond.
+    Vec2 moved_off(int64_t face, Vec2 n) const {
+        const FaceMap m = face_map(view_.camera, corners_of(view_, face).data());
+        const Vec3 p = m.times(n);
+        const double sign = p.z < 0 ? -1 : 1;
+        // Barycentrics times p.z, as affine functions of n: value and slope.
+        const auto row = [&](double Vec3::* r) { return Vec3{m.column[0].*r, m.column[1].*r, p.*r}; };
+        const Vec3 u = row(&Vec3::x), v = row(&Vec3::y), w = row(&Vec3::z);
+        Vec2 away;
+        double farthest = -std::numeric_limits<double>::infinity();
+        for (const Vec3 b : {u, v, w - u - v}) {
+            const double slope = length(Vec2{b.x, b.y}), distance = -sign * b.z / slope;
+            if (slope > 0 && distance > farthest) farthest = distance, away = (-sign / slope) * Vec2{b.x, b.y};
+        }
+        double error = 0;
+        for (int i = 0; i < 3; ++i) {
+            const double* q = view_.scene.verts + 3 * int64_t(view_.scene.faces[3 * int64_t(face) + i]);
+            error = std::max(error, view_.frame.error({q[0], q[1], q[2]}));
+        }
+        return n + (2 * error / (view_.camera.perspective ? depth_of(view_, face, n) : 1.0)) * away;
     }
 
     // Ã · L of a point of a face, or of the background.
