@@ -173,11 +173,9 @@ class Coincidence {
             share.uncovered_depth = next.point.z;
         }
         if (!opposite.curve) return true;
-        if (share.uncovered < 0) {
-            if (!several_[far] && opposite.curve->edge_on.empty()) share.second = point_of(opposite, far);
-        } else if (share.uncovered_depth > opposite.point.z || share.weight < 1) {
-            share.second = {}, share.uncovered = -1;
-        }
+        const bool alone = share.uncovered < 0 && !several_[far] && opposite.curve->edge_on.empty();
+        if (share.weight < 1 || alone) share.second = point_of(opposite, far);
+        else if (share.uncovered_depth > opposite.point.z) share.second = {}, share.uncovered = -1;
         return true;
     }
 
