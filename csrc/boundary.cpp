@@ -140,9 +140,7 @@ class BoundaryChunk {
     // the neighbour that double would meet; so beside the ray that passes through the refused face goes another that is
     // moved off that face by as much as floats may err.
     int32_t beyond_float(const Lane& lane, Vec2 n, int32_t face, std::span<const int32_t> rejected) const {
-        const auto decide = [&](int32_t f) {
-            return lies_far_before(view_, f, lane.point.z) || meets(view_, f, n);
-        };
+        const auto decide = [&](int32_t f) { return lies_far_before(view_, f, lane.point.z) || meets(view_, f, n); };
         if (face < 0 || decide(face)) return face;
         std::vector<int32_t> blind(rejected.begin(), rejected.end());
         RayBatch rays(view_.frame);

@@ -18,10 +18,12 @@
 //
 //  - Faces of the front curve end on both sides: it takes the whole jump, for nothing else shows when it moves.
 //  - The front faces of both sides touch, on curves of their own (two roofs, a T-junction): each is taken for the front
-//    one with the weight ½, as each covers half of the strip that both sweep.
+//    one with the weight ½, as each covers half of the strip that both sweep, and the other is the second curve. With
+//    U what a curve uncovers, the one on minus then has (L₋ − U₋) / 2 + (L₋ − L₊) / 4, the mean of its own derivatives,
+//    plus (U₋ − U₊) / 4, and the one on plus the same, mirrored.
 //  - Before the uncovered face, another ends on the other side. No other curve may then have a share, and the front one
-//    takes the whole jump, its derivative where its face grows; unless those two are all there is, and each has the
-//    mean of its own.
+//    takes the whole jump, its derivative where its face grows; unless the two curves are all there is, and each has
+//    the mean of its own.
 //  - The front curve is the far side of a face seen edge-on, which shows whichever side moves: half to each.
 #pragma once
 
@@ -36,8 +38,8 @@
 
 namespace edgegrad {
 
-// World units by which what touches may lie apart: some spacings of the input's coordinates, and what doubles leave of a
-// thing of that size.
+// World units by which what touches may lie apart: some spacings of the input's coordinates, and what doubles leave of
+// a thing of that size.
 inline constexpr double rounding_of_doubles = 64 * std::numeric_limits<double>::epsilon();
 inline double contact(double spacing, double coordinate, double size) {
     return 8 * spacing * coordinate + rounding_of_doubles * size;
@@ -72,13 +74,13 @@ struct CoincidentCurve {
 struct CoincidentShare {
     HalfEdge side[2] = {};  // what is seen on minus and plus; face −1: what lies behind
     double side_t[2] = {};
-    double far_depth = -std::numeric_limits<double>::infinity();  // of another curve's face on the side that is not front
+    double far_depth = -std::numeric_limits<double>::infinity();  // of another curve's face, on the side opposite
     double weight = 1;
     int front = 0;  // the side on which the curve's own face ends
 
     // The second curve, and what the front one uncovers: a face, or, with none, what lies behind.
     EdgePoint second = {};  // without vertices: none
-    bool halves = false;  // it gets half of the jump
+    bool halves = false;    // it gets half of the jump
     int32_t uncovered = -1;
     Barycentrics uncovered_b = {};
     double uncovered_depth = std::numeric_limits<double>::infinity();
@@ -211,9 +213,7 @@ class Coincidence {
                        std::max(length(p.point), length(q.point)));
     }
 
-    bool touch(const Place& p, const Place& q) const {
-        return std::fabs(p.point.z - q.point.z) <= tolerance(p, q);
-    }
+    bool touch(const Place& p, const Place& q) const { return std::fabs(p.point.z - q.point.z) <= tolerance(p, q); }
 
     // Whether, of two faces that end on the same side, the first lies in front: a strict order, and the same for all
     // who ask. Where they touch, the plane of the one in front separates the other from the viewer.
