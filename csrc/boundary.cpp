@@ -3,15 +3,7 @@
 //
 // Where other curves lie on this one in the image (coincident.h), the ray runs along the rims of their faces, and which
 // of these it meets would be left to rounding. So it is blind to them too, and they are asked in double. One that lies
-// apart by more than the rounding of doubles covers the point or not. One that does not covers one side of it:
-//
-//  - at the same depth (a box on a box), its faces and those of this curve are taken for the faces of one edge, of
-//    which each curve moves its share;
-//  - before or behind (the back edge of a box that is seen straight on), the sample is the mean of two: one sees what
-//    lies before on one side of the curve and what lies behind on the other, one the reverse.
-//
-// Along the order of depth the jumps then add up to what is seen on one side minus what is seen on the other, so that a
-// motion that all share has its true derivative. One that parts them has another derivative for each direction.
+// apart by more than the rounding of doubles covers the point or not; those that do not, coincidence.h puts in order.
 
 #include "boundary.h"
 
@@ -19,6 +11,7 @@
 #include <limits>
 #include <vector>
 
+#include "coincidence.h"
 #include "coincident.h"
 #include "crease_control.h"
 #include "curve.h"
@@ -38,6 +31,7 @@ class BoundaryChunk {
         : view_(view),
           finder_(finder),
           coincident_(coincident),
+          coincidence_(view, finder),
           grad_(grad),
           C_(N ? N : view.scene.channels),
           rays_(view.frame),
@@ -49,7 +43,7 @@ class BoundaryChunk {
         const int i = rays_.count;
         const Vec2 x = curve.position(s);
         if (!view_.adjoint.template at<N>(x, adjoint_.data() + i * C_)) return;
-        if (places_ == 0 || place_[places_ - 1].curve.edge != curve.edge) {
+        if (places_ == 0 || place_[places_ - 1].own.curve.edge != curve.edge) {
             // A place of which no sample waits, for all were hidden, is free again: so there are never more than lanes.
             if (places_ > 0 && (i == 0 || lane_[i - 1].place != places_ - 1)) --places_;
             start(place_[places_++], curve);
@@ -64,12 +58,8 @@ class BoundaryChunk {
                 .t = t,
                 .point = (1 - t) * curve.a + t * curve.b,
                 .weight = weight,
-                .side = {{curve.minus, t}, {curve.plus, t}},
-                .views = place.others.empty() ? 1 : 2};
-        for (const Curve& other : place.others) {
-            add_other(other, curve, lane);
-            if (!lane.is_seen()) return;
-        }
+                .share = {.side = {curve.minus, curve.plus}, .side_t = {t, t}}};
+        if (place.coincident && !share(place, lane)) return;
         rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
         rejected_[i] =
             place.others.empty() ? view_.geometry.topology().faces(curve.edge) : std::span<const int32_t>(place.blind);
@@ -79,14 +69,16 @@ class BoundaryChunk {
     void finish() {
         cast();
         flush();
+        flush_second();
     }
 
    private:
     // A curve, and those that lie on it.
     struct Place {
-        Curve curve;
-        std::vector<Curve> others;
+        CoincidentCurve own;  // without its faces unless it is coincident
+        std::vector<CoincidentCurve> others;
         std::vector<int32_t> blind;  // faces of all of them
+        bool coincident = false;
     };
 
     // What lies at a point of the image, behind a curve: a face, or −1 for the background.
@@ -96,12 +88,6 @@ class BoundaryChunk {
         double depth = std::numeric_limits<double>::infinity();
     };
 
-    // What is seen next to a curve: a face that ends there, or, with none, what lies behind.
-    struct Side {
-        HalfEdge face;
-        double t = 0;  // on its edge
-    };
-
     // A sample: the point t of a curve, seen at x.
     struct Lane {
         int place = 0;
@@ -109,25 +95,28 @@ class BoundaryChunk {
         double t = 0;
         Vec3 point;
         double weight = 0;
-        Side side[2];   // minus, plus
-        int share = 1;  // curves that move together here
-        int views = 1;  // two where other curves lie before or behind, each of which covers one side of the point
-        bool hidden[2] = {};
-        Surface behind[2];
-
-        bool is_seen() const { return !hidden[0] || (views == 2 && !hidden[1]); }
+        CoincidentShare share = {};
+        Surface behind = {};
     };
 
     void start(Place& place, const Curve& curve) {
-        place.curve = curve;
+        place.own.curve = curve;
         place.others.clear(), place.blind.clear();
-        if (coincident_.empty()) return;
         const Topology& topology = view_.geometry.topology();
         const auto blind_to = [&](int64_t edge) {
             for (const int32_t f : topology.faces(edge)) place.blind.push_back(f);
         };
         for (const int64_t edge : coincident_.of(curve.edge))
-            if (Curve c; finder_.find(edge, c)) place.others.push_back(c), blind_to(edge);
+            if (Curve c; finder_.find(edge, c)) {
+                place.others.push_back(coincidence_.on_line(c, curve));
+                blind_to(edge);
+            }
+        const auto halves = topology.half_edges(curve.edge);
+        place.coincident = !place.others.empty() || std::any_of(halves.begin(), halves.end(), [&](const HalfEdge& h) {
+            return finder_.turn_of(h) == 0;
+        });
+        if (!place.coincident) return;
+        place.own = coincidence_.on_line(curve, curve);
         if (place.others.empty()) return;
         blind_to(curve.edge);
         std::sort(place.blind.begin(), place.blind.end());
@@ -138,42 +127,110 @@ class BoundaryChunk {
         view_.geometry.caster().cast(rays_, rejected_);
         for (int i = 0; i < rays_.count; ++i) {
             const Vec2 n = rays_.n(i);
-            const auto decide = [&](int32_t face) {
-                return lies_far_before(view_, face, lane_[i].point.z) || meets(view_, face, n);
-            };
-            const int32_t behind =
-                view_.geometry.caster().beyond_float(view_.frame, n, rays_.face[i], rejected_[i], decide);
-            add_sample(place_[lane_[i].place], lane_[i], behind, adjoint_.data() + i * C_);
+            const int32_t behind = beyond_float(lane_[i], n, rays_.face[i], rejected_[i]);
+            add_sample(place_[lane_[i].place].own.curve, lane_[i], behind, adjoint_.data() + i * C_);
         }
         rays_.count = places_ = 0;
     }
 
-    // Ã · L of what is seen on one side.
-    double adjoint_radiance(const Lane& lane, const Side& side, const Surface& behind, const double* adjoint) {
-        if (side.face.face < 0 && behind.face < 0) return view_.adjoint.template times_background<N>(lane.x);
-        if (side.face.face >= 0) shade<N>(view_.scene, side.face.face, at_edge(side.face, side.t), radiance_.data());
-        else shade<N>(view_.scene, behind.face, behind.b, radiance_.data());
+    // The face that a ray truly meets, where `face` is what the cast found. Float and double may place the ray on
+    // different sides of an edge between two faces that it runs through, and where that edge lies on the curve in the
+    // image (the diagonal of a box's front, before an edge of its back) they do so again and again. Then float misses
+    // the neighbour that double would meet; so beside the ray that passes through the refused face goes another that is
+    // moved off that face by as much as floats may err.
+    int32_t beyond_float(const Lane& lane, Vec2 n, int32_t face, std::span<const int32_t> rejected) const {
+        const auto decide = [&](int32_t f) { return lies_far_before(view_, f, lane.point.z) || meets(view_, f, n); };
+        if (face < 0 || decide(face)) return face;
+        std::vector<int32_t> blind(rejected.begin(), rejected.end());
+        RayBatch rays(view_.frame);
+        int32_t nearest = -1;
+        double depth = std::numeric_limits<double>::infinity();
+        while (face >= 0 && !decide(face)) {
+            const Vec2 beside = moved_off(face, n);
+            rays.n_x[0] = n.x, rays.n_y[0] = n.y, rays.n_x[1] = beside.x, rays.n_y[1] = beside.y, rays.count = 2;
+            blind.insert(std::upper_bound(blind.begin(), blind.end(), face), face);
+            const std::span<const int32_t> all[2] = {blind, blind};
+            rays.prepare();
+            view_.geometry.caster().cast(rays, all);
+            face = rays.face[0];
+            if (const int32_t other = rays.face[1]; other >= 0 && decide(other))
+                if (const double z = depth_of(view_, other, n); z < depth) nearest = other, depth = z;
+        }
+        return face >= 0 && depth_of(view_, face, n) < depth ? face : nearest;
+    }
+
+    // n, moved away from a face that does not cover it, across the side that it lies beyond.
+    Vec2 moved_off(int64_t face, Vec2 n) const {
+        const FaceMap m = face_map(view_.camera, corners_of(view_, face).data());
+        const Vec3 p = m.times(n);
+        const double sign = p.z < 0 ? -1 : 1;
+        // Barycentrics times p.z, as affine functions of n: value and slope.
+        const auto row = [&](double Vec3::* r) { return Vec3{m.column[0].*r, m.column[1].*r, p.*r}; };
+        const Vec3 u = row(&Vec3::x), v = row(&Vec3::y), w = row(&Vec3::z);
+        Vec2 away;
+        double farthest = -std::numeric_limits<double>::infinity();
+        for (const Vec3 b : {u, v, w - u - v}) {
+            const double slope = length(Vec2{b.x, b.y}), distance = -sign * b.z / slope;
+            if (slope > 0 && distance > farthest) farthest = distance, away = (-sign / slope) * Vec2{b.x, b.y};
+        }
+        double error = 0;
+        for (int i = 0; i < 3; ++i) {
+            const double* q = view_.scene.verts + 3 * int64_t(view_.scene.faces[3 * int64_t(face) + i]);
+            error = std::max(error, view_.frame.error({q[0], q[1], q[2]}));
+        }
+        return n + (2 * error / (view_.camera.perspective ? depth_of(view_, face, n) : 1.0)) * away;
+    }
+
+    // Ã · L of a point of a face, or of the background.
+    double adjoint_radiance(const Lane& lane, int64_t face, Barycentrics b, const double* adjoint) {
+        if (face < 0) return view_.adjoint.template times_background<N>(lane.x);
+        shade<N>(view_.scene, face, b, radiance_.data());
         double sum = 0;
         for (int c = 0; c < C_; ++c) sum += adjoint[c] * radiance_[c];
         return sum;
     }
 
-    void add_sample(const Place& place, Lane& lane, int32_t hit, const double* adjoint) {
-        const Curve& curve = place.curve;
+    void add_sample(const Curve& curve, Lane& lane, int32_t hit, const double* adjoint) {
         if (hit >= 0 && !lies_behind(hit, curve, lane)) return;
-        double jump = 0;
-        for (int k = 0; k < lane.views; ++k)
-            if (!lane.hidden[k])
-                jump += adjoint_radiance(lane, lane.side[0], lane.behind[k], adjoint) -
-                        adjoint_radiance(lane, lane.side[1], lane.behind[k], adjoint);
-        const double scale = lane.weight * jump / (lane.views * lane.share);
+        CoincidentShare& share = lane.share;
+        const Surface& behind = lane.behind;
+        // What the ray meets may lie before the others.
+        if (share.far_depth > behind.depth) share.side[1 - share.front].face = -1;
+        double radiance[2];
+        for (int k = 0; k < 2; ++k) {
+            const HalfEdge& h = share.side[k];
+            radiance[k] = h.face >= 0 ? adjoint_radiance(lane, h.face, at_edge(h, share.side_t[k]), adjoint)
+                                      : adjoint_radiance(lane, behind.face, behind.b, adjoint);
+        }
+        const double scale = lane.weight * share.weight, jump = scale * (radiance[0] - radiance[1]);
+        double to_second = 0;
+        if (share.halves) {
+            to_second = jump / 2;
+        } else if (share.second.vertex[0] >= 0 && !(share.uncovered_depth > behind.depth && share.uncovered >= 0)) {
+            const double uncovered = share.uncovered >= 0
+                                         ? adjoint_radiance(lane, share.uncovered, share.uncovered_b, adjoint)
+                                         : adjoint_radiance(lane, behind.face, behind.b, adjoint);
+            to_second = scale / 2 * (share.front == 0 ? uncovered - radiance[1] : radiance[0] - uncovered);
+        }
         const Vec2 tangent = curve.tangent();
-        Vec3 point_bar;
-        project_vjp(view_.camera, lane.point, {scale * tangent.y, -scale * tangent.x}, point_bar, grad_.k);
-
+        const auto move = [&](Vec3 point, double jump) {
+            Vec3 point_bar;
+            project_vjp(view_.camera, point, {jump * tangent.y, -jump * tangent.x}, point_bar, grad_.k);
+            return point_bar;
+        };
         if (current_.edge != curve.edge) flush(), current_ = curve, a_bar_ = b_bar_ = {};
+        const Vec3 point_bar = move(lane.point, jump - to_second);
         a_bar_ += (1 - lane.t) * point_bar;
         b_bar_ += lane.t * point_bar;
+        if (to_second == 0) return;
+        const EdgePoint& second = share.second;
+        if (second.vertex[0] != second_[0] || second.vertex[1] != second_[1]) {
+            flush_second();
+            for (int i = 0; i < 2; ++i) second_[i] = second.vertex[i], second_bar_[i] = {};
+        }
+        const Vec3 second_bar = move(second.point, to_second);
+        second_bar_[0] += (1 - second.t) * second_bar;
+        second_bar_[1] += second.t * second_bar;
     }
 
     // False if a face that the ray meets hides the point; else it lies behind, and is kept if it is the nearest so far.
@@ -181,43 +238,32 @@ class BoundaryChunk {
         const auto corner = corners_of(view_, face);
         if (lies_far_before(view_, face, lane.point.z) || hides(face, corner.data(), lane.point, curve)) return false;
         const double depth = depth_of(view_, face, lane.n);
-        for (int k = 0; k < lane.views; ++k)
-            if (depth < lane.behind[k].depth)
-                lane.behind[k] = {face, barycentrics_of_hit(face_map(view_.camera, corner.data()), lane.n), depth};
+        if (depth < lane.behind.depth)
+            lane.behind = {face, barycentrics_of_hit(face_map(view_.camera, corner.data()), lane.n), depth};
         return true;
     }
 
-    // What a curve that lies on this one does to a sample of it.
-    void add_other(const Curve& other, const Curve& curve, Lane& lane) const {
-        const Vec2 along = other.tangent(), from = lane.x - other.x0;
-        const double squared = along.x * along.x + along.y * along.y,
-                     s = (from.x * along.x + from.y * along.y) / squared;
-        const double apart = std::fabs(wedge(along, from)) / std::sqrt(squared);
-        if (!(apart <= std::max(curve.rounding, other.rounding))) {
+    // What the curves that lie on this one leave to a sample of it; false if nothing.
+    bool share(const Place& place, Lane& lane) {
+        const Curve& curve = place.own.curve;
+        coincidence_.start(place.own, lane.x, lane.t);
+        for (const CoincidentCurve& coincident : place.others) {
+            const Curve& other = coincident.curve;
+            const Vec2 along = other.tangent(), from = lane.x - other.x0;
+            const double squared = along.x * along.x + along.y * along.y,
+                         s = (from.x * along.x + from.y * along.y) / squared;
+            const double apart = std::fabs(wedge(along, from)) / std::sqrt(squared);
+            if (apart <= std::max(curve.rounding, other.rounding)) {
+                if (s >= 0 && s <= 1) coincidence_.add(coincident, other.parameter(s));
+                continue;
+            }
             const auto own = view_.geometry.topology().faces(curve.edge);
             for (const int32_t f : view_.geometry.topology().faces(other.edge))
                 if (std::find(own.begin(), own.end(), f) == own.end() && meets(view_, f, lane.n) &&
                     !lies_behind(f, curve, lane))
-                    lane.hidden[0] = lane.hidden[1] = true;
-            return;
+                    return false;
         }
-        if (s < 0 || s > 1) return;
-        const double t = other.parameter(s), depth = (1 - t) * other.a.z + t * other.b.z;
-        const bool opposite = along.x * curve.tangent().x + along.y * curve.tangent().y < 0;
-        const HalfEdge* half[2] = {opposite ? &other.plus : &other.minus, opposite ? &other.minus : &other.plus};
-        if (std::fabs(depth - lane.point.z) <= contact(curve, std::max(std::fabs(depth), length(lane.point)))) {
-            ++lane.share;
-            for (int k = 0; k < 2; ++k)
-                if (Side& side = lane.side[k];
-                    half[k]->face >= 0 &&
-                    (side.face.face < 0 || !in_front(view_, side.face, *half[k], curve.a, curve.b)))
-                    side = {*half[k], t};
-            return;
-        }
-        for (int k = 0; k < 2; ++k)
-            if (depth < lane.point.z) lane.hidden[k] |= half[k]->face >= 0;
-            else if (const HalfEdge& covers = *half[!k]; covers.face >= 0 && depth < lane.behind[k].depth)
-                lane.behind[k] = {covers.face, at_edge(covers, t), depth};
+        return coincidence_.finish(lane.share);
     }
 
     // Whether a face that the ray meets lies before the point: its plane has the point on one side and the viewer on
@@ -233,7 +279,9 @@ class BoundaryChunk {
         for (int i = 0; i < 3; ++i)
             size = std::max({size, std::fabs(corner[i].x), std::fabs(corner[i].y), std::fabs(corner[i].z)});
         const double apart = behind / length(normal), rounding = rounding_of_doubles * size;
-        return apart > rounding && (apart > contact(curve, size) || shares_vertex(face, curve.edge));
+        const HalfEdge& h = curve.minus.face >= 0 ? curve.minus : curve.plus;
+        return apart > rounding && (apart > contact(view_.options.spacing, largest_coordinate(view_.scene, h), size) ||
+                                    shares_vertex(face, curve.edge));
     }
 
     bool shares_vertex(int64_t face, int64_t edge) const {
@@ -242,18 +290,6 @@ class BoundaryChunk {
             for (int i = 0; i < 3; ++i)
                 if (std::find(v, v + 3, view_.scene.faces[3 * int64_t(f) + i]) != v + 3) return true;
         return false;
-    }
-
-    // World units by which what touches at the curve may lie apart, for the rounding of the input and of doubles.
-    static constexpr double rounding_of_doubles = 64 * std::numeric_limits<double>::epsilon();
-    double contact(const Curve& curve, double size) const {
-        const HalfEdge& h = curve.minus.face >= 0 ? curve.minus : curve.plus;
-        double coordinate = 0;
-        for (const int corner : {h.first(), h.second()})
-            for (int axis = 0; axis < 3; ++axis)
-                coordinate = std::max(coordinate,
-                                      std::fabs(view_.scene.verts[3 * int64_t(vertex(view_.scene, h, corner)) + axis]));
-        return 8 * view_.options.spacing * coordinate + rounding_of_doubles * size;
     }
 
     // The gradient goes to the vertices of the face that ends at the curve; where a face lies on either side, half to
@@ -270,9 +306,16 @@ class BoundaryChunk {
         current_.edge = -1;
     }
 
+    void flush_second() {
+        for (int i = 0; i < 2; ++i)
+            if (second_[i] >= 0) grad_.q.add<3>(second_[i], &second_bar_[i].x);
+        second_[0] = second_[1] = -1;
+    }
+
     const BackwardView<T>& view_;
     const CurveFinder<T>& finder_;
     const CoincidentCurves& coincident_;
+    Coincidence<T> coincidence_;
     ChunkGrad& grad_;
     const int C_;
 
@@ -285,6 +328,8 @@ class BoundaryChunk {
 
     Curve current_;
     Vec3 a_bar_, b_bar_;
+    int32_t second_[2] = {-1, -1};  // vertices
+    Vec3 second_bar_[2];
 };
 
 }  // namespace

@@ -116,6 +116,9 @@ class CurveFinder {
 
     bool finds_creases() const { return jumps_; }
 
+    // On which side of its edge a face lies in the image; see side_of.
+    int turn_of(const HalfEdge& h) const { return side_of(h, facing_); }
+
     // The curve of an edge; false when there is none.
     bool find(int64_t edge, Curve& c) const {
         const auto halves = view_.geometry.topology().half_edges(edge);
