@@ -84,6 +84,26 @@ def test_finds_the_pose(background, capsys):
     assert capsys.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_where_gradients_are_off(mode):
+    """A fit takes gradients of its own, also of what was made there."""
+
+    def fit():
+        view = camera(size=24).to(torch.float64)
+        mesh = bracket()
+        mesh = mesh.replace(verts=1.0 * mesh.verts, faces=mesh.faces.int())
+        return fit_pose(
+            mesh, picture(view), view, init=1.0 * START, background=1.0 * BACKGROUND, fit_focal=True, steps=3, progress=False
+        )  # fmt: skip
+
+    expected = fit()
+    with mode():
+        found = fit()
+        assert not torch.is_grad_enabled()
+    assert torch.equal(found.R, expected.R) and torch.equal(found.t, expected.t) and found.loss == expected.loss
+    assert expected.loss < 0.3 * expected.history[0].loss
+
+
 @pytest.mark.parametrize("plain", [False, True], ids=["coloured", "plain"])
 def test_finds_the_pose_with_a_mask(plain):
     view = camera()
