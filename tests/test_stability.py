@@ -25,12 +25,12 @@ from edgegrad.report.cases.measure import LIMIT, NOISY, QUICK, RAISED, RIGHT, WR
 
 stability = importlib.import_module("edgegrad.report.stability")  # the package has a function of this name
 FAST = [name for name, case in CASES.items() if not case.slow]
-LIMITS = {name for name, case in CASES.items() if case.limit}
 
 
 def check(name: str, effort: Effort) -> None:
+    """Right; where a limit is known, what it allows, and not more than that: what has become right is no limit any longer."""
     row = measure.measure(CASES[name], effort)
-    assert row["verdict"] == RIGHT or (row["verdict"] == LIMIT and name in LIMITS), row
+    assert row["verdict"] == (LIMIT if CASES[name].limit else RIGHT), row
 
 
 @pytest.mark.parametrize("name", FAST)
