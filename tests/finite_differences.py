@@ -70,9 +70,13 @@ def check(name: str, truth: float, found: Estimate, slack: float = 0.005, most: 
 def check_ratio(
     case: Case, step: float, spp: int = 1024, seeds: int = 4, filter: str = "box", **options: object
 ) -> float:
-    """The gradient over the finite difference lies within 1 ± 0.02, and both are known well enough to say so."""
+    """The gradient over the finite difference; it must be right."""
     fd = finite_difference(case, step, spp, seeds, filter=filter)
-    g = gradient(case, 2 * seeds, filter=filter, **options)
+    return right_ratio(fd, gradient(case, 2 * seeds, filter=filter, **options))
+
+
+def right_ratio(fd: Estimate, g: Estimate) -> float:
+    """The gradient over the finite difference lies within 1 ± 0.02, and both are known well enough to say so."""
     ratio = g.mean / fd.mean
     noise = (fd.error**2 + g.error**2) ** 0.5 / abs(fd.mean)
     assert noise < 0.01, f"too noisy to tell: {fd}, {g}"
