@@ -54,9 +54,10 @@ def render(
                      faces it hit, which says where to put them
 
     Differentiable once, in reverse, in every floating-point tensor of the scene and the camera; torch.vmap and torch.func's
-    transforms in reverse mode work, an element of the batch at a time. The image has the dtype of the colours and comes back
-    on the scene's device. Raises TypeError or ValueError that names the argument, and MemoryError, before it allocates, with
-    the figure and what to lower; so does its backward pass. A second derivative, or one in forward mode, raises RuntimeError.
+    transforms in reverse mode work, one element of the batch at a time, all with the same seed. The image has the dtype of
+    the colours and comes back on the scene's device. Raises TypeError or ValueError that names the argument, and MemoryError,
+    before it allocates, with the figure and what to lower; so does its backward pass. A second derivative, or one in forward
+    mode, raises RuntimeError.
     """
     arguments = render_arguments(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
