@@ -17,7 +17,7 @@ demo: $(VENV)/.ready
 
 # A worker for each processor, of one thread each (tests/conftest.py); a test may take so many seconds of processor time.
 WORKERS := -n logical --maxprocesses 8
-BUDGET := 20
+BUDGET := 30
 test: $(VENV)/.ready
 	$(BIN)/python -m pytest -m "not slow" $(WORKERS) --budget $(BUDGET)
 
