@@ -15,18 +15,21 @@ export GOMP_SPINCOUNT ?= 3000
 demo: $(VENV)/.ready
 	$(BIN)/edgegrad demo --out out/demo
 
+# A worker for each processor, of one thread each (tests/conftest.py); a test may take so many seconds of processor time.
+WORKERS := -n logical --maxprocesses 8
+BUDGET := 30
 test: $(VENV)/.ready
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" $(WORKERS) --budget $(BUDGET)
 
 test-slow: $(VENV)/.ready
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow $(WORKERS)
 
 # The tests of the kernel, with a kernel in which AddressSanitizer and UndefinedBehaviorSanitizer watch every access and
 # sum. Python itself is not built with them, so they are loaded before it; what it leaks at its end is not looked at.
 SANITIZE := build/sanitize
 # Files, pictures, whole fits and long statistics call the kernel as the other tests do, only for longer; tests of load
 # measure memory and time, of which the sanitizers take more, and fork() takes minutes with them.
-WITHOUT := bad_files cli finite_differences fit fit_faults io load notebooks oracles report
+WITHOUT := bad_files cli derivatives fit fit_faults io load notebooks oracles report
 PRELOAD := $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so 2>/dev/null))
 sanitize: $(VENV)/.ready
 ifneq ($(words $(filter /%,$(PRELOAD))),3)

@@ -96,9 +96,19 @@ def check_integer(name: str, tensor: Tensor) -> None:
 
 
 def values_visible(*tensors: Tensor) -> bool:
-    """Whether values may be looked at: not while torch.compile traces, where the kernel's own checks take over, and not
-    those of meta tensors, which have none."""
-    return not torch.compiler.is_compiling() and not any(tensor.is_meta for tensor in tensors)
+    """Whether values may be looked at: not while torch.compile traces or torch.vmap runs, where the kernel's own checks take
+    over, and not those of meta tensors, which have none."""
+    return not torch.compiler.is_compiling() and not any(tensor.is_meta or _batched(tensor) for tensor in tensors)
+
+
+def _batched(tensor: Tensor) -> bool:
+    """Whether torch.vmap shows one element of a batch in its place, perhaps within other transforms of torch.func."""
+    functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
+    while functorch.is_functorch_wrapped_tensor(tensor):
+        if functorch.is_batchedtensor(tensor):
+            return True
+        tensor = functorch.get_unwrapped(tensor)
+    return False
 
 
 def check_not_meta(name: str, tensor: Tensor) -> None:

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from . import _memory as memory
 from ._check import as_int, check_finite, check_not_meta, check_positive_int, check_shape
@@ -41,7 +40,8 @@ def render(
 
     spp              samples a pixel of the image
     seed             the same seed gives the same bits, image and gradient, at any number of threads; cameras of a batch
-                     get samples of their own
+                     get samples of their own. With a constant seed, each step of an optimisation repeats the samples of
+                     image and gradient, and their error does not average out: pass seed=step
     surface_samples  samples of the gradient inside faces, for each camera: an int in all, or None for ½ a unit of surface,
                      (area + longest side · 1 px) summed over the triangles in view; 4 where they are textured, ⅛ as many
                      where the image saw neither the triangle nor a neighbour (1/64 if it saw what hangs together with it
@@ -53,17 +53,19 @@ def render(
     grad_seed        seed of the gradient's samples; derived from `seed` when None. They also depend on the image by which
                      faces it hit, which says where to put them
 
-    Differentiable in every floating-point tensor of the scene and the camera. The image has the dtype of the colours and
-    comes back on the scene's device. Raises TypeError or ValueError that names the argument, and MemoryError, before it
-    allocates, with the figure and what to lower; so does its backward pass.
+    Differentiable once, in reverse, in every floating-point tensor of the scene and the camera; torch.vmap and torch.func's
+    transforms in reverse mode work, one element of the batch at a time, all with the same seed. The image has the dtype of
+    the colours and comes back on the scene's device. Raises TypeError or ValueError that names the argument, and MemoryError,
+    before it allocates, with the figure and what to lower; so does its backward pass. A second derivative, or one in forward
+    mode, raises RuntimeError.
     """
     arguments = render_arguments(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
         filter=filter, grad_seed=grad_seed,
     )  # fmt: skip
-    image, *_ = _Render.apply(*arguments)
-    # Not image[0]: its derivative would copy the adjoint into zeros.
-    return (image if camera.batch is not None else image.squeeze(0)).to(as_scene(scene).meshes[0].verts.device)
+    function = _Render if torch.compiler.is_compiling() else _RenderEager
+    image, *_ = function.apply(camera.batch is not None, *arguments)
+    return image.to(as_scene(scene).meshes[0].verts.device)
 
 
 def render_arguments(
@@ -328,7 +330,7 @@ def backward_kernel(
 ) -> tuple[list[Tensor | None], list[Profile]]:
     """The gradients of what is wanted, float64, and what the kernel did for each camera. `dry` only counts samples.
 
-    Raises MemoryError.
+    `adjoint` is (B, H, W, C), or (H, W, C) for a single camera. Raises MemoryError.
     """
     with gradient_room(adjoint, *args):
         return _backward_kernel(adjoint, view, *args, dry=dry)
@@ -349,19 +351,22 @@ def _backward_kernel(adjoint: Tensor, view: View, *args: Any, dry: bool) -> tupl
     if background is not None and background.ndim == 1:
         background = background[None, None]
     adjoint = adjoint.detach().contiguous()
+    images = adjoint if adjoint.dim() == 4 else adjoint[None]
     try:
         profiles = [
             scene.backward(
                 _kernel_camera(world_to_camera[b], K[b], perspective, height, width),
                 spp, surface_samples, edge_samples, filter, grad_seed if b == 0 else _derived_seed(grad_seed, b + 1),
-                torch.get_num_threads(), work.motion, work.boundary, dry, adjoint[b].numpy(),
+                torch.get_num_threads(), work.motion, work.boundary, dry, images[b].numpy(),
                 *(part[b].numpy() for part in view), verts, colors, uvs, texels, background,
                 None if gw2c is None else gw2c[b], None if gK is None else gK[b],
             )
             for b in range(world_to_camera.shape[0])
         ]  # fmt: skip
     except ValueError:
-        check_finite("the gradient of the image", adjoint)  # as the kernel does, but this knows the place in the batch
+        check_finite(
+            "the gradient of the image", adjoint
+        )  # as the kernel does, but here with the index that the user knows
         raise
     return grads, profiles
 
@@ -387,30 +392,99 @@ def _render_backward_fake(
     )
 
 
+FIRST_ORDER = (
+    "second derivatives of a rendered image are not available (its gradient is an estimate whose own derivative is not "
+    "computed); for curvature use Gauss-Newton, JᵀJ from backward passes over the image, as edgegrad.fit.fit_pose does"
+)
+REVERSE = (
+    "forward-mode derivatives (jvp, jacfwd, hessian) of a rendered image are not available; "
+    "use reverse mode: backward(), torch.func.grad, vjp or jacrev"
+)
+
+
 class _Render(torch.autograd.Function):
-    """edgegrad::render, differentiated by edgegrad::render_backward."""
+    """edgegrad::render, differentiated by edgegrad::render_backward. The image of a single camera loses its batch axis."""
 
     @staticmethod
-    def forward(*args: Any) -> tuple[Tensor, ...]:
-        return torch.ops.edgegrad.render(*args[:18])
+    def forward(batched: bool, *args: Any) -> tuple[Tensor, ...]:
+        image, *view = torch.ops.edgegrad.render(*args[:18])
+        return image if batched else image.squeeze(0), *view
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         _, *view = output
         ctx.mark_non_differentiable(*view)
-        ctx.save_for_backward(*view, *inputs[:11])
-        ctx.options = inputs[11:]
+        ctx.save_for_backward(*view, *inputs[1:12])
+        ctx.options = inputs[12:]
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         coverage, farthest, seen, *tensors = ctx.saved_tensors
-        wanted = [ctx.needs_input_grad[i] for i in DIFFERENTIABLE]
-        grads = torch.ops.edgegrad.render_backward(
-            grad_outputs[0], coverage, farthest, seen, *tensors, *ctx.options, wanted
-        )
-        out: list[Tensor | None] = [None] * (len(tensors) + len(ctx.options))
+        wanted = [ctx.needs_input_grad[1 + i] for i in DIFFERENTIABLE]
+        arguments = (grad_outputs[0], coverage, farthest, seen, *tensors, *ctx.options)
+        if torch.compiler.is_compiling():  # which refuses second derivatives itself
+            grads = torch.ops.edgegrad.render_backward(*arguments, wanted)
+        else:
+            grads = _RenderBackward.apply(*arguments, *wanted)
+        out: list[Tensor | None] = [None] * (1 + len(tensors) + len(ctx.options))
         for i, want, grad in zip(DIFFERENTIABLE, wanted, grads, strict=True):
             if want:
-                out[i] = grad
+                out[1 + i] = grad
         return tuple(out)
+
+
+class _RenderEager(_Render):
+    """_Render with what torch.compile does not trace: inference tensors, and the transforms of torch.func."""
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        # A tensor that was made in torch.inference_mode() cannot be kept for later, but a copy of it can.
+        later = not torch.is_inference_mode_enabled()
+        kept = (a.clone() if later and isinstance(a, Tensor) and a.is_inference() else a for a in inputs)
+        _Render.setup_context(ctx, tuple(kept), output)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        return _one_by_one(_RenderEager, info.batch_size, in_dims, args)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        raise RuntimeError(REVERSE)
+
+
+class _RenderBackward(torch.autograd.Function):
+    """edgegrad::render_backward. A function of its own, so that whoever asks for its derivative hears that there is none:
+    once_differentiable takes it for zero where the adjoint is a constant, as it is for a loss linear in the image."""
+
+    @staticmethod
+    def forward(*args: Any) -> tuple[Tensor, ...]:
+        many = len(DIFFERENTIABLE)
+        return torch.ops.edgegrad.render_backward(*args[:-many], list(args[-many:]))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        raise RuntimeError(FIRST_ORDER)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        return _one_by_one(_RenderBackward, info.batch_size, in_dims, args)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        raise RuntimeError(FIRST_ORDER)
+
+
+def _one_by_one(
+    function: type[torch.autograd.Function], count: int, in_dims: tuple[int | None, ...], args: tuple[Any, ...]
+) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    """torch.vmap of a function with several outputs: call by call."""
+    results = [
+        function.apply(*(a if dim is None else a.select(dim, i) for a, dim in zip(args, in_dims, strict=True)))
+        for i in range(count)
+    ]
+    outputs = tuple(torch.stack(parts) for parts in zip(*results, strict=True))
+    return outputs, (0,) * len(outputs)

@@ -130,7 +130,7 @@ def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
     index = index.cpu()
     if alone:
         # A look at the extremes costs less than a copy of a million indices.
-        if index.dtype == torch.int64 and (not values_visible() or not all_below(index, 2**31)):
+        if index.dtype == torch.int64 and (not values_visible(index) or not all_below(index, 2**31)):
             index = index.clamp(-(2**31), 2**31 - 1)
     else:
         index = index.long()  # in fewer bits the sum could wrap around too

@@ -79,7 +79,7 @@ print(json.dumps({"same": first == again, "grown": max(resident) - resident[0], 
 """
 
 
-@pytest.mark.parametrize("steps", [600, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("steps", [250, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_memory_stays_and_results_repeat_over_many_steps(steps, tmp_path):
     """Twice so many steps, with the same bits at the end of each run, in 5 MB more than after the first 100."""
     found = script(STEPS, steps, timeout=1200, folder=tmp_path)

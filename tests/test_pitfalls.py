@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from finite_differences import check_ratio, gradient, loss, rotation
+from finite_differences import Estimate, check_ratio, finite_difference, gradient, right_ratio, rotation
 from scenes import cube, default_samples, front_camera, icosphere, smooth_adjoint, smooth_colors, soup
 from torch import Tensor
 
@@ -251,10 +251,17 @@ def test_loss_of_a_sparse_adjoint() -> None:
 
 
 def test_the_ratio_check_rejects() -> None:
-    camera = front_camera(48)
+    """A gradient without its boundary term, 0.95 and 1.05 times the right one, and what is too noisy to tell."""
+    case = moving(tilted_cube(), front_camera(48))
     with pytest.raises(AssertionError, match="ratio"):
-        check_ratio(moving(tilted_cube(), camera), 0.006, visibility=False)
-    assert loss(*moving(tilted_cube(), camera)(torch.zeros((), dtype=F64))).isfinite()
+        check_ratio(case, 0.006, visibility=False)
+    fd, right = finite_difference(case, 0.006, 1024, 4), gradient(case, 8, **SAMPLES)
+    assert right_ratio(fd, right)
+    for factor in (0.95, 1.05):
+        with pytest.raises(AssertionError, match="ratio"):
+            right_ratio(fd, Estimate(factor * right.mean, factor * right.error))
+    with pytest.raises(AssertionError, match="too noisy to tell"):
+        right_ratio(fd, Estimate(right.mean, 0.02 * abs(right.mean)))
 
 
 def test_vertex_in_the_eye() -> None:

@@ -25,12 +25,13 @@ from edgegrad.report.cases.measure import LIMIT, NOISY, QUICK, RAISED, RIGHT, WR
 
 stability = importlib.import_module("edgegrad.report.stability")  # the package has a function of this name
 FAST = [name for name, case in CASES.items() if not case.slow]
-LIMITS = {name for name, case in CASES.items() if case.limit}
 
 
 def check(name: str, effort: Effort) -> None:
-    row = measure.measure(CASES[name], effort)
-    assert row["verdict"] == RIGHT or (row["verdict"] == LIMIT and name in LIMITS), row
+    """Right, or a limit where one is known: what has become right is none any longer. However long it takes, or a busy machine
+    would have fewer seeds, and with more noise more is right."""
+    row = measure.measure(CASES[name], dataclasses.replace(effort, seconds=math.inf))
+    assert row["verdict"] == (LIMIT if CASES[name].limit else RIGHT), row
 
 
 @pytest.mark.parametrize("name", FAST)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 import torch
@@ -21,6 +23,8 @@ SIZE = 20
 TRIANGLE = one_triangle()
 MESH, BACKGROUND = TRIANGLE.meshes[0], TRIANGLE.background
 CAMERA = front_camera(SIZE)
+OTHER = eg.Camera.look_at((-1.2, 0.6, 3.0), (0.0, 0.0, 0.0), fov_y=40.0, size=(SIZE, SIZE)).to(F64)
+BATCH = eg.Camera.stack([CAMERA, OTHER])
 ADJOINT = smooth_adjoint(SIZE, SIZE, 3)
 
 
@@ -204,6 +208,18 @@ def test_without_gradients(mode):
     assert torch.equal(image, expected) and not image.requires_grad
 
 
+def test_with_what_was_made_in_inference_mode():
+    """Autograd keeps no such tensor, but a copy of it."""
+    with torch.inference_mode():
+        scene, camera = TRIANGLE.transformed(scale=1.0), CAMERA.to(F64, copy=True)
+        scene = scene.replace(meshes=[scene.meshes[0].replace(colors=1.0 * MESH.colors, faces=MESH.faces.int())])
+    assert scene.meshes[0].colors.is_inference() and camera.K.is_inference()
+    t = leaf(torch.zeros(3, dtype=F64))
+    mesh = scene.meshes[0].replace(verts=MESH.verts + t)
+    image = eg.render(eg.Scene(mesh, BACKGROUND), camera, 4)
+    assert torch.equal(gradients(image, [t])[0], gradients(triangle(MESH.verts + t), [t])[0])
+
+
 def test_image_requires_gradients_if_anything_does():
     assert not eg.render(TRIANGLE, CAMERA, 4).requires_grad
     assert eg.render(TRIANGLE, CAMERA.replace(K=leaf(CAMERA.K)), 4).requires_grad
@@ -252,6 +268,25 @@ def test_in_a_module_with_an_optimiser():
     assert losses[-1] < 0.3 * losses[0]
 
 
+def test_the_loop_in_the_readme(monkeypatch):
+    """Each step draws samples of its own: with one seed for all, their error would not average out."""
+    text = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    (loop,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "optimizer.step()" in block)
+    target = eg.render(MESH.transformed(t=[0.05, -0.03, 0.0]), CAMERA, 64, seed=1 << 40)
+    seeds, render = [], eg.render
+
+    def watched(*args, seed: int, **options) -> Tensor:
+        seeds.append(seed)
+        return render(*args, seed=seed, **options)
+
+    monkeypatch.setattr(eg, "render", watched)
+    names = {"torch": torch, "eg": eg, "mesh": MESH, "camera": CAMERA, "target": target}
+    exec(loop.replace("range(200)", "range(40)"), names)
+    assert len(set(seeds)) == len(seeds) == 40
+    fitted, start = (render(MESH.replace(verts=v), CAMERA, 64) for v in (names["verts"], MESH.verts))
+    assert (fitted - target).norm() < 0.6 * (start - target).norm()
+
+
 def test_twice_in_one_graph():
     verts = leaf(MESH.verts)
     mesh = MESH.replace(verts=verts)
@@ -280,38 +315,193 @@ def test_gradient_is_linear_in_the_adjoint():
     assert not torch.autograd.grad(image, verts, torch.zeros_like(ADJOINT))[0].any()
 
 
-def test_double_backward_is_refused():
+SECOND = "second derivatives of a rendered image are not available.*Gauss-Newton"
+FORWARD = "forward-mode derivatives .* of a rendered image are not available; use reverse mode"
+
+
+def triangle(verts: Tensor, camera: eg.Camera = CAMERA) -> Tensor:
+    return eg.render(eg.Scene(MESH.replace(verts=verts), BACKGROUND), camera, 4)
+
+
+def linear(verts: Tensor) -> Tensor:
+    return (triangle(verts) * ADJOINT).sum()
+
+
+def quadratic(verts: Tensor) -> Tensor:
+    return triangle(verts).square().sum()
+
+
+def first_order(loss: Callable[[Tensor], Tensor], verts: Tensor) -> Tensor:
+    """The gradient as a function of the vertices, in the graph."""
+    return torch.autograd.grad(loss(verts), verts, create_graph=True)[0]
+
+
+def gradient_penalty(loss: Callable[[Tensor], Tensor]) -> None:
     verts = leaf(MESH.verts)
-    image = eg.render(MESH.replace(verts=verts), CAMERA, 4)
-    (gradient,) = torch.autograd.grad((image * leaf(ADJOINT)).sum(), verts, create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        gradient.sum().backward()
+    (loss(verts) + first_order(loss, verts).square().sum()).backward()
+
+
+def learnt_step(loss: Callable[[Tensor], Tensor]) -> None:
+    """As in meta-learning: the loss after a step, differentiated by where the step began."""
+    verts = leaf(MESH.verts)
+    loss(verts - 0.1 * first_order(loss, verts)).backward()
+
+
+def by_the_adjoint(loss: Callable[[Tensor], Tensor]) -> None:
+    """The gradient is linear in the adjoint; that derivative is the one of forward mode."""
+    verts, weight = leaf(MESH.verts), leaf(torch.ones((), dtype=F64))
+    first_order(lambda v: weight * loss(v), verts).sum().backward()
+
+
+TWICE = {
+    "gradient penalty": gradient_penalty,
+    "learnt step": learnt_step,
+    "by the adjoint": by_the_adjoint,
+    "functional.hessian": lambda loss: torch.autograd.functional.hessian(loss, MESH.verts),
+    "functional.hessian, vectorized": lambda loss: torch.autograd.functional.hessian(loss, MESH.verts, vectorize=True),
+    "functional.hvp": lambda loss: torch.autograd.functional.hvp(loss, MESH.verts, MESH.verts),
+    "functional.vhp": lambda loss: torch.autograd.functional.vhp(loss, MESH.verts, MESH.verts),
+    "functional.jvp": lambda loss: torch.autograd.functional.jvp(
+        loss, MESH.verts, MESH.verts
+    ),  # by two backward passes
+    "grad(grad)": lambda loss: torch.func.grad(lambda v: torch.func.grad(loss)(v).sum())(MESH.verts),
+    "jacrev(grad)": lambda loss: torch.func.jacrev(torch.func.grad(loss))(MESH.verts),
+    "jacrev(jacrev)": lambda loss: torch.func.jacrev(torch.func.jacrev(loss))(MESH.verts),
+}
+
+
+@pytest.mark.parametrize("loss", [linear, quadratic])
+@pytest.mark.parametrize("way", TWICE)
+def test_second_derivatives_are_refused(way, loss):
+    """Zeros came, without a word, where the loss is linear in the image, and from some of these for any loss."""
+    with pytest.raises(RuntimeError, match=SECOND):
+        TWICE[way](loss)
+
+
+def test_a_gradient_in_the_graph_is_no_second_derivative():
+    for loss in (linear, quadratic):
+        verts, other = leaf(MESH.verts), leaf(MESH.verts)
+        assert torch.equal(first_order(loss, verts), torch.autograd.grad(loss(other), other)[0])
+
+
+def test_forward_mode_is_refused():
+    for transform in (torch.func.jacfwd, torch.func.hessian):
+        with pytest.raises(RuntimeError, match=FORWARD):
+            transform(linear)(MESH.verts)
+    with pytest.raises(RuntimeError, match=FORWARD):
+        torch.func.jvp(linear, (MESH.verts,), (MESH.verts,))
+    constant = torch.func.jacfwd(lambda x: x * triangle(MESH.verts).sum())(torch.ones(()))  # of what is not rendered
+    assert torch.equal(constant, triangle(MESH.verts).sum())
 
 
 def test_functional_gradient():
-    def loss(verts):
-        return (eg.render(MESH.replace(verts=verts), CAMERA, 4) * ADJOINT).sum()
-
     verts = leaf(MESH.verts)
-    assert torch.equal(torch.func.grad(loss)(MESH.verts), *torch.autograd.grad(loss(verts), verts))
+    assert torch.equal(torch.func.grad(linear)(MESH.verts), *torch.autograd.grad(linear(verts), verts))
 
 
-def test_change_in_place_before_backward():
-    """What a gradient needs is either still there, or its loss is noticed."""
+@pytest.mark.parametrize("jacobian", [torch.func.jacrev, None])
+def test_jacobian(jacobian):
+    """A row of it is the gradient of a pixel."""
+    small = CAMERA.resized((4, 5))
+    verts = leaf(MESH.verts)
+    image = triangle(verts, small)
+    if jacobian is None:
+        found = torch.autograd.functional.jacobian(lambda v: triangle(v, small), MESH.verts, vectorize=True)
+    else:
+        found = jacobian(lambda v: triangle(v, small))(MESH.verts)
+    assert found.shape == (4, 5, 3, 3, 3)
+    for pixel in ((1, 2, 0), (2, 3, 1)):
+        expected = torch.autograd.grad(image[pixel], verts, retain_graph=True)[0]
+        assert expected.any() and torch.equal(found[pixel], expected)
+
+
+SHIFTS = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.2], [0.0, -0.2, 0.1]], dtype=F64)
+EYES = torch.tensor([[0.0, 0.0, 4.0], [0.5, 0.2, 3.0]], dtype=F64)
+FOCAL = torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=F64))
+
+
+def textured(texture: Tensor) -> eg.Mesh:
+    return eg.Mesh(MESH.verts, MESH.faces, texture=texture, uvs=MESH.verts[:, :2], uv_faces=MESH.faces)
+
+
+def view_from(eye: Tensor, fov_y: Tensor | float = 40.0) -> eg.Camera:
+    return eg.Camera.look_at(eye, (0.0, 0.0, 0.0), fov_y=fov_y, size=(SIZE, SIZE))
+
+
+BATCHES = {
+    "verts": (triangle, MESH.verts + SHIFTS[:, None]),
+    "translation": (lambda t: eg.render(MESH.transformed(t=t), CAMERA, 4), SHIFTS),
+    "colours": (lambda c: eg.render(MESH.replace(colors=c), CAMERA, 4), MESH.colors + SHIFTS[:, None]),
+    "background": (lambda b: eg.render(eg.Scene(MESH, b), CAMERA, 4), SHIFTS),
+    "texture": (lambda t: eg.render(textured(t), CAMERA, 4), ADJOINT[:6, :6].reshape(2, 3, 6, 3)),
+    "world_to_camera": (
+        lambda m: triangle(MESH.verts, CAMERA.replace(world_to_camera=m)),
+        CAMERA.world_to_camera + torch.nn.functional.pad(SHIFTS[:, :, None], (3, 0, 0, 1)),
+    ),
+    "K": (lambda k: triangle(MESH.verts, CAMERA.replace(K=k)), CAMERA.K + SHIFTS[:, :1, None] * FOCAL),
+    "eye": (lambda e: triangle(MESH.verts, view_from(e)), EYES),
+    "fov_y": (lambda f: triangle(MESH.verts, view_from(EYES[0], f)), torch.tensor([30.0, 50.0], dtype=F64)),
+}
+
+
+@pytest.mark.parametrize("name", BATCHES)
+def test_vmap(name):
+    """Of anything, images and gradients are those of a loop; also of the other transforms within it, and around it."""
+    function, batch = BATCHES[name]
+
+    def loss(x: Tensor) -> Tensor:
+        return (function(x) * ADJOINT).sum()
+
+    assert torch.equal(torch.vmap(function)(batch), torch.stack([function(x) for x in batch]))
+    expected = torch.stack([torch.func.grad(loss)(x) for x in batch])
+    assert expected.any()
+    assert torch.equal(torch.vmap(torch.func.grad(loss))(batch), expected)
+    assert torch.equal(torch.func.grad(lambda x: torch.vmap(loss)(x).sum())(batch), expected)
+    leaves = leaf(batch)
+    torch.vmap(loss)(leaves).sum().backward()
+    assert torch.equal(leaves.grad, expected)
+
+
+def test_vmap_in_vmap_over_other_axes():
+    verts = (MESH.verts + SHIFTS[:, None])[None] * torch.tensor([1.0, 1.1], dtype=F64)[:, None, None, None]
+    images = torch.vmap(torch.vmap(triangle, in_dims=1, out_dims=2))(verts.movedim(1, 2))
+    expected = torch.stack([torch.stack([triangle(v) for v in row], 2) for row in verts])
+    assert torch.equal(images, expected)
+
+
+def test_vmap_still_refuses_what_is_not_finite():
+    verts = MESH.verts + SHIFTS[:, None]
+    verts[1, 2, 0] = torch.nan
+    with pytest.raises(ValueError, match=r"verts: expected finite numbers, got nan at \[2, 0\]"):
+        torch.vmap(triangle)(verts)
+
+
+@pytest.mark.parametrize("value", [torch.nan, -torch.inf])
+def test_an_adjoint_that_is_not_finite_is_named_at_its_place(value):
+    """That of the image as the user has it, with an axis for cameras where there is a batch of them."""
+    for camera, place in ((CAMERA, (7, 4, 1)), (eg.Camera.stack([CAMERA]), (0, 7, 4, 1)), (BATCH, (1, 7, 4, 2))):
+        image = triangle(leaf(MESH.verts), camera)
+        adjoint = torch.ones_like(image)
+        adjoint[place] = value
+        where = ", ".join(map(str, place))
+        with pytest.raises(ValueError, match=rf"the gradient of the image: .* got {value} at \[{where}\] \(1 such"):
+            image.backward(adjoint)
+
+
+def test_verts_changed_in_place_before_backward():
+    """float32 is copied into the kernel's double: the gradient is that of the image. float64 is kept itself: that is noticed."""
     for dtype in (F32, F64):
         mesh = MESH.to(dtype)
         verts = leaf(mesh.verts)
-        image = eg.render(mesh.replace(verts=verts), CAMERA, 4)
-        expected = gradients(image, [verts])[0]
+        expected = gradients(eg.render(mesh.replace(verts=verts), CAMERA, 4), [verts])
         image = eg.render(mesh.replace(verts=verts), CAMERA, 4)
         with torch.no_grad():
             verts += 0.3
-        try:
-            found = gradients(image, [verts])[0]
-        except RuntimeError as error:
-            assert "modified by an inplace operation" in str(error)
+        if dtype == F32:
+            assert same_bits(gradients(image, [verts]), expected)
         else:
-            assert torch.equal(found, expected)
+            with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+                gradients(image, [verts])
 
 
 # -- layouts and dtypes -----------------------------------------------------------------------------------------------
@@ -462,8 +652,6 @@ def test_cuda_tensors_come_back():
 
 
 # -- batches of cameras -----------------------------------------------------------------------------------------------
-
-OTHER = eg.Camera.look_at((-1.2, 0.6, 3.0), (0.0, 0.0, 0.0), fov_y=40.0, size=(SIZE, SIZE)).to(F64)
 
 
 def test_batch_of_one_is_that_camera():

@@ -27,6 +27,8 @@ ASIDE, ASIDE_STEPS = 0.2, 20  # radians between the starts on the coarsest level
 FINAL_SPP = 64  # samples a pixel when start and end are compared
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def fit_pose(
     mesh: Mesh | Scene,
     target: Tensor,
@@ -68,7 +70,8 @@ def fit_pose(
     callback    called after each step with the best fit so far
 
     KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set.
-    Raises TypeError or ValueError that names the argument, also when the object leaves no trace in the picture at the start.
+    Works in torch.no_grad() and torch.inference_mode() too. Raises TypeError or ValueError that names the argument, also when
+    the object leaves no trace in the picture at the start.
     """
     began = time.perf_counter()
     for name, count in (("max_size", max_size), ("steps", steps), ("spp", spp)):

@@ -65,7 +65,8 @@ class PoseTask:
             raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
         if camera.batch is not None:
             raise ValueError(f"camera: expected one camera, got {camera.batch}; fit one picture at a time")
-        scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu")
+        # Copies, for autograd does not keep tensors that were made in torch.inference_mode().
+        scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu", copy=True)
         picture = _image("target", target, camera.size)
         plain = all(part.channels is None for part in scene.meshes)
         C = picture.shape[-1] if plain else scene.channels
@@ -99,7 +100,7 @@ class PoseTask:
             raise ValueError("fit_focal: expected False with fit_scale and an orthographic camera, where both are one")
         free = [0, 1, 2, 3, 4] + [5] * depth + [GROW] * fit_scale + [ZOOM] * fit_focal
         return PoseTask(
-            Scene(double), picture, behind, camera.to("cpu").to(torch.float64), (low + high) / 2, size, free
+            Scene(double), picture, behind, camera.to("cpu", torch.float64, copy=True), (low + high) / 2, size, free
         )
 
     def pyramid(self, start: Pose, max_size: int, spp: int) -> list[Level]:

@@ -1,23 +1,25 @@
 """Images without sampling: exact pixel integrals, whose autograd is the exact gradient, boundary term included.
 
-For the box filter a pixel is an integral of the radiance over a square. Where the visible surface is cut into convex
-polygons, each of one face and within one pixel,
+A pixel is an integral of the radiance, weighted with the filter k around its centre q. Where the visible surface is cut
+into convex polygons, each of one face and within one cell of a grid on which k is smooth,
 
-    I_q = Σ_polygons ∫ L dx + (1 - coverage_q) background_q,      coverage_q = Σ_polygons area,
+    I_q = Σ_polygons ∫ k(x - q) L dx + (1 - coverage_q) background_q,      coverage_q = Σ_polygons ∫ k(x - q) dx,
 
-and each term is a smooth function of the corners of its polygon. Which polygons there are is combinatorics, decided
-here without derivatives; each of their corners is the intersection of two lines (edges of faces, borders of pixels), so
-its position is computed once more from the scene, with derivatives. That one expression holds both terms of the
-gradient: radiance that changes at a point, and polygons whose sides move.
+and each term is a smooth function of the corners of its polygon. For the box filter, k = 1, the cells are the pixels.
+Which polygons there are is combinatorics, decided here without derivatives; each of their corners is the intersection of
+two lines (edges of faces, borders of cells), so its position is computed once more from the scene, with derivatives. That
+one expression holds both terms of the gradient: radiance that changes at a point, and polygons whose sides move.
 
 It is right for faces that do not pass through each other, in front of a perspective camera, in general position. Edges
-and vertices that faces share are recognised, also when each face has its own copies. But where an edge lies on a pixel
+and vertices that faces share are recognised, also when each face has its own copies. But where an edge lies on a cell's
 border the image is right and has no two-sided derivative, and where edges of two occluders that share no vertex lie on
-one line before a third face, the derivative may be that of the wrong edge. Textures are not supported.
+one line before a third face, the derivative may be that of the wrong edge.
+Textures are cut into the cells in which they are bilinear, whose lines are straight in the image as well.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -33,20 +35,27 @@ from ..scene import Scene
 ON_LINE = 1e-12
 
 
-def exact_image(scene: Scene, camera: Camera, order: int = 5, visibility: bool = True) -> Tensor:
+def exact_image(scene: Scene, camera: Camera, order: int = 5, visibility: bool = True, filter: str = "box") -> Tensor:
     """Image (H, W, C) float64, differentiable in vertices, colours, background and camera.
 
-    order       of the Gauss rule that integrates the radiance over a triangle; not used where colours are constant
+    order       of the Gauss rule that integrates over a triangle; not used where colours and filter are constant
     visibility  False holds the polygons still, which leaves the gradient inside faces, as in `render`
+    filter      as in `render`
     """
-    H, W = camera.size
-    C = scene.channels
+    size, C = camera.size, scene.channels
+    # Pixel i sees the cells i … i + reach, whose middle, i + (reach + 1) / 2, is its centre.
+    reach = {"box": 0, "tent": 1, "gaussian": 2}[filter]
+    H, W = size[0] + reach, size[1] + reach
+    shift = torch.zeros_like(camera.K)
+    shift[:2, 2] = 0.5 * reach
+    camera = camera.replace(K=camera.K + shift, size=(H, W))
     view = project(scene, camera)
-    corners = torch.cat([_corner_colors(mesh, C) for mesh in scene.meshes])
-    line = torch.cat([view.edges.reshape(-1, 3), _pixel_borders(W, axis=0), _pixel_borders(H, axis=1)])
+    texel_lines, lines_of_face = _texel_lines(scene, view)
+    line = torch.cat([view.edges.reshape(-1, 3), texel_lines, _cell_borders(W, axis=0), _cell_borders(H, axis=1)])
     with torch.no_grad():
         lines = Lines(line / line[:, :2].norm(dim=1, keepdim=True), _line_ends(scene, len(line)))
-        pieces, pixel = split_by_pixels(visible_pieces(view, lines), lines, H, W)
+        pieces = split_by_texels(visible_pieces(view, lines), lines, lines_of_face)
+        pieces, cell = split_by_cells(pieces, lines, H, W)
 
     # The corners again, with derivatives: each where the side that ends there meets the side that begins there.
     before = pieces.before()
@@ -64,17 +73,34 @@ def exact_image(scene: Scene, camera: Camera, order: int = 5, visibility: bool =
     n, k = torch.nonzero(torch.arange(2, xy.shape[1]) < pieces.corners[:, None], as_tuple=True)
     triangle = torch.stack([xy[n, 0], xy[n, k + 1], xy[n, k + 2]], 1)
     area = 0.5 * _wedge(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
-    face, pixel = pieces.face[n], pixel[n]
+    face, row, column = pieces.face[n], cell[n] // W, cell[n] % W
 
-    constant = all(mesh.colors is None and mesh.corner_colors is None for mesh in scene.meshes)
-    points, weights = gauss_triangle(1 if constant else order)
-    b = _barycentrics(view.edges[face], points @ triangle)  # (T, G, 3)
-    mean = torch.einsum("g,tgi,tic->tc", weights, b, corners[face])
+    constant = all(m.colors is None and m.corner_colors is None and m.texture is None for m in scene.meshes)
+    points, weights = gauss_triangle(1 if constant and filter == "box" else order)
+    x = points @ triangle  # (T, G, 2)
+    radiance = _radiance(scene, face, _barycentrics(view.edges[face], x))  # (T, G, C)
 
-    image = torch.zeros((H * W, C), dtype=torch.float64).index_add(0, pixel, area[:, None] * mean)
-    coverage = torch.zeros(H * W, dtype=torch.float64).index_add(0, pixel, area)
+    image = torch.zeros((size[0] * size[1], C), dtype=torch.float64)
+    coverage = torch.zeros(size[0] * size[1], dtype=torch.float64)
+    for i, j in ((row - up, column - left) for up in range(reach + 1) for left in range(reach + 1)):
+        center = torch.stack([j, i], -1)[:, None] + 0.5 * (reach + 1)
+        part = area[:, None] * weights * filter_weight(filter, x - center).prod(-1)  # (T, G)
+        inside = (i >= 0) & (i < size[0]) & (j >= 0) & (j < size[1])
+        pixel = (i * size[1] + j)[inside]
+        image = image.index_add(0, pixel, torch.einsum("tg,tgc->tc", part, radiance)[inside])
+        coverage = coverage.index_add(0, pixel, part.sum(1)[inside])
     background = torch.zeros(C) if scene.background is None else scene.background
-    return image.reshape(H, W, C) + (1.0 - coverage).reshape(H, W, 1) * background.double()
+    return image.reshape(*size, C) + (1.0 - coverage).reshape(*size, 1) * background.double()
+
+
+def filter_weight(filter: str, d: Tensor) -> Tensor:
+    """k at offsets from a pixel's centre within its support, along one axis."""
+    if filter == "box":
+        return torch.ones_like(d)
+    if filter == "tent":
+        return 1.0 - d.abs()
+    sigma = 0.5
+    return torch.exp(-0.5 * (d / sigma) ** 2) / (math.erf(3.0 / math.sqrt(2.0)) * math.sqrt(2.0 * math.pi) * sigma)
 
 
 def gauss_triangle(order: int) -> tuple[Tensor, Tensor]:
@@ -118,7 +144,7 @@ def project(scene: Scene, camera: Camera) -> View:
 
 def _line_ends(scene: Scene, count: int) -> Tensor:
     """The two vertices (count, 2) that each line passes through, equal positions welded: first the edges of the faces.
-    Pixel borders pass through none, and have a negative number each instead."""
+    The other lines pass through none, and have a negative number each instead."""
     faces, first = [], 0
     for mesh in scene.meshes:
         faces.append(mesh.faces.long() + first)
@@ -130,16 +156,68 @@ def _line_ends(scene: Scene, count: int) -> Tensor:
     return torch.cat([ends, -borders[:, None].expand(-1, 2)])
 
 
-def _pixel_borders(n: int, axis: int) -> Tensor:
-    """The lines (n + 1, 3) between pixels, x = 0 … n for axis 0 or y = 0 … n for axis 1."""
+def _cell_borders(n: int, axis: int) -> Tensor:
+    """The lines (n + 1, 3) between cells, x = 0 … n for axis 0 or y = 0 … n for axis 1."""
     lines = torch.zeros((n + 1, 3), dtype=torch.float64)
     lines[:, axis], lines[:, 2] = 1.0, -torch.arange(n + 1)
     return lines
 
 
+def _texel_corners(mesh: Mesh) -> Tensor:
+    """Columns and rows (F, 3, 2) of a texture where the corners of its faces lie; whole numbers are the middles of texels."""
+    assert mesh.uvs is not None and mesh.uv_faces is not None and mesh.texture is not None
+    h, w = mesh.texture.shape[:2]
+    u, v = mesh.uvs.double().unbind(-1)
+    return torch.stack([u * w - 0.5, (1.0 - v) * h - 0.5], -1)[mesh.uv_faces.long()]
+
+
+def _texel_lines(scene: Scene, view: View) -> tuple[Tensor, Tensor]:
+    """Lines (N, 3) through the middles of texels, between which a texture is bilinear, and which of all lines they are for each
+    face (F, M), padded with -1."""
+    lines, table, first = [], torch.full((len(view.P), 0), -1), 0
+    for mesh in scene.meshes:
+        if mesh.texture is not None:
+            for f, corners in enumerate(_texel_corners(mesh), first):
+                low, high = (
+                    corners.detach().amin(0).ceil().int().tolist(),
+                    corners.detach().amax(0).floor().int().tolist(),
+                )
+                offsets = [corners[:, a] - k for a in range(2) for k in range(low[a], high[a] + 1)]
+                # At a point the values of the edges are in proportion to barycentrics: a·x + b·y + c = Σ edge · offset.
+                lines += [(view.edges[f] * offset[:, None]).sum(0) for offset in offsets]
+                table = torch.nn.functional.pad(table, (0, max(0, len(offsets) - table.shape[1])), value=-1)
+                table[f, : len(offsets)] = 3 * len(view.P) + len(lines) - len(offsets) + torch.arange(len(offsets))
+        first += len(mesh.faces)
+    return torch.stack(lines) if lines else torch.zeros((0, 3), dtype=torch.float64), table
+
+
+def _radiance(scene: Scene, face: Tensor, b: Tensor) -> Tensor:
+    """Radiance (T, G, C) at the barycentrics b (T, G, 3) in the faces (T,); the points of one row lie between the same texels."""
+    C = scene.channels
+    corners = torch.cat([_corner_colors(mesh, C) for mesh in scene.meshes])
+    radiance = torch.einsum("tgi,tic->tgc", b, corners[face])
+    first = 0
+    for mesh in scene.meshes:
+        rows = torch.nonzero((face >= first) & (face < first + len(mesh.faces)))[:, 0]
+        if mesh.texture is not None and len(rows):
+            place = b[rows] @ _texel_corners(mesh)[face[rows] - first]  # (T', G, 2)
+            cell = place.detach().mean(1).floor()
+            x, y = (place - cell[:, None]).unbind(-1)
+            h, w = mesh.texture.shape[:2]
+            total = torch.zeros((), dtype=torch.float64)
+            for i, weight_y in ((0, 1.0 - y), (1, y)):
+                for j, weight_x in ((0, 1.0 - x), (1, x)):
+                    texel = mesh.texture.double()[(cell[:, 1].long() + i) % h, (cell[:, 0].long() + j) % w]
+                    total = total + (weight_y * weight_x)[..., None] * texel[:, None]
+            radiance = radiance.index_put((rows,), total)
+        first += len(mesh.faces)
+    return radiance
+
+
 def _corner_colors(mesh: Mesh, channels: int) -> Tensor:
-    """(F, 3, C), whatever kind of colours the mesh has."""
-    assert mesh.texture is None, "exact_image: textures are not supported"
+    """(F, 3, C), whatever kind of colours the mesh has; zero for a texture."""
+    if mesh.texture is not None:
+        return torch.zeros((len(mesh.faces), 3, channels), dtype=torch.float64)
     if mesh.colors is not None:
         return mesh.colors.double()[mesh.faces.long()]
     if mesh.corner_colors is not None:
@@ -163,7 +241,7 @@ def _wedge(a: Tensor, b: Tensor) -> Tensor:
 
 
 class Lines(NamedTuple):
-    """L lines: edge i of face f is number 3 f + i; then come the borders of pixels, across and down."""
+    """L lines: edge i of face f is number 3 f + i; then come those of texels, and the borders of cells, across and down."""
 
     unit: Tensor  # (L, 3) (a, b, c) with a² + b² = 1, so that a·x + b·y + c is a distance in pixels
     ends: Tensor  # (L, 2) the vertices it passes through
@@ -275,8 +353,17 @@ def visible_pieces(view: View, lines: Lines) -> Polygons:
     return pieces
 
 
-def split_by_pixels(pieces: Polygons, lines: Lines, H: int, W: int) -> tuple[Polygons, Tensor]:
-    """The pieces cut along the borders of pixels, without what lies outside the image, and their pixels y · W + x."""
+def split_by_texels(pieces: Polygons, lines: Lines, lines_of_face: Tensor) -> Polygons:
+    """The pieces cut along lines of their own faces (F, M), padded with -1."""
+    for column in lines_of_face.T:
+        line = column[pieces.face]
+        whole, cut, line = pieces.take(line < 0), pieces.take(line >= 0), line[line >= 0]
+        pieces = _join([whole, cut.cut(lines, line), cut.cut(lines, line, -1)])
+    return pieces
+
+
+def split_by_cells(pieces: Polygons, lines: Lines, H: int, W: int) -> tuple[Polygons, Tensor]:
+    """The pieces cut along the borders of cells, without what lies outside of them all, and their cells y · W + x."""
     index = []
     first = len(lines.unit) - (W + 1) - (H + 1)  # line of the first border
     for axis, n in ((0, W), (1, H)):

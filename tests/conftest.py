@@ -1,0 +1,42 @@
+"""How tests run: on one thread each, for several run at a time, and within a budget of processor time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+torch.set_num_threads(1)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--budget", type=float, help="seconds of processor time that a test may take if it is not slow")
+
+
+def processor_time() -> float:
+    """Seconds of this process, and of the children it waited for. Those on the clock would depend on what else runs."""
+    return sum(os.times()[:4])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    began = processor_time()
+    yield
+    taken, budget = processor_time() - began, item.config.getoption("budget")
+    item.user_properties.append(("processor time", taken))
+    if budget is not None and taken > budget and item.get_closest_marker("slow") is None:
+        pytest.fail(
+            f"took {taken:.1f} s of processor time, may take {budget:g} s; make it shorter, or mark it slow", False
+        )
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """The tests that took most, so that one sees what to make shorter."""
+    reports = terminalreporter.stats.get("passed", [])
+    times = {r.nodeid: dict(r.user_properties).get("processor time", 0.0) for r in reports if r.when == "call"}
+    if terminalreporter.config.getoption("budget") is not None and times:
+        terminalreporter.section(f"{sum(times.values()):.0f} s of processor time")
+        for name in sorted(times, key=times.__getitem__, reverse=True)[:10]:
+            terminalreporter.line(f"{times[name]:6.1f} s  {name}")
