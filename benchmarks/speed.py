@@ -26,9 +26,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import edgegrad as eg  # before torch, for it says how threads wait
-
-# isort: split
 import numpy as np
 import torch
 from common import Kernel, Step, single, sphere
@@ -36,6 +33,7 @@ from scenes import cube, front_camera, icosphere, smooth_adjoint, smooth_colors
 from torch import Tensor
 from tqdm import tqdm
 
+import edgegrad as eg
 from edgegrad._kernel import core
 from edgegrad.report import build, mitsuba
 
@@ -513,7 +511,6 @@ def settings(quick: bool) -> dict[str, Any]:
     return {
         "date": time.strftime("%Y-%m-%d %H:%M:%S"), "quick": quick, "threads": torch.get_num_threads(),
         "cores": os.cpu_count(), "load": os.getloadavg()[0], "system": platform.platform(),
-        "wait_policy": os.environ["OMP_WAIT_POLICY"], "spin_count": os.environ.get("GOMP_SPINCOUNT"),
         "python": platform.python_version(), "torch": torch.__version__,
         "edgegrad": eg.__version__, "mitsuba": mitsuba.available(),
         "kernel": hashlib.sha256(Path(core.__file__).read_bytes()).hexdigest()[:12],

@@ -13,7 +13,8 @@ Geometry::Geometry(const int32_t* faces, int64_t n_faces, int64_t n_verts)
 namespace {
 
 std::mutex mutex;
-std::list<std::shared_ptr<Geometry>> kept;  // the most recently used first
+// The most recently used first. Never destroyed: another thread may render while the process ends.
+std::list<std::shared_ptr<Geometry>>& kept = *new std::list<std::shared_ptr<Geometry>>;
 constexpr size_t most_kept = 8;
 
 template <class T>

@@ -1,30 +1,33 @@
+// Threads of our own, not OpenMP's. How those wait is fixed when torch loads them: by default they spin for milliseconds,
+// and a loop ends when all of them had a processor, work or no work. Beside a busy process a step took 10 times as long.
 #include "parallel.h"
 
 #include <condition_variable>
 #include <system_error>
-#include <vector>
 
-#if defined(_M_X64) || defined(__x86_64__)
+#if defined(__x86_64__) || defined(_M_X64)
 #include <immintrin.h>
+#endif
+#ifdef __linux__
+#include <dlfcn.h>
 #endif
 
 namespace edgegrad {
 
 namespace {
 
-// Long enough for a worker to be there for the next loop of the same pass, and short beside the slice of time that it
-// would take from another thread on a busy machine.
+// Long enough to be there for the next loop of the same pass; short beside what other processes would miss.
 constexpr std::chrono::microseconds spin_time(100);
 constexpr std::chrono::milliseconds asking_time(50);
 
-// Whether `ready` came true within the time of spinning.
+// Waits a little without sleep: whether `ready` came true.
 template <class Ready>
 bool spin(Ready ready) {
     const auto end = std::chrono::steady_clock::now() + spin_time;
     do {
         for (int k = 0; k < 16; ++k) {
             if (ready()) return true;
-#if defined(_M_X64) || defined(__x86_64__)
+#if defined(__x86_64__) || defined(_M_X64)
             _mm_pause();
 #else
             std::this_thread::yield();
@@ -34,35 +37,36 @@ bool spin(Ready ready) {
     return false;
 }
 
-// Items that threads take one by one. The call waits for the items that were taken, not for threads: a worker that
-// joined and then got no processor holds up nobody, and finds later that nothing is left.
+// A loop whose items are taken one by one. The caller waits for items that were taken, not for threads: a worker that
+// joined and then got no processor holds up nobody, and later finds that nothing is left.
 class Job {
    public:
-    Job(int64_t n, int places, const ItemBody& body) : places_(places), n_(n), body_(body) {}
+    Job(int64_t n, int places, const ItemBody& body) : places(places), n_(n), body_(body) {}
 
-    // Takes items until none is left. `body_` lives as long as one is not done.
+    // Takes items until none is left. What belongs to the caller is touched only while one is not done.
     void work(int thread) {
         for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < n_;) {
             body_(thread, i);
-            if (done_.fetch_add(1, std::memory_order_acq_rel) + 1 < n_ || thread == 0) continue;
+            const bool last = done_.fetch_add(1, std::memory_order_release) + 1 == n_;
+            if (!last || thread == 0) continue;
             const std::lock_guard lock(mutex_);
             finished_.notify_one();
         }
     }
 
     void wait(const std::function<void()>& waiting) {
-        const auto done = [this] { return done_.load(std::memory_order_acquire) == n_; };
-        if (spin(done)) return;
+        const auto finished = [this] { return done_.load(std::memory_order_acquire) == n_; };
+        if (spin(finished)) return;
         std::unique_lock lock(mutex_);
-        while (!finished_.wait_for(lock, asking_time, done)) {
+        while (!finished_.wait_for(lock, asking_time, finished)) {
             lock.unlock();
             waiting();
             lock.lock();
         }
     }
 
-    // Of workers, which are threads 1, 2, …; guarded by the pool's mutex.
-    int places_, joined_ = 0;
+    // Workers that may still join and that did: threads 1, 2, … Guarded by the mutex of the pool.
+    int places, joined = 0;
 
    private:
     const int64_t n_;
@@ -72,44 +76,43 @@ class Job {
     std::condition_variable finished_;
 };
 
-// The workers, as many as any call asked for beside its own thread. All calls share them.
+// The workers: as many as a call asked for beside its own thread. Calls at the same time share them.
 class Pool {
    public:
     void add(const std::shared_ptr<Job>& job) {
         int wake;
         {
-            const std::lock_guard lock(mutex_);
-            start_workers(job->places_);
+            const std::lock_guard guard(mutex_);
+            start_workers(job->places);
             jobs_.push_back(job);
-            places_ += job->places_;
+            places_ += job->places;
             wake = std::min(sleeping_, places_ - spinning_);
         }
         for (; wake > 0; --wake) wake_.notify_one();
     }
 
-    // No worker joins from now on.
-    void remove(const Job* job) {
-        const std::lock_guard lock(mutex_);
-        remove_locked(job);
+    // No worker joins it from now on.
+    void remove(const Job& job) {
+        const std::lock_guard guard(mutex_);
+        drop(job);
     }
 
-    std::mutex mutex_;  // held around fork()
+    void lock() { mutex_.lock(); }
+    void unlock() { mutex_.unlock(); }
 
    private:
     void start_workers(int n) {
         try {
             for (; workers_ < n; ++workers_) std::thread([this] { run(); }).detach();
-        } catch (const std::system_error&) {  // no more threads to be had: those that are there do all
+        } catch (const std::system_error&) {  // the system gives no more: those that there are do the work
         }
     }
 
-    void remove_locked(const Job* job) {
-        for (auto it = jobs_.begin(); it != jobs_.end(); ++it)
-            if (it->get() == job) {
-                places_ -= job->places_;
-                jobs_.erase(it);
-                return;
-            }
+    void drop(const Job& job) {
+        const auto found = std::find_if(jobs_.begin(), jobs_.end(), [&](const auto& j) { return j.get() == &job; });
+        if (found == jobs_.end()) return;
+        places_ -= job.places;
+        jobs_.erase(found);
     }
 
     void run() {
@@ -117,13 +120,13 @@ class Pool {
         for (;;) {
             if (!jobs_.empty()) {
                 const std::shared_ptr<Job> job = jobs_.front();
-                const int thread = ++job->joined_;
+                const int thread = ++job->joined;
                 --places_;
-                if (--job->places_ == 0) remove_locked(job.get());
+                if (--job->places == 0) drop(*job);
                 lock.unlock();
                 job->work(thread);
                 lock.lock();
-                remove_locked(job.get());  // nothing is left of it
+                drop(*job);  // nothing is left of it
                 continue;
             }
             ++spinning_;
@@ -131,15 +134,15 @@ class Pool {
             spin([this] { return places_.load(std::memory_order_relaxed) > 0; });
             lock.lock();
             --spinning_;
-            if (!jobs_.empty()) continue;
             ++sleeping_;
             wake_.wait(lock, [this] { return !jobs_.empty(); });
             --sleeping_;
         }
     }
 
+    std::mutex mutex_;
     std::condition_variable wake_;
-    std::vector<std::shared_ptr<Job>> jobs_;  // with places, the oldest first
+    std::vector<std::shared_ptr<Job>> jobs_;  // those with places, the oldest first
     std::atomic<int> places_{0};              // of all of them
     int workers_ = 0, spinning_ = 0, sleeping_ = 0;
 };
@@ -153,15 +156,24 @@ void share(int64_t n, int threads, const ItemBody& body, const std::function<voi
     const auto job = std::make_shared<Job>(n, threads - 1, body);
     pool->add(job);
     job->work(0);
-    pool->remove(job.get());
+    pool->remove(*job);
     job->wait(waiting);
 }
 
-void before_fork_of_workers() { pool->mutex_.lock(); }
+void before_fork_of_workers() {
+#ifdef __linux__
+    // Torch's own too: in the child GNU's OpenMP would wait for the threads that the parent's had. It starts new ones
+    // where there are none.
+    constexpr int omp_pause_hard = 2;
+    if (void* pause = dlsym(RTLD_DEFAULT, "omp_pause_resource_all"))
+        reinterpret_cast<int (*)(int)>(pause)(omp_pause_hard);
+#endif
+    pool->lock();
+}
 
 void after_fork_of_workers(bool child) {
-    if (child) pool = new Pool;  // without workers; the old one is as they left it
-    else pool->mutex_.unlock();
+    if (child) pool = new Pool;  // the old one is as its threads left it, and may be locked for ever
+    else pool->unlock();
 }
 
 }  // namespace edgegrad
