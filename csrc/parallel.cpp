@@ -147,6 +147,27 @@ class Pool {
     int workers_ = 0, spinning_ = 0, sleeping_ = 0;
 };
 
+// Lets torch's threads sleep while they wait. Those of GNU's OpenMP spin for milliseconds between torch's operators, and
+// so take processors from our workers, from other processes and from each other; but only for microseconds where the
+// process has more of them than processors. So one thread makes as many as there are processors, which sleep for good.
+bool calm_openmp() {
+#ifdef __linux__
+    using Parallel = void (*)(void (*)(void*), void*, unsigned, unsigned);
+    const auto parallel = reinterpret_cast<Parallel>(dlsym(RTLD_DEFAULT, "GOMP_parallel"));
+    if (!parallel || dlsym(RTLD_DEFAULT, "__kmpc_fork_call")) return false;  // not GNU's
+    try {
+        std::thread([parallel] {
+            parallel([](void*) {}, nullptr, std::max(2u, std::thread::hardware_concurrency()), 0);
+            for (;;) std::this_thread::sleep_for(std::chrono::hours(1));
+        }).detach();
+    } catch (const std::system_error&) {
+    }
+#endif
+    return true;
+}
+
+[[maybe_unused]] const bool calm = calm_openmp();
+
 // Never destroyed: workers wait in it until the process is gone.
 Pool* pool = new Pool;
 

@@ -217,26 +217,6 @@ def test_workers_that_wait_sleep(tmp_path):
     assert script(WAITING, folder=tmp_path) > 0, "no worker did anything"
 
 
-EXIT = """
-def render_for_ever():
-    k = 0
-    while True:
-        k += 1
-        step(k)
-
-torch.set_num_threads(4)
-for _ in range(2):
-    threading.Thread(target=render_for_ever, daemon=True).start()
-time.sleep(0.3 + 0.01 * int(sys.argv[1]))
-print(json.dumps("end"))
-"""
-
-
-@pytest.mark.parametrize("turn", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 30))])
-def test_a_process_ends_while_threads_render(turn, tmp_path):
-    assert script(EXIT, turn, timeout=60, folder=tmp_path) == "end"
-
-
 # -- processes --------------------------------------------------------------------------------------------------------
 
 # Each child has a time limit of its own, far above what it needs: what it guards against is waiting for ever.
