@@ -1,5 +1,6 @@
-// Threads of our own, not OpenMP's. How those wait is fixed when torch loads them: by default they spin for milliseconds,
-// and a loop ends when all of them had a processor, work or no work. Beside a busy process a step took 10 times as long.
+// Threads of our own, not OpenMP's. How those wait is fixed when torch loads them: by default they spin for
+// milliseconds, and a loop ends when all of them had a processor, work or no work. Beside a busy process a step took 10
+// times as long.
 #include "parallel.h"
 
 #include <condition_variable>
@@ -147,9 +148,10 @@ class Pool {
     int workers_ = 0, spinning_ = 0, sleeping_ = 0;
 };
 
-// Lets torch's threads sleep while they wait. Those of GNU's OpenMP spin for milliseconds between torch's operators, and
-// so take processors from our workers, from other processes and from each other; but only for microseconds where the
-// process has more of them than processors. So one thread makes as many as there are processors, which sleep for good.
+// Lets torch's threads sleep while they wait. Those of GNU's OpenMP spin for milliseconds between torch's operators,
+// and so take processors from our workers, from other processes and from each other; but only for microseconds where
+// the process has more of them than processors. So one thread makes as many as there are processors, which sleep for
+// good.
 bool calm_openmp() {
 #ifdef __linux__
     using Parallel = void (*)(void (*)(void*), void*, unsigned, unsigned);

@@ -26,8 +26,9 @@ struct Interrupted : std::exception {
 // One item of a loop: body(thread, i), where the calling thread is thread 0.
 using ItemBody = std::function<void(int, int64_t)>;
 
-// Calls body(thread, i) once for each i = 0 … n − 1, in no order, on the calling thread and up to `threads` − 1 workers.
-// While the calling thread waits for what the others took, it calls waiting() 20 times a second. Neither may throw.
+// Calls body(thread, i) once for each i = 0 … n − 1, in no order, on the calling thread and up to `threads` − 1
+// workers. While the calling thread waits for what the others took, it calls waiting() 20 times a second. Neither may
+// throw.
 void share(int64_t n, int threads, const ItemBody& body, const std::function<void()>& waiting);
 
 // To be called around fork(), in whose child there are no workers; they are started anew.
