@@ -1,4 +1,5 @@
-"""What needs a process of its own; speed.py starts it:  python fresh.py import | first cube | first sphere | memory"""
+"""What needs a process of its own; speed.py starts it:
+python fresh.py import | first cube | first sphere | steps edgegrad | steps torch | memory"""
 
 from __future__ import annotations
 
@@ -48,6 +49,36 @@ def first_render(name: str) -> dict[str, float]:
     return {"first": first, "moved": moved, "same": statistics.median(render(9e-3) for _ in range(9))}
 
 
+def steps(first: str, repeats: int = 50) -> dict[str, float]:
+    """Median and 90 % quantile of the seconds of a step as users write it, by what was imported first."""
+    if first == "edgegrad":
+        import edgegrad as eg
+
+        # isort: split
+        import torch
+    else:
+        import torch
+
+        # isort: split
+        import edgegrad as eg
+    from common import sphere
+
+    mesh, camera, _ = sphere(256)
+    target = eg.render(mesh.replace(verts=mesh.verts * 1.05), camera)
+    verts = mesh.verts.clone().requires_grad_()
+    optimizer = torch.optim.Adam([verts], lr=1e-5)
+    seconds = []
+    for k in range(repeats + 3):
+        begin = time.perf_counter()
+        optimizer.zero_grad()
+        image = eg.render(mesh.replace(verts=verts), camera, seed=k)
+        ((image - target).square().mean() + 1e-3 * (image[1:] - image[:-1]).abs().mean()).backward()
+        optimizer.step()
+        seconds.append(time.perf_counter() - begin)
+    seconds = sorted(seconds[3:])
+    return {"median": statistics.median(seconds), "slow": seconds[int(0.9 * repeats)]}
+
+
 def memory(height: int = 1080, width: int = 1920, spp: int = 64) -> dict[str, float]:
     """Bytes of the peak of an image and its gradients (vertices and colours) above scene, image, adjoint and gradients."""
     from common import single, sphere
@@ -81,4 +112,4 @@ def _status(key: str) -> int:
 
 if __name__ == "__main__":
     what, *rest = sys.argv[1:]
-    print(json.dumps({"import": import_seconds, "first": first_render, "memory": memory}[what](*rest)))
+    print(json.dumps({"import": import_seconds, "first": first_render, "steps": steps, "memory": memory}[what](*rest)))

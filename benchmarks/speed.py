@@ -24,23 +24,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import edgegrad as eg  # before torch, for it says how threads wait
-
-# isort: split
 import numpy as np
 import torch
 from common import Converged, Kernel, Step, single, sphere
 from torch import Tensor
 from tqdm import tqdm
 
+import edgegrad as eg
 from edgegrad._kernel import core
 from edgegrad.report import build, mitsuba
 from edgegrad.report.methods import default_samples, differentiate
 from edgegrad.report.scenes import ReportScene, cube, front_camera, smooth_adjoint, smooth_colors
 from edgegrad.report.scenes import sphere as icosphere
 
+Value = TypeVar("Value")
 Run = Callable[[float, int], tuple[Tensor, float]]  # (budget, seed) → gradient (V, 3), seconds
 FACTORS = tuple(2.0**k for k in range(-6, 7))  # times edgegrad's default samples
 SPP = tuple(4.0**k for k in range(6))
@@ -101,15 +100,15 @@ class Bench:
     def repeats(self, n: int) -> int:
         return max(3, n // 4) if self.quick else n
 
-    def interleaved(self, repeats: int, *sides: Callable[[], float]) -> list[list[float]]:
+    def interleaved(self, repeats: int, *sides: Callable[[], Value]) -> list[list[Value]]:
         """What each side returns, its seconds, in turns: A B A B …; the first turn is not counted."""
         n = self.repeats(repeats)
-        found: list[list[float]] = [[] for _ in sides]
+        found: list[list[Value]] = [[] for _ in sides]
         for turn in range(n + 1):
             self.bar.set_postfix_str(f"{turn} of {n}")
-            for side, seconds in zip(sides, found, strict=True):
-                seconds.append(side())
-        return [seconds[1:] for seconds in found]
+            for side, values in zip(sides, found, strict=True):
+                values.append(side())
+        return [values[1:] for values in found]
 
 
 def median_row(what: str, values: Sequence[float], **rest: Any) -> Row:
@@ -272,6 +271,23 @@ def fresh(*arguments: str) -> dict[str, float]:
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)} failed:\n{done.stderr}")
     return json.loads(done.stdout)
+
+
+def order(bench: Bench) -> list[Row]:
+    """A step where torch was imported first, over one where edgegrad was: alone, and beside two busy processes."""
+    rows = []
+    for load in (0, 2):
+        busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(load)]
+        try:
+            ours, theirs = bench.interleaved(4, lambda: fresh("steps", "edgegrad"), lambda: fresh("steps", "torch"))
+        finally:
+            for process in busy:
+                process.kill()
+        for key, name in (("median", "median"), ("slow", "90 % quantile")):
+            first, second = ([run[key] for run in side] for side in (ours, theirs))
+            what = f"a step, torch imported first over edgegrad first, {name}" + (", machine busy" if load else "")
+            rows.append(ratio_row(what, second, first, note=f"{milliseconds(second)} over {milliseconds(first)}"))
+    return rows
 
 
 def bits(bench: Bench) -> list[Row]:
@@ -568,6 +584,7 @@ ROWS: dict[str, Callable[[Bench], list[Row]]] = {
     "threads": threads,
     "memory": memory,
     "start": start,
+    "order": order,
     "bits": bits,
     "textures": textures,
     "sparse": sparse,
@@ -586,7 +603,6 @@ def settings(quick: bool) -> dict[str, Any]:
     return {
         "date": time.strftime("%Y-%m-%d %H:%M:%S"), "quick": quick, "threads": torch.get_num_threads(),
         "cores": os.cpu_count(), "load": os.getloadavg()[0], "system": platform.platform(),
-        "wait_policy": os.environ["OMP_WAIT_POLICY"], "spin_count": os.environ.get("GOMP_SPINCOUNT"),
         "python": platform.python_version(), "torch": torch.__version__,
         "edgegrad": eg.__version__, "mitsuba": mitsuba.available(),
         "kernel": kernel_hash(),

@@ -8,6 +8,7 @@
 #include <nanobind/stl/string.h>
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstdio>
 #include <limits>
@@ -46,13 +47,15 @@ std::string text(double number) {
     return out;
 }
 
-// Looks at blocks of numbers, in parallel where threads save more than they cost: whether all pass.
+// Looks at blocks of numbers, on several threads where these save more than they cost: whether all pass.
 template <class T, class Pass>
-bool all_pass(const T* values, int64_t n, Pass pass) {
-    constexpr int64_t block = 4096, parallel_from = 1 << 18;
-    bool all = true;
-#pragma omp parallel for reduction(&& : all) if (n > parallel_from)
-    for (int64_t k = 0; k < n; k += block) all = all && pass(values + k, std::min(block, n - k));
+bool all_pass(const T* values, int64_t n, int threads, Pass pass) {
+    constexpr int64_t block = 1 << 16, parallel_from = 1 << 18;
+    if (n <= parallel_from) return pass(values, n);
+    std::atomic<bool> all{true};
+    Team(threads).each((n + block - 1) / block, [&](int64_t k) {
+        if (all && !pass(values + k * block, std::min(block, n - k * block))) all = false;
+    });
     return all;
 }
 
@@ -74,8 +77,8 @@ EDGEGRAD_VECTORIZED bool are_finite(const T* values, int64_t n) {
 }
 
 template <class T>
-void check_finite(const char* name, const T* values, int64_t n, int64_t width) {
-    if (all_pass(values, n, are_finite<T>)) return;
+void check_finite(const char* name, const T* values, int64_t n, int64_t width, int threads) {
+    if (all_pass(values, n, threads, are_finite<T>)) return;
     for (int64_t i = 0; i < n; ++i)
         if (!(std::fabs(values[i]) <= largest<T>))
             refuse(std::string(name) + ": expected " +
@@ -93,19 +96,20 @@ EDGEGRAD_VECTORIZED bool are_below(const T* values, int64_t n, T count) {
 }
 
 template <class T>
-bool all_below(nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu> array, T count) {
-    return all_pass(array.data(), array.size(), [=](const T* v, int64_t n) { return are_below(v, n, count); });
+bool all_below(nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu> array, T count, int threads) {
+    return all_pass(array.data(), array.size(), threads, [=](const T* v, int64_t n) { return are_below(v, n, count); });
 }
 
 template <class T>
-bool all_finite(nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu> array) {
-    return all_pass(array.data(), array.size(), are_finite<T>);
+bool all_finite(nb::ndarray<const T, nb::numpy, nb::c_contig, nb::device::cpu> array, int threads) {
+    return all_pass(array.data(), array.size(), threads, are_finite<T>);
 }
 
 // `n` indices, in rows of three, of which the first is number `first`.
-void check_indices(const char* name, const int32_t* values, int64_t n, int64_t count, const char* of,
+void check_indices(const char* name, const int32_t* values, int64_t n, int64_t count, const char* of, int threads,
                    int64_t first = 0) {
-    if (all_pass(values, n, [=](const int32_t* v, int64_t m) { return are_below(v, m, int32_t(count)); })) return;
+    if (all_pass(values, n, threads, [=](const int32_t* v, int64_t m) { return are_below(v, m, int32_t(count)); }))
+        return;
     for (int64_t i = 0; i < n; ++i)
         if (values[i] < 0 || values[i] >= count)
             refuse(std::string(name) + ": expected indices from 0 to " + std::to_string(count - 1) + " (rows of " + of +
@@ -127,7 +131,7 @@ struct SceneArrays {
 
     SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int32_t, 2> corners_, In<T, 2> colors_,
                 In<double, 2> uvs_, In<T, 2> texels_, In<int64_t, 2> textures_, In<int32_t, 1> face_texture_,
-                In<T, 3> background_, double spacing_)
+                In<T, 3> background_, double spacing_, int threads)
         : verts(verts_),
           faces(faces_),
           corners(corners_),
@@ -149,17 +153,17 @@ struct SceneArrays {
         width("textures", textures.shape(1), 3);
         if (corners.shape(0) != faces.shape(0)) refuse("corners: expected one row a face");
         if (faces.shape(0) == 0 || verts.shape(0) == 0) refuse("faces: expected at least one face, got none");
-        check_finite("verts", verts.data(), verts.size(), 3);
-        check_finite("colors", colors.data(), colors.size(), C);
-        check_finite("uvs", uvs.data(), uvs.size(), 2);
-        check_finite("texture", texels.data(), texels.size(), C);
-        check_finite("background", background.data(), background.size(), C);
-        check_indices("faces", faces.data(), faces.size(), verts.shape(0), "verts");
+        check_finite("verts", verts.data(), verts.size(), 3, threads);
+        check_finite("colors", colors.data(), colors.size(), C, threads);
+        check_finite("uvs", uvs.data(), uvs.size(), 2, threads);
+        check_finite("texture", texels.data(), texels.size(), C, threads);
+        check_finite("background", background.data(), background.size(), C, threads);
+        check_indices("faces", faces.data(), faces.size(), verts.shape(0), "verts", threads);
         const bool textured = textures.shape(0) > 0;
         if (!textured) {
             // Colours of vertices are indexed by the faces.
             if (corners.data() == faces.data() && colors.shape(0) >= verts.shape(0)) return;
-            check_indices("colors", corners.data(), corners.size(), colors.shape(0), "colors");
+            check_indices("colors", corners.data(), corners.size(), colors.shape(0), "colors", threads);
             return;
         }
         if (face_texture.shape(0) != faces.shape(0)) refuse("face_texture: expected one number a face");
@@ -173,7 +177,7 @@ struct SceneArrays {
                 refuse("face_texture: expected a texture's number, got " + std::to_string(face_texture(f)));
             const bool t = face_texture(f) >= 0;
             check_indices(t ? "uv_faces" : "colors", corners.data() + 3 * f, 3, t ? uvs.shape(0) : colors.shape(0),
-                          t ? "uvs" : "colors", 3 * f);
+                          t ? "uvs" : "colors", 1, 3 * f);
         }
     }
 
@@ -208,8 +212,8 @@ Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, bool perspect
     if (world_to_camera.shape(0) != 4 || world_to_camera.shape(1) != 4)
         refuse("world_to_camera: expected shape (4, 4)");
     if (K.shape(0) != 3 || K.shape(1) != 3) refuse("K: expected shape (3, 3)");
-    check_finite("world_to_camera", world_to_camera.data(), 16, 4);
-    check_finite("K", K.data(), 9, 3);
+    check_finite("world_to_camera", world_to_camera.data(), 16, 4, 1);
+    check_finite("K", K.data(), 9, 3, 1);
     const Camera camera(world_to_camera.data(), K.data(), perspective, width, height);
     if (camera.k_det == 0) refuse("K: expected focal lengths that are not zero, got a singular matrix");
     return camera;
@@ -302,7 +306,7 @@ Profile backward(const SceneArrays<T>& scene, const Camera& camera, int spp, int
     check_background(scene, camera);
     check_image("adjoint", adjoint, camera, scene.background.shape(2));
     check_forward_output(scene, camera, coverage, farthest, seen);
-    check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2));
+    check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2), threads);
     const auto data = [](auto& array, const auto& like, const char* name) -> double* {
         if (!array) return nullptr;
         if (array->size() != like.size()) refuse(std::string("gradient of ") + name + ": expected the size of " + name);
@@ -360,10 +364,10 @@ void bind_scene(nb::module_& m, const char* name) {
     using Scene = SceneArrays<T>;
     nb::class_<Scene>(m, name)
         .def(nb::init<In<double, 2>, In<int32_t, 2>, In<int32_t, 2>, In<T, 2>, In<double, 2>, In<T, 2>, In<int64_t, 2>,
-                      In<int32_t, 1>, In<T, 3>, double>(),
+                      In<int32_t, 1>, In<T, 3>, double, int>(),
              "verts"_a.noconvert(), "faces"_a.noconvert(), "corners"_a.noconvert(), "colors"_a.noconvert(),
              "uvs"_a.noconvert(), "texels"_a.noconvert(), "textures"_a.noconvert(), "face_texture"_a.noconvert(),
-             "background"_a.noconvert(), "spacing"_a)
+             "background"_a.noconvert(), "spacing"_a, "threads"_a)
         .def("forward", &forward<T>, "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a, "image"_a.noconvert(),
              "coverage"_a.noconvert(), "farthest"_a.noconvert(), "seen"_a.noconvert())
         .def(
@@ -406,7 +410,7 @@ void bind_scene(nb::module_& m, const char* name) {
             "shade_at",
             [](const Scene& scene, const Camera& camera, In<int32_t, 1> faces, In<double, 2> points,
                Out<double, 2> radiance) {
-                check_indices("faces", faces.data(), faces.size(), scene.faces.shape(0), "faces");
+                check_indices("faces", faces.data(), faces.size(), scene.faces.shape(0), "faces", 1);
                 shade_at(scene.view(), camera, faces.size(), faces.data(), points.data(), radiance.data());
             },
             "camera"_a, "faces"_a.noconvert(), "points"_a.noconvert(), "radiance"_a.noconvert())
@@ -415,7 +419,7 @@ void bind_scene(nb::module_& m, const char* name) {
             [](const Scene& scene, const Camera& camera, In<int32_t, 1> faces, In<double, 2> points,
                In<double, 2> radiance_bar, Out<double, 2> verts, Out<double, 2> colors, Out<double, 2> uvs,
                Out<double, 2> texels, Out<double, 2> world_to_camera, Out<double, 2> K) {
-                check_indices("faces", faces.data(), faces.size(), scene.faces.shape(0), "faces");
+                check_indices("faces", faces.data(), faces.size(), scene.faces.shape(0), "faces", 1);
                 SceneGrad grad;
                 grad.verts = verts.data(), grad.colors = colors.data(), grad.uvs = uvs.data(),
                 grad.texels = texels.data();
@@ -437,13 +441,13 @@ NB_MODULE(_core, m) {
     m.def("embree_version", &embree_version);
     m.def("packet_width", &packet_width);
     // Without the interpreter's lock, for which a thread that holds the kernel's may wait.
-    m.def("all_finite", &all_finite<float>, "array"_a.noconvert());
-    m.def("all_finite", &all_finite<double>, "array"_a.noconvert());
-    m.def("all_below", &all_below<int32_t>, "array"_a.noconvert(), "count"_a);
-    m.def("all_below", &all_below<int64_t>, "array"_a.noconvert(), "count"_a);
+    m.def("all_finite", &all_finite<float>, "array"_a.noconvert(), "threads"_a = 1);
+    m.def("all_finite", &all_finite<double>, "array"_a.noconvert(), "threads"_a = 1);
+    m.def("all_below", &all_below<int32_t>, "array"_a.noconvert(), "count"_a, "threads"_a = 1);
+    m.def("all_below", &all_below<int64_t>, "array"_a.noconvert(), "count"_a, "threads"_a = 1);
     m.def("clear_geometry", &clear_geometry, nb::call_guard<nb::gil_scoped_release>());
     m.def("before_fork", &before_fork, nb::call_guard<nb::gil_scoped_release>());
-    m.def("after_fork", &after_fork);
+    m.def("after_fork", &after_fork, "child"_a);
     nb::class_<Camera>(m, "Camera")
         .def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "perspective"_a, "width"_a,
              "height"_a);

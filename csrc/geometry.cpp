@@ -1,9 +1,5 @@
 #include "geometry.h"
 
-#if defined(__GNUC__) && !defined(__clang__)
-#include <omp.h>
-#endif
-
 #include <algorithm>
 #include <cstring>
 #include <list>
@@ -17,7 +13,8 @@ Geometry::Geometry(const int32_t* faces, int64_t n_faces, int64_t n_verts)
 namespace {
 
 std::mutex mutex;
-std::list<std::shared_ptr<Geometry>> kept;  // the most recently used first
+// The most recently used first. Never destroyed: another thread may render while the process ends.
+std::list<std::shared_ptr<Geometry>>& kept = *new std::list<std::shared_ptr<Geometry>>;
 constexpr size_t most_kept = 8;
 
 template <class T>
@@ -87,16 +84,14 @@ void before_fork() {
     if (forks++) return;
     mutex.lock();
     embree_mutex.lock();
-    // GNU's runtime starts new threads at the next parallel loop; others see to it themselves at fork(). Embree's
-    // threads are not missed in the child, where the one that builds can do all of the work.
+    // Embree's threads are not missed in the child, where the one that builds can do all of the work.
     let_embree_sleep();
-#if defined(__GNUC__) && !defined(__clang__)
-    omp_pause_resource_all(omp_pause_hard);
-#endif
+    before_fork_of_workers();
 }
 
-void after_fork() {
+void after_fork(bool child) {
     if (--forks) return;
+    after_fork_of_workers(child);
     embree_mutex.unlock();
     mutex.unlock();
 }

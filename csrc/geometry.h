@@ -58,9 +58,8 @@ std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n
 void clear_geometry();
 
 // To be called around fork(), so that the child can render. Only the thread that forks lives on there. Before, wait
-// until no thread changes kept geometry or builds a ray structure, since the child would find their locks taken; and
-// end the threads that OpenMP keeps for this one, since the child would wait for them.
+// until no thread changes kept geometry or builds a ray structure, since the child would find their locks taken.
 void before_fork();
-void after_fork();  // in the parent and in the child
+void after_fork(bool child);  // in the parent and in the child
 
 }  // namespace edgegrad

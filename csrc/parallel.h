@@ -1,8 +1,8 @@
-// The only place that starts threads: how many a loop is worth, and what happens when one of them fails.
+// Loops over threads: how many a loop is worth, and what happens when one of them fails.
 //
-// An exception must not leave a region of OpenMP: the process would end. So bodies run under a guard, which keeps the
-// first exception, lets the others finish early, and hands it on when all have. The same way out serves whoever wants
-// to stop a long call: the thread that called the kernel asks from time to time.
+// An exception must not leave a thread: the process would end. So bodies run under a guard, which keeps the first
+// exception, lets the others finish early, and hands it on when all have. The same way out serves whoever wants to stop
+// a long call: the thread that called the kernel asks from time to time.
 #pragma once
 
 #include <algorithm>
@@ -10,9 +10,11 @@
 #include <chrono>
 #include <cstdint>
 #include <exception>
+#include <functional>
 #include <memory>
 #include <mutex>
 #include <thread>
+#include <vector>
 
 namespace edgegrad {
 
@@ -20,6 +22,18 @@ namespace edgegrad {
 struct Interrupted : std::exception {
     const char* what() const noexcept override { return "interrupted"; }
 };
+
+// One item of a loop: body(thread, i), where the calling thread is thread 0.
+using ItemBody = std::function<void(int, int64_t)>;
+
+// Calls body(thread, i) once for each i = 0 … n − 1, in no order, on the calling thread and up to `threads` − 1
+// workers. While the calling thread waits for what the others took, it calls waiting() 20 times a second. Neither may
+// throw.
+void share(int64_t n, int threads, const ItemBody& body, const std::function<void()>& waiting);
+
+// To be called around fork(), in whose child there are no workers; they are started anew.
+void before_fork_of_workers();
+void after_fork_of_workers(bool child);
 
 // The threads of one call of the kernel.
 class Team {
@@ -71,13 +85,18 @@ class Team {
     template <class Make, class Body>
     void each_with(int64_t n, Make make, Body body) {
         check();
-#pragma omp parallel num_threads(threads_for(n))
-        {
-            decltype(make()) state;
-            guard([&] { state = make(); });
-#pragma omp for schedule(dynamic, 1)
-            for (int64_t i = 0; i < n; ++i) guard([&] { check(), body(*state, i); });
-        }
+        const int threads = threads_for(n);
+        std::vector<decltype(make())> states(threads);
+        const auto item = [&](int thread, int64_t i) {
+            guard([&] {
+                check();
+                if (!states[thread]) states[thread] = make();
+                body(*states[thread], i);
+            });
+        };
+        if (threads > 1) share(n, threads, item, [&] { guard([&] { check(); }); });
+        else
+            for (int64_t i = 0; i < n; ++i) item(0, i);
         rethrow();
     }
 

@@ -111,34 +111,22 @@ class Scatter {
         Stopwatch watch;
         for (int64_t first = 0; first < n; first += chunk * wave) {
             const int64_t chunks = std::min(wave, (n - first + chunk - 1) / chunk);
-            // One region for both loops: waking threads twice a wave would be felt.
-#pragma omp parallel num_threads(team_.threads_for(chunks))
-            {
-#pragma omp for schedule(dynamic, 1)
-                for (int64_t i = 0; i < chunks; ++i)
-                    team_.guard([&] {
-                        team_.check();
-                        ChunkGrad& g = grads_[i];
-                        prepare(g, to, owners);
-                        const int64_t begin = first + i * chunk;
-                        body(begin, std::min(begin + chunk, n), g);
-                    });
-#pragma omp master
-                seconds[0] += watch.lap();
-                // The system may give fewer threads than were asked for.
-#pragma omp for schedule(static, 1)
-                for (int owner = 0; owner < owners; ++owner)
-                    team_.guard([&] {
-                        for (int64_t i = 0; i < chunks; ++i) {
-                            if (to.q) grads_[i].q.add_to(to.q, owner);
-                            if (to.x) grads_[i].x.add_to(to.x, owner);
-                            if (to.colors) grads_[i].colors.add_to(to.colors, owner);
-                            if (to.uvs) grads_[i].uvs.add_to(to.uvs, owner);
-                            if (to.texels) grads_[i].texels.add_to(to.texels, owner);
-                        }
-                    });
-            }
-            team_.rethrow();
+            team_.each(chunks, [&](int64_t i) {
+                ChunkGrad& g = grads_[i];
+                prepare(g, to, owners);
+                const int64_t begin = first + i * chunk;
+                body(begin, std::min(begin + chunk, n), g);
+            });
+            seconds[0] += watch.lap();
+            team_.each(owners, [&](int64_t owner) {
+                for (int64_t i = 0; i < chunks; ++i) {
+                    if (to.q) grads_[i].q.add_to(to.q, int(owner));
+                    if (to.x) grads_[i].x.add_to(to.x, int(owner));
+                    if (to.colors) grads_[i].colors.add_to(to.colors, int(owner));
+                    if (to.uvs) grads_[i].uvs.add_to(to.uvs, int(owner));
+                    if (to.texels) grads_[i].texels.add_to(to.texels, int(owner));
+                }
+            });
             for (int64_t i = 0; i < chunks; ++i)
                 for (int c = 0; c < 6; ++c) to.k[c] += grads_[i].k[c];
             seconds[1] += watch.lap();

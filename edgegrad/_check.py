@@ -128,9 +128,9 @@ def check_fields(thing: Any, given: Iterable[str]) -> None:
 def _ask_kernel(question: Callable[..., bool], tensor: Tensor, *more: Any) -> bool:
     """Whether the kernel says yes of the numbers of a tensor. No where these are no array in memory: on another device,
     strided, seen through a transform of torch.func, or without storage. Torch would wake all threads for what one does
-    faster."""
+    faster; the kernel takes more for long arrays."""
     try:
-        return tensor.data_ptr() != 0 and question(tensor.numpy(), *more)
+        return tensor.data_ptr() != 0 and question(tensor.numpy(), *more, torch.get_num_threads())
     except (RuntimeError, TypeError):
         return False
 

@@ -53,4 +53,8 @@ def load() -> Any:
 core = load()
 # Without this a worker of a DataLoader, or of multiprocessing, that is forked after its parent rendered waits for ever.
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=core.before_fork, after_in_parent=core.after_fork, after_in_child=core.after_fork)
+    os.register_at_fork(
+        before=core.before_fork,
+        after_in_parent=lambda: core.after_fork(child=False),
+        after_in_child=lambda: core.after_fork(child=True),
+    )

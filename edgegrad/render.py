@@ -173,7 +173,7 @@ def _kernel_scene(flat: Flat, spacing: float):
     kind = core.SceneDouble if flat.colors.dtype == torch.float64 else core.SceneFloat
     background = flat.background if flat.background.dim() == 3 else flat.background[None, None]
     arrays = [t.detach().contiguous().numpy() for t in (*flat[:-1], background)]
-    return kind(*arrays, spacing)
+    return kind(*arrays, spacing, torch.get_num_threads())
 
 
 def _kernel_camera(world_to_camera: Tensor, K: Tensor, perspective: bool, height: int, width: int):

@@ -140,6 +140,83 @@ def test_the_same_bits_from_8_threads_as_alone(case):
     assert all(result == alone[i] for results in found for i, result in results)
 
 
+def bits_with(threads, mesh, seed=0):
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        return bits(mesh, seed)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_the_same_bits_with_1_2_and_5_threads_and_several_callers(tmp_path):
+    """Also where callers with different numbers of threads share the workers."""
+    meshes = [icosphere(5), soup(icosphere(4))]
+    alone = [bits_with(1, mesh) for mesh in meshes]
+    for threads in (2, 5):
+        assert [bits_with(threads, mesh) for mesh in meshes] == alone
+    found, begin = {}, threading.Barrier(4)
+
+    def work(k):
+        torch.set_num_threads((1, 2, 5, 3)[k])  # of this thread of Python
+        begin.wait()
+        found[k] = [bits(meshes[(k + turn) % 2]) for turn in range(4)]
+
+    callers = [threading.Thread(target=work, args=(k,)) for k in range(4)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join(120)
+    assert found == {k: [alone[(k + turn) % 2] for turn in range(4)] for k in range(4)}
+
+
+IMPORT = """
+import os
+before = dict(os.environ)
+import json
+import edgegrad as eg
+import torch
+from scenes import front_camera, icosphere
+eg.render(icosphere(3), front_camera(32))
+print(json.dumps(dict(os.environ) == before))
+"""
+
+
+def test_the_environment_stays_as_it_is(tmp_path):
+    """How threads wait is the kernel's own matter, whatever was imported first: it asks for no variable."""
+    file = tmp_path / "script.py"
+    file.write_text(IMPORT)
+    environment = {**os.environ, "PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
+    run = subprocess.run([sys.executable, str(file)], env=environment, capture_output=True, text=True, timeout=120)
+    assert run.stdout.strip() == "true", run.stderr
+
+
+WAITING = """
+def seconds_of_workers():
+    "Processor time of all threads but this one."
+    return time.process_time() - time.thread_time()
+
+torch.set_num_threads(3)
+step(size=64)
+time.sleep(0.1)  # other libraries' threads come to rest
+begin = seconds_of_workers()
+with torch.no_grad():
+    for _ in range(20):
+        eg.render(SPHERE, front_camera(64), spp=4)
+        time.sleep(0.01)
+        quiet = seconds_of_workers()
+        time.sleep(0.02)
+        quiet = seconds_of_workers() - quiet
+        assert quiet < 0.005, f"workers took {quiet} s of processor time while nothing was to do"
+print(json.dumps(seconds_of_workers() - begin))
+"""
+
+
+def test_workers_that_wait_sleep(tmp_path):
+    """Spinning would take the processors from torch and from other processes."""
+    assert script(WAITING, folder=tmp_path) > 0, "no worker did anything"
+
+
 # -- processes --------------------------------------------------------------------------------------------------------
 
 # Each child has a time limit of its own, far above what it needs: what it guards against is waiting for ever.
@@ -147,9 +224,12 @@ PROCESSES = """
 import importlib, multiprocessing
 import edgegrad._kernel
 
+NUMBERS = torch.linspace(0, 1, 1 << 20)
+
 def child(threads):
     if threads:
         torch.set_num_threads(threads)
+    assert NUMBERS.mul(2.0).sum() > 0  # torch takes threads of its own for so many
     return [step(k) for k in (0, 1, 0)]
 
 def children(method, threads=0):
@@ -174,6 +254,7 @@ if __name__ == "__main__":
     torch.set_num_threads(4)
     importlib.reload(edgegrad._kernel)  # as where a notebook imports changed code anew: what fork() calls is there twice
     before = children("fork")
+    child(0)
     expected = [step(k) for k in (0, 1, 0)]
     found = {"before": before, "after": children("fork"), "two threads": children("fork", 2), "loader": loaded()}
 

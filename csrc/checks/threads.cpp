@@ -1,10 +1,10 @@
-// The kernel without Python under ThreadSanitizer: two threads of the program render at once, each with four threads of
-// OpenMP, the same and different geometry, while vertices move and calls are interrupted.
+// The kernel without Python under ThreadSanitizer: two threads of the program render at once, each as one of four that
+// share its work, the same and different geometry, while vertices move and calls are interrupted.
 //
 //     threads PATH_OF_LIBEMBREE4 [race]
 //
-// Each image and gradient must have the bits that it has alone. With `race`, two threads add to one number, which must
-// be reported.
+// Each image and gradient must have the bits that it has alone. With `race`, the threads of a loop add to one number,
+// which must be reported.
 
 #include <array>
 #include <cmath>
@@ -194,8 +194,10 @@ bool same_bits_at_once() {
 int main(int argc, char** argv) {
     if (argc > 2 && std::strcmp(argv[2], "race") == 0) {
         int sum = 0;
-#pragma omp parallel num_threads(team_size)
-        for (int i = 0; i < 1000; ++i) ++sum;
+        Team(team_size).each(100, [&](int64_t) {
+            std::this_thread::sleep_for(std::chrono::milliseconds(1));  // the others are awake by then
+            ++sum;
+        });
         return std::printf("%d\n", sum) < 0;
     }
     if (argc != 2) return std::puts("usage: threads PATH_OF_LIBEMBREE4 [race]"), 2;
