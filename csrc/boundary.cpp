@@ -206,7 +206,7 @@ class BoundaryChunk {
         const double t = other.parameter(s), depth = (1 - t) * other.a.z + t * other.b.z;
         const bool opposite = along.x * curve.tangent().x + along.y * curve.tangent().y < 0;
         const HalfEdge* half[2] = {opposite ? &other.plus : &other.minus, opposite ? &other.minus : &other.plus};
-        if (std::fabs(depth - lane.point.z) <= contact(curve, std::max(std::fabs(depth), length(lane.point)))) {
+        if (std::fabs(depth - lane.point.z) <= contact(curve, std::max(std::fabs(depth), length(lane.point)), a_face(other))) {
             ++lane.share;
             for (int k = 0; k < 2; ++k)
                 if (Side& side = lane.side[k];
@@ -234,7 +234,7 @@ class BoundaryChunk {
         for (int i = 0; i < 3; ++i)
             size = std::max({size, std::fabs(corner[i].x), std::fabs(corner[i].y), std::fabs(corner[i].z)});
         const double apart = behind / length(normal), rounding = rounding_of_doubles * size;
-        return apart > rounding && (apart > contact(curve, size) || shares_vertex(face, curve.edge));
+        return apart > rounding && (apart > contact(curve, size, face) || shares_vertex(face, curve.edge));
     }
 
     bool shares_vertex(int64_t face, int64_t edge) const {
@@ -245,16 +245,22 @@ class BoundaryChunk {
         return false;
     }
 
-    // World units by which what touches at the curve may lie apart, for the rounding of the input and of doubles.
+    static int64_t a_face(const Curve& c) { return c.minus.face >= 0 ? c.minus.face : c.plus.face; }
+
+    // World units by which a face that touches at the curve may lie apart, for the rounding of the input, of which that
+    // of the coarser mesh counts, and of doubles.
     static constexpr double rounding_of_doubles = 64 * std::numeric_limits<double>::epsilon();
-    double contact(const Curve& curve, double size) const {
+    double contact(const Curve& curve, double size, int64_t face) const {
         const HalfEdge& h = curve.minus.face >= 0 ? curve.minus : curve.plus;
         double coordinate = 0;
         for (const int corner : {h.first(), h.second()})
             for (int axis = 0; axis < 3; ++axis)
                 coordinate = std::max(coordinate,
                                       std::fabs(view_.scene.verts[3 * int64_t(vertex(view_.scene, h, corner)) + axis]));
-        return 8 * view_.options.spacing * coordinate + rounding_of_doubles * size;
+        const Spacing& spacing = view_.options.spacing;
+        return 8 * std::max(spacing.of(vertex(view_.scene, h, h.first())), spacing.of(view_.scene.faces[3 * face])) *
+                   coordinate +
+               rounding_of_doubles * size;
     }
 
     // The gradient goes to the vertices of the face that ends at the curve; where a face lies on either side, half to

@@ -110,6 +110,7 @@ class Scatter {
             grads_.resize(most);
         Stopwatch watch;
         for (int64_t first = 0; first < n; first += chunk * wave) {
+            team_.check();  // the calling thread may get no chunk of a wave
             const int64_t chunks = std::min(wave, (n - first + chunk - 1) / chunk);
             // One region for both loops: waking threads twice a wave would be felt.
 #pragma omp parallel num_threads(team_.threads_for(chunks))

@@ -85,7 +85,7 @@ def leaf(tensor: Tensor) -> Tensor:
 # -- operators --------------------------------------------------------------------------------------------------------
 
 
-def operator_inputs(scene: eg.Scene, spacing: float = 2.0**-52) -> tuple:
+def operator_inputs(scene: eg.Scene, spacing: tuple[float, ...] = (0, 2.0**-52)) -> tuple:
     return (*flatten(scene), CAMERA.world_to_camera[None], CAMERA.K[None], True, SIZE, SIZE, 4, "box", 0, spacing)
 
 
@@ -617,7 +617,7 @@ def test_seeds():
 
 def sample_counts(surface: int, edge: int, adjoint: Tensor, boundary: bool = True) -> tuple[int, int]:
     """What the kernel says it drew for the triangle's vertices."""
-    scene = _kernel_scene(flatten(TRIANGLE), spacing=2.0**-52)
+    scene = _kernel_scene(flatten(TRIANGLE), spacing=[0, 2.0**-52])
     camera = _kernel_camera(CAMERA.world_to_camera, CAMERA.K, True, SIZE, SIZE)
     coverage, seen = torch.zeros(SIZE, SIZE, dtype=F64), torch.ones(1, dtype=torch.uint8)
     arrays = adjoint.contiguous().numpy(), coverage.numpy(), seen.numpy(), torch.zeros(3, 3, dtype=F64).numpy()
