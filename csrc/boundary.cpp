@@ -206,7 +206,8 @@ class BoundaryChunk {
         const double t = other.parameter(s), depth = (1 - t) * other.a.z + t * other.b.z;
         const bool opposite = along.x * curve.tangent().x + along.y * curve.tangent().y < 0;
         const HalfEdge* half[2] = {opposite ? &other.plus : &other.minus, opposite ? &other.minus : &other.plus};
-        if (std::fabs(depth - lane.point.z) <= contact(curve, std::max(std::fabs(depth), length(lane.point)), a_face(other))) {
+        if (std::fabs(depth - lane.point.z) <=
+            contact(curve, std::max(std::fabs(depth), length(lane.point)), a_face(other))) {
             ++lane.share;
             for (int k = 0; k < 2; ++k)
                 if (Side& side = lane.side[k];

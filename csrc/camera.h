@@ -104,8 +104,7 @@ struct ViewVolume {
     double offset[4];
     Vec2 low, high;  // of the rectangle
 
-    ViewVolume(const Camera& c, double margin)
-        : low{-margin, -margin}, high{c.width + margin, c.height + margin} {
+    ViewVolume(const Camera& c, double margin) : low{-margin, -margin}, high{c.width + margin, c.height + margin} {
         const double bound[4] = {low.x, high.x, low.y, high.y};
         for (int i = 0; i < 4; ++i) {
             const double* row = c.k + (i < 2 ? 0 : 3);

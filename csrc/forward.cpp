@@ -254,8 +254,8 @@ class PixelRow {
     std::vector<double> sum_, radiance_;
 };
 
-// The pixels whose samples may hit something: those in an octagon around the images of all vertices of faces, if these lie
-// before the eye. With a pixel more on each side, for Embree sees positions rounded to floats.
+// The pixels whose samples may hit something: those in an octagon around the images of all vertices of faces, if these
+// lie before the eye. With a pixel more on each side, for Embree sees positions rounded to floats.
 class ReachablePixels {
    public:
     ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius, Team& team)

@@ -46,8 +46,8 @@ class Geometry {
 // The geometry of these faces at these positions, with what is wanted. One that is still in memory is used
 // again: as it is when the positions are the same, updated when they moved and nobody else uses it. What is compared is
 // the content of the arrays, so tensors may be copied, changed in place or freed without harm. What can take long is
-// done without a lock: a signal handler may render, or wait for a thread that does. So two threads that ask for the same
-// new geometry at once both make it, and one is kept. Throws Interrupted where the call is to stop.
+// done without a lock: a signal handler may render, or wait for a thread that does. So two threads that ask for the
+// same new geometry at once both make it, and one is kept. Throws Interrupted where the call is to stop.
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
                                                  int64_t n_verts, const Spacing& spacing, GeometryWanted wanted,
                                                  Team& team, GeometryWork& work);

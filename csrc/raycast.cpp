@@ -204,8 +204,8 @@ RayCaster::~RayCaster() {
 //
 // Its unit matters only where the scene spans many powers of ten, for floats round alike at any scale: but Embree takes
 // products of three lengths, which must not leave the range of floats, 1e-38 … 1e38. So where the farthest vertex lies
-// very many times the size of a face away, that size (its geometric mean) lies as far below the unit as that vertex lies
-// above it.
+// very many times the size of a face away, that size (its geometric mean) lies as far below the unit as that vertex
+// lies above it.
 void RayCaster::set_frame(const double* verts, Team& team) {
     const auto vertex = [&](int64_t v) { return Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]}; };
     const Vec3 base = vertex(faces_[0]);
@@ -398,8 +398,8 @@ struct ValidLanes {
 } constexpr valid_lanes;
 
 struct RejectContext {
-    RayQueryContext query;  // first, so that a pointer to it is a pointer to this
-    const std::span<const int32_t>* rejected;  // by ray, or null
+    RayQueryContext query;                          // first, so that a pointer to it is a pointer to this
+    const std::span<const int32_t>* rejected;       // by ray, or null
     bool (*meets)(const void* data, int32_t face);  // or null
     const void* data;
     int32_t face = -1;  // that was asked for last, and the answer: the rays of a packet mostly ask together

@@ -158,10 +158,8 @@ class RayBatch {
 
 template <class Meets>
 void RayCaster::cast_through(RayBatch& batch, const std::span<const int32_t>* rejected, Meets meets) const {
-    cast(batch, rejected, {[](const void* data, int32_t face) -> bool {
-                               return (*static_cast<const Meets*>(data))(face);
-                           },
-                           &meets});
+    cast(batch, rejected,
+         {[](const void* data, int32_t face) -> bool { return (*static_cast<const Meets*>(data))(face); }, &meets});
 }
 
 template <class Meets>

@@ -9,8 +9,8 @@
 
 namespace edgegrad {
 
-// Relative spacing of the numbers in which the user gave the vertices, which may differ from mesh to mesh: value[i] from
-// vertex first[i] on.
+// Relative spacing of the numbers in which the user gave the vertices, which may differ from mesh to mesh: value[i]
+// from vertex first[i] on.
 struct Spacing {
     std::vector<int32_t> first{0};
     std::vector<double> value{0};

@@ -68,9 +68,7 @@ class PlaceGrid {
         int32_t vertex, next;
     };
 
-    static double magnitude(const double* p) {
-        return std::max({std::fabs(p[0]), std::fabs(p[1]), std::fabs(p[2])});
-    }
+    static double magnitude(const double* p) { return std::max({std::fabs(p[0]), std::fabs(p[1]), std::fabs(p[2])}); }
     // Of what is far below the least float, all is taken for one, so that cells do not vanish.
     static int binade(double magnitude) { return magnitude > 0x1p-900 ? std::ilogb(magnitude) : -900; }
     // Four to eight reaches of the magnitudes in that binade, so that few cells lie within reach of a point.
