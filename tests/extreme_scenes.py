@@ -21,7 +21,7 @@ import edgegrad as eg
 
 F32, F64 = torch.float32, torch.float64
 LARGEST = float(torch.finfo(F32).max)
-SECONDS = 5.0  # of a processor, for a scene: a hundred times what most take
+SECONDS = 30.0  # of a processor, for a scene; hundreds of coincident curves, whose cost is a square, may take 10
 
 
 class TooSlow(Exception):
