@@ -6,6 +6,7 @@
 #include <nanobind/stl/map.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <atomic>
@@ -16,6 +17,7 @@
 #include <optional>
 #include <string>
 #include <type_traits>
+#include <vector>
 
 #include "render.h"
 #include "stopwatch.h"
@@ -116,6 +118,17 @@ void check_indices(const char* name, const int32_t* values, int64_t n, int64_t c
                    "), got " + std::to_string(values[i]) + " at " + at(first + i, 3));
 }
 
+// From pairs of numbers: a vertex, and the spacing from there on.
+Spacing make_spacing(const std::vector<double>& pairs) {
+    Spacing spacing{{}, {}};
+    for (size_t i = 0; i + 1 < pairs.size(); i += 2)
+        spacing.first.push_back(int32_t(pairs[i])), spacing.value.push_back(pairs[i + 1]);
+    if (pairs.empty() || pairs.size() % 2 || spacing.first[0] != 0 ||
+        !std::is_sorted(spacing.first.begin(), spacing.first.end()))
+        refuse("spacing: expected pairs of a vertex and a spacing, ascending from vertex 0");
+    return spacing;
+}
+
 // The arrays of a scene, kept alive, checked, and seen as the kernel sees them.
 template <class T>
 struct SceneArrays {
@@ -127,11 +140,11 @@ struct SceneArrays {
     In<int64_t, 2> textures;
     In<int32_t, 1> face_texture;
     In<T, 3> background;  // (1, 1, C) or (H, W, C)
-    double spacing;
+    Spacing spacing;
 
     SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int32_t, 2> corners_, In<T, 2> colors_,
                 In<double, 2> uvs_, In<T, 2> texels_, In<int64_t, 2> textures_, In<int32_t, 1> face_texture_,
-                In<T, 3> background_, double spacing_, int threads)
+                In<T, 3> background_, const std::vector<double>& spacing_, int threads)
         : verts(verts_),
           faces(faces_),
           corners(corners_),
@@ -141,7 +154,7 @@ struct SceneArrays {
           textures(textures_),
           face_texture(face_texture_),
           background(background_),
-          spacing(spacing_) {
+          spacing(make_spacing(spacing_)) {
         const auto width = [](const char* name, size_t got, size_t expected) {
             if (got != expected)
                 refuse(std::string(name) + ": expected " + std::to_string(expected) + " columns, got " +
@@ -201,9 +214,7 @@ struct SceneArrays {
     }
 
     std::shared_ptr<const Geometry> geometry(GeometryWanted wanted, Team& team, GeometryWork& work) const {
-        // Nobody is asked whether to go on: a lock is held, which a signal handler that renders would wait for.
-        Team quiet(team.threads());
-        return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, wanted, quiet,
+        return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, wanted, team,
                                 work);
     }
 };
@@ -364,7 +375,7 @@ void bind_scene(nb::module_& m, const char* name) {
     using Scene = SceneArrays<T>;
     nb::class_<Scene>(m, name)
         .def(nb::init<In<double, 2>, In<int32_t, 2>, In<int32_t, 2>, In<T, 2>, In<double, 2>, In<T, 2>, In<int64_t, 2>,
-                      In<int32_t, 1>, In<T, 3>, double, int>(),
+                      In<int32_t, 1>, In<T, 3>, const std::vector<double>&, int>(),
              "verts"_a.noconvert(), "faces"_a.noconvert(), "corners"_a.noconvert(), "colors"_a.noconvert(),
              "uvs"_a.noconvert(), "texels"_a.noconvert(), "textures"_a.noconvert(), "face_texture"_a.noconvert(),
              "background"_a.noconvert(), "spacing"_a, "threads"_a)

@@ -280,7 +280,11 @@ class BoundaryChunk {
             size = std::max({size, std::fabs(corner[i].x), std::fabs(corner[i].y), std::fabs(corner[i].z)});
         const double apart = behind / length(normal), rounding = rounding_of_doubles * size;
         const HalfEdge& h = curve.minus.face >= 0 ? curve.minus : curve.plus;
-        return apart > rounding && (apart > contact(view_.options.spacing, largest_coordinate(view_.scene, h), size) ||
+        // Of the two meshes, the coarser one's numbers count.
+        const Spacing& spacing = view_.options.spacing;
+        const double coarser =
+            std::max(spacing.of(vertex(view_.scene, h, h.first())), spacing.of(view_.scene.faces[3 * face]));
+        return apart > rounding && (apart > contact(coarser, largest_coordinate(view_.scene, h), size) ||
                                     shares_vertex(face, curve.edge));
     }
 

@@ -6,6 +6,7 @@
 // once, and the cotangents of q are turned into those of p, R and t once, when all samples are done.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 
 #include "array.h"
@@ -30,7 +31,8 @@ struct Camera {
         : perspective(perspective_), width(width_), height(height_) {
         for (int i = 0; i < 3; ++i)
             R.row[i] = {world_to_camera[4 * i], world_to_camera[4 * i + 1], world_to_camera[4 * i + 2]};
-        t = {world_to_camera[3], world_to_camera[7], world_to_camera[11]};
+        // An orthographic view is the same from any distance; from none, depths are rounded least.
+        t = {world_to_camera[3], world_to_camera[7], perspective ? world_to_camera[11] : 0.0};
         for (int i = 0; i < 6; ++i) k[i] = K[i];
         R_inverse = inverse(R);
         pixels_per_unit = std::fabs(k[0]) + std::fabs(k[1]) + std::fabs(k[3]) + std::fabs(k[4]);
@@ -100,9 +102,10 @@ inline void normalised_vjp(const Camera& c, Vec2 n, Vec2 bar, double k_bar[6]) {
 struct ViewVolume {
     Vec3 normal[4];
     double offset[4];
+    Vec2 low, high;  // of the rectangle
 
-    ViewVolume(const Camera& c, double margin) {
-        const double bound[4] = {-margin, c.width + margin, -margin, c.height + margin};
+    ViewVolume(const Camera& c, double margin) : low{-margin, -margin}, high{c.width + margin, c.height + margin} {
+        const double bound[4] = {low.x, high.x, low.y, high.y};
         for (int i = 0; i < 4; ++i) {
             const double* row = c.k + (i < 2 ? 0 : 3);
             const double sign = i % 2 ? -1.0 : 1.0, constant = sign * (row[2] - bound[i]);
@@ -119,6 +122,9 @@ struct ViewVolume {
         for (int i = 0; i < 4; ++i) code |= (distance(i, q) < 0) << i;
         return code;
     }
+
+    // The nearest point in the rectangle: rounding may leave what was clipped outside.
+    Vec2 inside(Vec2 x) const { return {std::clamp(x.x, low.x, high.x), std::clamp(x.y, low.y, high.y)}; }
 
     // The part [t0, t1] of the segment (1 − t) a + t b that lies inside; false when there is none.
     bool clip_segment(Vec3 a, Vec3 b, double& t0, double& t1) const {

@@ -67,7 +67,7 @@ struct CoincidentCurve {
     Curve curve;
     HalfEdge side[2] = {};               // those that end on minus and plus of the line; face −1: none
     std::vector<HalfEdge> edge_on = {};  // those that lie on the line
-    double coordinate = 0;
+    double coordinate = 0, spacing = 0;  // of its ends: the largest, and that of the input's numbers
 };
 
 // What a sample of a curve stands for.
@@ -106,7 +106,9 @@ class Coincidence {
             HalfEdge& end = c.side[(turn > 0) == opposite];
             if (end.face < 0 || !in_front(view_, end, h, curve.a, curve.b)) end = h;
         }
-        c.coordinate = largest_coordinate(view_.scene, view_.geometry.topology().half_edges(curve.edge)[0]);
+        const HalfEdge& h = view_.geometry.topology().half_edges(curve.edge)[0];
+        c.coordinate = largest_coordinate(view_.scene, h);
+        c.spacing = view_.options.spacing.of(vertex(view_.scene, h, h.first()));
         return c;
     }
 
@@ -209,7 +211,7 @@ class Coincidence {
     }
 
     double tolerance(const Place& p, const Place& q) const {
-        return contact(view_.options.spacing, std::max(p.curve->coordinate, q.curve->coordinate),
+        return contact(std::max(p.curve->spacing, q.curve->spacing), std::max(p.curve->coordinate, q.curve->coordinate),
                        std::max(length(p.point), length(q.point)));
     }
 

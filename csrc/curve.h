@@ -96,15 +96,6 @@ class CurveFinder {
    public:
     explicit CurveFinder(const BackwardView<T>& view)
         : view_(view), facing_(view.scene.n_faces), jumps_(may_jump(view.scene, view.geometry.topology())) {
-        const int64_t blocks = Team::blocks(view.scene.n_verts);
-        std::vector<double> farthest(blocks, 0.0);
-        view.team.each_block(view.scene.n_verts, [&](int64_t k, int64_t first, int64_t last) {
-            for (int64_t i = 3 * first; i < 3 * last; ++i)
-                farthest[k] = std::max(farthest[k], std::fabs(view.scene.verts[i]));
-        });
-        const Vec3 t = view.camera.t;
-        coordinate_ = *std::max_element(farthest.begin(), farthest.end()) +
-                      std::max({std::fabs(t.x), std::fabs(t.y), std::fabs(t.z)});
         view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
             const auto& q = view.vertices.q;
             for (int64_t f = first; f < last; ++f) {
@@ -153,21 +144,41 @@ class CurveFinder {
             const Vec3 q0 = (1 - c.t0) * c.a + c.t0 * c.b, q1 = (1 - c.t1) * c.a + c.t1 * c.b;
             c.w0 = camera.depth_weight(q0), c.w1 = camera.depth_weight(q1);
             if (!(c.w0 > 0 && c.w1 > 0)) return false;  // ends in the eye itself
-            c.x0 = project(camera, q0), c.x1 = project(camera, q1);
+            c.x0 = view_.volume.inside(project(camera, q0)), c.x1 = view_.volume.inside(project(camera, q1));
         }
         c.edge = edge, c.minus = side[0], c.plus = side[1];
         c.length = length(c.tangent());
-        const double pixels = std::fabs(camera.k[2]) + std::fabs(camera.k[5]) + length(c.x0) + length(c.x1);
-        c.rounding = 32 * std::numeric_limits<double>::epsilon() *
-                     (camera.pixels_per_unit / std::min(c.w0, c.w1) * coordinate_ + pixels);
-        return c.length > 0;
+        c.rounding = rounding(c, va, vb);
+        return c.length > 0 && c.rounding < most_rounding;
     }
 
    private:
+    // Of the pixel positions, px: an edge that is so long, or so far away, that doubles do not say where it runs in the
+    // image has no curve there. The bound is a generous one.
+    static constexpr double most_rounding = 16;
+
+    // Of the pixel positions of a curve that ends at these vertices, px. A sum q = R p + t is rounded as its terms are
+    // large, axis by axis: an orthographic camera far away loses depth, not place. In perspective, X / Z is rounded
+    // with X, and with Z as large as it is itself.
+    double rounding(const Curve& c, int32_t va, int32_t vb) const {
+        const Camera& camera = view_.camera;
+        double p[3] = {};
+        for (const int32_t v : {va, vb})
+            for (int i = 0; i < 3; ++i) p[i] = std::max(p[i], std::fabs(view_.scene.verts[3 * int64_t(v) + i]));
+        const auto terms = [&](int row, double t) {
+            const Vec3 r = camera.R.row[row];
+            return std::fabs(r.x) * p[0] + std::fabs(r.y) * p[1] + std::fabs(r.z) * p[2] + std::fabs(t);
+        };
+        const double w = std::min(c.w0, c.w1), across = std::max(terms(0, camera.t.x), terms(1, camera.t.y)),
+                     depth = camera.perspective ? terms(2, camera.t.z) / w : 1;
+        const double pixels = std::fabs(camera.k[2]) + std::fabs(camera.k[5]) + length(c.x0) + length(c.x1);
+        return 32 * std::numeric_limits<double>::epsilon() *
+               (camera.pixels_per_unit / w * across + std::max(1.0, depth) * pixels);
+    }
+
     const BackwardView<T>& view_;
-    Array<int8_t> facing_;   // orientation of each face in the image
-    double coordinate_ = 0;  // the largest there is, in the world and the camera
-    const bool jumps_;       // false: neighbouring faces are known to carry the same radiance at their edge
+    Array<int8_t> facing_;  // orientation of each face in the image
+    const bool jumps_;      // false: neighbouring faces are known to carry the same radiance at their edge
 };
 
 }  // namespace edgegrad

@@ -56,6 +56,7 @@ struct IntersectArguments {
     X(rtcSetSceneFlags, void, (Scene, int))                                                                  \
     X(rtcSetSceneBuildQuality, void, (Scene, int))                                                           \
     X(rtcCommitScene, void, (Scene))                                                                         \
+    X(rtcSetSceneProgressMonitorFunction, void, (Scene, bool (*)(void*, double), void*))                     \
     X(rtcNewGeometry, Geometry, (Device, int))                                                               \
     X(rtcReleaseGeometry, void, (Geometry))                                                                  \
     X(rtcSetSharedGeometryBuffer, void, (Geometry, int, unsigned, int, const void*, size_t, size_t, size_t)) \

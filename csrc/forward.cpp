@@ -138,7 +138,7 @@ class PixelRow {
     static constexpr unsigned n_kept = 64;
 
     void trace() {
-        if (++traced_ % 256 == 0) team_.check();
+        if (++traced_ % 16 == 0) team_.check();
         rays_.prepare();
         caster_.cast(rays_);
         if (scene_.n_faces > in_cache) prefetch_faces();
@@ -151,11 +151,16 @@ class PixelRow {
                 for (unsigned left = (1u << lanes) - 1 - on_face(rays_.face + i, -1); left;) {
                     const int first = std::countr_zero(left);
                     const int32_t face = rays_.face[i + first];
+                    const Shaded& s = shaded(face);
+                    if (s.unseen) [[unlikely]] {
+                        cast_beyond();
+                        left &= ~on_face(rays_.face + i, -1);
+                        continue;
+                    }
                     const unsigned same = on_face(rays_.face + i, face);
                     left &= ~same;
-                    const Shaded& s = shaded(face);
                     Barycentrics b;
-                    if ((same & (same - 1)) && !s.textured && !s.unseen &&
+                    if ((same & (same - 1)) && !s.textured &&
                         add_barycentrics(s.map, rays_.n_x + i, rays_.n_y + i, rays_.face + i, face, b)) {
                         const int n = std::popcount(same);
                         s.radiance.add_to(sum, b, n);
@@ -166,8 +171,11 @@ class PixelRow {
                             hits += add(i + std::countr_zero(one), part_[p].column, sum);
                     }
                 }
-            for (; i < end; ++i)
+            for (; i < end; ++i) {
+                if (rays_.face[i] >= 0 && shaded(rays_.face[i]).unseen) [[unlikely]]
+                    cast_beyond();
                 if (rays_.face[i] >= 0) hits += add(i, part_[p].column, sum);
+            }
             hits_[part_[p].column] += hits;
             for (int c = 0; c < C_; ++c) sum_[part_[p].column * C_ + c] += sum[c];
         }
@@ -180,11 +188,9 @@ class PixelRow {
         farthest_[column] = std::max(farthest_[column], s.depth.within(middle, reach_));
     }
 
-    // Adds what ray i, of a pixel in this column, sees to the sum; whether it sees anything.
-    bool add(int i, int column, typename AffineRadiance<N>::Sum& sum) {
-        int32_t face = rays_.face[i];
-        if (shaded(face).unseen) [[unlikely]]
-            if ((face = beyond(face, i)) < 0) return false;
+    // Adds what ray i, of a pixel in this column, sees to the sum: one sample.
+    int add(int i, int column, typename AffineRadiance<N>::Sum& sum) {
+        const int32_t face = rays_.face[i];
         const Shaded& s = shaded(face);
         note_depth(s, column);
         const Barycentrics b = barycentrics_of_hit(s.map, rays_.n(i));
@@ -194,7 +200,7 @@ class PixelRow {
         } else {
             s.radiance.add_to(sum, b, 1);
         }
-        return true;
+        return 1;
     }
 
     Shaded& shaded(int32_t face) {
@@ -220,9 +226,16 @@ class PixelRow {
                 }
     }
 
-    // What ray i meets behind a face that holds the eye.
-    int32_t beyond(int32_t face, int i) {
-        return caster_.beyond_float(frame_, rays_.n(i), face, {}, [&](int32_t f) { return !shaded(f).unseen; });
+    // Casts the rays again, through the faces whose plane holds the eye. What the others hit stays the same.
+    void cast_beyond() {
+        rays_.prepare();
+        caster_.cast_through(rays_, nullptr, [&](int32_t face) { return !is_unseen(face); });
+    }
+
+    bool is_unseen(int32_t face) const {
+        const int32_t* v = scene_.faces + 3 * int64_t(face);
+        const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
+        return camera_.perspective && passes_through_eye(corner);
     }
 
     void keep(Shaded& s, int32_t face) {
@@ -267,16 +280,17 @@ class PixelRow {
     std::vector<double> sum_, radiance_;
 };
 
-// The pixels whose samples may hit something: those in an octagon around the images of all vertices, if these lie
-// before the eye. With a pixel more on each side, for Embree sees positions rounded to floats.
+// The pixels whose samples may hit something: those in an octagon around the images of all vertices of faces, if these
+// lie before the eye. With a pixel more on each side, for Embree sees positions rounded to floats.
 class ReachablePixels {
    public:
-    ReachablePixels(const Camera& camera, const Array<Vec3>& q, double radius, Team& team)
+    ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius, Team& team)
         : width_(camera.width), margin_(radius + 1) {
         std::vector<Bounds> of_block(Team::blocks(q.size()));
         team.each_block(q.size(), [&](int64_t k, int64_t first, int64_t last) {
             Bounds b;
             for (int64_t v = first; v < last; ++v) {
+                if (!caster.uses(v)) continue;
                 const Vec2 x = project(camera, q[v]);
                 const double far = std::max(std::fabs(x.x), std::fabs(x.y));
                 if (!(camera.depth_weight(q[v]) > 0) || !std::isfinite(far)) {
@@ -337,7 +351,7 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
     // two faces at one depth wins, and how sums are rounded.
     const int unit = std::min(tile, RayBatch::size / std::gcd(RayBatch::size, o.spp));
     const RayFrame frame(caster, camera);
-    const ReachablePixels reachable(camera, q, o.filter.radius() - 0.5, team);
+    const ReachablePixels reachable(camera, caster, q, o.filter.radius() - 0.5, team);
     team.each_with(
         int64_t(tiles_x) * tiles_y,
         [&] { return std::make_unique<PixelRow<N, T>>(scene, camera, caster, frame, o, team, q, out); },

@@ -24,48 +24,84 @@ bool same(const std::vector<T>& kept_values, const T* values, int64_t n) {
 
 }  // namespace
 
-std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
-                                                 int64_t n_verts, double spacing, GeometryWanted wanted, Team& team,
-                                                 GeometryWork& work) {
-    const std::lock_guard lock(mutex);
-    auto found = kept.end();
-    bool moved = true;
-    for (auto it = kept.begin(); it != kept.end(); ++it) {
-        if (!same((*it)->faces_, faces, 3 * n_faces)) continue;
-        if (same((*it)->verts_, verts, 3 * n_verts) && (*it)->spacing_ == spacing) {
-            found = it, moved = false;
-            break;
+// One request for geometry: what is found in the list and what is put there, each under the lock.
+class KeptGeometry {
+   public:
+    KeptGeometry(const int32_t* faces, int64_t n_faces, const double* verts, int64_t n_verts, const Spacing& spacing)
+        : faces_(faces), verts_(verts), n_faces_(n_faces), n_verts_(n_verts), spacing_(spacing) {}
+
+    std::shared_ptr<const Geometry> acquire(GeometryWanted wanted, Team& team, GeometryWork& work) {
+        const bool moved = !find(wanted);
+        if (moved) {
+            work.rays = true;
+            if (!geometry_) geometry_ = std::make_shared<Geometry>(faces_, n_faces_, n_verts_);
+            geometry_->caster_.update(verts_, team);
+            geometry_->verts_.assign(verts_, verts_ + 3 * n_verts_);
+            geometry_->spacing_ = spacing_;
         }
-        // In use only by this list: free to be moved.
-        if (found == kept.end() && it->use_count() == 1 && (*it)->verts_.size() == size_t(3 * n_verts)) found = it;
+        const int32_t* faces = geometry_->faces_.data();
+        if (weld_) {
+            work.edges = true;
+            if (!topology_) topology_ = std::make_unique<Topology>(faces, n_faces_, n_verts_, team);
+            topology_->weld(verts_, spacing_, team);
+        }
+        if (make_parts_) parts_ = std::make_unique<Parts>(faces, n_faces_, n_verts_, team);
+        keep(moved);
+        return geometry_;
     }
-    std::shared_ptr<Geometry> geometry;
-    if (found != kept.end()) {
-        geometry = *found;
-        kept.erase(found);
-    } else {
-        geometry = std::make_shared<Geometry>(faces, n_faces, n_verts);
+
+   private:
+    // Whether there is geometry at these positions. If not, takes one to be moved out of the list, where there is one
+    // that nobody uses.
+    bool find(GeometryWanted wanted) {
+        const std::lock_guard lock(mutex);
+        auto found = kept.end();
+        bool here = false;
+        for (auto it = kept.begin(); it != kept.end() && !here; ++it) {
+            if (!same((*it)->faces_, faces_, 3 * n_faces_)) continue;
+            here = same((*it)->verts_, verts_, 3 * n_verts_) && (*it)->spacing_ == spacing_;
+            const bool free = it->use_count() == 1 && (*it)->verts_.size() == size_t(3 * n_verts_);
+            if (here || (free && found == kept.end())) found = it;
+        }
+        if (found != kept.end()) geometry_ = *found;
+        if (geometry_ && !here) kept.erase(found), geometry_->welded_ = false;
+        weld_ = wanted.topology && !(geometry_ && geometry_->welded_);
+        make_parts_ = wanted.parts && !(geometry_ && geometry_->parts_);
+        // Edges of other positions, which nobody looks at: taken, so that nobody else welds them at the same time.
+        if (weld_ && geometry_) topology_ = std::move(geometry_->topology_);
+        return here;
     }
-    if (moved) {
-        work.rays = true;
-        geometry->verts_.clear();  // should the update fail, these positions must not be taken for it
-        geometry->caster_.update(verts, team);
-        geometry->verts_.assign(verts, verts + 3 * n_verts);
-        geometry->spacing_ = spacing;
-        geometry->welded_ = false;
+
+    // Puts what was made into the geometry, and that into the list, unless another thread has done so meanwhile.
+    void keep(bool moved) {
+        const std::lock_guard lock(mutex);
+        if (topology_ && !geometry_->welded_) geometry_->topology_ = std::move(topology_), geometry_->welded_ = true;
+        if (parts_ && !geometry_->parts_) geometry_->parts_ = std::move(parts_);
+        const auto equal = [&](const std::shared_ptr<Geometry>& other) {
+            return other == geometry_ ||
+                   (moved && other->spacing_ == spacing_ && same(other->verts_, verts_, 3 * n_verts_) &&
+                    same(other->faces_, faces_, 3 * n_faces_));
+        };
+        kept.remove_if(equal);
+        kept.push_front(geometry_);
+        while (kept.size() > most_kept) kept.pop_back();
     }
-    if (wanted.topology && !geometry->welded_) {
-        work.edges = true;
-        if (!geometry->topology_)
-            geometry->topology_ = std::make_unique<Topology>(geometry->faces_.data(), n_faces, n_verts);
-        geometry->topology_->weld(verts, spacing);
-        geometry->welded_ = true;
-    }
-    if (wanted.parts && !geometry->parts_)
-        geometry->parts_ = std::make_unique<Parts>(geometry->faces_.data(), n_faces, n_verts);
-    kept.push_front(geometry);
-    while (kept.size() > most_kept) kept.pop_back();
-    return geometry;
+
+    const int32_t* const faces_;
+    const double* const verts_;
+    const int64_t n_faces_, n_verts_;
+    const Spacing& spacing_;
+
+    std::shared_ptr<Geometry> geometry_;
+    bool weld_ = false, make_parts_ = false;
+    std::unique_ptr<Topology> topology_;
+    std::unique_ptr<Parts> parts_;
+};
+
+std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
+                                                 int64_t n_verts, const Spacing& spacing, GeometryWanted wanted,
+                                                 Team& team, GeometryWork& work) {
+    return KeptGeometry(faces, n_faces, verts, n_verts, spacing).acquire(wanted, team, work);
 }
 
 void clear_geometry() {

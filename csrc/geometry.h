@@ -27,32 +27,30 @@ class Geometry {
 
     const RayCaster& caster() const { return caster_; }
 
-    // The edges at the current positions; made when first asked for. Not to be called by two threads at once for the
-    // same geometry: acquire_geometry does it.
+    // These two are there if acquire_geometry was asked for them; the edges are those at the current positions.
     const Topology& topology() const { return *topology_; }
-
-    // The same holds for these.
     const Parts& parts() const { return *parts_; }
 
    private:
-    friend std::shared_ptr<const Geometry> acquire_geometry(const int32_t*, int64_t, const double*, int64_t, double,
-                                                            GeometryWanted, Team&, GeometryWork&);
+    friend class KeptGeometry;
 
     std::vector<int32_t> faces_;
     std::vector<double> verts_;
     RayCaster caster_;
     std::unique_ptr<Topology> topology_;
     std::unique_ptr<Parts> parts_;
-    double spacing_ = 0;   // of the numbers in which the user gave the positions: decides what is welded
+    Spacing spacing_;      // decides what is welded
     bool welded_ = false;  // at the current positions
 };
 
 // The geometry of these faces at these positions, with what is wanted. One that is still in memory is used
 // again: as it is when the positions are the same, updated when they moved and nobody else uses it. What is compared is
-// the content of the arrays, so tensors may be copied, changed in place or freed without harm.
+// the content of the arrays, so tensors may be copied, changed in place or freed without harm. What can take long is
+// done without a lock: a signal handler may render, or wait for a thread that does. So two threads that ask for the
+// same new geometry at once both make it, and one is kept. Throws Interrupted where the call is to stop.
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,
-                                                 int64_t n_verts, double spacing, GeometryWanted wanted, Team& team,
-                                                 GeometryWork& work);
+                                                 int64_t n_verts, const Spacing& spacing, GeometryWanted wanted,
+                                                 Team& team, GeometryWork& work);
 
 // Forgets all kept geometry that is not in use.
 void clear_geometry();

@@ -172,10 +172,11 @@ void bind_pieces(nb::module_& m) {
 
     using Verts = nb::ndarray<const double, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
     using Faces = nb::ndarray<const int32_t, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-    // The faces of each edge, as (face, corner, backwards).
-    p.def("edges", [](Verts verts, Faces faces, double spacing) {
-        Topology topology(faces.data(), faces.shape(0), verts.shape(0));
-        topology.weld(verts.data(), spacing);
+    // The faces of each edge, as (face, corner, backwards); the vertices from first[i] on have spacing[i].
+    p.def("edges", [](Verts verts, Faces faces, std::vector<int32_t> first, std::vector<double> spacing) {
+        Team team(1);
+        Topology topology(faces.data(), faces.shape(0), verts.shape(0), team);
+        topology.weld(verts.data(), {first, spacing}, team);
         std::vector<std::vector<std::tuple<int, int, bool>>> out(topology.n_edges());
         for (int64_t e = 0; e < topology.n_edges(); ++e)
             for (const HalfEdge& h : topology.half_edges(e)) out[e].emplace_back(h.face, h.corner, h.backwards);

@@ -34,14 +34,23 @@ struct VisiblePolygon {
             if (camera.facing(p.q[v[0]], p.q[v[1]], p.q[v[2]]) == 0) return false;
             Vec3 polygon[ViewVolume::most_corners] = {p.q[v[0]], p.q[v[1]], p.q[v[2]]};
             n = volume.clip_triangle(polygon);
-            nearest = std::numeric_limits<double>::infinity();
+            double least = std::numeric_limits<double>::infinity(), farthest = 0;
+            nearest = least;
             for (int i = 0; i < n; ++i) {
                 nearest = std::min(nearest, polygon[i].z);
                 // Only a triangle through the eye itself has a corner there; it has no image to sample.
-                if (!(camera.depth_weight(polygon[i]) > 0)) return false;
-                corner[i] = project(camera, polygon[i]);
+                least = std::min(least, camera.depth_weight(polygon[i]));
+                if (!(least > 0)) return false;
+                corner[i] = volume.inside(project(camera, polygon[i]));
             }
             if (n < 3) return false;
+            for (int i = 0; i < 3; ++i) farthest = std::max(farthest, length(p.q[v[i]]));
+            // A point between corners that lie very far away is rounded as they are. If that shows, the whole view is
+            // taken: samples that miss the face find nothing.
+            if (!(std::numeric_limits<double>::epsilon() * farthest / least * camera.pixels_per_unit < 0.1)) {
+                const Vec2 a = volume.low, b = volume.high, view[4] = {a, {b.x, a.y}, b, {a.x, b.y}};
+                n = std::copy(view, view + 4, corner) - corner;
+            }
         }
         area = 0;
         low = high = corner[0];

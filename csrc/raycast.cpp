@@ -11,10 +11,13 @@
 #endif
 
 #include <algorithm>
+#include <bit>
 #include <chrono>
 #include <cmath>
+#include <cstdio>
 #include <filesystem>
 #include <fstream>
+#include <future>
 #include <limits>
 #include <new>
 #include <numeric>
@@ -165,7 +168,10 @@ RayCaster::RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts)
     : faces_(faces),
       n_faces_(n_faces),
       n_verts_(n_verts),
+      used_(n_verts, 0),
       positions_(3 * size_t(n_verts) + 1, 0.f) {  // Embree reads 16 bytes a vertex
+    for (int64_t i = 0; i < 3 * n_faces; ++i) used_[faces[i]] = 1;
+    if (std::find(used_.begin(), used_.end(), 0) == used_.end()) used_ = {};
     const std::lock_guard lock(embree_mutex);
     if (!rtc.device) throw std::runtime_error("Embree is not open");
     Geometry geometry = rtc.rtcNewGeometry(rtc.device, GEOMETRY_TYPE_TRIANGLE);
@@ -180,6 +186,8 @@ RayCaster::RayCaster(const int32_t* faces, int64_t n_faces, int64_t n_verts)
     rtc.rtcSetSceneBuildQuality(scene, BUILD_QUALITY_LOW);
     rtc.rtcSetSceneFlags(scene, SCENE_FLAG_DYNAMIC | SCENE_FLAG_ROBUST | SCENE_FLAG_FILTER_FUNCTION_IN_ARGUMENTS);
     rtc.rtcAttachGeometry(scene, geometry);
+    rtc.rtcSetSceneProgressMonitorFunction(
+        scene, [](void* stop, double) { return !static_cast<const std::atomic<bool>*>(stop)->load(); }, &stop_);
     throw_on_error("making a scene");
 }
 
@@ -189,55 +197,96 @@ RayCaster::~RayCaster() {
     rtc.rtcReleaseScene(static_cast<Scene>(scene_));
 }
 
-// Where the detail is: the mean of the faces' centroids weighted with 1 / (longest side)². Floats are as fine as their
-// distance to the origin is short, so a small object on a wide ground plane keeps its shape.
-Vec3 RayCaster::detail_centre(const double* verts, Team& team) const {
-    const int64_t blocks = Team::blocks(n_faces_);
-    const auto vertex = [&](int32_t v) {
-        return Vec3{verts[3 * int64_t(v)], verts[3 * int64_t(v) + 1], verts[3 * int64_t(v) + 2]};
-    };
+// The frame in which Embree sees the scene.
+//
+// Its origin is where the detail is: the mean of the faces' centroids weighted with 1 / (longest side)². Floats are as
+// fine as their distance to the origin is short, so a small object on a wide ground plane keeps its shape.
+//
+// Its unit matters only where the scene spans many powers of ten, for floats round alike at any scale: but Embree takes
+// products of three lengths, which must not leave the range of floats, 1e-38 … 1e38. So where the farthest vertex lies
+// very many times the size of a face away, that size (its geometric mean) lies as far below the unit as that vertex
+// lies above it.
+void RayCaster::set_frame(const double* verts, Team& team) {
+    const auto vertex = [&](int64_t v) { return Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]}; };
     const Vec3 base = vertex(faces_[0]);
-    std::vector<Vec3> sum(blocks);
-    std::vector<double> weight(blocks, 0.0);
+    struct Block {
+        Vec3 sum;
+        double weight = 0;
+        int64_t faces = 0, powers = 0;  // those that have a side; log₂ of its square, summed
+    };
+    std::vector<Block> of_faces(Team::blocks(n_faces_));
     team.each_block(n_faces_, [&](int64_t k, int64_t first, int64_t last) {
-        Vec3 block_sum;
-        double block_weight = 0;
+        Block block;
         for (int64_t f = first; f < last; ++f) {
             if (constexpr int ahead = 16; f + ahead < last)
                 for (int i = 0; i < 3; ++i) prefetch(verts + 3 * int64_t(faces_[3 * (f + ahead) + i]));
             const Vec3 a = vertex(faces_[3 * f]), b = vertex(faces_[3 * f + 1]), c = vertex(faces_[3 * f + 2]);
             const double side = std::max({dot(b - a, b - a), dot(c - b, c - b), dot(a - c, a - c)});
+            if (side > 0) ++block.faces, block.powers += int64_t(std::bit_cast<uint64_t>(side) >> 52) - 1023;
             double w = 1 / side;
             if (!(w <= std::numeric_limits<double>::max())) w = 0;  // a single point
-            block_weight += w;
-            block_sum += w * (a - base + (b - base) + (c - base));
+            block.weight += w;
+            block.sum += w * (a - base + (b - base) + (c - base));
         }
-        sum[k] = (1.0 / 3) * block_sum, weight[k] = block_weight;
+        block.sum = (1.0 / 3) * block.sum;
+        of_faces[k] = block;
     });
-    Vec3 total;
-    double total_weight = 0;
-    for (int64_t k = 0; k < blocks; ++k) total += sum[k], total_weight += weight[k];
-    const Vec3 centre = base + (1 / total_weight) * total;
-    return std::isfinite(centre.x + centre.y + centre.z) ? centre : base;
-}
+    Block all;
+    for (const Block& b : of_faces)
+        all.sum += b.sum, all.weight += b.weight, all.faces += b.faces, all.powers += b.powers;
+    centre_ = base + (1 / all.weight) * all.sum;
+    if (!std::isfinite(centre_.x + centre_.y + centre_.z)) centre_ = base;
 
-void RayCaster::update(const double* verts, Team& team) {
-    centre_ = detail_centre(verts, team);
     std::vector<double> farthest(Team::blocks(n_verts_), 0.0);
     team.each_block(n_verts_, [&](int64_t k, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
-            const Vec3 p = Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]} - centre_;
+            if (!uses(v)) continue;
+            const Vec3 p = vertex(v) - centre_;
             farthest[k] = std::max(farthest[k], dot(p, p));
         }
     });
-    radius_ = std::sqrt(*std::max_element(farthest.begin(), farthest.end()));
-    if (!(radius_ > 0)) radius_ = 1;  // a single point
+    unit_ = std::sqrt(*std::max_element(farthest.begin(), farthest.end())), radius_ = 1;
+    if (!(unit_ > 0)) unit_ = 1;  // a single point
+    if (!all.faces) return;
+    constexpr int ordinary = 20, most = 70, most_of_radius = 36;  // powers of two
+    const double size = double(all.powers) / (2 * double(all.faces)), span = std::log2(unit_) - size;
+    if (span > most) {
+        char text[256];
+        std::snprintf(text, sizeof text,
+                      "verts: expected faces within 1e21 times their size of each other, got a vertex %.1e away from "
+                      "faces of about %.1e; leave out what is so far or bring it nearer",
+                      unit_, std::exp2(size));
+        throw std::invalid_argument(text);
+    }
+    if (span <= ordinary) return;
+    radius_ = std::exp2(std::min(int(span / 2), most_of_radius));
+    unit_ /= radius_;
+}
+
+void RayCaster::update(const double* verts, Team& team) {
+    set_frame(verts, team);
     team.each_block(n_verts_, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
-            const Vec3 p = (1 / radius_) * (Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]} - centre_);
+            if (!uses(v)) continue;  // may be farther than floats reach
+            const Vec3 p = (1 / unit_) * (Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]} - centre_);
             positions_[3 * v] = float(p.x), positions_[3 * v + 1] = float(p.y), positions_[3 * v + 2] = float(p.z);
         }
     });
+    // Embree asks from any of its threads and holds locks of its own meanwhile. So that this one can ask the caller,
+    // whose signal handlers may render, another one builds what takes long.
+    if (n_faces_ < int64_t(1) << 18) return build();
+    auto built = std::async(std::launch::async, [&] { build(); });
+    try {
+        while (built.wait_for(std::chrono::milliseconds(20)) == std::future_status::timeout) team.check();
+    } catch (...) {
+        stop_ = true;
+        built.wait();
+        throw;
+    }
+    built.get();
+}
+
+void RayCaster::build() {
     const std::lock_guard lock(embree_mutex);
     if (committed_) rtc.rtcUpdateGeometryBuffer(static_cast<Geometry>(geometry_), BUFFER_TYPE_VERTEX, 0);
     {
@@ -254,16 +303,17 @@ RayFrame::RayFrame(const RayCaster& caster, const Camera& camera)
     : axis_x_(camera.R_inverse * Vec3{1, 0, 0}),
       axis_y_(camera.R_inverse * Vec3{0, 1, 0}),
       axis_z_(camera.R_inverse * Vec3{0, 0, 1}),
-      eye_((1 / caster.radius_) * (camera.R_inverse * -camera.t - caster.centre_)),
+      eye_((1 / caster.unit_) * (camera.R_inverse * -camera.t - caster.centre_)),
       centre_(caster.centre_),
-      inverse_radius_(1 / caster.radius_),
+      unit_(caster.unit_),
+      radius_(caster.radius_),
       perspective_(camera.perspective),
-      far_(!camera.perspective || length(eye_) > 4) {}
+      far_(!camera.perspective || length(eye_) > 4 * radius_) {}
 
 double RayFrame::error(Vec3 p) const {
     // Positions are rounded as far from the centre as they are; rays where they start: see prepare().
-    const double start = far_ ? 2 : length(eye_), point = inverse_radius_ * length(p - centre_);
-    return 4 * std::numeric_limits<float>::epsilon() * (point + start) / inverse_radius_;
+    const double start = unit_ * (far_ ? 2 * radius_ : length(eye_));
+    return 4 * std::numeric_limits<float>::epsilon() * (length(p - centre_) + start);
 }
 
 template <int W>
@@ -306,10 +356,10 @@ template <int W>
             const Vec3 across = x[i] * X + y[i] * Y;
             Vec3 o = frame_.eye_, d = Z;
             if (frame_.perspective_) d += across;
-            else o += frame_.inverse_radius_ * across;
-            // Everything lies in the unit ball. Float positions of a far origin would be coarser than the scene, so the
+            else o += (1 / frame_.unit_) * across;
+            // Everything lies in a ball. Float positions of a far origin would be coarser than the scene, so the
             // ray starts just before the ball, computed here in double; never behind the eye.
-            const double start = -dot(o, d) / dot(d, d) - 2;
+            const double start = -dot(o, d) / dot(d, d) - 2 * frame_.radius_;
             o += (frame_.perspective_ && start < 0 ? 0 : start) * d;
             p.origin_x[i] = float(o.x), p.origin_y[i] = float(o.y), p.origin_z[i] = float(o.z);
             p.direction_x[i] = float(d.x), p.direction_y[i] = float(d.y), p.direction_z[i] = float(d.z);
@@ -348,31 +398,44 @@ struct ValidLanes {
 } constexpr valid_lanes;
 
 struct RejectContext {
-    RayQueryContext query;  // first, so that a pointer to it is a pointer to this
-    const std::span<const int32_t>* rejected;
+    RayQueryContext query;                          // first, so that a pointer to it is a pointer to this
+    const std::span<const int32_t>* rejected;       // by ray, or null
+    bool (*meets)(const void* data, int32_t face);  // or null
+    const void* data;
+    int32_t face = -1;  // that was asked for last, and the answer: the rays of a packet mostly ask together
+    bool is_met = false;
 };
 
 void reject(const FilterArguments* a) {
-    const auto* context = reinterpret_cast<const RejectContext*>(a->context);
+    auto* context = reinterpret_cast<RejectContext*>(a->context);
     const auto* id = static_cast<const unsigned*>(a->ray) + 10 * a->N;
     const auto* face = static_cast<const unsigned*>(a->hit) + 5 * a->N;
     for (unsigned i = 0; i < a->N; ++i) {
         if (!a->valid[i]) continue;
-        const auto& rejected = context->rejected[id[i]];
         const int32_t f = int32_t(face[i]);
-        // Most are the two faces of an edge; longer lists come sorted.
-        const bool found = rejected.size() > 16 ? std::binary_search(rejected.begin(), rejected.end(), f)
-                                                : std::find(rejected.begin(), rejected.end(), f) != rejected.end();
+        bool found = false;
+        if (context->rejected) {
+            // Most are the two faces of an edge; longer lists come sorted.
+            const auto& rejected = context->rejected[id[i]];
+            found = rejected.size() > 16 ? std::binary_search(rejected.begin(), rejected.end(), f)
+                                         : std::find(rejected.begin(), rejected.end(), f) != rejected.end();
+        }
+        if (!found && context->meets) {
+            if (context->face != f) context->face = f, context->is_met = context->meets(context->data, f);
+            found = !context->is_met;
+        }
         if (found) a->valid[i] = 0;
     }
 }
 
 }  // namespace
 
-void RayCaster::intersect(RayBatch& batch, const std::span<const int32_t>* rejected) const {
-    RejectContext context{{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}}, nullptr};
-    const int flags = RAY_QUERY_FLAG_COHERENT | (rejected ? RAY_QUERY_FLAG_INVOKE_ARGUMENT_FILTER : 0);
-    IntersectArguments arguments{flags, FEATURE_FLAG_ALL, &context.query, rejected ? reject : nullptr, nullptr, 0};
+void RayCaster::intersect(RayBatch& batch, const std::span<const int32_t>* rejected, const Decision* meets) const {
+    RejectContext context{{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}}, nullptr, nullptr, nullptr};
+    if (meets) context.meets = meets->call, context.data = meets->data;
+    const bool any = rejected || meets;
+    const int flags = RAY_QUERY_FLAG_COHERENT | (any ? RAY_QUERY_FLAG_INVOKE_ARGUMENT_FILTER : 0);
+    IntersectArguments arguments{flags, FEATURE_FLAG_ALL, &context.query, any ? reject : nullptr, nullptr, 0};
     const auto each = [&](auto& packets, int width, auto intersect) {
         for (int k = 0; k < batch.count; k += width) {
             if (rejected) context.rejected = rejected + k;
@@ -386,6 +449,11 @@ void RayCaster::intersect(RayBatch& batch, const std::span<const int32_t>* rejec
 
 void RayCaster::cast(RayBatch& batch, const std::span<const int32_t>* rejected) const {
     intersect(batch, rejected);
+    batch.read_faces();
+}
+
+void RayCaster::cast(RayBatch& batch, const std::span<const int32_t>* rejected, const Decision& meets) const {
+    intersect(batch, rejected, &meets);
     batch.read_faces();
 }
 

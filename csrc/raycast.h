@@ -1,8 +1,8 @@
 // The only door to Embree: opens the library, keeps a ray structure over triangles, casts packets of rays.
 #pragma once
 
-#include <algorithm>
 #include <array>
+#include <atomic>
 #include <cstdint>
 #include <mutex>
 #include <span>
@@ -55,12 +55,20 @@ class RayCaster {
     RayCaster(const RayCaster&) = delete;
     RayCaster& operator=(const RayCaster&) = delete;
 
-    // New positions (V, 3), world units.
+    // New positions (V, 3), world units. Throws std::invalid_argument if floats cannot hold the faces together, and
+    // Interrupted, after which the caster is of no more use.
     void update(const double* verts, Team& team);
+
+    // Whether a face has this vertex.
+    bool uses(int64_t vertex) const { return used_.empty() || used_[vertex]; }
 
     // The nearest face along each ray of the batch, where ray i is blind to the faces in rejected[i], if given. Those
     // of a ray ascend if they are more than 16.
     void cast(RayBatch& batch, const std::span<const int32_t>* rejected = nullptr) const;
+
+    // The same through what `meets(face)` refuses.
+    template <class Meets>
+    void cast_through(RayBatch& batch, const std::span<const int32_t>* rejected, Meets meets) const;
 
     // What one ray truly meets, where `face` is what the cast found. Embree decides in float, so near its rim a face
     // may be hit that the ray misses: at a silhouette of a fine mesh that is a neighbour which is seen less wide than
@@ -72,17 +80,30 @@ class RayCaster {
    private:
     friend class RayFrame;
     friend double bare_loop(const Camera&, const RayCaster&, const struct ForwardOptions&, int, Team&);
-    void intersect(RayBatch& batch, const std::span<const int32_t>* rejected = nullptr) const;
-    Vec3 detail_centre(const double* verts, Team& team) const;
+
+    // What `call(data, face)` says of each face that a ray might hit.
+    struct Decision {
+        bool (*call)(const void* data, int32_t face);
+        const void* data;
+    };
+    void intersect(RayBatch& batch, const std::span<const int32_t>* rejected = nullptr,
+                   const Decision* meets = nullptr) const;
+    void cast(RayBatch& batch, const std::span<const int32_t>* rejected, const Decision& meets) const;
+
+    void set_frame(const double* verts, Team& team);
+    void build();
 
     const int32_t* faces_;
     int64_t n_faces_, n_verts_;
-    // Embree sees (p − centre) / radius: a scene keeps its float precision wherever it lies and whatever its unit.
+    std::vector<uint8_t> used_;  // (V,) by faces; empty: all are
+    // Embree sees (p − centre) / unit: a scene keeps its float precision wherever it lies and whatever its unit. All
+    // lies within `radius` of the origin there.
     Vec3 centre_;
-    double radius_ = 1;
+    double unit_ = 1, radius_ = 1;
     std::vector<float> positions_;
     void *scene_ = nullptr, *geometry_ = nullptr;
     bool committed_ = false;
+    std::atomic<bool> stop_{false};  // asks a build to end
 };
 
 // The rays of one camera as Embree sees them.
@@ -97,7 +118,7 @@ class RayFrame {
     friend class RayBatch;
     Vec3 axis_x_, axis_y_, axis_z_;  // of the camera, in world coordinates times whatever scale they have
     Vec3 eye_, centre_;
-    double inverse_radius_;
+    double unit_, radius_;
     bool perspective_, far_;
 };
 
@@ -136,20 +157,20 @@ class RayBatch {
 };
 
 template <class Meets>
+void RayCaster::cast_through(RayBatch& batch, const std::span<const int32_t>* rejected, Meets meets) const {
+    cast(batch, rejected,
+         {[](const void* data, int32_t face) -> bool { return (*static_cast<const Meets*>(data))(face); }, &meets});
+}
+
+template <class Meets>
 int32_t RayCaster::beyond_float(const RayFrame& frame, Vec2 n, int32_t face, std::span<const int32_t> rejected,
                                 Meets meets) const {
     if (face < 0 || meets(face)) return face;
-    std::vector<int32_t> blind(rejected.begin(), rejected.end());
     RayBatch ray(frame);
     ray.n_x[0] = n.x, ray.n_y[0] = n.y, ray.count = 1;
-    do {
-        blind.insert(std::upper_bound(blind.begin(), blind.end(), face), face);
-        const std::span<const int32_t> all = blind;
-        ray.prepare();
-        cast(ray, &all);
-        face = ray.face[0];
-    } while (face >= 0 && !meets(face));
-    return face;
+    ray.prepare();
+    cast_through(ray, &rejected, meets);
+    return ray.face[0];
 }
 
 }  // namespace edgegrad

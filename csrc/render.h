@@ -79,7 +79,7 @@ struct BackwardOptions {
     uint64_t seed;
     bool interior_geometry;  // whether the colours vary over faces, so that moving them shows inside
     bool boundary;
-    double spacing;     // relative spacing of the numbers in which the user gave the vertices
+    Spacing spacing;
     bool dry;           // only count the samples
     int pixel_spp = 0;  // if not zero, all of the interior term from so many samples a pixel, for the benchmarks
 };

@@ -110,6 +110,7 @@ class Scatter {
             grads_.resize(most);
         Stopwatch watch;
         for (int64_t first = 0; first < n; first += chunk * wave) {
+            team_.check();  // the calling thread may get no chunk of a wave
             const int64_t chunks = std::min(wave, (n - first + chunk - 1) / chunk);
             team_.each(chunks, [&](int64_t i) {
                 ChunkGrad& g = grads_[i];

@@ -1,11 +1,27 @@
 // Plain views of the arrays of a scene, as edgegrad/scene.py lays them out, and SceneGrad, their mirror.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
+#include <vector>
 
 #include "math.h"
 
 namespace edgegrad {
+
+// Relative spacing of the numbers in which the user gave the vertices, which may differ from mesh to mesh: value[i]
+// from vertex first[i] on.
+struct Spacing {
+    std::vector<int32_t> first{0};
+    std::vector<double> value{0};
+
+    double of(int32_t vertex) const {
+        if (value.size() == 1) return value[0];
+        return value[std::upper_bound(first.begin(), first.end(), vertex) - first.begin() - 1];
+    }
+
+    bool operator==(const Spacing&) const = default;
+};
 
 // A corner of a face refers to a row of `colors`, or, where the face carries a texture, to a row of `uvs`.
 // Colours of vertices, faces and corners differ only in that index. T is float or double.

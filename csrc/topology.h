@@ -9,6 +9,9 @@
 #include <span>
 #include <vector>
 
+#include "parallel.h"
+#include "scene.h"
+
 namespace edgegrad {
 
 // A face at an edge: the face, and which of its sides (corner i to corner i + 1) lies on the edge.
@@ -24,7 +27,7 @@ struct HalfEdge {
 // Which faces hang together: those that share a vertex by index, and all that share one with them.
 class Parts {
    public:
-    Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts);
+    Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team);
 
     int64_t size() const { return size_; }
     // The part of a face, by one of its vertices.
@@ -37,10 +40,10 @@ class Parts {
 
 class Topology {
    public:
-    Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts);
+    Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team);
 
-    // Welds what coincides at these positions (V, 3). `spacing` is the relative spacing of the numbers the user gave.
-    void weld(const double* verts, double spacing);
+    // Welds what coincides at these positions (V, 3).
+    void weld(const double* verts, const Spacing& spacing, Team& team);
 
     // Whether vertices were welded.
     bool welds() const { return !welded_.empty(); }
@@ -55,7 +58,7 @@ class Topology {
     }
 
    private:
-    void build();
+    void build(Team& team);
 
     const int32_t* faces_;
     int64_t n_faces_, n_verts_;

@@ -19,7 +19,7 @@ from ._check import as_int, check_finite, check_not_meta, check_positive_int, ch
 from ._kernel import core
 from .camera import Camera
 from .mesh import Mesh
-from .scene import Flat, Scene, flatten
+from .scene import Flat, Scene, flatten, vertex_spacing
 
 FILTERS = ("box", "tent", "gaussian")
 
@@ -107,13 +107,11 @@ def render_arguments(
     world_to_camera = camera.world_to_camera.cpu().double().reshape(-1, 4, 4)
     K = camera.K.cpu().double().reshape(-1, 3, 3)
     B = max(world_to_camera.shape[0], K.shape[0])
-    # The spacing of the coarsest numbers among the vertices, to which copies of a point may differ.
-    spacing = max(torch.finfo(mesh.verts.dtype).eps for mesh in scene.meshes)
     return (
         *flat,
         world_to_camera.expand(B, 4, 4).contiguous(),
         K.expand(B, 3, 3).contiguous(),
-        camera.projection == "perspective", *camera.size, spp, filter, seed, spacing,
+        camera.projection == "perspective", *camera.size, spp, filter, seed, vertex_spacing(scene),
         *counts, grad_seed, radiance_varies(scene), visibility,
     )  # fmt: skip
 
@@ -158,7 +156,7 @@ _SCENE = (
     "Tensor verts, Tensor faces, Tensor corners, Tensor colors, Tensor uvs, Tensor texels, Tensor textures, "
     "Tensor face_texture, Tensor background, Tensor world_to_camera, Tensor K"
 )
-_IMAGE = "bool perspective, int height, int width, int spp, str filter, int seed, float spacing"
+_IMAGE = "bool perspective, int height, int width, int spp, str filter, int seed, float[] spacing"
 _GRADIENT = "int surface_samples, int edge_samples, int grad_seed, bool interior_geometry, bool boundary"
 
 torch.library.define("edgegrad::render", f"({_SCENE}, {_IMAGE}) -> (Tensor, Tensor, Tensor, Tensor)")
@@ -169,11 +167,11 @@ torch.library.define(
 )
 
 
-def _kernel_scene(flat: Flat, spacing: float):
+def _kernel_scene(flat: Flat, spacing: Sequence[float]):
     kind = core.SceneDouble if flat.colors.dtype == torch.float64 else core.SceneFloat
     background = flat.background if flat.background.dim() == 3 else flat.background[None, None]
     arrays = [t.detach().contiguous().numpy() for t in (*flat[:-1], background)]
-    return kind(*arrays, spacing, torch.get_num_threads())
+    return kind(*arrays, list(spacing), torch.get_num_threads())
 
 
 def _kernel_camera(world_to_camera: Tensor, K: Tensor, perspective: bool, height: int, width: int):

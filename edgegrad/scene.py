@@ -138,6 +138,19 @@ def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
     return index.to(torch.int32)
 
 
+def vertex_spacing(scene: Scene) -> list[float]:
+    """The relative spacing of the numbers in which the vertices were given, by which copies of a point may differ: pairs of
+    the number of a vertex in the flat arrays and the spacing from there on."""
+    pairs: list[float] = []
+    n_verts = 0
+    for mesh in scene.meshes:
+        spacing = torch.finfo(mesh.verts.dtype).eps
+        if not pairs or pairs[-1] != spacing:
+            pairs += [float(n_verts), spacing]
+        n_verts += mesh.verts.shape[0]
+    return pairs
+
+
 def flatten(scene: Scene) -> Flat:
     """The arrays of a scene; every step is a differentiable torch operation, so gradients find their way back."""
     C = scene.channels

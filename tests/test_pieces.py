@@ -482,7 +482,7 @@ EPS32, EPS64 = 2.0**-23, 2.0**-52
 
 def edges_of(verts: torch.Tensor, faces: torch.Tensor, spacing: float = EPS64) -> list[list[tuple[int, int, bool]]]:
     """The edges, each a list of its half-edges (face, corner where it begins, whether against the edge)."""
-    return pieces.edges(verts.double().numpy(), faces.int().numpy(), spacing)
+    return pieces.edges(verts.double().numpy(), faces.int().numpy(), [0], [spacing])
 
 
 def faces_at(edges: list[list[tuple[int, int, bool]]]) -> list[int]:

@@ -28,7 +28,7 @@ class Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx, verts, colors, uvs, texels, world_to_camera, K, flat, view, faces, points):
         flat = flat._replace(verts=verts, colors=colors, uvs=uvs, texels=texels)
-        kernel = _kernel_scene(flat, spacing=0.0), _kernel_camera(world_to_camera, K, *view)
+        kernel = _kernel_scene(flat, spacing=[0.0, 0.0]), _kernel_camera(world_to_camera, K, *view)
         radiance = torch.empty((len(points), flat.background.shape[-1]), dtype=F64)
         kernel[0].shade_at(kernel[1], faces.int().numpy(), points.numpy(), radiance.numpy())
         ctx.save_for_backward(verts, colors, uvs, texels, world_to_camera, K)

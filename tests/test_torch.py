@@ -89,7 +89,7 @@ def leaf(tensor: Tensor) -> Tensor:
 # -- operators --------------------------------------------------------------------------------------------------------
 
 
-def operator_inputs(scene: eg.Scene, spacing: float = 2.0**-52) -> tuple:
+def operator_inputs(scene: eg.Scene, spacing: tuple[float, ...] = (0, 2.0**-52)) -> tuple:
     return (*flatten(scene), CAMERA.world_to_camera[None], CAMERA.K[None], True, SIZE, SIZE, 4, "box", 0, spacing)
 
 
@@ -805,7 +805,7 @@ def test_seeds():
 
 def sample_counts(surface: int, edge: int, adjoint: Tensor, boundary: bool = True) -> tuple[int, int]:
     """What the kernel says it drew for the triangle's vertices."""
-    scene = _kernel_scene(flatten(TRIANGLE), spacing=2.0**-52)
+    scene = _kernel_scene(flatten(TRIANGLE), spacing=[0, 2.0**-52])
     camera = _kernel_camera(CAMERA.world_to_camera, CAMERA.K, True, SIZE, SIZE)
     # All pixels covered by many samples, so that no budget binds; nothing is occluded.
     coverage, farthest = torch.ones(SIZE, SIZE, dtype=F64), torch.full((SIZE, SIZE), torch.inf)

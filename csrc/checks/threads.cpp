@@ -118,7 +118,7 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
     GeometryWork work;
     {
         const auto geometry =
-            acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, 1e-7, {}, team, work);
+            acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, {{0}, {1e-7}}, {}, team, work);
         render_forward(view, camera, geometry->caster(), {spp, Filter(filter), 1}, team,
                        ForwardOutput<T>{image.data(), coverage.data(), farthest.data(), seen.data()});
     }
@@ -127,8 +127,8 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
     const SceneGrad grad{verts.data(),      colors.data(), uvs.data(), texels.data(),
                          background.data(), pose.data(),   K.data()};
     const auto geometry =
-        acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, 1e-7, {true, true}, team, work);
-    const BackwardOptions options{spp, -1, -1, Filter(filter), 2, true, true, 1e-7, false};
+        acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, {{0}, {1e-7}}, {true, true}, team, work);
+    const BackwardOptions options{spp, -1, -1, Filter(filter), 2, true, true, {{0}, {1e-7}}, false};
     render_backward(view, camera, *geometry, options, team, image.data(),
                     ForwardView<T>{coverage.data(), farthest.data(), seen.data()}, grad);
     std::vector<double> all(image.begin(), image.end());
