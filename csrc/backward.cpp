@@ -120,25 +120,30 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
             return;
         }
         // Both terms are measured before samples are drawn, since they share a budget.
-        watch.lap();
+        SampleCounts wanted;
         std::optional<SurfaceMeasure<T>> surface;
-        if (interior) surface.emplace(measure_surface<N>(view, interior_geometry, to));
-        profile.measure = watch.lap();
+        if (interior) {
+            watch.lap();
+            surface.emplace(measure_surface<N>(view, interior_geometry, to));
+            wanted.surface = surface->wanted(o.surface_samples);
+            profile.surface_wanted = surface->pixel_samples() + wanted.surface;
+            profile.measure = watch.lap();
+        }
         std::optional<Curves<T>> curves;
-        if (boundary) curves.emplace(measure_curves<N>(view));
-        const SampleCounts wanted{surface ? surface->wanted(o.surface_samples) : 0,
-                                  curves ? curves->wanted(o.edge_samples) : 0};
+        if (boundary) {
+            watch.lap();
+            curves.emplace(measure_curves<N>(view));
+            wanted.edge = profile.edge_wanted = curves->wanted(o.edge_samples);
+            profile.silhouettes = curves->silhouettes, profile.creases = curves->creases;
+            profile.curves = watch.lap();
+        }
         const SampleBudget budget(forward.coverage, int64_t(camera.width) * camera.height, o.spp, team);
-        const SampleCounts share = budget.share(wanted);
-        if (curves) profile.silhouettes = curves->silhouettes, profile.creases = curves->creases;
-        if (surface) profile.surface_wanted = surface->pixel_samples() + wanted.surface;
-        profile.edge_wanted = wanted.edge;
-        profile.curves = watch.lap();
-        if (surface)
-            add_interior<N>(view, *surface, o.surface_samples >= 0 ? wanted.surface : share.surface, interior_geometry,
-                            to, profile);
+        SampleCounts n = budget.share(wanted);
+        if (o.surface_samples >= 0) n.surface = wanted.surface;
+        if (o.edge_samples >= 0) n.edge = wanted.edge;
+        if (surface) add_interior<N>(view, *surface, n.surface, interior_geometry, to, profile);
         if (curves) {
-            add_boundary<N>(view, *curves, o.edge_samples >= 0 ? wanted.edge : share.edge, to, profile);
+            add_boundary<N>(view, *curves, n.edge, to, profile);
             if (!curves->x_bar.empty()) add_places(view, curves->x_bar, to);
         }
     });

@@ -343,9 +343,12 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, Des
                   BackwardProfile& profile) {
     profile.edge_samples = n;
     if (n == 0 || view.options.dry) return;
+    Stopwatch watch;
     const CurveFinder<T>& finder = curves.finder;
     const CoincidentCurves coincident(curves.segments, view.team);
     Systematic systematic(curves.of_edge, view.team);
+    profile.curves += watch.lap();
+    if (!(systematic.total() > 0)) return;
     systematic.draw(n, to_unit(hash(view.options.seed, 3, gradient_stream)));
     const bool controls = !curves.x_bar.empty();
     if (controls) to.x = curves.x_bar.data();

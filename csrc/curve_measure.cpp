@@ -65,8 +65,7 @@ class MeasuredEdges {
             const double visible = visibility(c, low, high), m = c.length * visible * jump(c, x);
             of_edge_[e] = m * importance;
             found.pixels += m;
-            // One that is occluded meets no ray behind another, for what occludes it lies before it there too.
-            if (visible == 1 || visible == missed) found.segments.push_back({e, c.x0, c.x1, reach_of_rays(view_, c)});
+            found.segments.push_back({e, c.x0, c.x1, reach_of_rays(view_, c)});
         }
     }
 

@@ -144,6 +144,7 @@ void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64
                              surface.is_large.data(), geometry, to, profile.surface);
     if (n == 0) return;
     Systematic systematic(surface.of_face, view.team);
+    if (!(systematic.total() > 0)) return;
     systematic.draw(n, to_unit(hash(o.seed, 1, gradient_stream)));
     add_surface_samples<N>(view, n, systematic, surface, geometry, to, profile.surface);
 }

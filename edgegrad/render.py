@@ -479,9 +479,9 @@ class _RenderBackward(torch.autograd.Function):
 def _one_by_one(
     function: type[torch.autograd.Function], count: int, in_dims: tuple[int | None, ...], args: tuple[Any, ...]
 ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-    """torch.vmap of a function with several outputs: call by call."""
+    """torch.vmap of a function with several outputs: call by call. What is no tensor, as the list of spacings, has no batch axis."""
     results = [
-        function.apply(*(a if dim is None else a.select(dim, i) for a, dim in zip(args, in_dims, strict=True)))
+        function.apply(*(a.select(dim, i) if isinstance(dim, int) else a for a, dim in zip(args, in_dims, strict=True)))
         for i in range(count)
     ]
     outputs = tuple(torch.stack(parts) for parts in zip(*results, strict=True))

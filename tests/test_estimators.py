@@ -122,10 +122,10 @@ def test_hidden_layers() -> None:
     assert (total - alone).norm() < 0.01 * alone.norm()
     one, _ = default_samples(layers[0], camera, adjoint)
     all_layers, _ = default_samples(scene, camera, adjoint)
-    # Each of the others an eighth of what it would cost if it were seen.
-    if_seen = eg.plan(scene.replace(meshes=[m.replace(verts=v) for m, v in zip(layers, leaves, strict=True)]), camera)
-    first = eg.plan(layers[0].replace(verts=leaves[0]), camera)
-    assert all_layers - one < 1.01 / 8 * (if_seen["interior"].samples - first["interior"].samples)
+    # Each of the others, which all lie behind the first, a sixteenth of what it would cost if it were visible: most of their
+    # faces a 64th, those behind the limb, where some samples hit nothing, an eighth.
+    if_visible = eg.plan(layers[0].replace(verts=leaves[0]), camera)["interior"].samples
+    assert all_layers - one < 19 / 16 * if_visible
 
 
 def turned_away(mesh: eg.Mesh, camera: eg.Camera) -> torch.Tensor:
@@ -136,7 +136,8 @@ def turned_away(mesh: eg.Mesh, camera: eg.Camera) -> torch.Tensor:
 
 @pytest.mark.parametrize("inside_out", [False, True])
 def test_the_far_side_costs_little(inside_out: bool) -> None:
-    """Where no face is seen from behind, those that turn their backs get a sixty-fourth of the samples; else an eighth."""
+    """What lies behind the near side gets a 64th of the samples. Near the limb, where some samples hit nothing, faces that turn
+    their backs get a 64th where no face is visible from behind, else an eighth."""
     camera, adjoint = front_camera(128), smooth_adjoint(128, 128, 3)
     mesh = icosphere(5)
     if inside_out:
@@ -148,7 +149,7 @@ def test_the_far_side_costs_little(inside_out: bool) -> None:
         default_samples(mesh.replace(faces=faces), camera, adjoint)[0]
         for faces in (mesh.faces[~far], mesh.faces, mixed)
     )
-    assert whole - near_half < 0.2 * (either_side - near_half)
+    assert whole - near_half < 0.4 * (either_side - near_half) and either_side - near_half < 0.4 * near_half
 
 
 def test_what_hangs_together_says_where_to_look() -> None:

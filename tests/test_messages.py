@@ -417,7 +417,7 @@ def test_adjoint_that_is_not_finite(value):
 def kernel_scene(**arrays: np.ndarray) -> object:
     """The kernel's scene of a textured mesh, some of its arrays replaced."""
     flat = flatten(eg.Scene([textured(), mesh(colors=VERTS)]))
-    return _kernel_scene(flat._replace(**{name: torch.as_tensor(array) for name, array in arrays.items()}), 1e-7)
+    return _kernel_scene(flat._replace(**{name: torch.as_tensor(array) for name, array in arrays.items()}), [0, 1e-7])
 
 
 FLAT = flatten(eg.Scene([textured(), mesh(colors=VERTS)]))

@@ -149,7 +149,9 @@ def test_plan_is_what_the_kernel_does(name, kernel):
             # An adjoint that is the same everywhere lets small faces do with fewer, but never with less than a sixteenth.
             most, taken = planned["interior"].samples, done["surface_samples"]
             assert most / 16 <= taken <= most, case
-            assert planned["boundary"].samples == done["edge_samples"], case
+            # Creases have controls too, and take a sixty-fourth at least.
+            most, taken = planned["boundary"].samples, done["edge_samples"]
+            assert most / 64 <= taken <= most and (planned["creases"].on or taken == most), case
             for term, part in (
                 ("view", "view"), ("interior", "surface rays"), ("topology", "curves"), ("boundary", "edge rays"),
                 ("silhouettes", "silhouettes"), ("creases", "creases"),
@@ -190,7 +192,8 @@ def test_batches_add_up(kernel):
     done = step(kernel, creased(), batch, ("verts", "world_to_camera"))
     for term in ("image", "interior", "boundary"):
         assert planned[term].samples == 3 * single[term].samples
-    assert planned["boundary"].samples == done["edge_samples"] and len(kernel.backward) == 3
+    most, taken = planned["boundary"].samples, done["edge_samples"]
+    assert most / 64 <= taken <= most and len(kernel.backward) == 3
     assert "3 cameras" in planned["image"].why
 
 
@@ -447,7 +450,7 @@ def test_profile_rebuilds_for_every_repeat(monkeypatch):
 
     def forward_kernel(*args):
         output = render_module.forward_kernel(*args)
-        built.append(bool(output[3][0]["built rays"]))
+        built.append(bool(output[2][0]["built rays"]))
         return output
 
     monkeypatch.setattr(importlib.import_module("edgegrad.plan"), "forward_kernel", forward_kernel)
