@@ -284,8 +284,8 @@ class BoundaryChunk {
         const Spacing& spacing = view_.options.spacing;
         const double coarser =
             std::max(spacing.of(vertex(view_.scene, h, h.first())), spacing.of(view_.scene.faces[3 * face]));
-        return apart > rounding && (apart > contact(coarser, largest_coordinate(view_.scene, h), size) ||
-                                    shares_vertex(face, curve.edge));
+        return apart > rounding &&
+               (apart > contact(coarser, largest_coordinate(view_.scene, h), size) || shares_vertex(face, curve.edge));
     }
 
     bool shares_vertex(int64_t face, int64_t edge) const {

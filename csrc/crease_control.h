@@ -1,17 +1,19 @@
-// A control variate for creases, as control.h is one for faces: what a short crease that is seen whole would give if
-// the adjoint and the radiance on both its sides were affine along it.
+// A control variate for creases, as control.h is one for faces: what a crease would give if all of it were visible.
 //
-// With ends a and b in the image, τ = x_b − x_a, the filtered adjoint Ã_i there and the jump ΔL_j = L₋ − L₊, the
-// integral ∫ Ã · ΔL (δx ∧ τ) ds over s in (0, 1) would be
+// Its radiance is known on both sides, so with τ = x_b − x_a, the jump ΔL = L₋ − L₊, affine between the ends, and φ_a =
+// 1 − s, φ_b = s the boundary term would be
 //
-//     Σ_ijk w_ijk (Ã_i · ΔL_j) (δx_k ∧ τ),   i, j, k in {a, b},   w = ∫ φ_i φ_j φ_k ds = ¼ if i = j = k, else 1/12
+//     Σ_k δx_k ∧ τ ∫ Ã(x(s)) · ΔL(s) φ_k(s) ds,   k in {a, b}.
 //
-// with φ_a = 1 − s and φ_b = s. It is added for all such creases, and its integrand is taken away at each sample, so
-// that nothing is biased, whatever it is worth.
+// Between the lines where the pixel filter begins and ends, Ã is a constant (box) or a quadratic of s (tent), so
+// Gauss's rule gives the integral exactly; of a Gaussian the quadratic through three points of each piece serves. That
+// is added for all such creases, and its integrand taken away at each sample, so that nothing is biased; samples find
+// only where the crease is occluded after all.
 #pragma once
 
 #include <algorithm>
 #include <cmath>
+#include <vector>
 
 #include "curve.h"
 #include "interior.h"
@@ -46,14 +48,15 @@ bool joins_colors(const SceneView<T>& scene, const Curve& c) {
 template <int N, class T>
 class CreaseControl {
    public:
-    explicit CreaseControl(const BackwardView<T>& view) : view_(view), C_(N ? N : view.scene.channels) {}
+    explicit CreaseControl(const BackwardView<T>& view) : view_(view), C_(N ? N : view.scene.channels), A_(C_) {}
 
     // Begins with a curve; false where there is no control.
     bool set(const Curve& curve) {
         const SceneView<T>& scene = view_.scene;
-        if (!joins_colors(scene, curve) || curve.t0 > 0 || curve.t1 < 1 || !(curve.length <= longest)) return false;
-        // A crease that comes near the eye is not affine in the image.
-        if (!(std::max(curve.w0, curve.w1) < 2 * std::min(curve.w0, curve.w1))) return false;
+        if (!joins_colors(scene, curve) || curve.t0 > 0 || curve.t1 < 1) return false;
+        // A crease that comes near the eye does not move in the image as its ends do.
+        bend_ = std::fabs(curve.w1 - curve.w0) / (curve.w0 + curve.w1);
+        if (!(bend_ < 1.0 / 3)) return false;
         const auto minus = view_.hits->of(scene.faces + 3 * int64_t(curve.minus.face));
         const auto plus = view_.hits->of(scene.faces + 3 * int64_t(curve.plus.face));
         if (!minus.whole || !plus.whole) return false;
@@ -62,48 +65,40 @@ class CreaseControl {
         for (int k = 0; k < 2; ++k) {
             vertex_[0][k] = vertex(scene, curve.minus, k ? curve.minus.second() : curve.minus.first());
             vertex_[1][k] = vertex(scene, curve.plus, k ? curve.plus.second() : curve.plus.first());
-            adjoint_[k] = view_.vertex_adjoint.data() + int64_t(vertex_[0][k]) * C_;
-        }
-        const CreaseColors<T> colors(scene, curve);
-        aa_ = ab_ = ba_ = bb_ = 0;
-        const int C = N ? N : C_;
-        for (int c = 0; c < C; ++c) {
-            const double ja = colors.jump(0, c), jb = colors.jump(1, c);
-            aa_ += adjoint_[0][c] * ja, ab_ += adjoint_[0][c] * jb;
-            ba_ += adjoint_[1][c] * ja, bb_ += adjoint_[1][c] * jb;
         }
         at_a_ = at_b_ = 0;
         return true;
     }
 
-    // What its density is multiplied by: fewer samples where the adjoint hardly changes along it.
+    // What its density is multiplied by: the fewer samples the less may hide a part of it.
     double density() const {
-        if (!clear_) return 1;
-        const Vec2 middle = curve_->position(0.5);
-        const auto pixel = [](double x, int count) {
-            return int64_t(std::clamp(std::floor(x), 0.0, double(count - 1)));
-        };
-        const T* inside = view_.adjoint.of(pixel(middle.y, view_.camera.height) * view_.camera.width +
-                                           pixel(middle.x, view_.camera.width));
-        double sum = 0, change = 0;
-        for (int c = 0; c < C_; ++c) {
-            const double a = adjoint_[0][c], b = adjoint_[1][c];
-            sum += std::fabs(a) + std::fabs(b);
-            change = change + std::fabs(b - a) + std::fabs(2 * inside[c] - a - b);
-        }
-        if (!(sum > 0)) return 1;
-        return std::clamp(std::max(rough * change / sum, curve_->length / wide), least, 1.0);
+        return std::clamp(std::max(curve_->length / wide, bend_), clear_ ? least : least_at_rims, 1.0);
     }
 
     void add_integral() {
-        at_a_ += 0.25 * aa_ + (1.0 / 12) * (ab_ + ba_ + bb_);
-        at_b_ += 0.25 * bb_ + (1.0 / 12) * (aa_ + ab_ + ba_);
+        const CreaseColors<T> colors(view_.scene, *curve_);
+        // Gauss-Legendre with three points, exact up to degree 5.
+        constexpr double node[3] = {-0.7745966692414834, 0, 0.7745966692414834},
+                         weight[3] = {5. / 18, 8. / 18, 5. / 18};
+        for (double begin = 0; begin < 1;) {
+            const double end = end_of_piece(begin);
+            const Piece piece(*this, begin, end, colors);
+            for (int j = 0; j < 3; ++j) {
+                const double s = 0.5 * ((begin + end) + node[j] * (end - begin));
+                const double value = weight[j] * (end - begin) * piece.at(s);
+                at_a_ += (1 - s) * value, at_b_ += s * value;
+            }
+            begin = end;
+        }
     }
 
     // At the fraction s of the curve, of a sample with this weight.
     void subtract(double s, double weight) {
-        const double r = 1 - s, value = weight * (r * (r * aa_ + s * ab_) + s * (r * ba_ + s * bb_));
-        at_a_ -= r * value, at_b_ -= s * value;
+        const CreaseColors<T> colors(view_.scene, *curve_);
+        double begin = 0, end = end_of_piece(0);
+        while (end < s) begin = end, end = end_of_piece(begin);
+        const double value = weight * Piece(*this, begin, end, colors).at(s);
+        at_a_ -= (1 - s) * value, at_b_ -= s * value;
     }
 
     // The cotangents of the places of the ends, half to each face's own vertices.
@@ -117,18 +112,59 @@ class CreaseControl {
     }
 
    private:
-    // px: from `wide` on a crease gets all its samples, from `longest` on its ends say little of what is between.
-    static constexpr double least = 1.0 / 64, wide = 128, longest = 64, rough = 0.25;
+    // Ã · ΔL between two lines of the filter: Ã by its values at the ends and in the middle, constant for a box.
+    class Piece {
+       public:
+        Piece(CreaseControl& control, double begin, double end, const CreaseColors<T>& colors)
+            : middle_(0.5 * (begin + end)), half_(0.5 * (end - begin)) {
+            const bool box = control.view_.options.filter.is_box();
+            for (int k = box ? 1 : 0; k < (box ? 2 : 3); ++k) {
+                control.view_.adjoint.template at<N>(control.curve_->position(middle_ + (k - 1) * half_),
+                                                     control.A_.data());
+                for (int c = 0; c < control.C_; ++c)
+                    a_[k] += control.A_[c] * colors.jump(0, c), b_[k] += control.A_[c] * colors.jump(1, c);
+            }
+            if (box) a_[0] = a_[2] = a_[1], b_[0] = b_[2] = b_[1];
+        }
+        double at(double s) const {
+            const double r = half_ > 0 ? (s - middle_) / half_ : 0, low = 0.5 * r * (r - 1), high = 0.5 * r * (r + 1);
+            const double a = low * a_[0] + (1 - r * r) * a_[1] + high * a_[2];
+            const double b = low * b_[0] + (1 - r * r) * b_[1] + high * b_[2];
+            return (1 - s) * a + s * b;
+        }
+
+       private:
+        double middle_, half_, a_[3] = {}, b_[3] = {};  // Ã times the jump at either end of the curve
+    };
+
+    // Where the piece that begins at s ends: at the next line of the filter, the border of a pixel for a box, the
+    // middle of one else; or at 1.
+    double end_of_piece(double s) const {
+        const double shift = view_.options.filter.is_box() ? 0 : 0.5;
+        double end = 1;
+        const auto meet = [&](double origin, double along) {
+            if (along == 0) return;
+            // The next line lies at least a millionth of the curve ahead, for s may be rounded to before the last one.
+            const double here = origin + (s + 1e-6) * along - shift;
+            const double line = along > 0 ? std::floor(here) + 1 : std::ceil(here) - 1;
+            end = std::min(end, (line + shift - origin) / along);
+        };
+        meet(curve_->x0.x, tangent_.x), meet(curve_->x0.y, tangent_.y);
+        return std::max(end, s + 1e-6);
+    }
+
+    // Of a crease beside faces that the image did not hit, and of others; and from which length on, px, it gets all.
+    static constexpr double least_at_rims = 1.0 / 16, least = 1.0 / 256, wide = 256;
 
     const BackwardView<T>& view_;
     const int C_;
     const Curve* curve_ = nullptr;
     Vec2 tangent_;
     bool clear_ = false;
+    double bend_ = 0;
     int32_t vertex_[2][2];  // of minus and plus; a and b
-    const T* adjoint_[2];
-    double aa_ = 0, ab_ = 0, ba_ = 0, bb_ = 0;  // Ã_i · ΔL_j
     double at_a_ = 0, at_b_ = 0;
+    std::vector<double> A_;
 };
 
 }  // namespace edgegrad

@@ -12,10 +12,10 @@ namespace {
 // Default samples a pixel of curve; see surface_measure.cpp.
 constexpr double samples_per_pixel = 24;
 
-// What the measure of a curve is multiplied by if it lies behind what the image hit (occlusion.h), and that of a crease
-// if no face at its ends was hit. Never zero, for it may be visible all the same. Not so for silhouettes that were not
-// hit: at the limb of a fine mesh faces are a hundredth of a pixel wide and hit by chance.
-constexpr double occluded = 1.0 / 16, occluded_crease = 1.0 / 64, missed = 1.0 / 8;
+// What the measure of a silhouette and of a crease is multiplied by if it lies behind what the image hit (occlusion.h).
+// Never zero, for it may be visible all the same. Of what was merely not hit, only creases get fewer samples: at the
+// limb of a fine mesh the faces beside a silhouette are a hundredth of a pixel wide and hit by chance.
+constexpr double occluded = 1.0 / 16, occluded_crease = 1.0 / 256;
 
 // How far, in pixels, a ray may miss the points of a curve. A hundredth where it would be more: by then the image shows
 // floats, not faces.
@@ -75,7 +75,9 @@ class MeasuredEdges {
         if (view_.occlusion.hides(low, high, nearest)) return c.is_crease() ? occluded_crease : occluded;
         if (!c.is_crease() || !view_.hits) return 1;
         const auto hit = [&](int corner) { return view_.hits->at(vertex(view_.scene, c.minus, corner)); };
-        return hit(c.minus.first()) || hit(c.minus.second()) ? 1 : missed;
+        if (hit(c.minus.first()) || hit(c.minus.second())) return 1;
+        const int32_t vertex = view_.scene.faces[3 * int64_t(c.minus.face)];
+        return view_.hits->where_missed(vertex, side_of(view_, c.minus.face));
     }
 
     // Relative to a jump of the size of the mean radiance, which is taken where nothing is known.

@@ -76,10 +76,14 @@ class ImageHits {
         return {(a | b | c) != 0, (a & b & c & hit) != 0, !((a | b | c) & rim)};
     }
 
-    // Of the faces of its part that were hit, the share that was hit from this side, 1 or 2; 1 where too few were.
-    double share_of_side(int32_t vertex, int side) const {
+    // What the density of samples is multiplied by on a face with this vertex that was not hit, nor a neighbour: by
+    // less if the image hit the part of the surface to which it belongs from the other side alone, as a closed mesh.
+    // `side`, 1 or 2, is that from which the face would be visible. Never zero, for it may be visible all the same. A
+    // side counts in full from a share of `some` of the hits on its part.
+    static constexpr double missed = 1.0 / 8;
+    double where_missed(int32_t vertex, int side) const {
         const int64_t part = parts_.size() > 1 ? parts_.of(vertex) : 0;
-        return share_[2 * part + side - 1];
+        return std::clamp(share_[2 * part + side - 1] / some * missed, turned_away, missed);
     }
 
     void prefetch(int32_t vertex) const { edgegrad::prefetch(&at_[vertex]); }
@@ -87,10 +91,11 @@ class ImageHits {
    private:
     // Of a vertex: of a face that was hit; of a face that has such vertices and others.
     static constexpr uint8_t hit = 1, rim = 2;
+    static constexpr double turned_away = 1.0 / 64, some = 1.0 / 16;
     static constexpr int enough = 64;  // faces that tell which sides of a part are visible
     const Parts& parts_;
     std::vector<uint8_t> at_;
-    std::vector<float> share_;  // by part and side
+    std::vector<float> share_;  // by part and side: of the faces of the part that were hit; 1 where too few were
 };
 
 }  // namespace edgegrad

@@ -12,11 +12,9 @@ namespace edgegrad {
 
 namespace {
 
-// What the measure of a triangle is multiplied by if the image hit neither it nor a neighbour; if, besides, it hit the
-// part of the surface to which it belongs from the other side alone, as a closed mesh; and if it lies behind what the
-// image hit (occlusion.h). Never zero, for it may be visible all the same. A side counts in full from a share of `some`
-// of the hits on its part.
-constexpr double missed = 1.0 / 8, turned_away = 1.0 / 64, occluded = 1.0 / 64, some = 1.0 / 16;
+// What the measure of a triangle is multiplied by if it lies behind what the image hit (occlusion.h), and neither it
+// nor a neighbour was hit; and if a neighbour was. Never zero, for it may be visible all the same.
+constexpr double occluded = 1.0 / 64, occluded_beside_hits = 1.0 / 8;
 
 // Default samples a unit of (area + longest side · 1 px): where colours are interpolated, and where a texture may vary
 // from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
@@ -25,7 +23,7 @@ constexpr double colored = 0.5, textured = 4;
 
 // Where the adjoint is as rough as noise it changes from pixel to pixel within a face: up to so many times more samples
 // are taken, on faces that are several pixels long.
-constexpr double most = 4;
+constexpr double most = 5;
 double more_if_rough(double rough, double longest) {
     return std::clamp(rough, 1.0, std::clamp(longest / 2, 1.0, most));
 }
@@ -148,10 +146,9 @@ class MeasuredChunk {
     double default_samples(int64_t f, const Extent& e, ImageHits::Face hits, Side side) const {
         const double m = (e.area + e.longest) * (is_textured(view_.scene, f) ? textured : colored);
         const bool behind = !view_.seen[f] && view_.occlusion.hides(e.low, e.high, e.nearest);
-        if (hits.partly) return behind ? m * missed : m;
+        if (hits.partly) return behind ? m * occluded_beside_hits : m;
         if (behind) return m * occluded;
-        const double share = view_.hits->share_of_side(view_.scene.faces[3 * f], side());
-        return m * std::clamp(share / some * missed, turned_away, missed);
+        return m * view_.hits->where_missed(view_.scene.faces[3 * f], side());
     }
 
     // A face without a control.
