@@ -154,7 +154,7 @@ class CreaseControl {
     }
 
     // Of a crease beside faces that the image did not hit, and of others; and from which length on, px, it gets all.
-    static constexpr double least_at_rims = 1.0 / 16, least = 1.0 / 256, wide = 256;
+    static constexpr double least_at_rims = 1.0 / 16, least = 1.0 / 512, wide = 512;
 
     const BackwardView<T>& view_;
     const int C_;
