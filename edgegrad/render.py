@@ -43,11 +43,14 @@ def render(
                      get samples of their own. With a constant seed, each step of an optimisation repeats the samples of
                      image and gradient, and their error does not average out: pass seed=step
     surface_samples  samples of the gradient inside faces, for each camera: an int in all, or None for ½ a unit of surface,
-                     (area + longest side · 1 px) summed over the triangles in view; 4 where they are textured, ⅛ as many
-                     where the image saw neither the triangle nor a neighbour (1/64 if it saw what hangs together with it
-                     from the other side alone, as a closed mesh), and down to 1/16 where triangles are small and the loss
-                     changes little over them. Large textured triangles take whole samples a pixel, at least one
-    edge_samples     samples of the gradient at edges, for each camera: an int in all, or None for 24 a pixel of curve
+                     (area + longest side · 1 px) summed over the triangles in view; 4 where they are textured; up to 5 times
+                     as many where the loss is as rough as noise, down to 1/16 where triangles are small and it changes
+                     little over them, ⅛ to 1/64 where they are most likely occluded. Large textured triangles, and large
+                     ones under a rough loss, take whole samples a pixel, at least one
+    edge_samples     samples of the gradient at edges, for each camera: an int in all, or None for 24 a pixel of curve, 1/16
+                     where it is most likely occluded; creases by the size of their jump, and few where all of one is visible.
+                     Default samples of both kinds together take about as long as the image at most: plan() says where
+                     that bound
     visibility       False leaves out what moves at silhouettes and other jumps; the gradient is then that of the shading alone
     filter           "box" (1 px wide), "tent" (2 px) or "gaussian" (σ ½ px, 3 px)
     grad_seed        seed of the gradient's samples; derived from `seed` when None. They also depend on the image by which

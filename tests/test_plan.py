@@ -428,7 +428,7 @@ def test_profile():
     assert all(seconds > 0 for seconds in found.values()) and found.seconds == pytest.approx(sum(found.values()))
     planned = eg.plan(scene, camera, 4)
     assert found.samples["image_samples"] == planned["image"].samples
-    assert found.samples["edge_samples"] == planned["boundary"].samples
+    assert planned["boundary"].samples / 4 < found.samples["edge_samples"] <= planned["boundary"].samples
     assert 0 < found.samples["surface_samples"] <= planned["interior"].samples
     lines = str(found).splitlines()
     assert len(lines) == len(found) + 3 and "█" in str(found) and "edge samples" in lines[-1]

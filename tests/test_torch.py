@@ -827,10 +827,10 @@ def test_sample_counts():
     assert sample_counts(123, 45, ADJOINT) == (123, 45)
     assert sample_counts(-1, -1, smooth, boundary=False) == (surface, 0)
     assert sample_counts(123, 45, torch.zeros_like(ADJOINT)) == (0, 0)  # where the loss does not look
-    # A loss as rough as noise has up to four times as many inside a face that is several pixels wide, and no more at edges.
+    # A loss as rough as noise has up to five times as many inside a face that is several pixels wide, and no more at edges.
     noise = torch.randn(ADJOINT.shape, generator=torch.Generator().manual_seed(0), dtype=F64)
     surface, edge = sample_counts(-1, -1, noise)
-    assert 2 * expected[0] < surface <= 4 * expected[0] + 4 and edge == expected[1]
+    assert 2 * expected[0] < surface <= 5 * expected[0] + 5 and edge == expected[1]
 
 
 def test_more_samples_are_better():
