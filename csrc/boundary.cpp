@@ -25,6 +25,47 @@ namespace edgegrad {
 
 namespace {
 
+// A set of faces that is emptied at no cost.
+class FaceSet {
+   public:
+    void clear() { ++round_, size_ = 0; }
+
+    // False if it is there already.
+    bool insert(int32_t face) {
+        if (2 * size_ >= slots_.size()) grow();
+        const bool inserted = insert_into(slots_, face);
+        size_ += inserted;
+        return inserted;
+    }
+
+   private:
+    struct Slot {
+        int32_t face = -1;
+        uint32_t round = 0;  // of an earlier one: the slot is free
+    };
+
+    bool insert_into(std::vector<Slot>& slots, int32_t face) const {
+        for (size_t i = mix(uint64_t(face));; ++i) {
+            Slot& slot = slots[i & (slots.size() - 1)];
+            if (slot.round == round_ && slot.face == face) return false;
+            if (slot.round == round_) continue;
+            slot = {face, round_};
+            return true;
+        }
+    }
+
+    void grow() {
+        std::vector<Slot> larger(2 * slots_.size());
+        for (const Slot& slot : slots_)
+            if (slot.round == round_) insert_into(larger, slot.face);
+        slots_.swap(larger);
+    }
+
+    std::vector<Slot> slots_ = std::vector<Slot>(32);
+    size_t size_ = 0;
+    uint32_t round_ = 1;
+};
+
 template <int N, class T>
 class BoundaryChunk {
    public:
@@ -109,8 +150,8 @@ class BoundaryChunk {
         place.own.curve = curve;
         place.segment = coincident_.find(curve.edge);
         const auto halves = view_.geometry.topology().half_edges(curve.edge);
-        place.edge_on = std::any_of(halves.begin(), halves.end(),
-                                    [&](const HalfEdge& h) { return finder_.turn_of(h) == 0; });
+        place.edge_on =
+            std::any_of(halves.begin(), halves.end(), [&](const HalfEdge& h) { return finder_.turn_of(h) == 0; });
         place.with_faces = false;
         other_edges_.clear();
     }
@@ -255,29 +296,32 @@ class BoundaryChunk {
             if (!place.with_faces) place.own = coincidence_.on_line(curve, curve), place.with_faces = true;
             coincidence_.start(place.own, lane.x, lane.t);
         };
-        bool visible = true;
+        bool alone = true, visible = true;
         const auto add = [&](const ImageSegment& o) {
-            if (blind.empty()) begin();
-            const auto own = topology.faces(curve.edge), faces = topology.faces(o.edge);
-            blind.insert(blind.end(), faces.begin(), faces.end());
+            if (alone) begin(), alone = false;
+            const auto faces = topology.faces(o.edge);
             const Vec2 along = o.b - o.a, from = lane.x - o.a;
             const double squared = along.x * along.x + along.y * along.y,
                          s = (from.x * along.x + from.y * along.y) / squared;
             const double apart = std::fabs(wedge(along, from)) / std::sqrt(squared);
             if (apart <= std::max(curve.rounding, o.rounding)) {
+                blind.insert(blind.end(), faces.begin(), faces.end());
                 if (s < 0 || s > 1) return true;
                 const CoincidentCurve& c = other(o.edge, curve);
                 return visible = coincidence_.add(c, c.curve.parameter(s));
             }
-            for (const int32_t f : faces)
-                if (std::find(own.begin(), own.end(), f) == own.end() && meets(view_, f, lane.n) &&
-                    !lies_behind(f, curve, lane))
-                    return visible = false;
+            for (const int32_t f : faces) {
+                if (!asked_.insert(f)) continue;
+                blind.push_back(f);
+                if (meets(view_, f, lane.n) && !lies_behind(f, curve, lane)) return visible = false;
+            }
             return true;
         };
+        asked_.clear();
+        for (const int32_t f : topology.faces(curve.edge)) asked_.insert(f);
         if (place.segment) coincident_.at(*place.segment, lane.x, add);
         if (!visible) return false;
-        if (blind.empty()) {
+        if (alone) {
             if (!place.edge_on) return true;
             begin();
         }
@@ -302,8 +346,8 @@ class BoundaryChunk {
         const Spacing& spacing = view_.options.spacing;
         const double coarser =
             std::max(spacing.of(vertex(view_.scene, h, h.first())), spacing.of(view_.scene.faces[3 * face]));
-        return apart > rounding && (apart > contact(coarser, largest_coordinate(view_.scene, h), size) ||
-                                    shares_vertex(face, curve.edge));
+        return apart > rounding &&
+               (apart > contact(coarser, largest_coordinate(view_.scene, h), size) || shares_vertex(face, curve.edge));
     }
 
     bool shares_vertex(int64_t face, int64_t edge) const {
@@ -347,6 +391,7 @@ class BoundaryChunk {
     int places_ = 0;
     std::vector<int64_t> other_edges_;    // of the curves on the line of the latest
     std::deque<CoincidentCurve> others_;  // theirs; those beyond wait to be used again
+    FaceSet asked_;                       // whether the latest sample's ray meets them
     std::vector<int32_t> blind_[RayBatch::size];
     std::span<const int32_t> rejected_[RayBatch::size];
     std::vector<double> adjoint_, radiance_;

@@ -2,7 +2,7 @@
 
 #include <bit>
 #include <limits>
-#include <stdexcept>
+#include <new>
 
 namespace edgegrad {
 
@@ -27,7 +27,7 @@ bool side_by_side(const ImageSegment& s, const ImageSegment& o) {
 // For each of many buckets, whether one or several segments were put there. Two buckets may share a place.
 class Occupancy {
    public:
-    explicit Occupancy(int64_t segments) : words_(std::bit_ceil(uint64_t(segments))), mask_(words_.size() - 1) {}
+    explicit Occupancy(int64_t segments) : words_(std::bit_ceil(2 * uint64_t(segments))), mask_(words_.size() - 1) {}
 
     // By any thread, in any order.
     void add(uint64_t key) {
@@ -86,11 +86,11 @@ void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment
         std::erase_if(parts[k], [&](const ImageSegment& s) {
             bool alone = true;
             lines_.each_cell(s, [&](const LineBuckets::Line& l) {
+                if (!alone) return;
                 const uint64_t own = LineBuckets::key(l);
                 uint64_t keys[4];
                 LineBuckets::keys_around(l, keys);
-                for (const uint64_t key : keys)
-                    alone &= !(key == own ? occupancy.several(key) : occupancy.any(key));
+                for (const uint64_t key : keys) alone &= !(key == own ? occupancy.several(key) : occupancy.any(key));
             });
             return alone;
         });
@@ -133,9 +133,10 @@ void CoincidentCurves::fill(Team& team) {
     // The threads put them there in any order.
     team.each_block(buckets, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t k = first; k < last; ++k)
-            std::sort(entries_.begin() + begin_[k], entries_.begin() + begin_[k + 1], [](const Entry& e, const Entry& o) {
-                return e.depth != o.depth ? e.depth < o.depth : e.segment < o.segment;
-            });
+            std::sort(entries_.begin() + begin_[k], entries_.begin() + begin_[k + 1],
+                      [](const Entry& e, const Entry& o) {
+                          return e.depth != o.depth ? e.depth < o.depth : e.segment < o.segment;
+                      });
     });
 }
 

@@ -37,13 +37,13 @@ class LineBuckets {
         double direction, distance;
     };
 
-    explicit LineBuckets(double cell = 1, double margin = 0) : cell_(cell), margin_(margin) {}
+    explicit LineBuckets(double cell = 1, double margin = 0) : cell_(cell), per_cell_(1 / cell), margin_(margin) {}
 
     // Calls found(line) for every cell that the segment passes at less than the margin.
     template <class Found>
     void each_cell(const ImageSegment& s, Found found) const {
         const Direction direction(s.b - s.a);
-        const int parts = 1 + int(std::min(direction.length / cell_, 0x1p20));
+        const int parts = 1 + int(std::min(direction.length * per_cell_, 0x1p20));
         int64_t last_i0 = INT64_MAX, last_j0 = 0, last_i1 = 0, last_j1 = 0;
         for (int k = 0; k < parts; ++k) {
             const Vec2 p = s.a + (double(k) / parts) * (s.b - s.a), q = s.a + (double(k + 1) / parts) * (s.b - s.a);
@@ -73,18 +73,19 @@ class LineBuckets {
     }
 
     // Whether lines of that direction run along x rather than y.
-    static bool runs_along_x(const Line& l) { return std::fabs(1 - l.direction * direction_step) > 0.5; }
+    static bool runs_along_x(const Line& l) { return std::fabs(l.direction - directions / 2.0) > directions / 4.0; }
 
    private:
     // In place of an angle: 1 − x / (|x| + y) of a direction with y ≥ 0, which is from 0 to 2 and grows by ½ to 1 a
     // radian.
     static constexpr int64_t directions = 400;
-    static constexpr double direction_step = 2.0 / directions, distance_step = 0.05;  // px
+    static constexpr double distance_step = 0.05;  // px
     struct Direction {
         Vec2 along;
-        double length, direction;
+        double length, direction, per_distance;
         explicit Direction(Vec2 d) : along(d.y < 0 || (d.y == 0 && d.x < 0) ? -1 * d : d), length(edgegrad::length(d)) {
-            direction = (1 - along.x / (std::fabs(along.x) + along.y)) / direction_step;
+            direction = (1 - along.x / (std::fabs(along.x) + along.y)) * (directions / 2.0);
+            per_distance = 1 / (length * distance_step);
         }
     };
 
@@ -92,11 +93,11 @@ class LineBuckets {
         const int64_t i = int64_t(x);
         return i - (double(i) > x);
     }
-    int64_t index(double x) const { return floor(x / cell_); }
+    int64_t index(double x) const { return floor(x * per_cell_); }
 
     Line line(const Direction& d, Vec2 a, int64_t i, int64_t j) const {
         const Vec2 middle{(double(i) + 0.5) * cell_, (double(j) + 0.5) * cell_};
-        return {uint64_t(i) << 32 ^ uint64_t(j), d.direction, wedge(d.along, a - middle) / (d.length * distance_step)};
+        return {uint64_t(i) << 32 ^ uint64_t(j), d.direction, wedge(d.along, a - middle) * d.per_distance};
     }
 
     static uint64_t key(const Line& l, int64_t direction, double distance) {
@@ -106,7 +107,7 @@ class LineBuckets {
                    uint64_t(floor(distance)) * 0x91e10da5c79e7b1dull);
     }
 
-    double cell_, margin_;  // px
+    double cell_, per_cell_, margin_;  // px
 };
 
 class CoincidentCurves {

@@ -67,7 +67,7 @@ class MeasuredEdges {
             of_edge_[e] = m * importance;
             found.pixels += m;
             // One that is occluded meets no ray behind another, for what occludes it lies before it there too.
-            if (visible == 1 || visible == missed) 
+            if (visible == 1 || visible == missed)
                 segments.push_back({.edge = e,
                                     .a = c.x0,
                                     .b = c.x1,

@@ -19,9 +19,9 @@ struct CurvesFound {
 template <class T>
 struct Curves : CurvesFound {
     CurveFinder<T> finder;
-    Array<double> of_edge;  // (E,) the measure
+    Array<double> of_edge;                            // (E,) the measure
     std::vector<std::vector<ImageSegment>> segments;  // those where the loss looks, by ascending edges
-    Array<double> x_bar;    // (V, 2) what controls add to the cotangents of places in the image; empty: there are none
+    Array<double> x_bar;  // (V, 2) what controls add to the cotangents of places in the image; empty: there are none
 
     explicit Curves(const BackwardView<T>& view);
 
