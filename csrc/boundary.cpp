@@ -8,7 +8,9 @@
 #include "boundary.h"
 
 #include <algorithm>
+#include <deque>
 #include <limits>
+#include <utility>
 #include <vector>
 
 #include "coincidence.h"
@@ -22,6 +24,47 @@
 namespace edgegrad {
 
 namespace {
+
+// A set of faces that is emptied at no cost.
+class FaceSet {
+   public:
+    void clear() { ++round_, size_ = 0; }
+
+    // False if it is there already.
+    bool insert(int32_t face) {
+        if (2 * size_ >= slots_.size()) grow();
+        const bool inserted = insert_into(slots_, face);
+        size_ += inserted;
+        return inserted;
+    }
+
+   private:
+    struct Slot {
+        int32_t face = -1;
+        uint32_t round = 0;  // of an earlier one: the slot is free
+    };
+
+    bool insert_into(std::vector<Slot>& slots, int32_t face) const {
+        for (size_t i = mix(uint64_t(face));; ++i) {
+            Slot& slot = slots[i & (slots.size() - 1)];
+            if (slot.round == round_ && slot.face == face) return false;
+            if (slot.round == round_) continue;
+            slot = {face, round_};
+            return true;
+        }
+    }
+
+    void grow() {
+        std::vector<Slot> larger(2 * slots_.size());
+        for (const Slot& slot : slots_)
+            if (slot.round == round_) insert_into(larger, slot.face);
+        slots_.swap(larger);
+    }
+
+    std::vector<Slot> slots_ = std::vector<Slot>(32);
+    size_t size_ = 0;
+    uint32_t round_ = 1;
+};
 
 template <int N, class T>
 class BoundaryChunk {
@@ -48,7 +91,7 @@ class BoundaryChunk {
             if (places_ > 0 && (i == 0 || lane_[i - 1].place != places_ - 1)) --places_;
             start(place_[places_++], curve);
         }
-        const Place& place = place_[places_ - 1];
+        Place& place = place_[places_ - 1];
         const Vec2 n = normalised(view_.camera, x);
         const double t = curve.parameter(s);
         Lane& lane = lane_[i];
@@ -59,10 +102,15 @@ class BoundaryChunk {
                 .point = (1 - t) * curve.a + t * curve.b,
                 .weight = weight,
                 .share = {.side = {curve.minus, curve.plus}, .side_t = {t, t}}};
-        if (place.coincident && !share(place, lane)) return;
+        const std::span<const int32_t> own = view_.geometry.topology().faces(curve.edge);
+        blind_[i].clear();
+        if ((place.segment || place.edge_on) && !share(place, lane, blind_[i])) return;
+        if (!blind_[i].empty()) {
+            blind_[i].insert(blind_[i].end(), own.begin(), own.end());
+            std::sort(blind_[i].begin(), blind_[i].end());
+        }
         rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
-        rejected_[i] =
-            place.others.empty() ? view_.geometry.topology().faces(curve.edge) : std::span<const int32_t>(place.blind);
+        rejected_[i] = blind_[i].empty() ? own : std::span<const int32_t>(blind_[i]);
         if (++rays_.count == RayBatch::size) cast();
     }
 
@@ -73,12 +121,11 @@ class BoundaryChunk {
     }
 
    private:
-    // A curve, and those that lie on it.
+    // A curve.
     struct Place {
-        CoincidentCurve own;  // without its faces unless it is coincident
-        std::vector<CoincidentCurve> others;
-        std::vector<int32_t> blind;  // faces of all of them
-        bool coincident = false;
+        CoincidentCurve own;          // without its faces until they are asked for
+        const ImageSegment* segment;  // where others lie on it somewhere; else null
+        bool edge_on, with_faces;     // whether a face of it is seen edge-on; whether `own` has them
     };
 
     // What lies at a point of the image, behind a curve: a face, or −1 for the background.
@@ -101,25 +148,23 @@ class BoundaryChunk {
 
     void start(Place& place, const Curve& curve) {
         place.own.curve = curve;
-        place.others.clear(), place.blind.clear();
-        const Topology& topology = view_.geometry.topology();
-        const auto blind_to = [&](int64_t edge) {
-            for (const int32_t f : topology.faces(edge)) place.blind.push_back(f);
-        };
-        for (const int64_t edge : coincident_.of(curve.edge))
-            if (Curve c; finder_.find(edge, c)) {
-                place.others.push_back(coincidence_.on_line(c, curve));
-                blind_to(edge);
-            }
-        const auto halves = topology.half_edges(curve.edge);
-        place.coincident = !place.others.empty() || std::any_of(halves.begin(), halves.end(), [&](const HalfEdge& h) {
-            return finder_.turn_of(h) == 0;
-        });
-        if (!place.coincident) return;
-        place.own = coincidence_.on_line(curve, curve);
-        if (place.others.empty()) return;
-        blind_to(curve.edge);
-        std::sort(place.blind.begin(), place.blind.end());
+        place.segment = coincident_.find(curve.edge);
+        const auto halves = view_.geometry.topology().half_edges(curve.edge);
+        place.edge_on =
+            std::any_of(halves.begin(), halves.end(), [&](const HalfEdge& h) { return finder_.turn_of(h) == 0; });
+        place.with_faces = false;
+        other_edges_.clear();
+    }
+
+    // Another curve on the line of the latest.
+    const CoincidentCurve& other(int64_t edge, const Curve& line) {
+        const size_t k = std::find(other_edges_.begin(), other_edges_.end(), edge) - other_edges_.begin();
+        if (k < other_edges_.size()) return others_[k];
+        other_edges_.push_back(edge);
+        if (k == others_.size()) others_.emplace_back();
+        Curve c;
+        finder_.find(edge, c);
+        return others_[k] = coincidence_.on_line(c, line);
     }
 
     void cast() {
@@ -243,25 +288,42 @@ class BoundaryChunk {
         return true;
     }
 
-    // What the curves that lie on this one leave to a sample of it; false if nothing.
-    bool share(const Place& place, Lane& lane) {
-        const Curve& curve = place.own.curve;
-        coincidence_.start(place.own, lane.x, lane.t);
-        for (const CoincidentCurve& coincident : place.others) {
-            const Curve& other = coincident.curve;
-            const Vec2 along = other.tangent(), from = lane.x - other.x0;
+    // What the curves that lie on this one leave to a sample of it; false if nothing. Gathers their faces in `blind`.
+    bool share(Place& place, Lane& lane, std::vector<int32_t>& blind) {
+        const Curve curve = place.own.curve;
+        const Topology& topology = view_.geometry.topology();
+        const auto begin = [&] {
+            if (!place.with_faces) place.own = coincidence_.on_line(curve, curve), place.with_faces = true;
+            coincidence_.start(place.own, lane.x, lane.t);
+        };
+        bool alone = true, visible = true;
+        const auto add = [&](const ImageSegment& o) {
+            if (alone) begin(), alone = false;
+            const auto faces = topology.faces(o.edge);
+            const Vec2 along = o.b - o.a, from = lane.x - o.a;
             const double squared = along.x * along.x + along.y * along.y,
                          s = (from.x * along.x + from.y * along.y) / squared;
             const double apart = std::fabs(wedge(along, from)) / std::sqrt(squared);
-            if (apart <= std::max(curve.rounding, other.rounding)) {
-                if (s >= 0 && s <= 1) coincidence_.add(coincident, other.parameter(s));
-                continue;
+            if (apart <= std::max(curve.rounding, o.rounding)) {
+                blind.insert(blind.end(), faces.begin(), faces.end());
+                if (s < 0 || s > 1) return true;
+                const CoincidentCurve& c = other(o.edge, curve);
+                return visible = coincidence_.add(c, c.curve.parameter(s));
             }
-            const auto own = view_.geometry.topology().faces(curve.edge);
-            for (const int32_t f : view_.geometry.topology().faces(other.edge))
-                if (std::find(own.begin(), own.end(), f) == own.end() && meets(view_, f, lane.n) &&
-                    !lies_behind(f, curve, lane))
-                    return false;
+            for (const int32_t f : faces) {
+                if (!asked_.insert(f)) continue;
+                blind.push_back(f);
+                if (meets(view_, f, lane.n) && !lies_behind(f, curve, lane)) return visible = false;
+            }
+            return true;
+        };
+        asked_.clear();
+        for (const int32_t f : topology.faces(curve.edge)) asked_.insert(f);
+        if (place.segment) coincident_.at(*place.segment, lane.x, add);
+        if (!visible) return false;
+        if (alone) {
+            if (!place.edge_on) return true;
+            begin();
         }
         return coincidence_.finish(lane.share);
     }
@@ -327,6 +389,10 @@ class BoundaryChunk {
     Lane lane_[RayBatch::size];
     Place place_[RayBatch::size];  // of the lanes
     int places_ = 0;
+    std::vector<int64_t> other_edges_;    // of the curves on the line of the latest
+    std::deque<CoincidentCurve> others_;  // theirs; those beyond wait to be used again
+    FaceSet asked_;                       // whether the latest sample's ray meets them
+    std::vector<int32_t> blind_[RayBatch::size];
     std::span<const int32_t> rejected_[RayBatch::size];
     std::vector<double> adjoint_, radiance_;
 
@@ -345,7 +411,7 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, Des
     if (n == 0 || view.options.dry) return;
     Stopwatch watch;
     const CurveFinder<T>& finder = curves.finder;
-    const CoincidentCurves coincident(curves.segments, view.team);
+    const CoincidentCurves coincident(std::move(curves.segments), view.team);
     Systematic systematic(curves.of_edge, view.team);
     profile.curves += watch.lap();
     if (!(systematic.total() > 0)) return;

@@ -116,34 +116,33 @@ class Coincidence {
     void start(const CoincidentCurve& own, Vec2 x, double t) {
         own_ = {&own, t, (1 - t) * own.curve.a + t * own.curve.b};
         x_ = x;
-        first_[0] = first_[1] = {};
-        several_[0] = several_[1] = false;
+        for (int k = 0; k < 2; ++k) first_[k] = {}, several_[k] = false, before_[k] = own_.side(k).face >= 0;
     }
 
-    // Another curve that passes through x.
-    void add(const CoincidentCurve& other, double t) {
+    // Another curve that passes through x. False once the gradient goes to others, whatever else passes.
+    bool add(const CoincidentCurve& other, double t) {
         const Place place{&other, t, (1 - t) * other.curve.a + t * other.curve.b};
         for (int k = 0; k < 2; ++k) {
             if (other.side[k].face < 0) continue;
             several_[k] |= first_[k].curve != nullptr;
-            if (!first_[k].curve || lies_before(place, first_[k], k)) first_[k] = place;
+            if (first_[k].curve && !lies_before(place, first_[k], k)) continue;
+            first_[k] = place;
+            before_[k] = before_[k] && lies_before(own_, place, k);
         }
+        return before_[0] || before_[1];
     }
 
     // False where the gradient goes to others.
     bool finish(CoincidentShare& share) const {
-        bool before[2];
-        for (int k = 0; k < 2; ++k)
-            before[k] = own_.side(k).face >= 0 && (!first_[k].curve || lies_before(own_, first_[k], k));
-        if (!before[0] && !before[1]) return false;
+        if (!before_[0] && !before_[1]) return false;
         share = {};
         for (int k = 0; k < 2; ++k) {
-            const Place& p = before[k] ? own_ : first_[k];
+            const Place& p = before_[k] ? own_ : first_[k];
             share.side[k].face = -1;
             if (p.curve) share.side[k] = p.side(k), share.side_t[k] = p.t;
         }
-        if (before[0] && before[1]) return true;
-        const int near = share.front = before[0] ? 0 : 1, far = 1 - near;
+        if (before_[0] && before_[1]) return true;
+        const int near = share.front = before_[0] ? 0 : 1, far = 1 - near;
         const Place& opposite = first_[far];
         if (opposite.curve) {
             share.far_depth = opposite.point.z;
@@ -263,6 +262,7 @@ class Coincidence {
     const CurveFinder<T>& finder_;
     Place own_, first_[2];  // of the others, the front-most on either side
     bool several_[2] = {};
+    bool before_[2] = {};  // whether the curve's own face lies before that one
     Vec2 x_;
 };
 

@@ -1,11 +1,8 @@
 #include "coincident.h"
 
-#include <algorithm>
 #include <bit>
-#include <cmath>
-#include <utility>
-
-#include "sampler.h"
+#include <limits>
+#include <new>
 
 namespace edgegrad {
 
@@ -27,104 +24,135 @@ bool side_by_side(const ImageSegment& s, const ImageSegment& o) {
     return distance(first) <= reach && distance(last) <= reach;
 }
 
-// Segments by the lines they lie on: buckets of direction, distance to the middle of a cell of the image, and cell.
-// What runs side by side shares a cell, and there lies within half a bucket. Cells are some segments wide, so that few
-// share one where a mesh is fine and many where it is coarse.
-class LineBuckets {
+// For each of many buckets, whether one or several segments were put there. Two buckets may share a place.
+class Occupancy {
    public:
-    explicit LineBuckets(const std::vector<ImageSegment>& segments)
-        : head_(std::bit_ceil(std::max<size_t>(64, 4 * segments.size())), -1), mask_(head_.size() - 1) {
-        double total = 0, reach = 0;
-        for (const ImageSegment& s : segments) total += length(s.b - s.a), reach = std::max(reach, s.reach);
-        const double mean = total / double(std::max<size_t>(1, segments.size()));
-        cell_ = std::min(std::max({4 * mean, 8 * reach, 1e-6}), 16.0);  // a millionth: so that cells can be counted
-    }
+    explicit Occupancy(int64_t segments) : words_(std::bit_ceil(2 * uint64_t(segments))), mask_(words_.size() - 1) {}
 
-    // Calls found(j) for every segment j added before that may run side by side with s, then adds s as number i.
-    template <class Found>
-    void add(int64_t i, const ImageSegment& s, Found found) {
-        Vec2 along = s.b - s.a;
-        if (along.y < 0 || (along.y == 0 && along.x < 0)) along = -1 * along;
-        const double angle = std::atan2(along.y, along.x);
-        const int parts = 1 + int(std::min(length(along) / cell_, 0x1p20));
-        int64_t last_i0 = INT64_MAX, last_j0 = 0, last_i1 = 0, last_j1 = 0;
-        for (int k = 0; k < parts; ++k) {
-            const Vec2 p = s.a + (double(k) / parts) * (s.b - s.a), q = s.a + (double(k + 1) / parts) * (s.b - s.a);
-            const int64_t i0 = index(std::min(p.x, q.x)), i1 = index(std::max(p.x, q.x));
-            const int64_t j0 = index(std::min(p.y, q.y)), j1 = index(std::max(p.y, q.y));
-            for (int64_t y = j0; y <= j1; ++y)
-                for (int64_t x = i0; x <= i1; ++x) {
-                    if (x >= last_i0 && x <= last_i1 && y >= last_j0 && y <= last_j1) continue;
-                    const Vec2 middle{(double(x) + 0.5) * cell_, (double(y) + 0.5) * cell_};
-                    const double distance = wedge(along, s.a - middle) / length(along);
-                    add(i, x, y, angle, distance, found);
-                    // Directions wrap around, and the side of the line with them.
-                    if (angle < angle_step) add(i, x, y, angle + M_PI, -distance, found);
-                }
-            last_i0 = i0, last_i1 = i1, last_j0 = j0, last_j1 = j1;
-        }
+    // By any thread, in any order.
+    void add(uint64_t key) {
+        std::atomic<uint64_t>& w = word(key);
+        const uint64_t one = bit(key), there = w.fetch_or(one, std::memory_order_relaxed);
+        if (there & one && !(there & one << 1)) w.fetch_or(one << 1, std::memory_order_relaxed);
     }
+    bool any(uint64_t key) const { return word(key).load(std::memory_order_relaxed) & bit(key); }
+    bool several(uint64_t key) const { return word(key).load(std::memory_order_relaxed) & bit(key) << 1; }
 
    private:
-    static constexpr double angle_step = 0.005, distance_step = 0.05;  // radians, px
-    struct Entry {
-        uint64_t key;
-        int64_t segment;
-        int64_t next;
-    };
+    static uint64_t bit(uint64_t key) { return uint64_t(1) << (key >> 59 << 1); }
+    std::atomic<uint64_t>& word(uint64_t key) { return words_[key & mask_]; }
+    const std::atomic<uint64_t>& word(uint64_t key) const { return words_[key & mask_]; }
 
-    int64_t index(double x) const { return int64_t(std::floor(x / cell_)); }
-
-    template <class Found>
-    void add(int64_t i, int64_t x, int64_t y, double angle, double distance, Found found) {
-        const double u = angle / angle_step, v = distance / distance_step;
-        const auto key = [&](double u, double v) {
-            return hash(uint64_t(x) << 32 ^ uint64_t(y), uint64_t(int64_t(std::floor(u))),
-                        uint64_t(int64_t(std::floor(v))));
-        };
-        for (const double du : {-0.5, 0.5})
-            for (const double dv : {-0.5, 0.5}) {
-                const uint64_t wanted = key(u + du, v + dv);
-                for (int64_t e = head_[wanted & mask_]; e >= 0; e = entries_[e].next)
-                    if (entries_[e].key == wanted && entries_[e].segment != i) found(entries_[e].segment);
-            }
-        const uint64_t own = key(u, v);
-        entries_.push_back({own, i, head_[own & mask_]});
-        head_[own & mask_] = int64_t(entries_.size()) - 1;
-    }
-
-    double cell_ = 16;  // px
-    std::vector<int64_t> head_;
-    size_t mask_;
-    std::vector<Entry> entries_;
+    std::vector<std::atomic<uint64_t>> words_;  // 32 pairs of bits each
+    uint64_t mask_;
 };
 
 }  // namespace
 
-CoincidentCurves::CoincidentCurves(const std::vector<ImageSegment>& segments, Team& team) {
-    std::vector<std::pair<int64_t, int64_t>> pairs;
-    LineBuckets buckets(segments);
-    for (int64_t i = 0; i < int64_t(segments.size()); ++i) {
-        if (i % 4096 == 0) team.check();
-        buckets.add(i, segments[i], [&](int64_t j) {
-            if (side_by_side(segments[i], segments[j]) || side_by_side(segments[j], segments[i]))
-                pairs.insert(pairs.end(), {{segments[i].edge, segments[j].edge}, {segments[j].edge, segments[i].edge}});
-        });
+CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, Team& team) {
+    int64_t n = 0;
+    double total = 0;
+    for (const auto& part : parts) {
+        n += int64_t(part.size());
+        for (const ImageSegment& s : part) total += length(s.b - s.a), margin_ = std::max(margin_, s.reach);
     }
-    std::sort(pairs.begin(), pairs.end());
-    pairs.erase(std::unique(pairs.begin(), pairs.end()), pairs.end());
-    for (const auto& [edge, other] : pairs) {
-        if (edge_.empty() || edge_.back() != edge) edge_.push_back(edge), offset_.push_back(int64_t(other_.size()));
-        other_.push_back(other);
-    }
-    offset_.push_back(int64_t(other_.size()));
+    if (n == 0) return;
+    // Some segments wide, so that few share a cell where a mesh is fine and many where it is coarse; a millionth: so
+    // that cells can be counted; at most 16 px, so that distances in a cell tell lines apart, unless many long segments
+    // would pass too many cells.
+    const double cell = std::min(std::max({4 * total / double(n), 8 * margin_, 1e-6}), 16.0);
+    lines_ = LineBuckets(std::max(cell, total / (2.0 * double(n) + 0x1p16)), margin_);
+    keep_those_not_alone(parts, n, team);
+
+    std::vector<int64_t> first(parts.size() + 1, 0);
+    for (size_t k = 0; k < parts.size(); ++k) first[k + 1] = first[k] + int64_t(parts[k].size());
+    segments_ = Array<ImageSegment>(first.back());
+    team.each(int64_t(parts.size()), [&](int64_t k) {
+        std::copy(parts[k].begin(), parts[k].end(), segments_.begin() + first[k]);
+        parts[k] = {};
+    });
+    if (!segments_.empty()) fill(team);
 }
 
-std::span<const int64_t> CoincidentCurves::of(int64_t edge) const {
-    const auto at = std::lower_bound(edge_.begin(), edge_.end(), edge);
-    if (at == edge_.end() || *at != edge) return {};
-    const int64_t i = at - edge_.begin();
-    return {other_.data() + offset_[i], other_.data() + offset_[i + 1]};
+// In most scenes nearly all segments are alone on their lines.
+void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment>>& parts, int64_t n,
+                                            Team& team) const {
+    Occupancy occupancy(n);
+    team.each(int64_t(parts.size()), [&](int64_t k) {
+        for (const ImageSegment& s : parts[k])
+            lines_.each_cell(s, [&](const LineBuckets::Line& l) { occupancy.add(LineBuckets::key(l)); });
+    });
+    team.each(int64_t(parts.size()), [&](int64_t k) {
+        std::erase_if(parts[k], [&](const ImageSegment& s) {
+            bool alone = true;
+            lines_.each_cell(s, [&](const LineBuckets::Line& l) {
+                if (!alone) return;
+                const uint64_t own = LineBuckets::key(l);
+                uint64_t keys[4];
+                LineBuckets::keys_around(l, keys);
+                for (const uint64_t key : keys) alone &= !(key == own ? occupancy.several(key) : occupancy.any(key));
+            });
+            return alone;
+        });
+    });
+}
+
+void CoincidentCurves::fill(Team& team) {
+    const int64_t n = segments_.size(), buckets = int64_t(std::bit_ceil(2 * uint64_t(n)));
+    mask_ = uint64_t(buckets - 1);
+    std::vector<std::atomic<uint32_t>> end(buckets);
+    const auto each_entry = [&](auto entry) {
+        team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
+            for (int64_t i = first; i < last; ++i)
+                lines_.each_cell(segments_[i], [&](const LineBuckets::Line& l) { entry(i, l); });
+        });
+    };
+    each_entry([&](int64_t, const LineBuckets::Line& l) {
+        end[LineBuckets::key(l) & mask_].fetch_add(1, std::memory_order_relaxed);
+    });
+    begin_.resize(buckets + 1);
+    uint64_t sum = 0;
+    for (int64_t k = 0; k < buckets; ++k) {
+        begin_[k] = uint32_t(sum);
+        sum += end[k].exchange(uint32_t(sum), std::memory_order_relaxed);
+    }
+    if (sum > std::numeric_limits<uint32_t>::max()) throw std::bad_alloc();  // 64 GB
+    begin_[buckets] = uint32_t(sum);
+    entries_ = Array<Entry>(int64_t(sum));
+    each_entry([&](int64_t i, const LineBuckets::Line& l) {
+        const ImageSegment& s = segments_[i];
+        const bool x = LineBuckets::runs_along_x(l);
+        const double a = x ? s.a.x : s.a.y, b = x ? s.b.x : s.b.y;
+        constexpr float far = std::numeric_limits<float>::infinity();
+        entries_[end[LineBuckets::key(l) & mask_].fetch_add(1, std::memory_order_relaxed)] = {
+            .low = std::nextafter(float(std::min(a, b) - margin_), -far),
+            .high = std::nextafter(float(std::max(a, b) + margin_), far),
+            .depth = float(s.depth),
+            .segment = uint32_t(i)};
+    });
+    // The threads put them there in any order.
+    team.each_block(buckets, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t k = first; k < last; ++k)
+            std::sort(entries_.begin() + begin_[k], entries_.begin() + begin_[k + 1],
+                      [](const Entry& e, const Entry& o) {
+                          return e.depth != o.depth ? e.depth < o.depth : e.segment < o.segment;
+                      });
+    });
+}
+
+const ImageSegment* CoincidentCurves::find(int64_t edge) const {
+    const auto at = std::lower_bound(segments_.begin(), segments_.end(), edge,
+                                     [](const ImageSegment& s, int64_t edge) { return s.edge < edge; });
+    return at != segments_.end() && at->edge == edge ? at : nullptr;
+}
+
+bool CoincidentCurves::passes(const ImageSegment& other, const ImageSegment& own, Vec2 x) {
+    const Vec2 along = other.b - other.a, from = x - other.a;
+    const double far = length(along), reach = std::max(own.reach, other.reach);
+    const double t = from.x * along.x + from.y * along.y;
+    if (!(t >= -reach * far && t <= (far + reach) * far)) return false;
+    if (!(std::fabs(wedge(along, from)) <= 2 * reach * far)) return false;  // spares most of what follows
+    return side_by_side(own, other) || side_by_side(other, own);
 }
 
 }  // namespace edgegrad

@@ -50,6 +50,7 @@ class MeasuredEdges {
         : view_(view), finder_(finder), radiance_(radiance), of_edge_(of_edge), control_(view) {}
 
     CurvesFound found;
+    std::vector<ImageSegment> segments;
 
     // `x`: where controls go; null if there are none.
     void add(int64_t first, int64_t last, RowBuffer* x) {
@@ -65,14 +66,22 @@ class MeasuredEdges {
             const double visible = visibility(c, low, high), m = c.length * visible * jump(c, x);
             of_edge_[e] = m * importance;
             found.pixels += m;
-            found.segments.push_back({e, c.x0, c.x1, reach_of_rays(view_, c)});
+            segments.push_back({.edge = e,
+                                .a = c.x0,
+                                .b = c.x1,
+                                .reach = reach_of_rays(view_, c),
+                                .rounding = c.rounding,
+                                .depth = nearest_depth(c)});
         }
     }
 
    private:
+    static double nearest_depth(const Curve& c) {
+        return std::min((1 - c.t0) * c.a.z + c.t0 * c.b.z, (1 - c.t1) * c.a.z + c.t1 * c.b.z);
+    }
+
     double visibility(const Curve& c, Vec2 low, Vec2 high) const {
-        const double nearest = std::min((1 - c.t0) * c.a.z + c.t0 * c.b.z, (1 - c.t1) * c.a.z + c.t1 * c.b.z);
-        if (view_.occlusion.hides(low, high, nearest)) return c.is_crease() ? occluded_crease : occluded;
+        if (view_.occlusion.hides(low, high, nearest_depth(c))) return c.is_crease() ? occluded_crease : occluded;
         if (!c.is_crease() || !view_.hits) return 1;
         const auto hit = [&](int corner) { return view_.hits->at(vertex(view_.scene, c.minus, corner)); };
         if (hit(c.minus.first()) || hit(c.minus.second())) return 1;
@@ -119,29 +128,27 @@ Curves<T> measure_curves(const BackwardView<T>& view) {
     Curves<T> out(view);
     const int64_t E = out.of_edge.size();
     const double radiance = mean_radiance(view.scene, view.team);
-    const auto measure = [&](int64_t first, int64_t last, RowBuffer* x) {
+    std::vector<CurvesFound> parts;
+    const auto measure = [&](int64_t k, int64_t first, int64_t last, RowBuffer* x) {
         MeasuredEdges<N, T> part(view, out.finder, radiance, out.of_edge);
         part.add(first, last, x);
-        return std::move(part.found);
+        parts[k] = part.found, out.segments[k] = std::move(part.segments);
     };
-    std::vector<CurvesFound> parts;
+    const auto resize = [&](int64_t n) { parts.resize(n), out.segments.resize(n); };
     if (out.x_bar.empty()) {
-        parts.resize(Team::blocks(E));
-        view.team.each_block(E,
-                             [&](int64_t k, int64_t first, int64_t last) { parts[k] = measure(first, last, nullptr); });
+        resize(Team::blocks(E));
+        view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) { measure(k, first, last, nullptr); });
     } else {
-        parts.resize((E + scatter_chunk - 1) / scatter_chunk);
+        resize((E + scatter_chunk - 1) / scatter_chunk);
         Destination whole;
         whole.x = out.x_bar.data();
         double seconds[2] = {};
         view.scatter.add(E, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-            parts[first / scatter_chunk] = measure(first, last, &grad.x);
+            measure(first / scatter_chunk, first, last, &grad.x);
         });
     }
-    for (const CurvesFound& part : parts) {
+    for (const CurvesFound& part : parts)
         out.pixels += part.pixels, out.silhouettes += part.silhouettes, out.creases += part.creases;
-        out.segments.insert(out.segments.end(), part.segments.begin(), part.segments.end());
-    }
     return out;
 }
 

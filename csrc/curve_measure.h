@@ -15,13 +15,13 @@ namespace edgegrad {
 struct CurvesFound {
     double pixels = 0;                     // the measure without the adjoint, which default samples go by
     int64_t silhouettes = 0, creases = 0;  // in view
-    std::vector<ImageSegment> segments;    // those where the loss looks
 };
 template <class T>
 struct Curves : CurvesFound {
     CurveFinder<T> finder;
-    Array<double> of_edge;  // (E,) the measure
-    Array<double> x_bar;    // (V, 2) what controls add to the cotangents of places in the image; empty: there are none
+    Array<double> of_edge;                            // (E,) the measure
+    std::vector<std::vector<ImageSegment>> segments;  // those where the loss looks, by ascending edges
+    Array<double> x_bar;  // (V, 2) what controls add to the cotangents of places in the image; empty: there are none
 
     explicit Curves(const BackwardView<T>& view);
 

@@ -194,7 +194,7 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
                 else "no jump in view"
             ),
             samples=edge,
-            bytes=memory.edge_measure(F) + boundary_rows,
+            bytes=memory.edge_measure(F) + memory.curves_on_lines(silhouettes + creases) + boundary_rows,
         ),
         "silhouettes": Term(
             silhouettes > 0, no_boundary or (f"{silhouettes:,} in view" if silhouettes else "none in view")

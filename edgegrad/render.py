@@ -298,7 +298,9 @@ def gradient_room(adjoint: Tensor, *args: Any) -> AbstractContextManager[None]:
         needs["controls"] = memory.rows(F, F, 3, 2, V) * work.motion
         needs["surface samples"] = surface_rows(many if surface_samples < 0 else surface_samples, args)
     if work.boundary:
-        needs["edges in view"] = memory.edge_measure(F)
+        # Where all attributes are indexed like the vertices, curves are silhouettes: a quarter of a mesh that is tangled.
+        jumps = flat.corners.data_ptr() != flat.faces.data_ptr()
+        needs["edges in view"] = memory.edge_measure(F) + memory.curves_on_lines(memory.edges(F) // (1 if jumps else 4))
         needs["edge samples"] = memory.rows(many if edge_samples < 0 else edge_samples, memory.edges(F), 4, 3, V)
     kept = {"ray structure": memory.ray_structure(F, V), "topology": memory.topology(F) * work.boundary}
     return memory.room("backward pass", needs, kept, lambda: _lower(args) + ", or let fewer tensors require a gradient")
@@ -482,7 +484,7 @@ class _RenderBackward(torch.autograd.Function):
 def _one_by_one(
     function: type[torch.autograd.Function], count: int, in_dims: tuple[int | None, ...], args: tuple[Any, ...]
 ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-    """torch.vmap of a function with several outputs: call by call. What is no tensor, as the list of spacings, has no batch axis."""
+    """torch.vmap of a function with several outputs: call by call. What is no tensor has no batch axis."""
     results = [
         function.apply(*(a.select(dim, i) if isinstance(dim, int) else a for a, dim in zip(args, in_dims, strict=True)))
         for i in range(count)
