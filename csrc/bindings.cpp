@@ -21,6 +21,7 @@
 
 #include "render.h"
 #include "stopwatch.h"
+#include "unlocked.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -252,31 +253,6 @@ void check_background(const SceneArrays<T>& scene, const Camera& camera) {
                std::to_string(b.shape(1)));
 }
 
-// Whether a signal handler of Python raised, as that of Ctrl-C does.
-bool interrupted() {
-    nb::gil_scoped_acquire acquire;
-    return PyErr_CheckSignals() != 0;
-}
-
-// Handlers run in the main thread alone; in others asking would only wait for the lock.
-bool in_main_thread() {
-    const nb::object main = nb::module_::import_("threading").attr("main_thread")();
-    return nb::cast<unsigned long>(main.attr("ident")) == PyThread_get_thread_ident();
-}
-
-// Calls f(team) without the interpreter's lock.
-template <class F>
-auto unlocked(int threads, F f) {
-    const auto ask = in_main_thread() ? interrupted : nullptr;
-    try {
-        nb::gil_scoped_release release;
-        Team team(threads, ask);
-        return f(team);
-    } catch (const Interrupted&) {
-        throw nb::python_error();  // that of the handler
-    }
-}
-
 // What a pass did, by name: counts, and seconds.
 using Profile = std::map<std::string, double>;
 
@@ -448,7 +424,7 @@ void bind_scene(nb::module_& m, const char* name) {
 NB_MODULE(_core, m) {
     m.doc() = "The edgegrad kernel. Use it through the edgegrad package.";
     nb::set_leak_warnings(false);  // of a process that ends while a thread of it renders
-    m.def("open_embree", &open_embree, "path"_a, "options"_a, nb::call_guard<nb::gil_scoped_release>());
+    m.def("open_embree", &open_embree, "path"_a, "options"_a, nb::call_guard<Unlocked>());
     m.def("embree_version", &embree_version);
     m.def("packet_width", &packet_width);
     // Without the interpreter's lock, for which a thread that holds the kernel's may wait.
@@ -456,9 +432,16 @@ NB_MODULE(_core, m) {
     m.def("all_finite", &all_finite<double>, "array"_a.noconvert(), "threads"_a = 1);
     m.def("all_below", &all_below<int32_t>, "array"_a.noconvert(), "count"_a, "threads"_a = 1);
     m.def("all_below", &all_below<int64_t>, "array"_a.noconvert(), "count"_a, "threads"_a = 1);
-    m.def("clear_geometry", &clear_geometry, nb::call_guard<nb::gil_scoped_release>());
-    m.def("before_fork", &before_fork, nb::call_guard<nb::gil_scoped_release>());
-    m.def("after_fork", &after_fork, "child"_a);
+    m.def("clear_geometry", &clear_geometry, nb::call_guard<Unlocked>());
+    m.def("await_callers", &await_callers, nb::call_guard<nb::gil_scoped_release>());
+    m.def("before_fork", &before_fork, nb::call_guard<Unlocked>());
+    m.def(
+        "after_fork",
+        [](bool child) {
+            if (child) forget_other_callers();
+            after_fork(child);
+        },
+        "child"_a);
     nb::class_<Camera>(m, "Camera")
         .def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "perspective"_a, "width"_a,
              "height"_a);

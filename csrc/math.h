@@ -6,7 +6,9 @@
 #include <limits>
 
 // A function compiled twice, of which the processor takes what it can run: loops over arrays gain from AVX2.
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__)
+// Not with ThreadSanitizer, which would watch the choice, made before it can.
+#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__GLIBC__) && \
+    !defined(__SANITIZE_THREAD__)
 #define EDGEGRAD_VECTORIZED __attribute__((target_clones("avx2", "default")))
 #else
 #define EDGEGRAD_VECTORIZED

@@ -149,9 +149,12 @@ class Pool {
 };
 
 // Lets torch's threads sleep while they wait. Those of GNU's OpenMP spin for milliseconds between torch's operators,
-// and so take processors from our workers, from other processes and from each other; but only for microseconds where
-// the process has more of them than processors. So one thread makes as many as there are processors, which sleep for
-// good.
+// and so take processors from our workers, from other processes and from each other; but a hundred turns only where the
+// process has more of them than processors, as its manual says of GOMP_SPINCOUNT. So one thread makes as many as there
+// are processors, which sleep for good. Where nothing of this name is loaded, or LLVM's or Intel's OpenMP, which answer
+// to it too and have rules of their own, nothing is done. Where OMP_THREAD_LIMIT allows no more threads, torch's spin
+// as before. It changes how threads wait and no result. A system that has not so many threads to give ends the process,
+// as it would for torch's own.
 bool calm_openmp() {
 #ifdef __linux__
     using Parallel = void (*)(void (*)(void*), void*, unsigned, unsigned);

@@ -272,6 +272,7 @@ void RayCaster::update(const double* verts, Team& team) {
             positions_[3 * v] = float(p.x), positions_[3 * v + 1] = float(p.y), positions_[3 * v + 2] = float(p.z);
         }
     });
+    stop_ = false;  // what Embree's threads read comes after this, also for ThreadSanitizer, which cannot watch Embree
     // Embree asks from any of its threads and holds locks of its own meanwhile. So that this one can ask the caller,
     // whose signal handlers may render, another one builds what takes long.
     if (n_faces_ < int64_t(1) << 18) return build();

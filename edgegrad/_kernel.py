@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib.metadata
 import importlib.util
 import os
@@ -51,6 +52,8 @@ def load() -> Any:
 
 
 core = load()
+# Without this a process that ends while daemon threads render is often aborted (csrc/unlocked.h).
+atexit.register(core.await_callers)
 # Without this a worker of a DataLoader, or of multiprocessing, that is forked after its parent rendered waits for ever.
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(

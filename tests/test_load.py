@@ -170,6 +170,27 @@ def test_the_same_bits_with_1_2_and_5_threads_and_several_callers(tmp_path):
     assert found == {k: [alone[(k + turn) % 2] for turn in range(4)] for k in range(4)}
 
 
+ENDING = """
+def loop():
+    while True:
+        step()
+
+for _ in range(3):
+    threading.Thread(target=loop, daemon=True).start()
+time.sleep(0.3)
+"""
+
+
+def test_a_process_ends_while_daemon_threads_render(tmp_path):
+    """Python then ends each thread that asks for its lock, which aborts the process where C++ frames are in the way."""
+    file = tmp_path / "script.py"
+    file.write_text(COMMON + ENDING)
+    environment = {**psutil.Process().environ(), "PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
+    for _ in range(3):
+        run = subprocess.run([sys.executable, str(file)], env=environment, capture_output=True, text=True, timeout=120)
+        assert (run.returncode, run.stderr) == (0, "")
+
+
 IMPORT = """
 import os
 before = dict(os.environ)
