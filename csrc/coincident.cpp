@@ -8,22 +8,6 @@ namespace edgegrad {
 
 namespace {
 
-// Whether two segments run side by side within their reach.
-bool side_by_side(const ImageSegment& s, const ImageSegment& o) {
-    const Vec2 along = s.b - s.a;
-    const double squared = along.x * along.x + along.y * along.y, reach = std::max(s.reach, o.reach);
-    const auto parameter = [&](Vec2 x) { return ((x.x - s.a.x) * along.x + (x.y - s.a.y) * along.y) / squared; };
-    const double t0 = parameter(o.a), t1 = parameter(o.b);
-    // Segments that merely touch end to end do not; a millionth of the length is no loss.
-    const double first = std::max(0.0, std::min(t0, t1)), last = std::min(1.0, std::max(t0, t1));
-    if (!(last - first > 1e-6)) return false;
-    const auto distance = [&](double t) {  // of the point t of s to the line of o
-        const Vec2 x = s.a + t * along, other = o.b - o.a;
-        return std::fabs(wedge(other, x - o.a)) / length(other);
-    };
-    return distance(first) <= reach && distance(last) <= reach;
-}
-
 // For each of many buckets, whether one or several segments were put there. Two buckets may share a place.
 class Occupancy {
    public:
@@ -49,6 +33,22 @@ class Occupancy {
 
 }  // namespace
 
+// Whether two segments run side by side within their reach.
+bool CoincidentCurves::side_by_side(const ImageSegment& s, const ImageSegment& o) {
+    const Vec2 along = s.b - s.a;
+    const double squared = along.x * along.x + along.y * along.y, reach = std::max(s.reach, o.reach);
+    const auto parameter = [&](Vec2 x) { return ((x.x - s.a.x) * along.x + (x.y - s.a.y) * along.y) / squared; };
+    const double t0 = parameter(o.a), t1 = parameter(o.b);
+    // Segments that merely touch end to end do not; a millionth of the length is no loss.
+    const double first = std::max(0.0, std::min(t0, t1)), last = std::min(1.0, std::max(t0, t1));
+    if (!(last - first > 1e-6)) return false;
+    const auto distance = [&](double t) {  // of the point t of s to the line of o
+        const Vec2 x = s.a + t * along, other = o.b - o.a;
+        return std::fabs(wedge(other, x - o.a)) / length(other);
+    };
+    return distance(first) <= reach && distance(last) <= reach;
+}
+
 CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, Team& team) {
     int64_t n = 0;
     double total = 0;
@@ -71,7 +71,9 @@ CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts,
         std::copy(parts[k].begin(), parts[k].end(), segments_.begin() + first[k]);
         parts[k] = {};
     });
-    if (!segments_.empty()) fill(team);
+    if (segments_.empty()) return;
+    fill(team);
+    find_companions(team);
 }
 
 // In most scenes nearly all segments are alone on their lines.
@@ -140,10 +142,43 @@ void CoincidentCurves::fill(Team& team) {
     });
 }
 
+// Buckets are shared by what follows end to end along a line, too. Where one holds many, all of them are kept unasked.
+void CoincidentCurves::find_companions(Team& team) {
+    constexpr uint32_t many = 64;
+    std::vector<std::vector<Companion>> parts(Team::blocks(segments_.size()));
+    const auto any_beside = [&](const ImageSegment& s, const LineBuckets::Line& l) {
+        uint64_t keys[4];
+        LineBuckets::keys_around(l, keys);
+        const bool x = LineBuckets::runs_along_x(l);
+        const float low = float(std::min(x ? s.a.x : s.a.y, x ? s.b.x : s.b.y)),
+                    high = float(std::max(x ? s.a.x : s.a.y, x ? s.b.x : s.b.y));
+        for (const uint64_t key : keys) {
+            const uint32_t first = begin_[key & mask_], last = begin_[(key & mask_) + 1];
+            if (last - first > many) return true;
+            for (uint32_t i = first; i < last; ++i) {
+                const Entry& e = entries_[i];
+                const ImageSegment& o = segments_[e.segment];
+                if (e.low <= high && low <= e.high && &o != &s && (side_by_side(s, o) || side_by_side(o, s)))
+                    return true;
+            }
+        }
+        return false;
+    };
+    team.each_block(segments_.size(), [&](int64_t k, int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i) {
+            bool found = false;
+            lines_.each_cell(segments_[i],
+                             [&](const LineBuckets::Line& l) { found = found || any_beside(segments_[i], l); });
+            if (found) parts[k].push_back({segments_[i].edge, uint32_t(i)});
+        }
+    });
+    for (const auto& part : parts) companions_.insert(companions_.end(), part.begin(), part.end());
+}
+
 const ImageSegment* CoincidentCurves::find(int64_t edge) const {
-    const auto at = std::lower_bound(segments_.begin(), segments_.end(), edge,
-                                     [](const ImageSegment& s, int64_t edge) { return s.edge < edge; });
-    return at != segments_.end() && at->edge == edge ? at : nullptr;
+    const auto at = std::lower_bound(companions_.begin(), companions_.end(), edge,
+                                     [](const Companion& c, int64_t edge) { return c.edge < edge; });
+    return at != companions_.end() && at->edge == edge ? &segments_[at->segment] : nullptr;
 }
 
 bool CoincidentCurves::passes(const ImageSegment& other, const ImageSegment& own, Vec2 x) {

@@ -147,10 +147,19 @@ class CoincidentCurves {
 
     void keep_those_not_alone(std::vector<std::vector<ImageSegment>>& parts, int64_t n, Team& team) const;
     void fill(Team& team);
+    void find_companions(Team& team);
+    static bool side_by_side(const ImageSegment& s, const ImageSegment& o);
     static bool passes(const ImageSegment& other, const ImageSegment& own, Vec2 x);
 
     LineBuckets lines_;
-    Array<ImageSegment> segments_{0};  // by ascending edges
+    // A segment that others lie on.
+    struct Companion {
+        int64_t edge;
+        uint32_t segment;
+    };
+
+    Array<ImageSegment> segments_{0};    // by ascending edges
+    std::vector<Companion> companions_;  // by ascending edges
     uint64_t mask_ = 0;
     std::vector<uint32_t> begin_;  // of each bucket, in entries_
     Array<Entry> entries_{0};

@@ -69,9 +69,9 @@ def curves_on_lines(curves: int) -> int:
     """Bytes, at most, of `curves` curves in view sorted by the lines that they lie on (csrc/coincident.h).
 
     A curve is 64 bytes in a list that doubles as it grows, and again where others lie on its line, with up to 16 of two tables,
-    and 16 in each of up to 7 cells of the image; most pass one or two, and are alone.
+    16 in each of up to 7 cells of the image, and 16 more, twice, once it has a companion; most pass one or two, and are alone.
     """
-    return (64 + 2 * 16 + 7 * 16) * curves
+    return (64 + 2 * 16 + 7 * 16 + 2 * 16) * curves
 
 
 def rows(samples: int, primitives: int | None, each: int, width: int, destinations: int) -> int:
