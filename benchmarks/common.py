@@ -45,7 +45,7 @@ class Kernel:
         self.adjoint = adjoint.to(self.flat.colors.dtype).contiguous()
         self.image = torch.empty_like(self.adjoint)
         self.coverage = self.adjoint.new_empty(camera.size)
-        self.farthest = torch.empty(camera.size)
+        self.depths = torch.empty((*camera.size, 2))
         self.seen = torch.empty(len(self.flat.faces), dtype=torch.uint8)
         textured = len(self.flat.textures) > 0
         like = {
@@ -59,7 +59,7 @@ class Kernel:
 
     def forward(self, threads: int | None = None) -> float:
         """Seconds; writes `image`."""
-        outputs = self.image.numpy(), self.coverage.numpy(), self.farthest.numpy(), self.seen.numpy()
+        outputs = self.image.numpy(), self.coverage.numpy(), self.depths.numpy(), self.seen.numpy()
         begin = time.perf_counter()
         self.profile = self.scene.forward(self.camera, self.spp, "box", 0, threads or torch.get_num_threads(), *outputs)
         return time.perf_counter() - begin
@@ -81,7 +81,7 @@ class Kernel:
         self.profile = self.scene.backward(
             camera=self.camera, spp=self.spp, surface_samples=surface_samples, edge_samples=edge_samples, filter="box", seed=seed,
             threads=threads or torch.get_num_threads(), interior_geometry=interior, boundary=boundary, dry=False,
-            adjoint=self.adjoint.numpy(), coverage=self.coverage.numpy(), farthest=self.farthest.numpy(),
+            adjoint=self.adjoint.numpy(), coverage=self.coverage.numpy(), depths=self.depths.numpy(),
             seen=self.seen.numpy(), **wanted,
         )  # fmt: skip
         return time.perf_counter() - begin

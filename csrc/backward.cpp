@@ -80,7 +80,7 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
     const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, team);
     const FilteredAdjoint<T> filtered(adjoint, scene, o.filter, camera.width, camera.height);
     const Importance importance(adjoint, camera.width, camera.height, scene.channels, o.filter.radius() - 0.5, team);
-    const OcclusionHint occlusion(forward.farthest, camera.width, camera.height, team);
+    const OcclusionHint occlusion(forward.depths, camera.width, camera.height, team);
     const RayFrame frame(geometry.caster(), camera);
     Scatter scatter(team, scene.channels);
     // What the controls need, of faces and of creases.

@@ -16,6 +16,7 @@
 #include <vector>
 
 #include "curve.h"
+#include "depth_bound.h"
 #include "interior.h"
 
 namespace edgegrad {
@@ -70,9 +71,22 @@ class CreaseControl {
         return true;
     }
 
-    // What its density is multiplied by: the fewer samples the less may hide a part of it.
-    double density() const {
-        return std::clamp(std::max(curve_->length / wide, bend_), clear_ ? least : least_at_rims, 1.0);
+    // What its density is multiplied by: few samples where the image hit nothing before the crease, all of them else.
+    double density(Vec2 low, Vec2 high) const {
+        if (!clear_) return 1;
+        // Its own faces, and those beside them, may come nearer than it does as far as these pixels reach; not so where
+        // they are seen so flat that something else may be between.
+        const double reach = OcclusionHint::margin(low, high), across = reach / view_.camera.pixels_per_unit;
+        const Vec2 middle = normalised(view_.camera, curve_->position(0.5)), half{2 * across, 2 * across};
+        const double depth = std::min(curve_->a.z, curve_->b.z);
+        double nearest = depth;
+        for (const HalfEdge* h : {&curve_->minus, &curve_->plus})
+            nearest = std::min(
+                nearest, DepthBound::nearest_on_plane(view_.camera, corners_of(view_, h->face).data(), middle, half));
+        const double pixel = 2 / view_.camera.pixels_per_unit * (view_.camera.perspective ? depth : 1.0);  // at most
+        const double flat = 3 * reach * pixel;
+        if (!(depth - nearest <= flat) || !view_.occlusion.exposes(low, high, nearest - 2 * pixel)) return 1;
+        return std::clamp(std::max(curve_->length / wide, bend_), least, 1.0);
     }
 
     void add_integral() {
@@ -153,8 +167,8 @@ class CreaseControl {
         return std::max(end, s + 1e-6);
     }
 
-    // Of a crease beside faces that the image did not hit, and of others; and from which length on, px, it gets all.
-    static constexpr double least_at_rims = 1.0 / 16, least = 1.0 / 512, wide = 512;
+    // Of a short crease; and from which length on, px, it gets all samples.
+    static constexpr double least = 1.0 / 32, wide = 256;
 
     const BackwardView<T>& view_;
     const int C_;

@@ -63,7 +63,7 @@ class MeasuredEdges {
             const Vec2 high{std::max(c.x0.x, c.x1.x), std::max(c.x0.y, c.x1.y)};
             const double importance = view_.importance.mean(low, high);
             if (!(importance > 0) || !std::isfinite(c.length)) continue;
-            const double visible = visibility(c, low, high), m = c.length * visible * jump(c, x);
+            const double visible = visibility(c, low, high), m = c.length * visible * jump(c, low, high, x);
             of_edge_[e] = m * importance;
             found.pixels += m;
             segments.push_back({.edge = e,
@@ -81,7 +81,8 @@ class MeasuredEdges {
     }
 
     double visibility(const Curve& c, Vec2 low, Vec2 high) const {
-        if (view_.occlusion.hides(low, high, nearest_depth(c))) return c.is_crease() ? occluded_crease : occluded;
+        if (view_.occlusion.hides(low, high, nearest_depth(c)))
+            return OcclusionHint::factor(c.is_crease() ? occluded_crease : occluded, view_.options.spp);
         if (!c.is_crease() || !view_.hits) return 1;
         const auto hit = [&](int corner) { return view_.hits->at(vertex(view_.scene, c.minus, corner)); };
         if (hit(c.minus.first()) || hit(c.minus.second())) return 1;
@@ -90,7 +91,7 @@ class MeasuredEdges {
     }
 
     // Relative to a jump of the size of the mean radiance, which is taken where nothing is known.
-    double jump(const Curve& c, RowBuffer* x) {
+    double jump(const Curve& c, Vec2 low, Vec2 high, RowBuffer* x) {
         if (!joins_colors(view_.scene, c)) return 1;
         const CreaseColors<T> colors(view_.scene, c);
         const int C = view_.scene.channels;
@@ -98,7 +99,7 @@ class MeasuredEdges {
         if (!x || !control_.set(c)) return size;
         control_.add_integral();
         control_.flush(*x);
-        return size * control_.density();
+        return size * control_.density(low, high);
     }
 
     static constexpr double largest = 2;  // so that a bright face among dark ones does not take all samples

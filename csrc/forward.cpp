@@ -92,6 +92,7 @@ class PixelRow {
     void render(int x0, int x1, int y) {
         std::fill(sum_.begin(), sum_.end(), 0.0);
         std::fill(hits_, hits_ + tile, 0);
+        std::fill(nearest_, nearest_ + tile, std::numeric_limits<double>::infinity());
         std::fill(farthest_, farthest_ + tile, -std::numeric_limits<double>::infinity());
         x0_ = x0, y_ = y;
         for (int x = x0; x < x1; ++x)
@@ -110,7 +111,9 @@ class PixelRow {
             for (int c = 0; c < C_; ++c)
                 out_.image[pixel * C_ + c] = T(sum_[x * C_ + c] / spp_ + (1 - share) * behind[c]);
             out_.coverage[pixel] = T(share);
-            out_.farthest[pixel] = hits_[x] == spp_ ? rounded_up(farthest_[x]) : std::numeric_limits<float>::infinity();
+            out_.depths[2 * pixel] = rounded_down(nearest_[x]);
+            out_.depths[2 * pixel + 1] =
+                hits_[x] == spp_ ? rounded_up(farthest_[x]) : std::numeric_limits<float>::infinity();
         }
     }
 
@@ -121,7 +124,7 @@ class PixelRow {
             const T* behind = scene_.background_at(pixel);
             std::copy(behind, behind + C_, out_.image + pixel * C_);
             out_.coverage[pixel] = 0;
-            out_.farthest[pixel] = std::numeric_limits<float>::infinity();
+            out_.depths[2 * pixel] = out_.depths[2 * pixel + 1] = std::numeric_limits<float>::infinity();
         }
     }
 
@@ -182,10 +185,10 @@ class PixelRow {
         rays_.count = parts_ = 0;
     }
 
-    // The farthest depth that is hit in a pixel.
+    // Between which depths a pixel hits.
     void note_depth(const Shaded& s, int column) {
         const Vec2 middle = normalised(camera_, {x0_ + column + 0.5, y_ + 0.5});
-        farthest_[column] = std::max(farthest_[column], s.depth.within(middle, reach_));
+        s.depth.widen(middle, reach_, nearest_[column], farthest_[column]);
     }
 
     // Adds what ray i, of a pixel in this column, sees to the sum: one sample.
@@ -276,7 +279,7 @@ class PixelRow {
     Shaded kept_[n_kept];
     int x0_ = 0, y_ = 0;  // the first pixel of the row
     int hits_[tile];
-    double farthest_[tile];
+    double nearest_[tile], farthest_[tile];
     std::vector<double> sum_, radiance_;
 };
 

@@ -57,10 +57,11 @@ class PixelRays {
 // Where the forward pass writes.
 template <class T>
 struct ForwardOutput {
-    T* image;         // (H, W, C)
-    T* coverage;      // (H, W): the filtered share of each pixel where something is hit
-    float* farthest;  // (H, W): no sample hit anything beyond this depth; infinite where one hit nothing
-    uint8_t* seen;    // (F,): 0, or the side, 1 or 2, from which a sample hit the face
+    T* image;       // (H, W, C)
+    T* coverage;    // (H, W): the filtered share of each pixel where something is hit
+    float* depths;  // (H, W, 2): all that samples hit lies between these; the farther one is infinite where one hit
+                    // nothing
+    uint8_t* seen;  // (F,): 0, or the side, 1 or 2, from which a sample hit the face
 };
 
 template <class T>
@@ -99,7 +100,7 @@ struct BackwardProfile {
 template <class T>
 struct ForwardView {
     const T* coverage;
-    const float* farthest;
+    const float* depths;
     const uint8_t* seen;
 };
 

@@ -146,8 +146,8 @@ class MeasuredChunk {
     double default_samples(int64_t f, const Extent& e, ImageHits::Face hits, Side side) const {
         const double m = (e.area + e.longest) * (is_textured(view_.scene, f) ? textured : colored);
         const bool behind = !view_.seen[f] && view_.occlusion.hides(e.low, e.high, e.nearest);
-        if (hits.partly) return behind ? m * occluded_beside_hits : m;
-        if (behind) return m * occluded;
+        if (hits.partly) return behind ? m * OcclusionHint::factor(occluded_beside_hits, view_.options.spp) : m;
+        if (behind) return m * OcclusionHint::factor(occluded, view_.options.spp);
         return m * view_.hits->where_missed(view_.scene.faces[3 * f], side());
     }
 

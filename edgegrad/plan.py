@@ -126,7 +126,7 @@ def _image_terms(scene: Scene, arguments: Sequence[Any], any_gradient: bool) -> 
         "kept for backward": Term(
             any_gradient,
             "coverage, depths, and which faces were seen" if any_gradient else "nothing requires a gradient",
-            bytes=B * (height * width * (word + 4) + F),
+            bytes=B * (height * width * (word + 8) + F),
         ),
     }
 
@@ -146,7 +146,7 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
         ones = flat.colors.new_ones((B, height, width, C))
     view = View(
         ones[..., 0].contiguous(),
-        ones.new_full((B, height, width), math.inf, dtype=torch.float32),
+        ones.new_full((B, height, width, 2), math.inf, dtype=torch.float32),
         flat.faces.new_ones((B, F), dtype=torch.uint8),
     )
     _, profiles = backward_kernel(ones, view, *arguments, wanted, dry=True)

@@ -96,7 +96,7 @@ def kernel(monkeypatch):
 
     def watched_backward(adjoint, view, *arguments, **options):
         if seen.everything:
-            view = view._replace(farthest=torch.full_like(view.farthest, torch.inf), seen=torch.ones_like(view.seen))
+            view = view._replace(depths=torch.full_like(view.depths, torch.inf), seen=torch.ones_like(view.seen))
         seen.adjoint = adjoint
         seen.grads, profiles = backward(adjoint, view, *arguments, **options)
         seen.backward += profiles
@@ -274,8 +274,8 @@ def test_nothing_but_the_plan_is_kept_for_the_backward_pass():
     node = eg.render(scene, camera, spp=4).grad_fn
     while not hasattr(node, "saved_tensors"):
         node = node.next_functions[0][0]
-    coverage, farthest, seen, *inputs = node.saved_tensors
-    assert coverage.nbytes + farthest.nbytes + seen.nbytes == eg.plan(scene, camera)["kept for backward"].bytes
+    coverage, depths, seen, *inputs = node.saved_tensors
+    assert coverage.nbytes + depths.nbytes + seen.nbytes == eg.plan(scene, camera)["kept for backward"].bytes
     flat = [*flatten(scene), camera.world_to_camera[None], camera.K[None]]
     assert [tuple(t.shape) for t in inputs] == [tuple(t.shape) for t in flat]
     assert eg.render(cube(), CAMERA, spp=4).grad_fn is None
