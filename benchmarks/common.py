@@ -45,7 +45,9 @@ class Kernel:
         self.adjoint = adjoint.to(self.flat.colors.dtype).contiguous()
         self.image = torch.empty_like(self.adjoint)
         self.coverage = self.adjoint.new_empty(camera.size)
-        self.depths = torch.empty((*camera.size, 2))
+        self.depth = torch.empty(camera.size)
+        self.hit = torch.empty((*camera.size, 2), dtype=torch.int32)
+        self.interior = bool(arguments[21])  # whether colours vary within faces
         self.seen = torch.empty(len(self.flat.faces), dtype=torch.uint8)
         textured = len(self.flat.textures) > 0
         like = {
@@ -59,7 +61,7 @@ class Kernel:
 
     def forward(self, threads: int | None = None) -> float:
         """Seconds; writes `image`."""
-        outputs = self.image.numpy(), self.coverage.numpy(), self.depths.numpy(), self.seen.numpy()
+        outputs = self.image.numpy(), self.coverage.numpy(), self.depth.numpy(), self.hit.numpy(), self.seen.numpy()
         begin = time.perf_counter()
         self.profile = self.scene.forward(self.camera, self.spp, "box", 0, threads or torch.get_num_threads(), *outputs)
         return time.perf_counter() - begin
@@ -70,7 +72,7 @@ class Kernel:
         edge_samples: int = -1,
         seed: int = 0,
         *,
-        interior: bool = True,
+        interior: bool | None = None,
         boundary: bool = True,
         appearance: bool = False,
         threads: int | None = None,
@@ -80,9 +82,10 @@ class Kernel:
         begin = time.perf_counter()
         self.profile = self.scene.backward(
             camera=self.camera, spp=self.spp, surface_samples=surface_samples, edge_samples=edge_samples, filter="box", seed=seed,
-            threads=threads or torch.get_num_threads(), interior_geometry=interior, boundary=boundary, dry=False,
-            adjoint=self.adjoint.numpy(), coverage=self.coverage.numpy(), depths=self.depths.numpy(),
-            seen=self.seen.numpy(), **wanted,
+            threads=threads or torch.get_num_threads(), boundary=boundary, dry=False,
+            interior_geometry=self.interior if interior is None else interior,
+            adjoint=self.adjoint.numpy(), coverage=self.coverage.numpy(), depth=self.depth.numpy(),
+            hit=self.hit.numpy(), seen=self.seen.numpy(), **wanted,
         )  # fmt: skip
         return time.perf_counter() - begin
 

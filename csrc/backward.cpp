@@ -80,7 +80,7 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
     const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, team);
     const FilteredAdjoint<T> filtered(adjoint, scene, o.filter, camera.width, camera.height);
     const Importance importance(adjoint, camera.width, camera.height, scene.channels, o.filter.radius() - 0.5, team);
-    const OcclusionHint occlusion(forward.depths, camera.width, camera.height, team);
+    const OcclusionHint occlusion(forward.depth, camera.width, camera.height, team);
     const RayFrame frame(geometry.caster(), camera);
     Scatter scatter(team, scene.channels);
     // What the controls need, of faces and of creases.
@@ -89,7 +89,7 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
     std::optional<ImageHits> hits;
     if (!o.pixel_spp && (interior || creases)) hits.emplace(scene, geometry.parts(), forward.seen, team);
     const Array<T> vertex_adjoint =
-        hits ? adjoint_at_vertices(filtered, vertices, *hits, scene.channels, team) : Array<T>(0);
+        hits && interior ? adjoint_at_vertices(filtered, vertices, *hits, scene.channels, team) : Array<T>(0);
     const BackwardView<T> view{.scene = scene,
                                .camera = camera,
                                .geometry = geometry,
@@ -104,6 +104,7 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
                                .occlusion = occlusion,
                                .hits = hits ? &*hits : nullptr,
                                .seen = forward.seen,
+                               .hit = forward.hit,
                                .vertex_adjoint = vertex_adjoint};
     profile.view = watch.lap();
 

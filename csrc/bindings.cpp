@@ -258,18 +258,20 @@ using Profile = std::map<std::string, double>;
 
 template <class T>
 void check_forward_output(const SceneArrays<T>& scene, const Camera& camera, const Out<T, 2>& coverage,
-                          const Out<float, 3>& depths, const Out<uint8_t, 1>& seen) {
+                          const Out<float, 2>& depth, const Out<int32_t, 3>& hit, const Out<uint8_t, 1>& seen) {
     if (coverage.size() != size_t(camera.width) * camera.height) refuse("coverage: expected the size of the image");
-    if (depths.size() != 2 * coverage.size()) refuse("depths: expected two numbers a pixel");
+    if (depth.size() != coverage.size()) refuse("depth: expected one number a pixel");
+    if (hit.size() != 2 * coverage.size()) refuse("hit: expected two numbers a pixel");
     if (seen.size() != scene.faces.shape(0)) refuse("seen: expected one number a face");
 }
 
 template <class T>
 Profile forward(const SceneArrays<T>& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed,
-                int threads, Out<T, 3> image, Out<T, 2> coverage, Out<float, 3> depths, Out<uint8_t, 1> seen) {
+                int threads, Out<T, 3> image, Out<T, 2> coverage, Out<float, 2> depth, Out<int32_t, 3> hit,
+                Out<uint8_t, 1> seen) {
     check_background(scene, camera);
     check_image("image", image, camera, scene.background.shape(2));
-    check_forward_output(scene, camera, coverage, depths, seen);
+    check_forward_output(scene, camera, coverage, depth, hit, seen);
     const ForwardOptions options{spp, make_filter(filter), seed};
     return unlocked(threads, [&](Team& team) -> Profile {
         Stopwatch watch;
@@ -277,7 +279,7 @@ Profile forward(const SceneArrays<T>& scene, const Camera& camera, int spp, cons
         const auto geometry = scene.geometry({}, team, work);
         const double update = watch.lap();
         render_forward(scene.view(), camera, geometry->caster(), options, team,
-                       ForwardOutput<T>{image.data(), coverage.data(), depths.data(), seen.data()});
+                       ForwardOutput<T>{image.data(), coverage.data(), depth.data(), hit.data(), seen.data()});
         return {{"update", update}, {"forward", watch.lap()}, {"built rays", work.rays}};
     });
 }
@@ -285,14 +287,14 @@ Profile forward(const SceneArrays<T>& scene, const Camera& camera, int spp, cons
 template <class T>
 Profile backward(const SceneArrays<T>& scene, const Camera& camera, int spp, int64_t surface_samples,
                  int64_t edge_samples, const std::string& filter, uint64_t seed, int threads, bool interior_geometry,
-                 bool boundary, bool dry, Out<T, 3> adjoint, Out<T, 2> coverage, Out<float, 3> depths,
-                 Out<uint8_t, 1> seen, std::optional<Out<double, 2>> verts, std::optional<Out<double, 2>> colors,
-                 std::optional<Out<double, 2>> uvs, std::optional<Out<double, 2>> texels,
-                 std::optional<Out<double, 3>> background, std::optional<Out<double, 2>> world_to_camera,
-                 std::optional<Out<double, 2>> K) {
+                 bool boundary, bool dry, Out<T, 3> adjoint, Out<T, 2> coverage, Out<float, 2> depth,
+                 Out<int32_t, 3> hit, Out<uint8_t, 1> seen, std::optional<Out<double, 2>> verts,
+                 std::optional<Out<double, 2>> colors, std::optional<Out<double, 2>> uvs,
+                 std::optional<Out<double, 2>> texels, std::optional<Out<double, 3>> background,
+                 std::optional<Out<double, 2>> world_to_camera, std::optional<Out<double, 2>> K) {
     check_background(scene, camera);
     check_image("adjoint", adjoint, camera, scene.background.shape(2));
-    check_forward_output(scene, camera, coverage, depths, seen);
+    check_forward_output(scene, camera, coverage, depth, hit, seen);
     check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2), threads);
     const auto data = [](auto& array, const auto& like, const char* name) -> double* {
         if (!array) return nullptr;
@@ -325,7 +327,7 @@ Profile backward(const SceneArrays<T>& scene, const Camera& camera, int spp, int
             scene.geometry({grad.geometry() && boundary, interior || (grad.geometry() && boundary)}, team, work);
         update = watch.lap();
         return render_backward(scene.view(), camera, *geometry, options, team, adjoint.data(),
-                               ForwardView<T>{coverage.data(), depths.data(), seen.data()}, grad);
+                               ForwardView<T>{coverage.data(), depth.data(), hit.data(), seen.data()}, grad);
     });
     return {{"surface_samples", double(p.surface_samples)},
             {"edge_samples", double(p.edge_samples)},
@@ -356,7 +358,7 @@ void bind_scene(nb::module_& m, const char* name) {
              "uvs"_a.noconvert(), "texels"_a.noconvert(), "textures"_a.noconvert(), "face_texture"_a.noconvert(),
              "background"_a.noconvert(), "spacing"_a, "threads"_a)
         .def("forward", &forward<T>, "camera"_a, "spp"_a, "filter"_a, "seed"_a, "threads"_a, "image"_a.noconvert(),
-             "coverage"_a.noconvert(), "depths"_a.noconvert(), "seen"_a.noconvert())
+             "coverage"_a.noconvert(), "depth"_a.noconvert(), "hit"_a.noconvert(), "seen"_a.noconvert())
         .def(
             "bare_loop",
             [](const Scene& scene, const Camera& camera, int spp, const std::string& filter, uint64_t seed,
@@ -382,7 +384,7 @@ void bind_scene(nb::module_& m, const char* name) {
                     const auto geometry = scene.geometry({}, team, work);
                     const BackwardProfile p =
                         render_backward(scene.view(), camera, *geometry, options, team, adjoint.data(),
-                                        ForwardView<T>{nullptr, nullptr, seen.data()}, grad);
+                                        ForwardView<T>{.seen = seen.data()}, grad);
                     return p.surface[0] + p.surface[1];
                 });
             },
@@ -390,9 +392,9 @@ void bind_scene(nb::module_& m, const char* name) {
             "colors"_a = nb::none())
         .def("backward", &backward<T>, "camera"_a, "spp"_a, "surface_samples"_a, "edge_samples"_a, "filter"_a, "seed"_a,
              "threads"_a, "interior_geometry"_a, "boundary"_a, "dry"_a, "adjoint"_a.noconvert(),
-             "coverage"_a.noconvert(), "depths"_a.noconvert(), "seen"_a.noconvert(), "verts"_a = nb::none(),
-             "colors"_a = nb::none(), "uvs"_a = nb::none(), "texels"_a = nb::none(), "background"_a = nb::none(),
-             "world_to_camera"_a = nb::none(), "K"_a = nb::none())
+             "coverage"_a.noconvert(), "depth"_a.noconvert(), "hit"_a.noconvert(), "seen"_a.noconvert(),
+             "verts"_a = nb::none(), "colors"_a = nb::none(), "uvs"_a = nb::none(), "texels"_a = nb::none(),
+             "background"_a = nb::none(), "world_to_camera"_a = nb::none(), "K"_a = nb::none())
         .def(
             "shade_at",
             [](const Scene& scene, const Camera& camera, In<int32_t, 1> faces, In<double, 2> points,

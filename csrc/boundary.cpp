@@ -16,6 +16,7 @@
 #include "coincidence.h"
 #include "coincident.h"
 #include "crease_control.h"
+#include "crossings.h"
 #include "curve.h"
 #include "curve_measure.h"
 #include "sampler.h"
@@ -411,11 +412,11 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, Des
     if (n == 0 || view.options.dry) return;
     Stopwatch watch;
     const CurveFinder<T>& finder = curves.finder;
-    const CoincidentCurves coincident(std::move(curves.segments), view.team);
     Systematic systematic(curves.of_edge, view.team);
-    profile.curves += watch.lap();
     if (!(systematic.total() > 0)) return;
     systematic.draw(n, to_unit(hash(view.options.seed, 3, gradient_stream)));
+    const CoincidentCurves coincident(std::move(curves.segments), systematic, view.team);
+    profile.curves += watch.lap();
     const bool controls = !curves.x_bar.empty();
     if (controls) to.x = curves.x_bar.data();
     view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
@@ -430,10 +431,12 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, Des
             if (curve.edge != edge) {
                 if (controlled) control.flush(grad.x);
                 finder.find(edge, curve);
-                controlled = controls && control.set(curve);
+                controlled = controls && curves.is_controlled[edge] && control.set(curve);
             }
             const double weight = systematic.weight(edge);
-            const double s = std::clamp((position - systematic.begin_of(edge)) / systematic.measure_of(edge), 0.0, 1.0);
+            const double end = curve.is_crease() ? std::min(Crossings::float_reach / curve.length, 0.1) : 0;
+            const double s =
+                std::clamp((position - systematic.begin_of(edge)) / systematic.measure_of(edge), end, 1 - end);
             if (controlled) control.subtract(s, weight);
             chunk.add(curve, s, weight);
         }

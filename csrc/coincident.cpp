@@ -49,7 +49,8 @@ bool CoincidentCurves::side_by_side(const ImageSegment& s, const ImageSegment& o
     return distance(first) <= reach && distance(last) <= reach;
 }
 
-CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, Team& team) {
+CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, const Systematic& samples,
+                                   Team& team) {
     int64_t n = 0;
     double total = 0;
     for (const auto& part : parts) {
@@ -62,7 +63,7 @@ CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts,
     // would pass too many cells.
     const double cell = std::min(std::max({4 * total / double(n), 8 * margin_, 1e-6}), 16.0);
     lines_ = LineBuckets(std::max(cell, total / (2.0 * double(n) + 0x1p16)), margin_);
-    keep_those_not_alone(parts, n, team);
+    keep_those_not_alone(parts, samples, team);
 
     std::vector<int64_t> first(parts.size() + 1, 0);
     for (size_t k = 0; k < parts.size(); ++k) first[k + 1] = first[k] + int64_t(parts[k].size());
@@ -73,26 +74,54 @@ CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts,
     });
     if (segments_.empty()) return;
     fill(team);
-    find_companions(team);
+    find_companions(samples, team);
 }
 
 // In most scenes nearly all segments are alone on their lines.
-void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment>>& parts, int64_t n,
+void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment>>& parts, const Systematic& samples,
                                             Team& team) const {
-    Occupancy occupancy(n);
-    team.each(int64_t(parts.size()), [&](int64_t k) {
-        for (const ImageSegment& s : parts[k])
-            lines_.each_cell(s, [&](const LineBuckets::Line& l) { occupancy.add(LineBuckets::key(l)); });
+    const int64_t n = int64_t(parts.size());
+    std::atomic<int64_t> sampled = 0;
+    team.each(n, [&](int64_t k) {
+        sampled += std::count_if(parts[k].begin(), parts[k].end(),
+                                 [&](const ImageSegment& s) { return samples.may_draw(s.edge); });
     });
-    team.each(int64_t(parts.size()), [&](int64_t k) {
+    // Of sampled ones all buckets that lines beside them may be in; the others then ask for their own alone.
+    Occupancy around_sampled(4 * sampled), of_sampled(sampled), of_others(sampled);
+    team.each(n, [&](int64_t k) {
+        for (const ImageSegment& s : parts[k])
+            if (samples.may_draw(s.edge))
+                lines_.each_cell(s, [&](const LineBuckets::Line& l) {
+                    uint64_t keys[4];
+                    LineBuckets::keys_around(l, keys);
+                    for (const uint64_t key : keys) around_sampled.add(key);
+                    of_sampled.add(LineBuckets::key(l));
+                });
+    });
+    team.each(n, [&](int64_t k) {
         std::erase_if(parts[k], [&](const ImageSegment& s) {
+            if (samples.may_draw(s.edge)) return false;
+            bool beside = false;
+            lines_.each_cell(s, [&](const LineBuckets::Line& l) {
+                const uint64_t key = LineBuckets::key(l);
+                if (!around_sampled.any(key)) return;
+                beside = true;
+                of_others.add(key);
+            });
+            return !beside;
+        });
+    });
+    team.each(n, [&](int64_t k) {
+        std::erase_if(parts[k], [&](const ImageSegment& s) {
+            if (!samples.may_draw(s.edge)) return false;
             bool alone = true;
             lines_.each_cell(s, [&](const LineBuckets::Line& l) {
                 if (!alone) return;
                 const uint64_t own = LineBuckets::key(l);
                 uint64_t keys[4];
                 LineBuckets::keys_around(l, keys);
-                for (const uint64_t key : keys) alone &= !(key == own ? occupancy.several(key) : occupancy.any(key));
+                for (const uint64_t key : keys)
+                    alone &= !of_others.any(key) && !(key == own ? of_sampled.several(key) : of_sampled.any(key));
             });
             return alone;
         });
@@ -143,7 +172,7 @@ void CoincidentCurves::fill(Team& team) {
 }
 
 // Buckets are shared by what follows end to end along a line, too. Where one holds many, all of them are kept unasked.
-void CoincidentCurves::find_companions(Team& team) {
+void CoincidentCurves::find_companions(const Systematic& samples, Team& team) {
     constexpr uint32_t many = 64;
     std::vector<std::vector<Companion>> parts(Team::blocks(segments_.size()));
     const auto any_beside = [&](const ImageSegment& s, const LineBuckets::Line& l) {
@@ -166,6 +195,7 @@ void CoincidentCurves::find_companions(Team& team) {
     };
     team.each_block(segments_.size(), [&](int64_t k, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) {
+            if (!samples.may_draw(segments_[i].edge)) continue;
             bool found = false;
             lines_.each_cell(segments_[i],
                              [&](const LineBuckets::Line& l) { found = found || any_beside(segments_[i], l); });

@@ -15,6 +15,7 @@
 #include "math.h"
 #include "parallel.h"
 #include "sampler.h"
+#include "systematic.h"
 
 namespace edgegrad {
 
@@ -112,10 +113,10 @@ class LineBuckets {
 
 class CoincidentCurves {
    public:
-    // Of the segments in all parts, by ascending edges.
-    CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, Team& team);
+    // Of the segments in all parts, by ascending edges. Only what lies near those that have samples is kept.
+    CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, const Systematic& samples, Team& team);
 
-    // The segment of an edge; null if no other lies on it anywhere.
+    // The segment of an edge that has samples; null if no other lies on it anywhere.
     const ImageSegment* find(int64_t edge) const;
 
     // Calls found(other) for the segments that run side by side with one of find() and pass its point x, by less than
@@ -145,9 +146,10 @@ class CoincidentCurves {
         uint32_t segment;
     };
 
-    void keep_those_not_alone(std::vector<std::vector<ImageSegment>>& parts, int64_t n, Team& team) const;
+    void keep_those_not_alone(std::vector<std::vector<ImageSegment>>& parts, const Systematic& samples,
+                              Team& team) const;
     void fill(Team& team);
-    void find_companions(Team& team);
+    void find_companions(const Systematic& samples, Team& team);
     static bool side_by_side(const ImageSegment& s, const ImageSegment& o);
     static bool passes(const ImageSegment& other, const ImageSegment& own, Vec2 x);
 

@@ -58,10 +58,6 @@ class CreaseControl {
         // A crease that comes near the eye does not move in the image as its ends do.
         bend_ = std::fabs(curve.w1 - curve.w0) / (curve.w0 + curve.w1);
         if (!(bend_ < 1.0 / 3)) return false;
-        const auto minus = view_.hits->of(scene.faces + 3 * int64_t(curve.minus.face));
-        const auto plus = view_.hits->of(scene.faces + 3 * int64_t(curve.plus.face));
-        if (!minus.whole || !plus.whole) return false;
-        clear_ = minus.clear && plus.clear;
         curve_ = &curve, tangent_ = curve.tangent();
         for (int k = 0; k < 2; ++k) {
             vertex_[0][k] = vertex(scene, curve.minus, k ? curve.minus.second() : curve.minus.first());
@@ -71,23 +67,8 @@ class CreaseControl {
         return true;
     }
 
-    // What its density is multiplied by: few samples where the image hit nothing before the crease, all of them else.
-    double density(Vec2 low, Vec2 high) const {
-        if (!clear_) return 1;
-        // Its own faces, and those beside them, may come nearer than it does as far as these pixels reach; not so where
-        // they are seen so flat that something else may be between.
-        const double reach = OcclusionHint::margin(low, high), across = reach / view_.camera.pixels_per_unit;
-        const Vec2 middle = normalised(view_.camera, curve_->position(0.5)), half{2 * across, 2 * across};
-        const double depth = std::min(curve_->a.z, curve_->b.z);
-        double nearest = depth;
-        for (const HalfEdge* h : {&curve_->minus, &curve_->plus})
-            nearest = std::min(
-                nearest, DepthBound::nearest_on_plane(view_.camera, corners_of(view_, h->face).data(), middle, half));
-        const double pixel = 2 / view_.camera.pixels_per_unit * (view_.camera.perspective ? depth : 1.0);  // at most
-        const double flat = 3 * reach * pixel;
-        if (!(depth - nearest <= flat) || !view_.occlusion.exposes(low, high, nearest - 2 * pixel)) return 1;
-        return std::clamp(std::max(curve_->length / wide, bend_), least, 1.0);
-    }
+    // What its density is multiplied by, if a short crease gets `least`.
+    double density(double least) const { return std::clamp(std::max(curve_->length / wide, bend_), least, 1.0); }
 
     void add_integral() {
         const CreaseColors<T> colors(view_.scene, *curve_);
@@ -117,12 +98,12 @@ class CreaseControl {
 
     // The cotangents of the places of the ends, half to each face's own vertices.
     void flush(RowBuffer& x) {
-        for (const auto& vertices : vertex_)
-            for (int k = 0; k < 2; ++k) {
-                const double half = 0.5 * (k ? at_b_ : at_a_);
-                const Vec2 x_bar{half * tangent_.y, -half * tangent_.x};
-                x.template add<2>(vertices[k], &x_bar.x);
-            }
+        for (int k = 0; k < 2; ++k) {
+            const bool copies = vertex_[0][k] != vertex_[1][k];
+            const double value = (copies ? 0.5 : 1) * (k ? at_b_ : at_a_);
+            const Vec2 x_bar{value * tangent_.y, -value * tangent_.x};
+            for (int side = 0; side < (copies ? 2 : 1); ++side) x.template add<2>(vertex_[side][k], &x_bar.x);
+        }
     }
 
    private:
@@ -167,14 +148,12 @@ class CreaseControl {
         return std::max(end, s + 1e-6);
     }
 
-    // Of a short crease; and from which length on, px, it gets all samples.
-    static constexpr double least = 1.0 / 32, wide = 256;
+    static constexpr double wide = 1024;  // px, from which length on a crease gets all samples
 
     const BackwardView<T>& view_;
     const int C_;
     const Curve* curve_ = nullptr;
     Vec2 tangent_;
-    bool clear_ = false;
     double bend_ = 0;
     int32_t vertex_[2][2];  // of minus and plus; a and b
     double at_a_ = 0, at_b_ = 0;

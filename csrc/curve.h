@@ -110,6 +110,12 @@ class CurveFinder {
     // On which side of its edge a face lies in the image; see side_of.
     int turn_of(const HalfEdge& h) const { return side_of(h, facing_); }
 
+    // Whether an edge has one face on each side, as most have.
+    bool has_face_on_each_side(int64_t edge) const {
+        const auto halves = view_.geometry.topology().half_edges(edge);
+        return halves.size() == 2 && side_of(halves[0], facing_) * side_of(halves[1], facing_) < 0;
+    }
+
     // The curve of an edge; false when there is none.
     bool find(int64_t edge, Curve& c) const {
         const auto halves = view_.geometry.topology().half_edges(edge);
@@ -171,7 +177,8 @@ class CurveFinder {
         };
         const double w = std::min(c.w0, c.w1), across = std::max(terms(0, camera.t.x), terms(1, camera.t.y)),
                      depth = camera.perspective ? terms(2, camera.t.z) / w : 1;
-        const double pixels = std::fabs(camera.k[2]) + std::fabs(camera.k[5]) + length(c.x0) + length(c.x1);
+        const double pixels = std::fabs(camera.k[2]) + std::fabs(camera.k[5]) + std::fabs(c.x0.x) + std::fabs(c.x0.y) +
+                              std::fabs(c.x1.x) + std::fabs(c.x1.y);
         return 32 * std::numeric_limits<double>::epsilon() *
                (camera.pixels_per_unit / w * across + std::max(1.0, depth) * pixels);
     }

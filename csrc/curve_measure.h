@@ -22,6 +22,7 @@ struct Curves : CurvesFound {
     Array<double> of_edge;                            // (E,) the measure
     std::vector<std::vector<ImageSegment>> segments;  // those where the loss looks, by ascending edges
     Array<double> x_bar;  // (V, 2) what controls add to the cotangents of places in the image; empty: there are none
+    Array<uint8_t> is_controlled;  // (E,) whether x_bar has the integral of a crease; empty: there are none
 
     explicit Curves(const BackwardView<T>& view);
 

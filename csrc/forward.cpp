@@ -92,7 +92,8 @@ class PixelRow {
     void render(int x0, int x1, int y) {
         std::fill(sum_.begin(), sum_.end(), 0.0);
         std::fill(hits_, hits_ + tile, 0);
-        std::fill(nearest_, nearest_ + tile, std::numeric_limits<double>::infinity());
+        std::fill(first_, first_ + tile, std::numeric_limits<int32_t>::max());
+        std::fill(last_, last_ + tile, -1);
         std::fill(farthest_, farthest_ + tile, -std::numeric_limits<double>::infinity());
         x0_ = x0, y_ = y;
         for (int x = x0; x < x1; ++x)
@@ -111,9 +112,8 @@ class PixelRow {
             for (int c = 0; c < C_; ++c)
                 out_.image[pixel * C_ + c] = T(sum_[x * C_ + c] / spp_ + (1 - share) * behind[c]);
             out_.coverage[pixel] = T(share);
-            out_.depths[2 * pixel] = rounded_down(nearest_[x]);
-            out_.depths[2 * pixel + 1] =
-                hits_[x] == spp_ ? rounded_up(farthest_[x]) : std::numeric_limits<float>::infinity();
+            out_.depth[pixel] = hits_[x] == spp_ ? rounded_up(farthest_[x]) : std::numeric_limits<float>::infinity();
+            out_.hit[2 * pixel] = hits_[x] ? first_[x] : -1, out_.hit[2 * pixel + 1] = last_[x];
         }
     }
 
@@ -124,7 +124,8 @@ class PixelRow {
             const T* behind = scene_.background_at(pixel);
             std::copy(behind, behind + C_, out_.image + pixel * C_);
             out_.coverage[pixel] = 0;
-            out_.depths[2 * pixel] = out_.depths[2 * pixel + 1] = std::numeric_limits<float>::infinity();
+            out_.depth[pixel] = std::numeric_limits<float>::infinity();
+            out_.hit[2 * pixel] = out_.hit[2 * pixel + 1] = -1;
         }
     }
 
@@ -168,7 +169,7 @@ class PixelRow {
                         const int n = std::popcount(same);
                         s.radiance.add_to(sum, b, n);
                         hits += n;
-                        note_depth(s, part_[p].column);
+                        note_hit(s, part_[p].column);
                     } else {
                         for (unsigned one = same; one; one &= one - 1)
                             hits += add(i + std::countr_zero(one), part_[p].column, sum);
@@ -185,17 +186,18 @@ class PixelRow {
         rays_.count = parts_ = 0;
     }
 
-    // Between which depths a pixel hits.
-    void note_depth(const Shaded& s, int column) {
+    // What a pixel hits, and how far away.
+    void note_hit(const Shaded& s, int column) {
+        first_[column] = std::min(first_[column], s.face), last_[column] = std::max(last_[column], s.face);
         const Vec2 middle = normalised(camera_, {x0_ + column + 0.5, y_ + 0.5});
-        s.depth.widen(middle, reach_, nearest_[column], farthest_[column]);
+        farthest_[column] = std::max(farthest_[column], s.depth.farthest(middle, reach_));
     }
 
     // Adds what ray i, of a pixel in this column, sees to the sum: one sample.
     int add(int i, int column, typename AffineRadiance<N>::Sum& sum) {
         const int32_t face = rays_.face[i];
         const Shaded& s = shaded(face);
-        note_depth(s, column);
+        note_hit(s, column);
         const Barycentrics b = barycentrics_of_hit(s.map, rays_.n(i));
         if (s.textured) {
             shade<N>(scene_, face, b, radiance_.data());
@@ -279,7 +281,8 @@ class PixelRow {
     Shaded kept_[n_kept];
     int x0_ = 0, y_ = 0;  // the first pixel of the row
     int hits_[tile];
-    double nearest_[tile], farthest_[tile];
+    int32_t first_[tile], last_[tile];  // faces
+    double farthest_[tile];
     std::vector<double> sum_, radiance_;
 };
 

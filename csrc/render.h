@@ -59,8 +59,8 @@ template <class T>
 struct ForwardOutput {
     T* image;       // (H, W, C)
     T* coverage;    // (H, W): the filtered share of each pixel where something is hit
-    float* depths;  // (H, W, 2): all that samples hit lies between these; the farther one is infinite where one hit
-                    // nothing
+    float* depth;   // (H, W): nothing that samples hit lies farther away; infinite where one hit nothing
+    int32_t* hit;   // (H, W, 2): the first and the last of the faces that were hit, as the scene counts them; −1: none
     uint8_t* seen;  // (F,): 0, or the side, 1 or 2, from which a sample hit the face
 };
 
@@ -99,9 +99,10 @@ struct BackwardProfile {
 // What the backward pass takes from the forward pass; see ForwardOutput.
 template <class T>
 struct ForwardView {
-    const T* coverage;
-    const float* depths;
-    const uint8_t* seen;
+    const T* coverage = nullptr;
+    const float* depth = nullptr;
+    const int32_t* hit = nullptr;
+    const uint8_t* seen = nullptr;
 };
 
 // q = R p + t, backwards: p̄ = Rᵀ q̄, R̄ = Σ q̄ pᵀ, t̄ = Σ q̄, for q_bar (V, 3).

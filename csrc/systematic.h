@@ -54,6 +54,13 @@ class Systematic {
         }
     }
 
+    // Whether a point may fall on primitive k: true for all that get one, and, by rounding, a few more.
+    bool may_draw(int64_t k) const {
+        const double per_point = double(n_) / total(), slack = 1e-3;
+        const double next = std::ceil(begin_of(k) * per_point - shift_ - slack);
+        return measure_of(k) > 0 && next + shift_ <= end_[k] * per_point + slack;
+    }
+
     double begin_of(int64_t k) const { return k ? end_[k - 1] : 0; }
     double measure_of(int64_t k) const { return end_[k] - begin_of(k); }
 

@@ -65,6 +65,11 @@ def edge_measure(faces: int) -> int:
     return faces + 8 * edges(faces)
 
 
+def creases(faces: int, verts: int, pixels: int) -> int:
+    """Bytes of the control of creases: its places at vertices, which edges have one, and where parts of the surface meet."""
+    return 16 * verts + edges(faces) + 5 * pixels
+
+
 def curves_on_lines(curves: int) -> int:
     """Bytes, at most, of `curves` curves in view sorted by the lines that they lie on (csrc/coincident.h).
 

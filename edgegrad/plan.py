@@ -125,8 +125,8 @@ def _image_terms(scene: Scene, arguments: Sequence[Any], any_gradient: bool) -> 
         "textures": Term(textures > 0, f"{textures} to look up" if textures else "no mesh has one"),
         "kept for backward": Term(
             any_gradient,
-            "coverage, depths, and which faces were seen" if any_gradient else "nothing requires a gradient",
-            bytes=B * (height * width * (word + 8) + F),
+            "coverage, depth, and which faces were hit" if any_gradient else "nothing requires a gradient",
+            bytes=B * (height * width * (word + 12) + F),
         ),
     }
 
@@ -146,7 +146,8 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
         ones = flat.colors.new_ones((B, height, width, C))
     view = View(
         ones[..., 0].contiguous(),
-        ones.new_full((B, height, width, 2), math.inf, dtype=torch.float32),
+        ones.new_full((B, height, width), math.inf, dtype=torch.float32),
+        flat.faces.new_zeros((B, height, width, 2), dtype=torch.int32),
         flat.faces.new_ones((B, F), dtype=torch.uint8),
     )
     _, profiles = backward_kernel(ones, view, *arguments, wanted, dry=True)
@@ -202,6 +203,7 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
         "creases": Term(
             creases > 0,
             no_boundary or (f"{creases:,} in view" if creases else "nothing jumps between neighbours"),
+            bytes=memory.creases(F, V, height * width) if creases else 0,
         ),
     }
     for name, i, want in zip(DIFFERENTIABLE_NAMES, DIFFERENTIABLE, wanted, strict=True):

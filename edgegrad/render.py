@@ -162,10 +162,10 @@ _SCENE = (
 _IMAGE = "bool perspective, int height, int width, int spp, str filter, int seed, float[] spacing"
 _GRADIENT = "int surface_samples, int edge_samples, int grad_seed, bool interior_geometry, bool boundary"
 
-torch.library.define("edgegrad::render", f"({_SCENE}, {_IMAGE}) -> (Tensor, Tensor, Tensor, Tensor)")
+torch.library.define("edgegrad::render", f"({_SCENE}, {_IMAGE}) -> (Tensor, Tensor, Tensor, Tensor, Tensor)")
 torch.library.define(
     "edgegrad::render_backward",
-    f"(Tensor adjoint, Tensor coverage, Tensor depths, Tensor seen, {_SCENE}, {_IMAGE}, {_GRADIENT}, bool[] wanted)"
+    f"(Tensor adjoint, Tensor coverage, Tensor depth, Tensor hit, Tensor seen, {_SCENE}, {_IMAGE}, {_GRADIENT}, bool[] wanted)"
     " -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)",
 )
 
@@ -190,9 +190,8 @@ class View(NamedTuple):
     """What the image pass leaves to the backward pass, for B cameras."""
 
     coverage: Tensor  # (B, H, W): the filtered share of a pixel where something is hit
-    depths: (
-        Tensor  # (B, H, W, 2) float32: all that samples hit lies between; the farther is infinite if one hit nothing
-    )
+    depth: Tensor  # (B, H, W) float32: nothing that samples hit lies farther away; infinite if one hit nothing
+    hit: Tensor  # (B, H, W, 2) int32: the first and the last of the faces that were hit; -1: none
     seen: Tensor  # (B, F) uint8: 0, or the side, 1 or 2, from which a face was hit
 
 
@@ -221,7 +220,8 @@ def _forward_kernel(*args: Any) -> tuple[Tensor, View, list[Profile]]:
 def _empty_view(flat: Flat, B: int, height: int, width: int) -> View:
     return View(
         flat.colors.new_empty((B, height, width)),
-        flat.colors.new_empty((B, height, width, 2), dtype=torch.float32),
+        flat.colors.new_empty((B, height, width), dtype=torch.float32),
+        flat.faces.new_empty((B, height, width, 2), dtype=torch.int32),
         flat.faces.new_empty((B, flat.faces.shape[0]), dtype=torch.uint8),
     )
 
@@ -271,7 +271,8 @@ def image_room(*args: Any) -> AbstractContextManager[None]:
     needs = {
         "image": B * height * width * C * word,
         "coverage": B * height * width * word,
-        "depths": B * height * width * 8,
+        "depth": B * height * width * 4,
+        "faces hit": B * height * width * 8,
         "faces seen": B * F,
         "vertices in view": 24 * V,
     }
@@ -301,6 +302,7 @@ def gradient_room(adjoint: Tensor, *args: Any) -> AbstractContextManager[None]:
         # Where all attributes are indexed like the vertices, curves are silhouettes: a quarter of a mesh that is tangled.
         jumps = flat.corners.data_ptr() != flat.faces.data_ptr()
         needs["edges in view"] = memory.edge_measure(F) + memory.curves_on_lines(memory.edges(F) // (1 if jumps else 4))
+        needs["creases"] = memory.creases(F, V, height * width) * jumps
         needs["edge samples"] = memory.rows(many if edge_samples < 0 else edge_samples, memory.edges(F), 4, 3, V)
     kept = {"ray structure": memory.ray_structure(F, V), "topology": memory.topology(F) * work.boundary}
     return memory.room("backward pass", needs, kept, lambda: _lower(args) + ", or let fewer tensors require a gradient")
@@ -376,16 +378,18 @@ def _backward_kernel(adjoint: Tensor, view: View, *args: Any, dry: bool) -> tupl
 
 @torch.library.impl("edgegrad::render_backward", "CPU")
 def _render_backward_cpu(*args: Any) -> tuple[Tensor, ...]:
-    adjoint, coverage, depths, seen, *inputs = args
+    adjoint, coverage, depth, hit, seen, *inputs = args
     return tuple(
         adjoint.new_empty(0, dtype=torch.float32) if g is None else g.to(inputs[i].dtype)
-        for i, g in zip(DIFFERENTIABLE, backward_kernel(adjoint, View(coverage, depths, seen), *inputs)[0], strict=True)
+        for i, g in zip(
+            DIFFERENTIABLE, backward_kernel(adjoint, View(coverage, depth, hit, seen), *inputs)[0], strict=True
+        )
     )
 
 
 @torch.library.register_fake("edgegrad::render_backward")
 def _render_backward_fake(
-    adjoint: Tensor, coverage: Tensor, depths: Tensor, seen: Tensor, *args: Any
+    adjoint: Tensor, coverage: Tensor, depth: Tensor, hit: Tensor, seen: Tensor, *args: Any
 ) -> tuple[Tensor, ...]:
     return tuple(
         torch.empty_like(args[i]) if want else adjoint.new_empty(0, dtype=torch.float32)
@@ -420,9 +424,9 @@ class _Render(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        coverage, depths, seen, *tensors = ctx.saved_tensors
+        coverage, depth, hit, seen, *tensors = ctx.saved_tensors
         wanted = [ctx.needs_input_grad[1 + i] for i in DIFFERENTIABLE]
-        arguments = (grad_outputs[0], coverage, depths, seen, *tensors, *ctx.options)
+        arguments = (grad_outputs[0], coverage, depth, hit, seen, *tensors, *ctx.options)
         if torch.compiler.is_compiling():  # which refuses second derivatives itself
             grads = torch.ops.edgegrad.render_backward(*arguments, wanted)
         else:

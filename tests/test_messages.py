@@ -454,15 +454,20 @@ def kernel_camera(pose: torch.Tensor = POSE, intrinsics: torch.Tensor = K) -> ob
     return core.Camera(pose.contiguous().numpy(), intrinsics.contiguous().numpy(), True, 8, 8)
 
 
+def pixels(coverage: np.ndarray) -> tuple[np.ndarray, ...]:
+    """What the image pass leaves to the backward pass."""
+    return coverage, coverage.copy(), np.stack([coverage] * 2, -1).astype(np.int32), SEEN
+
+
 def kernel_forward(channels: int = 3, height: int = 8, filter: str = "box") -> None:
     image, coverage = np.zeros((height, 8, channels), np.float32), np.zeros((height, 8), np.float32)
-    kernel_scene().forward(kernel_camera(), 1, filter, 0, 1, image, coverage, np.stack([coverage] * 2, -1), SEEN)
+    kernel_scene().forward(kernel_camera(), 1, filter, 0, 1, image, *pixels(coverage))
 
 
 def kernel_backward(**gradients: np.ndarray) -> None:
     image, coverage = np.zeros((8, 8, 3), np.float32), np.zeros((8, 8), np.float32)
     options = 1, -1, -1, "box", 0, 1, True, True, False
-    kernel_scene().backward(kernel_camera(), *options, image, coverage, np.stack([coverage] * 2, -1), SEEN, **gradients)
+    kernel_scene().backward(kernel_camera(), *options, image, *pixels(coverage), **gradients)
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def kernel(monkeypatch):
 
     def watched_backward(adjoint, view, *arguments, **options):
         if seen.everything:
-            view = view._replace(depths=torch.full_like(view.depths, torch.inf), seen=torch.ones_like(view.seen))
+            view = view._replace(depth=torch.full_like(view.depth, torch.inf), seen=torch.ones_like(view.seen))
         seen.adjoint = adjoint
         seen.grads, profiles = backward(adjoint, view, *arguments, **options)
         seen.backward += profiles
@@ -269,13 +269,15 @@ def test_no_texture_code_without_a_texture(kernel):
 
 
 def test_nothing_but_the_plan_is_kept_for_the_backward_pass():
-    """Tensors that autograd saves: the inputs, coverage, depths, and which faces were seen."""
+    """Tensors that autograd saves: the inputs, coverage, depth, and which faces were hit."""
     scene, camera = requiring(cube(), CAMERA, ("verts",))
     node = eg.render(scene, camera, spp=4).grad_fn
     while not hasattr(node, "saved_tensors"):
         node = node.next_functions[0][0]
-    coverage, depths, seen, *inputs = node.saved_tensors
-    assert coverage.nbytes + depths.nbytes + seen.nbytes == eg.plan(scene, camera)["kept for backward"].bytes
+    coverage, depth, hit, seen, *inputs = node.saved_tensors
+    assert (
+        coverage.nbytes + depth.nbytes + hit.nbytes + seen.nbytes == eg.plan(scene, camera)["kept for backward"].bytes
+    )
     flat = [*flatten(scene), camera.world_to_camera[None], camera.K[None]]
     assert [tuple(t.shape) for t in inputs] == [tuple(t.shape) for t in flat]
     assert eg.render(cube(), CAMERA, spp=4).grad_fn is None

@@ -808,8 +808,9 @@ def sample_counts(surface: int, edge: int, adjoint: Tensor, boundary: bool = Tru
     scene = _kernel_scene(flatten(TRIANGLE), spacing=[0, 2.0**-52])
     camera = _kernel_camera(CAMERA.world_to_camera, CAMERA.K, True, SIZE, SIZE)
     # All pixels covered by many samples, so that no budget binds; nothing is occluded.
-    coverage, depths = torch.ones(SIZE, SIZE, dtype=F64), torch.full((SIZE, SIZE, 2), torch.inf)
-    view = coverage.numpy(), depths.numpy(), torch.ones(1, dtype=torch.uint8).numpy()
+    coverage, depth = torch.ones(SIZE, SIZE, dtype=F64), torch.full((SIZE, SIZE), torch.inf)
+    hit = torch.zeros((SIZE, SIZE, 2), dtype=torch.int32)
+    view = coverage.numpy(), depth.numpy(), hit.numpy(), torch.ones(1, dtype=torch.uint8).numpy()
     arrays = adjoint.contiguous().numpy(), *view, torch.zeros(3, 3, dtype=F64).numpy()
     profile = scene.backward(camera, 1 << 20, surface, edge, "box", 0, 2, True, boundary, False, *arrays)
     return profile["surface_samples"], profile["edge_samples"]

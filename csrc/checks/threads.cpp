@@ -113,14 +113,15 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
     Team team(team_size, [] { return stop; });
     const SceneView<T> view = scene.view();
     std::vector<T> image(width * height * channels), coverage(width * height);
-    std::vector<float> depths(2 * width * height);
+    std::vector<float> depth(width * height);
+    std::vector<int32_t> hit(2 * width * height);
     std::vector<uint8_t> seen(view.n_faces);
     GeometryWork work;
     {
         const auto geometry =
             acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, {{0}, {1e-7}}, {}, team, work);
         render_forward(view, camera, geometry->caster(), {spp, Filter(filter), 1}, team,
-                       ForwardOutput<T>{image.data(), coverage.data(), depths.data(), seen.data()});
+                       ForwardOutput<T>{image.data(), coverage.data(), depth.data(), hit.data(), seen.data()});
     }
     std::vector<double> verts(scene.verts.size()), colors(scene.colors.size()), uvs(scene.uvs.size()),
         texels(scene.texels.size()), background(scene.background.size()), pose(16), K(9);
@@ -130,7 +131,7 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
         acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, {{0}, {1e-7}}, {true, true}, team, work);
     const BackwardOptions options{spp, -1, -1, Filter(filter), 2, true, true, {{0}, {1e-7}}, false};
     render_backward(view, camera, *geometry, options, team, image.data(),
-                    ForwardView<T>{coverage.data(), depths.data(), seen.data()}, grad);
+                    ForwardView<T>{coverage.data(), depth.data(), hit.data(), seen.data()}, grad);
     std::vector<double> all(image.begin(), image.end());
     for (const auto* values : {&verts, &colors, &uvs, &texels, &background, &pose, &K}) {
         const double size = std::inner_product(values->begin(), values->end(), values->begin(), 0.0);
