@@ -48,6 +48,7 @@ void add_world(const Camera& camera, const double* verts, const Array<double>& q
     team.each_block(V, [&](int64_t k, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
             const double *q = q_bar.data() + 3 * v, *p = verts + 3 * v;
+            if (q[0] == 0 && q[1] == 0 && q[2] == 0) continue;
             if (grad.verts) {
                 const Vec3 p_bar = transposed_times(camera.R, {q[0], q[1], q[2]});
                 grad.verts[3 * v] += p_bar.x, grad.verts[3 * v + 1] += p_bar.y, grad.verts[3 * v + 2] += p_bar.z;
@@ -87,7 +88,8 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
     const bool interior = interior_geometry || grad.appearance();
     const bool creases = boundary && may_jump(scene, geometry.topology());
     std::optional<ImageHits> hits;
-    if (!o.pixel_spp && (interior || creases)) hits.emplace(scene, geometry.parts(), forward.seen, team);
+    if (!o.pixel_spp && (interior || creases))
+        hits.emplace(scene, vertices, occlusion, geometry.parts(), forward.seen, team);
     const Array<T> vertex_adjoint =
         hits && interior ? adjoint_at_vertices(filtered, vertices, *hits, scene.channels, team) : Array<T>(0);
     const BackwardView<T> view{.scene = scene,
@@ -123,9 +125,10 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
         // Both terms are measured before samples are drawn, since they share a budget.
         SampleCounts wanted;
         std::optional<SurfaceMeasure<T>> surface;
+        Array<int8_t> facing(boundary ? scene.n_faces : 0);
         if (interior) {
             watch.lap();
-            surface.emplace(measure_surface<N>(view, interior_geometry, to));
+            surface.emplace(measure_surface<N>(view, interior_geometry, facing, to));
             wanted.surface = surface->wanted(o.surface_samples);
             profile.surface_wanted = surface->pixel_samples() + wanted.surface;
             profile.measure = watch.lap();
@@ -133,7 +136,8 @@ BackwardProfile render_backward(const SceneView<T>& scene, const Camera& camera,
         std::optional<Curves<T>> curves;
         if (boundary) {
             watch.lap();
-            curves.emplace(measure_curves<N>(view));
+            if (!interior) facing = facing_of_faces(view);
+            curves.emplace(measure_curves<N>(view, std::move(facing)));
             wanted.edge = profile.edge_wanted = curves->wanted(o.edge_samples);
             profile.silhouettes = curves->silhouettes, profile.creases = curves->creases;
             profile.curves = watch.lap();

@@ -142,6 +142,7 @@ struct SceneArrays {
     In<int32_t, 1> face_texture;
     In<T, 3> background;  // (1, 1, C) or (H, W, C)
     Spacing spacing;
+    bool by_vertex = false;
 
     SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int32_t, 2> corners_, In<T, 2> colors_,
                 In<double, 2> uvs_, In<T, 2> texels_, In<int64_t, 2> textures_, In<int32_t, 1> face_texture_,
@@ -175,8 +176,11 @@ struct SceneArrays {
         check_indices("faces", faces.data(), faces.size(), verts.shape(0), "verts", threads);
         const bool textured = textures.shape(0) > 0;
         if (!textured) {
-            // Colours of vertices are indexed by the faces.
-            if (corners.data() == faces.data() && colors.shape(0) >= verts.shape(0)) return;
+            // Colours of vertices are indexed by the faces, or by a copy of them.
+            by_vertex = colors.shape(0) >= verts.shape(0) &&
+                        (corners.data() == faces.data() ||
+                         std::equal(faces.data(), faces.data() + faces.size(), corners.data()));
+            if (by_vertex) return;
             check_indices("colors", corners.data(), corners.size(), colors.shape(0), "colors", threads);
             return;
         }
@@ -200,7 +204,7 @@ struct SceneArrays {
                 int64_t(verts.shape(0)),
                 faces.data(),
                 int64_t(faces.shape(0)),
-                corners.data(),
+                by_vertex ? faces.data() : corners.data(),  // one array: neighbours agree at their edge (may_jump)
                 colors.data(),
                 int64_t(colors.shape(0)),
                 uvs.data(),

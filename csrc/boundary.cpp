@@ -412,31 +412,29 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, Des
     if (n == 0 || view.options.dry) return;
     Stopwatch watch;
     const CurveFinder<T>& finder = curves.finder;
-    Systematic systematic(curves.of_edge, view.team);
+    Systematic systematic(curves.measure, view.team);
     if (!(systematic.total() > 0)) return;
     systematic.draw(n, to_unit(hash(view.options.seed, 3, gradient_stream)));
     const CoincidentCurves coincident(std::move(curves.segments), systematic, view.team);
     profile.curves += watch.lap();
-    const bool controls = !curves.x_bar.empty();
-    if (controls) to.x = curves.x_bar.data();
+    if (!curves.x_bar.empty()) to.x = curves.x_bar.data();
     view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         BoundaryChunk<N, T> chunk(view, finder, coincident, grad);
         CreaseControl<N, T> control(view);
         Curve curve;
         bool controlled = false;
-        int64_t edge = systematic.primitive(systematic.position(first));
+        int64_t k = systematic.primitive(systematic.position(first));
         for (int64_t i = first; i < last; ++i) {
             const double position = systematic.position(i);
-            edge = systematic.primitive(position, edge);
-            if (curve.edge != edge) {
+            k = systematic.primitive(position, k);
+            if (const MeasuredCurve& measured = curves.curve[k]; curve.edge != measured.edge) {
                 if (controlled) control.flush(grad.x);
-                finder.find(edge, curve);
-                controlled = controls && curves.is_controlled[edge] && control.set(curve);
+                finder.find(measured.edge, curve);
+                controlled = measured.controlled && control.set(curve);
             }
-            const double weight = systematic.weight(edge);
+            const double weight = systematic.weight(k);
             const double end = curve.is_crease() ? std::min(Crossings::float_reach / curve.length, 0.1) : 0;
-            const double s =
-                std::clamp((position - systematic.begin_of(edge)) / systematic.measure_of(edge), end, 1 - end);
+            const double s = std::clamp((position - systematic.begin_of(k)) / systematic.measure_of(k), end, 1 - end);
             if (controlled) control.subtract(s, weight);
             chunk.add(curve, s, weight);
         }

@@ -60,6 +60,15 @@ struct Camera {
         return s * k_det > 0 ? 1 : -1;
     }
 
+    // Bound of the rounding of pixel positions in or near the image, generous: each is a sum of products with
+    // normalised coordinates, which the inverse of K bounds, and of the principal point.
+    double rounding_of_positions() const {
+        const double most = 2.0 * (width + height) + std::fabs(k[2]) + std::fabs(k[5]);
+        double inverse = 0;
+        for (const double a : k_inverse) inverse += std::fabs(a);
+        return 32 * std::numeric_limits<double>::epsilon() * (1 + pixels_per_unit * inverse) * most;
+    }
+
     // From which side (q0, q1, q2) is seen: 1 or 2. Seen edge-on, either will do for those who ask.
     uint8_t side(Vec3 q0, Vec3 q1, Vec3 q2) const {
         return dot(view_direction(q0), cross(q1 - q0, q2 - q0)) > 0 ? 1 : 2;
@@ -181,18 +190,6 @@ inline Array<Vec3> camera_vertices(const Camera& camera, const double* verts, in
     return q;
 }
 
-inline VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n,
-                                Team& team) {
-    VertexView view{Array<Vec3>(n), Array<Vec2>(n), Array<uint8_t>(n)};
-    team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t v = first; v < last; ++v) {
-            const Vec3 q = view.q[v] = camera_vertex(camera, verts, v);
-            // At the eye itself every plane is met and the projection is undefined: call it outside all.
-            view.outcode[v] = camera.perspective && q.z <= 0 ? volume.outcode(q) | 16 : volume.outcode(q);
-            if (!view.outcode[v]) view.x[v] = project(camera, q);
-        }
-    });
-    return view;
-}
+VertexView view_vertices(const Camera& camera, const ViewVolume& volume, const double* verts, int64_t n, Team& team);
 
 }  // namespace edgegrad

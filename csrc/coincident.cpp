@@ -84,13 +84,13 @@ void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment
     std::atomic<int64_t> sampled = 0;
     team.each(n, [&](int64_t k) {
         sampled += std::count_if(parts[k].begin(), parts[k].end(),
-                                 [&](const ImageSegment& s) { return samples.may_draw(s.edge); });
+                                 [&](const ImageSegment& s) { return samples.may_draw(s.curve); });
     });
     // Of sampled ones all buckets that lines beside them may be in; the others then ask for their own alone.
     Occupancy around_sampled(4 * sampled), of_sampled(sampled), of_others(sampled);
     team.each(n, [&](int64_t k) {
         for (const ImageSegment& s : parts[k])
-            if (samples.may_draw(s.edge))
+            if (samples.may_draw(s.curve))
                 lines_.each_cell(s, [&](const LineBuckets::Line& l) {
                     uint64_t keys[4];
                     LineBuckets::keys_around(l, keys);
@@ -100,7 +100,7 @@ void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment
     });
     team.each(n, [&](int64_t k) {
         std::erase_if(parts[k], [&](const ImageSegment& s) {
-            if (samples.may_draw(s.edge)) return false;
+            if (samples.may_draw(s.curve)) return false;
             bool beside = false;
             lines_.each_cell(s, [&](const LineBuckets::Line& l) {
                 const uint64_t key = LineBuckets::key(l);
@@ -113,7 +113,7 @@ void CoincidentCurves::keep_those_not_alone(std::vector<std::vector<ImageSegment
     });
     team.each(n, [&](int64_t k) {
         std::erase_if(parts[k], [&](const ImageSegment& s) {
-            if (!samples.may_draw(s.edge)) return false;
+            if (!samples.may_draw(s.curve)) return false;
             bool alone = true;
             lines_.each_cell(s, [&](const LineBuckets::Line& l) {
                 if (!alone) return;
@@ -195,7 +195,7 @@ void CoincidentCurves::find_companions(const Systematic& samples, Team& team) {
     };
     team.each_block(segments_.size(), [&](int64_t k, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) {
-            if (!samples.may_draw(segments_[i].edge)) continue;
+            if (!samples.may_draw(segments_[i].curve)) continue;
             bool found = false;
             lines_.each_cell(segments_[i],
                              [&](const LineBuckets::Line& l) { found = found || any_beside(segments_[i], l); });

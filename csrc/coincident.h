@@ -21,7 +21,7 @@ namespace edgegrad {
 
 // A curve in the image.
 struct ImageSegment {
-    int64_t edge;
+    int32_t edge, curve;  // the latter as samples count it
     Vec2 a, b;
     double reach;     // px by which the rays of Embree may miss it: its floats are no finer
     double rounding;  // px, of its doubles

@@ -35,8 +35,14 @@ class CreaseVisibility {
 
     Relation relation(const Curve& c) const { return crossings_.relation(c, touching(c)); }
 
-    // Of a crease behind what the image hit.
-    static Expected hidden(Relation relation) { return {false, relation == Relation::apart ? 1.0 / 1024 : 1.0 / 256}; }
+    // Of a crease behind what the image hit in so many pixels (occlusion.h). If all of it is visible or none, a part
+    // that shows through a gap cannot be what rays missed.
+    Expected hidden(Relation relation, int64_t pixels) const {
+        constexpr OcclusionHint::Few whole{.rays = 0.5, .share = 1.0 / 64, .least = 1.0 / 256},
+            in_part{.rays = 2, .share = 1.0 / 128, .least = 1.0 / 256};
+        return {false,
+                view_.occlusion.factor(relation == Relation::apart ? whole : in_part, pixels, view_.options.spp)};
+    }
 
     // Of any other; nothing where rays must tell.
     std::optional<Expected> without_rays(const Curve& c, Relation relation) const {

@@ -28,6 +28,10 @@ struct Curve {
 
     bool is_crease() const { return minus.face >= 0 && plus.face >= 0; }
 
+    Vec2 low() const { return {std::min(x0.x, x1.x), std::min(x0.y, x1.y)}; }  // of its box
+    Vec2 high() const { return {std::max(x0.x, x1.x), std::max(x0.y, x1.y)}; }
+    double nearest_depth() const { return std::min((1 - t0) * a.z + t0 * b.z, (1 - t1) * a.z + t1 * b.z); }
+
     Vec2 tangent() const { return x1 - x0; }  // dx/ds, the same everywhere: a pinhole sees a straight line
 
     // At the fraction s of the curve in the image: the pixel position, and t on the edge (1 − t) a + t b.
@@ -90,36 +94,67 @@ inline int side_of(const HalfEdge& h, const Array<int8_t>& facing) {
     return h.backwards ? -facing[h.face] : facing[h.face];
 }
 
+// The orientation of each face in the image, Camera::facing (F,).
+template <class T>
+Array<int8_t> facing_of_faces(const BackwardView<T>& view) {
+    Array<int8_t> facing(view.scene.n_faces);
+    view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t f = first; f < last; ++f) {
+            const auto q = corners_of(view, f);
+            facing[f] = int8_t(view.camera.facing(q[0], q[1], q[2]));
+        }
+    });
+    return facing;
+}
+
 // Finds the curves of one view.
 template <class T>
 class CurveFinder {
    public:
-    explicit CurveFinder(const BackwardView<T>& view)
-        : view_(view), facing_(view.scene.n_faces), jumps_(may_jump(view.scene, view.geometry.topology())) {
-        view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
-            const auto& q = view.vertices.q;
-            for (int64_t f = first; f < last; ++f) {
-                const int32_t* v = view.scene.faces + 3 * f;
-                facing_[f] = int8_t(view.camera.facing(q[v[0]], q[v[1]], q[v[2]]));
-            }
-        });
-    }
+    // `facing` (F,): see facing_of_faces.
+    CurveFinder(const BackwardView<T>& view, Array<int8_t> facing)
+        : view_(view), facing_(std::move(facing)), jumps_(may_jump(view.scene, view.geometry.topology())) {}
 
     bool finds_creases() const { return jumps_; }
 
     // On which side of its edge a face lies in the image; see side_of.
     int turn_of(const HalfEdge& h) const { return side_of(h, facing_); }
 
-    // Whether an edge has one face on each side, as most have.
-    bool has_face_on_each_side(int64_t edge) const {
-        const auto halves = view_.geometry.topology().half_edges(edge);
-        return halves.size() == 2 && side_of(halves[0], facing_) * side_of(halves[1], facing_) < 0;
+    // Calls body(edge) for those of the edges first … last − 1 that may have a curve, or one that is no crease. Most
+    // have one face on each side; with no jump there is then nothing more to look at, and little of memory is read for
+    // them.
+    template <class Body>
+    void each(int64_t first, int64_t last, bool creases, Body body) const {
+        const Topology& topology = view_.geometry.topology();
+        const int8_t* const facing = facing_.data();
+        const bool jumps = creases && jumps_;
+        const int32_t* face = topology.faces(first).data();
+        std::vector<int64_t> edges;
+        for (int64_t e = first; e < last; ++e) {
+            if (topology.joins_two(e)) [[likely]] {
+                const bool through = facing[face[0]] * facing[face[1]] > 0;
+                face += 2;
+                if (through && !(jumps && carries_jump(e))) [[likely]]
+                    continue;
+            } else {
+                face += topology.faces(e).size();
+            }
+            edges.push_back(e);
+            topology.prefetch(e);
+        }
+        // What is asked of memory some edges ahead is there when it is wanted.
+        constexpr size_t ahead = 4;
+        for (size_t i = 0; i < edges.size(); ++i) {
+            if (i + 2 * ahead < edges.size()) prefetch_face(edges[i + 2 * ahead]);
+            if (i + ahead < edges.size()) prefetch_vertices(edges[i + ahead]);
+            body(edges[i]);
+        }
     }
 
     // The curve of an edge; false when there is none.
     bool find(int64_t edge, Curve& c) const {
         const auto halves = view_.geometry.topology().half_edges(edge);
-        // Most edges have one face on each side; with no jump there is then nothing more to look at.
+        // As in each().
         if (!jumps_ && halves.size() == 2 && side_of(halves[0], facing_) * side_of(halves[1], facing_) < 0)
             return false;
         const int32_t va = vertex(view_.scene, halves[0], halves[0].first()),
@@ -137,7 +172,8 @@ class CurveFinder {
             if (seen.face < 0 || !in_front(view_, seen, h, c.a, c.b)) seen = h;
         }
         if (side[0].face < 0 && side[1].face < 0) return false;
-        if (side[0].face >= 0 && side[1].face >= 0 && !(jumps_ && carries_jump(view_.scene, side[0], side[1])))
+        if (side[0].face >= 0 && side[1].face >= 0 &&
+            !(jumps_ && edgegrad::carries_jump(view_.scene, side[0], side[1])))
             return false;
 
         const Camera& camera = view_.camera;
@@ -159,6 +195,23 @@ class CurveFinder {
     }
 
    private:
+    void prefetch_face(int64_t edge) const {
+        prefetch(view_.scene.faces + 3 * int64_t(view_.geometry.topology().half_edges(edge)[0].face));
+    }
+    void prefetch_vertices(int64_t edge) const {
+        const HalfEdge& h = view_.geometry.topology().half_edges(edge)[0];
+        const VertexView& p = view_.vertices;
+        for (const int corner : {h.first(), h.second()}) {
+            const int32_t v = vertex(view_.scene, h, corner);
+            prefetch(&p.q[v]), prefetch(&p.x[v]), prefetch(&p.outcode[v]), prefetch(view_.scene.verts + 3 * int64_t(v));
+        }
+    }
+
+    bool carries_jump(int64_t edge) const {
+        const auto halves = view_.geometry.topology().half_edges(edge);
+        return edgegrad::carries_jump(view_.scene, halves[0], halves[1]);
+    }
+
     // Of the pixel positions, px: an edge that is so long, or so far away, that doubles do not say where it runs in the
     // image has no curve there. The bound is a generous one.
     static constexpr double most_rounding = 16;

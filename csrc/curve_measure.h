@@ -16,22 +16,27 @@ struct CurvesFound {
     double pixels = 0;                     // the measure without the adjoint, which default samples go by
     int64_t silhouettes = 0, creases = 0;  // in view
 };
+struct MeasuredCurve {
+    double measure = 0;
+    int32_t edge;
+    bool controlled = false;  // whether x_bar has the integral of a crease's control
+};
 template <class T>
 struct Curves : CurvesFound {
     CurveFinder<T> finder;
-    Array<double> of_edge;                            // (E,) the measure
-    std::vector<std::vector<ImageSegment>> segments;  // those where the loss looks, by ascending edges
+    std::vector<MeasuredCurve> curve;                 // those where the loss looks, by ascending edges
+    Array<double> measure{0};                         // theirs
+    std::vector<std::vector<ImageSegment>> segments;  // of those that others may lie on, by ascending edges
     Array<double> x_bar;  // (V, 2) what controls add to the cotangents of places in the image; empty: there are none
-    Array<uint8_t> is_controlled;  // (E,) whether x_bar has the integral of a crease; empty: there are none
 
-    explicit Curves(const BackwardView<T>& view);
+    Curves(const BackwardView<T>& view, Array<int8_t> facing);
 
     // Samples: so many as are given, if not −1, or the defaults.
     int64_t wanted(int64_t given) const;
 };
 
-// Finds and measures all curves, and begins x_bar with the integrals of the controls.
+// Finds and measures all curves, and begins x_bar with the integrals of the controls. `facing` (F,): Camera::facing.
 template <int N, class T>
-Curves<T> measure_curves(const BackwardView<T>& view);
+Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing);
 
 }  // namespace edgegrad

@@ -45,6 +45,29 @@ EDGEGRAD_VECTORIZED void bound_lanes(FaceLanes& f, int width, int height, double
     }
 }
 
+EDGEGRAD_VECTORIZED void bound_hidden(HiddenFaces& f, int width, int height, int columns, double rounding) {
+    EDGEGRAD_ROLLED
+    for (int i = 0; i < lanes; ++i)
+        f.wedge[i] =
+            (f.x[1][i] - f.x[0][i]) * (f.y[2][i] - f.y[0][i]) - (f.y[1][i] - f.y[0][i]) * (f.x[2][i] - f.x[0][i]);
+    const auto extent = [](double a, double b, double c) {
+        return std::max(std::max(a, b), c) - std::min(std::min(a, b), c);
+    };
+    EDGEGRAD_ROLLED
+    for (int i = 0; i < lanes; ++i)
+        f.side[i] = std::max(extent(f.x[0][i], f.x[1][i], f.x[2][i]), extent(f.y[0][i], f.y[1][i], f.y[2][i]));
+    EDGEGRAD_ROLLED
+    for (int i = 0; i < lanes; ++i) {
+        const double least = rounding * f.side[i];
+        f.extent[i] = 0.5 * std::fabs(f.wedge[i]) + f.side[i];
+        f.facing[i] = int32_t(f.wedge[i] > least) - int32_t(f.wedge[i] < -least);
+    }
+    EDGEGRAD_ROLLED
+    for (int i = 0; i < lanes; ++i)
+        f.tile[i] = whole(f.y[0][i], height - 1) / OcclusionHint::tile * columns +
+                    whole(f.x[0][i], width - 1) / OcclusionHint::tile;
+}
+
 // What one channel adds.
 EDGEGRAD_VECTORIZED void integrate_channel(FaceLanes& f, const double* __restrict A, const double* __restrict color,
                                            double* __restrict T) {
@@ -79,6 +102,10 @@ EDGEGRAD_VECTORIZED void integrate_channel(FaceLanes& f, const double* __restric
 }  // namespace
 
 void FaceLanes::bound(int width, int height, double radius) { bound_lanes(*this, width, height, radius); }
+
+void HiddenFaces::bound(const OcclusionHint& occlusion, double rounding) {
+    bound_hidden(*this, occlusion.width(), occlusion.height(), occlusion.columns(), rounding);
+}
 
 void FaceLanes::integrate() {
     for (double* a : {sum, change, apart}) std::fill(a, a + size, 0.0);

@@ -7,6 +7,7 @@
 
 #include "importance.h"
 #include "math.h"
+#include "occlusion.h"
 
 namespace edgegrad {
 
@@ -39,6 +40,21 @@ struct FaceLanes {
     std::vector<double> T;
     double x_bar[3][size], y_bar[3][size], sum[size], change[size], apart[size];
     void integrate();
+};
+
+// The same for faces of which little is asked, for they are hidden.
+struct HiddenFaces {
+    static constexpr int size = FaceLanes::size;
+
+    // Given: the faces, and the places of their corners in the image.
+    int64_t face[size];
+    double x[3][size] = {}, y[3][size] = {};
+
+    // By bound(): twice the signed area, px²; the longer side of the box, px; area + side · 1 px; the sign of the
+    // first, 0 unless it is larger than `rounding` times the second; OcclusionHint::tile_of the first corner.
+    double wedge[size], side[size], extent[size];
+    int32_t facing[size], tile[size];
+    void bound(const OcclusionHint& occlusion, double rounding);
 };
 
 }  // namespace edgegrad

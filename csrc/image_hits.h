@@ -7,6 +7,8 @@
 #include <vector>
 
 #include "array.h"
+#include "camera.h"
+#include "occlusion.h"
 #include "parallel.h"
 #include "scene.h"
 #include "topology.h"
@@ -19,8 +21,13 @@ class ImageHits {
    public:
     // `seen` (F,): see ForwardOutput.
     template <class T>
-    ImageHits(const SceneView<T>& scene, const Parts& parts, const uint8_t* seen, Team& team)
-        : parts_(parts), at_(scene.n_verts, 0), share_(2 * parts.size()) {
+    ImageHits(const SceneView<T>& scene, const VertexView& vertices, const OcclusionHint& occlusion, const Parts& parts,
+              const uint8_t* seen, Team& team)
+        : parts_(parts), at_(scene.n_verts), share_(2 * parts.size()) {
+        team.each_block(scene.n_verts, [&](int64_t, int64_t first, int64_t last) {
+            for (int64_t v = first; v < last; ++v)
+                at_[v] = !vertices.outcode[v] && occlusion.hides_around(vertices.x[v], vertices.q[v].z) ? behind : 0;
+        });
         std::vector<int32_t> hits(2 * parts_.size(), 0);  // faces that were hit, by part and side
         const auto mark = [&](const int32_t* v, uint8_t bit) {
             for (int i = 0; i < 3; ++i) {
@@ -45,7 +52,9 @@ class ImageHits {
             }
             count();
         });
-        team.each_block(scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+        team.each_block(scene.n_faces, [&](int64_t k, int64_t first, int64_t last) {
+            // Where no face of a part was hit there is no rim.
+            if (const int64_t part = parts_.of_block(k); part >= 0 && hits[2 * part] + hits[2 * part + 1] == 0) return;
             for (int64_t f = first; f < last; ++f) {
                 const int32_t* v = scene.faces + 3 * f;
                 const auto is_hit = [&](int i) {
@@ -73,7 +82,13 @@ class ImageHits {
     };
     Face of(const int32_t* v) const {
         const uint8_t a = at_[v[0]], b = at_[v[1]], c = at_[v[2]];
-        return {(a | b | c) != 0, (a & b & c & hit) != 0, !((a | b | c) & rim)};
+        return {((a | b | c) & (hit | rim)) != 0, (a & b & c & hit) != 0, !((a | b | c) & rim)};
+    }
+
+    // Whether the corners of a face lie inside the view, behind all that was hit around them (OcclusionHint), and it is
+    // no neighbour of a face that was hit.
+    bool are_behind(const int32_t* v) const {
+        return at_[v[0]] == behind && at_[v[1]] == behind && at_[v[2]] == behind;
     }
 
     // What the density of samples is multiplied by on a face with this vertex that was not hit, nor a neighbour: by
@@ -89,12 +104,12 @@ class ImageHits {
     void prefetch(int32_t vertex) const { edgegrad::prefetch(&at_[vertex]); }
 
    private:
-    // Of a vertex: of a face that was hit; of a face that has such vertices and others.
-    static constexpr uint8_t hit = 1, rim = 2;
+    // Of a vertex: of a face that was hit; of a face that has such vertices and others; behind all around it.
+    static constexpr uint8_t hit = 1, rim = 2, behind = 4;
     static constexpr double turned_away = 1.0 / 64, some = 1.0 / 16;
     static constexpr int enough = 64;  // faces that tell which sides of a part are visible
     const Parts& parts_;
-    std::vector<uint8_t> at_;
+    Array<uint8_t> at_;
     std::vector<float> share_;  // by part and side: of the faces of the part that were hit; 1 where too few were
 };
 

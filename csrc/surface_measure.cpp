@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cmath>
+#include <optional>
 
 #include "face_lanes.h"
 #include "polygon.h"
@@ -12,9 +13,10 @@ namespace edgegrad {
 
 namespace {
 
-// What the measure of a triangle is multiplied by if it lies behind what the image hit (occlusion.h), and neither it
-// nor a neighbour was hit; and if a neighbour was. Never zero, for it may be visible all the same.
-constexpr double occluded = 1.0 / 64, occluded_beside_hits = 1.0 / 8;
+// How few samples a triangle gets if it lies behind what the image hit (occlusion.h), and neither it nor a neighbour
+// was hit; and what its measure is multiplied by if a neighbour was. Never zero, for it may be visible all the same.
+constexpr OcclusionHint::Few occluded{.rays = 2, .share = 1.0 / 64, .least = 1.0 / 64};
+constexpr double occluded_beside_hits = 1.0 / 8;
 
 // Default samples a unit of (area + longest side · 1 px): where colours are interpolated, and where a texture may vary
 // from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
@@ -36,6 +38,11 @@ constexpr double large = 256;
 // A face with a control is sampled the less the better that is likely to be: the adjoint changes little, and the face
 // is not wide, px. From `widest` on its corners say little.
 constexpr double least = 1.0 / 16, wide = 32, widest = 64;
+
+// A face this long, px, has each of its points within OcclusionHint::reach of a corner: two thirds of the longest side
+// are the most that a point of a triangle is away from the nearest.
+constexpr double small = 1.5 * OcclusionHint::reach;
+static_assert(small < 2 * OcclusionHint::tile);
 
 // The pixels that large triangles may touch, by tiles.
 class PixelMask {
@@ -81,17 +88,20 @@ class PixelMask {
 template <int N, class T>
 class MeasuredChunk {
    public:
-    MeasuredChunk(const BackwardView<T>& view, bool geometry, const Destination& to, SurfaceMeasure<T>& out,
-                  PixelMask& mask, ChunkGrad& grad)
+    MeasuredChunk(const BackwardView<T>& view, const std::vector<double>& importance_around, bool geometry,
+                  const Destination& to, Array<int8_t>& facing, SurfaceMeasure<T>& out, PixelMask& mask,
+                  ChunkGrad& grad)
         : view_(view),
+          importance_around_(importance_around),
           want_places_(geometry),
           want_colors_(to.colors),
+          facing_(facing),
+          want_facing_(!facing.empty()),
           out_(out),
           mask_(mask),
           grad_(grad),
           C_(N ? N : view.scene.channels),
           rough_(2 * view.importance.roughness() * view.importance.roughness()),
-          lanes_(C_),
           colors_(C_) {}
 
     double total() const { return total_; }
@@ -99,26 +109,73 @@ class MeasuredChunk {
 
     void add(int64_t first, int64_t last) {
         for (int64_t g = first; g < last; g += FaceLanes::size) {
-            lanes_.count = 0;
-            for (int64_t f = g; f < std::min(g + FaceLanes::size, last); ++f) gather(f, f + ahead < last);
+            add_hidden(g, std::min(g + FaceLanes::size, last), last);
+            if (n_others_ == 0) continue;
+            if (!lanes_) lanes_.emplace(C_);
+            lanes_->count = 0;
+            for (int i = 0; i < n_others_; ++i) gather(others_[i]);
             look();
         }
     }
 
    private:
+    // Lays out those of the faces that are small and lie behind all that was hit around their corners. Of these there
+    // may be many, and they get few samples, so little is asked of them. The others are listed.
+    void add_hidden(int64_t first, int64_t last, int64_t end) {
+        const VertexView& p = view_.vertices;
+        const ImageHits& hits = *view_.hits;
+        const Vec2* x = p.x.data();
+        HiddenFaces& l = hidden_;
+        int count = 0;
+        n_others_ = 0;
+        std::fill(&out_.of_face[first], &out_.of_face[first] + (last - first), 0.0);
+        std::fill(&out_.is_controlled[first], &out_.is_controlled[first] + (last - first), uint8_t(0));
+        for (int64_t f = first; f < last; ++f) {
+            const int32_t* v = view_.scene.faces + 3 * f;
+            if (f + ahead < end)
+                for (int i = 0; i < 3; ++i) prefetch(x + v[3 * ahead + i]), hits.prefetch(v[3 * ahead + i]);
+            if (hits.are_behind(v)) {
+                l.face[count] = f;
+                for (int k = 0; k < 3; ++k) l.x[k][count] = x[v[k]].x, l.y[k][count] = x[v[k]].y;
+                ++count;
+                continue;
+            }
+            others_[n_others_++] = f;
+            for (int i = 0; i < 3; ++i)
+                prefetch(&p.outcode[v[i]]), prefetch(&p.q[v[i]]), prefetch(&view_.vertex_adjoint[int64_t(v[i]) * C_]);
+        }
+        if (!count) return;
+        l.bound(view_.occlusion, rounding_);
+        int8_t* facing = facing_.data();
+        const double default_factor = colored * hidden_by_all_around_;
+        for (int i = 0; i < count; ++i) {
+            const int64_t f = l.face[i];
+            if (!(l.side[i] <= small)) {
+                others_[n_others_++] = f;
+                continue;
+            }
+            if (l.facing[i] == 0) [[unlikely]] {
+                set_facing(f, l.wedge[i], l.side[i]);
+                if (l.wedge[i] == 0) continue;
+            } else if (want_facing_) {
+                facing[f] = int8_t(l.facing[i]);
+            }
+            const double importance = importance_around_[l.tile[i]];
+            if (!(importance > 0)) continue;
+            const double m =
+                l.extent[i] * (is_textured(view_.scene, f) ? textured * hidden_by_all_around_ : default_factor);
+            out_.of_face[f] = m * importance;
+            total_ += m;
+        }
+    }
+
     // Puts a face that lies inside the view into the lanes, where all are looked at together; any other is laid out
     // here.
-    void gather(int64_t f, bool more) {
+    void gather(int64_t f) {
         const int32_t* v = view_.scene.faces + 3 * f;
         const VertexView& p = view_.vertices;
-        if (more)
-            for (int i = 0; i < 3; ++i) {
-                const int32_t w = v[3 * ahead + i];
-                prefetch(&p.x[w]), prefetch(&p.outcode[w]), view_.hits->prefetch(w);
-                prefetch(&p.q[w]), prefetch(&view_.vertex_adjoint[int64_t(w) * C_]);
-            }
-        out_.of_face[f] = 0, out_.is_controlled[f] = 0;
         if (p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) {
+            set_facing(f, 0, 0);
             if (!polygon_.set(view_.camera, view_.volume, p, v)) return;
             const double importance = view_.importance.mean(polygon_.low, polygon_.high);
             const Extent extent{polygon_.area, polygon_.longest, polygon_.low, polygon_.high, polygon_.nearest};
@@ -126,13 +183,27 @@ class MeasuredChunk {
             if (importance > 0) lay_out(f, m, importance, extent);
             return;
         }
-        const int i = lanes_.count++;
-        lanes_.face[i] = f;
+        const int i = lanes_->count++;
+        lanes_->face[i] = f;
         for (int k = 0; k < 3; ++k) {
             const Vec2 x = p.x[v[k]];
-            lanes_.x[k][i] = x.x, lanes_.y[k][i] = x.y, lanes_.z[k][i] = p.q[v[k]].z;
+            lanes_->x[k][i] = x.x, lanes_->y[k][i] = x.y, lanes_->z[k][i] = p.q[v[k]].z;
         }
     }
+
+    // By twice the signed area in the image, px², unless its rounding decides; `side`: about how long the face is, px.
+    void set_facing(int64_t f, double twice, double side) {
+        if (!want_facing_) return;
+        if (std::fabs(twice) > rounding_ * side) [[likely]] {
+            facing_[f] = twice > 0 ? 1 : -1;
+            return;
+        }
+        const auto q = corners_of(view_, f);
+        facing_[f] = int8_t(view_.camera.facing(q[0], q[1], q[2]));
+    }
+
+    // What the measure of a face is multiplied by if it lies behind what was hit in so many pixels.
+    double hidden(int64_t pixels) const { return view_.occlusion.factor(occluded, pixels, view_.options.spp); }
 
     // What there is of a face in the image.
     struct Extent {
@@ -145,9 +216,9 @@ class MeasuredChunk {
     template <class Side>
     double default_samples(int64_t f, const Extent& e, ImageHits::Face hits, Side side) const {
         const double m = (e.area + e.longest) * (is_textured(view_.scene, f) ? textured : colored);
-        const bool behind = !view_.seen[f] && view_.occlusion.hides(e.low, e.high, e.nearest);
-        if (hits.partly) return behind ? m * OcclusionHint::factor(occluded_beside_hits, view_.options.spp) : m;
-        if (behind) return m * OcclusionHint::factor(occluded, view_.options.spp);
+        const int64_t hiding = view_.seen[f] ? 0 : view_.occlusion.hiding_pixels(e.low, e.high, e.nearest);
+        if (hits.partly) return hiding ? m * OcclusionHint::factor(occluded_beside_hits, view_.options.spp) : m;
+        if (hiding) return m * hidden(hiding);
         return m * view_.hits->where_missed(view_.scene.faces[3 * f], side());
     }
 
@@ -168,7 +239,7 @@ class MeasuredChunk {
 
     // Lays out the faces in the lanes.
     void look() {
-        FaceLanes& l = lanes_;
+        FaceLanes& l = *lanes_;
         if (!l.count) return;
         l.bound(view_.camera.width, view_.camera.height, view_.importance.radius());
         for (int i = 0; i < l.count; ++i) view_.importance.prefetch(l.i0[i], l.i1[i], l.j0[i], l.j1[i]);
@@ -178,6 +249,7 @@ class MeasuredChunk {
             const int64_t f = l.face[i];
             const double area = 0.5 * std::fabs(l.wedge[i]);
             controlled_[i] = false;
+            set_facing(f, l.wedge[i], l.longest[i]);
             if (!(area > 0) || !(importance_[i] > 0)) continue;
             const ImageHits::Face seen = view_.hits->of(view_.scene.faces + 3 * f);
             const auto [x0, x1] = std::minmax({l.x[0][i], l.x[1][i], l.x[2][i]});
@@ -201,17 +273,17 @@ class MeasuredChunk {
 
     void gather_control(int i) {
         const int C = N ? N : C_;
-        const int64_t f = lanes_.face[i];
+        const int64_t f = lanes_->face[i];
         const int32_t *v = view_.scene.faces + 3 * f, *row = view_.scene.corners + 3 * f;
         constexpr int next = FaceLanes::size;
-        double *adjoint = lanes_.adjoint.data() + i, *color = lanes_.color.data() + i;
+        double *adjoint = lanes_->adjoint.data() + i, *color = lanes_->color.data() + i;
         for (int k = 0; k < 3; ++k) {
             const T* A = &view_.vertex_adjoint[int64_t(v[k]) * C];
             for (int c = 0; c < C; ++c) adjoint[(7 * c + k) * next] = A[c];
         }
         for (int k = 0; k < 4; ++k) {
             const T* A =
-                view_.adjoint.of(int64_t(lanes_.inside[1][k][i]) * view_.camera.width + lanes_.inside[0][k][i]);
+                view_.adjoint.of(int64_t(lanes_->inside[1][k][i]) * view_.camera.width + lanes_->inside[0][k][i]);
             for (int c = 0; c < C; ++c) adjoint[(7 * c + 3 + k) * next] = A[c];
         }
         const auto color_of = [&](int k) { return view_.scene.colors + int64_t(row[k]) * C; };
@@ -224,7 +296,7 @@ class MeasuredChunk {
 
     void add_controls() {
         const int C = N ? N : C_;
-        FaceLanes& l = lanes_;
+        FaceLanes& l = *lanes_;
         l.integrate();
         for (int i = 0; i < l.count; ++i) {
             if (!controlled_[i]) continue;
@@ -254,24 +326,32 @@ class MeasuredChunk {
     // the middles of the sides and of the face, and to the mean of its box. Corners alone may agree by chance, as the
     // signs of an L1 loss do.
     double variation(int i) const {
-        const FaceLanes& l = lanes_;
+        const FaceLanes& l = *lanes_;
         if (!(l.sum[i] > 0)) return 1;
         return std::max({l.change[i] / l.sum[i], l.apart[i] / l.sum[i],
                          std::fabs(1 - view_.importance.of(l.sum[i] / 3) / importance_[i])});
     }
 
     // What is asked of memory for a face so far ahead is there when it is wanted.
-    static constexpr int ahead = 16;
+    static constexpr int ahead = 32;
     const BackwardView<T>& view_;
+    const std::vector<double>& importance_around_;  // of what lies within two tiles of a point, by its own
     const bool want_places_, want_colors_;
+    Array<int8_t>& facing_;
+    const bool want_facing_;
     SurfaceMeasure<T>& out_;
     PixelMask& mask_;
     ChunkGrad& grad_;
     const int C_;
-    const double rough_;  // of faces without a control
+    const double rough_;                                                 // of faces without a control
+    const double rounding_ = 16 * view_.camera.rounding_of_positions();  // of a wedge, over the longer side
     double total_ = 0, of_large_ = 0;
     VisiblePolygon polygon_;
-    FaceLanes lanes_;
+    std::optional<FaceLanes> lanes_;  // none before there is a face for them
+    HiddenFaces hidden_;
+    int64_t others_[FaceLanes::size];
+    int n_others_ = 0;
+    const double hidden_by_all_around_ = hidden(OcclusionHint::pixels_around);
     double importance_[FaceLanes::size], samples_[FaceLanes::size];
     bool controlled_[FaceLanes::size], clear_[FaceLanes::size];
     std::vector<double> colors_;
@@ -280,7 +360,7 @@ class MeasuredChunk {
 }  // namespace
 
 template <int N, class T>
-SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Destination& to) {
+SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Array<int8_t>& facing, Destination& to) {
     const BackwardOptions& o = view.options;
     const int64_t F = view.scene.n_faces, chunks = (F + scatter_chunk - 1) / scatter_chunk;
     SurfaceMeasure<T> out{Array<double>(F), Array<uint8_t>(F), {}, {}};
@@ -291,9 +371,17 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, De
     Destination whole;
     whole.x = geometry ? x_bar.data() : nullptr, whole.colors = to.colors;
     std::vector<double> total(chunks), of_large(chunks);
+    const int columns = view.occlusion.columns(), rows = view.occlusion.rows();
+    std::vector<double> importance_around(size_t(columns) * rows);
+    view.team.each(rows, [&](int64_t j) {
+        constexpr double tile = OcclusionHint::tile;
+        for (int i = 0; i < columns; ++i)
+            importance_around[j * columns + i] =
+                view.importance.mean({(i - 2) * tile, (j - 2) * tile}, {(i + 3) * tile, (j + 3) * tile});
+    });
     double seconds[2] = {};
     view.scatter.add(F, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        MeasuredChunk<N, T> chunk(view, geometry, to, out, mask, grad);
+        MeasuredChunk<N, T> chunk(view, importance_around, geometry, to, facing, out, mask, grad);
         chunk.add(first, last);
         total[first / scatter_chunk] = chunk.total(), of_large[first / scatter_chunk] = chunk.of_large();
     });
@@ -308,8 +396,8 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, De
 
 // clang-format off
 #define EDGEGRAD_INSTANTIATE(N) \
-    template SurfaceMeasure<float> measure_surface<N>(const BackwardView<float>&, bool, Destination&); \
-    template SurfaceMeasure<double> measure_surface<N>(const BackwardView<double>&, bool, Destination&);
+    template SurfaceMeasure<float> measure_surface<N>(const BackwardView<float>&, bool, Array<int8_t>&, Destination&); \
+    template SurfaceMeasure<double> measure_surface<N>(const BackwardView<double>&, bool, Array<int8_t>&, Destination&);
 EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
 #undef EDGEGRAD_INSTANTIATE
 // clang-format on

@@ -32,8 +32,9 @@ struct SurfaceMeasure {
     int64_t pixel_samples() const { return pixel_spp * int64_t(pixels.size()); }
 };
 
-// Measures all faces, and adds to `to` the integrals of the controls.
+// Measures all faces, and adds to `to` the integrals of the controls. What it finds of their orientation in the image
+// it writes into `facing` (F,), as Camera::facing has it, unless that is empty.
 template <int N, class T>
-SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Destination& to);
+SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Array<int8_t>& facing, Destination& to);
 
 }  // namespace edgegrad

@@ -98,6 +98,13 @@ Parts::Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team)
         up[std::max(a, b)] = std::min(a, b);
     }
     for (int64_t v = 0; v < n_verts; ++v) part_[v] = up[v] == v ? size_++ : part_[up[v]];
+    of_block_.resize(Team::blocks(n_faces));
+    team.each_block(n_faces, [&](int64_t k, int64_t first, int64_t last) {
+        int32_t part = part_[faces[3 * first]];
+        for (int64_t f = first; f < last && part >= 0; ++f)
+            if (part_[faces[3 * f]] != part) part = -1;
+        of_block_[k] = part;
+    });
 }
 
 Topology::Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team)
@@ -190,11 +197,13 @@ void Topology::build(Team& team) {
             if (e + 1 == last || (e + 1)->upper != e->upper) offset_.push_back(i + 1);
         }
     }
+    joins_two_.resize(n_edges());
     // The direction of an edge is that of its first half-edge.
     for (int64_t e = 0; e < n_edges(); ++e) {
         if (e % check_every == 0) team.check();
         const bool flip = half_edge_[offset_[e]].backwards;
         for (int64_t i = offset_[e]; i < offset_[e + 1]; ++i) half_edge_[i].backwards ^= flip;
+        joins_two_[e] = offset_[e + 1] - offset_[e] == 2 && half_edge_[offset_[e] + 1].backwards;
     }
 }
 

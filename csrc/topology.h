@@ -9,6 +9,7 @@
 #include <span>
 #include <vector>
 
+#include "array.h"
 #include "parallel.h"
 #include "scene.h"
 
@@ -32,9 +33,11 @@ class Parts {
     int64_t size() const { return size_; }
     // The part of a face, by one of its vertices.
     int32_t of(int32_t vertex) const { return part_[vertex]; }
+    // That of all faces in a block (Team::each_block); −1: they are of several.
+    int32_t of_block(int64_t block) const { return of_block_[block]; }
 
    private:
-    std::vector<int32_t> part_;
+    std::vector<int32_t> part_, of_block_;
     int32_t size_ = 0;
 };
 
@@ -57,6 +60,12 @@ class Topology {
         return {face_.data() + offset_[edge], face_.data() + offset_[edge + 1]};
     }
 
+    // Whether an edge has two faces, which run along it in opposite directions, as where a surface goes on.
+    bool joins_two(int64_t edge) const { return joins_two_[edge]; }
+
+    // Asks for what the half-edges will be looked up by.
+    void prefetch(int64_t edge) const { edgegrad::prefetch(&offset_[edge]); }
+
    private:
     void build(Team& team);
 
@@ -67,6 +76,7 @@ class Topology {
     std::vector<int64_t> offset_;
     std::vector<HalfEdge> half_edge_;
     std::vector<int32_t> face_;
+    std::vector<uint8_t> joins_two_;
 };
 
 }  // namespace edgegrad

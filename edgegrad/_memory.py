@@ -38,7 +38,7 @@ def ray_structure(faces: int, verts: int) -> int:
 
 def topology(faces: int) -> int:
     """Bytes of the edges of a closed mesh."""
-    return 36 * faces + 8 * edges(faces)
+    return 36 * faces + 9 * edges(faces)
 
 
 def edges(faces: int) -> int:
@@ -61,22 +61,23 @@ def surface_measure(faces: int, verts: int, pixels: int, textured: bool, radianc
 
 
 def edge_measure(faces: int) -> int:
-    """Bytes for which side of a face is seen, and the edges laid end to end."""
-    return faces + 8 * edges(faces)
+    """Bytes for which side of a face is seen."""
+    return faces
 
 
-def creases(faces: int, verts: int, pixels: int) -> int:
-    """Bytes of the control of creases: its places at vertices, which edges have one, and where parts of the surface meet."""
-    return 16 * verts + edges(faces) + 5 * pixels
+def creases(verts: int, pixels: int) -> int:
+    """Bytes of the control of creases: its places at vertices, and where parts of the surface meet."""
+    return 16 * verts + 5 * pixels
 
 
 def curves_on_lines(curves: int) -> int:
-    """Bytes, at most, of `curves` curves in view sorted by the lines that they lie on (csrc/coincident.h).
+    """Bytes, at most, of `curves` curves in view laid end to end and sorted by the lines that they lie on (csrc/coincident.h).
 
-    A curve is 64 bytes in a list that doubles as it grows, and again where others lie on its line, with up to 16 of two tables,
-    16 in each of up to 7 cells of the image, and 16 more, twice, once it has a companion; most pass one or two, and are alone.
+    A curve has 16 bytes in a list that doubles as it grows and 24 beside it; 64 in another such list, and again where others lie
+    on its line, with up to 16 of two tables, 16 in each of up to 7 cells of the image, and 16 more, twice, once it has a
+    companion; most pass one or two, and are alone.
     """
-    return (64 + 2 * 16 + 7 * 16 + 2 * 16) * curves
+    return (2 * 16 + 24 + 64 + 2 * 16 + 7 * 16 + 2 * 16) * curves
 
 
 def rows(samples: int, primitives: int | None, each: int, width: int, destinations: int) -> int:

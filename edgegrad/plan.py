@@ -203,7 +203,7 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
         "creases": Term(
             creases > 0,
             no_boundary or (f"{creases:,} in view" if creases else "nothing jumps between neighbours"),
-            bytes=memory.creases(F, V, height * width) if creases else 0,
+            bytes=memory.creases(V, height * width) if creases else 0,
         ),
     }
     for name, i, want in zip(DIFFERENTIABLE_NAMES, DIFFERENTIABLE, wanted, strict=True):

@@ -302,7 +302,7 @@ def gradient_room(adjoint: Tensor, *args: Any) -> AbstractContextManager[None]:
         # Where all attributes are indexed like the vertices, curves are silhouettes: a quarter of a mesh that is tangled.
         jumps = flat.corners.data_ptr() != flat.faces.data_ptr()
         needs["edges in view"] = memory.edge_measure(F) + memory.curves_on_lines(memory.edges(F) // (1 if jumps else 4))
-        needs["creases"] = memory.creases(F, V, height * width) * jumps
+        needs["creases"] = memory.creases(V, height * width) * jumps
         needs["edge samples"] = memory.rows(many if edge_samples < 0 else edge_samples, memory.edges(F), 4, 3, V)
     kept = {"ray structure": memory.ray_structure(F, V), "topology": memory.topology(F) * work.boundary}
     return memory.room("backward pass", needs, kept, lambda: _lower(args) + ", or let fewer tensors require a gradient")

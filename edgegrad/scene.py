@@ -168,6 +168,8 @@ def flatten(scene: Scene) -> Flat:
     verts, faces, corners, colors, uvs, texels, textures, face_texture = ([] for _ in range(8))
     n_verts = n_colors = n_uvs = n_texels = 0
     alone = len(scene.meshes) == 1
+    # Colours of vertices are indexed by the faces. That it is one tensor tells the kernel that neighbours agree at their edge.
+    by_vertex = all(mesh.texture is None and mesh.colors is not None for mesh in scene.meshes)
     for mesh in scene.meshes:
         V, F = mesh.verts.shape[0], mesh.faces.shape[0]
         mesh_faces = _rows(mesh.faces, V, n_verts, alone)
@@ -184,7 +186,7 @@ def flatten(scene: Scene) -> Flat:
             n_uvs, n_texels = n_uvs + mesh.uvs.shape[0], n_texels + h * w
         else:
             if mesh.colors is not None:
-                rows, index = mesh.colors, mesh_faces - n_verts if n_verts else mesh_faces
+                rows, index = mesh.colors, mesh_faces if by_vertex or not n_verts else mesh_faces - n_verts
             elif mesh.corner_colors is not None:
                 rows = mesh.corner_colors.reshape(3 * F, C)
                 index = torch.arange(3 * F, dtype=torch.int32, device=cpu).reshape(F, 3)
@@ -195,7 +197,8 @@ def flatten(scene: Scene) -> Flat:
                 rows = torch.full((1, C), PLAIN, dtype=dtype, device=cpu)
                 index = torch.zeros((F, 3), dtype=torch.int32, device=cpu)
             colors.append(rows.cpu().to(dtype))
-            corners.append(index + n_colors if n_colors else index)
+            if not by_vertex:
+                corners.append(index + n_colors if n_colors else index)
             n_colors += rows.shape[0]
             if any_texture:
                 face_texture.append(torch.full((F,), -1, dtype=torch.int32, device=cpu))
@@ -208,10 +211,11 @@ def flatten(scene: Scene) -> Flat:
         background = torch.zeros(C, dtype=dtype, device=cpu)
     else:
         background = scene.background.cpu().to(dtype).contiguous()
+    all_faces = join(faces, empty(3, torch.int32))
     return Flat(
         join(verts, empty(3, torch.float64)),
-        join(faces, empty(3, torch.int32)),
-        join(corners, empty(3, torch.int32)),
+        all_faces,
+        all_faces if by_vertex else join(corners, empty(3, torch.int32)),
         join(colors, empty(C, dtype)),
         join(uvs, empty(2, torch.float64)),
         join(texels, empty(C, dtype)),

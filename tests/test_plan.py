@@ -222,6 +222,15 @@ def test_scene_is_copied_only_if_it_must_be(kernel):
     assert eg.plan(mesh.to(torch.float32), CAMERA)["scene"].bytes == copied + 12
 
 
+def test_colours_of_vertices_have_no_creases_in_a_scene_of_several_meshes(kernel):
+    """One array for faces and corners tells the kernel so; else it looked at every edge for a jump."""
+    assert step(kernel, eg.Scene([cube(), cube(0.3)]), kinds=("verts",))["creases"] == 0
+    flat = kernel.scenes[0]
+    assert flat.corners.data_ptr() == flat.faces.data_ptr() and flat.faces.max() == 15
+    step(kernel, eg.Scene([cube(), creased()]), kinds=("verts",))
+    assert kernel.scenes[1].corners.data_ptr() != kernel.scenes[1].faces.data_ptr()
+
+
 def built(mesh, camera=CAMERA, kinds=(), **options) -> tuple[bool, bool]:
     """Whether the kernel built the ray structure in the forward pass, and found the edges in the backward pass."""
     scene, camera = requiring(mesh, camera, kinds)
