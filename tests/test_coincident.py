@@ -204,3 +204,40 @@ def test_few_samples_are_unbiased(edge_samples: int | None) -> None:
         found.append(gradient(lambda shift, options=options: eg.render(scene(shift), camera, spp=1, **options)))
     mean, error = torch.stack(found).mean(0), torch.stack(found).std(0) / len(found) ** 0.5
     assert float(((mean - exact) / error).abs().max()) < 4.0, (mean, error, exact)
+
+
+@pytest.mark.parametrize("spacings", [4, 16])
+def test_what_lies_closer_than_the_input_tells(spacings: int) -> None:
+    """A sheet that another hides from less than eight spacings of float32 away counts as touching it, and has a gradient
+    (README, Limits); from farther away it has none."""
+    corners = torch.tensor([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    behind = (0.8 * corners + torch.tensor([0.03, 0.02, spacings * 2.0**-24])).requires_grad_()
+    front, back = (eg.Mesh(v, faces, face_colors=torch.full((2, 3), c)) for v, c in ((corners, 0.2), (behind, 0.9)))
+    camera = eg.Camera.look_at((0.1, 0.2, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (32, 32))
+    adjoint = torch.linspace(0.0, 1.0, 32)[:, None, None].expand(32, 32, 3)
+    (eg.render(eg.Scene([front, back]), camera) * adjoint).sum().backward()
+    assert behind.grad is not None
+    assert bool(behind.grad.any()) == (spacings < 8)
+
+
+@pytest.mark.parametrize(("apart", "least", "most"), [(3e-7, 0.999, 1.001), (1e-6, 1.05, 1.6), (1e-4, 0.97, 1.06)])
+def test_copies_that_are_not_quite_in_one_place(apart: float, least: float, most: float) -> None:
+    """Faces with vertices of their own, in float32: up to eight spacings they are one; just beyond, each side of a face is a
+    border that its neighbour does not quite cover, and the gradient is up to a fifth too large (README, Limits)."""
+    ball = icosphere(2)
+    colors = torch.rand((len(ball.faces), 3), generator=torch.Generator().manual_seed(0))
+    camera = eg.Camera.look_at((0.1, 0.2, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (64, 64))
+    y, x = torch.meshgrid(*2 * [torch.linspace(0.0, 1.0, 64)], indexing="ij")
+    index = ball.faces.reshape(-1)
+    noise = 2 * torch.rand((len(index), 3), generator=torch.Generator().manual_seed(1)) - 1
+
+    def gradient(verts: Tensor, faces: Tensor) -> Tensor:
+        verts = verts.clone().requires_grad_()
+        image = eg.render(eg.Mesh(verts, faces, face_colors=colors), camera, edge_samples=400_000)
+        return torch.autograd.grad((image * torch.stack([x, y, x * y], -1)).sum(), verts)[0].double()
+
+    true = gradient(ball.verts.float(), ball.faces)
+    copies = gradient(ball.verts.float()[index] + apart * noise, torch.arange(len(index)).reshape(-1, 3))
+    found = torch.zeros_like(true).index_add_(0, index, copies)
+    assert least < float((found * true).sum() / true.square().sum()) < most
