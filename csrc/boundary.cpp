@@ -191,7 +191,12 @@ class BoundaryChunk {
         RayBatch rays(view_.frame);
         int32_t nearest = -1;
         double depth = std::numeric_limits<double>::infinity();
-        while (face >= 0 && !decide(face)) {
+        for (int refused = 0; face >= 0 && !decide(face); ++refused) {
+            // Where floats see hundreds of faces in one place, one ray decides on all of them.
+            if (refused == most_refused) {
+                face = view_.geometry.caster().beyond_float(view_.frame, n, face, blind, decide);
+                break;
+            }
             const Vec2 beside = moved_off(face, n);
             rays.n_x[0] = n.x, rays.n_y[0] = n.y, rays.n_x[1] = beside.x, rays.n_y[1] = beside.y, rays.count = 2;
             blind.insert(std::upper_bound(blind.begin(), blind.end(), face), face);
@@ -204,6 +209,8 @@ class BoundaryChunk {
         }
         return face >= 0 && depth_of(view_, face, n) < depth ? face : nearest;
     }
+
+    static constexpr int most_refused = 3;
 
     // n, moved away from a face that does not cover it, across the side that it lies beyond.
     Vec2 moved_off(int64_t face, Vec2 n) const {
