@@ -217,8 +217,8 @@ _COUNTS = ("surface_samples", "edge_samples", "surface_wanted", "edge_wanted", "
 
 
 def _bound(samples: int, wanted: int) -> str:
-    """What plan() says where the budget cut the default samples: they take no longer than the image."""
-    return f"; {wanted:,} by default, cut to take no longer than the image" if 0 < samples < wanted else ""
+    """What plan() says where the budget (csrc/budget.h) may cut the default samples."""
+    return f"; by default up to {wanted:,}, but no more than take the image's time" if 0 < samples < wanted else ""
 
 
 def _bytes_of_copies(scene: Scene, flat: Flat) -> int:
