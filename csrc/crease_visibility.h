@@ -56,7 +56,7 @@ class CreaseVisibility {
 
     // Adds rays to some points of a crease to the batch; returns its place there.
     int ask(const Curve& c, Relation relation) {
-        asked_[size_] = {c, std::max(fewest(c, relation), 1.0 / 128)};
+        asked_[size_] = {c, std::max(fewest(c, relation), 1.0 / 128), where_missed(c)};
         for (const double s : asked_at) {
             const Vec2 n = normalised(view_.camera, c.position(s));
             rays_.n_x[rays_.count] = n.x, rays_.n_y[rays_.count++] = n.y;
@@ -71,23 +71,26 @@ class CreaseVisibility {
         rays_.prepare();
         view_.geometry.caster().cast(rays_);
         for (int k = 0, ray = 0; k < size_; ++k) {
-            const auto& [c, fewest] = asked_[k];
+            const auto& [c, fewest, missed] = asked_[k];
             int visible = 0, hidden = 0;
             for (const double s : asked_at) {
                 const Answer a = at(c, s, ray++);
                 visible += a == Answer::visible, hidden += a == Answer::hidden;
             }
-            body(k, c, Expected{visible > hidden, std::max(visible, hidden) == int(std::size(asked_at)) ? fewest : 1});
+            // Beside what the image hit, one that rays find hidden may be visible between them, as at a limb.
+            const bool agreed = visible == points || (hidden == points && missed < 1);
+            body(k, c, Expected{visible > hidden, agreed ? std::min(fewest, missed) : missed});
         }
         rays_.count = size_ = 0;
     }
 
     static constexpr double asked_at[] = {0.05, 0.35, 0.65, 0.95};
-    static constexpr int most = RayBatch::size / int(std::size(asked_at));  // creases in a batch
+    static constexpr int points = int(std::size(asked_at)), most = RayBatch::size / points;  // creases in a batch
 
    private:
     // Least fractions of the samples: where nothing may divide a crease; and where it may, but rays find it undivided.
-    static constexpr double few = 1.0 / 512, beside_silhouettes = 1.0 / 128, beside_parts = 1.0 / 32;
+    static constexpr double few = 1.0 / 512, beside_silhouettes = 1.0 / 128, beside_parts = 1.0 / 32,
+                            beside_missed = 1.0 / 8;  // faces near which others were not hit: something may pass through
 
     double fewest(const Curve& c, Relation relation) const {
         if (relation != Relation::apart) return beside_parts;
@@ -102,6 +105,7 @@ class CreaseVisibility {
                 high = {std::max(high.x, x.x), std::max(high.y, x.y)};
                 farthest = std::max(farthest, view_.vertices.q[v].z);
             }
+        if (!hits(c.minus).clear || !hits(c.plus).clear) return beside_missed;
         return meeting_.in(low, high) ? beside_parts : crossings_.in(low, high, farthest) ? beside_silhouettes : few;
     }
 
@@ -135,7 +139,7 @@ class CreaseVisibility {
 
     struct Asked {
         Curve curve;
-        double fewest;
+        double fewest, missed;
     };
 
     const BackwardView<T>& view_;

@@ -122,8 +122,7 @@ class MeasuredEdges {
 
     void add_crease(const Curve& c, const Jump& jump, int64_t hiding) {
         const Relation relation = visibility_->relation(c);
-        // On the line of a crease that no silhouette meets, nothing else is visible.
-        if (relation != Relation::apart) segments.push_back(image_segment(view_, c, jump.curve));
+        segments.push_back(image_segment(view_, c, jump.curve));
         if (hiding) return measure(c, jump, visibility_->hidden(relation, hiding).samples);
         const bool controls = control_.set(c);
         if (const auto expected = visibility_->without_rays(c, controls ? relation : Relation::across)) {

@@ -195,6 +195,23 @@ def coloured_sphere(subdivisions: int) -> eg.Mesh:
     return eg.Mesh(ball.verts.to(F64), ball.faces, face_colors=colors)
 
 
+def through_itself() -> eg.Mesh:
+    """A small sphere that comes out of a large one, with which it shares one vertex: one connected part."""
+    large, small = (
+        coloured_sphere(3),
+        coloured_sphere(3).transformed(scale=0.4, t=torch.tensor([0.3, 0.2, 0.8], dtype=F64)),
+    )
+    faces = small.faces + len(large.verts)
+    link = (large.verts - small.verts[0]).norm(dim=1).argmin().to(faces.dtype)
+    faces = torch.where(faces == len(large.verts), link, faces)
+    assert large.face_colors is not None and small.face_colors is not None
+    return eg.Mesh(
+        torch.cat([large.verts, small.verts]),
+        torch.cat([large.faces, faces]),
+        face_colors=torch.cat([large.face_colors, small.face_colors]),
+    )
+
+
 # Creases all of which are visible or hidden; such that another mesh passes through them, where no silhouette tells; and the
 # creases of a sheet seen flat, which its own bumps hide.
 CREASES = {
@@ -204,6 +221,7 @@ CREASES = {
         [coloured_grid(20, lambda x, y: 0 * x, 2), coloured_grid(23, lambda x, y: 0.3 * x + 0.013 * y + 0.006, 3)],
         (0.3, -0.2, -3.5), 0.02,
     ),
+    "a part through itself": ([through_itself()], (0.3, -0.2, 3.5), 0.02),
     "waves, seen flat": ([coloured_grid(20, lambda x, y: 0.1 * torch.sin(9 * x), 4)], (3.0, -0.2, 0.6), 0.03),
 }  # fmt: skip
 
