@@ -51,12 +51,12 @@ class CreaseVisibility {
         // On the side of a closed mesh that is turned away.
         if (missed < ImageHits::missed) return Expected{false, relation == Relation::apart ? missed / 16 : missed};
         if (fewest(c, relation) != few || !(view_.seen[c.minus.face] || view_.seen[c.plus.face])) return std::nullopt;
-        return Expected{true, 1.0 / 512};
+        return Expected{true, by_evidence(few)};
     }
 
     // Adds rays to some points of a crease to the batch; returns its place there.
     int ask(const Curve& c, Relation relation) {
-        asked_[size_] = {c, std::max(fewest(c, relation), 1.0 / 128), where_missed(c)};
+        asked_[size_] = {c, by_evidence(std::max(fewest(c, relation), beside_silhouettes)), where_missed(c)};
         for (const double s : asked_at) {
             const Vec2 n = normalised(view_.camera, c.position(s));
             rays_.n_x[rays_.count] = n.x, rays_.n_y[rays_.count++] = n.y;
@@ -90,7 +90,11 @@ class CreaseVisibility {
    private:
     // Least fractions of the samples: where nothing may divide a crease; and where it may, but rays find it undivided.
     static constexpr double few = 1.0 / 512, beside_silhouettes = 1.0 / 128, beside_parts = 1.0 / 32,
-                            beside_missed = 1.0 / 8;  // faces near which others were not hit: something may pass through
+                            beside_missed =
+                                1.0 / 8;  // faces near which others were not hit: something may pass through
+
+    // Fewer than 16 rays a pixel miss more of where parts meet, and of which faces are divided.
+    double by_evidence(double least) const { return OcclusionHint::factor(least, view_.options.spp); }
 
     double fewest(const Curve& c, Relation relation) const {
         if (relation != Relation::apart) return beside_parts;
