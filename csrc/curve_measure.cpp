@@ -30,7 +30,8 @@ double reach_of_rays(const BackwardView<T>& view, const Curve& c) {
         const double* p = view.scene.verts + 3 * int64_t(vertex(view.scene, h, corner));
         error = std::max(error, view.frame.error({p[0], p[1], p[2]}));
     }
-    return std::max(c.rounding, std::min(view.camera.pixels_per_unit / std::min(c.w0, c.w1) * error, 0.01));
+    return std::max(c.rounding,
+                    std::min(view.camera.pixels_per_unit / std::min(c.w0, c.w1) * error, Crossings::float_reach));
 }
 
 // Mean of Σ_c |L| over all colours: the size of a jump of which nothing is known.

@@ -177,7 +177,7 @@ def test_what_hangs_together_says_where_to_look() -> None:
 def test_nothing_slips_through_a_fine_mesh() -> None:
     """Embree decides in float which of two neighbours a ray meets, and double may decide for the other. A ray that then passes
     through the one must not slip past the other too: a few in a hundred thousand did, and samples of the far side weigh much. One
-    in a million still does: in 1 of 30 such runs."""
+    in six million still does (1 of 30 such runs), on a single face."""
     mesh, adjoint = icosphere(6), smooth_adjoint(256, 256, 3).float()
     camera = eg.Camera.look_at((0.9, 0.7, 3.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (256, 256))
     hidden = turned_away(mesh.replace(verts=mesh.verts.to(camera.K.dtype)), camera)
@@ -189,6 +189,6 @@ def test_nothing_slips_through_a_fine_mesh() -> None:
             mesh.replace(verts=verts, colors=colors), camera, 1, seed, surface_samples=200_000, visibility=False
         )
         (gradient,) = torch.autograd.grad(image, verts, adjoint)
-        slipped += bool(gradient[hidden].any())
+        slipped += int(gradient[hidden].any(-1).sum())
         assert gradient[~hidden].any()
-    assert slipped <= 1
+    assert slipped <= 3  # vertices
