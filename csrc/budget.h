@@ -45,7 +45,7 @@ class SampleBudget {
    private:
     // A sample of the gradient costs several rays of the image: it is placed by a search, traced among strangers,
     // decided in double and scattered (docs/performance.md).
-    static constexpr double rays_a_surface_sample = 3.5, rays_an_edge_sample = 4.7, share_of_image = 1;
+    static constexpr double rays_a_surface_sample = 3.9, rays_an_edge_sample = 5.2, share_of_image = 1;
     static constexpr int64_t least = 1 << 14;  // some milliseconds, so that small images and few rays lose nothing
     double rays_ = 0;
 };
