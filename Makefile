@@ -51,8 +51,8 @@ ifeq ($(filter /%,$(shell $(CXX) -print-file-name=libtsan.so 2>/dev/null)),)
 	@echo "make sanitize-threads: skipped, for $(CXX) has no libtsan.so, which comes with g++ on Linux"
 else
 	rm -rf $(THREADS) && mkdir -p $(THREADS)
-	printf '%s\n' $(filter-out csrc/bindings.cpp csrc/pieces.cpp,$(wildcard csrc/*.cpp)) csrc/checks/threads.cpp | \
-	  xargs -P 2 -I@ sh -c '$(CXX) -std=c++20 -O1 -g -pthread -fsanitize=thread -ffp-contract=off -w -c @ -o $(THREADS)/$$(basename @).o'
+	printf '%s\n' $(filter-out csrc/python/% csrc/checks/faults.cpp,$(filter %.cpp,$(SOURCES))) | \
+	  xargs -P 2 -I@ sh -c '$(CXX) -std=c++20 -O1 -g -pthread -fsanitize=thread -ffp-contract=off -w -Icsrc -c @ -o $(THREADS)/$$(basename @).o'
 	$(CXX) -pthread -fsanitize=thread $(THREADS)/*.o -ldl -o $(THREADS)/threads
 	embree=$$($(BIN)/python -c "from edgegrad._kernel import embree_path as path; print(path())") && \
 	export TSAN_OPTIONS=ignore_noninstrumented_modules=1 && \

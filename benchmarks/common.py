@@ -13,12 +13,13 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad._files import replacing
-from edgegrad.render import Profile, _kernel_camera, _kernel_scene, render_arguments
+from edgegrad._kernel import core
+from edgegrad._ops import Hits, Profile, kernel_camera, kernel_hits, kernel_scene
+from edgegrad._request import make_request
 from edgegrad.report.methods import differentiate
 from edgegrad.report.references import standard_error
 from edgegrad.report.scenes import ReportScene, smooth_adjoint
 from edgegrad.report.scenes import sphere as icosphere
-from edgegrad.scene import Flat
 
 
 def sphere(size: int | tuple[int, int], subdivisions: int = 6) -> tuple[eg.Mesh, eg.Camera, Tensor]:
@@ -38,32 +39,25 @@ class Kernel:
     """A scene before a camera as the kernel takes it: its two passes, without the share of torch and Python."""
 
     def __init__(self, scene: eg.Scene | eg.Mesh, camera: eg.Camera, adjoint: Tensor, spp: int = 16) -> None:
-        arguments = render_arguments(scene, camera, spp)
-        self.flat, self.spp = Flat(*arguments[:9]), spp
-        self.scene = _kernel_scene(self.flat, arguments[17])
-        self.camera = _kernel_camera(arguments[9][0], arguments[10][0], *arguments[11:14])
-        self.adjoint = adjoint.to(self.flat.colors.dtype).contiguous()
+        request = make_request(scene, camera, spp)
+        flat, self.options = request.scene, core.ImageOptions(**request.image._asdict())
+        self.scene, self.camera = kernel_scene(flat), kernel_camera(request.camera)
+        self.adjoint = adjoint.to(flat.colors.dtype).contiguous()
         self.image = torch.empty_like(self.adjoint)
-        self.coverage = self.adjoint.new_empty(camera.size)
-        self.depth = torch.empty(camera.size)
-        self.hit = torch.empty((*camera.size, 2), dtype=torch.int32)
-        self.interior = bool(arguments[21])  # whether colours vary within faces
-        self.seen = torch.empty(len(self.flat.faces), dtype=torch.uint8)
-        textured = len(self.flat.textures) > 0
-        like = {
-            "verts": self.flat.verts,
-            "uvs" if textured else "colors": self.flat.uvs if textured else self.flat.colors,
+        self.interior = request.gradient.radiance_varies
+        self.hits = kernel_hits(Hits.empty(request))
+        appearance = ("uvs", "texels") if len(flat.textures) else ("colors",)
+        self.grads = {
+            name: torch.zeros_like(request.slot(name), dtype=torch.float64) for name in ("verts", *appearance)
         }
-        like |= {"texels": self.flat.texels} if textured else {}
-        self.grads = {name: torch.zeros_like(t, dtype=torch.float64) for name, t in like.items()}
         self.profile: Profile = {}  # of the last pass
         self.forward()
 
     def forward(self, threads: int | None = None) -> float:
         """Seconds; writes `image`."""
-        outputs = self.image.numpy(), self.coverage.numpy(), self.depth.numpy(), self.hit.numpy(), self.seen.numpy()
+        threads = threads or torch.get_num_threads()
         begin = time.perf_counter()
-        self.profile = self.scene.forward(self.camera, self.spp, "box", 0, threads or torch.get_num_threads(), *outputs)
+        self.profile = self.scene.forward(self.camera, self.options, threads, self.image.numpy(), self.hits)
         return time.perf_counter() - begin
 
     def backward(
@@ -79,14 +73,18 @@ class Kernel:
     ) -> float:
         """Seconds; writes `grads`: that of the vertices and, with `appearance`, those of what colours them."""
         wanted = {name: grad.zero_().numpy() for name, grad in self.grads.items() if appearance or name == "verts"}
+        options = core.GradientOptions(
+            surface_samples=surface_samples,
+            edge_samples=edge_samples,
+            seed=seed,
+            interior_geometry=self.interior if interior is None else interior,
+            boundary=boundary,
+        )
+        threads = threads or torch.get_num_threads()
         begin = time.perf_counter()
         self.profile = self.scene.backward(
-            camera=self.camera, spp=self.spp, surface_samples=surface_samples, edge_samples=edge_samples, filter="box", seed=seed,
-            threads=threads or torch.get_num_threads(), boundary=boundary, dry=False,
-            interior_geometry=self.interior if interior is None else interior,
-            adjoint=self.adjoint.numpy(), coverage=self.coverage.numpy(), depth=self.depth.numpy(),
-            hit=self.hit.numpy(), seen=self.seen.numpy(), **wanted,
-        )  # fmt: skip
+            self.camera, self.options, options, threads, self.adjoint.numpy(), self.hits, wanted
+        )
         return time.perf_counter() - begin
 
     def gradient(self, surface_samples: int, edge_samples: int, seed: int, **terms: Any) -> tuple[Tensor, float]:

@@ -160,7 +160,9 @@ def forward(bench: Bench) -> list[Row]:
             eg.render(mesh, camera)
 
     widths = sorted({8, core.packet_width()})
-    loops = [lambda n=n: kernel.scene.bare_loop(kernel.camera, 16, "box", 0, n, threads) for n in widths]
+    loops = [
+        lambda n=n: core.for_tests.bare_loop(kernel.scene, kernel.camera, kernel.options, n, threads) for n in widths
+    ]
     *bare, inside, whole = bench.interleaved(21, *loops, kernel.forward, lambda: seconds_of(call))
     target: dict[str, Any] = {"must": 0.8, "aim": 0.95, "more_is_better": True}
     rows = []
@@ -525,8 +527,6 @@ def step(bench: Bench) -> list[Row]:
 
 def interior(bench: Bench) -> list[Row]:
     kernel, inside, _ = equal()
-    if not hasattr(kernel.scene, "pixel_backward"):
-        raise Skipped("the kernel has no pixel_backward; build it anew")
     surface, _ = kernel.default_samples()
     verts = torch.zeros_like(inside)
 
@@ -536,14 +536,9 @@ def interior(bench: Bench) -> list[Row]:
     def theirs(spp: float, seed: int) -> tuple[Tensor, float]:
         # The forward pass again, and the shading differentiated at each hit. The seconds are those of its pixel loop and of
         # adding up; not of what the kernel sets up around it and this estimator does not need.
-        seconds = kernel.scene.pixel_backward(
-            kernel.camera,
-            round(spp),
-            "box",
-            seed,
-            torch.get_num_threads(),
-            kernel.adjoint.numpy(),
-            verts.zero_().numpy(),
+        image = core.ImageOptions(spp=round(spp), filter="box", seed=seed)
+        seconds = core.for_tests.pixel_backward(
+            kernel.scene, kernel.camera, image, torch.get_num_threads(), kernel.adjoint.numpy(), verts.zero_().numpy()
         )
         return verts.clone(), seconds
 

@@ -52,7 +52,7 @@ def load() -> Any:
 
 
 core = load()
-# Without this a process that ends while daemon threads render is often aborted (csrc/unlocked.h).
+# Without this a process that ends while daemon threads render is often aborted (csrc/python/unlocked.h).
 atexit.register(core.await_callers)
 # Without this a worker of a DataLoader, or of multiprocessing, that is forked after its parent rendered waits for ever.
 if hasattr(os, "register_at_fork"):

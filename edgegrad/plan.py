@@ -6,7 +6,7 @@ import inspect
 import math
 import statistics
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,22 +15,12 @@ from torch import Tensor
 
 from . import _memory as memory
 from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
+from ._kernel import core
+from ._ops import Hits, backward_kernel, forward_kernel, image_room, pass_size
+from ._request import SLOTS, Request, Work, as_scene, label, make_request, required
 from .camera import Camera
 from .mesh import Mesh
-from .render import (
-    DIFFERENTIABLE,
-    DIFFERENTIABLE_NAMES,
-    View,
-    as_scene,
-    backward_kernel,
-    backward_work,
-    forward_kernel,
-    image_room,
-    render,
-    render_arguments,
-    requires_grad,
-    surface_rows,
-)
+from .render import render
 from .scene import Flat, Scene
 
 # -- the plan ---------------------------------------------------------------------------------------------------------
@@ -97,18 +87,17 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
     """
     _check_options("plan", options)
     scene = as_scene(scene)
-    arguments = render_arguments(scene, camera, spp, seed, **options)
-    wanted = requires_grad(arguments)
-    return Plan({**_image_terms(scene, arguments, any(wanted)), **_gradient_terms(arguments, wanted)})
+    request = make_request(scene, camera, spp, seed, **options)
+    wanted = required(request)
+    return Plan({**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted)})
 
 
-def _image_terms(scene: Scene, arguments: Sequence[Any], any_gradient: bool) -> dict[str, Term]:
-    flat, B = Flat(*arguments[:9]), len(arguments[9])
-    height, width, spp = arguments[12:15]
-    V, F, C, word = len(flat.verts), len(flat.faces), flat.background.shape[-1], flat.colors.element_size()
-    copied = _bytes_of_copies(scene, flat)
+def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str, Term]:
+    camera, B, spp = request.camera, request.cameras, request.image.spp
+    needs = core.image_bytes(pass_size(request), B)
+    copied = _bytes_of_copies(scene, request.scene)
     cameras = "" if B == 1 else f", {B} cameras"
-    textures = len(flat.textures)
+    textures = len(request.scene.textures)
     return {
         "scene": Term(
             copied > 0,
@@ -118,73 +107,70 @@ def _image_terms(scene: Scene, arguments: Sequence[Any], any_gradient: bool) -> 
         "ray structure": Term(
             True,
             "built once, and again when vertices moved",
-            bytes=memory.ray_structure(F, V),
+            bytes=needs["ray structure"],
         ),
-        "image": Term(True, f"{spp} samples a pixel{cameras}", B * height * width * spp, B * height * width * C * word),
+        "image": Term(True, f"{spp} samples a pixel{cameras}", B * camera.height * camera.width * spp, needs["image"]),
         # Its memory is the user's own, or counted with the scene.
         "textures": Term(textures > 0, f"{textures} to look up" if textures else "no mesh has one"),
         "kept for backward": Term(
             any_gradient,
             "coverage, depth, and which faces were hit" if any_gradient else "nothing requires a gradient",
-            bytes=B * (height * width * (word + 12) + F),
+            bytes=sum(needs[name] for name in ("coverage", "depth", "faces hit", "faces seen")),
         ),
     }
 
 
-def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[str, Term]:
-    flat, B = Flat(*arguments[:9]), len(arguments[9])
-    height, width = arguments[12:14]
-    varies, visibility = arguments[21:23]
-    V, F, C = len(flat.verts), len(flat.faces), flat.background.shape[-1]
-    image_bytes = B * height * width * C * flat.colors.element_size()
-    verts, _, _, _, _, world_to_camera, K = wanted
-    moves = verts or world_to_camera or K
-    work = backward_work(varies, visibility, wanted)
+def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term]:
+    flat, camera, B = request.scene, request.camera, request.cameras
+    work = Work.of(request.gradient, wanted)
+    moves = any(name in wanted for name in ("verts", "world_to_camera", "K"))
 
     # The kernel counts them itself. It is asked whatever is wanted, for it also checks what render() leaves to it.
-    with image_room(*arguments):
-        ones = flat.colors.new_ones((B, height, width, C))
-    view = View(
+    with image_room(request):
+        ones = flat.colors.new_ones((B, camera.height, camera.width, request.channels))
+    hits = Hits(
         ones[..., 0].contiguous(),
-        ones.new_full((B, height, width), math.inf, dtype=torch.float32),
-        flat.faces.new_zeros((B, height, width, 2), dtype=torch.int32),
-        flat.faces.new_ones((B, F), dtype=torch.uint8),
+        ones.new_full(ones.shape[:-1], math.inf, dtype=torch.float32),
+        flat.faces.new_zeros((*ones.shape[:-1], 2), dtype=torch.int32),
+        flat.faces.new_ones((B, len(flat.faces)), dtype=torch.uint8),
     )
-    _, profiles = backward_kernel(ones, view, *arguments, wanted, dry=True)
+    _, profiles = backward_kernel(ones, hits, request, wanted, dry=True)
     counts = {name: int(sum(profile[name] for profile in profiles)) for name in _COUNTS}
     surface, edge, silhouettes, creases = (
         counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases")
     )
+    needs = core.gradient_bytes(
+        pass_size(request), motion=work.motion, boundary=work.boundary, wanted=list(wanted),
+        surface_samples=surface, edge_samples=edge, curves=silhouettes + creases,
+    )  # fmt: skip
+
+    def bytes_of(*parts: str) -> int:
+        return sum(needs.get(part, 0) for part in parts)
 
     # Why the terms are off, "" where nothing keeps them from running.
     still = "" if moves else "neither verts nor the camera require a gradient"
-    no_boundary = still or ("" if visibility else "visibility=False")
+    no_boundary = still or ("" if request.gradient.visibility else "visibility=False")
     no_interior = ""
     if not (work.motion or work.appearance):
         no_interior = "each face has one radiance, wherever it moves" if moves else "nothing asks for it"
-    reasons = [DIFFERENTIABLE_NAMES[i] for i in (1, 2, 3) if wanted[i]]
+    reasons = [label(name) for name in ("colors", "uvs", "texels") if name in wanted]
     reasons += ["radiance varies over faces that move"] if work.motion else []
 
-    interior_rows = surface_rows(surface, [*arguments, wanted])
-    boundary_rows = memory.rows(edge, silhouettes + creases, 4, 3, V)
     terms = {
         "view": Term(
             any(work),
             "where vertices are and where the loss looks" if any(work) else "nothing asks for it",
-            bytes=image_bytes + memory.view(height, width, V, moves),
+            bytes=ones.nbytes + bytes_of("view"),
         ),
         "interior": Term(
             surface > 0,
             no_interior
             or (", ".join(reasons) + _bound(surface, counts["surface_wanted"]) if surface else "nothing in view"),
             samples=surface,
-            bytes=interior_rows
-            + memory.surface_measure(
-                F, V, height * width, len(flat.textures) > 0, C * flat.colors.element_size(), work.motion
-            ),
+            bytes=bytes_of("faces in view", "controls", "surface samples"),
         ),
         "topology": Term(
-            work.boundary, no_boundary or "edges, found once for a set of faces", bytes=memory.topology(F)
+            work.boundary, no_boundary or "edges, found once for a set of faces", bytes=bytes_of("topology")
         ),
         "boundary": Term(
             edge > 0,
@@ -195,7 +181,7 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
                 else "no jump in view"
             ),
             samples=edge,
-            bytes=memory.edge_measure(F) + memory.curves_on_lines(silhouettes + creases) + boundary_rows,
+            bytes=bytes_of("edges in view", "edge samples"),
         ),
         "silhouettes": Term(
             silhouettes > 0, no_boundary or (f"{silhouettes:,} in view" if silhouettes else "none in view")
@@ -203,12 +189,12 @@ def _gradient_terms(arguments: Sequence[Any], wanted: Sequence[bool]) -> dict[st
         "creases": Term(
             creases > 0,
             no_boundary or (f"{creases:,} in view" if creases else "nothing jumps between neighbours"),
-            bytes=memory.creases(V, height * width) if creases else 0,
+            bytes=bytes_of("creases"),
         ),
     }
-    for name, i, want in zip(DIFFERENTIABLE_NAMES, DIFFERENTIABLE, wanted, strict=True):
-        why = "required; summed in double" if want else "not required"
-        terms[f"{name} gradient"] = Term(want, why, bytes=8 * arguments[i].numel())
+    for name in SLOTS:
+        why = "required; summed in double" if name in wanted else "not required"
+        terms[f"{label(name)} gradient"] = Term(name in wanted, why, bytes=8 * request.slot(name).numel())
     return terms
 
 
@@ -217,7 +203,7 @@ _COUNTS = ("surface_samples", "edge_samples", "surface_wanted", "edge_wanted", "
 
 
 def _bound(samples: int, wanted: int) -> str:
-    """What plan() says where the budget (csrc/budget.h) may cut the default samples."""
+    """What plan() says where the budget (csrc/backward/budget.h) may cut the default samples."""
     return f"; by default up to {wanted:,}, but no more than take the image's time" if 0 < samples < wanted else ""
 
 
@@ -226,7 +212,9 @@ def _bytes_of_copies(scene: Scene, flat: Flat) -> int:
     tensors = [value for mesh in scene.meshes for value in vars(mesh).values() if value is not None]
     tensors += [] if scene.background is None else [scene.background]
     own = {tensor.untyped_storage().data_ptr() for tensor in tensors}
-    copies = {storage.data_ptr(): storage.nbytes() for storage in (tensor.untyped_storage() for tensor in flat)}
+    copies = {
+        storage.data_ptr(): storage.nbytes() for storage in (t.untyped_storage() for t in flat if isinstance(t, Tensor))
+    }
     return sum(size for where, size in copies.items() if where not in own)
 
 
@@ -305,26 +293,25 @@ def profile(
     _check_options("profile", options)
     scene, repeats = as_scene(scene), check_positive_int("repeats", repeats)
     # What is kept between calls must not help: before each step the vertices are elsewhere, each time somewhere else.
-    arguments = render_arguments(scene, camera, spp, seed, **options)
-    spp_at = 14
-    wanted = requires_grad(arguments)
-    wanted = wanted if any(wanted) else [True] + [False] * 6
-    adjoint = _adjoint(adjoint, camera, arguments)
+    request = make_request(scene, camera, spp, seed, **options)
+    wanted = required(request) or ("verts",)
+    adjoint = _adjoint(adjoint, camera, request)
 
     runs = []
     for repeat in range(repeats):
-        elsewhere = arguments[0].detach() * (1.001 + 1e-6 * repeat)
-        forward_kernel(elsewhere, *arguments[1:spp_at], 1, *arguments[spp_at + 1 :])
+        verts = request.scene.verts.detach() * (1.001 + 1e-6 * repeat)
+        elsewhere = request._replace(scene=request.scene._replace(verts=verts), image=request.image._replace(spp=1))
+        forward_kernel(elsewhere)
         begin = time.perf_counter()
-        step = render_arguments(scene, camera, spp, seed, **options)
-        _, view, forward = forward_kernel(*step)
-        _, backward = backward_kernel(adjoint, view, *step, wanted)
+        step = make_request(scene, camera, spp, seed, **options)
+        _, hits, forward = forward_kernel(step)
+        _, backward = backward_kernel(adjoint, hits, step, wanted)
         wall = time.perf_counter() - begin
         done = _sum([*forward, *backward])
         runs.append({**done, "python": wall - sum(done[part] for part in _PARTS)})
     seconds = {part: statistics.median(run[part] for run in runs) for part in (*_PARTS, "python")}
     samples = {
-        "image_samples": adjoint.shape[:-1].numel() * arguments[spp_at],
+        "image_samples": adjoint.shape[:-1].numel() * request.image.spp,
         **{name: int(runs[-1][name]) for name in ("surface_samples", "edge_samples", "silhouettes", "creases")},
     }
     return Profile(seconds, samples)
@@ -337,18 +324,17 @@ def _check_options(function: str, options: Mapping[str, Any]) -> None:
         raise TypeError(f"{function}: expected only the options {', '.join(known)}, got {unknown[0]!r}")
 
 
-def _adjoint(adjoint: Tensor | None, camera: Camera, arguments: Sequence[Any]) -> Tensor:
+def _adjoint(adjoint: Tensor | None, camera: Camera, request: Request) -> Tensor:
     """(B, H, W, C), as the kernel reads it. Raises TypeError or ValueError."""
-    flat, B = Flat(*arguments[:9]), len(arguments[9])
-    shape = (*camera.size, flat.background.shape[-1])
+    B, shape = request.cameras, (*camera.size, request.channels)
     if adjoint is None:
-        return flat.colors.new_ones((B, *shape))
+        return request.scene.colors.new_ones((B, *shape))
     adjoint = as_tensor("adjoint", adjoint, floating=True).detach()
     check_float("adjoint", adjoint)
     fix = "it is the derivative of the loss by the image: give it the image's shape"
     check_shape("adjoint", adjoint, shape if camera.batch is None else (B, *shape), fix=fix)
     check_finite("adjoint", adjoint)
-    return adjoint.to(flat.colors).reshape(B, *shape).contiguous()
+    return adjoint.to(request.scene.colors).reshape(B, *shape).contiguous()
 
 
 def _sum(profiles: Iterable[Mapping[str, float]]) -> dict[str, float]:

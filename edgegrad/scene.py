@@ -122,6 +122,9 @@ class Flat(NamedTuple):
     textures: Tensor  # (N, 3) int64: first texel, height, width
     face_texture: Tensor  # (F,) int32: texture of the face, −1 for none; (0,) when the scene has no texture
     background: Tensor  # (C,) or (H, W, C)
+    spacing: list[
+        float
+    ]  # of the numbers in which the vertices were given: pairs of a vertex and the spacing from there on
 
 
 def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
@@ -138,7 +141,7 @@ def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
     return index.to(torch.int32)
 
 
-def vertex_spacing(scene: Scene) -> list[float]:
+def _vertex_spacing(scene: Scene) -> list[float]:
     """The relative spacing of the numbers in which the vertices were given, by which copies of a point may differ: pairs of
     the number of a vertex in the flat arrays and the spacing from there on."""
     pairs: list[float] = []
@@ -222,4 +225,5 @@ def flatten(scene: Scene) -> Flat:
         torch.tensor(textures, dtype=torch.int64, device=cpu).reshape(-1, 3),
         join(face_texture, torch.empty(0, dtype=torch.int32, device=cpu)),
         background,
+        _vertex_spacing(scene),
     )

@@ -1,14 +1,12 @@
 """Too little memory: what does not fit is refused before it is allocated, with figures and what to lower."""
 
-import importlib
-
 import psutil
 import pytest
 import torch
 from scenes import cube, front_camera, icosphere
 
 import edgegrad as eg
-from edgegrad import _memory
+from edgegrad import _memory, _ops
 
 
 @pytest.fixture
@@ -110,7 +108,7 @@ def test_a_failed_allocation_is_explained(cause, monkeypatch):
     def fail(*_, **__):
         raise cause
 
-    monkeypatch.setattr(importlib.import_module("edgegrad.render"), "_kernel_scene", fail)
+    monkeypatch.setattr(_ops, "kernel_scene", fail)
     with pytest.raises(MemoryError, match=r"render: expected .*than the system grants, got about .*; lower") as error:
         eg.render(cube(), front_camera(16))
     assert error.value.__cause__ is cause
@@ -120,7 +118,7 @@ def test_other_errors_are_not_taken_for_memory(monkeypatch):
     def fail(*_, **__):
         raise RuntimeError("something else")
 
-    monkeypatch.setattr(importlib.import_module("edgegrad.render"), "_kernel_scene", fail)
+    monkeypatch.setattr(_ops, "kernel_scene", fail)
     with pytest.raises(RuntimeError, match=r"^something else$"):
         eg.render(cube(), front_camera(16))
 

@@ -16,7 +16,7 @@ from scenes import cube, front_camera
 import edgegrad as eg
 from edgegrad import _kernel
 from edgegrad._kernel import core
-from edgegrad.render import _kernel_scene
+from edgegrad._ops import kernel_scene as scene_of_kernel
 from edgegrad.scene import flatten
 
 F64 = torch.float64
@@ -417,7 +417,7 @@ def test_adjoint_that_is_not_finite(value):
 def kernel_scene(**arrays: np.ndarray) -> object:
     """The kernel's scene of a textured mesh, some of its arrays replaced."""
     flat = flatten(eg.Scene([textured(), mesh(colors=VERTS)]))
-    return _kernel_scene(flat._replace(**{name: torch.as_tensor(array) for name, array in arrays.items()}), [0, 1e-7])
+    return scene_of_kernel(flat._replace(**{name: torch.as_tensor(array) for name, array in arrays.items()}))
 
 
 FLAT = flatten(eg.Scene([textured(), mesh(colors=VERTS)]))
@@ -454,20 +454,21 @@ def kernel_camera(pose: torch.Tensor = POSE, intrinsics: torch.Tensor = K) -> ob
     return core.Camera(pose.contiguous().numpy(), intrinsics.contiguous().numpy(), True, 8, 8)
 
 
-def pixels(coverage: np.ndarray) -> tuple[np.ndarray, ...]:
+def pixels(coverage: np.ndarray) -> object:
     """What the image pass leaves to the backward pass."""
-    return coverage, coverage.copy(), np.stack([coverage] * 2, -1).astype(np.int32), SEEN
+    return core.HitsFloat(coverage, coverage.copy(), np.stack([coverage] * 2, -1).astype(np.int32), SEEN)
 
 
 def kernel_forward(channels: int = 3, height: int = 8, filter: str = "box") -> None:
     image, coverage = np.zeros((height, 8, channels), np.float32), np.zeros((height, 8), np.float32)
-    kernel_scene().forward(kernel_camera(), 1, filter, 0, 1, image, *pixels(coverage))
+    options = core.ImageOptions(spp=1, filter=filter, seed=0)
+    kernel_scene().forward(kernel_camera(), options, 1, image, pixels(coverage))
 
 
 def kernel_backward(**gradients: np.ndarray) -> None:
     image, coverage = np.zeros((8, 8, 3), np.float32), np.zeros((8, 8), np.float32)
-    options = 1, -1, -1, "box", 0, 1, True, True, False
-    kernel_scene().backward(kernel_camera(), *options, image, *pixels(coverage), **gradients)
+    options = core.ImageOptions(spp=1, filter="box", seed=0), core.GradientOptions(seed=0)
+    kernel_scene().backward(kernel_camera(), *options, 1, image, pixels(coverage), gradients)
 
 
 @pytest.mark.parametrize(
@@ -483,6 +484,7 @@ def kernel_backward(**gradients: np.ndarray) -> None:
         (lambda: kernel_forward(filter="sinc"), ['filter: expected "box", "tent" or "gaussian", got "sinc"']),
         (lambda: kernel_backward(verts=np.zeros((3, 3))), ["gradient of verts: expected the size of verts"]),
         (lambda: kernel_backward(texels=np.zeros((3, 3))), ["gradient of texels: expected the size of texels"]),
+        (lambda: kernel_backward(lights=np.zeros(3)), ["gradients: there is none of lights"]),
     ],
 )
 def test_kernel_refuses_arguments_that_do_not_fit(call, parts):

@@ -13,10 +13,11 @@ import torch
 from scenes import cube, front_camera, icosphere, occluded_triangle, one_triangle, smooth_adjoint
 
 import edgegrad as eg
+from edgegrad import _ops
 from edgegrad._kernel import core
+from edgegrad._request import label, make_request, required
 from edgegrad.scene import flatten
 
-render_module = importlib.import_module("edgegrad.render")  # the package has a function of this name
 F64 = torch.float64
 CAMERA = front_camera(24)
 KINDS = ("verts", "colors", "uvs", "texture", "background", "world_to_camera", "K")
@@ -87,28 +88,28 @@ def requiring(scene: eg.Scene | eg.Mesh, camera: eg.Camera, kinds: tuple[str, ..
 def kernel(monkeypatch):
     """What the kernel is given and says when render() and the backward pass call it."""
     seen = SimpleNamespace(scenes=[], forward=[], backward=[], grads=None, adjoint=None, everything=False)
-    forward, backward, scene = render_module.forward_kernel, render_module.backward_kernel, render_module._kernel_scene
+    forward, backward, scene = _ops.forward_kernel, _ops.backward_kernel, _ops.kernel_scene
 
-    def watched_forward(*arguments):
-        result = forward(*arguments)
+    def watched_forward(request):
+        result = forward(request)
         seen.forward += result[-1]
         return result
 
-    def watched_backward(adjoint, view, *arguments, **options):
+    def watched_backward(adjoint, hits, request, wanted, **options):
         if seen.everything:
-            view = view._replace(depth=torch.full_like(view.depth, torch.inf), seen=torch.ones_like(view.seen))
+            hits = hits._replace(depth=torch.full_like(hits.depth, torch.inf), seen=torch.ones_like(hits.seen))
         seen.adjoint = adjoint
-        seen.grads, profiles = backward(adjoint, view, *arguments, **options)
+        seen.grads, profiles = backward(adjoint, hits, request, wanted, **options)
         seen.backward += profiles
         return seen.grads, profiles
 
-    def watched_scene(flat, spacing):
+    def watched_scene(flat):
         seen.scenes.append(flat)
-        return scene(flat, spacing)
+        return scene(flat)
 
-    monkeypatch.setattr(render_module, "forward_kernel", watched_forward)
-    monkeypatch.setattr(render_module, "backward_kernel", watched_backward)
-    monkeypatch.setattr(render_module, "_kernel_scene", watched_scene)
+    monkeypatch.setattr(_ops, "forward_kernel", watched_forward)
+    monkeypatch.setattr(_ops, "backward_kernel", watched_backward)
+    monkeypatch.setattr(_ops, "kernel_scene", watched_scene)
     return seen
 
 
@@ -158,7 +159,7 @@ def test_plan_is_what_the_kernel_does(name, kernel):
             ):  # fmt: skip
                 assert planned[term].on == (done[part] > 0), (term, *case)
             wanted = [planned[f"{kind} gradient"].on for kind in KINDS]
-            assert wanted == ([g is not None for g in kernel.grads] if kernel.backward else [False] * 7), case
+            assert wanted == [bool(kernel.backward) and k in map(label, kernel.grads) for k in KINDS], case
             assert planned["kept for backward"].on == bool(kernel.backward), case
             for term in planned.values():
                 assert term.on or (term.samples == 0 and term.bytes == 0 and term.why), case
@@ -234,12 +235,11 @@ def test_colours_of_vertices_have_no_creases_in_a_scene_of_several_meshes(kernel
 def built(mesh, camera=CAMERA, kinds=(), **options) -> tuple[bool, bool]:
     """Whether the kernel built the ray structure in the forward pass, and found the edges in the backward pass."""
     scene, camera = requiring(mesh, camera, kinds)
-    arguments = render_module.render_arguments(scene, camera, 1, **options)
-    image, view, (forward,) = render_module.forward_kernel(*arguments)
+    request = make_request(scene, camera, 1, **options)
+    image, hits, (forward,) = _ops.forward_kernel(request)
     if not kinds:
         return bool(forward["built rays"]), False
-    wanted = render_module.requires_grad(arguments)
-    backward = render_module.backward_kernel(torch.ones_like(image), view, *arguments, wanted)[1][0]
+    backward = _ops.backward_kernel(torch.ones_like(image), hits, request, required(request))[1][0]
     assert not backward["built rays"]
     return bool(forward["built rays"]), bool(backward["built edges"])
 
@@ -287,7 +287,7 @@ def test_nothing_but_the_plan_is_kept_for_the_backward_pass():
     assert (
         coverage.nbytes + depth.nbytes + hit.nbytes + seen.nbytes == eg.plan(scene, camera)["kept for backward"].bytes
     )
-    flat = [*flatten(scene), camera.world_to_camera[None], camera.K[None]]
+    flat = [t for t in flatten(scene) if isinstance(t, torch.Tensor)] + [camera.world_to_camera[None], camera.K[None]]
     assert [tuple(t.shape) for t in inputs] == [tuple(t.shape) for t in flat]
     assert eg.render(cube(), CAMERA, spp=4).grad_fn is None
     assert eg.plan(cube(), CAMERA)["kept for backward"].bytes == 0
@@ -336,9 +336,9 @@ def test_no_creases_where_nothing_jumps(kernel):
 def test_only_what_is_required_is_differentiated(kind, kernel):
     """What is not wanted has no array that the kernel could write to."""
     step(kernel, textured(), kinds=(kind,))
-    assert [k for k, grad in zip(KINDS, kernel.grads, strict=True) if grad is not None] == [kind]
+    assert [label(slot) for slot in kernel.grads] == [kind]
     step(kernel, textured(), kinds=tuple(k for k in KINDS if k != kind))
-    assert [k for k, grad in zip(KINDS, kernel.grads, strict=True) if grad is None] == [kind]
+    assert [k for k in KINDS if k not in map(label, kernel.grads)] == [kind]
 
 
 @pytest.mark.parametrize("kinds", [("verts",), ("texture",), KINDS])
@@ -459,8 +459,8 @@ def test_profile_rebuilds_for_every_repeat(monkeypatch):
     """Once elsewhere, once where the vertices are."""
     built = []
 
-    def forward_kernel(*args):
-        output = render_module.forward_kernel(*args)
+    def forward_kernel(request):
+        output = _ops.forward_kernel(request)
         built.append(bool(output[2][0]["built rays"]))
         return output
 

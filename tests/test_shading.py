@@ -16,8 +16,10 @@ from torch.autograd.function import once_differentiable
 
 import edgegrad as eg
 from edgegrad import reference
-from edgegrad.render import FILTERS, _kernel_camera, _kernel_scene
-from edgegrad.scene import Flat, flatten
+from edgegrad._kernel import core
+from edgegrad._ops import kernel_camera, kernel_scene
+from edgegrad._request import FILTERS, PackedCamera, pack_camera
+from edgegrad.scene import flatten
 
 F64 = torch.float64
 
@@ -28,9 +30,10 @@ class Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx, verts, colors, uvs, texels, world_to_camera, K, flat, view, faces, points):
         flat = flat._replace(verts=verts, colors=colors, uvs=uvs, texels=texels)
-        kernel = _kernel_scene(flat, spacing=[0.0, 0.0]), _kernel_camera(world_to_camera, K, *view)
+        packed = PackedCamera(world_to_camera[None], K[None], *view)
+        kernel = kernel_scene(flat), kernel_camera(packed)
         radiance = torch.empty((len(points), flat.background.shape[-1]), dtype=F64)
-        kernel[0].shade_at(kernel[1], faces.int().numpy(), points.numpy(), radiance.numpy())
+        core.for_tests.shade_at(*kernel, faces.int().numpy(), points.numpy(), radiance.numpy())
         ctx.save_for_backward(verts, colors, uvs, texels, world_to_camera, K)
         ctx.rest = kernel, faces, points
         return radiance
@@ -41,16 +44,16 @@ class Shade(torch.autograd.Function):
         (scene, camera), faces, points = ctx.rest
         grads = [torch.zeros_like(x) for x in ctx.saved_tensors]
         arrays = [x.numpy() for x in (faces.int(), points, radiance_bar.contiguous(), *grads)]
-        scene.shade_at_vjp(camera, *arrays)
+        core.for_tests.shade_at_vjp(scene, camera, *arrays)
         return (*grads, None, None, None, None)
 
 
 def shade(scene: eg.Scene, camera: eg.Camera, faces: Tensor, points: Tensor) -> Tensor:
     flat = flatten(scene)
     assert flat.colors.dtype == F64
-    view = camera.projection == "perspective", *camera.size
+    view = pack_camera(camera)[2:]
     # The kernel's scene is built in forward from the four that may require gradients, and the rest.
-    fixed = Flat(*(t.detach() for t in flat))
+    fixed = flat._replace(**{n: t.detach() for n, t in flat._asdict().items() if isinstance(t, Tensor)})
     return Shade.apply(
         flat.verts, flat.colors, flat.uvs, flat.texels, camera.world_to_camera, camera.K, fixed, view, faces, points
     )

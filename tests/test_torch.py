@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from scenes import cube, front_camera, icosphere, one_triangle, smooth_adjoint, smooth_colors
@@ -15,7 +16,8 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad import reference
 from edgegrad._kernel import core
-from edgegrad.render import _kernel_camera, _kernel_scene
+from edgegrad._ops import Hits, kernel_camera, kernel_hits, kernel_scene
+from edgegrad._request import make_request, pack_camera
 from edgegrad.scene import flatten
 
 F32, F64 = torch.float32, torch.float64
@@ -89,8 +91,8 @@ def leaf(tensor: Tensor) -> Tensor:
 # -- operators --------------------------------------------------------------------------------------------------------
 
 
-def operator_inputs(scene: eg.Scene, spacing: tuple[float, ...] = (0, 2.0**-52)) -> tuple:
-    return (*flatten(scene), CAMERA.world_to_camera[None], CAMERA.K[None], True, SIZE, SIZE, 4, "box", 0, spacing)
+def operator_inputs(scene: eg.Scene) -> tuple:
+    return make_request(scene, CAMERA, 4, surface_samples=200, edge_samples=200, grad_seed=3).pack()
 
 
 SCENES = {"colors": lambda: TRIANGLE, "mixed": mixed_scene, "float32": lambda: TRIANGLE.to(F32)}
@@ -107,8 +109,7 @@ def test_opcheck_render(scene):
 def test_opcheck_render_backward(scene, wanted):
     inputs = operator_inputs(SCENES[scene]())
     image, *forward = torch.ops.edgegrad.render(*inputs)
-    gradient = (200, 200, 3, True, True, [w == "1" for w in wanted])
-    inputs = (ADJOINT[None].to(image.dtype), *forward, *inputs, *gradient)
+    inputs = (ADJOINT[None].to(image.dtype), *forward, *inputs, [w == "1" for w in wanted])
     torch.library.opcheck(torch.ops.edgegrad.render_backward.default, inputs)
 
 
@@ -805,14 +806,22 @@ def test_seeds():
 
 def sample_counts(surface: int, edge: int, adjoint: Tensor, boundary: bool = True) -> tuple[int, int]:
     """What the kernel says it drew for the triangle's vertices."""
-    scene = _kernel_scene(flatten(TRIANGLE), spacing=[0, 2.0**-52])
-    camera = _kernel_camera(CAMERA.world_to_camera, CAMERA.K, True, SIZE, SIZE)
     # All pixels covered by many samples, so that no budget binds; nothing is occluded.
-    coverage, depth = torch.ones(SIZE, SIZE, dtype=F64), torch.full((SIZE, SIZE), torch.inf)
-    hit = torch.zeros((SIZE, SIZE, 2), dtype=torch.int32)
-    view = coverage.numpy(), depth.numpy(), hit.numpy(), torch.ones(1, dtype=torch.uint8).numpy()
-    arrays = adjoint.contiguous().numpy(), *view, torch.zeros(3, 3, dtype=F64).numpy()
-    profile = scene.backward(camera, 1 << 20, surface, edge, "box", 0, 2, True, boundary, False, *arrays)
+    hits = Hits(
+        torch.ones(1, SIZE, SIZE, dtype=F64),
+        torch.full((1, SIZE, SIZE), torch.inf),
+        torch.zeros((1, SIZE, SIZE, 2), dtype=torch.int32),
+        torch.ones((1, 1), dtype=torch.uint8),
+    )
+    profile = kernel_scene(flatten(TRIANGLE)).backward(
+        kernel_camera(pack_camera(CAMERA)),
+        core.ImageOptions(spp=1 << 20, filter="box", seed=0),
+        core.GradientOptions(seed=0, surface_samples=surface, edge_samples=edge, boundary=boundary),
+        threads=2,
+        adjoint=adjoint.contiguous().numpy(),
+        hits=kernel_hits(hits),
+        gradients={"verts": np.zeros((3, 3))},
+    )
     return profile["surface_samples"], profile["edge_samples"]
 
 

@@ -16,11 +16,13 @@
 #include <thread>
 #include <vector>
 
-#include "../render.h"
+#include "backward/backward.h"
 
 using namespace edgegrad;
 
 namespace {
+
+const Spacing spacing{{0}, {1e-7}};
 
 constexpr int width = 96, height = 64, channels = 3, team_size = 4, rounds = 6;
 
@@ -95,7 +97,8 @@ struct Scene {
                 face_texture.data(),
                 background.data(),
                 true,
-                channels};
+                channels,
+                &spacing};
     }
 };
 
@@ -117,21 +120,20 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
     std::vector<int32_t> hit(2 * width * height);
     std::vector<uint8_t> seen(view.n_faces);
     GeometryWork work;
+    const HitBuffers<T> hits{coverage.data(), depth.data(), hit.data(), seen.data()};
+    const ImageOptions options{spp, Filter(filter), 1};
     {
         const auto geometry =
-            acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, {{0}, {1e-7}}, {}, team, work);
-        render_forward(view, camera, geometry->caster(), {spp, Filter(filter), 1}, team,
-                       ForwardOutput<T>{image.data(), coverage.data(), depth.data(), hit.data(), seen.data()});
+            acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, spacing, {}, team, work);
+        render_forward(view, camera, geometry->caster(), options, team, image.data(), hits);
     }
     std::vector<double> verts(scene.verts.size()), colors(scene.colors.size()), uvs(scene.uvs.size()),
         texels(scene.texels.size()), background(scene.background.size()), pose(16), K(9);
-    const SceneGrad grad{verts.data(),      colors.data(), uvs.data(), texels.data(),
+    const Gradients grad{verts.data(),      colors.data(), uvs.data(), texels.data(),
                          background.data(), pose.data(),   K.data()};
     const auto geometry =
-        acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, {{0}, {1e-7}}, {true, true}, team, work);
-    const BackwardOptions options{spp, -1, -1, Filter(filter), 2, true, true, {{0}, {1e-7}}, false};
-    render_backward(view, camera, *geometry, options, team, image.data(),
-                    ForwardView<T>{coverage.data(), depth.data(), hit.data(), seen.data()}, grad);
+        acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, spacing, {true, true}, team, work);
+    render_backward(BackwardInput<T>{view, camera, *geometry, options, image.data(), hits}, {.seed = 2}, team, grad);
     std::vector<double> all(image.begin(), image.end());
     for (const auto* values : {&verts, &colors, &uvs, &texels, &background, &pose, &K}) {
         const double size = std::inner_product(values->begin(), values->end(), values->begin(), 0.0);

@@ -6,10 +6,10 @@
 #include <type_traits>
 #include <vector>
 
-#include "../scatter.h"
-#include "../scene.h"
-#include "../surface.h"
-#include "texture.h"
+#include "contract/scatter.h"
+#include "scene/scene.h"
+#include "shading/surface.h"
+#include "shading/texture.h"
 
 namespace edgegrad {
 

@@ -4,7 +4,7 @@
 #include <cmath>
 #include <cstdint>
 
-#include "../math.h"
+#include "core/math.h"
 
 namespace edgegrad {
 

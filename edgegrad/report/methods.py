@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from .. import __version__
+from .._ops import backward_kernel, forward_kernel
+from .._request import make_request
 from ..camera import Camera
 from ..mesh import Mesh
-from ..render import backward_kernel, forward_kernel, render, render_arguments
+from ..render import render
 from ..scene import Scene
 from . import mitsuba
 from .scenes import ReportScene
@@ -84,11 +86,9 @@ def differentiate(scene: ReportScene, **options: object) -> tuple[Tensor, float,
 
 def default_samples(scene: Scene | Mesh, camera: Camera, adjoint: Tensor) -> tuple[int, int]:
     """How many surface and edge samples the kernel takes when it is not told, for the gradient of the vertices."""
-    arguments = render_arguments(scene, camera, FORWARD_SPP)
-    _, view, _ = forward_kernel(*arguments)
-    wanted = [True] + [False] * 6  # the vertices alone
-    adjoint = adjoint.to(view.coverage.dtype)[None]
-    _, (profile,) = backward_kernel(adjoint, view, *arguments, wanted)
+    request = make_request(scene, camera, FORWARD_SPP)
+    _, hits, _ = forward_kernel(request)
+    _, (profile,) = backward_kernel(adjoint.to(hits.coverage.dtype)[None], hits, request, ["verts"])
     return int(profile["surface_samples"]), int(profile["edge_samples"])
 
 

@@ -1,0 +1,53 @@
+// The gradient of a loss of the image.
+#pragma once
+
+#include <cstdint>
+
+#include "forward/forward.h"
+#include "scene/geometry.h"
+#include "scene/gradients.h"
+
+namespace edgegrad {
+
+struct GradientOptions {
+    int64_t surface_samples = -1;  // in all; −1: the default (surface_measure.cpp)
+    int64_t edge_samples = -1;     // in all; −1: the default (curve_measure.cpp)
+    uint64_t seed = 0;
+    bool interior_geometry = true;  // whether the colours vary over faces, so that moving them shows inside
+    bool boundary = true;
+    bool dry = false;   // only count the samples
+    int pixel_spp = 0;  // if not zero, all of the interior term from so many samples a pixel, for the benchmarks
+};
+
+// What a backward pass did, and the seconds that each part took.
+struct BackwardProfile {
+    int64_t surface_samples = 0, edge_samples = 0;
+    int64_t surface_wanted = 0, edge_wanted = 0;   // default samples before the budget (budget.h)
+    int64_t silhouettes = 0, creases = 0;          // curves in view
+    double view = 0;                               // vertices in camera coordinates, where the loss looks
+    double measure = 0, curves = 0;                // triangles and curves laid end to end
+    double surface[2] = {0, 0}, edge[2] = {0, 0};  // samples with their rays; adding what they found
+    double world = 0;                              // from camera coordinates to the user's arrays
+};
+
+// What a gradient is taken of.
+template <class T>
+struct BackwardInput {
+    const SceneView<T>& scene;
+    const Camera& camera;
+    const Geometry& geometry;
+    const ImageOptions& image;  // of the image that was made
+    const T* adjoint;           // ∂loss/∂image (H, W, C)
+    HitBuffers<T> hits;         // of that image
+};
+
+// Adds the gradient to what `grad` points to.
+template <class T>
+BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOptions& options, Team& team,
+                                const Gradients& grad);
+
+// q = R p + t, backwards: p̄ = Rᵀ q̄, R̄ = Σ q̄ pᵀ, t̄ = Σ q̄, for q_bar (V, 3).
+void add_world(const Camera& camera, const double* verts, const Array<double>& q_bar, Team& team,
+               const Gradients& grad);
+
+}  // namespace edgegrad

@@ -1,0 +1,79 @@
+// What both terms of the backward pass look at, and what they ask of a face in double.
+#pragma once
+
+#include <algorithm>
+#include <array>
+
+#include "backward/backward.h"
+#include "backward/image_hits.h"
+#include "backward/occlusion.h"
+#include "camera/vertices.h"
+#include "contract/scatter.h"
+#include "film/importance.h"
+#include "shading/surface.h"
+
+namespace edgegrad {
+
+// What both terms of the backward pass look at.
+template <class T>
+struct BackwardView {
+    const SceneView<T>& scene;
+    const Camera& camera;
+    const Geometry& geometry;
+    const ViewVolume& volume;
+    const VertexView& vertices;
+    const FilteredAdjoint<T>& adjoint;
+    const Importance& importance;
+    const ImageOptions& image;  // of the image that was made
+    const GradientOptions& options;
+    Team& team;
+    Scatter& scatter;
+    const RayFrame& frame;
+    const OcclusionHint& occlusion;
+    const ImageHits* hits;           // null where neither term asks
+    const uint8_t* seen;             // (F,): 0, or the side from which the forward pass hit the face
+    const int32_t* hit;              // (H, W, 2): the first and the last of the faces hit in each pixel
+    const Array<T>& vertex_adjoint;  // (V, C): Ã at the vertices of faces that were hit (vertex_image.h)
+};
+
+template <class T>
+std::array<Vec3, 3> corners_of(const BackwardView<T>& view, int64_t face) {
+    const int32_t* v = view.scene.faces + 3 * face;
+    const auto& q = view.vertices.q;
+    return {q[v[0]], q[v[1]], q[v[2]]};
+}
+
+template <class T>
+uint8_t side_of(const BackwardView<T>& view, int64_t face) {
+    const auto q = corners_of(view, face);
+    return view.camera.side(q[0], q[1], q[2]);
+}
+
+// Whether the ray at n meets a face, decided in double.
+template <class T>
+bool meets(const BackwardView<T>& view, int64_t face, Vec2 n) {
+    const auto corner = corners_of(view, face);
+    return covers(face_map(view.camera, corner.data()), n) &&
+           !(view.camera.perspective && passes_through_eye(corner.data()));
+}
+
+// The depth at which the ray at n meets a face.
+template <class T>
+double depth_of(const BackwardView<T>& view, int64_t face, Vec2 n) {
+    const auto corner = corners_of(view, face);
+    const Barycentrics b = barycentrics_of_hit(face_map(view.camera, corner.data()), n);
+    return b[0] * corner[0].z + b[1] * corner[1].z + b[2] * corner[2].z;
+}
+
+// Whether a face lies before a depth by several times its size. If a ray that float says to meet it misses it after
+// all, then mostly because it meets a neighbour, and one that passed through the face might slip past that neighbour
+// too; so there float decides, as it did for the image.
+template <class T>
+bool lies_far_before(const BackwardView<T>& view, int64_t face, double depth) {
+    const auto q = corners_of(view, face);
+    const double gap = depth - std::max({q[0].z, q[1].z, q[2].z});
+    const Vec3 a = q[1] - q[0], b = q[2] - q[1], c = q[0] - q[2];
+    return gap > 0 && gap * gap > 16 * std::max({dot(a, a), dot(b, b), dot(c, c)});
+}
+
+}  // namespace edgegrad

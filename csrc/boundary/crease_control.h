@@ -1,0 +1,162 @@
+// A control variate for creases, as control.h is one for faces: what a crease would give if all of it were visible.
+//
+// Its radiance is known on both sides, so with τ = x_b − x_a, the jump ΔL = L₋ − L₊, affine between the ends, and φ_a =
+// 1 − s, φ_b = s the boundary term would be
+//
+//     Σ_k δx_k ∧ τ ∫ Ã(x(s)) · ΔL(s) φ_k(s) ds,   k in {a, b}.
+//
+// Between the lines where the pixel filter begins and ends, Ã is a constant (box) or a quadratic of s (tent), so
+// Gauss's rule gives the integral exactly; of a Gaussian the quadratic through three points of each piece serves. That
+// is added for all such creases, and its integrand taken away at each sample, so that nothing is biased; samples find
+// only where the crease is occluded after all.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "backward/view.h"
+#include "boundary/curve.h"
+
+namespace edgegrad {
+
+// Rows of the colours on both sides of a crease at its ends.
+template <class T>
+struct CreaseColors {
+    const T *minus[2], *plus[2];
+
+    CreaseColors(const SceneView<T>& scene, const Curve& c) {
+        const auto row = [&](const HalfEdge& h, int corner) {
+            return scene.colors + int64_t(scene.corners[3 * int64_t(h.face) + corner]) * scene.channels;
+        };
+        minus[0] = row(c.minus, c.minus.first()), minus[1] = row(c.minus, c.minus.second());
+        plus[0] = row(c.plus, c.plus.first()), plus[1] = row(c.plus, c.plus.second());
+    }
+    double jump(int end, int channel) const { return double(minus[end][channel]) - plus[end][channel]; }
+    double size(int end, int channels) const {
+        double sum = 0;
+        for (int c = 0; c < channels; ++c) sum += std::fabs(jump(end, c));
+        return sum;
+    }
+};
+
+template <class T>
+bool joins_colors(const SceneView<T>& scene, const Curve& c) {
+    return c.is_crease() && !is_textured(scene, c.minus.face) && !is_textured(scene, c.plus.face);
+}
+
+template <int N, class T>
+class CreaseControl {
+   public:
+    explicit CreaseControl(const BackwardView<T>& view) : view_(view), C_(N ? N : view.scene.channels), A_(C_) {}
+
+    // Begins with a curve; false where there is no control.
+    bool set(const Curve& curve) {
+        const SceneView<T>& scene = view_.scene;
+        if (!joins_colors(scene, curve) || curve.t0 > 0 || curve.t1 < 1) return false;
+        // A crease that comes near the eye does not move in the image as its ends do.
+        bend_ = std::fabs(curve.w1 - curve.w0) / (curve.w0 + curve.w1);
+        if (!(bend_ < 1.0 / 3)) return false;
+        curve_ = &curve, tangent_ = curve.tangent();
+        for (int k = 0; k < 2; ++k) {
+            vertex_[0][k] = vertex(scene, curve.minus, k ? curve.minus.second() : curve.minus.first());
+            vertex_[1][k] = vertex(scene, curve.plus, k ? curve.plus.second() : curve.plus.first());
+        }
+        at_a_ = at_b_ = 0;
+        return true;
+    }
+
+    // What its density is multiplied by, if a short crease gets `least`.
+    double density(double least) const { return std::clamp(std::max(curve_->length / wide, bend_), least, 1.0); }
+
+    void add_integral() {
+        const CreaseColors<T> colors(view_.scene, *curve_);
+        // Gauss-Legendre with three points, exact up to degree 5.
+        constexpr double node[3] = {-0.7745966692414834, 0, 0.7745966692414834},
+                         weight[3] = {5. / 18, 8. / 18, 5. / 18};
+        for (double begin = 0; begin < 1;) {
+            const double end = end_of_piece(begin);
+            const Piece piece(*this, begin, end, colors);
+            for (int j = 0; j < 3; ++j) {
+                const double s = 0.5 * ((begin + end) + node[j] * (end - begin));
+                const double value = weight[j] * (end - begin) * piece.at(s);
+                at_a_ += (1 - s) * value, at_b_ += s * value;
+            }
+            begin = end;
+        }
+    }
+
+    // At the fraction s of the curve, of a sample with this weight.
+    void subtract(double s, double weight) {
+        const CreaseColors<T> colors(view_.scene, *curve_);
+        double begin = 0, end = end_of_piece(0);
+        while (end < s) begin = end, end = end_of_piece(begin);
+        const double value = weight * Piece(*this, begin, end, colors).at(s);
+        at_a_ -= (1 - s) * value, at_b_ -= s * value;
+    }
+
+    // The cotangents of the places of the ends, half to each face's own vertices.
+    void flush(RowBuffer& x) {
+        for (int k = 0; k < 2; ++k) {
+            const bool copies = vertex_[0][k] != vertex_[1][k];
+            const double value = (copies ? 0.5 : 1) * (k ? at_b_ : at_a_);
+            const Vec2 x_bar{value * tangent_.y, -value * tangent_.x};
+            for (int side = 0; side < (copies ? 2 : 1); ++side) x.template add<2>(vertex_[side][k], &x_bar.x);
+        }
+    }
+
+   private:
+    // Ã · ΔL between two lines of the filter: Ã by its values at the ends and in the middle, constant for a box.
+    class Piece {
+       public:
+        Piece(CreaseControl& control, double begin, double end, const CreaseColors<T>& colors)
+            : middle_(0.5 * (begin + end)), half_(0.5 * (end - begin)) {
+            const bool box = control.view_.image.filter.is_box();
+            for (int k = box ? 1 : 0; k < (box ? 2 : 3); ++k) {
+                control.view_.adjoint.template at<N>(control.curve_->position(middle_ + (k - 1) * half_),
+                                                     control.A_.data());
+                for (int c = 0; c < control.C_; ++c)
+                    a_[k] += control.A_[c] * colors.jump(0, c), b_[k] += control.A_[c] * colors.jump(1, c);
+            }
+            if (box) a_[0] = a_[2] = a_[1], b_[0] = b_[2] = b_[1];
+        }
+        double at(double s) const {
+            const double r = half_ > 0 ? (s - middle_) / half_ : 0, low = 0.5 * r * (r - 1), high = 0.5 * r * (r + 1);
+            const double a = low * a_[0] + (1 - r * r) * a_[1] + high * a_[2];
+            const double b = low * b_[0] + (1 - r * r) * b_[1] + high * b_[2];
+            return (1 - s) * a + s * b;
+        }
+
+       private:
+        double middle_, half_, a_[3] = {}, b_[3] = {};  // Ã times the jump at either end of the curve
+    };
+
+    // Where the piece that begins at s ends: at the next line of the filter, the border of a pixel for a box, the
+    // middle of one else; or at 1.
+    double end_of_piece(double s) const {
+        const double shift = view_.image.filter.is_box() ? 0 : 0.5;
+        double end = 1;
+        const auto meet = [&](double origin, double along) {
+            if (along == 0) return;
+            // The next line lies at least a millionth of the curve ahead, for s may be rounded to before the last one.
+            const double here = origin + (s + 1e-6) * along - shift;
+            const double line = along > 0 ? std::floor(here) + 1 : std::ceil(here) - 1;
+            end = std::min(end, (line + shift - origin) / along);
+        };
+        meet(curve_->x0.x, tangent_.x), meet(curve_->x0.y, tangent_.y);
+        return std::max(end, s + 1e-6);
+    }
+
+    static constexpr double wide = 1024;  // px, from which length on a crease gets all samples
+
+    const BackwardView<T>& view_;
+    const int C_;
+    const Curve* curve_ = nullptr;
+    Vec2 tangent_;
+    double bend_ = 0;
+    int32_t vertex_[2][2];  // of minus and plus; a and b
+    double at_a_ = 0, at_b_ = 0;
+    std::vector<double> A_;
+};
+
+}  // namespace edgegrad

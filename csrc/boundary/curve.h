@@ -1,0 +1,244 @@
+// Where the image jumps along an edge: silhouettes, open borders and creases, for any number of faces on the edge.
+//
+// On each side of the edge in the image, what is seen next to it is the incident face on that side that lies in front,
+// or, if there is none, what lies behind. If both sides carry the same radiance by construction, there is no curve.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <vector>
+
+#include "backward/view.h"
+#include "scene/topology.h"
+#include "shading/shade.h"
+
+namespace edgegrad {
+
+struct Curve {
+    int64_t edge = -1;
+    HalfEdge minus, plus;   // the faces next to the curve; face −1: none, what lies behind is seen
+    Vec3 a, b;              // ends of the edge, camera coordinates
+    double t0 = 0, t1 = 0;  // its part within the view
+    double w0 = 1, w1 = 1;  // denominators of the projection at t0 and t1
+    Vec2 x0, x1;            // their pixel positions
+    double length = 0;      // px
+    double rounding = 0;    // px, of the positions
+
+    bool is_crease() const { return minus.face >= 0 && plus.face >= 0; }
+
+    Vec2 low() const { return {std::min(x0.x, x1.x), std::min(x0.y, x1.y)}; }  // of its box
+    Vec2 high() const { return {std::max(x0.x, x1.x), std::max(x0.y, x1.y)}; }
+    double nearest_depth() const { return std::min((1 - t0) * a.z + t0 * b.z, (1 - t1) * a.z + t1 * b.z); }
+
+    Vec2 tangent() const { return x1 - x0; }  // dx/ds, the same everywhere: a pinhole sees a straight line
+
+    // At the fraction s of the curve in the image: the pixel position, and t on the edge (1 − t) a + t b.
+    Vec2 position(double s) const { return x0 + s * (x1 - x0); }
+    double parameter(double s) const { return t0 + (t1 - t0) * (s * w0 / ((1 - s) * w1 + s * w0)); }
+};
+
+// Barycentrics, in a face, of the point t of an edge of that face. Exact: the face is known, nothing is intersected.
+inline Barycentrics at_edge(const HalfEdge& h, double t) {
+    double b[3] = {0, 0, 0};
+    b[h.first()] = 1 - t, b[h.second()] = t;
+    return {b[1], b[2]};
+}
+
+template <class T>
+int32_t vertex(const SceneView<T>& scene, const HalfEdge& h, int corner) {
+    return scene.faces[3 * int64_t(h.face) + corner];
+}
+
+// Whether, of two faces on the same side of the edge (a, b) in the image, the first lies in front. Then its plane
+// separates the other one from the viewer.
+template <class T>
+bool in_front(const BackwardView<T>& view, const HalfEdge& first, const HalfEdge& second, Vec3 a, Vec3 b) {
+    const auto opposite = [&](const HalfEdge& h) { return view.vertices.q[vertex(view.scene, h, (h.corner + 2) % 3)]; };
+    const Vec3 normal = cross(b - a, opposite(first) - a);
+    const double viewer = -dot(normal, view.camera.view_direction(a)), other = dot(normal, opposite(second) - a);
+    return other == 0 || (viewer > 0) != (other > 0);
+}
+
+// Whether two faces may differ in radiance along the edge they share: their values at its ends are compared.
+template <class T>
+bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
+    const bool textured = is_textured(scene, m.face);
+    if (textured != is_textured(scene, p.face)) return true;
+    if (textured && scene.face_texture[m.face] != scene.face_texture[p.face]) return true;
+    const auto row = [&](const HalfEdge& h, int corner) {
+        return int64_t(scene.corners[3 * int64_t(h.face) + corner]);
+    };
+    const int64_t ends[2][2] = {{row(m, m.first()), row(p, p.first())}, {row(m, m.second()), row(p, p.second())}};
+    for (const auto& [i, j] : ends) {
+        if (i == j) continue;
+        if (textured && !std::equal(scene.uvs + 2 * i, scene.uvs + 2 * i + 2, scene.uvs + 2 * j)) return true;
+        const int C = scene.channels;
+        if (!textured && !std::equal(scene.colors + C * i, scene.colors + C * (i + 1), scene.colors + C * j))
+            return true;
+    }
+    return false;
+}
+
+// Whether neighbouring faces may differ in radiance at their common edge. Attributes that are indexed like the vertices
+// are the same on both sides of an edge, unless it joins copies.
+template <class T>
+bool may_jump(const SceneView<T>& scene, const Topology& topology) {
+    return scene.corners != scene.faces || topology.welds();
+}
+
+// A face that turns clockwise in the image (x right, y down) lies to the right of its sides, where the normal
+// (τ_y, −τ_x) does not point. One seen exactly edge-on covers nothing. > 0: the side of minus, < 0: of plus.
+inline int side_of(const HalfEdge& h, const Array<int8_t>& facing) {
+    return h.backwards ? -facing[h.face] : facing[h.face];
+}
+
+// The orientation of each face in the image, Camera::facing (F,).
+template <class T>
+Array<int8_t> facing_of_faces(const BackwardView<T>& view) {
+    Array<int8_t> facing(view.scene.n_faces);
+    view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t f = first; f < last; ++f) {
+            const auto q = corners_of(view, f);
+            facing[f] = int8_t(view.camera.facing(q[0], q[1], q[2]));
+        }
+    });
+    return facing;
+}
+
+// Finds the curves of one view.
+template <class T>
+class CurveFinder {
+   public:
+    // `facing` (F,): see facing_of_faces.
+    CurveFinder(const BackwardView<T>& view, Array<int8_t> facing)
+        : view_(view), facing_(std::move(facing)), jumps_(may_jump(view.scene, view.geometry.topology())) {}
+
+    bool finds_creases() const { return jumps_; }
+
+    // On which side of its edge a face lies in the image; see side_of.
+    int turn_of(const HalfEdge& h) const { return side_of(h, facing_); }
+
+    // Calls body(edge) for those of the edges first … last − 1 that may have a curve, or one that is no crease. Most
+    // have one face on each side; with no jump there is then nothing more to look at, and little of memory is read for
+    // them.
+    template <class Body>
+    void each(int64_t first, int64_t last, bool creases, Body body) const {
+        const Topology& topology = view_.geometry.topology();
+        const int8_t* const facing = facing_.data();
+        const bool jumps = creases && jumps_;
+        const int32_t* face = topology.faces(first).data();
+        std::vector<int64_t> edges;
+        for (int64_t e = first; e < last; ++e) {
+            if (topology.joins_two(e)) [[likely]] {
+                const bool through = facing[face[0]] * facing[face[1]] > 0;
+                face += 2;
+                if (through && !(jumps && carries_jump(e))) [[likely]]
+                    continue;
+            } else {
+                face += topology.faces(e).size();
+            }
+            edges.push_back(e);
+            topology.prefetch(e);
+        }
+        // What is asked of memory some edges ahead is there when it is wanted.
+        constexpr size_t ahead = 4;
+        for (size_t i = 0; i < edges.size(); ++i) {
+            if (i + 2 * ahead < edges.size()) prefetch_face(edges[i + 2 * ahead]);
+            if (i + ahead < edges.size()) prefetch_vertices(edges[i + ahead]);
+            body(edges[i]);
+        }
+    }
+
+    // The curve of an edge; false when there is none.
+    bool find(int64_t edge, Curve& c) const {
+        const auto halves = view_.geometry.topology().half_edges(edge);
+        // As in each().
+        if (!jumps_ && halves.size() == 2 && side_of(halves[0], facing_) * side_of(halves[1], facing_) < 0)
+            return false;
+        const int32_t va = vertex(view_.scene, halves[0], halves[0].first()),
+                      vb = vertex(view_.scene, halves[0], halves[0].second());
+        const VertexView& p = view_.vertices;
+        if (p.outcode[va] & p.outcode[vb]) return false;
+        c.a = p.q[va], c.b = p.q[vb];
+
+        HalfEdge side[2];  // minus, plus
+        side[0].face = side[1].face = -1;
+        for (const HalfEdge& h : halves) {
+            const int turn = side_of(h, facing_);
+            if (turn == 0) continue;
+            HalfEdge& seen = side[turn > 0 ? 0 : 1];
+            if (seen.face < 0 || !in_front(view_, seen, h, c.a, c.b)) seen = h;
+        }
+        if (side[0].face < 0 && side[1].face < 0) return false;
+        if (side[0].face >= 0 && side[1].face >= 0 &&
+            !(jumps_ && edgegrad::carries_jump(view_.scene, side[0], side[1])))
+            return false;
+
+        const Camera& camera = view_.camera;
+        if (!(p.outcode[va] | p.outcode[vb])) {
+            c.t0 = 0, c.t1 = 1;
+            c.x0 = p.x[va], c.x1 = p.x[vb];
+            c.w0 = camera.depth_weight(c.a), c.w1 = camera.depth_weight(c.b);
+        } else {
+            if (!view_.volume.clip_segment(c.a, c.b, c.t0, c.t1)) return false;
+            const Vec3 q0 = (1 - c.t0) * c.a + c.t0 * c.b, q1 = (1 - c.t1) * c.a + c.t1 * c.b;
+            c.w0 = camera.depth_weight(q0), c.w1 = camera.depth_weight(q1);
+            if (!(c.w0 > 0 && c.w1 > 0)) return false;  // ends in the eye itself
+            c.x0 = view_.volume.inside(project(camera, q0)), c.x1 = view_.volume.inside(project(camera, q1));
+        }
+        c.edge = edge, c.minus = side[0], c.plus = side[1];
+        c.length = length(c.tangent());
+        c.rounding = rounding(c, va, vb);
+        return c.length > 0 && c.rounding < most_rounding;
+    }
+
+   private:
+    void prefetch_face(int64_t edge) const {
+        prefetch(view_.scene.faces + 3 * int64_t(view_.geometry.topology().half_edges(edge)[0].face));
+    }
+    void prefetch_vertices(int64_t edge) const {
+        const HalfEdge& h = view_.geometry.topology().half_edges(edge)[0];
+        const VertexView& p = view_.vertices;
+        for (const int corner : {h.first(), h.second()}) {
+            const int32_t v = vertex(view_.scene, h, corner);
+            prefetch(&p.q[v]), prefetch(&p.x[v]), prefetch(&p.outcode[v]), prefetch(view_.scene.verts + 3 * int64_t(v));
+        }
+    }
+
+    bool carries_jump(int64_t edge) const {
+        const auto halves = view_.geometry.topology().half_edges(edge);
+        return edgegrad::carries_jump(view_.scene, halves[0], halves[1]);
+    }
+
+    // Of the pixel positions, px: an edge that is so long, or so far away, that doubles do not say where it runs in the
+    // image has no curve there. The bound is a generous one.
+    static constexpr double most_rounding = 16;
+
+    // Of the pixel positions of a curve that ends at these vertices, px. A sum q = R p + t is rounded as its terms are
+    // large, axis by axis: an orthographic camera far away loses depth, not place. In perspective, X / Z is rounded
+    // with X, and with Z as large as it is itself.
+    double rounding(const Curve& c, int32_t va, int32_t vb) const {
+        const Camera& camera = view_.camera;
+        double p[3] = {};
+        for (const int32_t v : {va, vb})
+            for (int i = 0; i < 3; ++i) p[i] = std::max(p[i], std::fabs(view_.scene.verts[3 * int64_t(v) + i]));
+        const auto terms = [&](int row, double t) {
+            const Vec3 r = camera.R.row[row];
+            return std::fabs(r.x) * p[0] + std::fabs(r.y) * p[1] + std::fabs(r.z) * p[2] + std::fabs(t);
+        };
+        const double w = std::min(c.w0, c.w1), across = std::max(terms(0, camera.t.x), terms(1, camera.t.y)),
+                     depth = camera.perspective ? terms(2, camera.t.z) / w : 1;
+        const double pixels = std::fabs(camera.k[2]) + std::fabs(camera.k[5]) + std::fabs(c.x0.x) + std::fabs(c.x0.y) +
+                              std::fabs(c.x1.x) + std::fabs(c.x1.y);
+        return 32 * std::numeric_limits<double>::epsilon() *
+               (camera.pixels_per_unit / w * across + std::max(1.0, depth) * pixels);
+    }
+
+    const BackwardView<T>& view_;
+    Array<int8_t> facing_;  // orientation of each face in the image
+    const bool jumps_;      // false: neighbouring faces are known to carry the same radiance at their edge
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,255 @@
+#include "boundary/curve_measure.h"
+
+#include <algorithm>
+#include <cmath>
+#include <optional>
+
+#include "boundary/crease_control.h"
+#include "boundary/crease_visibility.h"
+#include "core/channels.h"
+
+namespace edgegrad {
+
+namespace {
+
+// Default samples a pixel of curve; see surface_measure.cpp.
+constexpr double samples_per_pixel = 24;
+
+// How few samples a silhouette gets if it lies behind what the image hit (occlusion.h). Never none, for it may be
+// visible all the same; a gap may run along it, so that fewer rays than elsewhere find it. What was merely not hit
+// counts in full: at the limb of a fine mesh the faces beside a silhouette are a hundredth of a pixel wide and hit by
+// chance. Of creases more is known: crease_visibility.h.
+constexpr OcclusionHint::Few occluded{.rays = 8, .share = 1.0 / 256, .least = 1.0 / 16};
+
+// How far, in pixels, a ray may miss the points of a curve. A hundredth where it would be more: by then the image shows
+// floats, not faces.
+template <class T>
+double reach_of_rays(const BackwardView<T>& view, const Curve& c) {
+    double error = 0;
+    const HalfEdge& h = c.minus.face >= 0 ? c.minus : c.plus;
+    for (const int corner : {h.first(), h.second()}) {
+        const double* p = view.scene.verts + 3 * int64_t(vertex(view.scene, h, corner));
+        error = std::max(error, view.frame.error({p[0], p[1], p[2]}));
+    }
+    return std::max(c.rounding,
+                    std::min(view.camera.pixels_per_unit / std::min(c.w0, c.w1) * error, Crossings::float_reach));
+}
+
+// Mean of Σ_c |L| over all colours: the size of a jump of which nothing is known.
+template <class T>
+double mean_radiance(const SceneView<T>& scene, Team& team) {
+    std::vector<double> sum(Team::blocks(scene.n_colors), 0.0);
+    team.each_block(scene.n_colors, [&](int64_t k, int64_t first, int64_t last) {
+        for (int64_t i = first * scene.channels; i < last * scene.channels; ++i) sum[k] += std::fabs(scene.colors[i]);
+    });
+    double all = 0;
+    for (const double s : sum) all += s;
+    return scene.n_colors ? all / double(scene.n_colors) : 0;
+}
+
+template <class T>
+ImageSegment image_segment(const BackwardView<T>& view, const Curve& c, int64_t curve) {
+    return {.edge = int32_t(c.edge),
+            .curve = int32_t(curve),
+            .a = c.x0,
+            .b = c.x1,
+            .reach = reach_of_rays(view, c),
+            .rounding = c.rounding,
+            .depth = c.nearest_depth()};
+}
+
+// What tells of creases without a sample.
+struct CreaseHints {
+    Crossings crossings;
+    MeetingParts meeting;
+};
+
+// The curves of one chunk of edges.
+template <int N, class T>
+class MeasuredEdges {
+    using Relation = Crossings::Relation;
+
+   public:
+    // `hints`, and `x`, where controls go: null if there are no controls.
+    MeasuredEdges(const BackwardView<T>& view, const CurveFinder<T>& finder, double radiance, const CreaseHints* hints,
+                  RowBuffer* x)
+        : view_(view), finder_(finder), radiance_(radiance), x_(x), control_(view) {
+        if (hints) visibility_.emplace(view, hints->crossings, hints->meeting);
+    }
+
+    CurvesFound found;
+    std::vector<MeasuredCurve> curves;
+    std::vector<ImageSegment> segments;
+
+    void add(int64_t first, int64_t last) {
+        finder_.each(first, last, finder_.finds_creases(), [&](int64_t e) {
+            Curve c;
+            if (!finder_.find(e, c)) return;
+            ++(c.is_crease() ? found.creases : found.silhouettes);
+            const Vec2 low = c.low(), high = c.high();
+            const Jump jump{int64_t(curves.size()), size_of_jump(c), view_.importance.mean(low, high)};
+            if (!(jump.importance > 0) || !std::isfinite(c.length)) return;
+            curves.push_back({.edge = int32_t(e)});
+            const int64_t hiding = hiding_pixels(c, low, high);
+            if (c.is_crease() && visibility_) {
+                add_crease(c, jump, hiding);
+            } else {
+                segments.push_back(image_segment(view_, c, jump.curve));
+                measure(c, jump, hiding ? view_.occlusion.factor(occluded, hiding, view_.image.spp) : 1);
+            }
+        });
+        answer();
+    }
+
+   private:
+    // What a curve's measure is made of besides its length: how large the jump and the adjoint are.
+    struct Jump {
+        int64_t curve;  // in `curves`
+        double size, importance;
+    };
+
+    void measure(const Curve& c, const Jump& jump, double samples) {
+        const double pixels = c.length * jump.size * samples;
+        curves[jump.curve].measure = pixels * jump.importance;
+        found.pixels += pixels;
+    }
+
+    // In how many pixels a curve is behind all that was hit; 0: not in all of them.
+    int64_t hiding_pixels(const Curve& c, Vec2 low, Vec2 high) const {
+        const bool small = std::max(high.x - low.x, high.y - low.y) <= 2 * OcclusionHint::reach;
+        if (small && view_.occlusion.hides_around(0.5 * (low + high), c.nearest_depth()))
+            return OcclusionHint::pixels_around;
+        return view_.occlusion.hiding_pixels(low, high, c.nearest_depth());
+    }
+
+    void add_crease(const Curve& c, const Jump& jump, int64_t hiding) {
+        const Relation relation = visibility_->relation(c);
+        segments.push_back(image_segment(view_, c, jump.curve));
+        if (hiding) return measure(c, jump, visibility_->hidden(relation, hiding).samples);
+        const bool controls = control_.set(c);
+        if (const auto expected = visibility_->without_rays(c, controls ? relation : Relation::across)) {
+            if (controls) expect(c, jump, *expected);
+            else measure(c, jump, expected->samples);
+            return;
+        }
+        asked_[visibility_->ask(c, relation)] = jump;
+        if (visibility_->full()) answer();
+    }
+
+    void answer() {
+        if (!visibility_) return;
+        visibility_->answer([&](int k, const Curve& c, Expected expected) {
+            control_.set(c);
+            expect(c, asked_[k], expected);
+        });
+    }
+
+    void expect(const Curve& c, const Jump& jump, Expected expected) {
+        if (expected.visible) {
+            curves[jump.curve].controlled = true;
+            control_.add_integral();
+            control_.flush(*x_);
+        }
+        measure(c, jump, control_.density(expected.samples));
+    }
+
+    // Relative to a jump of the size of the mean radiance, which is taken where nothing is known.
+    double size_of_jump(const Curve& c) {
+        if (!joins_colors(view_.scene, c)) return 1;
+        const CreaseColors<T> colors(view_.scene, c);
+        const int C = view_.scene.channels;
+        return std::min(0.5 * (colors.size(0, C) + colors.size(1, C)) / radiance_, largest);
+    }
+
+    static constexpr double largest = 2;  // so that a bright face among dark ones does not take all samples
+    const BackwardView<T>& view_;
+    const CurveFinder<T>& finder_;
+    const double radiance_;
+    RowBuffer* x_;
+    CreaseControl<N, T> control_;
+    std::optional<CreaseVisibility<T>> visibility_;
+    Jump asked_[CreaseVisibility<T>::most];
+};
+
+// Silhouettes and borders.
+template <class T>
+std::vector<std::vector<ImageSegment>> silhouettes(const BackwardView<T>& view, const CurveFinder<T>& finder) {
+    const int64_t E = view.geometry.topology().n_edges();
+    std::vector<std::vector<ImageSegment>> parts(Team::blocks(E));
+    view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) {
+        finder.each(first, last, false, [&](int64_t e) {
+            Curve c;
+            if (finder.find(e, c) && !c.is_crease() && std::isfinite(c.length))
+                parts[k].push_back(image_segment(view, c, 0));
+        });
+    });
+    return parts;
+}
+
+}  // namespace
+
+template <class T>
+Curves<T>::Curves(const BackwardView<T>& view, Array<int8_t> facing)
+    : finder(view, std::move(facing)),
+      x_bar(zeros(view.hits && finder.finds_creases() && !view.options.dry ? 2 * view.scene.n_verts : 0, view.team)) {}
+
+template <class T>
+int64_t Curves<T>::wanted(int64_t given) const {
+    if (!(pixels > 0)) return 0;
+    return given >= 0 ? given : int64_t(std::ceil(samples_per_pixel * pixels));
+}
+
+template <int N, class T>
+Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing) {
+    Curves<T> out(view, std::move(facing));
+    const int64_t E = view.geometry.topology().n_edges();
+    const double radiance = out.finder.finds_creases() ? mean_radiance(view.scene, view.team) : 0;
+    const int width = view.camera.width, height = view.camera.height;
+    std::optional<CreaseHints> hints;
+    if (!out.x_bar.empty())
+        hints.emplace(Crossings(silhouettes(view, out.finder), width, height, view.team),
+                      MeetingParts(view.hit, view.scene.faces, view.geometry.parts(), width, height, view.team));
+    std::vector<CurvesFound> found;
+    std::vector<std::vector<MeasuredCurve>> curves;
+    const auto measure = [&](int64_t k, int64_t first, int64_t last, RowBuffer* x) {
+        MeasuredEdges<N, T> part(view, out.finder, radiance, hints ? &*hints : nullptr, x);
+        part.add(first, last);
+        found[k] = part.found, curves[k] = std::move(part.curves), out.segments[k] = std::move(part.segments);
+    };
+    const auto resize = [&](int64_t n) { found.resize(n), curves.resize(n), out.segments.resize(n); };
+    if (out.x_bar.empty()) {
+        resize(Team::blocks(E));
+        view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) { measure(k, first, last, nullptr); });
+    } else {
+        resize((E + scatter_chunk - 1) / scatter_chunk);
+        Destination whole;
+        whole.x = out.x_bar.data();
+        double seconds[2] = {};
+        view.scatter.add(E, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+            measure(first / scatter_chunk, first, last, &grad.x);
+        });
+    }
+    for (const CurvesFound& f : found)
+        out.pixels += f.pixels, out.silhouettes += f.silhouettes, out.creases += f.creases;
+    int64_t n = 0;
+    for (const auto& part : curves) n += int64_t(part.size());
+    out.curve.reserve(n), out.measure = Array<double>(n);
+    for (size_t k = 0; k < curves.size(); ++k) {
+        for (ImageSegment& s : out.segments[k]) s.curve += int32_t(out.curve.size());
+        for (const MeasuredCurve& c : curves[k])
+            out.measure[int64_t(out.curve.size())] = c.measure, out.curve.push_back(c);
+    }
+    return out;
+}
+
+// clang-format off
+#define EDGEGRAD_INSTANTIATE(N) \
+    template Curves<float> measure_curves<N>(const BackwardView<float>&, Array<int8_t>); \
+    template Curves<double> measure_curves<N>(const BackwardView<double>&, Array<int8_t>);
+EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
+#undef EDGEGRAD_INSTANTIATE
+template struct Curves<float>;
+template struct Curves<double>;
+// clang-format on
+
+}  // namespace edgegrad

@@ -1,0 +1,107 @@
+// The part of a face that is inside the view, and points on it.
+#pragma once
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+
+#include "camera/view_volume.h"
+#include "core/sierpinski.h"
+#include "shading/surface.h"
+
+namespace edgegrad {
+
+// A convex polygon in the image.
+struct VisiblePolygon {
+    Vec2 corner[ViewVolume::most_corners];
+    int n = 0;
+    double area = 0;     // px²
+    double longest = 0;  // px
+    double nearest = 0;  // depth
+    Vec2 low, high;
+
+    // Of the face with the vertices v; false when there is none.
+    bool set(const Camera& camera, const ViewVolume& volume, const VertexView& p, const int32_t* v) {
+        const uint8_t c0 = p.outcode[v[0]], c1 = p.outcode[v[1]], c2 = p.outcode[v[2]];
+        if (c0 & c1 & c2) return false;
+        if (!(c0 | c1 | c2)) {
+            n = 3;
+            for (int i = 0; i < 3; ++i) corner[i] = p.x[v[i]];
+            nearest = std::min({p.q[v[0]].z, p.q[v[1]].z, p.q[v[2]].z});
+        } else {
+            if (camera.facing(p.q[v[0]], p.q[v[1]], p.q[v[2]]) == 0) return false;
+            Vec3 polygon[ViewVolume::most_corners] = {p.q[v[0]], p.q[v[1]], p.q[v[2]]};
+            n = volume.clip_triangle(polygon);
+            double least = std::numeric_limits<double>::infinity(), farthest = 0;
+            nearest = least;
+            for (int i = 0; i < n; ++i) {
+                nearest = std::min(nearest, polygon[i].z);
+                // Only a triangle through the eye itself has a corner there; it has no image to sample.
+                least = std::min(least, camera.depth_weight(polygon[i]));
+                if (!(least > 0)) return false;
+                corner[i] = volume.inside(project(camera, polygon[i]));
+            }
+            if (n < 3) return false;
+            for (int i = 0; i < 3; ++i) farthest = std::max(farthest, length(p.q[v[i]]));
+            // A point between corners that lie very far away is rounded as they are. If that shows, the whole view is
+            // taken: samples that miss the face find nothing.
+            if (!(std::numeric_limits<double>::epsilon() * farthest / least * camera.pixels_per_unit < 0.1)) {
+                const Vec2 a = volume.low, b = volume.high, view[4] = {a, {b.x, a.y}, b, {a.x, b.y}};
+                n = std::copy(view, view + 4, corner) - corner;
+            }
+        }
+        area = 0;
+        low = high = corner[0];
+        double longest_squared = 0;
+        for (int i = 0; i < n; ++i) {
+            const Vec2 a = corner[i], b = corner[i + 1 < n ? i + 1 : 0], side = b - a;
+            longest_squared = std::max(longest_squared, side.x * side.x + side.y * side.y);
+            low = {std::min(low.x, a.x), std::min(low.y, a.y)};
+            high = {std::max(high.x, a.x), std::max(high.y, a.y)};
+            if (i >= 2) area += 0.5 * std::fabs(wedge(corner[i - 1] - corner[0], a - corner[0]));
+        }
+        longest = std::sqrt(longest_squared);
+        return area > 0;
+    }
+};
+
+// Points uniform over a polygon, along a curve that fills its triangles one after the other.
+class PolygonSampler {
+   public:
+    // About n points will be drawn.
+    void set(const VisiblePolygon& polygon, double n) { polygon_ = &polygon, n_ = n, triangle_ = 0, end_ = 0; }
+
+    // s in [0, 1) goes along the curve, u is a point of the unit square. Fast where s ascends.
+    Vec2 operator()(double s, Vec2 u) {
+        const Vec2* corner = polygon_->corner;
+        while (triangle_ < 2 || (s >= end_ && triangle_ + 1 < polygon_->n)) {
+            triangle_ = std::max(2, triangle_ + 1);
+            begin_ = end_;
+            const double area =
+                0.5 * std::fabs(wedge(corner[triangle_ - 1] - corner[0], corner[triangle_] - corner[0]));
+            share_ = area / polygon_->area, end_ = begin_ + share_;
+            // Two to four cells a point, so that each has one of its own.
+            const double cells = std::clamp(2 * n_ * share_, 1.0, double(1u << SierpinskiCurve::most_levels));
+            levels_ = std::bit_width(uint32_t(std::ceil(cells)) - 1);
+            curve_.set({1, 0}, {0, 0}, {0, 1}, levels_);
+        }
+        const double t = share_ > 0 ? std::clamp((s - begin_) / share_, 0.0, 1 - 0x1p-53) : 0;
+        const Vec2 p = curve_.point(uint32_t(t * (1u << levels_)), u);
+        lambda_ = {p.x, p.y};
+        return corner[0] + p.x * (corner[triangle_ - 1] - corner[0]) + p.y * (corner[triangle_] - corner[0]);
+    }
+
+    // Where the last point lies in its triangle.
+    Barycentrics lambda() const { return lambda_; }
+
+   private:
+    const VisiblePolygon* polygon_ = nullptr;
+    double n_ = 0, begin_ = 0, end_ = 0, share_ = 0;
+    int triangle_ = 0, levels_ = 0;
+    SierpinskiCurve curve_;
+    Barycentrics lambda_;
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,74 @@
+// Radiance and its derivative at points whose face is known: what one interior sample does, laid open for the tests.
+
+#include "checks/probe.h"
+
+#include <vector>
+
+#include "backward/backward.h"
+#include "camera/vertices.h"
+#include "contract/scatter.h"
+#include "shading/shade.h"
+
+namespace edgegrad {
+
+template <class T>
+void shade_at(const SceneView<T>& scene, const Camera& camera, int64_t n, const int32_t* faces, const double* points,
+              double* radiance) {
+    Team team(1);
+    const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
+    for (int64_t i = 0; i < n; ++i) {
+        const int32_t* v = scene.faces + 3 * int64_t(faces[i]);
+        const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
+        Barycentrics b;
+        barycentrics(face_map(camera, corner), normalised(camera, {points[2 * i], points[2 * i + 1]}), b);
+        shade<0>(scene, faces[i], b, radiance + i * scene.channels);
+    }
+}
+
+template <class T>
+void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, const int32_t* faces,
+                  const double* points, const double* radiance_bar, const Gradients& grad) {
+    Team team(1);
+    const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
+    ChunkGrad chunk;
+    chunk.q.prepare(3, 1), chunk.uvs.prepare(2, 1);
+    chunk.colors.prepare(scene.channels, 1), chunk.texels.prepare(scene.channels, 1);
+    CornerGrad rows;
+    for (int64_t i = 0; i < n; ++i) {
+        const int32_t *v = scene.faces + 3 * int64_t(faces[i]), *row = scene.corners + 3 * int64_t(faces[i]);
+        const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
+        const Vec2 n = normalised(camera, {points[2 * i], points[2 * i + 1]});
+        const FaceMap map = face_map(camera, corner);
+        const int width = is_textured(scene, faces[i]) ? 2 : scene.channels;
+        Barycentrics b;
+        barycentrics(map, n, b);
+        rows.reset(width);
+        const Barycentrics b_bar =
+            shade_vjp<0>(scene, faces[i], b, radiance_bar + i * scene.channels, true, rows, chunk);
+        FaceMap map_bar;
+        Vec2 n_bar;
+        Vec3 corner_bar[3];
+        barycentrics_vjp(map, n, b, b_bar, map_bar, n_bar);
+        face_map_vjp(camera, corner, map_bar, corner_bar);
+        normalised_vjp(camera, n, n_bar, chunk.k);
+        for (int j = 0; j < 3; ++j) {
+            chunk.q.add(v[j], &corner_bar[j].x);
+            (width == 2 && is_textured(scene, faces[i]) ? chunk.uvs : chunk.colors)
+                .add(row[j], rows.value.data() + j * width);
+        }
+    }
+    Array<double> q_bar = zeros(3 * scene.n_verts, team);
+    chunk.q.add_to(q_bar.data(), 0), chunk.colors.add_to(grad.colors, 0);
+    chunk.uvs.add_to(grad.uvs, 0), chunk.texels.add_to(grad.texels, 0);
+    add_world(camera, scene.verts, q_bar, team, grad);
+    for (int i = 0; i < 6; ++i) grad.K[i] += chunk.k[i];
+}
+
+template void shade_at(const SceneView<float>&, const Camera&, int64_t, const int32_t*, const double*, double*);
+template void shade_at(const SceneView<double>&, const Camera&, int64_t, const int32_t*, const double*, double*);
+template void shade_at_vjp(const SceneView<float>&, const Camera&, int64_t, const int32_t*, const double*,
+                           const double*, const Gradients&);
+template void shade_at_vjp(const SceneView<double>&, const Camera&, int64_t, const int32_t*, const double*,
+                           const double*, const Gradients&);
+
+}  // namespace edgegrad

@@ -1,0 +1,185 @@
+// The only writer of gradients: the same bits at any number of threads.
+//
+// Samples are worked on in chunks of fixed size. A chunk writes rows (index, values) into buffers of its own, one for
+// each owner of destinations; then each thread adds, chunk after chunk, the rows whose destination it owns. So each sum
+// has one owner and one order. Chunks are taken in waves, which bounds the memory; how many a wave has changes no
+// order.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <vector>
+
+#include "core/parallel.h"
+#include "core/stopwatch.h"
+#include "scene/scene.h"
+
+namespace edgegrad {
+
+class RowBuffer {
+   public:
+    // Bytes, at most, of the buffers that take the rows of `samples` samples, for Scatter's owners and chunks: `each`
+    // rows of `width` numbers come together for a run of samples on one primitive. There are `primitives`, or, if that
+    // is −1, as many as samples; and so many `destinations`.
+    struct Load {
+        int64_t samples, primitives, each, destinations;
+        int width;
+    };
+    static int64_t bytes(const Load& load, int threads);
+
+    void prepare(int width, int owners) {
+        if (recent_.empty()) width_ = width, rows_.resize(owners), recent_.resize(n_recent);
+    }
+    void clear() {
+        bool any = false;
+        for (Rows& r : rows_) any |= r.count > 0, r.count = 0;
+        if (any) std::fill(recent_.begin(), recent_.end(), Recent());
+    }
+    // W: the width at compile time, or 0.
+    template <int W = 0>
+    void add(int64_t index, const double* values) {
+        const int width = W ? W : width_;
+        // Neighbours in a mesh come soon after one another and share destinations: most rows are added to one that is
+        // there. Which are does not depend on the owners.
+        Recent& recent = recent_[uint64_t(index) % n_recent];
+        if (recent.index == index) {
+            double* row = rows_[recent.owner].value.data() + size_t(recent.row) * width;
+            for (int c = 0; c < width; ++c) row[c] += values[c];
+            return;
+        }
+        const uint32_t owner = rows_.size() > 1 ? uint32_t(uint64_t(index) / run) % uint32_t(rows_.size()) : 0;
+        Rows& r = rows_[owner];
+        recent = {index, owner, uint32_t(r.count)};
+        if (r.count == r.index.size()) {
+            r.index.resize(std::max<size_t>(fewest_rows, 2 * r.count));
+            r.value.resize(r.index.size() * width);
+        }
+        r.index[r.count] = index;
+        std::copy(values, values + width, r.value.begin() + r.count * width);
+        ++r.count;
+    }
+    void add_to(double* destination, int owner) const {
+        if (width_ == 2) add_to<2>(destination, rows_[owner]);
+        else if (width_ == 3) add_to<3>(destination, rows_[owner]);
+        else add_to<0>(destination, rows_[owner]);
+    }
+
+   private:
+    struct Rows {
+        size_t count = 0;
+        std::vector<int64_t> index;
+        std::vector<double> value;
+    };
+    struct Recent {
+        int64_t index = -1;
+        uint32_t owner = 0, row = 0;
+    };
+    template <int W>
+    void add_to(double* destination, const Rows& r) const {
+        const int width = W ? W : width_;
+        for (size_t k = 0; k < r.count; ++k)
+            for (int c = 0; c < width; ++c) destination[r.index[k] * width + c] += r.value[k * width + c];
+    }
+    static constexpr int n_recent = 256;
+    static constexpr size_t fewest_rows = 16;  // that a buffer has room for as soon as there is one
+    // Of destinations in turn, which balances and keeps owners apart in cache lines.
+    static constexpr uint64_t run = 32;
+    int width_ = 0;
+    std::vector<Rows> rows_;  // one for each owner
+    std::vector<Recent> recent_;
+};
+
+// What the samples of one chunk give.
+struct ChunkGrad {
+    RowBuffer q, x, colors, uvs, texels;  // vertices: q in camera coordinates, x in the image
+    double k[6] = {};                     // the upper rows of K
+};
+
+// Where it goes; null where none is wanted.
+struct Destination {
+    double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr;
+    double k[6] = {};
+    bool want_k = false;
+};
+
+// The rows of both, and their width; 0: the channels.
+struct RowSlot {
+    RowBuffer ChunkGrad::* rows;
+    double* Destination::* to;
+    int width;
+};
+constexpr RowSlot row_slots[] = {{&ChunkGrad::q, &Destination::q, 3},
+                                 {&ChunkGrad::x, &Destination::x, 2},
+                                 {&ChunkGrad::colors, &Destination::colors, 0},
+                                 {&ChunkGrad::uvs, &Destination::uvs, 2},
+                                 {&ChunkGrad::texels, &Destination::texels, 0}};
+
+// Samples in a chunk, chunks that are in memory at a time for each thread, and owners at most: more would only split
+// the buffers further.
+constexpr int64_t scatter_chunk = 512, chunks_in_flight = 16;
+constexpr int most_owners = 16;
+
+inline int64_t RowBuffer::bytes(const Load& load, int threads) {
+    const int64_t chunks = std::min((load.samples + scatter_chunk - 1) / scatter_chunk, chunks_in_flight * threads);
+    const int64_t samples = std::min(load.samples, scatter_chunk * chunks), owners = std::min(threads, most_owners);
+    // They come in order, so there are no more runs than primitives and ends of chunks.
+    const int64_t runs = load.primitives < 0 ? samples : std::min(samples, load.primitives + chunks);
+    const int64_t used = std::min<int64_t>(owners, (load.destinations + run - 1) / run);
+    const int64_t rows = std::max(load.each * runs, chunks * used * int64_t(fewest_rows));
+    return rows * int64_t(sizeof(int64_t) + sizeof(double) * load.width) +
+           chunks * (owners * int64_t(sizeof(Rows)) + n_recent * int64_t(sizeof(Recent)));
+}
+
+// The buffers of one backward pass, whose parts use them one after the other.
+class Scatter {
+   public:
+    // `channels`: of colours and texels.
+    Scatter(Team& team, int channels) : team_(team), channels_(channels) {}
+
+    // Calls body(first, last, ChunkGrad&) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
+    // samples and of the adding.
+    template <class Body>
+    void add(int64_t n, Destination& to, double (&seconds)[2], Body body) {
+        const int64_t chunk = scatter_chunk, wave = chunks_in_flight * team_.threads();
+        const int owners = std::min(team_.threads(), most_owners);
+        if (const int64_t most = std::min(wave, (n + chunk - 1) / chunk); int64_t(grads_.size()) < most)
+            grads_.resize(most);
+        Stopwatch watch;
+        for (int64_t first = 0; first < n; first += chunk * wave) {
+            team_.check();  // the calling thread may get no chunk of a wave
+            const int64_t chunks = std::min(wave, (n - first + chunk - 1) / chunk);
+            team_.each(chunks, [&](int64_t i) {
+                ChunkGrad& g = grads_[i];
+                prepare(g, to, owners);
+                const int64_t begin = first + i * chunk;
+                body(begin, std::min(begin + chunk, n), g);
+            });
+            seconds[0] += watch.lap();
+            team_.each(owners, [&](int64_t owner) {
+                for (int64_t i = 0; i < chunks; ++i)
+                    for (const RowSlot& slot : row_slots)
+                        if (double* const there = to.*slot.to) (grads_[i].*slot.rows).add_to(there, int(owner));
+            });
+            for (int64_t i = 0; i < chunks; ++i)
+                for (int c = 0; c < 6; ++c) to.k[c] += grads_[i].k[c];
+            seconds[1] += watch.lap();
+        }
+    }
+
+   private:
+    // Empties a chunk's buffers, and makes those that are wanted.
+    void prepare(ChunkGrad& g, const Destination& to, int owners) const {
+        for (const RowSlot& slot : row_slots) {
+            RowBuffer& rows = g.*slot.rows;
+            if (to.*slot.to) rows.prepare(slot.width ? slot.width : channels_, owners);
+            rows.clear();
+        }
+        std::fill(g.k, g.k + 6, 0.0);
+    }
+
+    Team& team_;
+    const int channels_;
+    std::vector<ChunkGrad> grads_;
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,58 @@
+// Large arrays: how they come to memory, and from there.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <memory>
+#include <type_traits>
+
+#include "core/parallel.h"
+
+namespace edgegrad {
+
+// Asks for what will be read soon.
+inline void prefetch(const void* p) {
+#if defined(__GNUC__)
+    __builtin_prefetch(p);
+#endif
+}
+
+// An array of which every element will be written before it is read, by several threads. Unlike std::vector it sets
+// nothing to zero: one thread would do that, and fetch the pages from the system, while the others wait. Memory comes
+// from the one that writes it first.
+template <class T>
+class Array {
+   public:
+    static_assert(std::is_trivially_copyable_v<T> && std::is_trivially_destructible_v<T>);
+
+    explicit Array(int64_t n) : data_(static_cast<T*>(::operator new(n * sizeof(T)))), size_(n) {}
+
+    T& operator[](int64_t i) { return data_.get()[i]; }
+    const T& operator[](int64_t i) const { return data_.get()[i]; }
+    T* data() { return data_.get(); }
+    const T* data() const { return data_.get(); }
+    T* begin() { return data_.get(); }
+    T* end() { return data_.get() + size_; }
+    const T* begin() const { return data_.get(); }
+    const T* end() const { return data_.get() + size_; }
+    int64_t size() const { return size_; }
+    bool empty() const { return size_ == 0; }
+    T& back() { return data_.get()[size_ - 1]; }
+    const T& back() const { return data_.get()[size_ - 1]; }
+
+   private:
+    struct Free {
+        void operator()(T* p) const { ::operator delete(p); }
+    };
+    std::unique_ptr<T, Free> data_;
+    int64_t size_;
+};
+
+inline Array<double> zeros(int64_t n, Team& team) {
+    Array<double> a(n);
+    team.each_block(
+        n, [&](int64_t, int64_t first, int64_t last) { std::fill(&a[first], &a[first] + (last - first), 0.0); });
+    return a;
+}
+
+}  // namespace edgegrad

@@ -1,0 +1,205 @@
+// Threads of our own, not OpenMP's. How those wait is fixed when torch loads them: by default they spin for
+// milliseconds, and a loop ends when all of them had a processor, work or no work. Beside a busy process a step took 10
+// times as long.
+#include "core/parallel.h"
+
+#include <condition_variable>
+#include <system_error>
+
+#if defined(__x86_64__) || defined(_M_X64)
+#include <immintrin.h>
+#endif
+#ifdef __linux__
+#include <dlfcn.h>
+#endif
+
+namespace edgegrad {
+
+namespace {
+
+// Long enough to be there for the next loop of the same pass; short beside what other processes would miss.
+constexpr std::chrono::microseconds spin_time(100);
+constexpr std::chrono::milliseconds asking_time(50);
+
+// Waits a little without sleep: whether `ready` came true.
+template <class Ready>
+bool spin(Ready ready) {
+    const auto end = std::chrono::steady_clock::now() + spin_time;
+    do {
+        for (int k = 0; k < 16; ++k) {
+            if (ready()) return true;
+#if defined(__x86_64__) || defined(_M_X64)
+            _mm_pause();
+#else
+            std::this_thread::yield();
+#endif
+        }
+    } while (std::chrono::steady_clock::now() < end);
+    return false;
+}
+
+// A loop whose items are taken one by one. The caller waits for items that were taken, not for threads: a worker that
+// joined and then got no processor holds up nobody, and later finds that nothing is left.
+class Job {
+   public:
+    Job(int64_t n, int places, const ItemBody& body) : places(places), n_(n), body_(body) {}
+
+    // Takes items until none is left. What belongs to the caller is touched only while one is not done.
+    void work(int thread) {
+        for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < n_;) {
+            body_(thread, i);
+            const bool last = done_.fetch_add(1, std::memory_order_release) + 1 == n_;
+            if (!last || thread == 0) continue;
+            const std::lock_guard lock(mutex_);
+            finished_.notify_one();
+        }
+    }
+
+    void wait(const std::function<void()>& waiting) {
+        const auto finished = [this] { return done_.load(std::memory_order_acquire) == n_; };
+        if (spin(finished)) return;
+        std::unique_lock lock(mutex_);
+        while (!finished_.wait_for(lock, asking_time, finished)) {
+            lock.unlock();
+            waiting();
+            lock.lock();
+        }
+    }
+
+    // Workers that may still join and that did: threads 1, 2, … Guarded by the mutex of the pool.
+    int places, joined = 0;
+
+   private:
+    const int64_t n_;
+    const ItemBody& body_;
+    std::atomic<int64_t> next_{0}, done_{0};
+    std::mutex mutex_;
+    std::condition_variable finished_;
+};
+
+// The workers: as many as a call asked for beside its own thread. Calls at the same time share them.
+class Pool {
+   public:
+    void add(const std::shared_ptr<Job>& job) {
+        int wake;
+        {
+            const std::lock_guard guard(mutex_);
+            start_workers(job->places);
+            jobs_.push_back(job);
+            places_ += job->places;
+            wake = std::min(sleeping_, places_ - spinning_);
+        }
+        for (; wake > 0; --wake) wake_.notify_one();
+    }
+
+    // No worker joins it from now on.
+    void remove(const Job& job) {
+        const std::lock_guard guard(mutex_);
+        drop(job);
+    }
+
+    void lock() { mutex_.lock(); }
+    void unlock() { mutex_.unlock(); }
+
+   private:
+    void start_workers(int n) {
+        try {
+            for (; workers_ < n; ++workers_) std::thread([this] { run(); }).detach();
+        } catch (const std::system_error&) {  // the system gives no more: those that there are do the work
+        }
+    }
+
+    void drop(const Job& job) {
+        const auto found = std::find_if(jobs_.begin(), jobs_.end(), [&](const auto& j) { return j.get() == &job; });
+        if (found == jobs_.end()) return;
+        places_ -= job.places;
+        jobs_.erase(found);
+    }
+
+    void run() {
+        std::unique_lock lock(mutex_);
+        for (;;) {
+            if (!jobs_.empty()) {
+                const std::shared_ptr<Job> job = jobs_.front();
+                const int thread = ++job->joined;
+                --places_;
+                if (--job->places == 0) drop(*job);
+                lock.unlock();
+                job->work(thread);
+                lock.lock();
+                drop(*job);  // nothing is left of it
+                continue;
+            }
+            ++spinning_;
+            lock.unlock();
+            spin([this] { return places_.load(std::memory_order_relaxed) > 0; });
+            lock.lock();
+            --spinning_;
+            ++sleeping_;
+            wake_.wait(lock, [this] { return !jobs_.empty(); });
+            --sleeping_;
+        }
+    }
+
+    std::mutex mutex_;
+    std::condition_variable wake_;
+    std::vector<std::shared_ptr<Job>> jobs_;  // those with places, the oldest first
+    std::atomic<int> places_{0};              // of all of them
+    int workers_ = 0, spinning_ = 0, sleeping_ = 0;
+};
+
+// Lets torch's threads sleep while they wait. Those of GNU's OpenMP spin for milliseconds between torch's operators,
+// and so take processors from our workers, from other processes and from each other; but a hundred turns only where the
+// process has more of them than processors, as its manual says of GOMP_SPINCOUNT. So one thread makes as many as there
+// are processors, which sleep for good. Where nothing of this name is loaded, or LLVM's or Intel's OpenMP, which answer
+// to it too and have rules of their own, nothing is done. Where OMP_THREAD_LIMIT allows no more threads, torch's spin
+// as before. It changes how threads wait and no result. A system that has not so many threads to give ends the process,
+// as it would for torch's own.
+bool calm_openmp() {
+#ifdef __linux__
+    using Parallel = void (*)(void (*)(void*), void*, unsigned, unsigned);
+    const auto parallel = reinterpret_cast<Parallel>(dlsym(RTLD_DEFAULT, "GOMP_parallel"));
+    if (!parallel || dlsym(RTLD_DEFAULT, "__kmpc_fork_call")) return false;  // not GNU's
+    try {
+        std::thread([parallel] {
+            parallel([](void*) {}, nullptr, std::max(2u, std::thread::hardware_concurrency()), 0);
+            for (;;) std::this_thread::sleep_for(std::chrono::hours(1));
+        }).detach();
+    } catch (const std::system_error&) {
+    }
+#endif
+    return true;
+}
+
+[[maybe_unused]] const bool calm = calm_openmp();
+
+// Never destroyed: workers wait in it until the process is gone.
+Pool* pool = new Pool;
+
+}  // namespace
+
+void share(int64_t n, int threads, const ItemBody& body, const std::function<void()>& waiting) {
+    const auto job = std::make_shared<Job>(n, threads - 1, body);
+    pool->add(job);
+    job->work(0);
+    pool->remove(*job);
+    job->wait(waiting);
+}
+
+void before_fork_of_workers() {
+#ifdef __linux__
+    // Torch's own too: in the child GNU's OpenMP would wait for the threads that the parent's had. It starts new ones
+    // where there are none.
+    constexpr int omp_pause_hard = 2;
+    if (void* pause = dlsym(RTLD_DEFAULT, "omp_pause_resource_all"))
+        reinterpret_cast<int (*)(int)>(pause)(omp_pause_hard);
+#endif
+    pool->lock();
+}
+
+void after_fork_of_workers(bool child) {
+    if (child) pool = new Pool;  // the old one is as its threads left it, and may be locked for ever
+    else pool->unlock();
+}
+
+}  // namespace edgegrad

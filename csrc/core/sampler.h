@@ -1,0 +1,60 @@
+// Stateless sample points: a function of seed, stream and index, so that no thread keeps a generator.
+#pragma once
+
+#include <bit>
+#include <cstdint>
+
+#include "core/math.h"
+
+namespace edgegrad {
+
+// Finaliser of splitmix64 (Steele, Lea and Flood 2014): a bijection whose output bits are well mixed.
+inline uint64_t mix(uint64_t x) {
+    x ^= x >> 30, x *= 0xbf58476d1ce4e5b9ull;
+    x ^= x >> 27, x *= 0x94d049bb133111ebull;
+    return x ^ (x >> 31);
+}
+
+inline uint64_t hash(uint64_t seed, uint64_t a, uint64_t b = 0) {
+    return mix(mix(mix(seed + 0x9e3779b97f4a7c15ull) + a + 0x9e3779b97f4a7c15ull) + b + 0x9e3779b97f4a7c15ull);
+}
+
+// Second argument of the hashes for the gradient's samples, so that they never meet those of a pixel of the image.
+constexpr uint64_t gradient_stream = 1;
+
+// The middle of one of 2⁵² equal cells of (0, 1): the bits as the fraction of a number between 1 and 2.
+inline double to_unit(uint64_t bits) {
+    return std::bit_cast<double>(bits >> 12 | 0x3ff0000000000000ull) - (1 - 0x1p-53);
+}
+
+// n points in the unit square: the golden-ratio lattice (i / n, i φ⁻¹) moved by a random shift (Cranley and Patterson
+// 1976), each point by itself uniform, so any mean over them is unbiased.
+class ShiftedLattice {
+   public:
+    explicit ShiftedLattice(int n) : step_(~0ull / n) {}
+
+    // Points first … first + n − 1 of the lattice whose shift is given by a random number.
+    void fill(uint64_t random, int first, int n, double* x, double* y) const {
+        uint64_t a = random + first * step_, b = mix(random) + first * golden;
+        for (int i = 0; i < n; ++i, a += step_, b += golden) x[i] = to_unit(a), y[i] = to_unit(b);
+    }
+
+   private:
+    static constexpr uint64_t golden = 0x9e3779b97f4a7c15;
+    uint64_t step_;
+};
+
+// A sequence of points whose every run of consecutive ones is spread evenly: i (1/p, 1/p²) with p³ = p + 1 (Roberts
+// 2018, "R2"), moved by a random shift.
+class ShiftedSequence {
+   public:
+    explicit ShiftedSequence(uint64_t random) : x_(random), y_(mix(random)) {}
+    Vec2 operator()(uint64_t i) const {
+        return {to_unit(x_ + i * 0xc13fa9a902a6328full), to_unit(y_ + i * 0x91e10da5c79e7b1dull)};
+    }
+
+   private:
+    uint64_t x_, y_;
+};
+
+}  // namespace edgegrad

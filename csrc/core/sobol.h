@@ -1,0 +1,80 @@
+// Sobol's points in the plane, scrambled, for pixels that share them: neighbours' samples complement one another.
+//
+// Of the (0,2)-sequence (Sobol 1967), every run of consecutive points that begins at a multiple of its length 2^m puts
+// as many of them into each of the boxes 2^−a × 2^(a−m) of the unit square. Pixels in the order of a space-filling
+// curve take runs one after another, so that the samples of one pixel are spread evenly, and so are the offsets in
+// blocks of 2 × 2, 4 × 4, … pixels (Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling
+// error via hierarchical ordering of pixels"). What they miss in one pixel is found in the next.
+#pragma once
+
+#include <cstdint>
+
+#include "core/sampler.h"
+
+namespace edgegrad {
+
+inline uint32_t reversed_bits(uint32_t x) {
+    x = (x >> 1 & 0x55555555u) | (x & 0x55555555u) << 1;
+    x = (x >> 2 & 0x33333333u) | (x & 0x33333333u) << 2;
+    x = (x >> 4 & 0x0f0f0f0fu) | (x & 0x0f0f0f0fu) << 4;
+    x = (x >> 8 & 0x00ff00ffu) | (x & 0x00ff00ffu) << 8;
+    return x >> 16 | x << 16;
+}
+
+// Bit c of x becomes bit 2 c.
+inline uint64_t spread_bits(uint32_t x) {
+    uint64_t s = x;
+    s = (s | s << 16) & 0x0000ffff0000ffffull;
+    s = (s | s << 8) & 0x00ff00ff00ff00ffull;
+    s = (s | s << 4) & 0x0f0f0f0f0f0f0f0full;
+    s = (s | s << 2) & 0x3333333333333333ull;
+    return (s | s << 1) & 0x5555555555555555ull;
+}
+
+// The place of a pixel on the Z-order curve (Morton 1966): the bits of x and y by turns.
+inline uint64_t z_order(uint32_t x, uint32_t y) { return spread_bits(x) | spread_bits(y) << 1; }
+
+class ScrambledSobol {
+   public:
+    explicit ScrambledSobol(uint64_t random) : x_(random), y_(mix(random)) {}
+
+    // Points first … first + n − 1. They repeat after 2³².
+    void fill(uint64_t first, int n, double* x, double* y) const {
+        for (int k = 0; k < n; ++k) {
+            const uint32_t i = uint32_t(first) + k;
+            x[k] = unit(x_(i)), y[k] = unit(y_(pascal(i)));
+        }
+    }
+
+   private:
+    // Both coordinates are held with the first binary digit in the lowest bit, where the first is i itself.
+
+    // The second coordinate: digit r is the sum of the digits c of i for which the binomial C(c, r) is odd, that is, of
+    // those c whose bits contain the bits of r.
+    static uint32_t pascal(uint32_t i) {
+        i ^= (i & 0xaaaaaaaau) >> 1;
+        i ^= (i & 0xccccccccu) >> 2;
+        i ^= (i & 0xf0f0f0f0u) >> 4;
+        i ^= (i & 0xff00ff00u) >> 8;
+        return i ^ i >> 16;
+    }
+    // Owen's scrambling: each digit is flipped or not by a hash of those before it, which keeps the boxes' counts and
+    // makes each point uniform. Sums and products carry from low bits to high ones alone, so they are such hashes
+    // (Laine and Karras 2011; constants by Vegdahl 2021).
+    struct Scramble {
+        explicit Scramble(uint64_t random) : shift(uint32_t(random)), factor(uint32_t(random >> 32) | 1) {}
+        uint32_t operator()(uint32_t x) const {
+            x ^= x * 0x3d20adeau;
+            x += shift;
+            x *= factor;
+            x ^= x * 0x05526c56u;
+            return x ^ x * 0x53a22864u;
+        }
+        uint32_t shift, factor;
+    };
+    static double unit(uint32_t x) { return to_unit(uint64_t(reversed_bits(x)) << 32 | 1u << 31); }
+
+    Scramble x_, y_;
+};
+
+}  // namespace edgegrad

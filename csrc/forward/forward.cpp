@@ -1,0 +1,396 @@
+// The pixel loop. The samples of a pixel are drawn in proportion to the filter and cast together.
+
+#include "forward/forward.h"
+
+#include <algorithm>
+#include <atomic>
+#include <bit>
+#include <cmath>
+#include <limits>
+#include <numeric>
+#include <vector>
+
+#include "camera/vertices.h"
+#include "core/channels.h"
+#include "core/sampler.h"
+#include "forward/depth_bound.h"
+#include "shading/shade.h"
+
+namespace edgegrad {
+
+EDGEGRAD_VECTORIZED void place_in_pixel(const Camera& camera, const Filter& filter, int x, int y, int n, double* n_x,
+                                        double* n_y) {
+    filter.sample(n, n_x), filter.sample(n, n_y);
+    // normalised(), with what the samples share in locals: the compiler cannot know that the arrays lie elsewhere.
+    const Vec2 n0 = normalised(camera, {x + 0.5, y + 0.5});
+    const double a = camera.k_inverse[0], b = camera.k_inverse[1], c = camera.k_inverse[2], d = camera.k_inverse[3];
+    for (int i = 0; i < n; ++i) {
+        const double dx = n_x[i], dy = n_y[i];
+        n_x[i] = n0.x + (a * dx + b * dy), n_y[i] = n0.y + (c * dx + d * dy);
+    }
+}
+
+EDGEGRAD_VECTORIZED void PixelRays::append(int x, int y, int first, int n, RayBatch& rays) const {
+    double *n_x = rays.n_x + rays.count, *n_y = rays.n_y + rays.count;
+    lattice_.fill(hash(seed_, uint64_t(y) * camera_.width + x), first, n, n_x, n_y);
+    place_in_pixel(camera_, filter_, x, y, n, n_x, n_y);
+    rays.count += n;
+}
+
+namespace {
+
+constexpr int lanes = 8;
+
+// Which of the lanes hit the face, as bits.
+inline unsigned on_face(const int32_t* hit, int32_t face) {
+    static constexpr unsigned bit[lanes] = {1, 2, 4, 8, 16, 32, 64, 128};
+    unsigned bits = 0;
+    EDGEGRAD_ROLLED for (int i = 0; i < lanes; ++i) bits |= hit[i] == face ? bit[i] : 0;
+    return bits;
+}
+
+// The sum of the barycentrics of all lanes that hit the face; false if one of them lies outside of it. All lanes are
+// worked on, without branches, so that they fill vectors; and summed in one order, however wide these are.
+EDGEGRAD_VECTORIZED bool add_barycentrics(const FaceMap& map, const double* x, const double* y, const int32_t* hit,
+                                          int32_t face, Barycentrics& sum) {
+    const Vec3 a = map.column[0], b = map.column[1], c = map.column[2];
+    double u[lanes], v[lanes];
+    int64_t outside = 0;
+    for (int i = 0; i < lanes; ++i) {
+        const double inverse = 1.0 / (x[i] * a.z + y[i] * b.z + c.z);
+        u[i] = (x[i] * a.x + y[i] * b.x + c.x) * inverse, v[i] = (x[i] * a.y + y[i] * b.y + c.y) * inverse;
+        const bool on = hit[i] == face;
+        outside |= int64_t(on) & ~int64_t((u[i] >= 0) & (v[i] >= 0) & (u[i] + v[i] <= 1));
+        u[i] = on ? u[i] : 0.0, v[i] = on ? v[i] : 0.0;
+    }
+    for (int i = 0; i < 4; ++i) u[i] += u[i + 4], v[i] += v[i + 4];
+    sum.u += (u[0] + u[2]) + (u[1] + u[3]), sum.v += (v[0] + v[2]) + (v[1] + v[3]);
+    return !outside;
+}
+
+constexpr int tile = 16;
+
+// The pixels of one row of a tile.
+template <int N, class T>
+class PixelRow {
+   public:
+    PixelRow(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const RayFrame& frame,
+             const ImageOptions& options, Team& team, const Array<Vec3>& q, T* image, const HitBuffers<T>& out)
+        : scene_(scene),
+          camera_(camera),
+          caster_(caster),
+          frame_(frame),
+          pixel_rays_(camera, options),
+          spp_(options.spp),
+          team_(team),
+          q_(q),
+          image_(image),
+          out_(out),
+          C_(N ? N : scene.channels),
+          reach_{options.filter.radius() * (std::fabs(camera.k_inverse[0]) + std::fabs(camera.k_inverse[1])),
+                 options.filter.radius() * (std::fabs(camera.k_inverse[2]) + std::fabs(camera.k_inverse[3]))},
+          rays_(frame),
+          sum_(tile * C_),
+          radiance_(C_) {}
+
+    void render(int x0, int x1, int y) {
+        std::fill(sum_.begin(), sum_.end(), 0.0);
+        std::fill(hits_, hits_ + tile, 0);
+        std::fill(first_, first_ + tile, std::numeric_limits<int32_t>::max());
+        std::fill(last_, last_ + tile, -1);
+        std::fill(farthest_, farthest_ + tile, -std::numeric_limits<double>::infinity());
+        x0_ = x0, y_ = y;
+        for (int x = x0; x < x1; ++x)
+            for (int done = 0; done < spp_;) {
+                const int n = std::min(spp_ - done, RayBatch::size - rays_.count);
+                pixel_rays_.append(x, y, done, n, rays_);
+                part_[parts_++] = {x - x0, n};
+                done += n;
+                if (rays_.count == RayBatch::size) trace();
+            }
+        trace();
+        for (int x = 0; x < x1 - x0; ++x) {
+            const int64_t pixel = int64_t(y) * camera_.width + x0 + x;
+            const double share = double(hits_[x]) / spp_;
+            const T* behind = scene_.background_at(pixel);
+            for (int c = 0; c < C_; ++c) image_[pixel * C_ + c] = T(sum_[x * C_ + c] / spp_ + (1 - share) * behind[c]);
+            out_.coverage[pixel] = T(share);
+            out_.depth[pixel] = hits_[x] == spp_ ? rounded_up(farthest_[x]) : std::numeric_limits<float>::infinity();
+            out_.hit[2 * pixel] = hits_[x] ? first_[x] : -1, out_.hit[2 * pixel + 1] = last_[x];
+        }
+    }
+
+    // The same where no ray can hit anything.
+    void leave_out(int x0, int x1, int y) {
+        for (int x = x0; x < x1; ++x) {
+            const int64_t pixel = int64_t(y) * camera_.width + x;
+            const T* behind = scene_.background_at(pixel);
+            std::copy(behind, behind + C_, image_ + pixel * C_);
+            out_.coverage[pixel] = 0;
+            out_.depth[pixel] = std::numeric_limits<float>::infinity();
+            out_.hit[2 * pixel] = out_.hit[2 * pixel + 1] = -1;
+        }
+    }
+
+   private:
+    // What the samples on one face have in common. Some faces are kept, for those in a pixel take turns and come again
+    // in the next one.
+    struct alignas(N ? 256 : 8) Shaded {
+        int32_t face = -1;
+        bool textured = false, unseen = false;
+        FaceMap map;
+        DepthBound depth;
+        AffineRadiance<N> radiance;
+    };
+    static constexpr unsigned n_kept = 64;
+
+    void trace() {
+        if (++traced_ % 16 == 0) team_.check();
+        rays_.prepare();
+        caster_.cast(rays_);
+        if (scene_.n_faces > in_cache) prefetch_faces();
+        int i = 0;
+        for (int p = 0; p < parts_; ++p) {
+            typename AffineRadiance<N>::Sum sum(C_);
+            int hits = 0;
+            const int end = i + part_[p].n;
+            for (; i + lanes <= end; i += lanes)
+                for (unsigned left = (1u << lanes) - 1 - on_face(rays_.face + i, -1); left;) {
+                    const int first = std::countr_zero(left);
+                    const int32_t face = rays_.face[i + first];
+                    const Shaded& s = shaded(face);
+                    if (s.unseen) [[unlikely]] {
+                        cast_beyond();
+                        left &= ~on_face(rays_.face + i, -1);
+                        continue;
+                    }
+                    const unsigned same = on_face(rays_.face + i, face);
+                    left &= ~same;
+                    Barycentrics b;
+                    if ((same & (same - 1)) && !s.textured &&
+                        add_barycentrics(s.map, rays_.n_x + i, rays_.n_y + i, rays_.face + i, face, b)) {
+                        const int n = std::popcount(same);
+                        s.radiance.add_to(sum, b, n);
+                        hits += n;
+                        note_hit(s, part_[p].column);
+                    } else {
+                        for (unsigned one = same; one; one &= one - 1)
+                            hits += add(i + std::countr_zero(one), part_[p].column, sum);
+                    }
+                }
+            for (; i < end; ++i) {
+                if (rays_.face[i] >= 0 && shaded(rays_.face[i]).unseen) [[unlikely]]
+                    cast_beyond();
+                if (rays_.face[i] >= 0) hits += add(i, part_[p].column, sum);
+            }
+            hits_[part_[p].column] += hits;
+            for (int c = 0; c < C_; ++c) sum_[part_[p].column * C_ + c] += sum[c];
+        }
+        rays_.count = parts_ = 0;
+    }
+
+    // What a pixel hits, and how far away.
+    void note_hit(const Shaded& s, int column) {
+        first_[column] = std::min(first_[column], s.face), last_[column] = std::max(last_[column], s.face);
+        const Vec2 middle = normalised(camera_, {x0_ + column + 0.5, y_ + 0.5});
+        farthest_[column] = std::max(farthest_[column], s.depth.farthest(middle, reach_));
+    }
+
+    // Adds what ray i, of a pixel in this column, sees to the sum: one sample.
+    int add(int i, int column, typename AffineRadiance<N>::Sum& sum) {
+        const int32_t face = rays_.face[i];
+        const Shaded& s = shaded(face);
+        note_hit(s, column);
+        const Barycentrics b = barycentrics_of_hit(s.map, rays_.n(i));
+        if (s.textured) {
+            shade<N>(scene_, face, b, radiance_.data());
+            for (int c = 0; c < C_; ++c) sum[c] += radiance_[c];
+        } else {
+            s.radiance.add_to(sum, b, 1);
+        }
+        return 1;
+    }
+
+    Shaded& shaded(int32_t face) {
+        Shaded& s = kept_[unsigned(face) % n_kept];
+        if (face != s.face) keep(s, face);
+        return s;
+    }
+
+    // Faces that are smaller than the distance of the samples are met once each, and their arrays are then waited for.
+    static constexpr int64_t in_cache = 1 << 18;
+    void prefetch_faces() const {
+        for (int i = 0; i < rays_.count; ++i)
+            if (const int64_t face = rays_.face[i]; face >= 0) {
+                prefetch(scene_.faces + 3 * face);
+                prefetch(scene_.corners + 3 * face);
+            }
+        for (int i = 0; i < rays_.count; ++i)
+            if (const int64_t face = rays_.face[i]; face >= 0)
+                for (int k = 0; k < 3; ++k) {
+                    prefetch(&q_[scene_.faces[3 * face + k]]);
+                    if (!is_textured(scene_, face))
+                        prefetch(scene_.colors + int64_t(scene_.corners[3 * face + k]) * C_);
+                }
+    }
+
+    // Casts the rays again, through the faces whose plane holds the eye. What the others hit stays the same.
+    void cast_beyond() {
+        rays_.prepare();
+        caster_.cast_through(rays_, nullptr, [&](int32_t face) { return !is_unseen(face); });
+    }
+
+    bool is_unseen(int32_t face) const {
+        const int32_t* v = scene_.faces + 3 * int64_t(face);
+        const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
+        return camera_.perspective && passes_through_eye(corner);
+    }
+
+    void keep(Shaded& s, int32_t face) {
+        s.face = face;
+        s.textured = is_textured(scene_, face);
+        const int32_t* v = scene_.faces + 3 * int64_t(face);
+        const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
+        s.map = face_map(camera_, corner);
+        s.unseen = camera_.perspective && passes_through_eye(corner);
+        if (s.unseen) return;
+        s.depth.set(camera_, corner, s.map);
+        if (!s.textured) s.radiance.set(scene_, face);
+        // Threads may write the same byte, always with the same value; reading first keeps its cache line shared.
+        std::atomic_ref<uint8_t> seen(out_.seen[face]);
+        if (!seen.load(std::memory_order_relaxed))
+            seen.store(camera_.side(corner[0], corner[1], corner[2]), std::memory_order_relaxed);
+    }
+
+    const SceneView<T>& scene_;
+    const Camera& camera_;
+    const RayCaster& caster_;
+    const RayFrame& frame_;
+    const PixelRays pixel_rays_;
+    const int spp_;
+    Team& team_;
+    const Array<Vec3>& q_;
+    T* const image_;  // (H, W, C)
+    const HitBuffers<T>& out_;
+    const int C_;
+    const Vec2 reach_;  // of the filter around a pixel, in normalised image coordinates
+
+    struct Part {
+        int column, n;
+    };
+    RayBatch rays_;
+    Part part_[RayBatch::size];  // of which pixels the rays are
+    int parts_ = 0;
+    unsigned traced_ = 0;
+    Shaded kept_[n_kept];
+    int x0_ = 0, y_ = 0;  // the first pixel of the row
+    int hits_[tile];
+    int32_t first_[tile], last_[tile];  // faces
+    double farthest_[tile];
+    std::vector<double> sum_, radiance_;
+};
+
+// The pixels whose samples may hit something: those in an octagon around the images of all vertices of faces, if these
+// lie before the eye. With a pixel more on each side, for Embree sees positions rounded to floats.
+class ReachablePixels {
+   public:
+    ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius, Team& team)
+        : width_(camera.width), margin_(radius + 1) {
+        std::vector<Bounds> of_block(Team::blocks(q.size()));
+        team.each_block(q.size(), [&](int64_t k, int64_t first, int64_t last) {
+            Bounds b;
+            for (int64_t v = first; v < last; ++v) {
+                if (!caster.uses(v)) continue;
+                const Vec2 x = project(camera, q[v]);
+                const double far = std::max(std::fabs(x.x), std::fabs(x.y));
+                if (!(camera.depth_weight(q[v]) > 0) || !std::isfinite(far)) {
+                    b = Bounds::everything();
+                    break;
+                }
+                b.add(0, x.x), b.add(1, x.y);
+                // Of what lies far outside, floats do not say where its sides pass the picture.
+                if (far < 1e5) b.add(2, x.x + x.y), b.add(3, x.x - x.y);
+                else b.low[2] = b.low[3] = -infinite, b.high[2] = b.high[3] = infinite;
+            }
+            of_block[k] = b;
+        });
+        for (const Bounds& b : of_block)
+            for (int k = 0; k < 4; ++k) bounds_.add(k, b.low[k]), bounds_.add(k, b.high[k]);
+    }
+
+    // In row y, half open.
+    struct Range {
+        int first, end;
+    };
+    Range row(int y) const {
+        const Bounds& b = bounds_;
+        const double low = y - margin_, high = y + 1 + margin_;
+        if (b.high[1] < low || b.low[1] > high) return {0, 0};
+        const double from = std::max({b.low[0], b.low[2] - high, b.low[3] + low});
+        const double to = std::min({b.high[0], b.high[2] - low, b.high[3] + high});
+        const auto pixel = [&](double x) { return int(std::clamp(x, 0.0, double(width_))); };
+        return {pixel(from - margin_), pixel(to + margin_ + 1)};
+    }
+
+   private:
+    static constexpr double infinite = std::numeric_limits<double>::infinity();
+    // Of x, y, x + y and x − y, px.
+    struct Bounds {
+        double low[4], high[4];
+
+        Bounds() { std::fill(low, low + 4, infinite), std::fill(high, high + 4, -infinite); }
+        static Bounds everything() {
+            Bounds b;
+            std::fill(b.low, b.low + 4, -infinite), std::fill(b.high, b.high + 4, infinite);
+            return b;
+        }
+        void add(int k, double x) { low[k] = std::min(low[k], x), high[k] = std::max(high[k], x); }
+    };
+    int width_;
+    double margin_;
+    Bounds bounds_;
+};
+
+template <int N, class T>
+void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o,
+                   Team& team, const Array<Vec3>& q, T* image, const HitBuffers<T>& out) {
+    // Tiles are lower where a pixel has many samples, so that the threads end together.
+    const int rows = std::clamp((1 << 16) / o.spp, 1, tile);
+    const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + rows - 1) / rows;
+    // So many pixels fill batches of rays. Only whole ones are left out: which rays lie in a packet decides which of
+    // two faces at one depth wins, and how sums are rounded.
+    const int unit = std::min(tile, RayBatch::size / std::gcd(RayBatch::size, o.spp));
+    const RayFrame frame(caster, camera);
+    const ReachablePixels reachable(camera, caster, q, o.filter.radius() - 0.5, team);
+    team.each_with(
+        int64_t(tiles_x) * tiles_y,
+        [&] { return std::make_unique<PixelRow<N, T>>(scene, camera, caster, frame, o, team, q, image, out); },
+        [&](PixelRow<N, T>& row, int64_t t) {
+            const int x0 = int(t % tiles_x) * tile, x1 = std::min(x0 + tile, camera.width);
+            const int y0 = int(t / tiles_x) * rows, y1 = std::min(y0 + rows, camera.height);
+            for (int y = y0; y < y1; ++y) {
+                const auto [first, end] = reachable.row(y);
+                const int from = x0 + (std::clamp(first, x0, x1) - x0) / unit * unit;
+                const int to = std::min(x1, x0 + (std::clamp(end, from, x1) - x0 + unit - 1) / unit * unit);
+                row.leave_out(x0, from, y), row.render(from, to, y), row.leave_out(to, x1, y);
+            }
+        });
+}
+
+}  // namespace
+
+template <class T>
+void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o,
+                    Team& team, T* image, const HitBuffers<T>& out) {
+    const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
+    std::fill(out.seen, out.seen + scene.n_faces, uint8_t(0));
+    dispatch_channels(scene.channels,
+                      [&]<int N>() { render_pixels<N>(scene, camera, caster, o, team, q, image, out); });
+}
+
+template void render_forward(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&, Team&,
+                             float*, const HitBuffers<float>&);
+template void render_forward(const SceneView<double>&, const Camera&, const RayCaster&, const ImageOptions&, Team&,
+                             double*, const HitBuffers<double>&);
+
+}  // namespace edgegrad

@@ -1,0 +1,101 @@
+// A control variate for the interior term: what a small face that is seen whole would give if everything on it were
+// affine in the image.
+//
+// Let λ_i be the barycentrics of a point within the image of the face, x_i and c_i the places and the colours of its
+// corners, and A_i the filtered adjoint there. If radiance and adjoint were L(x) = Σ λ_i c_i and Ã(x) = Σ λ_i A_i, then
+// with
+//
+//     T_i = ∫ λ_i Ã dx = area / 12 · (A_i + Σ_j A_j)        (C numbers)
+//
+// the interior term of the face would be T_i for the colour c_i, and −∇L · T_i for the place x_i, with ∇L constant.
+// λ_i(x) Ã(x) at a sample, in place of the integral, says what the control is at that sample. The integral plus the sum
+// over samples of (what is seen − the control) has the same mean as the sum over samples of what is seen, whatever the
+// control is worth; and where it is good, which is where a face is small, nothing hides it and the adjoint is nearly
+// affine on it, what is left to chance is a small part of the whole, and few samples do. A hidden face that is taken
+// for a seen one adds noise of mean zero where there was none.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <type_traits>
+#include <vector>
+
+#include "camera/vertices.h"
+#include "scene/scene.h"
+#include "shading/surface.h"
+
+namespace edgegrad {
+
+// What samples take away from the control of one face. Its integral is FaceLanes::integrate's.
+template <int N, class T>
+class Control {
+   public:
+    // `adjoint`: Ã at the vertices, (V, C).
+    Control(const SceneView<T>& scene, const VertexView& vertices, const T* adjoint)
+        : scene_(scene), vertices_(vertices), adjoint_(adjoint), C_(N ? N : scene.channels) {
+        if constexpr (N == 0) A_.resize(3 * C_), T_.resize(3 * C_);
+    }
+
+    // Of a face that lies inside the view.
+    void start(int64_t face) {
+        const int C = channels();
+        v_ = scene_.faces + 3 * face, row_ = scene_.corners + 3 * face;
+        for (int i = 0; i < 3; ++i)
+            for (int c = 0; c < C; ++c) A_[i * C + c] = adjoint_[int64_t(v_[i]) * C + c];
+        std::fill(T_.begin(), T_.end(), 0.0);
+    }
+
+    // Takes away the control at a sample that stands for so large a share of the face's area.
+    void subtract(Barycentrics lambda, double share) {
+        const int C = channels();
+        for (int c = 0; c < C; ++c) {
+            const double A = lambda[0] * A_[c] + lambda[1] * A_[C + c] + lambda[2] * A_[2 * C + c];
+            for (int i = 0; i < 3; ++i) T_[i * C + c] -= share * lambda[i] * A;
+        }
+    }
+
+    // Adds to the cotangents of the places of the corners.
+    //
+    //     ∇L = ((c_1 − c_0) (x_2 − x_0)⊥ − (c_2 − c_0) (x_1 − x_0)⊥) / ((x_1 − x_0) ∧ (x_2 − x_0))
+    //
+    // is multiplied with the area before it is divided by it, so that a thin face is no trouble.
+    void add_to_places(Vec2 x_bar[3]) const {
+        const int C = channels();
+        const Vec2 x0 = vertices_.x[v_[0]], e1 = vertices_.x[v_[1]] - x0, e2 = vertices_.x[v_[2]] - x0;
+        const double half = wedge(e1, e2) < 0 ? -0.5 : 0.5;
+        const auto color = [&](int i) { return scene_.colors + int64_t(row_[i]) * C; };
+        const T *c0 = color(0), *c1 = color(1), *c2 = color(2);
+        for (int c = 0; c < C; ++c) {
+            const double d1 = half * (double(c1[c]) - c0[c]), d2 = half * (double(c2[c]) - c0[c]);
+            const Vec2 gradient{d1 * e2.y - d2 * e1.y, d2 * e1.x - d1 * e2.x};  // times the area
+            for (int i = 0; i < 3; ++i) x_bar[i] += -T_[i * C + c] * gradient;
+        }
+    }
+
+    // Adds to those of the colours: (3, C), or a row for each.
+    void add_to_colors(double* color_bar) const {
+        const int C = channels();
+        const double a = area();
+        for (int k = 0; k < 3 * C; ++k) color_bar[k] += a * T_[k];
+    }
+
+   private:
+    int channels() const { return N ? N : C_; }
+    double area() const {
+        const Vec2 x0 = vertices_.x[v_[0]];
+        return 0.5 * std::fabs(wedge(vertices_.x[v_[1]] - x0, vertices_.x[v_[2]] - x0));
+    }
+
+    const SceneView<T>& scene_;
+    const VertexView& vertices_;
+    const T* adjoint_;
+    const int C_;
+
+    const int32_t *v_ = nullptr, *row_ = nullptr;
+    using Numbers = std::conditional_t<N == 0, std::vector<double>, std::array<double, 3 * N>>;
+    Numbers A_{}, T_{};  // (3, C); T over the area
+};
+
+}  // namespace edgegrad

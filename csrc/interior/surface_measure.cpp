@@ -1,0 +1,408 @@
+#include "interior/surface_measure.h"
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <optional>
+
+#include "backward/vertex_image.h"
+#include "camera/polygon.h"
+#include "core/channels.h"
+#include "interior/control.h"
+#include "interior/face_lanes.h"
+#include "shading/shade.h"
+
+namespace edgegrad {
+
+namespace {
+
+// How few samples a triangle gets if it lies behind what the image hit (occlusion.h), and neither it nor a neighbour
+// was hit; and what its measure is multiplied by if a neighbour was. Never zero, for it may be visible all the same.
+constexpr OcclusionHint::Few occluded{.rays = 2, .share = 1.0 / 64, .least = 1.0 / 64};
+constexpr double occluded_beside_hits = 1.0 / 8;
+
+// Default samples a unit of (area + longest side · 1 px): where colours are interpolated, and where a texture may vary
+// from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
+// (docs/performance.md).
+constexpr double colored = 0.5, textured = 4;
+
+// Where the adjoint is as rough as noise it changes from pixel to pixel within a face: up to so many times more samples
+// are taken, on faces that are several pixels long.
+constexpr double most = 5;
+double more_if_rough(double rough, double longest) {
+    return std::clamp(rough, 1.0, std::clamp(longest / 2, 1.0, most));
+}
+
+// From this area in the image on, px², a triangle with a texture, or under a rough adjoint, is left to samples of the
+// pixels. Each triangle's
+// integral is estimated in exactly one way, chosen before any sample is drawn, so the sum stays unbiased.
+constexpr double large = 256;
+
+// A face with a control is sampled the less the better that is likely to be: the adjoint changes little, and the face
+// is not wide, px. From `widest` on its corners say little.
+constexpr double least = 1.0 / 16, wide = 32, widest = 64;
+
+// A face this long, px, has each of its points within OcclusionHint::reach of a corner: two thirds of the longest side
+// are the most that a point of a triangle is away from the nearest.
+constexpr double small = 1.5 * OcclusionHint::reach;
+static_assert(small < 2 * OcclusionHint::tile);
+
+// The pixels that large triangles may touch, by tiles.
+class PixelMask {
+   public:
+    PixelMask(const Camera& camera, double radius)
+        : width_(camera.width),
+          height_(camera.height),
+          radius_(radius),
+          columns_((camera.width + tile - 1) / tile),
+          marked_(size_t(columns_) * ((camera.height + tile - 1) / tile), 0) {}
+
+    // A box in the image.
+    void mark(Vec2 low, Vec2 high) {
+        const auto index = [](double x, int most) {
+            return int(std::clamp(std::floor(x), 0.0, double(most - 1))) / tile;
+        };
+        const int i0 = index(low.x - radius_, width_), i1 = index(high.x + radius_, width_);
+        const int j0 = index(low.y - radius_, height_), j1 = index(high.y + radius_, height_);
+        for (int j = j0; j <= j1; ++j)
+            for (int i = i0; i <= i1; ++i)
+                std::atomic_ref(marked_[size_t(j) * columns_ + i]).store(1, std::memory_order_relaxed);
+    }
+
+    std::vector<int64_t> pixels() const {
+        std::vector<int64_t> out;
+        for (size_t t = 0; t < marked_.size(); ++t)
+            if (marked_[t])
+                for (int y = int(t) / columns_ * tile; y < std::min((int(t) / columns_ + 1) * tile, height_); ++y)
+                    for (int x = int(t) % columns_ * tile; x < std::min((int(t) % columns_ + 1) * tile, width_); ++x)
+                        out.push_back(int64_t(y) * width_ + x);
+        return out;
+    }
+
+   private:
+    static constexpr int tile = 16;
+    int width_, height_;
+    double radius_;
+    int columns_;
+    std::vector<uint8_t> marked_;
+};
+
+// Looks at the faces of one chunk.
+template <int N, class T>
+class MeasuredChunk {
+   public:
+    MeasuredChunk(const BackwardView<T>& view, const std::vector<double>& importance_around, bool geometry,
+                  const Destination& to, Array<int8_t>& facing, SurfaceMeasure<T>& out, PixelMask& mask,
+                  ChunkGrad& grad)
+        : view_(view),
+          importance_around_(importance_around),
+          want_places_(geometry),
+          want_colors_(to.colors),
+          facing_(facing),
+          want_facing_(!facing.empty()),
+          out_(out),
+          mask_(mask),
+          grad_(grad),
+          C_(N ? N : view.scene.channels),
+          rough_(2 * view.importance.roughness() * view.importance.roughness()),
+          colors_(C_) {}
+
+    double total() const { return total_; }
+    double of_large() const { return of_large_; }
+
+    void add(int64_t first, int64_t last) {
+        for (int64_t g = first; g < last; g += FaceLanes::size) {
+            add_hidden(g, std::min(g + FaceLanes::size, last), last);
+            if (n_others_ == 0) continue;
+            if (!lanes_) lanes_.emplace(C_);
+            lanes_->count = 0;
+            for (int i = 0; i < n_others_; ++i) gather(others_[i]);
+            look();
+        }
+    }
+
+   private:
+    // Lays out those of the faces that are small and lie behind all that was hit around their corners. Of these there
+    // may be many, and they get few samples, so little is asked of them. The others are listed.
+    void add_hidden(int64_t first, int64_t last, int64_t end) {
+        const VertexView& p = view_.vertices;
+        const ImageHits& hits = *view_.hits;
+        const Vec2* x = p.x.data();
+        HiddenFaces& l = hidden_;
+        int count = 0;
+        n_others_ = 0;
+        std::fill(&out_.of_face[first], &out_.of_face[first] + (last - first), 0.0);
+        std::fill(&out_.is_controlled[first], &out_.is_controlled[first] + (last - first), uint8_t(0));
+        for (int64_t f = first; f < last; ++f) {
+            const int32_t* v = view_.scene.faces + 3 * f;
+            if (f + ahead < end)
+                for (int i = 0; i < 3; ++i) prefetch(x + v[3 * ahead + i]), hits.prefetch(v[3 * ahead + i]);
+            if (hits.are_behind(v)) {
+                l.face[count] = f;
+                for (int k = 0; k < 3; ++k) l.x[k][count] = x[v[k]].x, l.y[k][count] = x[v[k]].y;
+                ++count;
+                continue;
+            }
+            others_[n_others_++] = f;
+            for (int i = 0; i < 3; ++i)
+                prefetch(&p.outcode[v[i]]), prefetch(&p.q[v[i]]), prefetch(&view_.vertex_adjoint[int64_t(v[i]) * C_]);
+        }
+        if (!count) return;
+        l.bound(view_.occlusion, rounding_);
+        int8_t* facing = facing_.data();
+        const double default_factor = colored * hidden_by_all_around_;
+        for (int i = 0; i < count; ++i) {
+            const int64_t f = l.face[i];
+            if (!(l.side[i] <= small)) {
+                others_[n_others_++] = f;
+                continue;
+            }
+            if (l.facing[i] == 0) [[unlikely]] {
+                set_facing(f, l.wedge[i], l.side[i]);
+                if (l.wedge[i] == 0) continue;
+            } else if (want_facing_) {
+                facing[f] = int8_t(l.facing[i]);
+            }
+            const double importance = importance_around_[l.tile[i]];
+            if (!(importance > 0)) continue;
+            const double m =
+                l.extent[i] * (is_textured(view_.scene, f) ? textured * hidden_by_all_around_ : default_factor);
+            out_.of_face[f] = m * importance;
+            total_ += m;
+        }
+    }
+
+    // Puts a face that lies inside the view into the lanes, where all are looked at together; any other is laid out
+    // here.
+    void gather(int64_t f) {
+        const int32_t* v = view_.scene.faces + 3 * f;
+        const VertexView& p = view_.vertices;
+        if (p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) {
+            set_facing(f, 0, 0);
+            if (!polygon_.set(view_.camera, view_.volume, p, v)) return;
+            const double importance = view_.importance.mean(polygon_.low, polygon_.high);
+            const Extent extent{polygon_.area, polygon_.longest, polygon_.low, polygon_.high, polygon_.nearest};
+            const double m = default_samples(f, extent, view_.hits->of(v), [&] { return side_of(view_, f); });
+            if (importance > 0) lay_out(f, m, importance, extent);
+            return;
+        }
+        const int i = lanes_->count++;
+        lanes_->face[i] = f;
+        for (int k = 0; k < 3; ++k) {
+            const Vec2 x = p.x[v[k]];
+            lanes_->x[k][i] = x.x, lanes_->y[k][i] = x.y, lanes_->z[k][i] = p.q[v[k]].z;
+        }
+    }
+
+    // By twice the signed area in the image, px², unless its rounding decides; `side`: about how long the face is, px.
+    void set_facing(int64_t f, double twice, double side) {
+        if (!want_facing_) return;
+        if (std::fabs(twice) > rounding_ * side) [[likely]] {
+            facing_[f] = twice > 0 ? 1 : -1;
+            return;
+        }
+        const auto q = corners_of(view_, f);
+        facing_[f] = int8_t(view_.camera.facing(q[0], q[1], q[2]));
+    }
+
+    // What the measure of a face is multiplied by if it lies behind what was hit in so many pixels.
+    double hidden(int64_t pixels) const { return view_.occlusion.factor(occluded, pixels, view_.image.spp); }
+
+    // What there is of a face in the image.
+    struct Extent {
+        double area, longest;  // px², px
+        Vec2 low, high;        // its box
+        double nearest;        // depth
+    };
+
+    // `side()` says from which side the face would be visible.
+    template <class Side>
+    double default_samples(int64_t f, const Extent& e, ImageHits::Face hits, Side side) const {
+        const double m = (e.area + e.longest) * (is_textured(view_.scene, f) ? textured : colored);
+        const int64_t hiding = view_.seen[f] ? 0 : view_.occlusion.hiding_pixels(e.low, e.high, e.nearest);
+        if (hits.partly) return hiding ? m * OcclusionHint::factor(occluded_beside_hits, view_.image.spp) : m;
+        if (hiding) return m * hidden(hiding);
+        return m * view_.hits->where_missed(view_.scene.faces[3 * f], side());
+    }
+
+    // A face without a control.
+    void lay_out(int64_t f, double m, double importance, const Extent& e) {
+        if (!std::isfinite(m)) return;  // coordinates beyond 1e150 cannot be sampled
+        const bool textured = is_textured(view_.scene, f);
+        if (!textured) m *= more_if_rough(rough_, e.longest);
+        if ((textured || rough_ > 1) && e.area >= large) {
+            out_.is_large[f] = 1;
+            mask_.mark(e.low, e.high);
+            of_large_ += m;
+        } else {
+            out_.of_face[f] = m * importance;
+            total_ += m;
+        }
+    }
+
+    // Lays out the faces in the lanes.
+    void look() {
+        FaceLanes& l = *lanes_;
+        if (!l.count) return;
+        l.bound(view_.camera.width, view_.camera.height, view_.importance.radius());
+        for (int i = 0; i < l.count; ++i) view_.importance.prefetch(l.i0[i], l.i1[i], l.j0[i], l.j1[i]);
+        for (int i = 0; i < l.count; ++i) importance_[i] = view_.importance.mean(l.i0[i], l.i1[i], l.j0[i], l.j1[i]);
+        bool any = false;
+        for (int i = 0; i < l.count; ++i) {
+            const int64_t f = l.face[i];
+            const double area = 0.5 * std::fabs(l.wedge[i]);
+            controlled_[i] = false;
+            set_facing(f, l.wedge[i], l.longest[i]);
+            if (!(area > 0) || !(importance_[i] > 0)) continue;
+            const ImageHits::Face seen = view_.hits->of(view_.scene.faces + 3 * f);
+            const auto [x0, x1] = std::minmax({l.x[0][i], l.x[1][i], l.x[2][i]});
+            const auto [y0, y1] = std::minmax({l.y[0][i], l.y[1][i], l.y[2][i]});
+            const Extent extent{area, l.longest[i], {x0, y0}, {x1, y1}, std::min({l.z[0][i], l.z[1][i], l.z[2][i]})};
+            samples_[i] =
+                default_samples(f, extent, seen, [&] { return (l.wedge[i] > 0) == (view_.camera.k_det > 0) ? 1 : 2; });
+            // One without texture and so small that its corners say what is between them. A face that comes near the
+            // eye is not affine in the image.
+            if (seen.whole && l.longest[i] <= widest && !view_.options.dry && !is_textured(view_.scene, f) &&
+                (!view_.camera.perspective || l.depths[i] < 2)) {
+                controlled_[i] = any = true;
+                clear_[i] = seen.clear;
+                gather_control(i);
+            } else {
+                lay_out(f, samples_[i], importance_[i], extent);
+            }
+        }
+        if (any) add_controls();
+    }
+
+    void gather_control(int i) {
+        const int C = N ? N : C_;
+        const int64_t f = lanes_->face[i];
+        const int32_t *v = view_.scene.faces + 3 * f, *row = view_.scene.corners + 3 * f;
+        constexpr int next = FaceLanes::size;
+        double *adjoint = lanes_->adjoint.data() + i, *color = lanes_->color.data() + i;
+        for (int k = 0; k < 3; ++k) {
+            const T* A = &view_.vertex_adjoint[int64_t(v[k]) * C];
+            for (int c = 0; c < C; ++c) adjoint[(7 * c + k) * next] = A[c];
+        }
+        for (int k = 0; k < 4; ++k) {
+            const T* A =
+                view_.adjoint.of(int64_t(lanes_->inside[1][k][i]) * view_.camera.width + lanes_->inside[0][k][i]);
+            for (int c = 0; c < C; ++c) adjoint[(7 * c + 3 + k) * next] = A[c];
+        }
+        const auto color_of = [&](int k) { return view_.scene.colors + int64_t(row[k]) * C; };
+        const T *c0 = color_of(0), *c1 = color_of(1), *c2 = color_of(2);
+        for (int c = 0; c < C; ++c) {
+            color[2 * c * next] = double(c1[c]) - c0[c];
+            color[(2 * c + 1) * next] = double(c2[c]) - c0[c];
+        }
+    }
+
+    void add_controls() {
+        const int C = N ? N : C_;
+        FaceLanes& l = *lanes_;
+        l.integrate();
+        for (int i = 0; i < l.count; ++i) {
+            if (!controlled_[i]) continue;
+            const int64_t f = l.face[i];
+            const int32_t *v = view_.scene.faces + 3 * f, *row = view_.scene.corners + 3 * f;
+            if (want_places_)
+                for (int k = 0; k < 3; ++k) {
+                    const Vec2 x_bar{l.x_bar[k][i], l.y_bar[k][i]};
+                    grad_.x.template add<2>(v[k], &x_bar.x);
+                }
+            if (want_colors_)
+                for (int k = 0; k < 3; ++k) {
+                    for (int c = 0; c < C; ++c)
+                        colors_[c] = 0.5 * std::fabs(l.wedge[i]) * l.T[(3 * c + k) * FaceLanes::size + i];
+                    grad_.colors.template add<N>(row[k], colors_.data());
+                }
+            double m = samples_[i];
+            const double rough = 2 * variation(i);
+            if (rough > 1) m *= more_if_rough(rough * rough, l.longest[i]);
+            else if (clear_[i] && l.longest[i] < wide) m *= std::max({rough, l.longest[i] / wide, least});
+            out_.is_controlled[f] = 1, out_.of_face[f] = m * importance_[i];
+            total_ += m;
+        }
+    }
+
+    // How much the adjoint changes over a face relative to its size: from one corner to the others, to the pixels at
+    // the middles of the sides and of the face, and to the mean of its box. Corners alone may agree by chance, as the
+    // signs of an L1 loss do.
+    double variation(int i) const {
+        const FaceLanes& l = *lanes_;
+        if (!(l.sum[i] > 0)) return 1;
+        return std::max({l.change[i] / l.sum[i], l.apart[i] / l.sum[i],
+                         std::fabs(1 - view_.importance.of(l.sum[i] / 3) / importance_[i])});
+    }
+
+    // What is asked of memory for a face so far ahead is there when it is wanted.
+    static constexpr int ahead = 32;
+    const BackwardView<T>& view_;
+    const std::vector<double>& importance_around_;  // of what lies within two tiles of a point, by its own
+    const bool want_places_, want_colors_;
+    Array<int8_t>& facing_;
+    const bool want_facing_;
+    SurfaceMeasure<T>& out_;
+    PixelMask& mask_;
+    ChunkGrad& grad_;
+    const int C_;
+    const double rough_;                                                 // of faces without a control
+    const double rounding_ = 16 * view_.camera.rounding_of_positions();  // of a wedge, over the longer side
+    double total_ = 0, of_large_ = 0;
+    VisiblePolygon polygon_;
+    std::optional<FaceLanes> lanes_;  // none before there is a face for them
+    HiddenFaces hidden_;
+    int64_t others_[FaceLanes::size];
+    int n_others_ = 0;
+    const double hidden_by_all_around_ = hidden(OcclusionHint::pixels_around);
+    double importance_[FaceLanes::size], samples_[FaceLanes::size];
+    bool controlled_[FaceLanes::size], clear_[FaceLanes::size];
+    std::vector<double> colors_;
+};
+
+}  // namespace
+
+template <int N, class T>
+SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Array<int8_t>& facing, Destination& to) {
+    const GradientOptions& o = view.options;
+    const int64_t F = view.scene.n_faces, chunks = (F + scatter_chunk - 1) / scatter_chunk;
+    SurfaceMeasure<T> out{Array<double>(F), Array<uint8_t>(F), {}, {}};
+    if (view.scene.face_texture || 2 * std::pow(view.importance.roughness(), 2) > 1) out.is_large.assign(F, 0);
+    PixelMask mask(view.camera, view.image.filter.radius() - 0.5);
+    // What the controls are of all of their faces, summed by the places of vertices in the image.
+    Array<double> x_bar = zeros(geometry ? 2 * view.scene.n_verts : 0, view.team);
+    Destination whole;
+    whole.x = geometry ? x_bar.data() : nullptr, whole.colors = to.colors;
+    std::vector<double> total(chunks), of_large(chunks);
+    const int columns = view.occlusion.columns(), rows = view.occlusion.rows();
+    std::vector<double> importance_around(size_t(columns) * rows);
+    view.team.each(rows, [&](int64_t j) {
+        constexpr double tile = OcclusionHint::tile;
+        for (int i = 0; i < columns; ++i)
+            importance_around[j * columns + i] =
+                view.importance.mean({(i - 2) * tile, (j - 2) * tile}, {(i + 3) * tile, (j + 3) * tile});
+    });
+    double seconds[2] = {};
+    view.scatter.add(F, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+        MeasuredChunk<N, T> chunk(view, importance_around, geometry, to, facing, out, mask, grad);
+        chunk.add(first, last);
+        total[first / scatter_chunk] = chunk.total(), of_large[first / scatter_chunk] = chunk.of_large();
+    });
+    if (geometry) add_places(view, x_bar, to);
+    for (int64_t k = 0; k < chunks; ++k) out.total += total[k], out.of_large += of_large[k];
+    if (out.of_large > 0) out.pixels = mask.pixels();
+    if (!out.pixels.empty())
+        out.pixel_spp = int(std::clamp(
+            std::round(out.scale(o.surface_samples) * out.of_large / double(out.pixels.size())), 1.0, 0x1p20));
+    return out;
+}
+
+// clang-format off
+#define EDGEGRAD_INSTANTIATE(N) \
+    template SurfaceMeasure<float> measure_surface<N>(const BackwardView<float>&, bool, Array<int8_t>&, Destination&); \
+    template SurfaceMeasure<double> measure_surface<N>(const BackwardView<double>&, bool, Array<int8_t>&, Destination&);
+EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
+#undef EDGEGRAD_INSTANTIATE
+// clang-format on
+
+}  // namespace edgegrad

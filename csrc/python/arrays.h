@@ -1,0 +1,161 @@
+// The arrays of a scene, of a camera and of what the image hit, kept alive, checked, and seen as the kernel sees them.
+#pragma once
+
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "forward/forward.h"
+#include "python/checks.h"
+#include "scene/geometry.h"
+
+namespace edgegrad {
+
+// From pairs of numbers: a vertex, and the spacing from there on.
+inline Spacing make_spacing(const std::vector<double>& pairs) {
+    Spacing spacing{{}, {}};
+    for (size_t i = 0; i + 1 < pairs.size(); i += 2)
+        spacing.first.push_back(int32_t(pairs[i])), spacing.value.push_back(pairs[i + 1]);
+    if (pairs.empty() || pairs.size() % 2 || spacing.first[0] != 0 ||
+        !std::is_sorted(spacing.first.begin(), spacing.first.end()))
+        refuse("spacing: expected pairs of a vertex and a spacing, ascending from vertex 0");
+    return spacing;
+}
+
+// The arrays of a scene, kept alive, checked, and seen as the kernel sees them.
+template <class T>
+struct SceneArrays {
+    In<double, 2> verts;
+    In<int32_t, 2> faces, corners;
+    In<T, 2> colors;
+    In<double, 2> uvs;
+    In<T, 2> texels;
+    In<int64_t, 2> textures;
+    In<int32_t, 1> face_texture;
+    In<T, 3> background;  // (1, 1, C) or (H, W, C)
+    Spacing spacing;
+    bool by_vertex = false;
+
+    SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int32_t, 2> corners_, In<T, 2> colors_,
+                In<double, 2> uvs_, In<T, 2> texels_, In<int64_t, 2> textures_, In<int32_t, 1> face_texture_,
+                In<T, 3> background_, const std::vector<double>& spacing_, int threads)
+        : verts(verts_),
+          faces(faces_),
+          corners(corners_),
+          colors(colors_),
+          uvs(uvs_),
+          texels(texels_),
+          textures(textures_),
+          face_texture(face_texture_),
+          background(background_),
+          spacing(make_spacing(spacing_)) {
+        const auto width = [](const char* name, size_t got, size_t expected) {
+            if (got != expected)
+                refuse(std::string(name) + ": expected " + std::to_string(expected) + " columns, got " +
+                       std::to_string(got));
+        };
+        const size_t C = background.shape(2);
+        width("verts", verts.shape(1), 3), width("faces", faces.shape(1), 3), width("corners", corners.shape(1), 3);
+        width("colors", colors.shape(1), C), width("uvs", uvs.shape(1), 2), width("texels", texels.shape(1), C);
+        width("textures", textures.shape(1), 3);
+        if (corners.shape(0) != faces.shape(0)) refuse("corners: expected one row a face");
+        if (faces.shape(0) == 0 || verts.shape(0) == 0) refuse("faces: expected at least one face, got none");
+        check_finite("verts", verts.data(), verts.size(), 3, threads);
+        check_finite("colors", colors.data(), colors.size(), C, threads);
+        check_finite("uvs", uvs.data(), uvs.size(), 2, threads);
+        check_finite("texture", texels.data(), texels.size(), C, threads);
+        check_finite("background", background.data(), background.size(), C, threads);
+        check_indices("faces", faces.data(), faces.size(), verts.shape(0), "verts", threads);
+        const bool textured = textures.shape(0) > 0;
+        if (!textured) {
+            // Colours of vertices are indexed by the faces, or by a copy of them.
+            by_vertex = colors.shape(0) >= verts.shape(0) &&
+                        (corners.data() == faces.data() ||
+                         std::equal(faces.data(), faces.data() + faces.size(), corners.data()));
+            if (by_vertex) return;
+            check_indices("colors", corners.data(), corners.size(), colors.shape(0), "colors", threads);
+            return;
+        }
+        if (face_texture.shape(0) != faces.shape(0)) refuse("face_texture: expected one number a face");
+        for (size_t i = 0; i < textures.shape(0); ++i) {
+            const int64_t first = textures(i, 0), h = textures(i, 1), w = textures(i, 2);
+            if (h < 1 || w < 1 || first < 0 || first + h * w > int64_t(texels.shape(0)))
+                refuse("textures: row " + std::to_string(i) + " lies outside the texels");
+        }
+        for (size_t f = 0; f < faces.shape(0); ++f) {
+            if (face_texture(f) >= int64_t(textures.shape(0)))
+                refuse("face_texture: expected a texture's number, got " + std::to_string(face_texture(f)));
+            const bool t = face_texture(f) >= 0;
+            check_indices(t ? "uv_faces" : "colors", corners.data() + 3 * f, 3, t ? uvs.shape(0) : colors.shape(0),
+                          t ? "uvs" : "colors", 1, 3 * f);
+        }
+    }
+
+    SceneView<T> view() const {
+        return {verts.data(),
+                int64_t(verts.shape(0)),
+                faces.data(),
+                int64_t(faces.shape(0)),
+                by_vertex ? faces.data() : corners.data(),  // one array: neighbours agree at their edge (may_jump)
+                colors.data(),
+                int64_t(colors.shape(0)),
+                uvs.data(),
+                int64_t(uvs.shape(0)),
+                texels.data(),
+                int64_t(texels.shape(0)),
+                textures.data(),
+                textures.shape(0) ? face_texture.data() : nullptr,
+                background.data(),
+                background.shape(0) * background.shape(1) > 1,
+                int(background.shape(2)),
+                &spacing};
+    }
+
+    std::shared_ptr<const Geometry> geometry(GeometryWanted wanted, Team& team, GeometryWork& work) const {
+        return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, wanted, team,
+                                work);
+    }
+};
+
+template <class T>
+struct HitArrays {
+    Out<T, 2> coverage;
+    Out<float, 2> depth;
+    Out<int32_t, 3> hit;
+    Out<uint8_t, 1> seen;
+
+    void check(const SceneArrays<T>& scene, const Camera& camera) const {
+        if (coverage.size() != size_t(camera.width) * camera.height) refuse("coverage: expected the size of the image");
+        if (depth.size() != coverage.size()) refuse("depth: expected one number a pixel");
+        if (hit.size() != 2 * coverage.size()) refuse("hit: expected two numbers a pixel");
+        if (seen.size() != scene.faces.shape(0)) refuse("seen: expected one number a face");
+    }
+    HitBuffers<T> view() const { return {coverage.data(), depth.data(), hit.data(), seen.data()}; }
+};
+
+inline Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, bool perspective, int width, int height) {
+    if (world_to_camera.shape(0) != 4 || world_to_camera.shape(1) != 4)
+        refuse("world_to_camera: expected shape (4, 4)");
+    if (K.shape(0) != 3 || K.shape(1) != 3) refuse("K: expected shape (3, 3)");
+    check_finite("world_to_camera", world_to_camera.data(), 16, 4, 1);
+    check_finite("K", K.data(), 9, 3, 1);
+    const Camera camera(world_to_camera.data(), K.data(), perspective, width, height);
+    if (camera.k_det == 0) refuse("K: expected focal lengths that are not zero, got a singular matrix");
+    return camera;
+}
+
+inline Filter make_filter(const std::string& name) {
+    if (name == "box") return Filter(FilterKind::box);
+    if (name == "tent") return Filter(FilterKind::tent);
+    if (name == "gaussian") return Filter(FilterKind::gaussian);
+    refuse("filter: expected \"box\", \"tent\" or \"gaussian\", got \"" + name + "\"");
+}
+
+inline ImageOptions make_image_options(int spp, const std::string& filter, uint64_t seed) {
+    return {spp, make_filter(filter), seed};
+}
+
+}  // namespace edgegrad

@@ -1,0 +1,249 @@
+// What only tests and benchmarks call: small functions with their _vjp and the parts of topology and sampling, each to
+// be compared with its definition; samples of one pass without the rest; the yardstick of the image's rays.
+
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include <array>
+#include <optional>
+#include <tuple>
+#include <vector>
+
+#include "backward/backward.h"
+#include "camera/camera.h"
+#include "checks/probe.h"
+#include "core/sampler.h"
+#include "core/sobol.h"
+#include "core/systematic.h"
+#include "film/film.h"
+#include "film/importance.h"
+#include "python/arrays.h"
+#include "python/unlocked.h"
+#include "scene/topology.h"
+#include "shading/surface.h"
+#include "shading/texture.h"
+
+using namespace nanobind::literals;
+
+namespace edgegrad {
+
+namespace {
+
+using A2 = std::array<double, 2>;
+using A3 = std::array<double, 3>;
+using A6 = std::array<double, 6>;
+using A33 = std::array<A3, 3>;
+
+Vec2 vec(const A2& a) { return {a[0], a[1]}; }
+Vec3 vec(const A3& a) { return {a[0], a[1], a[2]}; }
+FaceMap map(const A33& m) { return {{vec(m[0]), vec(m[1]), vec(m[2])}}; }
+A2 array(Vec2 a) { return {a.x, a.y}; }
+A3 array(Vec3 a) { return {a.x, a.y, a.z}; }
+A33 array(const FaceMap& m) { return {array(m.column[0]), array(m.column[1]), array(m.column[2])}; }
+
+FilterKind kind(const std::string& name) {
+    return name == "box" ? FilterKind::box : name == "tent" ? FilterKind::tent : FilterKind::gaussian;
+}
+
+// Functions of a whole scene.
+template <class T>
+void bind_scene_functions(nb::module_& m) {
+    using Scene = SceneArrays<T>;
+    m.def(
+        "bare_loop",
+        [](const Scene& scene, const Camera& camera, const ImageOptions& options, int packet_width, int threads) {
+            return unlocked(threads, [&](Team& team) {
+                GeometryWork work;
+                return bare_loop(camera, scene.geometry({}, team, work)->caster(), options, packet_width, team);
+            });
+        },
+        "scene"_a, "camera"_a, "options"_a, "packet_width"_a, "threads"_a);
+    // The interior term from samples of the pixels.
+    m.def(
+        "pixel_backward",
+        [](const Scene& scene, const Camera& camera, const ImageOptions& image, int threads, Out<T, 3> adjoint,
+           Out<double, 2> verts, std::optional<Out<double, 2>> colors) {
+            const GradientOptions options{.seed = image.seed, .boundary = false, .pixel_spp = image.spp};
+            const Gradients grad{.verts = verts.data(), .colors = colors ? colors->data() : nullptr};
+            return unlocked(threads, [&](Team& team) {
+                std::vector<uint8_t> seen(scene.faces.shape(0), 1);
+                GeometryWork work;
+                const auto geometry = scene.geometry({}, team, work);
+                const SceneView<T> view = scene.view();
+                const BackwardInput<T> input{view, camera, *geometry, image, adjoint.data(), {.seen = seen.data()}};
+                const BackwardProfile p = render_backward(input, options, team, grad);
+                return p.surface[0] + p.surface[1];
+            });
+        },
+        "scene"_a, "camera"_a, "image"_a, "threads"_a, "adjoint"_a.noconvert(), "verts"_a.noconvert(),
+        "colors"_a = nb::none());
+    m.def(
+        "shade_at",
+        [](const Scene& scene, const Camera& camera, In<int32_t, 1> faces, In<double, 2> points,
+           Out<double, 2> radiance) {
+            check_indices("faces", faces.data(), faces.size(), scene.faces.shape(0), "faces", 1);
+            shade_at(scene.view(), camera, faces.size(), faces.data(), points.data(), radiance.data());
+        },
+        "scene"_a, "camera"_a, "faces"_a.noconvert(), "points"_a.noconvert(), "radiance"_a.noconvert());
+    m.def(
+        "shade_at_vjp",
+        [](const Scene& scene, const Camera& camera, In<int32_t, 1> faces, In<double, 2> points,
+           In<double, 2> radiance_bar, Out<double, 2> verts, Out<double, 2> colors, Out<double, 2> uvs,
+           Out<double, 2> texels, Out<double, 2> world_to_camera, Out<double, 2> K) {
+            check_indices("faces", faces.data(), faces.size(), scene.faces.shape(0), "faces", 1);
+            const Gradients grad{.verts = verts.data(),
+                                 .colors = colors.data(),
+                                 .uvs = uvs.data(),
+                                 .texels = texels.data(),
+                                 .world_to_camera = world_to_camera.data(),
+                                 .K = K.data()};
+            shade_at_vjp(scene.view(), camera, faces.size(), faces.data(), points.data(), radiance_bar.data(), grad);
+        },
+        "scene"_a, "camera"_a, "faces"_a.noconvert(), "points"_a.noconvert(), "radiance_bar"_a.noconvert(),
+        "verts"_a.noconvert(), "colors"_a.noconvert(), "uvs"_a.noconvert(), "texels"_a.noconvert(),
+        "world_to_camera"_a.noconvert(), "K"_a.noconvert());
+}
+
+}  // namespace
+
+void bind_for_tests(nb::module_& m) {
+    nb::module_ p = m.def_submodule("for_tests", "What only tests and benchmarks call.");
+    bind_scene_functions<float>(p);
+    bind_scene_functions<double>(p);
+
+    p.def("project", [](const Camera& c, A3 q) { return array(project(c, vec(q))); });
+    p.def("project_vjp", [](const Camera& c, A3 q, A2 bar) {
+        Vec3 q_bar;
+        A6 k_bar{};
+        project_vjp(c, vec(q), vec(bar), q_bar, k_bar.data());
+        return std::tuple(array(q_bar), k_bar);
+    });
+    p.def("normalised", [](const Camera& c, A2 x) { return array(normalised(c, vec(x))); });
+    p.def("normalised_vjp", [](const Camera& c, A2 x, A2 bar) {
+        A6 k_bar{};
+        normalised_vjp(c, normalised(c, vec(x)), vec(bar), k_bar.data());
+        return k_bar;
+    });
+    p.def("cross", [](A3 a, A3 b) { return array(cross(vec(a), vec(b))); });
+    p.def("cross_vjp", [](A3 a, A3 b, A3 bar) {
+        Vec3 a_bar, b_bar;
+        cross_vjp(vec(a), vec(b), vec(bar), a_bar, b_bar);
+        return std::tuple(array(a_bar), array(b_bar));
+    });
+    p.def("dot", [](A3 a, A3 b) { return dot(vec(a), vec(b)); });
+    p.def("dot_vjp", [](A3 a, A3 b, double bar) {
+        Vec3 a_bar, b_bar;
+        dot_vjp(vec(a), vec(b), bar, a_bar, b_bar);
+        return std::tuple(array(a_bar), array(b_bar));
+    });
+    // A FaceMap by its columns.
+    p.def("face_map", [](const Camera& c, A33 q) {
+        const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])};
+        return array(face_map(c, corner));
+    });
+    p.def("face_map_vjp", [](const Camera& c, A33 q, A33 bar) {
+        const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])};
+        Vec3 q_bar[3];
+        face_map_vjp(c, corner, map(bar), q_bar);
+        return A33{array(q_bar[0]), array(q_bar[1]), array(q_bar[2])};
+    });
+    p.def("barycentrics", [](A33 m, A2 n) {
+        Barycentrics b;
+        const bool met = barycentrics(map(m), vec(n), b);
+        return std::tuple(met, A2{b.u, b.v});
+    });
+    p.def("barycentrics_vjp", [](A33 m, A2 n, A2 bar) {
+        Barycentrics b;
+        barycentrics(map(m), vec(n), b);
+        FaceMap m_bar;
+        Vec2 n_bar;
+        barycentrics_vjp(map(m), vec(n), b, {bar[0], bar[1]}, m_bar, n_bar);
+        return std::tuple(array(m_bar), array(n_bar));
+    });
+    p.def("inside", [](double u, double v) {
+        const Barycentrics b = inside({u, v});
+        return A2{b.u, b.v};
+    });
+
+    using Texels = nb::ndarray<const double, nb::numpy, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+    p.def("texture_eval", [](Texels texels, A2 uv) {
+        const Texture<double> t{texels.data(), 0, int64_t(texels.shape(0)), int64_t(texels.shape(1))};
+        std::vector<double> out(texels.shape(2));
+        eval<0>(t, footprint(t, vec(uv)), int(texels.shape(2)), out.data());
+        return out;
+    });
+    p.def("texture_eval_vjp", [](Texels texels, A2 uv, std::vector<double> bar) {
+        const Texture<double> t{texels.data(), 0, int64_t(texels.shape(0)), int64_t(texels.shape(1))};
+        const Footprint f = footprint(t, vec(uv));
+        std::array<int64_t, 4> texel;
+        std::array<double, 4> weight;
+        for (int i = 0; i < 4; ++i) texel[i] = f.texel[i], weight[i] = f.weight(i);
+        return std::tuple(array(eval_vjp<0>(t, f, int(texels.shape(2)), bar.data())), texel, weight);
+    });
+
+    p.def("filter_radius", [](const std::string& name) { return Filter(kind(name)).radius(); });
+    p.def("filter_weight", [](const std::string& name, double d) { return Filter(kind(name)).weight(d); });
+    p.def("filter_sample", [](const std::string& name, double u) { return Filter(kind(name)).sample(u); });
+    p.def("lattice", [](uint64_t random, int n) {
+        const ShiftedLattice lattice(n);
+        std::vector<double> x(n), y(n);
+        lattice.fill(mix(random), 0, 1, x.data(), y.data());
+        lattice.fill(mix(random), 1, n - 1, x.data() + 1, y.data() + 1);
+        std::vector<A2> points;
+        for (int i = 0; i < n; ++i) points.push_back({x[i], y[i]});
+        return points;
+    });
+    p.def("sequence", [](uint64_t random, int n) {
+        const ShiftedSequence sequence(mix(random));
+        std::vector<A2> points;
+        for (int i = 0; i < n; ++i) points.push_back(array(sequence(i)));
+        return points;
+    });
+    p.def(
+        "sobol",
+        [](uint64_t random, int n, uint64_t first) {
+            std::vector<double> x(n), y(n);
+            ScrambledSobol(mix(random)).fill(first, n, x.data(), y.data());
+            std::vector<A2> points;
+            for (int i = 0; i < n; ++i) points.push_back({x[i], y[i]});
+            return points;
+        },
+        "random"_a, "n"_a, "first"_a = 0);
+    p.def("z_order", &z_order);
+    p.def("systematic", [](std::vector<double> measure, int64_t n, double shift) {
+        Team team(1);
+        Array<double> ends(measure.size());
+        std::copy(measure.begin(), measure.end(), ends.begin());
+        Systematic systematic(ends, team);
+        systematic.draw(n, shift);
+        std::vector<std::tuple<int64_t, double>> out;  // primitive, weight
+        for (int64_t i = 0; i < n; ++i) {
+            const int64_t k = systematic.primitive(systematic.position(i));
+            out.emplace_back(k, systematic.weight(k));
+        }
+        return out;
+    });
+    using Image = nb::ndarray<const double, nb::numpy, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+    p.def("importance", [](Image adjoint, double radius, A2 low, A2 high) {
+        Team team(2);
+        const Importance importance(adjoint.data(), int(adjoint.shape(1)), int(adjoint.shape(0)), int(adjoint.shape(2)),
+                                    radius, team);
+        return importance.mean(vec(low), vec(high));
+    });
+
+    using Verts = nb::ndarray<const double, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+    using Faces = nb::ndarray<const int32_t, nb::numpy, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+    // The faces of each edge, as (face, corner, backwards); the vertices from first[i] on have spacing[i].
+    p.def("edges", [](Verts verts, Faces faces, std::vector<int32_t> first, std::vector<double> spacing) {
+        Team team(1);
+        Topology topology(faces.data(), faces.shape(0), verts.shape(0), team);
+        topology.weld(verts.data(), {first, spacing}, team);
+        std::vector<std::vector<std::tuple<int, int, bool>>> out(topology.n_edges());
+        for (int64_t e = 0; e < topology.n_edges(); ++e)
+            for (const HalfEdge& h : topology.half_edges(e)) out[e].emplace_back(h.face, h.corner, h.backwards);
+        return out;
+    });
+}
+
+}  // namespace edgegrad

@@ -1,0 +1,119 @@
+// What the passes take in memory, in bytes by part and at most, each as its owner tells: asked before they allocate.
+
+#include <nanobind/nanobind.h>
+#include <nanobind/stl/map.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <map>
+#include <string>
+#include <vector>
+
+#include "backward/image_hits.h"
+#include "boundary/curve_measure.h"
+#include "boundary/meeting_parts.h"
+#include "camera/vertices.h"
+#include "contract/scatter.h"
+#include "scene/geometry.h"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace edgegrad {
+
+namespace {
+
+using Bytes = std::map<std::string, int64_t>;
+
+// Rows of the arrays of a scene, the image of one camera, and who works.
+struct PassSize {
+    int64_t verts, faces, colors, uvs, texels, pixels;
+    int channels, number;  // bytes of one number of the image
+    bool textured;
+    bool jumps;  // whether neighbouring faces may differ where they meet
+    int threads;
+
+    // Of a closed mesh.
+    int64_t edges() const { return 3 * faces / 2; }
+};
+
+Bytes image_bytes(const PassSize& s, int64_t cameras) {
+    const int64_t pixels = cameras * s.pixels;
+    return {{"image", pixels * s.channels * s.number},
+            {"coverage", pixels * s.number},
+            {"depth", pixels * int64_t(sizeof(float))},
+            {"faces hit", pixels * 2 * int64_t(sizeof(int32_t))},
+            {"faces seen", cameras * s.faces},
+            {"vertices in view", s.verts * int64_t(sizeof(Vec3))},
+            {"ray structure", RayCaster::bytes(s.faces, s.verts)}};
+}
+
+// What of the gradient is wanted: that of what moves inside faces and at edges, and of the arrays of colours.
+struct GradientWork {
+    bool motion, boundary, colors, uvs, texels;
+    int64_t surface_samples, edge_samples, curves;  // −1: not known
+};
+
+Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
+    constexpr int64_t many = int64_t(1) << 62, word = sizeof(double);
+    const bool moves = w.motion || w.boundary, interior = w.motion || w.colors || w.uvs || w.texels;
+    const auto rows = [&](int64_t samples, int64_t primitives, int64_t each, int width, int64_t destinations) {
+        return RowBuffer::bytes({samples, primitives, each, destinations, width}, s.threads);
+    };
+    Bytes bytes;
+    if (interior || w.boundary) {
+        bytes["view"] = word * s.pixels + s.verts * (VertexView::bytes_per_vertex + 3 * word * moves);
+        bytes["ray structure"] = RayCaster::bytes(s.faces, s.verts);
+    }
+    if (interior) {
+        // The measure, and with the controls what they need of each vertex; large textured faces are left to pixels.
+        const int64_t per_vertex = ImageHits::bytes_per_vertex + s.channels * s.number + 2 * word * w.motion;
+        bytes["faces in view"] = (word + 1) * s.faces + per_vertex * s.verts + (s.faces + word * s.pixels) * s.textured;
+        bytes["controls"] = w.motion ? rows(s.faces, s.faces, 3, 2, s.verts) : 0;
+        const int64_t n = w.surface_samples < 0 ? many : w.surface_samples;
+        int64_t& samples = bytes["surface samples"];
+        if (w.motion) samples += rows(n, s.faces, 3, 3, s.verts);
+        // A face has a texture or colours: a run of samples leaves rows of one kind.
+        if (w.colors) samples += rows(n, s.faces, 3, s.channels, s.colors);
+        else if (w.uvs) samples += rows(n, s.faces, 3, 2, s.uvs);
+        if (w.texels) samples += rows(n, -1, 4, s.channels, s.texels);
+    }
+    if (w.boundary) {
+        // Where all attributes are indexed like the vertices, curves are silhouettes: a quarter of a tangled mesh.
+        const int64_t curves = w.curves < 0 ? s.edges() / (s.jumps ? 1 : 4) : w.curves;
+        bytes["edges in view"] = s.faces + curves * bytes_per_curve();
+        bytes["creases"] = s.jumps ? 2 * word * s.verts + MeetingParts::bytes_per_pixel * s.pixels : 0;
+        bytes["edge samples"] =
+            rows(w.edge_samples < 0 ? many : w.edge_samples, w.curves < 0 ? s.edges() : w.curves, 4, 3, s.verts);
+        bytes["topology"] = Topology::bytes(s.faces, s.edges());
+    }
+    return bytes;
+}
+
+}  // namespace
+
+void bind_memory(nb::module_& m) {
+    nb::class_<PassSize>(m, "PassSize")
+        .def(nb::new_([](int64_t verts, int64_t faces, int64_t colors, int64_t uvs, int64_t texels, int64_t pixels,
+                         int channels, int number, bool textured, bool jumps, int threads) {
+                 return PassSize{verts, faces, colors, uvs, texels, pixels, channels, number, textured, jumps, threads};
+             }),
+             nb::kw_only(), "verts"_a, "faces"_a, "colors"_a, "uvs"_a, "texels"_a, "pixels"_a, "channels"_a, "number"_a,
+             "textured"_a, "jumps"_a, "threads"_a);
+    m.def("image_bytes", &image_bytes, "size"_a, "cameras"_a);
+    m.def(
+        "gradient_bytes",
+        [](const PassSize& size, bool motion, bool boundary, const std::vector<std::string>& wanted,
+           int64_t surface_samples, int64_t edge_samples, int64_t curves) {
+            const auto is = [&](const char* name) {
+                return std::find(wanted.begin(), wanted.end(), name) != wanted.end();
+            };
+            return gradient_bytes(
+                size, {motion, boundary, is("colors"), is("uvs"), is("texels"), surface_samples, edge_samples, curves});
+        },
+        "size"_a, nb::kw_only(), "motion"_a, "boundary"_a, "wanted"_a, "surface_samples"_a = -1, "edge_samples"_a = -1,
+        "curves"_a = -1);
+}
+
+}  // namespace edgegrad

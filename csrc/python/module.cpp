@@ -1,0 +1,179 @@
+// The kernel's module: records of options, and the two passes. Tensors come as NumPy views without a copy, outputs are
+// arrays that the caller made, and the interpreter's lock is released while the kernel works.
+
+#include <nanobind/stl/map.h>
+#include <nanobind/stl/vector.h>
+
+#include <iterator>
+#include <map>
+#include <string>
+#include <vector>
+
+#include "backward/backward.h"
+#include "core/stopwatch.h"
+#include "python/arrays.h"
+#include "python/unlocked.h"
+
+using namespace nanobind::literals;
+
+namespace edgegrad {
+
+void bind_memory(nb::module_& m);     // memory.cpp
+void bind_for_tests(nb::module_& m);  // for_tests.cpp
+
+namespace {
+
+template <class T>
+void check_image(const char* name, const Out<T, 3>& image, const Camera& camera, size_t channels) {
+    if (int(image.shape(0)) != camera.height || int(image.shape(1)) != camera.width || image.shape(2) != channels)
+        refuse(std::string(name) + ": expected an image of the camera's size and the scene's channels");
+}
+
+template <class T>
+void check_background(const SceneArrays<T>& scene, const Camera& camera) {
+    const auto& b = scene.background;
+    if (b.shape(0) * b.shape(1) > 1 && (int(b.shape(0)) != camera.height || int(b.shape(1)) != camera.width))
+        refuse("background: expected the size of the image, " + std::to_string(camera.height) + " x " +
+               std::to_string(camera.width) + ", got " + std::to_string(b.shape(0)) + " x " +
+               std::to_string(b.shape(1)));
+}
+
+// What a pass did, by name: counts, and seconds.
+using Profile = std::map<std::string, double>;
+
+template <class T>
+Profile forward(const SceneArrays<T>& scene, const Camera& camera, const ImageOptions& options, int threads,
+                Out<T, 3> image, const HitArrays<T>& hits) {
+    check_background(scene, camera);
+    check_image("image", image, camera, scene.background.shape(2));
+    hits.check(scene, camera);
+    return unlocked(threads, [&](Team& team) -> Profile {
+        Stopwatch watch;
+        GeometryWork work;
+        const auto geometry = scene.geometry({}, team, work);
+        const double update = watch.lap();
+        render_forward(scene.view(), camera, geometry->caster(), options, team, image.data(), hits.view());
+        return {{"update", update}, {"forward", watch.lap()}, {"built rays", work.rays}};
+    });
+}
+
+// Arrays by the names of the slots that they are for.
+using GradientArrays = std::map<std::string, nb::ndarray<double, nb::numpy, nb::c_contig, nb::device::cpu>>;
+
+template <class T>
+Gradients make_gradients(const GradientArrays& arrays, const SceneView<T>& scene, const Camera& camera) {
+    Gradients grad;
+    for (const auto& [name, array] : arrays) {
+        const auto slot = std::find_if(std::begin(gradient_slots<T>), std::end(gradient_slots<T>),
+                                       [&](const GradientSlot<T>& s) { return name == s.name; });
+        if (slot == std::end(gradient_slots<T>)) refuse("gradients: there is none of " + name);
+        if (int64_t(array.size()) != slot->size(scene, int64_t(camera.width) * camera.height))
+            refuse("gradient of " + name + ": expected the size of " + name);
+        grad.*(slot->to) = array.data();
+    }
+    return grad;
+}
+
+template <class T>
+Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
+                 const GradientOptions& options, int threads, Out<T, 3> adjoint, const HitArrays<T>& hits,
+                 const GradientArrays& gradients) {
+    check_background(arrays, camera);
+    check_image("adjoint", adjoint, camera, arrays.background.shape(2));
+    hits.check(arrays, camera);
+    check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2), threads);
+    const SceneView<T> scene = arrays.view();
+    const Gradients grad = make_gradients(gradients, scene, camera);
+    GeometryWork work;
+    double update = 0;
+    const BackwardProfile p = unlocked(threads, [&](Team& team) {
+        Stopwatch watch;
+        const bool boundary = grad.geometry() && options.boundary;
+        const bool interior = (grad.geometry() && options.interior_geometry) || grad.appearance();
+        const auto geometry = arrays.geometry({boundary, interior || boundary}, team, work);
+        update = watch.lap();
+        return render_backward(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view()}, options,
+                               team, grad);
+    });
+    return {{"surface_samples", double(p.surface_samples)},
+            {"edge_samples", double(p.edge_samples)},
+            {"surface_wanted", double(p.surface_wanted)},
+            {"edge_wanted", double(p.edge_wanted)},
+            {"silhouettes", double(p.silhouettes)},
+            {"creases", double(p.creases)},
+            {"built rays", work.rays},
+            {"built edges", work.edges},
+            {"update", update},
+            {"view", p.view},
+            {"surface measure", p.measure},
+            {"surface rays", p.surface[0]},
+            {"surface scatter", p.surface[1]},
+            {"curves", p.curves},
+            {"edge rays", p.edge[0]},
+            {"edge scatter", p.edge[1]},
+            {"world", p.world}};
+}
+
+template <class T>
+void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
+    using Scene = SceneArrays<T>;
+    nb::class_<HitArrays<T>>(m, hits_name)
+        .def(nb::new_([](Out<T, 2> coverage, Out<float, 2> depth, Out<int32_t, 3> hit, Out<uint8_t, 1> seen) {
+                 return HitArrays<T>{coverage, depth, hit, seen};
+             }),
+             "coverage"_a.noconvert(), "depth"_a.noconvert(), "hit"_a.noconvert(), "seen"_a.noconvert());
+    nb::class_<Scene>(m, scene_name)
+        .def(nb::init<In<double, 2>, In<int32_t, 2>, In<int32_t, 2>, In<T, 2>, In<double, 2>, In<T, 2>, In<int64_t, 2>,
+                      In<int32_t, 1>, In<T, 3>, const std::vector<double>&, int>(),
+             "verts"_a.noconvert(), "faces"_a.noconvert(), "corners"_a.noconvert(), "colors"_a.noconvert(),
+             "uvs"_a.noconvert(), "texels"_a.noconvert(), "textures"_a.noconvert(), "face_texture"_a.noconvert(),
+             "background"_a.noconvert(), "spacing"_a, "threads"_a)
+        .def("forward", &forward<T>, "camera"_a, "options"_a, "threads"_a, "image"_a.noconvert(), "hits"_a)
+        .def("backward", &backward<T>, "camera"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(),
+             "hits"_a, "gradients"_a);
+}
+
+}  // namespace
+
+NB_MODULE(_core, m) {
+    m.doc() = "The edgegrad kernel. Use it through the edgegrad package.";
+    nb::set_leak_warnings(false);  // of a process that ends while a thread of it renders
+    m.def("open_embree", &open_embree, "path"_a, "options"_a, nb::call_guard<Unlocked>());
+    m.def("embree_version", &embree_version);
+    m.def("packet_width", &packet_width);
+    // Without the interpreter's lock, for which a thread that holds the kernel's may wait.
+    m.def("all_finite", &all_finite<float>, "array"_a.noconvert(), "threads"_a = 1);
+    m.def("all_finite", &all_finite<double>, "array"_a.noconvert(), "threads"_a = 1);
+    m.def("all_below", &all_below<int32_t>, "array"_a.noconvert(), "count"_a, "threads"_a = 1);
+    m.def("all_below", &all_below<int64_t>, "array"_a.noconvert(), "count"_a, "threads"_a = 1);
+    m.def("clear_geometry", &clear_geometry, nb::call_guard<Unlocked>());
+    m.def("await_callers", &await_callers, nb::call_guard<nb::gil_scoped_release>());
+    m.def("before_fork", &before_fork, nb::call_guard<Unlocked>());
+    m.def(
+        "after_fork",
+        [](bool child) {
+            if (child) forget_other_callers();
+            after_fork(child);
+        },
+        "child"_a);
+    nb::class_<Camera>(m, "Camera")
+        .def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "perspective"_a, "width"_a,
+             "height"_a);
+    nb::class_<ImageOptions>(m, "ImageOptions").def(nb::new_(&make_image_options), "spp"_a, "filter"_a, "seed"_a);
+    nb::class_<GradientOptions>(m, "GradientOptions")
+        .def(nb::new_([](uint64_t seed, int64_t surface_samples, int64_t edge_samples, bool interior_geometry,
+                         bool boundary, bool dry) {
+                 return GradientOptions{surface_samples, edge_samples, seed, interior_geometry, boundary, dry};
+             }),
+             "seed"_a, nb::kw_only(), "surface_samples"_a = -1, "edge_samples"_a = -1, "interior_geometry"_a = true,
+             "boundary"_a = true, "dry"_a = false);
+    std::vector<std::string> slots;
+    for (const auto& slot : gradient_slots<double>) slots.push_back(slot.name);
+    m.attr("GRADIENT_SLOTS") = nb::tuple(nb::cast(slots));
+    bind_scene<float>(m, "SceneFloat", "HitsFloat");
+    bind_scene<double>(m, "SceneDouble", "HitsDouble");
+    bind_memory(m);
+    bind_for_tests(m);
+}
+
+}  // namespace edgegrad

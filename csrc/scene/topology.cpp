@@ -1,0 +1,210 @@
+#include "scene/topology.h"
+
+#include <algorithm>
+#include <bit>
+#include <cmath>
+#include <functional>
+#include <numeric>
+
+#include "core/sampler.h"
+
+namespace edgegrad {
+
+namespace {
+
+// Items of a long loop after which it asks whether to go on.
+constexpr int64_t check_every = 1 << 14;
+
+// Places that were found so far, in a hash table of cells: one vertex for each place.
+//
+// Two copies that went through the same rotation and translation differ by a few roundings at most, so what lies within
+// a reach of 8 spacings of the largest coordinate is one place. No two places of one spacing lie within each other's
+// reach, so a cell of some reaches holds few of them, and finding one takes a constant time however many vertices
+// coincide. Spacings and magnitudes have cells of their own.
+class PlaceGrid {
+   public:
+    explicit PlaceGrid(size_t vertices) : head_(std::bit_ceil(std::max<size_t>(64, vertices)), -1) {}
+
+    // The nearest place of this spacing within reach of the vertex; −1: none.
+    int32_t nearest(const double* verts, int32_t vertex, double spacing) const {
+        const double *p = verts + 3 * int64_t(vertex), m = magnitude(p), reach = 8 * spacing * m;
+        int32_t found = -1;
+        double least = reach;
+        const int low = binade(m - reach), high = binade(m + reach);
+        for (int e = low; e <= high; ++e) {
+            const double cell = cell_of(e, spacing);
+            int64_t begin[3], end[3];
+            for (int i = 0; i < 3; ++i) begin[i] = index(p[i] - reach, cell), end[i] = index(p[i] + reach, cell);
+            for (int64_t x = begin[0]; x <= end[0]; ++x)
+                for (int64_t y = begin[1]; y <= end[1]; ++y)
+                    for (int64_t z = begin[2]; z <= end[2]; ++z) {
+                        const uint64_t key = key_of(e, spacing, x, y, z);
+                        for (int32_t i = head_[key & (head_.size() - 1)]; i >= 0; i = place_[i].next) {
+                            if (place_[i].key != key) continue;
+                            const double* o = verts + 3 * int64_t(place_[i].vertex);
+                            const double apart =
+                                std::max({std::fabs(p[0] - o[0]), std::fabs(p[1] - o[1]), std::fabs(p[2] - o[2])});
+                            if (apart < least || (apart == least && (found < 0 || place_[i].vertex < found)))
+                                least = apart, found = place_[i].vertex;
+                        }
+                    }
+        }
+        return found;
+    }
+
+    void add(const double* verts, int32_t vertex, double spacing) {
+        const double* p = verts + 3 * int64_t(vertex);
+        const int e = binade(magnitude(p));
+        const double cell = cell_of(e, spacing);
+        const uint64_t key = key_of(e, spacing, index(p[0], cell), index(p[1], cell), index(p[2], cell));
+        int32_t& head = head_[key & (head_.size() - 1)];
+        place_.push_back({key, vertex, head});
+        head = int32_t(place_.size()) - 1;
+    }
+
+   private:
+    struct Place {
+        uint64_t key;
+        int32_t vertex, next;
+    };
+
+    static double magnitude(const double* p) { return std::max({std::fabs(p[0]), std::fabs(p[1]), std::fabs(p[2])}); }
+    // Of what is far below the least float, all is taken for one, so that cells do not vanish.
+    static int binade(double magnitude) { return magnitude > 0x1p-900 ? std::ilogb(magnitude) : -900; }
+    // Four to eight reaches of the magnitudes in that binade, so that few cells lie within reach of a point.
+    static double cell_of(int binade, double spacing) { return std::ldexp(64 * std::max(spacing, 0x1p-52), binade); }
+    static int64_t index(double x, double cell) { return int64_t(std::floor(x / cell)); }
+    static uint64_t key_of(int binade, double spacing, int64_t x, int64_t y, int64_t z) {
+        return hash(hash(uint64_t(binade), std::bit_cast<uint64_t>(spacing), uint64_t(x)), uint64_t(y), uint64_t(z));
+    }
+
+    std::vector<int32_t> head_;
+    std::vector<Place> place_;
+};
+
+}  // namespace
+
+Parts::Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team) : part_(n_verts) {
+    // Disjoint sets, each named after its first vertex.
+    std::vector<int32_t> up(n_verts);
+    std::iota(up.begin(), up.end(), 0);
+    const auto first_of = [&](int32_t v) {
+        while (up[v] != v) v = up[v] = up[up[v]];
+        return v;
+    };
+    for (int64_t i = 0; i < 3 * n_faces; ++i) {
+        if (i % check_every == 0) team.check();
+        const int32_t a = first_of(faces[i]), b = first_of(faces[i - i % 3]);
+        up[std::max(a, b)] = std::min(a, b);
+    }
+    for (int64_t v = 0; v < n_verts; ++v) part_[v] = up[v] == v ? size_++ : part_[up[v]];
+    of_block_.resize(Team::blocks(n_faces));
+    team.each_block(n_faces, [&](int64_t k, int64_t first, int64_t last) {
+        int32_t part = part_[faces[3 * first]];
+        for (int64_t f = first; f < last && part >= 0; ++f)
+            if (part_[faces[3 * f]] != part) part = -1;
+        of_block_[k] = part;
+    });
+}
+
+Topology::Topology(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team)
+    : faces_(faces), n_faces_(n_faces), n_verts_(n_verts) {
+    build(team);
+    std::vector<bool> on_border(n_verts, false);
+    for (int64_t e = 0; e < n_edges(); ++e) {
+        if (e % check_every == 0) team.check();
+        const auto edge = half_edges(e);
+        if (edge.size() != 1) continue;
+        const int32_t* f = faces_ + 3 * int64_t(edge[0].face);
+        on_border[f[edge[0].corner]] = on_border[f[(edge[0].corner + 1) % 3]] = true;
+    }
+    for (int64_t v = 0; v < n_verts; ++v)
+        if (on_border[v]) candidates_.push_back(int32_t(v));
+}
+
+void Topology::weld(const double* verts, const Spacing& spacing, Team& team) {
+    if (candidates_.empty()) return;
+    // Copies that went through different roundings may lie between others of a coarser spacing, never the other way
+    // round: coarse ones come first.
+    std::vector<double> spacings = spacing.value;
+    std::sort(spacings.begin(), spacings.end(), std::greater<>());
+    spacings.erase(std::unique(spacings.begin(), spacings.end()), spacings.end());
+
+    std::vector<int32_t> welded(n_verts_);
+    std::iota(welded.begin(), welded.end(), 0);
+    bool any = false;
+    PlaceGrid places(candidates_.size());
+    for (size_t k = 0; k < spacings.size(); ++k)
+        for (size_t i = 0; i < candidates_.size(); ++i) {
+            if (i % check_every == 0) team.check();
+            const int32_t v = candidates_[i];
+            if (spacing.of(v) != spacings[k]) continue;
+            int32_t place = -1;
+            for (size_t coarser = 0; coarser <= k && place < 0; ++coarser)
+                place = places.nearest(verts, v, spacings[coarser]);
+            if (place >= 0) welded[v] = place, any = true;
+            else places.add(verts, v, spacings[k]);
+        }
+    if (!any) welded.clear();
+    if (welded == welded_) return;
+    welded_ = std::move(welded);
+    build(team);
+}
+
+void Topology::build(Team& team) {
+    // Half-edges in buckets of their lower vertex, each bucket sorted by the upper one: linear in the number of faces.
+    struct Entry {
+        int32_t upper;
+        HalfEdge half_edge;
+    };
+    const auto at = [&](int64_t face, int corner) {
+        const int32_t v = faces_[3 * face + corner % 3];
+        return welded_.empty() ? v : welded_[v];
+    };
+    // A face that uses a place twice has no area and no part in the surface.
+    const auto degenerate = [&](int64_t f) {
+        return at(f, 0) == at(f, 1) || at(f, 1) == at(f, 2) || at(f, 2) == at(f, 0);
+    };
+
+    std::vector<int64_t> begin(n_verts_ + 1, 0);
+    for (int64_t f = 0; f < n_faces_; ++f) {
+        if (f % check_every == 0) team.check();
+        if (degenerate(f)) continue;
+        for (int c = 0; c < 3; ++c) ++begin[std::min(at(f, c), at(f, c + 1)) + 1];
+    }
+    std::partial_sum(begin.begin(), begin.end(), begin.begin());
+    std::vector<Entry> entries(begin.back());
+    std::vector<int64_t> fill(begin.begin(), begin.end() - 1);
+    for (int64_t f = 0; f < n_faces_; ++f) {
+        if (f % check_every == 0) team.check();
+        if (degenerate(f)) continue;
+        for (int c = 0; c < 3; ++c) {
+            const int32_t a = at(f, c), b = at(f, c + 1);
+            entries[fill[std::min(a, b)]++] = {std::max(a, b), {int32_t(f), int8_t(c), a > b}};
+        }
+    }
+    offset_.assign(1, 0);
+    half_edge_.resize(entries.size());
+    face_.resize(entries.size());
+    for (int64_t v = 0; v < n_verts_; ++v) {
+        if (v % check_every == 0) team.check();
+        const auto first = entries.begin() + begin[v], last = entries.begin() + begin[v + 1];
+        std::stable_sort(first, last, [](const Entry& a, const Entry& b) { return a.upper < b.upper; });
+        for (auto e = first; e != last; ++e) {
+            const int64_t i = e - entries.begin();
+            half_edge_[i] = e->half_edge;
+            face_[i] = e->half_edge.face;
+            if (e + 1 == last || (e + 1)->upper != e->upper) offset_.push_back(i + 1);
+        }
+    }
+    joins_two_.resize(n_edges());
+    // The direction of an edge is that of its first half-edge.
+    for (int64_t e = 0; e < n_edges(); ++e) {
+        if (e % check_every == 0) team.check();
+        const bool flip = half_edge_[offset_[e]].backwards;
+        for (int64_t i = offset_[e]; i < offset_[e + 1]; ++i) half_edge_[i].backwards ^= flip;
+        joins_two_[e] = offset_[e + 1] - offset_[e] == 2 && half_edge_[offset_[e] + 1].backwards;
+    }
+}
+
+}  // namespace edgegrad

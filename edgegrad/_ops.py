@@ -1,0 +1,364 @@
+"""The kernel's two passes as operators of torch, and the autograd.Functions over them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import _memory as memory
+from ._check import check_finite
+from ._kernel import core
+from ._request import (
+    POSITIONS,
+    SCHEMA,
+    SLOTS,
+    PackedCamera,
+    Request,
+    Work,
+    derived_seed,
+    join,
+    label,
+    others_of,
+    tensors_of,
+)
+from .scene import Flat
+
+Profile = dict[str, float]
+
+
+class Hits(NamedTuple):
+    """What the image pass hit, for the backward pass; for B cameras."""
+
+    coverage: Tensor  # (B, H, W): the filtered share of a pixel where something is hit
+    depth: Tensor  # (B, H, W) float32: nothing that samples hit lies farther away; infinite if one hit nothing
+    hit: Tensor  # (B, H, W, 2) int32: the first and the last of the faces that were hit; -1: none
+    seen: Tensor  # (B, F) uint8: 0, or the side, 1 or 2, from which a face was hit
+
+    @classmethod
+    def empty(cls, request: Request) -> Hits:
+        B, height, width = request.cameras, request.camera.height, request.camera.width
+        flat = request.scene
+        return cls(
+            flat.colors.new_empty((B, height, width)),
+            flat.colors.new_empty((B, height, width), dtype=torch.float32),
+            flat.faces.new_empty((B, height, width, 2), dtype=torch.int32),
+            flat.faces.new_empty((B, flat.faces.shape[0]), dtype=torch.uint8),
+        )
+
+
+# -- the kernel ---------------------------------------------------------------------------------------------------------
+
+
+def kernel_scene(scene: Flat) -> Any:
+    kind = core.SceneDouble if scene.colors.dtype == torch.float64 else core.SceneFloat
+    background = scene.background if scene.background.dim() == 3 else scene.background[None, None]
+    arrays = scene._replace(background=background)._asdict()
+    arrays = {name: _array(value) if isinstance(value, Tensor) else value for name, value in arrays.items()}
+    return kind(**arrays, threads=torch.get_num_threads())
+
+
+def kernel_camera(camera: PackedCamera, index: int = 0) -> Any:
+    own = camera._replace(world_to_camera=camera.world_to_camera[index], K=camera.K[index])
+    return core.Camera(**{name: _array(v) if isinstance(v, Tensor) else v for name, v in own._asdict().items()})
+
+
+def kernel_hits(hits: Hits, index: int = 0) -> Any:
+    kind = core.HitsDouble if hits.coverage.dtype == torch.float64 else core.HitsFloat
+    return kind(**{name: part[index].numpy() for name, part in hits._asdict().items()})
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
+    """image (B, H, W, C), what the backward pass takes from it, and what the kernel did for each camera. Raises MemoryError."""
+    with image_room(request):
+        scene, options = kernel_scene(request.scene), request.image._asdict()
+        B, height, width = request.cameras, request.camera.height, request.camera.width
+        image = request.scene.colors.new_empty((B, height, width, request.channels))
+        hits = Hits.empty(request)
+        profiles = []
+        for b in range(B):
+            options["seed"] = _camera_seed(request.image.seed, b)
+            profiles.append(
+                scene.forward(
+                    camera=kernel_camera(request.camera, b),
+                    options=core.ImageOptions(**options),
+                    threads=torch.get_num_threads(),
+                    image=image[b].numpy(),
+                    hits=kernel_hits(hits, b),
+                )
+            )
+        return image, hits, profiles
+
+
+def backward_kernel(
+    adjoint: Tensor, hits: Hits, request: Request, wanted: Collection[str], *, dry: bool = False
+) -> tuple[dict[str, Tensor], list[Profile]]:
+    """The gradients of the slots that are wanted, float64, and what the kernel did for each camera. `dry` only counts samples.
+
+    `adjoint` is (B, H, W, C), or (H, W, C) for a single camera. Raises MemoryError.
+    """
+    with gradient_room(adjoint, request, wanted):
+        work, options = Work.of(request.gradient, wanted), request.gradient
+        scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
+        # Sums are taken in double whatever the arrays hold. NumPy has its zeros from the system, torch would wake all threads.
+        grads = {name: np.zeros(request.slot(name).shape) for name in SLOTS if name in wanted}
+        images = adjoint.detach().contiguous()
+        images = images if images.dim() == 4 else images[None]
+        try:
+            profiles = [
+                scene.backward(
+                    camera=kernel_camera(request.camera, b),
+                    image=image,
+                    options=core.GradientOptions(
+                        surface_samples=options.surface_samples,
+                        edge_samples=options.edge_samples,
+                        seed=_camera_seed(options.grad_seed, b),
+                        interior_geometry=work.motion,
+                        boundary=work.boundary,
+                        dry=dry,
+                    ),
+                    threads=torch.get_num_threads(),
+                    adjoint=images[b].numpy(),
+                    hits=kernel_hits(hits, b),
+                    # Each camera has a gradient of its own.
+                    gradients={n: g[b] if n in PackedCamera._fields else g for n, g in grads.items()},
+                )
+                for b in range(request.cameras)
+            ]
+        except ValueError:
+            # As the kernel does, but here with the index that the user knows.
+            check_finite("the gradient of the image", adjoint)
+            raise
+        return {name: torch.from_numpy(grad) for name, grad in grads.items()}, profiles
+
+
+def _camera_seed(seed: int, camera: int) -> int:
+    """Cameras of a batch get samples of their own."""
+    return seed if camera == 0 else derived_seed(seed, camera + 1)
+
+
+# -- memory -------------------------------------------------------------------------------------------------------------
+
+
+def pass_size(request: Request) -> Any:
+    """What the kernel's needs depend on."""
+    flat, camera = request.scene, request.camera
+    return core.PassSize(
+        verts=len(flat.verts),
+        faces=len(flat.faces),
+        colors=len(flat.colors),
+        uvs=len(flat.uvs),
+        texels=len(flat.texels),
+        pixels=camera.height * camera.width,
+        channels=request.channels,
+        number=flat.colors.element_size(),
+        textured=len(flat.textures) > 0,
+        jumps=flat.corners.data_ptr() != flat.faces.data_ptr(),
+        threads=torch.get_num_threads(),
+    )
+
+
+KEPT = ("ray structure", "topology")  # what may be there already, from an earlier call
+
+
+def image_room(request: Request) -> AbstractContextManager[None]:
+    """Raises MemoryError before its block if the image does not fit."""
+    needs = core.image_bytes(pass_size(request), request.cameras)
+    return memory.room("render", needs, lambda: _lower(request))
+
+
+def gradient_room(adjoint: Tensor, request: Request, wanted: Collection[str]) -> AbstractContextManager[None]:
+    """Raises MemoryError before its block if the gradients do not fit."""
+    work, options = Work.of(request.gradient, wanted), request.gradient
+    needs = {}
+    for name in SLOTS:
+        if name in wanted:
+            tensor = request.slot(name)  # in double, and then in the tensor's own type
+            needs[f"{label(name)} gradient"] = (8 + tensor.element_size() % 8) * tensor.numel()
+    needs["gradient by the image"] = adjoint.numel() * adjoint.element_size() * (not adjoint.is_contiguous())
+    needs |= core.gradient_bytes(
+        pass_size(request),
+        motion=work.motion,
+        boundary=work.boundary,
+        wanted=list(wanted),
+        surface_samples=options.surface_samples,
+        edge_samples=options.edge_samples,
+    )
+    return memory.room("backward pass", needs, lambda: _lower(request) + ", or let fewer tensors require a gradient")
+
+
+def _lower(request: Request) -> str:
+    camera = request.camera
+    return (
+        f"the camera's size ({camera.width} × {camera.height} pixels), its batch ({request.cameras}), "
+        f"the channels ({request.channels}) or the faces ({len(request.scene.faces):,})"
+    )
+
+
+# -- operators ----------------------------------------------------------------------------------------------------------
+
+torch.library.define("edgegrad::render", f"({SCHEMA}) -> (Tensor, Tensor, Tensor, Tensor, Tensor)")
+torch.library.define(
+    "edgegrad::render_backward",
+    f"(Tensor adjoint, Tensor coverage, Tensor depth, Tensor hit, Tensor seen, {SCHEMA}, bool[] wanted) -> ("
+    + ", ".join("Tensor" for _ in SLOTS)
+    + ")",
+)
+
+
+@torch.library.impl("edgegrad::render", "CPU")
+def _render_cpu(*args: Any) -> tuple[Tensor, ...]:
+    image, hits, _ = forward_kernel(Request.unpack(args))
+    return image, *hits
+
+
+@torch.library.register_fake("edgegrad::render")
+def _render_fake(*args: Any) -> tuple[Tensor, ...]:
+    request = Request.unpack(args)
+    size = request.cameras, request.camera.height, request.camera.width, request.channels
+    return request.scene.colors.new_empty(size), *Hits.empty(request)
+
+
+def _arguments(args: Sequence[Any]) -> tuple[Tensor, Hits, Request, list[bool]]:
+    """Those of edgegrad::render_backward."""
+    adjoint, coverage, depth, hit, seen, *packed, wanted = args
+    return adjoint, Hits(coverage, depth, hit, seen), Request.unpack(packed), wanted
+
+
+@torch.library.impl("edgegrad::render_backward", "CPU")
+def _render_backward_cpu(*args: Any) -> tuple[Tensor, ...]:
+    adjoint, hits, request, flags = _arguments(args)
+    wanted = [name for name, want in zip(SLOTS, flags, strict=True) if want]
+    grads, _ = backward_kernel(adjoint, hits, request, wanted)
+    return tuple(grads[name].to(request.slot(name).dtype) if name in grads else _nothing(adjoint) for name in SLOTS)
+
+
+@torch.library.register_fake("edgegrad::render_backward")
+def _render_backward_fake(*args: Any) -> tuple[Tensor, ...]:
+    adjoint, _, request, flags = _arguments(args)
+    return tuple(
+        torch.empty_like(request.slot(name)) if want else _nothing(adjoint)
+        for name, want in zip(SLOTS, flags, strict=True)
+    )
+
+
+def _nothing(adjoint: Tensor) -> Tensor:
+    """What an operator returns for a gradient that is not wanted."""
+    return adjoint.new_empty(0, dtype=torch.float32)
+
+
+# -- autograd -----------------------------------------------------------------------------------------------------------
+
+FIRST_ORDER = (
+    "second derivatives of a rendered image are not available (its gradient is an estimate whose own derivative is not "
+    "computed); for curvature use Gauss-Newton, JᵀJ from backward passes over the image, as edgegrad.fit.fit_pose does"
+)
+REVERSE = (
+    "forward-mode derivatives (jvp, jacfwd, hessian) of a rendered image are not available; "
+    "use reverse mode: backward(), torch.func.grad, vjp or jacrev"
+)
+
+
+def render_image(request: Request, batched: bool) -> Tensor:
+    """The image (B, H, W, C), or (H, W, C) unless `batched`, as a function of the request's tensors."""
+    function = _Render if torch.compiler.is_compiling() else _RenderEager
+    image, *_ = function.apply(batched, *request.pack())
+    return image
+
+
+class _Render(torch.autograd.Function):
+    """edgegrad::render, differentiated by edgegrad::render_backward. The image of a single camera loses its batch axis."""
+
+    @staticmethod
+    def forward(batched: bool, *args: Any) -> tuple[Tensor, ...]:
+        image, *hits = torch.ops.edgegrad.render(*args)
+        return image if batched else image.squeeze(0), *hits
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        _, *hits = output
+        _, *packed = inputs
+        ctx.mark_non_differentiable(*hits)
+        ctx.save_for_backward(*hits, *tensors_of(packed))
+        ctx.others = others_of(packed)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        coverage, depth, hit, seen, *tensors = ctx.saved_tensors
+        wanted = [ctx.needs_input_grad[1 + i] for i in POSITIONS]
+        packed = join(tensors, ctx.others)
+        arguments = (grad_outputs[0], coverage, depth, hit, seen, *packed)
+        if torch.compiler.is_compiling():  # which refuses second derivatives itself
+            grads = torch.ops.edgegrad.render_backward(*arguments, wanted)
+        else:
+            grads = _RenderBackward.apply(*arguments, *wanted)
+        out: list[Tensor | None] = [None] * (1 + len(packed))
+        for i, want, grad in zip(POSITIONS, wanted, grads, strict=True):
+            if want:
+                out[1 + i] = grad
+        return tuple(out)
+
+
+class _RenderEager(_Render):
+    """_Render with what torch.compile does not trace: inference tensors, and the transforms of torch.func."""
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        # A tensor that was made in torch.inference_mode() cannot be kept for later, but a copy of it can.
+        later = not torch.is_inference_mode_enabled()
+        kept = (a.clone() if later and isinstance(a, Tensor) and a.is_inference() else a for a in inputs)
+        _Render.setup_context(ctx, tuple(kept), output)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        return _one_by_one(_RenderEager, info.batch_size, in_dims, args)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        raise RuntimeError(REVERSE)
+
+
+class _RenderBackward(torch.autograd.Function):
+    """edgegrad::render_backward. A function of its own, so that whoever asks for its derivative hears that there is none:
+    once_differentiable takes it for zero where the adjoint is a constant, as it is for a loss linear in the image."""
+
+    @staticmethod
+    def forward(*args: Any) -> tuple[Tensor, ...]:
+        many = len(SLOTS)
+        return torch.ops.edgegrad.render_backward(*args[:-many], list(args[-many:]))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        raise RuntimeError(FIRST_ORDER)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        return _one_by_one(_RenderBackward, info.batch_size, in_dims, args)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        raise RuntimeError(FIRST_ORDER)
+
+
+def _one_by_one(
+    function: type[torch.autograd.Function], count: int, in_dims: tuple[int | None, ...], args: tuple[Any, ...]
+) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    """torch.vmap of a function with several outputs: call by call. What is no tensor has no batch axis."""
+    results = [
+        function.apply(*(a.select(dim, i) if isinstance(dim, int) else a for a, dim in zip(args, in_dims, strict=True)))
+        for i in range(count)
+    ]
+    outputs = tuple(torch.stack(parts) for parts in zip(*results, strict=True))
+    return outputs, (0,) * len(outputs)
