@@ -1,0 +1,69 @@
+// What the estimator (boundary.cpp) knows of a curve along which the image jumps.
+//
+// A sample is a point of a curve. Its ray, from the camera to that point, ignores the faces that meet in the curve;
+// what it finds hides the point, or lies behind it. A source of curves says where the point is and which faces the ray
+// ignores, then which surfaces the two sides show, and at last, given their radiance, adds the adjoint of the motion.
+#pragma once
+
+#include <concepts>
+#include <cstdint>
+#include <limits>
+#include <span>
+#include <vector>
+
+#include "contract/scatter.h"
+#include "shading/surface.h"
+
+namespace edgegrad {
+
+// A point of a face, or, with face −1, of the background.
+struct SurfacePoint {
+    int64_t face = -1;
+    Barycentrics b;
+    double depth = std::numeric_limits<double>::infinity();
+};
+
+// Faces that meet in a curve, and how exactly the input says where it lies: the largest coordinate of its ends in the
+// world, and the relative spacing of such numbers.
+struct CurveFaces {
+    std::span<const int32_t> faces;
+    double coordinate = 0, spacing = 0;
+};
+
+struct CurveSample {
+    Vec2 x, n;          // the pixel position, and its normalised image coordinates
+    Vec3 point;         // camera coordinates
+    double weight = 0;  // inverse of the density of samples along the curve's fraction s
+    SurfacePoint behind = {};
+
+    // What the ray does not see; ascends if it is more than 16. `gathered` keeps them where they are not listed
+    // elsewhere.
+    std::span<const int32_t> ignored;
+    std::vector<int32_t> gathered;
+};
+
+// The surfaces of which a sample needs the radiance: minus, plus, and at most one more.
+struct SampleSurfaces {
+    static constexpr int most = 3;
+    SurfacePoint at[most];
+    int count = 2;
+};
+
+// `place` sets where the fraction s of a curve lies, of a sample that has its x, n and weight; false if no ray is
+// needed to know that nothing shows there. `faces_of` serves the test whether what the ray meets hides the point.
+// `add_motion` takes Ã · L of each of the surfaces. `finish` adds what was summed for the latest curve. `cast` tells
+// that no sample waits any more.
+template <class S>
+concept CurveSource = std::derived_from<typename S::Sample, CurveSample> &&
+                      requires(S& source, const S& known, typename S::Sample& sample, const typename S::Curve& curve,
+                               double s, const double* radiance, ChunkGrad& grad) {
+                          { known.position(curve, s) } -> std::same_as<Vec2>;
+                          { source.place(curve, s, sample) } -> std::same_as<bool>;
+                          { known.faces_of(sample) } -> std::same_as<const CurveFaces&>;
+                          { source.surfaces(sample) } -> std::same_as<SampleSurfaces>;
+                          source.add_motion(sample, radiance, grad);
+                          source.cast();
+                          source.finish(grad);
+                      };
+
+}  // namespace edgegrad
