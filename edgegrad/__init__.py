@@ -4,7 +4,7 @@ from .camera import Camera
 from .io import load_camera, load_mesh, load_scene, read_image, save_camera, write_image
 from .mesh import Mesh
 from .plan import Plan, plan, profile
-from .render import render
+from .render import jvp, render, screen_gradient
 from .scene import Scene
 
 __version__ = "0.1.0"
@@ -14,6 +14,7 @@ __all__ = [
     "Mesh",
     "Plan",
     "Scene",
+    "jvp",
     "load_camera",
     "load_mesh",
     "load_scene",
@@ -22,5 +23,6 @@ __all__ = [
     "read_image",
     "render",
     "save_camera",
+    "screen_gradient",
     "write_image",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
@@ -106,7 +106,6 @@ def backward_kernel(
     `adjoint` is (B, H, W, C), or (H, W, C) for a single camera. Raises MemoryError.
     """
     with gradient_room(adjoint, request, wanted):
-        work, options = Work.of(request.gradient, wanted), request.gradient
         scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
         # Sums are taken in double whatever the arrays hold. NumPy has its zeros from the system, torch would wake all threads.
         grads = {name: np.zeros(request.slot(name).shape) for name in SLOTS if name in wanted}
@@ -117,14 +116,7 @@ def backward_kernel(
                 scene.backward(
                     camera=kernel_camera(request.camera, b),
                     image=image,
-                    options=core.GradientOptions(
-                        surface_samples=options.surface_samples,
-                        edge_samples=options.edge_samples,
-                        seed=_camera_seed(options.grad_seed, b),
-                        interior_geometry=work.motion,
-                        boundary=work.boundary,
-                        dry=dry,
-                    ),
+                    options=_gradient_options(request, wanted, b, dry),
                     threads=torch.get_num_threads(),
                     adjoint=images[b].numpy(),
                     hits=kernel_hits(hits, b),
@@ -138,6 +130,61 @@ def backward_kernel(
             check_finite("the gradient of the image", adjoint)
             raise
         return {name: torch.from_numpy(grad) for name, grad in grads.items()}, profiles
+
+
+def jvp_kernel(hits: Hits, request: Request, tangents: Mapping[str, Tensor], directions: int) -> Tensor:
+    """Derivatives (D, B, H, W, C) of the image in D directions, in the type of the image: `tangents` (D, …) by slot, zero
+    where there is none. Raises MemoryError."""
+    with derivatives_room(request, tangents, directions):
+        scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
+        given = {name: np.ascontiguousarray(t.detach().double().numpy()) for name, t in tangents.items()}
+        adjoint = request.scene.colors.new_ones((request.camera.height, request.camera.width, request.channels))
+        out = np.zeros((request.cameras, *adjoint.shape[:2], directions, request.channels))
+        for b in range(request.cameras):
+            scene.jvp(
+                camera=kernel_camera(request.camera, b),
+                image=image,
+                options=_gradient_options(request, tangents, b),
+                threads=torch.get_num_threads(),
+                adjoint=adjoint.numpy(),
+                hits=kernel_hits(hits, b),
+                tangents=[
+                    {name: t[d, b] if name in PackedCamera._fields else t[d] for name, t in given.items()}
+                    for d in range(directions)
+                ],
+                image_dot=out[b],
+            )
+        return torch.from_numpy(out).permute(3, 0, 1, 2, 4).to(request.scene.colors.dtype).contiguous()
+
+
+def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Tensor:
+    """How the loss changes as what is seen in a pixel moves right and down: (B, H, W, 2). Raises MemoryError."""
+    with derivatives_room(request, ["verts"], 1):
+        scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
+        out = np.zeros((*adjoint.shape[:3], 2))
+        for b in range(request.cameras):
+            scene.screen_gradient(
+                camera=kernel_camera(request.camera, b),
+                image=image,
+                options=_gradient_options(request, ["verts"], b),
+                threads=torch.get_num_threads(),
+                adjoint=adjoint[b].numpy(),
+                hits=kernel_hits(hits, b),
+                gradient=out[b],
+            )
+        return torch.from_numpy(out).to(adjoint.dtype)
+
+
+def _gradient_options(request: Request, wanted: Collection[str], camera: int, dry: bool = False) -> Any:
+    options, work = request.gradient, Work.of(request.gradient, wanted)
+    return core.GradientOptions(
+        seed=_camera_seed(options.grad_seed, camera),
+        surface_samples=options.surface_samples,
+        edge_samples=options.edge_samples,
+        interior_geometry=work.motion,
+        boundary=work.boundary,
+        dry=dry,
+    )
 
 
 def _camera_seed(seed: int, camera: int) -> int:
@@ -195,6 +242,20 @@ def gradient_room(adjoint: Tensor, request: Request, wanted: Collection[str]) ->
     return memory.room("backward pass", needs, lambda: _lower(request) + ", or let fewer tensors require a gradient")
 
 
+def derivatives_room(request: Request, wanted: Collection[str], directions: int) -> AbstractContextManager[None]:
+    """Raises MemoryError before its block if derivatives in so many directions do not fit."""
+    work, options, size = Work.of(request.gradient, wanted), request.gradient, pass_size(request)
+    width = directions * request.channels
+    needs = core.gradient_bytes(
+        size, motion=work.motion, boundary=work.boundary, wanted=[], surface_samples=0, edge_samples=0
+    )
+    needs["derivatives"] = 2 * 8 * request.cameras * request.camera.height * request.camera.width * width
+    samples = max(options.surface_samples, options.edge_samples)
+    needs["samples in pixels"] = core.pixel_row_bytes(size, samples=samples, width=width)
+    needs["tangents"] = sum(8 * directions * request.slot(name).numel() for name in wanted)
+    return memory.room("jvp", needs, lambda: _lower(request) + ", or ask for fewer directions at a time")
+
+
 def _lower(request: Request) -> str:
     camera = request.camera
     return (
@@ -211,6 +272,12 @@ torch.library.define(
     f"(Tensor adjoint, Tensor coverage, Tensor depth, Tensor hit, Tensor seen, {SCHEMA}, bool[] wanted) -> ("
     + ", ".join("Tensor" for _ in SLOTS)
     + ")",
+)
+
+
+torch.library.define(
+    "edgegrad::render_jvp",
+    f"(Tensor coverage, Tensor depth, Tensor hit, Tensor seen, {SCHEMA}, Tensor?[] tangents, int directions) -> Tensor",
 )
 
 
@@ -250,6 +317,21 @@ def _render_backward_fake(*args: Any) -> tuple[Tensor, ...]:
     )
 
 
+@torch.library.impl("edgegrad::render_jvp", "CPU")
+def _render_jvp_cpu(*args: Any) -> Tensor:
+    coverage, depth, hit, seen, *packed, tangents, directions = args
+    given = {name: tangent for name, tangent in zip(SLOTS, tangents, strict=True) if tangent is not None}
+    return jvp_kernel(Hits(coverage, depth, hit, seen), Request.unpack(packed), given, directions)
+
+
+@torch.library.register_fake("edgegrad::render_jvp")
+def _render_jvp_fake(*args: Any) -> Tensor:
+    _, _, _, _, *packed, _, directions = args
+    request = Request.unpack(packed)
+    size = directions, request.cameras, request.camera.height, request.camera.width, request.channels
+    return request.scene.colors.new_empty(size)
+
+
 def _nothing(adjoint: Tensor) -> Tensor:
     """What an operator returns for a gradient that is not wanted."""
     return adjoint.new_empty(0, dtype=torch.float32)
@@ -260,10 +342,6 @@ def _nothing(adjoint: Tensor) -> Tensor:
 FIRST_ORDER = (
     "second derivatives of a rendered image are not available (its gradient is an estimate whose own derivative is not "
     "computed); for curvature use Gauss-Newton, JᵀJ from backward passes over the image, as edgegrad.fit.fit_pose does"
-)
-REVERSE = (
-    "forward-mode derivatives (jvp, jacfwd, hessian) of a rendered image are not available; "
-    "use reverse mode: backward(), torch.func.grad, vjp or jacrev"
 )
 
 
@@ -285,9 +363,10 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         _, *hits = output
-        _, *packed = inputs
+        ctx.batched, *packed = inputs
         ctx.mark_non_differentiable(*hits)
         ctx.save_for_backward(*hits, *tensors_of(packed))
+        ctx.save_for_forward(*hits, *tensors_of(packed))
         ctx.others = others_of(packed)
 
     @staticmethod
@@ -322,8 +401,51 @@ class _RenderEager(_Render):
         return _one_by_one(_RenderEager, info.batch_size, in_dims, args)
 
     @staticmethod
+    def jvp(ctx: Any, batched: Any, *tangents: Any) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        coverage, depth, hit, seen, *tensors = ctx.saved_tensors
+        given = [tangents[i] for i in POSITIONS]
+        packed = join(tensors, ctx.others)
+        image_dot = _RenderJvp.apply(coverage, depth, hit, seen, *packed, *given)
+        return image_dot if ctx.batched else image_dot.squeeze(0), None, None, None, None
+
+
+class _RenderJvp(torch.autograd.Function):
+    """edgegrad::render_jvp in one direction; torch.vmap over tangents takes all of theirs in one pass."""
+
+    @staticmethod
+    def forward(*args: Any) -> Tensor:
+        *rest, tangents = _with_tangents(args)
+        tangents = [None if t is None else t[None] for t in tangents]
+        return torch.ops.edgegrad.render_jvp(*rest, tangents, 1)[0]
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        raise RuntimeError(FIRST_ORDER)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, int]:
+        *rest, tangents = _with_tangents(args)
+        dims = in_dims[len(rest) :]
+        if any(dim is not None for dim in in_dims[: len(rest)]):  # scenes of their own
+            return _one_by_one(_RenderJvp, info.batch_size, in_dims, args)
+        tangents = [
+            None if t is None else t.expand(info.batch_size, *t.shape) if dim is None else t.movedim(dim, 0)
+            for t, dim in zip(tangents, dims, strict=True)
+        ]
+        return torch.ops.edgegrad.render_jvp(*rest, tangents, info.batch_size), 0
+
+    @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:
-        raise RuntimeError(REVERSE)
+        raise RuntimeError(FIRST_ORDER)
+
+
+def _with_tangents(args: Sequence[Any]) -> list[Any]:
+    """The last arguments, a tangent for each slot, as one list."""
+    return [*args[: -len(SLOTS)], list(args[-len(SLOTS) :])]
 
 
 class _RenderBackward(torch.autograd.Function):
@@ -354,11 +476,13 @@ class _RenderBackward(torch.autograd.Function):
 
 def _one_by_one(
     function: type[torch.autograd.Function], count: int, in_dims: tuple[int | None, ...], args: tuple[Any, ...]
-) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-    """torch.vmap of a function with several outputs: call by call. What is no tensor has no batch axis."""
+) -> Any:
+    """torch.vmap of a function, call by call. What is no tensor has no batch axis."""
     results = [
         function.apply(*(a.select(dim, i) if isinstance(dim, int) else a for a, dim in zip(args, in_dims, strict=True)))
         for i in range(count)
     ]
+    if isinstance(results[0], Tensor):
+        return torch.stack(results), 0
     outputs = tuple(torch.stack(parts) for parts in zip(*results, strict=True))
     return outputs, (0,) * len(outputs)

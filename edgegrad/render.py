@@ -6,9 +6,14 @@ the derivative of the expected image.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
+import torch
 from torch import Tensor
 
-from ._ops import render_image
+from ._check import as_tensor, check_finite, check_float, check_shape
+from ._ops import forward_kernel, render_image, screen_gradient_kernel
 from ._request import as_scene, make_request
 from .camera import Camera
 from .mesh import Mesh
@@ -47,11 +52,12 @@ def render(
     grad_seed        seed of the gradient's samples; derived from `seed` when None. They also depend on the image by which
                      faces it hit, which says where to put them
 
-    Differentiable once, in reverse, in every floating-point tensor of the scene and the camera; torch.vmap and torch.func's
-    transforms in reverse mode work, one element of the batch at a time, all with the same seed. The image has the dtype of
+    Differentiable once, in reverse and in forward mode, in every floating-point tensor of the scene and the camera; torch.vmap
+    and torch.func's transforms work, one element of the batch at a time, all with the same seed; tangents of one image
+    (torch.func.jacfwd) in one pass. The image has the dtype of
     the colours and comes back on the scene's device. Raises TypeError or ValueError that names the argument, and MemoryError,
-    before it allocates, with the figure and what to lower; so does its backward pass. A second derivative, or one in forward
-    mode, raises RuntimeError.
+    before it allocates, with the figure and what to lower; so does its backward pass. A second derivative raises
+    RuntimeError.
     """
     request = make_request(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
@@ -59,3 +65,78 @@ def render(
     )  # fmt: skip
     image = render_image(request, batched=camera.batch is not None)
     return image.to(as_scene(scene).meshes[0].verts.device)
+
+
+def jvp(
+    scene: Scene | Mesh, camera: Camera, tangents: Mapping[Tensor, Tensor], spp: int = 16, seed: int = 0, **options: Any
+) -> tuple[Tensor, Tensor]:
+    """The image, and its derivatives in D directions: (D, H, W, C), or (D, B, H, W, C) for a batch of cameras.
+
+    tangents   for tensors of the scene or the camera, the very ones that these hold, their derivatives (D, *shape) in each
+               direction: `{mesh.verts: dv, camera.K: dK}`; those of all others are zero
+
+    All directions share the samples of one pass. The other arguments are those of render(); samples go by area and length
+    alone, for no loss says where it looks. The same as torch.func.jvp of render(), under torch.vmap. Raises what render()
+    raises.
+    """
+    if not isinstance(tangents, Mapping) or not tangents:
+        raise TypeError("tangents: expected a mapping of tensors of the scene and the camera to their tangents")
+    scene = as_scene(scene)
+    things = [*scene.meshes, scene, camera]
+    owned = {id(value) for thing in things for value in vars(thing).values() if isinstance(value, Tensor)}
+    directions = {len(tangent) for tangent in tangents.values()}
+    if len(directions) > 1:
+        raise ValueError(f"tangents: expected as many directions of all, got {sorted(directions)}")
+    (D,) = directions
+    leaves = list(tangents)
+    for leaf, tangent in tangents.items():
+        if id(leaf) not in owned:
+            raise ValueError(
+                f"tangents: expected tensors that the scene or the camera holds, got one of shape {tuple(leaf.shape)} that "
+                "neither does; give mesh.verts of the mesh itself, say"
+            )
+        check_float("tangents", tangent)
+        check_shape("tangents", tangent, (D, *leaf.shape), fix="the first axis counts directions")
+        check_finite("tangents", tangent)
+
+    def image(*values: Tensor) -> Tensor:
+        moved = dict(zip(map(id, leaves), values, strict=True))
+
+        def replaced(thing: Any, **fields: Any) -> Any:
+            own = {n: moved[id(v)] for n, v in vars(thing).items() if isinstance(v, Tensor) and id(v) in moved}
+            return thing.replace(**fields, **own) if own or fields else thing
+
+        meshes = [replaced(mesh) for mesh in scene.meshes]
+        return render(replaced(scene, meshes=meshes), replaced(camera), spp, seed, **options)
+
+    def direction(*values: Tensor) -> tuple[Tensor, ...]:
+        return torch.func.jvp(image, tuple(leaves), values)
+
+    with torch.no_grad():
+        values = tuple(tangent.to(leaf) for leaf, tangent in tangents.items())
+        out_dims: Any = (None, 0)  # the image does not depend on the direction
+        primal, image_dot = torch.func.vmap(direction, out_dims=out_dims)(*values)
+        return primal, image_dot
+
+
+def screen_gradient(
+    scene: Scene | Mesh, camera: Camera, adjoint: Tensor, spp: int = 16, seed: int = 0, **options: Any
+) -> Tensor:
+    """How a loss changes as what is seen in each pixel moves in the image: (H, W, 2), or (B, H, W, 2), right and down, per pixel.
+
+    adjoint   ∂loss/∂image, of the image's shape
+
+    It shows where content should go: against it. Its sum is the derivative for moving everything together; what the background
+    does is not in it. The other arguments are those of render(). Raises what render() raises.
+    """
+    request = make_request(scene, camera, spp, seed, **options)
+    adjoint = as_tensor("adjoint", adjoint, floating=True).detach()
+    check_float("adjoint", adjoint)
+    shape = (*camera.size, request.channels)
+    fix = "it is the derivative of the loss by the image: give it the image's shape"
+    check_shape("adjoint", adjoint, shape if camera.batch is None else (request.cameras, *shape), fix=fix)
+    check_finite("adjoint", adjoint)
+    _, hits, _ = forward_kernel(request)
+    images = adjoint.to(request.scene.colors).reshape(request.cameras, *shape).contiguous()
+    gradient = screen_gradient_kernel(images, hits, request)
+    return (gradient if camera.batch is not None else gradient[0]).to(adjoint.device)

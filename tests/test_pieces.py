@@ -139,6 +139,26 @@ def test_barycentrics_vjp(perspective):
     check_vjp(lambda m, n: np.array(pieces.barycentrics(m, n)[1]), pieces.barycentrics_vjp, [face_map, N])
 
 
+def check_jvp(jvp: Arrays | np.ndarray, vjp: Arrays, tangents: Arrays, bar: np.ndarray) -> None:
+    """⟨bar, J u⟩ = ⟨Jᵀ bar, u⟩."""
+    products = [float(np.sum(np.asarray(b) * u)) for b, u in zip(vjp, tangents, strict=True)]
+    np.testing.assert_allclose(np.sum(bar * np.asarray(jvp)), sum(products), rtol=1e-12)
+
+
+@perspective
+def test_forward_mode_is_the_adjoint(perspective):
+    camera, q, x = kernel_camera(K6, perspective), np.array([0.4, -0.7, 2.3]), np.array([11.3, 40.2])
+    q_dot, k_dot, bar = random(3), random(6, seed=2), random(2, seed=3)
+    check_jvp(pieces.project_jvp(camera, q, q_dot, k_dot), pieces.project_vjp(camera, q, bar), [q_dot, k_dot], bar)
+    check_jvp(pieces.normalised_jvp(camera, x, k_dot), [pieces.normalised_vjp(camera, x, bar)], [k_dot], bar)
+    moved, map_bar = random(3, 3, seed=4), random(3, 3, seed=5)
+    vjp = [pieces.face_map_vjp(camera, TRIANGLE, map_bar)]
+    check_jvp(pieces.face_map_jvp(camera, TRIANGLE, moved), vjp, [moved], map_bar)
+    face_map, n_dot = np.array(pieces.face_map(camera, TRIANGLE)), random(2, seed=6)
+    vjp = pieces.barycentrics_vjp(face_map, N, bar)
+    check_jvp(pieces.barycentrics_jvp(face_map, N, map_bar, n_dot), vjp, [map_bar, n_dot], bar)
+
+
 def test_check_rejects_a_wrong_vjp():
     def forward(a, b):
         return np.array(pieces.cross(a, b))

@@ -17,7 +17,7 @@ import edgegrad as eg
 from edgegrad import reference
 from edgegrad._kernel import core
 from edgegrad._ops import Hits, kernel_camera, kernel_hits, kernel_scene
-from edgegrad._request import make_request, pack_camera
+from edgegrad._request import SLOTS, make_request, pack_camera
 from edgegrad.scene import flatten
 
 F32, F64 = torch.float32, torch.float64
@@ -111,6 +111,15 @@ def test_opcheck_render_backward(scene, wanted):
     image, *forward = torch.ops.edgegrad.render(*inputs)
     inputs = (ADJOINT[None].to(image.dtype), *forward, *inputs, [w == "1" for w in wanted])
     torch.library.opcheck(torch.ops.edgegrad.render_backward.default, inputs)
+
+
+@pytest.mark.parametrize("moving", ["1111111", "1000000", "0100110"])
+def test_opcheck_render_jvp(moving):
+    request = make_request(mixed_scene(), CAMERA, 4, surface_samples=200, edge_samples=200)
+    _, *hits = torch.ops.edgegrad.render(*request.pack())
+    slots = [request.slot(name) for name in SLOTS]
+    tangents = [torch.ones(2, *x.shape, dtype=F64) if m == "1" else None for m, x in zip(moving, slots, strict=True)]
+    torch.library.opcheck(torch.ops.edgegrad.render_jvp.default, (*hits, *request.pack(), tangents, 2))
 
 
 # -- torch.compile ----------------------------------------------------------------------------------------------------
@@ -316,165 +325,8 @@ def test_gradient_is_linear_in_the_adjoint():
     assert not torch.autograd.grad(image, verts, torch.zeros_like(ADJOINT))[0].any()
 
 
-SECOND = "second derivatives of a rendered image are not available.*Gauss-Newton"
-FORWARD = "forward-mode derivatives .* of a rendered image are not available; use reverse mode"
-
-
 def triangle(verts: Tensor, camera: eg.Camera = CAMERA) -> Tensor:
     return eg.render(eg.Scene(MESH.replace(verts=verts), BACKGROUND), camera, 4)
-
-
-def linear(verts: Tensor) -> Tensor:
-    return (triangle(verts) * ADJOINT).sum()
-
-
-def quadratic(verts: Tensor) -> Tensor:
-    return triangle(verts).square().sum()
-
-
-def first_order(loss: Callable[[Tensor], Tensor], verts: Tensor) -> Tensor:
-    """The gradient as a function of the vertices, in the graph."""
-    return torch.autograd.grad(loss(verts), verts, create_graph=True)[0]
-
-
-def gradient_penalty(loss: Callable[[Tensor], Tensor]) -> None:
-    verts = leaf(MESH.verts)
-    (loss(verts) + first_order(loss, verts).square().sum()).backward()
-
-
-def learnt_step(loss: Callable[[Tensor], Tensor]) -> None:
-    """As in meta-learning: the loss after a step, differentiated by where the step began."""
-    verts = leaf(MESH.verts)
-    loss(verts - 0.1 * first_order(loss, verts)).backward()
-
-
-def by_the_adjoint(loss: Callable[[Tensor], Tensor]) -> None:
-    """The gradient is linear in the adjoint; that derivative is the one of forward mode."""
-    verts, weight = leaf(MESH.verts), leaf(torch.ones((), dtype=F64))
-    first_order(lambda v: weight * loss(v), verts).sum().backward()
-
-
-TWICE = {
-    "gradient penalty": gradient_penalty,
-    "learnt step": learnt_step,
-    "by the adjoint": by_the_adjoint,
-    "functional.hessian": lambda loss: torch.autograd.functional.hessian(loss, MESH.verts),
-    "functional.hessian, vectorized": lambda loss: torch.autograd.functional.hessian(loss, MESH.verts, vectorize=True),
-    "functional.hvp": lambda loss: torch.autograd.functional.hvp(loss, MESH.verts, MESH.verts),
-    "functional.vhp": lambda loss: torch.autograd.functional.vhp(loss, MESH.verts, MESH.verts),
-    "functional.jvp": lambda loss: torch.autograd.functional.jvp(
-        loss, MESH.verts, MESH.verts
-    ),  # by two backward passes
-    "grad(grad)": lambda loss: torch.func.grad(lambda v: torch.func.grad(loss)(v).sum())(MESH.verts),
-    "jacrev(grad)": lambda loss: torch.func.jacrev(torch.func.grad(loss))(MESH.verts),
-    "jacrev(jacrev)": lambda loss: torch.func.jacrev(torch.func.jacrev(loss))(MESH.verts),
-}
-
-
-@pytest.mark.parametrize("loss", [linear, quadratic])
-@pytest.mark.parametrize("way", TWICE)
-def test_second_derivatives_are_refused(way, loss):
-    """Zeros came, without a word, where the loss is linear in the image, and from some of these for any loss."""
-    with pytest.raises(RuntimeError, match=SECOND):
-        TWICE[way](loss)
-
-
-def test_a_gradient_in_the_graph_is_no_second_derivative():
-    for loss in (linear, quadratic):
-        verts, other = leaf(MESH.verts), leaf(MESH.verts)
-        assert torch.equal(first_order(loss, verts), torch.autograd.grad(loss(other), other)[0])
-
-
-def test_forward_mode_is_refused():
-    for transform in (torch.func.jacfwd, torch.func.hessian):
-        with pytest.raises(RuntimeError, match=FORWARD):
-            transform(linear)(MESH.verts)
-    with pytest.raises(RuntimeError, match=FORWARD):
-        torch.func.jvp(linear, (MESH.verts,), (MESH.verts,))
-    constant = torch.func.jacfwd(lambda x: x * triangle(MESH.verts).sum())(torch.ones(()))  # of what is not rendered
-    assert torch.equal(constant, triangle(MESH.verts).sum())
-
-
-def test_functional_gradient():
-    verts = leaf(MESH.verts)
-    assert torch.equal(torch.func.grad(linear)(MESH.verts), *torch.autograd.grad(linear(verts), verts))
-
-
-@pytest.mark.parametrize("jacobian", [torch.func.jacrev, None])
-def test_jacobian(jacobian):
-    """A row of it is the gradient of a pixel."""
-    small = CAMERA.resized((4, 5))
-    verts = leaf(MESH.verts)
-    image = triangle(verts, small)
-    if jacobian is None:
-        found = torch.autograd.functional.jacobian(lambda v: triangle(v, small), MESH.verts, vectorize=True)
-    else:
-        found = jacobian(lambda v: triangle(v, small))(MESH.verts)
-    assert found.shape == (4, 5, 3, 3, 3)
-    for pixel in ((1, 2, 0), (2, 3, 1)):
-        expected = torch.autograd.grad(image[pixel], verts, retain_graph=True)[0]
-        assert expected.any() and torch.equal(found[pixel], expected)
-
-
-SHIFTS = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.2], [0.0, -0.2, 0.1]], dtype=F64)
-EYES = torch.tensor([[0.0, 0.0, 4.0], [0.5, 0.2, 3.0]], dtype=F64)
-FOCAL = torch.diag(torch.tensor([1.0, 1.0, 0.0], dtype=F64))
-
-
-def textured(texture: Tensor) -> eg.Mesh:
-    return eg.Mesh(MESH.verts, MESH.faces, texture=texture, uvs=MESH.verts[:, :2], uv_faces=MESH.faces)
-
-
-def view_from(eye: Tensor, fov_y: Tensor | float = 40.0) -> eg.Camera:
-    return eg.Camera.look_at(eye, (0.0, 0.0, 0.0), fov_y=fov_y, size=(SIZE, SIZE))
-
-
-BATCHES = {
-    "verts": (triangle, MESH.verts + SHIFTS[:, None]),
-    "translation": (lambda t: eg.render(MESH.transformed(t=t), CAMERA, 4), SHIFTS),
-    "colours": (lambda c: eg.render(MESH.replace(colors=c), CAMERA, 4), MESH.colors + SHIFTS[:, None]),
-    "background": (lambda b: eg.render(eg.Scene(MESH, b), CAMERA, 4), SHIFTS),
-    "texture": (lambda t: eg.render(textured(t), CAMERA, 4), ADJOINT[:6, :6].reshape(2, 3, 6, 3)),
-    "world_to_camera": (
-        lambda m: triangle(MESH.verts, CAMERA.replace(world_to_camera=m)),
-        CAMERA.world_to_camera + torch.nn.functional.pad(SHIFTS[:, :, None], (3, 0, 0, 1)),
-    ),
-    "K": (lambda k: triangle(MESH.verts, CAMERA.replace(K=k)), CAMERA.K + SHIFTS[:, :1, None] * FOCAL),
-    "eye": (lambda e: triangle(MESH.verts, view_from(e)), EYES),
-    "fov_y": (lambda f: triangle(MESH.verts, view_from(EYES[0], f)), torch.tensor([30.0, 50.0], dtype=F64)),
-}
-
-
-@pytest.mark.parametrize("name", BATCHES)
-def test_vmap(name):
-    """Of anything, images and gradients are those of a loop; also of the other transforms within it, and around it."""
-    function, batch = BATCHES[name]
-
-    def loss(x: Tensor) -> Tensor:
-        return (function(x) * ADJOINT).sum()
-
-    assert torch.equal(torch.vmap(function)(batch), torch.stack([function(x) for x in batch]))
-    expected = torch.stack([torch.func.grad(loss)(x) for x in batch])
-    assert expected.any()
-    assert torch.equal(torch.vmap(torch.func.grad(loss))(batch), expected)
-    assert torch.equal(torch.func.grad(lambda x: torch.vmap(loss)(x).sum())(batch), expected)
-    leaves = leaf(batch)
-    torch.vmap(loss)(leaves).sum().backward()
-    assert torch.equal(leaves.grad, expected)
-
-
-def test_vmap_in_vmap_over_other_axes():
-    verts = (MESH.verts + SHIFTS[:, None])[None] * torch.tensor([1.0, 1.1], dtype=F64)[:, None, None, None]
-    images = torch.vmap(torch.vmap(triangle, in_dims=1, out_dims=2))(verts.movedim(1, 2))
-    expected = torch.stack([torch.stack([triangle(v) for v in row], 2) for row in verts])
-    assert torch.equal(images, expected)
-
-
-def test_vmap_still_refuses_what_is_not_finite():
-    verts = MESH.verts + SHIFTS[:, None]
-    verts[1, 2, 0] = torch.nan
-    with pytest.raises(ValueError, match=r"verts: expected finite numbers, got nan at \[2, 0\]"):
-        torch.vmap(triangle)(verts)
 
 
 @pytest.mark.parametrize("value", [torch.nan, -torch.inf])

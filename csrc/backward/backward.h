@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <vector>
 
 #include "forward/forward.h"
 #include "scene/geometry.h"
@@ -15,8 +16,9 @@ struct GradientOptions {
     uint64_t seed = 0;
     bool interior_geometry = true;  // whether the colours vary over faces, so that moving them shows inside
     bool boundary = true;
-    bool dry = false;   // only count the samples
-    int pixel_spp = 0;  // if not zero, all of the interior term from so many samples a pixel, for the benchmarks
+    bool dry = false;      // only count the samples
+    bool controls = true;  // whether integrals that are known serve as control variates; they are of one given adjoint
+    int pixel_spp = 0;     // if not zero, all of the interior term from so many samples a pixel, for the benchmarks
 };
 
 // What a backward pass did, and the seconds that each part took.
@@ -45,6 +47,17 @@ struct BackwardInput {
 template <class T>
 BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOptions& options, Team& team,
                                 const Gradients& grad);
+
+// Derivatives of the image in several directions, forward mode: adds to `image_dot` (H, W, D, C). `adjoint` says how
+// much each pixel matters for where samples go; ones, if all do.
+template <class T>
+void render_tangents(const BackwardInput<T>& input, GradientOptions options, Team& team,
+                     const std::vector<Tangents>& tangents, double* image_dot);
+
+// The gradient by places in the image: adds to `gradient` (H, W, 2) how the loss changes as what is seen in a pixel
+// moves right and down, per pixel that it moves.
+template <class T>
+void render_screen_gradient(const BackwardInput<T>& input, GradientOptions options, Team& team, double* gradient);
 
 // q = R p + t, backwards: p̄ = Rᵀ q̄, R̄ = Σ q̄ pᵀ, t̄ = Σ q̄, for q_bar (V, 3).
 void add_world(const Camera& camera, const double* verts, const Array<double>& q_bar, Team& team,

@@ -34,6 +34,12 @@ struct BackwardView {
     const uint8_t* seen;             // (F,): 0, or the side from which the forward pass hit the face
     const int32_t* hit;              // (H, W, 2): the first and the last of the faces hit in each pixel
     const Array<T>& vertex_adjoint;  // (V, C): Ã at the vertices of faces that were hit (vertex_image.h)
+
+    // That holds x.
+    int64_t pixel(Vec2 x) const {
+        const auto index = [](double x, int size) { return int64_t(std::clamp(std::floor(x), 0.0, size - 1.0)); };
+        return index(x.y, camera.height) * camera.width + index(x.x, camera.width);
+    }
 };
 
 template <class T>

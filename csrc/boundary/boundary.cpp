@@ -6,38 +6,43 @@
 #include <span>
 #include <vector>
 
+#include "boundary/contractions.h"
 #include "boundary/crease_control.h"
 #include "boundary/crossings.h"
 #include "boundary/curve_measure.h"
 #include "boundary/edge_source.h"
-#include "core/channels.h"
 #include "core/sampler.h"
 #include "core/systematic.h"
-#include "shading/shade.h"
 
 namespace edgegrad {
 
 namespace {
 
+template <int N, class T>
+ReverseBoundary<N, T> contract(const BackwardView<T>& view, const Reverse&, ChunkGrad& grad) {
+    return {view, grad};
+}
+template <int N, class T>
+ForwardBoundary<T> contract(const BackwardView<T>& view, const Forward& c, ChunkGrad& grad) {
+    return {view, c.directions, grad};
+}
+template <int N, class T>
+ScreenBoundary<T> contract(const BackwardView<T>& view, const Screen&, ChunkGrad& grad) {
+    return {view, grad};
+}
+
 // Samples of one source, in batches of rays.
-template <int N, class T, CurveSource Source>
+template <class Contraction, class T, CurveSource Source>
 class CurveSamples {
    public:
-    CurveSamples(const BackwardView<T>& view, Source& source, ChunkGrad& grad)
-        : view_(view),
-          visibility_(view),
-          source_(source),
-          grad_(grad),
-          C_(N ? N : view.scene.channels),
-          rays_(view.frame),
-          adjoint_(RayBatch::size * C_),
-          radiance_(C_) {}
+    CurveSamples(const BackwardView<T>& view, Source& source, Contraction contraction)
+        : view_(view), visibility_(view), source_(source), contraction_(std::move(contraction)), rays_(view.frame) {}
 
     // The point at the fraction s of the curve.
     void add(const typename Source::Curve& curve, double s, double weight) {
         const int i = rays_.count;
         const Vec2 x = source_.position(curve, s);
-        if (!view_.adjoint.template at<N>(x, adjoint_.data() + i * C_)) return;
+        if (!contraction_.wants(i, x)) return;
         typename Source::Sample& sample = sample_[i];
         sample.x = x, sample.n = normalised(view_.camera, x), sample.weight = weight;
         if (!source_.place(curve, s, sample)) return;
@@ -46,9 +51,9 @@ class CurveSamples {
         if (++rays_.count == RayBatch::size) cast();
     }
 
-    void finish() {
+    void finish(ChunkGrad& grad) {
         cast();
-        source_.finish(grad_);
+        source_.finish(grad);
     }
 
    private:
@@ -59,42 +64,27 @@ class CurveSamples {
             typename Source::Sample& sample = sample_[i];
             const int32_t hit = visibility_.beyond_float(sample, rays_.face[i]);
             if (hit >= 0 && !visibility_.lies_behind(hit, source_.faces_of(sample), sample)) continue;
-            const SampleSurfaces surfaces = source_.surfaces(sample);
-            double radiance[SampleSurfaces::most];
-            for (int k = 0; k < surfaces.count; ++k)
-                radiance[k] = adjoint_radiance(sample.x, surfaces.at[k], adjoint_.data() + i * C_);
-            source_.add_motion(sample, radiance, grad_);
+            contraction_.add(i, source_, sample);
         }
         rays_.count = 0;
         source_.cast();
     }
 
-    // Ã · L of a point of a face, or of the background.
-    double adjoint_radiance(Vec2 x, const SurfacePoint& p, const double* adjoint) {
-        if (p.face < 0) return view_.adjoint.template times_background<N>(x);
-        shade<N>(view_.scene, p.face, p.b, radiance_.data());
-        double sum = 0;
-        for (int c = 0; c < C_; ++c) sum += adjoint[c] * radiance_[c];
-        return sum;
-    }
-
     const BackwardView<T>& view_;
     const Visibility<T> visibility_;
     Source& source_;
-    ChunkGrad& grad_;
-    const int C_;
+    Contraction contraction_;
 
     RayBatch rays_;
     typename Source::Sample sample_[RayBatch::size];
     std::span<const int32_t> ignored_[RayBatch::size];
-    std::vector<double> adjoint_, radiance_;
 };
 
 }  // namespace
 
-template <int N, class T>
-void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, Destination& to,
-                  BackwardProfile& profile) {
+template <int N, class Contraction, class T>
+void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, const Contraction& contraction,
+                  Destination& to, BackwardProfile& profile) {
     profile.edge_samples = n;
     if (n == 0 || view.options.dry) return;
     Stopwatch watch;
@@ -107,7 +97,7 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, Des
     if (!curves.x_bar.empty()) to.x = curves.x_bar.data();
     view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         EdgeSource<T> edges(view, finder, coincident);
-        CurveSamples<N, T, EdgeSource<T>> samples(view, edges, grad);
+        CurveSamples samples(view, edges, contract<N>(view, contraction, grad));
         CreaseControl<N, T> control(view);
         Curve curve;
         bool controlled = false;
@@ -127,16 +117,15 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, Des
             samples.add(curve, s, weight);
         }
         if (controlled) control.flush(grad.x);
-        samples.finish();
+        samples.finish(grad);
     });
     to.x = nullptr;
 }
 
 // clang-format off
-#define EDGEGRAD_INSTANTIATE(N) \
-    template void add_boundary<N, float>(const BackwardView<float>&, Curves<float>&, int64_t, Destination&, BackwardProfile&); \
-    template void add_boundary<N, double>(const BackwardView<double>&, Curves<double>&, int64_t, Destination&, BackwardProfile&);
-EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
+#define EDGEGRAD_INSTANTIATE(N, C, T) \
+    template void add_boundary<N, C, T>(const BackwardView<T>&, Curves<T>&, int64_t, const C&, Destination&, BackwardProfile&);
+EDGEGRAD_FOR_CONTRACTIONS(EDGEGRAD_INSTANTIATE)
 #undef EDGEGRAD_INSTANTIATE
 // clang-format on
 

@@ -8,14 +8,17 @@
 #pragma once
 
 #include "backward/view.h"
+#include "contract/contraction.h"
 
 namespace edgegrad {
 
 template <class T>
 struct Curves;
 
-// Adds what n samples find on the measured curves.
-template <int N, class T>
-void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, Destination& to, BackwardProfile& profile);
+// Adds what n samples find on the measured curves. See contract/contraction.h; N: the number of channels that code is
+// compiled for, or 0.
+template <int N, class Contraction, class T>
+void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, const Contraction& contraction,
+                  Destination& to, BackwardProfile& profile);
 
 }  // namespace edgegrad

@@ -191,7 +191,8 @@ std::vector<std::vector<ImageSegment>> silhouettes(const BackwardView<T>& view, 
 template <class T>
 Curves<T>::Curves(const BackwardView<T>& view, Array<int8_t> facing)
     : finder(view, std::move(facing)),
-      x_bar(zeros(view.hits && finder.finds_creases() && !view.options.dry ? 2 * view.scene.n_verts : 0, view.team)) {}
+      x_bar(zeros(view.hits && finder.finds_creases() && view.options.controls ? 2 * view.scene.n_verts : 0,
+                  view.team)) {}
 
 template <class T>
 int64_t Curves<T>::wanted(int64_t given) const {

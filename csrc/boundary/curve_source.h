@@ -11,6 +11,7 @@
 #include <span>
 #include <vector>
 
+#include "contract/forward.h"
 #include "contract/scatter.h"
 #include "shading/surface.h"
 
@@ -49,21 +50,32 @@ struct SampleSurfaces {
     int count = 2;
 };
 
+// What a sample's weight times the jump of the radiance, L₋ − L₊, is for what the curve moves with; and, of another
+// curve that lies on it, for what that one moves with (coincidence.h). Or the velocities δx ∧ τ of both.
+struct CurveJumps {
+    double first = 0, second = 0;
+};
+
 // `place` sets where the fraction s of a curve lies, of a sample that has its x, n and weight; false if no ray is
 // needed to know that nothing shows there. `faces_of` serves the test whether what the ray meets hides the point.
-// `add_motion` takes Ã · L of each of the surfaces. `finish` adds what was summed for the latest curve. `cast` tells
-// that no sample waits any more.
+// `jumps` takes one number, linear in the radiance, of each of the surfaces. `add_motion` takes the jumps of the loss;
+// `velocities` is what it is the adjoint of, in one direction, and `tangent` dx/ds. `finish` adds what was summed for
+// the latest curve. `cast` tells that no sample waits any more.
 template <class S>
-concept CurveSource = std::derived_from<typename S::Sample, CurveSample> &&
-                      requires(S& source, const S& known, typename S::Sample& sample, const typename S::Curve& curve,
-                               double s, const double* radiance, ChunkGrad& grad) {
-                          { known.position(curve, s) } -> std::same_as<Vec2>;
-                          { source.place(curve, s, sample) } -> std::same_as<bool>;
-                          { known.faces_of(sample) } -> std::same_as<const CurveFaces&>;
-                          { source.surfaces(sample) } -> std::same_as<SampleSurfaces>;
-                          source.add_motion(sample, radiance, grad);
-                          source.cast();
-                          source.finish(grad);
-                      };
+concept CurveSource =
+    std::derived_from<typename S::Sample, CurveSample> &&
+    requires(S& source, const S& known, typename S::Sample& sample, const typename S::Curve& curve, double s,
+             const double* radiance, CurveJumps jumps, const Direction& direction, ChunkGrad& grad) {
+        { known.position(curve, s) } -> std::same_as<Vec2>;
+        { source.place(curve, s, sample) } -> std::same_as<bool>;
+        { known.faces_of(sample) } -> std::same_as<const CurveFaces&>;
+        { source.surfaces(sample) } -> std::same_as<SampleSurfaces>;
+        { known.jumps(sample, radiance) } -> std::same_as<CurveJumps>;
+        { known.velocities(sample, direction) } -> std::same_as<CurveJumps>;
+        { known.tangent(sample) } -> std::same_as<Vec2>;
+        source.add_motion(sample, jumps, grad);
+        source.cast();
+        source.finish(grad);
+    };
 
 }  // namespace edgegrad

@@ -84,14 +84,43 @@ class EdgeSource {
         return surfaces;
     }
 
-    void add_motion(const Sample& sample, const double* radiance, ChunkGrad& grad) {
-        const Curve& curve = place_[sample.place].own.curve;
+    CurveJumps jumps(const Sample& sample, const double* radiance) const {
         const CoincidentShare& share = sample.share;
         const double scale = sample.weight * share.weight, jump = scale * (radiance[0] - radiance[1]);
         double to_second = 0;
         if (share.halves) to_second = jump / 2;
         else if (uncovers(sample))
             to_second = scale / 2 * (share.front == 0 ? radiance[2] - radiance[1] : radiance[0] - radiance[2]);
+        return {jump - to_second, to_second};
+    }
+
+    Vec2 tangent(const Sample& sample) const { return place_[sample.place].own.curve.tangent(); }
+
+    // δx ∧ τ of the point, with the vertices of the faces on either side in equal parts, as flush() has it.
+    CurveJumps velocities(const Sample& sample, const Direction& direction) const {
+        const Curve& curve = place_[sample.place].own.curve;
+        const Vec2 tangent = curve.tangent();
+        const auto velocity = [&](Vec3 point, Vec3 point_dot) {
+            return wedge(project_jvp(view_.camera, point, point_dot, direction.k.data()), tangent);
+        };
+        Vec3 point_dot;
+        for (const HalfEdge* h : {&curve.minus, &curve.plus}) {
+            if (h->face < 0) continue;
+            const double half = curve.is_crease() ? 0.5 : 1;
+            point_dot += half * ((1 - sample.t) * direction.q[vertex(view_.scene, *h, h->first())] +
+                                 sample.t * direction.q[vertex(view_.scene, *h, h->second())]);
+        }
+        const EdgePoint& second = sample.share.second;
+        const double of_second = second.vertex[0] >= 0 && second.vertex[1] >= 0
+                                     ? velocity(second.point, (1 - second.t) * direction.q[second.vertex[0]] +
+                                                                  second.t * direction.q[second.vertex[1]])
+                                     : 0;
+        return {velocity(sample.point, point_dot), of_second};
+    }
+
+    void add_motion(const Sample& sample, CurveJumps jumps, ChunkGrad& grad) {
+        const Curve& curve = place_[sample.place].own.curve;
+        const CoincidentShare& share = sample.share;
         const Vec2 tangent = curve.tangent();
         const auto move = [&](Vec3 point, double jump) {
             Vec3 point_bar;
@@ -99,16 +128,16 @@ class EdgeSource {
             return point_bar;
         };
         if (current_.edge != curve.edge) flush(grad), current_ = curve, a_bar_ = b_bar_ = {};
-        const Vec3 point_bar = move(sample.point, jump - to_second);
+        const Vec3 point_bar = move(sample.point, jumps.first);
         a_bar_ += (1 - sample.t) * point_bar;
         b_bar_ += sample.t * point_bar;
-        if (to_second == 0) return;
+        if (jumps.second == 0) return;
         const EdgePoint& second = share.second;
         if (second.vertex[0] != second_[0] || second.vertex[1] != second_[1]) {
             flush_second(grad);
             for (int i = 0; i < 2; ++i) second_[i] = second.vertex[i], second_bar_[i] = {};
         }
-        const Vec3 second_bar = move(second.point, to_second);
+        const Vec3 second_bar = move(second.point, jumps.second);
         second_bar_[0] += (1 - second.t) * second_bar;
         second_bar_[1] += second.t * second_bar;
     }

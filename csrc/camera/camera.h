@@ -90,6 +90,15 @@ inline void project_vjp(const Camera& c, Vec3 q, Vec2 bar, Vec3& q_bar, double k
     q_bar += Vec3{n_bar.x * w, n_bar.y * w, c.perspective ? -(n_bar.x * n.x + n_bar.y * n.y) * w : 0.0};
 }
 
+inline Vec2 project_jvp(const Camera& c, Vec3 q, Vec3 q_dot, const double k_dot[6]) {
+    const double w = 1.0 / c.depth_weight(q);
+    const Vec2 n{q.x * w, q.y * w};
+    const double along = c.perspective ? q_dot.z : 0.0;
+    const Vec2 n_dot{(q_dot.x - along * n.x) * w, (q_dot.y - along * n.y) * w};
+    return {c.k[0] * n_dot.x + c.k[1] * n_dot.y + k_dot[0] * n.x + k_dot[1] * n.y + k_dot[2],
+            c.k[3] * n_dot.x + c.k[4] * n_dot.y + k_dot[3] * n.x + k_dot[4] * n.y + k_dot[5]};
+}
+
 // Normalised image coordinates of a pixel position: n = A⁻¹ (x − c), with A the 2 × 2 part of K and c its last column.
 inline Vec2 normalised(const Camera& c, Vec2 x) {
     const double dx = x.x - c.k[2], dy = x.y - c.k[5], *A = c.k_inverse;
@@ -102,6 +111,18 @@ inline void normalised_vjp(const Camera& c, Vec2 n, Vec2 bar, double k_bar[6]) {
     const Vec2 m{A[0] * bar.x + A[2] * bar.y, A[1] * bar.x + A[3] * bar.y};  // A⁻ᵀ n̄
     k_bar[0] -= m.x * n.x, k_bar[1] -= m.x * n.y, k_bar[2] -= m.x;
     k_bar[3] -= m.y * n.x, k_bar[4] -= m.y * n.y, k_bar[5] -= m.y;
+}
+
+inline Vec2 normalised_jvp(const Camera& c, Vec2 n, const double k_dot[6]) {
+    const double *A = c.k_inverse, x = k_dot[0] * n.x + k_dot[1] * n.y + k_dot[2],
+                 y = k_dot[3] * n.x + k_dot[4] * n.y + k_dot[5];
+    return {-(A[0] * x + A[1] * y), -(A[2] * x + A[3] * y)};
+}
+
+// ∂n/∂x, backwards: A⁻ᵀ n̄, the cotangent of the pixel position.
+inline Vec2 pixel_vjp(const Camera& c, Vec2 n_bar) {
+    const double* A = c.k_inverse;
+    return {A[0] * n_bar.x + A[2] * n_bar.y, A[1] * n_bar.x + A[3] * n_bar.y};
 }
 
 }  // namespace edgegrad

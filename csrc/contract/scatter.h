@@ -92,17 +92,20 @@ class RowBuffer {
 // What the samples of one chunk give.
 struct ChunkGrad {
     RowBuffer q, x, colors, uvs, texels;  // vertices: q in camera coordinates, x in the image
+    RowBuffer pixels;                     // of what has the size of the image
     double k[6] = {};                     // the upper rows of K
 };
 
 // Where it goes; null where none is wanted.
 struct Destination {
-    double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr;
+    double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr, *pixels = nullptr;
+    int pixel_width = 0;  // numbers a pixel
     double k[6] = {};
     bool want_k = false;
 };
 
-// The rows of both, and their width; 0: the channels.
+// The rows of both, and their width.
+constexpr int as_channels = 0, as_pixels = -1;
 struct RowSlot {
     RowBuffer ChunkGrad::* rows;
     double* Destination::* to;
@@ -110,9 +113,10 @@ struct RowSlot {
 };
 constexpr RowSlot row_slots[] = {{&ChunkGrad::q, &Destination::q, 3},
                                  {&ChunkGrad::x, &Destination::x, 2},
-                                 {&ChunkGrad::colors, &Destination::colors, 0},
+                                 {&ChunkGrad::colors, &Destination::colors, as_channels},
                                  {&ChunkGrad::uvs, &Destination::uvs, 2},
-                                 {&ChunkGrad::texels, &Destination::texels, 0}};
+                                 {&ChunkGrad::texels, &Destination::texels, as_channels},
+                                 {&ChunkGrad::pixels, &Destination::pixels, as_pixels}};
 
 // Samples in a chunk, chunks that are in memory at a time for each thread, and owners at most: more would only split
 // the buffers further.
@@ -171,7 +175,10 @@ class Scatter {
     void prepare(ChunkGrad& g, const Destination& to, int owners) const {
         for (const RowSlot& slot : row_slots) {
             RowBuffer& rows = g.*slot.rows;
-            if (to.*slot.to) rows.prepare(slot.width ? slot.width : channels_, owners);
+            const int width = slot.width == as_channels ? channels_
+                              : slot.width == as_pixels ? to.pixel_width
+                                                        : slot.width;
+            if (to.*slot.to) rows.prepare(width, owners);
             rows.clear();
         }
         std::fill(g.k, g.k + 6, 0.0);

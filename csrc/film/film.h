@@ -59,48 +59,14 @@ class Filter {
     FilterKind kind_;
 };
 
-// The adjoint image seen through the filter. T is the type of images.
-template <class T>
-class FilteredAdjoint {
+// The pixels of an image with their filter.
+class FilteredPixels {
    public:
-    FilteredAdjoint(const T* adjoint, const SceneView<T>& scene, Filter filter, int width, int height)
-        : A_(adjoint), scene_(scene), filter_(filter), width_(width), height_(height) {}
+    FilteredPixels(Filter filter, int width, int height) : filter_(filter), width_(width), height_(height) {}
 
-    // A of a pixel, C numbers.
-    const T* of(int64_t pixel) const { return A_ + pixel * scene_.channels; }
-
-    // Ã(x), C numbers; false where it is zero in all channels.
-    template <int N>
-    bool at(Vec2 x, double* out) const {
-        const int C = N ? N : scene_.channels;
-        for (int c = 0; c < C; ++c) out[c] = 0;
-        for_pixels(x, [&](int64_t pixel, double weight) {
-            const T* A = A_ + pixel * C;
-            for (int c = 0; c < C; ++c) out[c] += weight * A[c];
-        });
-        bool any = false;
-        for (int c = 0; c < C; ++c) any |= out[c] != 0;
-        return any;
-    }
-
-    // Σ_pixels k(x − c) A · background: what the background at x contributes. Each pixel has a background of its own,
-    // so this is not Ã(x) times something.
-    template <int N>
-    double times_background(Vec2 x) const {
-        const int C = N ? N : scene_.channels;
-        double sum = 0;
-        for_pixels(x, [&](int64_t pixel, double weight) {
-            const T *A = A_ + pixel * C, *B = scene_.background_at(pixel);
-            double product = 0;
-            for (int c = 0; c < C; ++c) product += double(A[c]) * B[c];
-            sum += weight * product;
-        });
-        return sum;
-    }
-
-   private:
+    // Calls visit(pixel, k(x − c)) for those whose filter reaches x.
     template <class Visit>
-    void for_pixels(Vec2 x, Visit visit) const {
+    void around(Vec2 x, Visit visit) const {
         const double r = filter_.radius();
         // Pixels whose centre lies within r. The box takes floor(x) alone, so that a point on a border counts once.
         const bool box = filter_.is_box();
@@ -115,10 +81,54 @@ class FilteredAdjoint {
         }
     }
 
-    const T* A_;
-    const SceneView<T>& scene_;
+   private:
     Filter filter_;
     int width_, height_;
+};
+
+// The adjoint image seen through the filter. T is the type of images.
+template <class T>
+class FilteredAdjoint {
+   public:
+    FilteredAdjoint(const T* adjoint, const SceneView<T>& scene, Filter filter, int width, int height)
+        : A_(adjoint), scene_(scene), pixels_(filter, width, height) {}
+
+    // A of a pixel, C numbers.
+    const T* of(int64_t pixel) const { return A_ + pixel * scene_.channels; }
+
+    // Ã(x), C numbers; false where it is zero in all channels.
+    template <int N>
+    bool at(Vec2 x, double* out) const {
+        const int C = N ? N : scene_.channels;
+        for (int c = 0; c < C; ++c) out[c] = 0;
+        pixels_.around(x, [&](int64_t pixel, double weight) {
+            const T* A = A_ + pixel * C;
+            for (int c = 0; c < C; ++c) out[c] += weight * A[c];
+        });
+        bool any = false;
+        for (int c = 0; c < C; ++c) any |= out[c] != 0;
+        return any;
+    }
+
+    // Σ_pixels k(x − c) A · background: what the background at x contributes. Each pixel has a background of its own,
+    // so this is not Ã(x) times something.
+    template <int N>
+    double times_background(Vec2 x) const {
+        const int C = N ? N : scene_.channels;
+        double sum = 0;
+        pixels_.around(x, [&](int64_t pixel, double weight) {
+            const T *A = A_ + pixel * C, *B = scene_.background_at(pixel);
+            double product = 0;
+            for (int c = 0; c < C; ++c) product += double(A[c]) * B[c];
+            sum += weight * product;
+        });
+        return sum;
+    }
+
+   private:
+    const T* A_;
+    const SceneView<T>& scene_;
+    FilteredPixels pixels_;
 };
 
 }  // namespace edgegrad

@@ -1,4 +1,5 @@
-// Surface samples: points on the triangles rather than pixels that happen to hit them.
+// Surface samples: points on the triangles rather than pixels that happen to hit them; and, for large textured
+// triangles, samples of the pixels.
 //
 // Triangles are laid end to end by a measure m of which area + longest side · 1 px is a part (surface_measure.h). A
 // point uniform in the image of its triangle then has the weight area · M / (n m). At a grazing angle the integrand
@@ -13,60 +14,59 @@
 #include "camera/polygon.h"
 #include "core/channels.h"
 #include "core/sampler.h"
+#include "core/sobol.h"
 #include "core/systematic.h"
-#include "interior/face_grad.h"
+#include "interior/contractions.h"
 #include "interior/surface_measure.h"
-#include "shading/shade.h"
 
 namespace edgegrad {
 
 namespace {
 
-// The samples of one chunk.
 template <int N, class T>
+ReverseInterior<N, T> contract(const BackwardView<T>& view, const Reverse& c, const Destination& to, ChunkGrad& grad) {
+    return {view, c.geometry, to, grad};
+}
+template <int N, class T>
+ForwardInterior<T> contract(const BackwardView<T>& view, const Forward& c, const Destination&, ChunkGrad& grad) {
+    return {view, c.directions, grad};
+}
+template <int N, class T>
+ScreenInterior<T> contract(const BackwardView<T>& view, const Screen&, const Destination&, ChunkGrad& grad) {
+    return {view, grad};
+}
+
+// The samples of one chunk.
+template <class Contraction, class T>
 class InteriorChunk {
    public:
-    InteriorChunk(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
-        : view_(view),
-          grad_(view, geometry, to, grad),
-          C_(N ? N : view.scene.channels),
-          rays_(view.frame),
-          weighted_(RayBatch::size * C_) {}
+    InteriorChunk(const BackwardView<T>& view, Contraction contraction)
+        : view_(view), contraction_(std::move(contraction)), rays_(view.frame) {}
 
-    // A sample at x, with barycentrics λ in the image, that stands for a share of the face's area.
-    void add(int64_t face, Vec2 x, Barycentrics lambda, double share, double area, bool controlled) {
+    void add(const SurfaceSample& sample) {
         const int i = rays_.count;
-        double* weighted = weighted_.data() + i * C_;
-        if (!view_.adjoint.template at<N>(x, weighted) && !controlled) return;
-        for (int c = 0; c < C_; ++c) weighted[c] *= share * area;
-        const Vec2 n = normalised(view_.camera, x);
-        sample_[i] = {int32_t(face), controlled, lambda, share}, rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
+        if (!contraction_.wants(i, sample)) return;
+        const Vec2 n = normalised(view_.camera, sample.x);
+        sample_[i] = sample, rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
         if (++rays_.count == RayBatch::size) cast();
     }
 
     void finish() {
         cast();
-        grad_.flush();
+        contraction_.finish();
     }
 
    private:
     void cast() {
         rays_.prepare();
         view_.geometry.caster().cast(rays_);
-        for (int i = 0; i < rays_.count; ++i) {
-            const Sample& s = sample_[i];
-            const bool seen = sees(i);
-            if (!seen && !s.controlled) continue;
-            if (grad_.face() != s.face) grad_.flush(), grad_.start(s.face, s.controlled);
-            if (seen) grad_.add(rays_.n(i), weighted_.data() + i * C_);
-            if (s.controlled) grad_.control().subtract(s.lambda, s.share);
-        }
+        for (int i = 0; i < rays_.count; ++i) contraction_.add(i, sample_[i], rays_.n(i), is_visible(i));
         rays_.count = 0;
     }
 
     // Whether nothing lies before the sample. Its ray may miss its own face, when that is thinner than floats are
     // apart; then what counts is whether what it met instead lies behind, by more than floats can tell.
-    bool sees(int i) const {
+    bool is_visible(int i) const {
         const int32_t own = sample_[i].face;
         if (rays_.face[i] == own) return true;
         const Vec2 n = rays_.n(i);
@@ -80,18 +80,10 @@ class InteriorChunk {
         return depth_of(view_, met, n) > depth + view_.frame.error({p[0], p[1], p[2]});
     }
 
-    struct Sample {
-        int32_t face;
-        bool controlled;
-        Barycentrics lambda;
-        double share;
-    };
     const BackwardView<T>& view_;
-    FaceGrad<N, T> grad_;
-    const int C_;
+    Contraction contraction_;
     RayBatch rays_;
-    Sample sample_[RayBatch::size];
-    std::vector<double> weighted_;
+    SurfaceSample sample_[RayBatch::size];
 };
 
 // What the gradient of a face will ask for once its rays are cast.
@@ -105,12 +97,13 @@ void prefetch_face(const BackwardView<T>& view, int64_t face) {
 }
 
 // Adds what n samples find on the faces, which are laid end to end.
-template <int N, class T>
+template <int N, class Contraction, class T>
 void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systematic& systematic,
-                         const SurfaceMeasure<T>& surface, bool geometry, Destination& to, double (&seconds)[2]) {
+                         const SurfaceMeasure<T>& surface, const Contraction& contraction, Destination& to,
+                         double (&seconds)[2]) {
     const ShiftedSequence sequence(hash(view.options.seed, 2, gradient_stream));
     view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        InteriorChunk<N, T> chunk(view, geometry, to, grad);
+        InteriorChunk chunk(view, contract<N>(view, contraction, to, grad));
         VisiblePolygon polygon;
         PolygonSampler sampler;
         int64_t face = -1;
@@ -127,7 +120,12 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
             }
             const double s = (position - systematic.begin_of(face)) / systematic.measure_of(face);
             const Vec2 x = sampler(s, sequence(i));
-            chunk.add(face, x, sampler.lambda(), share, polygon.area, surface.is_controlled[face]);
+            chunk.add({.face = int32_t(face),
+                       .controlled = surface.is_controlled[face] != 0,
+                       .x = x,
+                       .lambda = sampler.lambda(),
+                       .share = share,
+                       .weight = share * polygon.area});
         }
         chunk.finish();
     });
@@ -135,27 +133,66 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
 
 }  // namespace
 
-template <int N, class T>
-void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64_t n, bool geometry, Destination& to,
-                  BackwardProfile& profile) {
+// Samples of the pixels: rays through them, and the radiance where they hit differentiated with the weight A / spp.
+//
+// For a large triangle with a texture this beats surface samples: its rays are the most coherent there are, and those
+// of a pixel and of its neighbours are spread evenly over it (sobol.h). For others it is poor: a triangle that is seen
+// at a grazing angle, or is smaller than a pixel, is hit by chance.
+template <int N, class Contraction, class T>
+void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Contraction& contraction,
+                       Destination& to, double (&seconds)[2]) {
+    const auto& [pixels, spp, seed, faces] = samples;
+    const int width = view.camera.width;
+    const ScrambledSobol sobol(seed);
+    view.scatter.add(int64_t(pixels.size()), to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+        auto chunk = contract<N>(view, contraction, to, grad);
+        RayBatch rays(view.frame);
+        for (int64_t p = first; p < last; ++p) {
+            const int64_t pixel = pixels[p];
+            if (!chunk.begin_pixel(pixel, spp)) continue;
+            view.team.check();
+            const int x = int(pixel % width), y = int(pixel / width);
+            const uint64_t place = z_order(x, y) * spp;
+            for (int done = 0; done < spp; done += RayBatch::size) {
+                rays.count = std::min(spp - done, RayBatch::size);
+                sobol.fill(place + done, rays.count, rays.n_x, rays.n_y);
+                place_in_pixel(view.camera, view.image.filter, x, y, rays.count, rays.n_x, rays.n_y);
+                rays.prepare();
+                view.geometry.caster().cast(rays);
+                for (int i = 0; i < rays.count; ++i) {
+                    const int32_t face = rays.face[i];
+                    if (face < 0 || (faces && !faces[face])) continue;
+                    chunk.add_in_pixel(face, rays.n(i));
+                }
+            }
+        }
+        chunk.finish();
+    });
+}
+
+template <int N, class Contraction, class T>
+void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64_t n, const Contraction& contraction,
+                  Destination& to, BackwardProfile& profile) {
     const GradientOptions& o = view.options;
     profile.surface_samples = surface.pixel_samples() + n;
     if (o.dry) return;
-    if (surface.pixel_samples() > 0)
-        add_pixel_samples<N>(view, surface.pixels, surface.pixel_spp, hash(o.seed, 4, gradient_stream),
-                             surface.is_large.data(), geometry, to, profile.surface);
+    if (surface.pixel_samples() > 0) {
+        const PixelSamples samples{surface.pixels, surface.pixel_spp, hash(o.seed, 4, gradient_stream),
+                                   surface.is_large.data()};
+        add_pixel_samples<N>(view, samples, contraction, to, profile.surface);
+    }
     if (n == 0) return;
     Systematic systematic(surface.of_face, view.team);
     if (!(systematic.total() > 0)) return;
     systematic.draw(n, to_unit(hash(o.seed, 1, gradient_stream)));
-    add_surface_samples<N>(view, n, systematic, surface, geometry, to, profile.surface);
+    add_surface_samples<N>(view, n, systematic, surface, contraction, to, profile.surface);
 }
 
 // clang-format off
-#define EDGEGRAD_INSTANTIATE(N) \
-    template void add_interior<N, float>(const BackwardView<float>&, SurfaceMeasure<float>&, int64_t, bool, Destination&, BackwardProfile&); \
-    template void add_interior<N, double>(const BackwardView<double>&, SurfaceMeasure<double>&, int64_t, bool, Destination&, BackwardProfile&);
-EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
+#define EDGEGRAD_INSTANTIATE(N, C, T) \
+    template void add_interior<N, C, T>(const BackwardView<T>&, SurfaceMeasure<T>&, int64_t, const C&, Destination&, BackwardProfile&); \
+    template void add_pixel_samples<N, C, T>(const BackwardView<T>&, const PixelSamples&, const C&, Destination&, double (&)[2]);
+EDGEGRAD_FOR_CONTRACTIONS(EDGEGRAD_INSTANTIATE)
 #undef EDGEGRAD_INSTANTIATE
 // clang-format on
 

@@ -262,7 +262,7 @@ class MeasuredChunk {
                 default_samples(f, extent, seen, [&] { return (l.wedge[i] > 0) == (view_.camera.k_det > 0) ? 1 : 2; });
             // One without texture and so small that its corners say what is between them. A face that comes near the
             // eye is not affine in the image.
-            if (seen.whole && l.longest[i] <= widest && !view_.options.dry && !is_textured(view_.scene, f) &&
+            if (seen.whole && l.longest[i] <= widest && view_.options.controls && !is_textured(view_.scene, f) &&
                 (!view_.camera.perspective || l.depths[i] < 2)) {
                 controlled_[i] = any = true;
                 clear_[i] = seen.clear;

@@ -125,6 +125,24 @@ void bind_for_tests(nb::module_& m) {
         normalised_vjp(c, normalised(c, vec(x)), vec(bar), k_bar.data());
         return k_bar;
     });
+    // In forward mode.
+    p.def("project_jvp", [](const Camera& c, A3 q, A3 q_dot, A6 k_dot) {
+        return array(project_jvp(c, vec(q), vec(q_dot), k_dot.data()));
+    });
+    p.def("normalised_jvp", [](const Camera& c, A2 x, A6 k_dot) {
+        return array(normalised_jvp(c, normalised(c, vec(x)), k_dot.data()));
+    });
+    p.def("face_map_jvp", [](const Camera& c, A33 q, A33 q_dot) {
+        const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])},
+                   dot[3] = {vec(q_dot[0]), vec(q_dot[1]), vec(q_dot[2])};
+        return array(face_map_jvp(c, corner, dot));
+    });
+    p.def("barycentrics_jvp", [](A33 m, A2 n, A33 m_dot, A2 n_dot) {
+        Barycentrics b;
+        barycentrics(map(m), vec(n), b);
+        const Barycentrics dot = barycentrics_jvp(map(m), vec(n), b, map(m_dot), vec(n_dot));
+        return A2{dot.u, dot.v};
+    });
     p.def("cross", [](A3 a, A3 b) { return array(cross(vec(a), vec(b))); });
     p.def("cross_vjp", [](A3 a, A3 b, A3 bar) {
         Vec3 a_bar, b_bar;

@@ -114,6 +114,14 @@ void bind_memory(nb::module_& m) {
         },
         "size"_a, nb::kw_only(), "motion"_a, "boundary"_a, "wanted"_a, "surface_samples"_a = -1, "edge_samples"_a = -1,
         "curves"_a = -1);
+    // What samples leave in the pixels around them: at most nine, of a Gaussian.
+    m.def(
+        "pixel_row_bytes",
+        [](const PassSize& size, int64_t samples, int width) {
+            const int64_t n = samples < 0 ? int64_t(1) << 62 : samples;
+            return RowBuffer::bytes({n, -1, 9, size.pixels, width}, size.threads);
+        },
+        "size"_a, nb::kw_only(), "samples"_a, "width"_a);
 }
 
 }  // namespace edgegrad

@@ -114,6 +114,54 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Image
             {"world", p.world}};
 }
 
+// Geometry as the terms of a derivative want it.
+template <class T, class Work>
+void with_geometry(const SceneArrays<T>& arrays, bool boundary, int threads, Work work) {
+    unlocked(threads, [&](Team& team) {
+        GeometryWork done;
+        work(*arrays.geometry({boundary, true}, team, done), team);
+    });
+}
+
+// Of several directions: what each moves, by slot.
+template <class T>
+void jvp(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image, const GradientOptions& options,
+         int threads, Out<T, 3> adjoint, const HitArrays<T>& hits, const std::vector<GradientArrays>& tangents,
+         Out<double, 4> image_dot) {
+    check_background(arrays, camera);
+    check_image("adjoint", adjoint, camera, arrays.background.shape(2));
+    hits.check(arrays, camera);
+    const SceneView<T> scene = arrays.view();
+    std::vector<Tangents> directions;
+    for (const GradientArrays& given : tangents) {
+        const Gradients slots = make_gradients(given, scene, camera);
+        Tangents& t = directions.emplace_back();
+        for (const GradientSlot<T>& slot : gradient_slots<T>) t.*(slot.from) = slots.*(slot.to);
+    }
+    if (image_dot.size() != adjoint.size() * directions.size())
+        refuse("image_dot: expected the image's size for each direction");
+    with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
+        render_tangents(BackwardInput<T>{scene, camera, geometry, image, adjoint.data(), hits.view()}, options, team,
+                        directions, image_dot.data());
+    });
+}
+
+template <class T>
+void screen_gradient(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
+                     const GradientOptions& options, int threads, Out<T, 3> adjoint, const HitArrays<T>& hits,
+                     Out<double, 3> gradient) {
+    check_background(arrays, camera);
+    check_image("adjoint", adjoint, camera, arrays.background.shape(2));
+    hits.check(arrays, camera);
+    check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2), threads);
+    if (gradient.size() != size_t(2) * camera.width * camera.height) refuse("gradient: expected two numbers a pixel");
+    const SceneView<T> scene = arrays.view();
+    with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
+        render_screen_gradient(BackwardInput<T>{scene, camera, geometry, image, adjoint.data(), hits.view()}, options,
+                               team, gradient.data());
+    });
+}
+
 template <class T>
 void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
     using Scene = SceneArrays<T>;
@@ -130,7 +178,11 @@ void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
              "background"_a.noconvert(), "spacing"_a, "threads"_a)
         .def("forward", &forward<T>, "camera"_a, "options"_a, "threads"_a, "image"_a.noconvert(), "hits"_a)
         .def("backward", &backward<T>, "camera"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(),
-             "hits"_a, "gradients"_a);
+             "hits"_a, "gradients"_a)
+        .def("jvp", &jvp<T>, "camera"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a,
+             "tangents"_a, "image_dot"_a.noconvert())
+        .def("screen_gradient", &screen_gradient<T>, "camera"_a, "image"_a, "options"_a, "threads"_a,
+             "adjoint"_a.noconvert(), "hits"_a, "gradient"_a.noconvert());
 }
 
 }  // namespace
@@ -163,7 +215,7 @@ NB_MODULE(_core, m) {
     nb::class_<GradientOptions>(m, "GradientOptions")
         .def(nb::new_([](uint64_t seed, int64_t surface_samples, int64_t edge_samples, bool interior_geometry,
                          bool boundary, bool dry) {
-                 return GradientOptions{surface_samples, edge_samples, seed, interior_geometry, boundary, dry};
+                 return GradientOptions{surface_samples, edge_samples, seed, interior_geometry, boundary, dry, !dry};
              }),
              "seed"_a, nb::kw_only(), "surface_samples"_a = -1, "edge_samples"_a = -1, "interior_geometry"_a = true,
              "boundary"_a = true, "dry"_a = false);

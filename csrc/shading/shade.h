@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "contract/scatter.h"
+#include "scene/gradients.h"
 #include "scene/scene.h"
 #include "shading/surface.h"
 #include "shading/texture.h"
@@ -121,6 +122,38 @@ Barycentrics shade_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, 
         b_bar.v += bar[c] * (double(c2[c]) - c0[c]);
     }
     return b_bar;
+}
+
+// The derivative of the radiance, C numbers, for tangents of the barycentrics and of the arrays.
+template <class T>
+void shade_jvp(const SceneView<T>& scene, int64_t face, Barycentrics b, Barycentrics b_dot, const Tangents& tangents,
+               double* out) {
+    const int C = scene.channels;
+    const int32_t* row = scene.corners + 3 * face;
+    if (is_textured(scene, face)) {
+        const Texture<T> texture = texture_of(scene, face);
+        const Footprint f = footprint(texture, interpolated_uv(scene, face, b));
+        Vec2 uv_dot;
+        for (int i = 0; i < 3; ++i) {
+            const double b_i_dot = i == 0 ? -b_dot.u - b_dot.v : i == 1 ? b_dot.u : b_dot.v;
+            const double* uv = scene.uvs + 2 * int64_t(row[i]);
+            uv_dot += b_i_dot * Vec2{uv[0], uv[1]};
+            if (const double* dot = tangents.uvs) uv_dot += b[i] * Vec2{dot[2 * row[i]], dot[2 * row[i] + 1]};
+        }
+        for (int c = 0; c < C; ++c) {
+            out[c] = eval_jvp(texture, f, C, c, uv_dot);
+            if (tangents.texels)
+                for (int i = 0; i < 4; ++i) out[c] += f.weight(i) * tangents.texels[f.texel[i] * C + c];
+        }
+        return;
+    }
+    const auto color = [&](const auto* array, int i, int c) { return double(array[int64_t(row[i]) * C + c]); };
+    for (int c = 0; c < C; ++c) {
+        const double c0 = color(scene.colors, 0, c);
+        out[c] = b_dot.u * (color(scene.colors, 1, c) - c0) + b_dot.v * (color(scene.colors, 2, c) - c0);
+        if (tangents.colors)
+            for (int i = 0; i < 3; ++i) out[c] += b[i] * color(tangents.colors, i, c);
+    }
 }
 
 }  // namespace edgegrad

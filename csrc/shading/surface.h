@@ -55,6 +55,15 @@ inline void face_map_vjp(const Camera& camera, const Vec3 q[3], const FaceMap& b
     q_bar[2] += e2_bar;
 }
 
+inline FaceMap face_map_jvp(const Camera& camera, const Vec3 q[3], const Vec3 q_dot[3]) {
+    const Vec3 e1 = q[1] - q[0], e2 = q[2] - q[0], s = -q[0];
+    const Vec3 e1_dot = q_dot[1] - q_dot[0], e2_dot = q_dot[2] - q_dot[0], s_dot = -q_dot[0];
+    const auto product = [](Vec3 a, Vec3 a_dot, Vec3 b, Vec3 b_dot) { return cross(a_dot, b) + cross(a, b_dot); };
+    Vec3 U = product(e2, e2_dot, s, s_dot), V = product(s, s_dot, e1, e1_dot), D = product(e2, e2_dot, e1, e1_dot);
+    if (!camera.perspective) U = {-e2_dot.y, e2_dot.x, U.z}, V = {e1_dot.y, -e1_dot.x, V.z}, D = {0, 0, D.z};
+    return {{{U.x, V.x, D.x}, {U.y, V.y, D.y}, {U.z, V.z, D.z}}};
+}
+
 // False where the face is seen exactly edge-on or has no area.
 inline bool barycentrics(const FaceMap& m, Vec2 n, Barycentrics& b) {
     const Vec3 p = m.times(n);
@@ -88,6 +97,12 @@ inline void barycentrics_vjp(const FaceMap& m, Vec2 n, Barycentrics b, Barycentr
     const Vec3 p_bar{bar.u * inverse, bar.v * inverse, -(b.u * bar.u + b.v * bar.v) * inverse};
     m_bar.column[0] += n.x * p_bar, m_bar.column[1] += n.y * p_bar, m_bar.column[2] += p_bar;
     n_bar += Vec2{dot(p_bar, m.column[0]), dot(p_bar, m.column[1])};
+}
+
+inline Barycentrics barycentrics_jvp(const FaceMap& m, Vec2 n, Barycentrics b, const FaceMap& m_dot, Vec2 n_dot) {
+    const double inverse = 1.0 / m.times(n).z;
+    const Vec3 p_dot = m_dot.times(n) + n_dot.x * m.column[0] + n_dot.y * m.column[1];
+    return {(p_dot.x - b.u * p_dot.z) * inverse, (p_dot.y - b.v * p_dot.z) * inverse};
 }
 
 // Embree decides in float which triangle is hit, so the exact ray may pass just outside it. What was seen is the

@@ -61,4 +61,13 @@ Vec2 eval_vjp(const Texture<T>& t, const Footprint& f, int channels, const doubl
     return {a_bar * t.width, -b_bar * t.height};
 }
 
+// Of one channel's value, for a tangent of uv at fixed texels.
+template <class T>
+double eval_jvp(const Texture<T>& t, const Footprint& f, int channels, int channel, Vec2 uv_dot) {
+    const auto texel = [&](int i) { return double(t.texels[f.texel[i] * channels + channel]); };
+    const double a_dot = uv_dot.x * t.width, b_dot = -uv_dot.y * t.height;
+    return a_dot * ((1 - f.b) * (texel(1) - texel(0)) + f.b * (texel(3) - texel(2))) +
+           b_dot * ((1 - f.a) * (texel(2) - texel(0)) + f.a * (texel(3) - texel(1)));
+}
+
 }  // namespace edgegrad

@@ -1,0 +1,136 @@
+// What becomes of a sample on a curve, given the surfaces on its sides: in reverse mode cotangents of what the curve
+// moves with, in forward mode a derivative of the pixels around it, or the gradient by its place in the image.
+#pragma once
+
+#include <vector>
+
+#include "backward/view.h"
+#include "boundary/curve_source.h"
+#include "contract/contraction.h"
+#include "shading/shade.h"
+
+namespace edgegrad {
+
+// Each offers: wants(i, x), false if nothing could come of a sample at x; and add(i, source, sample) for those that it
+// wanted, where i tells the samples of a batch apart.
+
+// With Ã · L in place of radiance: one number a surface.
+template <int N, class T>
+class AdjointRadiance {
+   public:
+    explicit AdjointRadiance(const BackwardView<T>& view)
+        : view_(view), C_(N ? N : view.scene.channels), adjoint_(RayBatch::size * C_), radiance_(C_) {}
+
+    bool wants(int i, Vec2 x) { return view_.adjoint.template at<N>(x, adjoint_.data() + i * C_); }
+
+    double of(int i, Vec2 x, const SurfacePoint& p) {
+        if (p.face < 0) return view_.adjoint.template times_background<N>(x);
+        shade<N>(view_.scene, p.face, p.b, radiance_.data());
+        const double* adjoint = adjoint_.data() + i * C_;
+        double sum = 0;
+        for (int c = 0; c < C_; ++c) sum += adjoint[c] * radiance_[c];
+        return sum;
+    }
+
+    // The jumps of the loss at a sample.
+    template <CurveSource Source>
+    CurveJumps jumps(int i, Source& source, typename Source::Sample& sample) {
+        const SampleSurfaces surfaces = source.surfaces(sample);
+        double radiance[SampleSurfaces::most];
+        for (int k = 0; k < surfaces.count; ++k) radiance[k] = of(i, sample.x, surfaces.at[k]);
+        return source.jumps(sample, radiance);
+    }
+
+   private:
+    const BackwardView<T>& view_;
+    const int C_;
+    std::vector<double> adjoint_, radiance_;
+};
+
+template <int N, class T>
+class ReverseBoundary {
+   public:
+    ReverseBoundary(const BackwardView<T>& view, ChunkGrad& grad) : radiance_(view), grad_(grad) {}
+
+    bool wants(int i, Vec2 x) { return radiance_.wants(i, x); }
+    template <CurveSource Source>
+    void add(int i, Source& source, typename Source::Sample& sample) {
+        source.add_motion(sample, radiance_.jumps(i, source, sample), grad_);
+    }
+
+   private:
+    AdjointRadiance<N, T> radiance_;
+    ChunkGrad& grad_;
+};
+
+template <class T>
+class ForwardBoundary {
+   public:
+    ForwardBoundary(const BackwardView<T>& view, Directions directions, ChunkGrad& grad)
+        : view_(view),
+          directions_(directions),
+          C_(view.scene.channels),
+          pixels_(view.image.filter, view.camera.width, view.camera.height),
+          grad_(grad),
+          radiance_(SampleSurfaces::most * C_),
+          values_(directions.size() * C_) {}
+
+    bool wants(int, Vec2) const { return true; }
+
+    template <CurveSource Source>
+    void add(int, Source& source, typename Source::Sample& sample) {
+        const SampleSurfaces surfaces = source.surfaces(sample);
+        for (int k = 0; k < surfaces.count; ++k)
+            if (const SurfacePoint& p = surfaces.at[k]; p.face >= 0)
+                shade<0>(view_.scene, p.face, p.b, radiance_.data() + k * C_);
+        velocity_.resize(directions_.size());
+        for (size_t d = 0; d < directions_.size(); ++d)
+            velocity_[d] = directions_[d].moves() ? source.velocities(sample, directions_[d]) : CurveJumps{};
+        pixels_.around(sample.x, [&](int64_t pixel, double weight) {
+            // Each pixel has a background of its own.
+            const T* background = view_.scene.background_at(pixel);
+            for (int c = 0; c < C_; ++c) {
+                double radiance[SampleSurfaces::most];
+                for (int k = 0; k < surfaces.count; ++k)
+                    radiance[k] = surfaces.at[k].face >= 0 ? radiance_[k * C_ + c] : double(background[c]);
+                const CurveJumps jumps = source.jumps(sample, radiance);
+                for (size_t d = 0; d < directions_.size(); ++d)
+                    values_[d * C_ + c] =
+                        weight * (jumps.first * velocity_[d].first + jumps.second * velocity_[d].second);
+            }
+            grad_.pixels.add(pixel, values_.data());
+        });
+    }
+
+   private:
+    const BackwardView<T>& view_;
+    const Directions directions_;
+    const int C_;
+    const FilteredPixels pixels_;
+    ChunkGrad& grad_;
+    std::vector<double> radiance_;  // (3, C) of the surfaces
+    std::vector<CurveJumps> velocity_;
+    std::vector<double> values_;  // (D, C)
+};
+
+template <class T>
+class ScreenBoundary {
+   public:
+    ScreenBoundary(const BackwardView<T>& view, ChunkGrad& grad) : view_(view), radiance_(view), grad_(grad) {}
+
+    bool wants(int i, Vec2 x) { return radiance_.wants(i, x); }
+    template <CurveSource Source>
+    void add(int i, Source& source, typename Source::Sample& sample) {
+        const CurveJumps jumps = radiance_.jumps(i, source, sample);
+        const double jump = jumps.first + jumps.second;
+        const Vec2 tangent = source.tangent(sample), moved{jump * tangent.y, -jump * tangent.x};
+        grad_.pixels.template add<2>(view_.pixel(sample.x), &moved.x);
+    }
+
+   private:
+    const BackwardView<T>& view_;
+    AdjointRadiance<0, T> radiance_;
+    ChunkGrad& grad_;
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,184 @@
+// What becomes of a sample inside a face: in reverse mode a cotangent of what the face is made of (face_grad.h), in
+// forward mode a derivative of the pixels around it, or the gradient by its place in the image.
+#pragma once
+
+#include <vector>
+
+#include "contract/forward.h"
+#include "interior/face_grad.h"
+
+namespace edgegrad {
+
+// A sample at x, with barycentrics λ in the image, that stands for a share of the face's area; `weight`: px².
+struct SurfaceSample {
+    int32_t face;
+    bool controlled;
+    Vec2 x;
+    Barycentrics lambda;
+    double share, weight;
+};
+
+// Each offers: wants(i, sample), false if nothing could come of it; add(i, sample, n, visible) for those that it
+// wanted, where i tells the samples of a batch apart; and begin_pixel(pixel, spp), add_in_pixel(face, n) for samples
+// that were drawn in a pixel.
+
+template <int N, class T>
+class ReverseInterior {
+   public:
+    ReverseInterior(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
+        : view_(view),
+          C_(N ? N : view.scene.channels),
+          run_(view, geometry, to, grad),
+          weighted_(RayBatch::size * C_),
+          in_pixel_(C_) {}
+
+    bool wants(int i, const SurfaceSample& s) {
+        double* weighted = weighted_.data() + i * C_;
+        if (!view_.adjoint.template at<N>(s.x, weighted) && !s.controlled) return false;
+        for (int c = 0; c < C_; ++c) weighted[c] *= s.weight;
+        return true;
+    }
+
+    void add(int i, const SurfaceSample& s, Vec2 n, bool visible) {
+        if (!visible && !s.controlled) return;
+        if (run_.face() != s.face) run_.flush(), run_.start(s.face, s.controlled);
+        if (visible) run_.add(n, weighted_.data() + i * C_);
+        if (s.controlled) run_.control().subtract(s.lambda, s.share);
+    }
+
+    bool begin_pixel(int64_t pixel, int spp) {
+        const T* A = view_.adjoint.of(pixel);
+        for (int c = 0; c < C_; ++c) in_pixel_[c] = double(A[c]) / spp;
+        return std::any_of(A, A + C_, [](T a) { return a != 0; });
+    }
+
+    // Faces in a pixel take turns and come again in the next one: some runs are kept open.
+    void add_in_pixel(int32_t face, Vec2 n) {
+        if (open_.empty()) open_ = std::vector<FaceGrad<N, T>>(32, run_);
+        FaceGrad<N, T>& run = open_[unsigned(face) % open_.size()];
+        if (run.face() != face) run.flush(), run.start(face);
+        run.add(n, in_pixel_.data());
+    }
+
+    void finish() {
+        run_.flush();
+        for (FaceGrad<N, T>& run : open_) run.flush();
+    }
+
+   private:
+    const BackwardView<T>& view_;
+    const int C_;
+    FaceGrad<N, T> run_;
+    std::vector<FaceGrad<N, T>> open_;
+    std::vector<double> weighted_, in_pixel_;
+};
+
+template <class T>
+class ForwardInterior {
+   public:
+    ForwardInterior(const BackwardView<T>& view, Directions directions, ChunkGrad& grad)
+        : view_(view),
+          directions_(directions),
+          C_(view.scene.channels),
+          splat_(FilteredPixels(view.image.filter, view.camera.width, view.camera.height), grad.pixels,
+                 int(directions.size()) * C_),
+          values_(directions.size() * C_) {}
+
+    bool wants(int, const SurfaceSample&) const { return true; }
+
+    void add(int, const SurfaceSample& s, Vec2 n, bool visible) {
+        if (!visible || !differentiate(s.face, n)) return;
+        for (double& value : values_) value *= s.weight;
+        splat_.add(s.x, values_);
+    }
+
+    bool begin_pixel(int64_t pixel, int spp) {
+        pixel_ = pixel, spp_ = spp;
+        return true;
+    }
+    void add_in_pixel(int32_t face, Vec2 n) {
+        if (differentiate(face, n)) splat_.add(pixel_, 1.0 / spp_, values_);
+    }
+
+    void finish() {}
+
+   private:
+    // Writes the derivatives of the radiance at n.
+    bool differentiate(int32_t face, Vec2 n) {
+        const int32_t* v = view_.scene.faces + 3 * int64_t(face);
+        const auto corner = corners_of(view_, face);
+        const FaceMap map = face_map(view_.camera, corner.data());
+        Barycentrics b;
+        if (!barycentrics(map, n, b)) return false;
+        for (size_t d = 0; d < directions_.size(); ++d) {
+            const Direction& direction = directions_[d];
+            Barycentrics b_dot;
+            if (direction.moves()) {
+                const Vec3 corner_dot[3] = {direction.q[v[0]], direction.q[v[1]], direction.q[v[2]]};
+                b_dot = barycentrics_jvp(map, n, b, face_map_jvp(view_.camera, corner.data(), corner_dot),
+                                         normalised_jvp(view_.camera, n, direction.k.data()));
+            }
+            shade_jvp(view_.scene, face, b, b_dot, direction.tangents, values_.data() + d * C_);
+        }
+        return true;
+    }
+
+    const BackwardView<T>& view_;
+    const Directions directions_;
+    const int C_;
+    Splat splat_;
+    std::vector<double> values_;  // (D, C)
+    int64_t pixel_ = 0;
+    int spp_ = 1;
+};
+
+// −Ã · ∂L/∂x: how the loss changes as what is seen at x moves in the image.
+template <class T>
+class ScreenInterior {
+   public:
+    ScreenInterior(const BackwardView<T>& view, ChunkGrad& grad)
+        : view_(view), grad_(grad), adjoint_(RayBatch::size * view.scene.channels), in_pixel_(view.scene.channels) {}
+
+    bool wants(int i, const SurfaceSample& s) {
+        double* adjoint = adjoint_.data() + i * in_pixel_.size();
+        if (!view_.adjoint.template at<0>(s.x, adjoint)) return false;
+        for (size_t c = 0; c < in_pixel_.size(); ++c) adjoint[c] *= s.weight;
+        return true;
+    }
+    void add(int i, const SurfaceSample& s, Vec2 n, bool visible) {
+        if (visible) add(view_.pixel(s.x), s.face, n, adjoint_.data() + i * in_pixel_.size());
+    }
+
+    bool begin_pixel(int64_t pixel, int spp) {
+        const T* A = view_.adjoint.of(pixel);
+        pixel_ = pixel;
+        for (size_t c = 0; c < in_pixel_.size(); ++c) in_pixel_[c] = double(A[c]) / spp;
+        return std::any_of(in_pixel_.begin(), in_pixel_.end(), [](double a) { return a != 0; });
+    }
+    void add_in_pixel(int32_t face, Vec2 n) { add(pixel_, face, n, in_pixel_.data()); }
+
+    void finish() {}
+
+   private:
+    void add(int64_t pixel, int32_t face, Vec2 n, const double* radiance_bar) {
+        const auto corner = corners_of(view_, face);
+        const FaceMap map = face_map(view_.camera, corner.data());
+        Barycentrics b;
+        if (!barycentrics(map, n, b)) return;
+        corners_.reset(std::max(2, view_.scene.channels));
+        const Barycentrics b_bar = shade_vjp<0>(view_.scene, face, b, radiance_bar, false, corners_, grad_);
+        FaceMap map_bar;
+        Vec2 n_bar;
+        barycentrics_vjp(map, n, b, b_bar, map_bar, n_bar);
+        const Vec2 moved = -1 * pixel_vjp(view_.camera, n_bar);
+        grad_.pixels.template add<2>(pixel, &moved.x);
+    }
+
+    const BackwardView<T>& view_;
+    ChunkGrad& grad_;
+    std::vector<double> adjoint_, in_pixel_;
+    CornerGrad corners_;
+    int64_t pixel_ = 0;
+};
+
+}  // namespace edgegrad
