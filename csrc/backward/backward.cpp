@@ -65,7 +65,7 @@ void with_view(const BackwardInput<T>& input, const GradientOptions& o, const Te
     const FilteredAdjoint<T> filtered(adjoint, scene, image.filter, camera.width, camera.height);
     const Importance importance(adjoint, camera.width, camera.height, scene.channels, margin, team);
     const OcclusionHint occlusion(hit_buffers.depth, camera.width, camera.height, team);
-    const RayFrame frame(geometry.caster(), camera);
+    const CameraFrame frame(geometry.caster(), camera);
     Scatter scatter(team, scene.channels);
     // What the controls need, of faces and of creases.
     const bool creases = terms.boundary && may_jump(scene, geometry.topology());

@@ -28,7 +28,7 @@ struct BackwardView {
     const GradientOptions& options;
     Team& team;
     Scatter& scatter;
-    const RayFrame& frame;
+    const CameraFrame& frame;
     const OcclusionHint& occlusion;
     const ImageHits* hits;           // null where neither term asks
     const uint8_t* seen;             // (F,): 0, or the side from which the forward pass hit the face

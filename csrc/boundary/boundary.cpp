@@ -75,7 +75,7 @@ class CurveSamples {
     Source& source_;
     Contraction contraction_;
 
-    RayBatch rays_;
+    CameraRays rays_;
     typename Source::Sample sample_[RayBatch::size];
     std::span<const int32_t> ignored_[RayBatch::size];
 };

@@ -148,7 +148,7 @@ class CreaseVisibility {
     const BackwardView<T>& view_;
     const Crossings& crossings_;
     const MeetingParts& meeting_;
-    RayBatch rays_;
+    CameraRays rays_;
     Asked asked_[most];
     int size_ = 0;
 };

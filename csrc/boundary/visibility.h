@@ -40,13 +40,13 @@ class Visibility {
         const auto decide = [&](int32_t f) { return lies_far_before(view_, f, sample.point.z) || meets(view_, f, n); };
         if (face < 0 || decide(face)) return face;
         std::vector<int32_t> ignored(sample.ignored.begin(), sample.ignored.end());
-        RayBatch rays(view_.frame);
+        CameraRays rays(view_.frame);
         int32_t nearest = -1;
         double depth = std::numeric_limits<double>::infinity();
         for (int refused = 0; face >= 0 && !decide(face); ++refused) {
             // Where floats see hundreds of faces in one place, one ray decides on all of them.
             if (refused == most_refused) {
-                face = view_.geometry.caster().beyond_float(view_.frame, n, face, ignored, decide);
+                face = view_.frame.beyond_float(n, face, ignored, decide);
                 break;
             }
             const Vec2 beside = moved_off(face, n);

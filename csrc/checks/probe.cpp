@@ -1,7 +1,9 @@
-// Radiance and its derivative at points whose face is known: what one interior sample does, laid open for the tests.
+// Laid open for the tests: any rays, and what one interior sample does, the radiance at a point whose face is known and
+// its derivative.
 
 #include "checks/probe.h"
 
+#include <algorithm>
 #include <vector>
 
 #include "backward/backward.h"
@@ -62,6 +64,26 @@ void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, co
     chunk.uvs.add_to(grad.uvs, 0), chunk.texels.add_to(grad.texels, 0);
     add_world(camera, scene.verts, q_bar, team, grad);
     for (int i = 0; i < 6; ++i) grad.K[i] += chunk.k[i];
+}
+
+void cast_rays(const RayCaster& caster, const RayArrays& rays, const IgnoredArrays& ignored, int32_t* face,
+               uint8_t* hidden) {
+    const auto vec = [](const double* v) { return Vec3{v[0], v[1], v[2]}; };
+    for (int64_t first = 0; first < rays.size; first += RayBatch::size) {
+        RayBatch closest, any;
+        std::vector<RayCaster::Ignored> faces;
+        closest.count = any.count = int(std::min<int64_t>(RayBatch::size, rays.size - first));
+        for (int i = 0; i < closest.count; ++i) {
+            const int64_t k = first + i;
+            const Ray ray{vec(rays.origins + 3 * k), vec(rays.directions + 3 * k), rays.ends[k]};
+            closest.set(i, caster.frame(), ray), any.set(i, caster.frame(), ray);
+            faces.emplace_back(ignored.faces + ignored.first[k], ignored.faces + ignored.first[k + 1]);
+        }
+        caster.cast(closest, faces.data());
+        caster.cast_occluded(any, faces.data());
+        std::copy(closest.face, closest.face + closest.count, face + first);
+        std::copy(any.hidden, any.hidden + any.count, hidden + first);
+    }
 }
 
 template void shade_at(const SceneView<float>&, const Camera&, int64_t, const int32_t*, const double*, double*);

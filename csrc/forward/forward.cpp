@@ -30,7 +30,7 @@ EDGEGRAD_VECTORIZED void place_in_pixel(const Camera& camera, const Filter& filt
     }
 }
 
-EDGEGRAD_VECTORIZED void PixelRays::append(int x, int y, int first, int n, RayBatch& rays) const {
+EDGEGRAD_VECTORIZED void PixelRays::append(int x, int y, int first, int n, CameraRays& rays) const {
     double *n_x = rays.n_x + rays.count, *n_y = rays.n_y + rays.count;
     lattice_.fill(hash(seed_, uint64_t(y) * camera_.width + x), first, n, n_x, n_y);
     place_in_pixel(camera_, filter_, x, y, n, n_x, n_y);
@@ -74,7 +74,7 @@ constexpr int tile = 16;
 template <int N, class T>
 class PixelRow {
    public:
-    PixelRow(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const RayFrame& frame,
+    PixelRow(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const CameraFrame& frame,
              const ImageOptions& options, Team& team, const Array<Vec3>& q, T* image, const HitBuffers<T>& out)
         : scene_(scene),
           camera_(camera),
@@ -265,7 +265,7 @@ class PixelRow {
     const SceneView<T>& scene_;
     const Camera& camera_;
     const RayCaster& caster_;
-    const RayFrame& frame_;
+    const CameraFrame& frame_;
     const PixelRays pixel_rays_;
     const int spp_;
     Team& team_;
@@ -278,7 +278,7 @@ class PixelRow {
     struct Part {
         int column, n;
     };
-    RayBatch rays_;
+    CameraRays rays_;
     Part part_[RayBatch::size];  // of which pixels the rays are
     int parts_ = 0;
     unsigned traced_ = 0;
@@ -360,7 +360,7 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
     // So many pixels fill batches of rays. Only whole ones are left out: which rays lie in a packet decides which of
     // two faces at one depth wins, and how sums are rounded.
     const int unit = std::min(tile, RayBatch::size / std::gcd(RayBatch::size, o.spp));
-    const RayFrame frame(caster, camera);
+    const CameraFrame frame(caster, camera);
     const ReachablePixels reachable(camera, caster, q, o.filter.radius() - 0.5, team);
     team.each_with(
         int64_t(tiles_x) * tiles_y,

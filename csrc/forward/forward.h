@@ -4,10 +4,10 @@
 #include <cstdint>
 
 #include "camera/camera.h"
+#include "camera/camera_rays.h"
 #include "core/parallel.h"
 #include "core/sampler.h"
 #include "film/film.h"
-#include "rays/raycast.h"
 #include "scene/scene.h"
 
 namespace edgegrad {
@@ -27,7 +27,7 @@ class PixelRays {
     PixelRays(const Camera& camera, const ImageOptions& o)
         : camera_(camera), filter_(o.filter), seed_(o.seed), lattice_(o.spp) {}
 
-    void append(int x, int y, int first, int n, RayBatch& rays) const;
+    void append(int x, int y, int first, int n, CameraRays& rays) const;
 
    private:
     const Camera& camera_;

@@ -73,7 +73,7 @@ class InteriorChunk {
         const double depth = depth_of(view_, own, n);
         const auto far_before = [&](int32_t face) { return lies_far_before(view_, face, depth); };
         const auto decide = [&](int32_t face) { return face == own || far_before(face) || meets(view_, face, n); };
-        const int32_t met = view_.geometry.caster().beyond_float(view_.frame, n, rays_.face[i], {}, decide);
+        const int32_t met = view_.frame.beyond_float(n, rays_.face[i], {}, decide);
         if (met < 0 || met == own) return true;
         if (far_before(met)) return false;
         const double* p = view_.scene.verts + 3 * int64_t(view_.scene.faces[3 * int64_t(own)]);
@@ -82,7 +82,7 @@ class InteriorChunk {
 
     const BackwardView<T>& view_;
     Contraction contraction_;
-    RayBatch rays_;
+    CameraRays rays_;
     SurfaceSample sample_[RayBatch::size];
 };
 
@@ -146,7 +146,7 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
     const ScrambledSobol sobol(seed);
     view.scatter.add(int64_t(pixels.size()), to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         auto chunk = contract<N>(view, contraction, to, grad);
-        RayBatch rays(view.frame);
+        CameraRays rays(view.frame);
         for (int64_t p = first; p < last; ++p) {
             const int64_t pixel = pixels[p];
             if (!chunk.begin_pixel(pixel, spp)) continue;

@@ -59,6 +59,20 @@ void bind_scene_functions(nb::module_& m) {
             });
         },
         "scene"_a, "camera"_a, "options"_a, "packet_width"_a, "threads"_a);
+    // Any rays: ray i ignores the faces ignored[first[i]] … ignored[first[i + 1] − 1].
+    m.def(
+        "cast_rays",
+        [](const Scene& scene, In<double, 2> origins, In<double, 2> directions, In<double, 1> ends,
+           In<int32_t, 1> ignored, In<int64_t, 1> first, Out<int32_t, 1> face, Out<uint8_t, 1> hidden) {
+            return unlocked(1, [&](Team& team) {
+                GeometryWork work;
+                const auto geometry = scene.geometry({}, team, work);
+                cast_rays(geometry->caster(), {origins.data(), directions.data(), ends.data(), int64_t(ends.size())},
+                          {ignored.data(), first.data()}, face.data(), hidden.data());
+            });
+        },
+        "scene"_a, "origins"_a.noconvert(), "directions"_a.noconvert(), "ends"_a.noconvert(), "ignored"_a.noconvert(),
+        "first"_a.noconvert(), "face"_a.noconvert(), "hidden"_a.noconvert());
     // The interior term from samples of the pixels.
     m.def(
         "pixel_backward",

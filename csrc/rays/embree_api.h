@@ -37,6 +37,7 @@ struct FilterArguments {
     unsigned N;
 };
 
+// RTCIntersectArguments and RTCOccludedArguments, which are laid out alike.
 struct IntersectArguments {
     int flags;
     unsigned feature_mask;
@@ -66,6 +67,8 @@ struct IntersectArguments {
     X(rtcCommitGeometry, void, (Geometry))                                                                   \
     X(rtcAttachGeometry, unsigned, (Scene, Geometry))                                                        \
     X(rtcIntersect8, void, (const int*, Scene, void*, IntersectArguments*))                                  \
-    X(rtcIntersect16, void, (const int*, Scene, void*, IntersectArguments*))
+    X(rtcIntersect16, void, (const int*, Scene, void*, IntersectArguments*))                                 \
+    X(rtcOccluded8, void, (const int*, Scene, void*, IntersectArguments*))                                   \
+    X(rtcOccluded16, void, (const int*, Scene, void*, IntersectArguments*))
 
 }  // namespace edgegrad::embree

@@ -235,33 +235,34 @@ void RayCaster::set_frame(const double* verts, Team& team) {
     Block all;
     for (const Block& b : of_faces)
         all.sum += b.sum, all.weight += b.weight, all.faces += b.faces, all.powers += b.powers;
-    centre_ = base + (1 / all.weight) * all.sum;
-    if (!std::isfinite(centre_.x + centre_.y + centre_.z)) centre_ = base;
+    auto& [centre, unit, radius] = frame_;
+    centre = base + (1 / all.weight) * all.sum;
+    if (!std::isfinite(centre.x + centre.y + centre.z)) centre = base;
 
     std::vector<double> farthest(Team::blocks(n_verts_), 0.0);
     team.each_block(n_verts_, [&](int64_t k, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
             if (!uses(v)) continue;
-            const Vec3 p = vertex(v) - centre_;
+            const Vec3 p = vertex(v) - centre;
             farthest[k] = std::max(farthest[k], dot(p, p));
         }
     });
-    unit_ = std::sqrt(*std::max_element(farthest.begin(), farthest.end())), radius_ = 1;
-    if (!(unit_ > 0)) unit_ = 1;  // a single point
+    unit = std::sqrt(*std::max_element(farthest.begin(), farthest.end())), radius = 1;
+    if (!(unit > 0)) unit = 1;  // a single point
     if (!all.faces) return;
     constexpr int ordinary = 20, most = 70, most_of_radius = 36;  // powers of two
-    const double size = double(all.powers) / (2 * double(all.faces)), span = std::log2(unit_) - size;
+    const double size = double(all.powers) / (2 * double(all.faces)), span = std::log2(unit) - size;
     if (span > most) {
         char text[256];
         std::snprintf(text, sizeof text,
                       "verts: expected faces within 1e21 times their size of each other, got a vertex %.1e away from "
                       "faces of about %.1e; leave out what is so far or bring it nearer",
-                      unit_, std::exp2(size));
+                      unit, std::exp2(size));
         throw std::invalid_argument(text);
     }
     if (span <= ordinary) return;
-    radius_ = std::exp2(std::min(int(span / 2), most_of_radius));
-    unit_ /= radius_;
+    radius = std::exp2(std::min(int(span / 2), most_of_radius));
+    unit /= radius;
 }
 
 void RayCaster::update(const double* verts, Team& team) {
@@ -269,7 +270,7 @@ void RayCaster::update(const double* verts, Team& team) {
     team.each_block(n_verts_, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
             if (!uses(v)) continue;  // may be farther than floats reach
-            const Vec3 p = (1 / unit_) * (Vec3{verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]} - centre_);
+            const Vec3 p = frame_.position({verts[3 * v], verts[3 * v + 1], verts[3 * v + 2]});
             positions_[3 * v] = float(p.x), positions_[3 * v + 1] = float(p.y), positions_[3 * v + 2] = float(p.z);
         }
     });
@@ -301,23 +302,6 @@ void RayCaster::build() {
     committed_ = true;
 }
 
-RayFrame::RayFrame(const RayCaster& caster, const Camera& camera)
-    : axis_x_(camera.R_inverse * Vec3{1, 0, 0}),
-      axis_y_(camera.R_inverse * Vec3{0, 1, 0}),
-      axis_z_(camera.R_inverse * Vec3{0, 0, 1}),
-      eye_((1 / caster.unit_) * (camera.R_inverse * -camera.t - caster.centre_)),
-      centre_(caster.centre_),
-      unit_(caster.unit_),
-      radius_(caster.radius_),
-      perspective_(camera.perspective),
-      far_(!camera.perspective || length(eye_) > 4 * radius_) {}
-
-double RayFrame::error(Vec3 p) const {
-    // Positions are rounded as far from the centre as they are; rays where they start: see prepare().
-    const double start = unit_ * (far_ ? 2 * radius_ : length(eye_));
-    return 4 * std::numeric_limits<float>::epsilon() * (length(p - centre_) + start);
-}
-
 template <int W>
 RayPacket<W>::RayPacket() {
     std::fill(mask, mask + W, ~0u);
@@ -326,49 +310,30 @@ RayPacket<W>::RayPacket() {
     std::iota(id, id + W, 0u);
 }
 
-RayBatch::RayBatch(const RayFrame& frame, int width) : frame_(frame) {
+RayBatch::RayBatch(int width) {
     if (width == 16) packets_.emplace<Packets<16>>();
-    std::visit(
-        [&](auto& packets) {
-            for (auto& p : packets) {
-                std::fill(std::begin(p.origin_x), std::end(p.origin_x), float(frame.eye_.x));
-                std::fill(std::begin(p.origin_y), std::end(p.origin_y), float(frame.eye_.y));
-                std::fill(std::begin(p.origin_z), std::end(p.origin_z), float(frame.eye_.z));
-            }
-        },
-        packets_);
 }
 
-// Always inlined, so that they are compiled for each of the processors that prepare() and read_faces() below are for.
-template <int W>
-[[gnu::always_inline]] inline void RayBatch::prepare(Packets<W>& packets) const {
-    const Vec3 X = frame_.axis_x_, Y = frame_.axis_y_, Z = frame_.axis_z_;
-    for (int k = 0; k < count; k += W) {
-        RayPacket<W>& p = packets[k / W];
-        const double *x = n_x + k, *y = n_y + k;
-        EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.t_far[i] = std::numeric_limits<float>::infinity();
-        EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.geometry[i] = INVALID_GEOMETRY_ID;
-        if (!frame_.far_) {
-            EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.direction_x[i] = float(x[i] * X.x + y[i] * Y.x + Z.x);
-            EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.direction_y[i] = float(x[i] * X.y + y[i] * Y.y + Z.y);
-            EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.direction_z[i] = float(x[i] * X.z + y[i] * Y.z + Z.z);
-            continue;
-        }
-        for (int i = 0; i < W; ++i) {
-            const Vec3 across = x[i] * X + y[i] * Y;
-            Vec3 o = frame_.eye_, d = Z;
-            if (frame_.perspective_) d += across;
-            else o += (1 / frame_.unit_) * across;
-            // Everything lies in a ball. Float positions of a far origin would be coarser than the scene, so the
-            // ray starts just before the ball, computed here in double; never behind the eye.
-            const double start = -dot(o, d) / dot(d, d) - 2 * frame_.radius_;
-            o += (frame_.perspective_ && start < 0 ? 0 : start) * d;
-            p.origin_x[i] = float(o.x), p.origin_y[i] = float(o.y), p.origin_z[i] = float(o.z);
-            p.direction_x[i] = float(d.x), p.direction_y[i] = float(d.y), p.direction_z[i] = float(d.z);
-        }
+void RayBatch::set(int i, const RayFrame& frame, const Ray& ray) {
+    const double scale = length(ray.direction);
+    const Vec3 d = (1 / scale) * ray.direction;
+    Vec3 o = frame.position(ray.origin);
+    double end = ray.end * scale / frame.unit;
+    if (frame.is_far(o)) {
+        const double start = std::max(0.0, frame.start(o, d));
+        o += start * d, end -= start;
     }
+    const auto write = [&](auto& packet, int k) {
+        packet.origin_x[k] = float(o.x), packet.origin_y[k] = float(o.y), packet.origin_z[k] = float(o.z);
+        packet.direction_x[k] = float(d.x), packet.direction_y[k] = float(d.y), packet.direction_z[k] = float(d.z);
+        packet.t_far[k] = float(std::clamp(end, -1.0, double(std::numeric_limits<float>::max()))),
+        packet.geometry[k] = INVALID_GEOMETRY_ID;
+    };
+    if (auto* wide = std::get_if<Packets<16>>(&packets_)) write((*wide)[i / 16], i % 16);
+    else write(std::get<Packets<8>>(packets_)[i / 8], i % 8);
 }
 
+// Always inlined, so that it is compiled for each of the processors that read_faces() below is for.
 template <int W>
 [[gnu::always_inline]] inline void RayBatch::read_faces(const Packets<W>& packets) {
     for (int k = 0; k < count; k += W) {
@@ -376,11 +341,6 @@ template <int W>
         EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) face[k + i] =
             p.geometry[i] == INVALID_GEOMETRY_ID ? -1 : int32_t(p.triangle[i]);
     }
-}
-
-EDGEGRAD_VECTORIZED void RayBatch::prepare() {
-    if (auto* wide = std::get_if<Packets<16>>(&packets_)) prepare<16>(*wide);
-    else prepare<8>(std::get<Packets<8>>(packets_));
 }
 
 EDGEGRAD_VECTORIZED void RayBatch::read_faces() {
@@ -401,7 +361,7 @@ struct ValidLanes {
 
 struct RejectContext {
     RayQueryContext query;                          // first, so that a pointer to it is a pointer to this
-    const std::span<const int32_t>* rejected;       // by ray, or null
+    const RayCaster::Ignored* ignored;              // by ray, or null
     bool (*meets)(const void* data, int32_t face);  // or null
     const void* data;
     int32_t face = -1;  // that was asked for last, and the answer: the rays of a packet mostly ask together
@@ -416,11 +376,11 @@ void reject(const FilterArguments* a) {
         if (!a->valid[i]) continue;
         const int32_t f = int32_t(face[i]);
         bool found = false;
-        if (context->rejected) {
+        if (context->ignored) {
             // Most are the two faces of an edge; longer lists come sorted.
-            const auto& rejected = context->rejected[id[i]];
-            found = rejected.size() > 16 ? std::binary_search(rejected.begin(), rejected.end(), f)
-                                         : std::find(rejected.begin(), rejected.end(), f) != rejected.end();
+            const auto& ignored = context->ignored[id[i]];
+            found = ignored.size() > 16 ? std::binary_search(ignored.begin(), ignored.end(), f)
+                                        : std::find(ignored.begin(), ignored.end(), f) != ignored.end();
         }
         if (!found && context->meets) {
             if (context->face != f) context->face = f, context->is_met = context->meets(context->data, f);
@@ -432,31 +392,45 @@ void reject(const FilterArguments* a) {
 
 }  // namespace
 
-void RayCaster::intersect(RayBatch& batch, const std::span<const int32_t>* rejected, const Decision* meets) const {
+void RayCaster::trace(RayBatch& batch, Query query, const Ignored* ignored, const Decision* meets) const {
     RejectContext context{{{INVALID_GEOMETRY_ID}, {INVALID_GEOMETRY_ID}}, nullptr, nullptr, nullptr};
     if (meets) context.meets = meets->call, context.data = meets->data;
-    const bool any = rejected || meets;
+    const bool any = ignored || meets;
     const int flags = RAY_QUERY_FLAG_COHERENT | (any ? RAY_QUERY_FLAG_INVOKE_ARGUMENT_FILTER : 0);
     IntersectArguments arguments{flags, FEATURE_FLAG_ALL, &context.query, any ? reject : nullptr, nullptr, 0};
-    const auto each = [&](auto& packets, int width, auto intersect) {
+    const auto each = [&](auto& packets, int width, auto ask) {
         for (int k = 0; k < batch.count; k += width) {
-            if (rejected) context.rejected = rejected + k;
-            intersect(valid_lanes.first[std::min(width, batch.count - k)], static_cast<Scene>(scene_),
-                      &packets[k / width], &arguments);
+            if (ignored) context.ignored = ignored + k;
+            ask(valid_lanes.first[std::min(width, batch.count - k)], static_cast<Scene>(scene_), &packets[k / width],
+                &arguments);
         }
     };
-    if (auto* wide = std::get_if<RayBatch::Packets<16>>(&batch.packets_)) each(*wide, 16, rtc.rtcIntersect16);
-    else each(std::get<RayBatch::Packets<8>>(batch.packets_), 8, rtc.rtcIntersect8);
+    const bool closest = query == Query::closest;
+    if (auto* wide = std::get_if<RayBatch::Packets<16>>(&batch.packets_))
+        each(*wide, 16, closest ? rtc.rtcIntersect16 : rtc.rtcOccluded16);
+    else each(std::get<RayBatch::Packets<8>>(batch.packets_), 8, closest ? rtc.rtcIntersect8 : rtc.rtcOccluded8);
 }
 
-void RayCaster::cast(RayBatch& batch, const std::span<const int32_t>* rejected) const {
-    intersect(batch, rejected);
+void RayCaster::cast(RayBatch& batch, const Ignored* ignored) const {
+    trace(batch, Query::closest, ignored, nullptr);
     batch.read_faces();
 }
 
-void RayCaster::cast(RayBatch& batch, const std::span<const int32_t>* rejected, const Decision& meets) const {
-    intersect(batch, rejected, &meets);
+void RayCaster::cast(RayBatch& batch, const Ignored* ignored, const Decision& meets) const {
+    trace(batch, Query::closest, ignored, &meets);
     batch.read_faces();
+}
+
+// Embree moves the end of a ray that met something to −∞.
+void RayCaster::cast_occluded(RayBatch& batch, const Ignored* ignored) const {
+    trace(batch, Query::any, ignored, nullptr);
+    std::visit(
+        [&](const auto& packets) {
+            const int width = RayBatch::size / int(packets.size());
+            for (int i = 0; i < batch.count; ++i)
+                batch.hidden[i] = packets[i / width].t_far[i % width] == -std::numeric_limits<float>::infinity();
+        },
+        batch.packets_);
 }
 
 }  // namespace edgegrad

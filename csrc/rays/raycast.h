@@ -1,16 +1,18 @@
-// The only door to Embree: opens the library, keeps a ray structure over triangles, casts packets of rays.
+// The only door to Embree: opens the library, keeps a ray structure over triangles, casts packets of any
+// rays.
 #pragma once
 
 #include <array>
 #include <atomic>
 #include <cstdint>
+#include <limits>
 #include <mutex>
 #include <span>
 #include <string>
 #include <variant>
 #include <vector>
 
-#include "camera/camera.h"
+#include "core/math.h"
 #include "core/parallel.h"
 
 namespace edgegrad {
@@ -42,11 +44,31 @@ struct alignas(4 * W) RayPacket {
     float normal_x[W] = {}, normal_y[W] = {}, normal_z[W] = {}, u[W] = {}, v[W] = {};
     unsigned triangle[W] = {}, geometry[W] = {}, instance[W] = {}, instance_primitive[W] = {};
 
+    static constexpr unsigned nothing = ~0u;  // what `geometry` is before a cast, and if nothing is hit
     RayPacket();
 };
 
+// The frame in which Embree sees the scene: (p − centre) / unit, where all of it lies within `radius` of the origin.
+struct RayFrame {
+    Vec3 centre;
+    double unit = 1, radius = 1;
+
+    Vec3 position(Vec3 p) const { return (1 / unit) * (p - centre); }
+
+    // Whether floats around o, a position in the frame, would be coarser than the scene.
+    bool is_far(Vec3 o) const { return length(o) > 4 * radius; }
+
+    // How far along o + t d a ray may start instead: just before the ball in which everything lies.
+    double start(Vec3 o, Vec3 d) const { return -dot(o, d) / dot(d, d) - 2 * radius; }
+};
+
+// In world units; it ends at origin + end · direction.
+struct Ray {
+    Vec3 origin, direction;
+    double end = std::numeric_limits<double>::infinity();
+};
+
 class RayBatch;
-class RayFrame;
 
 class RayCaster {
    public:
@@ -68,33 +90,33 @@ class RayCaster {
     // Whether a face has this vertex.
     bool uses(int64_t vertex) const { return used_.empty() || used_[vertex]; }
 
-    // The nearest face along each ray of the batch, where ray i is blind to the faces in rejected[i], if given. Those
-    // of a ray ascend if they are more than 16.
-    void cast(RayBatch& batch, const std::span<const int32_t>* rejected = nullptr) const;
+    const RayFrame& frame() const { return frame_; }
+
+    // The faces that each ray of a batch ignores, if given. Those of a ray ascend if they are more than 16.
+    using Ignored = std::span<const int32_t>;
+
+    // The nearest face along each ray.
+    void cast(RayBatch& batch, const Ignored* ignored = nullptr) const;
 
     // The same through what `meets(face)` refuses.
     template <class Meets>
-    void cast_through(RayBatch& batch, const std::span<const int32_t>* rejected, Meets meets) const;
+    void cast_through(RayBatch& batch, const Ignored* ignored, Meets meets) const;
 
-    // What one ray truly meets, where `face` is what the cast found. Embree decides in float, so near its rim a face
-    // may be hit that the ray misses: at a silhouette of a fine mesh that is a neighbour which is seen less wide than
-    // floats are apart. `meets(face)` decides, in double where that matters; what it refuses is passed through.
-    template <class Meets>
-    int32_t beyond_float(const RayFrame& frame, Vec2 n, int32_t face, std::span<const int32_t> rejected,
-                         Meets meets) const;
+    // Whether a ray meets any face.
+    void cast_occluded(RayBatch& batch, const Ignored* ignored = nullptr) const;
+
+    // Embree's part of cast() alone, to be timed.
+    void trace(RayBatch& batch) const { trace(batch, Query::closest, nullptr, nullptr); }
 
    private:
-    friend class RayFrame;
-    friend double bare_loop(const Camera&, const RayCaster&, const struct ImageOptions&, int, Team&);
-
+    enum class Query { closest, any };
     // What `call(data, face)` says of each face that a ray might hit.
     struct Decision {
         bool (*call)(const void* data, int32_t face);
         const void* data;
     };
-    void intersect(RayBatch& batch, const std::span<const int32_t>* rejected = nullptr,
-                   const Decision* meets = nullptr) const;
-    void cast(RayBatch& batch, const std::span<const int32_t>* rejected, const Decision& meets) const;
+    void trace(RayBatch& batch, Query query, const Ignored* ignored, const Decision* meets) const;
+    void cast(RayBatch& batch, const Ignored* ignored, const Decision& meets) const;
 
     void set_frame(const double* verts, Team& team);
     void build();
@@ -102,81 +124,45 @@ class RayCaster {
     const int32_t* faces_;
     int64_t n_faces_, n_verts_;
     std::vector<uint8_t> used_;  // (V,) by faces; empty: all are
-    // Embree sees (p − centre) / unit: a scene keeps its float precision wherever it lies and whatever its unit. All
-    // lies within `radius` of the origin there.
-    Vec3 centre_;
-    double unit_ = 1, radius_ = 1;
+    // A scene keeps its float precision wherever it lies and whatever its unit.
+    RayFrame frame_;
     std::vector<float> positions_;
     void *scene_ = nullptr, *geometry_ = nullptr;
     bool committed_ = false;
     std::atomic<bool> stop_{false};  // asks a build to end
 };
 
-// The rays of one camera as Embree sees them.
-class RayFrame {
-   public:
-    RayFrame(const RayCaster& caster, const Camera& camera);
-
-    // World units by which a ray may miss a point p that it was aimed at: a few roundings of what Embree is given.
-    double error(Vec3 p) const;
-
-   private:
-    friend class RayBatch;
-    Vec3 axis_x_, axis_y_, axis_z_;  // of the camera, in world coordinates times whatever scale they have
-    Vec3 eye_, centre_;
-    double unit_, radius_;
-    bool perspective_, far_;
-};
-
-// Rays of a camera that wait to be cast together, by where they go in the image, and the faces that they hit. They are
-// all made before the first packet is cast: Embree loads whole vectors, and one that was just written piece by piece is
-// not there yet.
+// Rays that wait to be cast together, and what they met. They are all made before the first packet is cast: Embree
+// loads whole vectors, and one that was just written piece by piece is not there yet.
 class RayBatch {
    public:
     static constexpr int size = 64;
-    explicit RayBatch(const RayFrame& frame, int width = packet_width());
+    explicit RayBatch(int width = packet_width());
 
-    // Normalised image coordinates; the caller fills them from `count` on.
-    double n_x[size] = {}, n_y[size] = {};
     int count = 0;
 
-    Vec2 n(int i) const { return {n_x[i], n_y[i]}; }
+    // Makes ray i. It is cast once: a cast leaves what it met in its place.
+    void set(int i, const RayFrame& frame, const Ray& ray);
 
-    // Makes the rays.
-    void prepare();
+    int32_t face[size];    // after cast(): the one that each ray hit, −1 for nothing
+    uint8_t hidden[size];  // after cast_occluded(): whether there is one
 
-    // The face that each ray hit, −1 for nothing.
-    int32_t face[size];
+   protected:
+    template <int W>
+    using Packets = std::array<RayPacket<W>, size / W>;
+    std::variant<Packets<8>, Packets<16>> packets_;
 
    private:
     friend class RayCaster;
     template <int W>
-    using Packets = std::array<RayPacket<W>, size / W>;
-    template <int W>
-    void prepare(Packets<W>& packets) const;
-    template <int W>
     void read_faces(const Packets<W>& packets);
     void read_faces();
-
-    const RayFrame& frame_;
-    std::variant<Packets<8>, Packets<16>> packets_;
 };
 
 template <class Meets>
-void RayCaster::cast_through(RayBatch& batch, const std::span<const int32_t>* rejected, Meets meets) const {
-    cast(batch, rejected,
+void RayCaster::cast_through(RayBatch& batch, const Ignored* ignored, Meets meets) const {
+    cast(batch, ignored,
          {[](const void* data, int32_t face) -> bool { return (*static_cast<const Meets*>(data))(face); }, &meets});
-}
-
-template <class Meets>
-int32_t RayCaster::beyond_float(const RayFrame& frame, Vec2 n, int32_t face, std::span<const int32_t> rejected,
-                                Meets meets) const {
-    if (face < 0 || meets(face)) return face;
-    RayBatch ray(frame);
-    ray.n_x[0] = n.x, ray.n_y[0] = n.y, ray.count = 1;
-    ray.prepare();
-    cast_through(ray, &rejected, meets);
-    return ray.face[0];
 }
 
 }  // namespace edgegrad
