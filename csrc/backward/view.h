@@ -59,8 +59,7 @@ uint8_t side_of(const BackwardView<T>& view, int64_t face) {
 template <class T>
 bool meets(const BackwardView<T>& view, int64_t face, Vec2 n) {
     const auto corner = corners_of(view, face);
-    return covers(face_map(view.camera, corner.data()), n) &&
-           !(view.camera.perspective && passes_through_eye(corner.data()));
+    return covers(face_map(view.camera, corner.data()), n) && !view.camera.passes_through_eye(corner.data());
 }
 
 // The depth at which the ray at n meets a face.

@@ -120,7 +120,7 @@ class CreaseVisibility {
         const int32_t hit = rays_.face[ray];
         if (hit < 0 || hit == c.minus.face || hit == c.plus.face) return Answer::visible;
         const double t = c.parameter(s), depth = (1 - t) * c.a.z + t * c.b.z;
-        const double pixel = (view_.camera.perspective ? depth : 1) / view_.camera.pixels_per_unit;
+        const double pixel = view_.camera.pixel_at_depth(depth);
         const double behind = depth_of(view_, hit, rays_.n(ray)) - depth;
         return behind > touching(c) ? Answer::visible : behind < -pixel / 4 ? Answer::hidden : Answer::unknown;
     }

@@ -229,7 +229,7 @@ class CurveFinder {
             return std::fabs(r.x) * p[0] + std::fabs(r.y) * p[1] + std::fabs(r.z) * p[2] + std::fabs(t);
         };
         const double w = std::min(c.w0, c.w1), across = std::max(terms(0, camera.t.x), terms(1, camera.t.y)),
-                     depth = camera.perspective ? terms(2, camera.t.z) / w : 1;
+                     depth = camera.roundings_of_weight(terms(2, camera.t.z), w);
         const double pixels = std::fabs(camera.k[2]) + std::fabs(camera.k[5]) + std::fabs(c.x0.x) + std::fabs(c.x0.y) +
                               std::fabs(c.x1.x) + std::fabs(c.x1.y);
         return 32 * std::numeric_limits<double>::epsilon() *

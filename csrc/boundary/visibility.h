@@ -72,7 +72,7 @@ class Visibility {
     // curve (the front of a thin plate, for its back) are no other surface that touches: the input says how they lie.
     bool hides(int64_t face, const Vec3 corner[3], Vec3 point, const CurveFaces& own) const {
         const Vec3 normal = cross(corner[1] - corner[0], corner[2] - corner[0]);
-        const Vec3 to_viewer = view_.camera.perspective ? -corner[0] : Vec3{0, 0, -1};
+        const Vec3 to_viewer = view_.camera.to_viewer(corner[0]);
         const double viewer = dot(normal, to_viewer), behind = dot(normal, point - corner[0]) * (viewer > 0 ? -1 : 1);
         double size = 0;
         for (int i = 0; i < 3; ++i)
@@ -110,7 +110,7 @@ class Visibility {
             const double* q = view_.scene.verts + 3 * int64_t(view_.scene.faces[3 * int64_t(face) + i]);
             error = std::max(error, view_.frame.error({q[0], q[1], q[2]}));
         }
-        return n + (2 * error / (view_.camera.perspective ? depth_of(view_, face, n) : 1.0)) * away;
+        return n + (2 * error / view_.camera.unit_at_depth(depth_of(view_, face, n))) * away;
     }
 
     const BackwardView<T>& view_;

@@ -1,15 +1,15 @@
 // Cameras: point → pixel and back, in camera coordinates q = R p + t; each with its _vjp.
 //
-// A camera is the affine map K of normalised image coordinates n, which are (X/Z, Y/Z) in perspective and (X, Y) in an
-// orthographic view. What is seen at n lies on a ray: in perspective from the eye in the direction (n.x, n.y, 1), in an
-// orthographic view from (n.x, n.y, 0) along +Z. World coordinates come in only at the ends: vertices are transformed
-// once, and the cotangents of q are turned into those of p, R and t once, when all samples are done.
+// A camera is a projection to normalised image coordinates n (projection.h) and the affine map K of these. World
+// coordinates come in only at the ends: vertices are transformed once, and the cotangents of q are turned into those of
+// p, R and t once, when all samples are done.
 #pragma once
 
 #include <cmath>
 #include <cstdint>
 #include <limits>
 
+#include "camera/projection.h"
 #include "core/math.h"
 
 namespace edgegrad {
@@ -42,11 +42,32 @@ struct Camera {
 
     Vec3 to_camera(Vec3 p) const { return R * p + t; }
 
-    // Direction in which a viewer looks at q: from the eye, or along the axis.
-    Vec3 view_direction(Vec3 q) const { return perspective ? q : Vec3{0, 0, 1}; }
+    // f(Perspective()) or f(Orthographic()).
+    template <class F>
+    auto projection(F f) const {
+        return perspective ? f(Perspective()) : f(Orthographic());
+    }
 
-    // Denominator of the projection.
-    double depth_weight(Vec3 q) const { return perspective ? q.z : 1.0; }
+    // Of the projection; see Perspective.
+    double depth_weight(Vec3 q) const {
+        return projection([&](auto p) { return p.weight(q); });
+    }
+    Vec3 view_direction(Vec3 q) const {
+        return projection([&](auto p) { return p.view_direction(q); });
+    }
+    Vec3 to_viewer(Vec3 q) const { return -view_direction(q); }
+    double unit_at_depth(double z) const {
+        return projection([&](auto p) { return p.unit_at_depth(z); });
+    }
+    bool passes_through_eye(const Vec3 q[3]) const {
+        return projection([&](auto p) { return p.passes_through_eye(q); });
+    }
+
+    // World units that a pixel spans at a depth, at least.
+    double pixel_at_depth(double z) const { return unit_at_depth(z) / pixels_per_unit; }
+
+    // Whether what spans depths in this ratio moves in the image nearly as an affine function of its corners does.
+    bool is_nearly_affine(double depths) const { return !perspective || depths < 2; }
 
     // Orientation of (q0, q1, q2) in the image, x to the right and y down: > 0 where (x1 − x0) ∧ (x2 − x0) > 0.
     // The triple product decides for triangles that reach behind the camera too, and it is one number for the three
@@ -58,6 +79,9 @@ struct Camera {
         if (std::fabs(s) <= rounding_of_triple_product(view, e1, e2)) return 0;
         return s * k_det > 0 ? 1 : -1;
     }
+
+    // Roundings that the denominator w of a point has, relative to itself, if its depth is a sum of terms of this size.
+    double roundings_of_weight(double terms, double w) const { return perspective ? terms / w : 1; }
 
     // Bound of the rounding of pixel positions in or near the image, generous: each is a sum of products with
     // normalised coordinates, which the inverse of K bounds, and of the principal point.
@@ -87,14 +111,15 @@ inline void project_vjp(const Camera& c, Vec3 q, Vec2 bar, Vec3& q_bar, double k
     k_bar[0] += bar.x * n.x, k_bar[1] += bar.x * n.y, k_bar[2] += bar.x;
     k_bar[3] += bar.y * n.x, k_bar[4] += bar.y * n.y, k_bar[5] += bar.y;
     const Vec2 n_bar{c.k[0] * bar.x + c.k[3] * bar.y, c.k[1] * bar.x + c.k[4] * bar.y};
-    q_bar += Vec3{n_bar.x * w, n_bar.y * w, c.perspective ? -(n_bar.x * n.x + n_bar.y * n.y) * w : 0.0};
+    const double w_bar = -(n_bar.x * n.x + n_bar.y * n.y) * w;
+    q_bar += Vec3{n_bar.x * w, n_bar.y * w, c.projection([&](auto p) { return p.weight_vjp(w_bar); })};
 }
 
 inline Vec2 project_jvp(const Camera& c, Vec3 q, Vec3 q_dot, const double k_dot[6]) {
     const double w = 1.0 / c.depth_weight(q);
     const Vec2 n{q.x * w, q.y * w};
-    const double along = c.perspective ? q_dot.z : 0.0;
-    const Vec2 n_dot{(q_dot.x - along * n.x) * w, (q_dot.y - along * n.y) * w};
+    const double w_dot = c.projection([&](auto p) { return p.weight_jvp(q_dot); });
+    const Vec2 n_dot{(q_dot.x - w_dot * n.x) * w, (q_dot.y - w_dot * n.y) * w};
     return {c.k[0] * n_dot.x + c.k[1] * n_dot.y + k_dot[0] * n.x + k_dot[1] * n.y + k_dot[2],
             c.k[3] * n_dot.x + c.k[4] * n_dot.y + k_dot[3] * n.x + k_dot[4] * n.y + k_dot[5]};
 }

@@ -10,10 +10,10 @@
 #include <numeric>
 #include <vector>
 
+#include "camera/depth_bound.h"
 #include "camera/vertices.h"
 #include "core/channels.h"
 #include "core/sampler.h"
-#include "forward/depth_bound.h"
 #include "shading/shade.h"
 
 namespace edgegrad {
@@ -243,7 +243,7 @@ class PixelRow {
     bool is_unseen(int32_t face) const {
         const int32_t* v = scene_.faces + 3 * int64_t(face);
         const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
-        return camera_.perspective && passes_through_eye(corner);
+        return camera_.passes_through_eye(corner);
     }
 
     void keep(Shaded& s, int32_t face) {
@@ -252,7 +252,7 @@ class PixelRow {
         const int32_t* v = scene_.faces + 3 * int64_t(face);
         const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
         s.map = face_map(camera_, corner);
-        s.unseen = camera_.perspective && passes_through_eye(corner);
+        s.unseen = camera_.passes_through_eye(corner);
         if (s.unseen) return;
         s.depth.set(camera_, corner, s.map);
         if (!s.textured) s.radiance.set(scene_, face);

@@ -263,7 +263,7 @@ class MeasuredChunk {
             // One without texture and so small that its corners say what is between them. A face that comes near the
             // eye is not affine in the image.
             if (seen.whole && l.longest[i] <= widest && view_.options.controls && !is_textured(view_.scene, f) &&
-                (!view_.camera.perspective || l.depths[i] < 2)) {
+                view_.camera.is_nearly_affine(l.depths[i])) {
                 controlled_[i] = any = true;
                 clear_[i] = seen.clear;
                 gather_control(i);

@@ -1,0 +1,127 @@
+// From camera coordinates q to normalised image coordinates n, along straight rays: a projection says how, and its
+// models stand below. Which it is, a camera decides once (Camera::projection); nobody else asks, but by what it means.
+#pragma once
+
+#include <cmath>
+#include <concepts>
+#include <limits>
+
+#include "core/math.h"
+
+namespace edgegrad {
+
+// The barycentrics of a face are a projective map of normalised image coordinates: with h = (n.x, n.y, 1),
+//
+//     (u w, v w, w) = M h.
+//
+// This is the test of Möller and Trumbore 1997, s = o − q0, u = s·(d × e2) / e1·(d × e2), v = d·(s × e1) / e1·(d × e2),
+// with the ray taken out of the products, so that what belongs to the face is computed once for all of its samples.
+// Written with edges, not with positions seen from the eye, it loses only distance / size of the spacing of doubles.
+struct FaceMap {
+    Vec3 column[3];  // of M
+
+    Vec3 times(Vec2 n) const { return n.x * column[0] + n.y * column[1] + column[2]; }
+    Vec3 row(double Vec3::* r) const { return {column[0].*r, column[1].*r, column[2].*r}; }
+};
+
+// The rows of a FaceMap, (u w, v w, w) = (U · h, V · h, D · h); of a face with the sides e1 = q1 − q0 and e2 = q2 − q0,
+// and s = −q0.
+struct FaceRows {
+    Vec3 U, V, D;
+};
+struct FaceSides {
+    Vec3 e1, e2, s;
+};
+
+// All rays meet in the eye: n = (X/Z, Y/Z), the ray at n has o = 0 and d = h.
+struct Perspective {
+    // The denominator of the projection; its cotangent turned into that of Z; and its tangent.
+    static double weight(Vec3 q) { return q.z; }
+    static double weight_vjp(double bar) { return bar; }
+    static double weight_jvp(Vec3 q_dot) { return q_dot.z; }
+
+    // Direction in which a viewer looks at q.
+    static Vec3 view_direction(Vec3 q) { return q; }
+
+    // World units that one of n spans at a depth.
+    static double unit_at_depth(double z) { return z; }
+
+    // Whether the plane of a face holds the eye, as far as doubles can tell. It is then seen edge-on and covers
+    // nothing, though every ray meets the plane, in the eye.
+    static bool passes_through_eye(const Vec3 q[3]) {
+        const Vec3 e1 = q[1] - q[0], e2 = q[2] - q[0];
+        return std::fabs(dot(q[0], cross(e1, e2))) <= rounding_of_triple_product(q[0], e1, e2);
+    }
+
+    static FaceRows face_rows(FaceSides f) { return {cross(f.e2, f.s), cross(f.s, f.e1), cross(f.e2, f.e1)}; }
+    static void face_rows_vjp(FaceSides f, FaceRows bar, FaceSides& f_bar) {
+        cross_vjp(f.e2, f.s, bar.U, f_bar.e2, f_bar.s);
+        cross_vjp(f.s, f.e1, bar.V, f_bar.s, f_bar.e1);
+        cross_vjp(f.e2, f.e1, bar.D, f_bar.e2, f_bar.e1);
+    }
+
+    static FaceRows face_rows_jvp(FaceSides f, FaceSides dot) {
+        return {cross(dot.e2, f.s) + cross(f.e2, dot.s), cross(dot.s, f.e1) + cross(f.s, dot.e1),
+                cross(dot.e2, f.e1) + cross(f.e2, dot.e1)};
+    }
+
+    // Along the plane of a face 1/z is affine in n, for D · (z h) = D · q0: its coefficients, and the greatest depth
+    // where it is value ± change. Beyond the horizon, or with NaN, it is no bound.
+    static Vec3 depth_plane(const Vec3 q[3], FaceRows m) { return (1 / dot(q[0], m.D)) * m.D; }
+    static double farthest(double value, double change, double most) {
+        return value > change ? std::fmin(most, 1 / (value - change)) : most;
+    }
+};
+
+// All rays run along the axis: n = (X, Y), the ray at n has o = (n.x, n.y, 0) and d = (0, 0, 1).
+struct Orthographic {
+    static double weight(Vec3) { return 1; }
+    static double weight_vjp(double) { return 0; }
+    static double weight_jvp(Vec3) { return 0; }
+    static Vec3 view_direction(Vec3) { return {0, 0, 1}; }
+    static double unit_at_depth(double) { return 1; }
+    static bool passes_through_eye(const Vec3*) { return false; }
+
+    static FaceRows face_rows(FaceSides f) {
+        const auto& [e1, e2, s] = f;
+        return {{-e2.y, e2.x, s.y * e2.x - s.x * e2.y},
+                {e1.y, -e1.x, s.x * e1.y - s.y * e1.x},
+                {0, 0, e2.x * e1.y - e2.y * e1.x}};
+    }
+    static void face_rows_vjp(FaceSides f, FaceRows bar, FaceSides& f_bar) {
+        const auto& [e1, e2, s] = f;
+        const auto& [U, V, D] = bar;
+        f_bar.e2 += {U.y + s.y * U.z + e1.y * D.z, -U.x - s.x * U.z - e1.x * D.z, 0};
+        f_bar.e1 += {-V.y - s.y * V.z - e2.y * D.z, V.x + s.x * V.z + e2.x * D.z, 0};
+        f_bar.s += {e1.y * V.z - e2.y * U.z, e2.x * U.z - e1.x * V.z, 0};
+    }
+
+    static FaceRows face_rows_jvp(FaceSides f, FaceSides dot) {
+        const auto& [U, V, D] = Perspective::face_rows_jvp(f, dot);
+        return {{-dot.e2.y, dot.e2.x, U.z}, {dot.e1.y, -dot.e1.x, V.z}, {0, 0, D.z}};
+    }
+
+    // Here z itself is affine.
+    static Vec3 depth_plane(const Vec3 q[3], FaceRows m) {
+        return (1 / m.D.z) * ((q[1].z - q[0].z) * m.U + (q[2].z - q[0].z) * m.V) + Vec3{0, 0, q[0].z};
+    }
+    static double farthest(double value, double change, double most) { return std::fmin(most, value + change); }
+};
+
+template <class P>
+concept Projection = requires(Vec3 q, const Vec3* face, double x, FaceSides f, FaceSides& f_bar, FaceRows m) {
+    { P::weight(q) } -> std::same_as<double>;
+    { P::weight_vjp(x) } -> std::same_as<double>;
+    { P::weight_jvp(q) } -> std::same_as<double>;
+    { P::view_direction(q) } -> std::same_as<Vec3>;
+    { P::unit_at_depth(x) } -> std::same_as<double>;
+    { P::passes_through_eye(face) } -> std::same_as<bool>;
+    { P::face_rows(f) } -> std::same_as<FaceRows>;
+    P::face_rows_vjp(f, m, f_bar);
+    { P::face_rows_jvp(f, f) } -> std::same_as<FaceRows>;
+    { P::depth_plane(face, m) } -> std::same_as<Vec3>;
+    { P::farthest(x, x, x) } -> std::same_as<double>;
+};
+static_assert(Projection<Perspective> && Projection<Orthographic>);
+
+}  // namespace edgegrad
