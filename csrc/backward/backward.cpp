@@ -123,6 +123,7 @@ void add_terms(const BackwardView<T>& view, const Terms& terms, const T* coverag
         curves.emplace(measure_curves<N>(view, std::move(facing)));
         wanted.edge = profile.edge_wanted = curves->wanted(o.edge_samples);
         profile.silhouettes = curves->silhouettes, profile.creases = curves->creases;
+        profile.intersections = curves->intersections;
         profile.curves = watch.lap();
     }
     const SampleBudget budget(coverage, pixels, view.image.spp, view.team);

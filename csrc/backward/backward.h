@@ -24,12 +24,12 @@ struct GradientOptions {
 // What a backward pass did, and the seconds that each part took.
 struct BackwardProfile {
     int64_t surface_samples = 0, edge_samples = 0;
-    int64_t surface_wanted = 0, edge_wanted = 0;   // default samples before the budget (budget.h)
-    int64_t silhouettes = 0, creases = 0;          // curves in view
-    double view = 0;                               // vertices in camera coordinates, where the loss looks
-    double measure = 0, curves = 0;                // triangles and curves laid end to end
-    double surface[2] = {0, 0}, edge[2] = {0, 0};  // samples with their rays; adding what they found
-    double world = 0;                              // from camera coordinates to the user's arrays
+    int64_t surface_wanted = 0, edge_wanted = 0;              // default samples before the budget (budget.h)
+    int64_t silhouettes = 0, creases = 0, intersections = 0;  // curves in view
+    double view = 0;                                          // vertices in camera coordinates, where the loss looks
+    double measure = 0, curves = 0;                           // triangles and curves laid end to end
+    double surface[2] = {0, 0}, edge[2] = {0, 0};             // samples with their rays; adding what they found
+    double world = 0;                                         // from camera coordinates to the user's arrays
 };
 
 // What a gradient is taken of.

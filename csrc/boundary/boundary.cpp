@@ -11,6 +11,7 @@
 #include "boundary/crossings.h"
 #include "boundary/curve_measure.h"
 #include "boundary/edge_source.h"
+#include "boundary/intersection_source.h"
 #include "core/sampler.h"
 #include "core/systematic.h"
 
@@ -80,6 +81,74 @@ class CurveSamples {
     std::span<const int32_t> ignored_[RayBatch::size];
 };
 
+// Some of the samples.
+struct Drawn {
+    const Systematic& systematic;
+    int64_t first, last;
+
+    // Calls body(k, s, weight) for each: on the curve k, at its fraction s.
+    template <class Body>
+    void each(Body body) const {
+        int64_t k = systematic.primitive(systematic.position(first));
+        for (int64_t i = first; i < last; ++i) {
+            const double position = systematic.position(i);
+            k = systematic.primitive(position, k);
+            body(k, (position - systematic.begin_of(k)) / systematic.measure_of(k), systematic.weight(k));
+        }
+    }
+
+    // The first of them that is not on one of the first n curves.
+    int64_t before(int64_t n) const {
+        const auto on = [&](int64_t i) { return systematic.primitive(systematic.position(i)) < n; };
+        if (on(last - 1)) return last;
+        int64_t low = first, high = last - 1;  // which is not
+        while (low < high) {
+            const int64_t middle = (low + high) / 2;
+            if (on(middle)) low = middle + 1;
+            else high = middle;
+        }
+        return low;
+    }
+};
+
+template <int N, class Contraction, class T>
+void add_edges(const BackwardView<T>& view, const Curves<T>& curves, const CoincidentCurves& coincident,
+               const Drawn& drawn, const Contraction& contraction, ChunkGrad& grad) {
+    EdgeSource<T> source(view, curves.finder, coincident);
+    CurveSamples samples(view, source, contract<N>(view, contraction, grad));
+    CreaseControl<N, T> control(view);
+    Curve curve;
+    bool controlled = false;
+    drawn.each([&](int64_t k, double s, double weight) {
+        if (const MeasuredCurve& measured = curves.curve[k]; curve.edge != measured.edge) {
+            if (controlled) control.flush(grad.x);
+            curves.finder.find(measured.edge, curve);
+            controlled = measured.controlled && control.set(curve);
+        }
+        const double end = curve.is_crease() ? std::min(Crossings::float_reach / curve.length, 0.1) : 0;
+        s = std::clamp(s, end, 1 - end);
+        if (controlled) control.subtract(s, weight);
+        samples.add(curve, s, weight);
+    });
+    if (controlled) control.flush(grad.x);
+    samples.finish(grad);
+}
+
+template <int N, class Contraction, class T>
+void add_intersections(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& drawn,
+                       const Contraction& contraction, ChunkGrad& grad) {
+    const Intersections& intersections = view.geometry.intersections();
+    IntersectionSource<T> source(view);
+    CurveSamples samples(view, source, contract<N>(view, contraction, grad));
+    IntersectionCurve curve;
+    drawn.each([&](int64_t k, double s, double weight) {
+        const Intersection& i = intersections.all()[curves.intersection[k - int64_t(curves.curve.size())].index];
+        if (curve.faces != &i) find_intersection(view, curves.finder.facing(), i, curve);
+        samples.add(curve, std::clamp(s, 0.0, 1.0), weight * intersections.each_stands_for());
+    });
+    samples.finish(grad);
+}
+
 }  // namespace
 
 template <int N, class Contraction, class T>
@@ -88,7 +157,6 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
     profile.edge_samples = n;
     if (n == 0 || view.options.dry) return;
     Stopwatch watch;
-    const CurveFinder<T>& finder = curves.finder;
     Systematic systematic(curves.measure, view.team);
     if (!(systematic.total() > 0)) return;
     systematic.draw(n, to_unit(hash(view.options.seed, 3, gradient_stream)));
@@ -96,28 +164,10 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
     profile.curves += watch.lap();
     if (!curves.x_bar.empty()) to.x = curves.x_bar.data();
     view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        EdgeSource<T> edges(view, finder, coincident);
-        CurveSamples samples(view, edges, contract<N>(view, contraction, grad));
-        CreaseControl<N, T> control(view);
-        Curve curve;
-        bool controlled = false;
-        int64_t k = systematic.primitive(systematic.position(first));
-        for (int64_t i = first; i < last; ++i) {
-            const double position = systematic.position(i);
-            k = systematic.primitive(position, k);
-            if (const MeasuredCurve& measured = curves.curve[k]; curve.edge != measured.edge) {
-                if (controlled) control.flush(grad.x);
-                finder.find(measured.edge, curve);
-                controlled = measured.controlled && control.set(curve);
-            }
-            const double weight = systematic.weight(k);
-            const double end = curve.is_crease() ? std::min(Crossings::float_reach / curve.length, 0.1) : 0;
-            const double s = std::clamp((position - systematic.begin_of(k)) / systematic.measure_of(k), end, 1 - end);
-            if (controlled) control.subtract(s, weight);
-            samples.add(curve, s, weight);
-        }
-        if (controlled) control.flush(grad.x);
-        samples.finish(grad);
+        const Drawn drawn{systematic, first, last};
+        const int64_t middle = drawn.before(int64_t(curves.curve.size()));
+        if (first < middle) add_edges<N>(view, curves, coincident, {systematic, first, middle}, contraction, grad);
+        if (middle < last) add_intersections<N>(view, curves, {systematic, middle, last}, contraction, grad);
     });
     to.x = nullptr;
 }

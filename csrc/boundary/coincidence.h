@@ -34,8 +34,8 @@
 #include <span>
 #include <vector>
 
-#include "boundary/contact.h"
 #include "boundary/curve.h"
+#include "scene/contact.h"
 
 namespace edgegrad {
 

@@ -122,8 +122,7 @@ class ScreenBoundary {
     template <CurveSource Source>
     void add(int i, Source& source, typename Source::Sample& sample) {
         const CurveJumps jumps = radiance_.jumps(i, source, sample);
-        const double jump = jumps.first + jumps.second;
-        const Vec2 tangent = source.tangent(sample), moved{jump * tangent.y, -jump * tangent.x};
+        const Vec2 moved = (jumps.first + jumps.second) * source.normal(sample);
         grad_.pixels.template add<2>(view_.pixel(sample.x), &moved.x);
     }
 

@@ -116,6 +116,7 @@ class CurveFinder {
         : view_(view), facing_(std::move(facing)), jumps_(may_jump(view.scene, view.geometry.topology())) {}
 
     bool finds_creases() const { return jumps_; }
+    const Array<int8_t>& facing() const { return facing_; }
 
     // On which side of its edge a face lies in the image; see side_of.
     int turn_of(const HalfEdge& h) const { return side_of(h, facing_); }

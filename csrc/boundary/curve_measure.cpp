@@ -6,6 +6,7 @@
 
 #include "boundary/crease_control.h"
 #include "boundary/crease_visibility.h"
+#include "boundary/intersection_source.h"
 #include "core/channels.h"
 
 namespace edgegrad {
@@ -58,6 +59,13 @@ ImageSegment image_segment(const BackwardView<T>& view, const Curve& c, int64_t 
             .depth = c.nearest_depth()};
 }
 
+// In how many pixels a curve is behind all that was hit; 0: not in all of them.
+inline int64_t hiding_pixels(const OcclusionHint& occlusion, Vec2 low, Vec2 high, double nearest) {
+    const bool small = std::max(high.x - low.x, high.y - low.y) <= 2 * OcclusionHint::reach;
+    if (small && occlusion.hides_around(0.5 * (low + high), nearest)) return OcclusionHint::pixels_around;
+    return occlusion.hiding_pixels(low, high, nearest);
+}
+
 // What tells of creases without a sample.
 struct CreaseHints {
     Crossings crossings;
@@ -90,7 +98,7 @@ class MeasuredEdges {
             const Jump jump{int64_t(curves.size()), size_of_jump(c), view_.importance.mean(low, high)};
             if (!(jump.importance > 0) || !std::isfinite(c.length)) return;
             curves.push_back({.edge = int32_t(e)});
-            const int64_t hiding = hiding_pixels(c, low, high);
+            const int64_t hiding = hiding_pixels(view_.occlusion, low, high, c.nearest_depth());
             if (c.is_crease() && visibility_) {
                 add_crease(c, jump, hiding);
             } else {
@@ -112,14 +120,6 @@ class MeasuredEdges {
         const double pixels = c.length * jump.size * samples;
         curves[jump.curve].measure = pixels * jump.importance;
         found.pixels += pixels;
-    }
-
-    // In how many pixels a curve is behind all that was hit; 0: not in all of them.
-    int64_t hiding_pixels(const Curve& c, Vec2 low, Vec2 high) const {
-        const bool small = std::max(high.x - low.x, high.y - low.y) <= 2 * OcclusionHint::reach;
-        if (small && view_.occlusion.hides_around(0.5 * (low + high), c.nearest_depth()))
-            return OcclusionHint::pixels_around;
-        return view_.occlusion.hiding_pixels(low, high, c.nearest_depth());
     }
 
     void add_crease(const Curve& c, const Jump& jump, int64_t hiding) {
@@ -170,6 +170,34 @@ class MeasuredEdges {
     std::optional<CreaseVisibility<T>> visibility_;
     Jump asked_[CreaseVisibility<T>::most];
 };
+
+// Lines where faces pass through each other: those where the loss looks, appended to `out.intersection`. Nothing is
+// known of the jump.
+template <class T>
+void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
+    const auto& all = view.geometry.intersections().all();
+    const int64_t n = int64_t(all.size());
+    std::vector<CurvesFound> found(Team::blocks(n));
+    std::vector<std::vector<MeasuredIntersection>> parts(found.size());
+    view.team.each_block(n, [&](int64_t k, int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i) {
+            IntersectionCurve c;
+            if (!find_intersection(view, out.finder.facing(), all[i], c)) continue;
+            ++found[k].intersections;
+            const Vec2 low = c.low(), high = c.high();
+            const double importance = view.importance.mean(low, high);
+            if (!(importance > 0)) continue;
+            const int64_t hiding = hiding_pixels(view.occlusion, low, high, c.nearest_depth());
+            const double pixels = c.length * (hiding ? view.occlusion.factor(occluded, hiding, view.image.spp) : 1);
+            found[k].pixels += pixels;
+            parts[k].push_back({pixels * importance, int32_t(i)});
+        }
+    });
+    for (size_t k = 0; k < parts.size(); ++k) {
+        out.pixels += found[k].pixels, out.intersections += found[k].intersections;
+        out.intersection.insert(out.intersection.end(), parts[k].begin(), parts[k].end());
+    }
+}
 
 // Silhouettes and borders.
 template <class T>
@@ -234,7 +262,9 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing) {
         out.pixels += f.pixels, out.silhouettes += f.silhouettes, out.creases += f.creases;
     int64_t n = 0;
     for (const auto& part : curves) n += int64_t(part.size());
-    out.curve.reserve(n), out.measure = Array<double>(n);
+    measure_intersections(view, out);
+    out.curve.reserve(n), out.measure = Array<double>(n + int64_t(out.intersection.size()));
+    for (size_t i = 0; i < out.intersection.size(); ++i) out.measure[n + int64_t(i)] = out.intersection[i].measure;
     for (size_t k = 0; k < curves.size(); ++k) {
         for (ImageSegment& s : out.segments[k]) s.curve += int32_t(out.curve.size());
         for (const MeasuredCurve& c : curves[k])

@@ -59,7 +59,7 @@ struct CurveJumps {
 // `place` sets where the fraction s of a curve lies, of a sample that has its x, n and weight; false if no ray is
 // needed to know that nothing shows there. `faces_of` serves the test whether what the ray meets hides the point.
 // `jumps` takes one number, linear in the radiance, of each of the surfaces. `add_motion` takes the jumps of the loss;
-// `velocities` is what it is the adjoint of, in one direction, and `tangent` dx/ds. `finish` adds what was summed for
+// `velocities` is what it is the adjoint of, in one direction, and `normal` that of places x in the image. `finish` adds what was summed for
 // the latest curve. `cast` tells that no sample waits any more.
 template <class S>
 concept CurveSource =
@@ -72,7 +72,7 @@ concept CurveSource =
         { source.surfaces(sample) } -> std::same_as<SampleSurfaces>;
         { known.jumps(sample, radiance) } -> std::same_as<CurveJumps>;
         { known.velocities(sample, direction) } -> std::same_as<CurveJumps>;
-        { known.tangent(sample) } -> std::same_as<Vec2>;
+        { known.normal(sample) } -> std::same_as<Vec2>;
         source.add_motion(sample, jumps, grad);
         source.cast();
         source.finish(grad);

@@ -94,7 +94,11 @@ class EdgeSource {
         return {jump - to_second, to_second};
     }
 
-    Vec2 tangent(const Sample& sample) const { return place_[sample.place].own.curve.tangent(); }
+    // δx ∧ τ = δx · (τ_y, −τ_x).
+    Vec2 normal(const Sample& sample) const {
+        const Vec2 tangent = place_[sample.place].own.curve.tangent();
+        return {tangent.y, -tangent.x};
+    }
 
     // δx ∧ τ of the point, with the vertices of the faces on either side in equal parts, as flush() has it.
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {

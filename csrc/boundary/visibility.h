@@ -10,8 +10,8 @@
 #include <vector>
 
 #include "backward/view.h"
-#include "boundary/contact.h"
 #include "boundary/curve_source.h"
+#include "scene/contact.h"
 
 namespace edgegrad {
 

@@ -59,6 +59,15 @@ struct Camera {
     double unit_at_depth(double z) const {
         return projection([&](auto p) { return p.unit_at_depth(z); });
     }
+    double affine_depth_slope(double z) const {
+        return projection([&](auto p) { return p.affine_depth_slope(z); });
+    }
+    Vec2 affine_depth_gradient(Vec3 N, Vec3 q) const {
+        return projection([&](auto p) { return p.affine_depth_gradient(N, q); });
+    }
+    double along_ray(Vec3 N, Vec2 n) const {
+        return projection([&](auto p) { return p.along_ray(N, n); });
+    }
     bool passes_through_eye(const Vec3 q[3]) const {
         return projection([&](auto p) { return p.passes_through_eye(q); });
     }

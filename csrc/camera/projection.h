@@ -65,6 +65,14 @@ struct Perspective {
                 cross(dot.e2, f.e1) + cross(f.e2, dot.e1)};
     }
 
+    // What is affine in n along a plane, 1/z: its slope by z; and by n, on the plane with this normal through q, where
+    // 1/z = N · (n, 1) / N · q.
+    static double affine_depth_slope(double z) { return -1 / (z * z); }
+    static Vec2 affine_depth_gradient(Vec3 N, Vec3 q) { return (1 / dot(N, q)) * Vec2{N.x, N.y}; }
+
+    // N · dq/dz along the ray at n, q = z (n, 1).
+    static double along_ray(Vec3 N, Vec2 n) { return N.x * n.x + N.y * n.y + N.z; }
+
     // Along the plane of a face 1/z is affine in n, for D · (z h) = D · q0: its coefficients, and the greatest depth
     // where it is value ± change. Beyond the horizon, or with NaN, it is no bound.
     static Vec3 depth_plane(const Vec3 q[3], FaceRows m) { return (1 / dot(q[0], m.D)) * m.D; }
@@ -101,6 +109,11 @@ struct Orthographic {
         return {{-dot.e2.y, dot.e2.x, U.z}, {dot.e1.y, -dot.e1.x, V.z}, {0, 0, D.z}};
     }
 
+    // −z = (N_x n_x + N_y n_y − N · q) / N_z, and q = (n, z).
+    static double affine_depth_slope(double) { return -1; }
+    static Vec2 affine_depth_gradient(Vec3 N, Vec3) { return (1 / N.z) * Vec2{N.x, N.y}; }
+    static double along_ray(Vec3 N, Vec2) { return N.z; }
+
     // Here z itself is affine.
     static Vec3 depth_plane(const Vec3 q[3], FaceRows m) {
         return (1 / m.D.z) * ((q[1].z - q[0].z) * m.U + (q[2].z - q[0].z) * m.V) + Vec3{0, 0, q[0].z};
@@ -119,6 +132,9 @@ concept Projection = requires(Vec3 q, const Vec3* face, double x, FaceSides f, F
     { P::face_rows(f) } -> std::same_as<FaceRows>;
     P::face_rows_vjp(f, m, f_bar);
     { P::face_rows_jvp(f, f) } -> std::same_as<FaceRows>;
+    { P::affine_depth_slope(x) } -> std::same_as<double>;
+    { P::affine_depth_gradient(q, q) } -> std::same_as<Vec2>;
+    { P::along_ray(q, Vec2()) } -> std::same_as<double>;
     { P::depth_plane(face, m) } -> std::same_as<Vec3>;
     { P::farthest(x, x, x) } -> std::same_as<double>;
 };

@@ -20,6 +20,7 @@
 #include "film/importance.h"
 #include "python/arrays.h"
 #include "python/unlocked.h"
+#include "scene/intersections.h"
 #include "scene/topology.h"
 #include "shading/surface.h"
 #include "shading/texture.h"
@@ -275,6 +276,16 @@ void bind_for_tests(nb::module_& m) {
         for (int64_t e = 0; e < topology.n_edges(); ++e)
             for (const HalfEdge& h : topology.half_edges(e)) out[e].emplace_back(h.face, h.corner, h.backwards);
         return out;
+    });
+    // Where faces pass through each other, as (face, face, end, end), and for how many each of them stands.
+    p.def("intersections", [](Verts verts, Faces faces, double spacing, int threads) {
+        Team team(threads);
+        FaceOrder order;
+        const Intersections found(faces.data(), faces.shape(0), verts.data(), {{0}, {spacing}}, order, team);
+        std::vector<std::tuple<int, int, A3, A3>> out;
+        for (const Intersection& i : found.all())
+            out.emplace_back(i.face[0], i.face[1], A3{i.a.x, i.a.y, i.a.z}, A3{i.b.x, i.b.y, i.b.z});
+        return std::tuple(out, found.each_stands_for());
     });
 }
 

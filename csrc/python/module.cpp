@@ -90,7 +90,8 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Image
         Stopwatch watch;
         const bool boundary = grad.geometry() && options.boundary;
         const bool interior = (grad.geometry() && options.interior_geometry) || grad.appearance();
-        const auto geometry = arrays.geometry({boundary, interior || boundary}, team, work);
+        const auto geometry = arrays.geometry(
+            {.topology = boundary, .parts = interior || boundary, .intersections = boundary}, team, work);
         update = watch.lap();
         return render_backward(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view()}, options,
                                team, grad);
@@ -101,8 +102,10 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Image
             {"edge_wanted", double(p.edge_wanted)},
             {"silhouettes", double(p.silhouettes)},
             {"creases", double(p.creases)},
+            {"intersections", double(p.intersections)},
             {"built rays", work.rays},
             {"built edges", work.edges},
+            {"found intersections", work.intersections},
             {"update", update},
             {"view", p.view},
             {"surface measure", p.measure},

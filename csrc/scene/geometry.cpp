@@ -5,6 +5,8 @@
 #include <list>
 #include <mutex>
 
+#include "core/stopwatch.h"
+
 namespace edgegrad {
 
 Geometry::Geometry(const int32_t* faces, int64_t n_faces, int64_t n_verts)
@@ -46,6 +48,12 @@ class KeptGeometry {
             topology_->weld(verts_, spacing_, team);
         }
         if (make_parts_) parts_ = std::make_unique<Parts>(faces, n_faces_, n_verts_, team);
+        if (find_intersections_) {
+            work.intersections = true;
+            Stopwatch watch;
+            intersections_ = std::make_unique<Intersections>(faces, n_faces_, verts_, spacing_, order_, team);
+            work.seconds_of_intersections = watch.lap();
+        }
         keep(moved);
         return geometry_;
     }
@@ -66,6 +74,9 @@ class KeptGeometry {
         if (found != kept.end()) geometry_ = *found;
         if (geometry_ && !here) kept.erase(found), geometry_->welded_ = false;
         weld_ = wanted.topology && !(geometry_ && geometry_->welded_);
+        if (geometry_ && !here) geometry_->intersections_.reset();
+        find_intersections_ = wanted.intersections && !(geometry_ && geometry_->intersections_);
+        if (find_intersections_ && geometry_) order_ = std::move(geometry_->order_);
         make_parts_ = wanted.parts && !(geometry_ && geometry_->parts_);
         // Edges of other positions, which nobody looks at: taken, so that nobody else welds them at the same time.
         if (weld_ && geometry_) topology_ = std::move(geometry_->topology_);
@@ -77,6 +88,8 @@ class KeptGeometry {
         const std::lock_guard lock(mutex);
         if (topology_ && !geometry_->welded_) geometry_->topology_ = std::move(topology_), geometry_->welded_ = true;
         if (parts_ && !geometry_->parts_) geometry_->parts_ = std::move(parts_);
+        if (intersections_ && !geometry_->intersections_)
+            geometry_->intersections_ = std::move(intersections_), geometry_->order_ = std::move(order_);
         const auto equal = [&](const std::shared_ptr<Geometry>& other) {
             return other == geometry_ ||
                    (moved && other->spacing_ == spacing_ && same(other->verts_, verts_, 3 * n_verts_) &&
@@ -93,9 +106,11 @@ class KeptGeometry {
     const Spacing& spacing_;
 
     std::shared_ptr<Geometry> geometry_;
-    bool weld_ = false, make_parts_ = false;
+    bool weld_ = false, make_parts_ = false, find_intersections_ = false;
     std::unique_ptr<Topology> topology_;
     std::unique_ptr<Parts> parts_;
+    std::unique_ptr<Intersections> intersections_;
+    FaceOrder order_;
 };
 
 std::shared_ptr<const Geometry> acquire_geometry(const int32_t* faces, int64_t n_faces, const double* verts,

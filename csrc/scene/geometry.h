@@ -1,4 +1,5 @@
-// What depends on faces and positions alone, kept between calls: the ray structure and the edges.
+// What depends on faces and positions alone, kept between calls: the ray structure, the edges, and where
+// faces pass through each other.
 #pragma once
 
 #include <cstdint>
@@ -6,19 +7,22 @@
 #include <vector>
 
 #include "rays/raycast.h"
+#include "scene/intersections.h"
 #include "scene/topology.h"
 
 namespace edgegrad {
 
 // What acquire_geometry is to have ready besides the ray structure.
 struct GeometryWanted {
-    bool topology = false, parts = false;
+    bool topology = false, parts = false, intersections = false;
 };
 
 // What it had to do.
 struct GeometryWork {
     bool rays = false;   // built or updated the ray structure
     bool edges = false;  // found or welded the edges
+    bool intersections = false;
+    double seconds_of_intersections = 0;
 };
 
 class Geometry {
@@ -27,9 +31,11 @@ class Geometry {
 
     const RayCaster& caster() const { return caster_; }
 
-    // These two are there if acquire_geometry was asked for them; the edges are those at the current positions.
+    // These are there if acquire_geometry was asked for them; edges and intersections are those at the current
+    // positions.
     const Topology& topology() const { return *topology_; }
     const Parts& parts() const { return *parts_; }
+    const Intersections& intersections() const { return *intersections_; }
 
    private:
     friend class KeptGeometry;
@@ -39,8 +45,10 @@ class Geometry {
     RayCaster caster_;
     std::unique_ptr<Topology> topology_;
     std::unique_ptr<Parts> parts_;
-    Spacing spacing_;      // decides what is welded
-    bool welded_ = false;  // at the current positions
+    std::unique_ptr<Intersections> intersections_;  // null: not found yet at the current positions
+    FaceOrder order_;                               // that they were found in
+    Spacing spacing_;                               // decides what is welded
+    bool welded_ = false;                           // at the current positions
 };
 
 // The geometry of these faces at these positions, with what is wanted. One that is still in memory is used

@@ -1,0 +1,118 @@
+// Where two triangles pass through each other: a segment of the line that their planes share.
+//
+// Each triangle cuts that line in an interval, whose ends lie on sides of the triangle that pass through the other
+// plane; the segment is where both overlap (Möller 1997, "A fast triangle-triangle intersection test").
+//
+// Only what truly crosses counts: of either triangle a vertex lies before the other's plane and one behind it. A vertex
+// that lies on the plane up to the rounding of the input (contact.h) is on it, and so is one that both share. So faces
+// that share an edge, by index or by place, or that touch, have no segment; nor have coplanar ones.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "core/math.h"
+#include "scene/contact.h"
+
+namespace edgegrad {
+
+// A face in the world, and what a pair with it needs.
+struct PlacedFace {
+    const int32_t* vertex;  // 3
+    Vec3 p[3];
+    Vec3 e1, e2, normal;  // not normalised
+    double normal_length;
+    double coordinate;  // the largest of its coordinates
+    double spacing;     // relative, of the input's numbers
+
+    void set(const double* verts, const int32_t* v, double spacing_) {
+        vertex = v, spacing = spacing_, coordinate = 0;
+        for (int i = 0; i < 3; ++i) {
+            const double* q = verts + 3 * int64_t(v[i]);
+            p[i] = {q[0], q[1], q[2]};
+            coordinate = std::max({coordinate, std::fabs(q[0]), std::fabs(q[1]), std::fabs(q[2])});
+        }
+        e1 = p[1] - p[0], e2 = p[2] - p[0];
+        normal = cross(e1, e2);
+        normal_length = length(normal);
+    }
+};
+
+class FacePair {
+   public:
+    Vec3 a, b;  // the ends of the segment
+
+    // False if they do not pass through each other.
+    bool set(const PlacedFace& f, const PlacedFace& g) {
+        for (int i = 0; i < 3; ++i) shared_[0][i] = shared_[1][i] = false;
+        int shared = 0;
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j)
+                if (f.vertex[i] == g.vertex[j]) shared_[0][i] = shared_[1][j] = true, ++shared;
+        if (shared > 1) return false;
+        const double size = std::max(f.coordinate, g.coordinate);
+        const double tolerance =
+            shared ? rounding_of_doubles * size : contact(std::max(f.spacing, g.spacing), size, size);
+        if (!crosses(f, g, shared_[1], tolerance, distance_[1])) return false;
+        if (!crosses(g, f, shared_[0], tolerance, distance_[0])) return false;
+        Vec3 first[2], second[2];
+        interval(f, distance_[0], first);
+        interval(g, distance_[1], second);
+        return overlap(first, second);
+    }
+
+   private:
+    // The distances of the vertices of g from the plane of f, times the length of its normal; 0 on the plane. False
+    // unless some lie on either side.
+    static bool crosses(const PlacedFace& f, const PlacedFace& g, const bool (&shared)[3], double tolerance,
+                        double (&distance)[3]) {
+        bool before = false, behind = false;
+        for (int i = 0; i < 3; ++i) {
+            distance[i] = 0;
+            if (shared[i]) continue;
+            const Vec3 from = g.p[i] - f.p[0];
+            const double d = dot(f.normal, from);
+            if (std::fabs(d) <= tolerance * f.normal_length ||
+                std::fabs(d) <= rounding_of_triple_product(from, f.e1, f.e2))
+                continue;
+            distance[i] = d;
+            (d > 0 ? before : behind) = true;
+        }
+        return before && behind;
+    }
+
+    // Where the triangle meets the plane: its vertex there, or where a side passes through.
+    static void interval(const PlacedFace& f, const double (&distance)[3], Vec3 (&end)[2]) {
+        int n = 0;
+        for (int i = 0; i < 3; ++i) {
+            const int j = i == 2 ? 0 : i + 1;
+            if (distance[i] == 0) {
+                end[n++] = f.p[i];
+            } else if ((distance[i] > 0 && distance[j] < 0) || (distance[i] < 0 && distance[j] > 0)) {
+                // From the lower vertex on, so that the faces on both sides of an edge find the same point.
+                const bool low = f.vertex[i] < f.vertex[j];
+                const int k = low ? i : j, l = low ? j : i;
+                end[n++] = f.p[k] + (distance[k] / (distance[k] - distance[l])) * (f.p[l] - f.p[k]);
+            }
+        }
+    }
+
+    bool overlap(const Vec3 (&first)[2], const Vec3 (&second)[2]) {
+        // Along the longer one: nearly parallel planes say little of the direction.
+        const Vec3 u = first[1] - first[0], v = second[1] - second[0];
+        const Vec3 along = dot(u, u) > dot(v, v) ? u : v;
+        const auto at = [&](Vec3 p) { return dot(p - first[0], along); };
+        double f[2] = {0, at(first[1])}, g[2] = {at(second[0]), at(second[1])};
+        const int f0 = f[1] < f[0], g0 = g[1] < g[0];
+        const double begin = std::max(f[f0], g[g0]), end = std::min(f[1 - f0], g[1 - g0]);
+        a = f[f0] > g[g0] ? first[f0] : second[g0];
+        b = f[1 - f0] < g[1 - g0] ? first[1 - f0] : second[1 - g0];
+        return begin < end;
+    }
+
+    bool shared_[2][3];      // whether a vertex is one of the other face
+    double distance_[2][3];  // of the vertices from the plane of the other face
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,89 @@
+// Boxes of faces in a tree, to find which of them overlap.
+//
+// Faces are sorted along a space-filling curve (Morton 1966); eight in a row are a leaf, eight leaves in a row a node,
+// and so on. The order is kept while the faces move, as long as it is nearly as good as when it was made; boxes are
+// made anew.
+#pragma once
+
+#include <bit>
+#include <cstdint>
+#include <vector>
+
+#include "core/array.h"
+#include "core/parallel.h"
+
+namespace edgegrad {
+
+// An order of faces in which neighbours lie near one another.
+struct FaceOrder {
+    std::vector<int32_t> face;
+    double spread = 0;  // mean size of a leaf's box relative to that of all, when it was made
+};
+
+struct FaceBox {
+    float low[3], high[3];
+};
+
+// Eight boxes side by side. Those that are missing are empty.
+struct BoxGroup {
+    static constexpr int size = 8;
+    float low[3][size], high[3][size];
+
+    void set(int lane, const FaceBox& box);
+    FaceBox bounds() const;
+
+    // Bit i: box i overlaps this one.
+    unsigned overlapping(const FaceBox& box) const;
+};
+
+class FaceTree {
+   public:
+    static constexpr int leaf_size = BoxGroup::size;
+
+    // At these positions (V, 3). Makes the order where there is none, or one that fits no more.
+    FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, FaceOrder& order, Team& team);
+
+    int64_t n_leaves() const { return levels_[0].size(); }
+    const BoxGroup& leaf(int64_t i) const { return levels_[0][i]; }
+    // Of leaf and lane; −1: none.
+    int32_t face(int64_t leaf, int lane) const {
+        const int64_t i = leaf * leaf_size + lane;
+        return i < int64_t(face_->size()) ? (*face_)[i] : -1;
+    }
+
+    // Calls found(leaf) for all leaves from `first` on that overlap the box, in their order.
+    template <class Found>
+    void each_leaf(const FaceBox& box, int64_t first, Found found) const {
+        if (levels_.size() == 1) {
+            if (first == 0) found(int64_t(0));
+            return;
+        }
+        visit(int(levels_.size()) - 1, 0, box, first, found);
+    }
+
+    static int64_t bytes(int64_t faces) {
+        return faces * int64_t(sizeof(int32_t) + sizeof(BoxGroup) / BoxGroup::size * 8 / 7);
+    }
+
+   private:
+    void make_boxes(const int32_t* faces, const double* verts, Team& team);
+    double spread() const;
+
+    // Group i of a level holds the boxes of groups 8 i … 8 i + 7 of the one below.
+    template <class Found>
+    void visit(int level, int64_t i, const FaceBox& box, int64_t first, Found& found) const {
+        const BoxGroup& group = levels_[level][i];
+        const int64_t span = int64_t(1) << 3 * (level - 1);  // leaves in one of its boxes
+        for (unsigned hits = group.overlapping(box); hits; hits &= hits - 1) {
+            const int64_t child = BoxGroup::size * i + std::countr_zero(hits);
+            if ((child + 1) * span <= first) continue;
+            if (level == 1) found(child);
+            else visit(level - 1, child, box, first, found);
+        }
+    }
+
+    const std::vector<int32_t>* face_ = nullptr;
+    std::vector<Array<BoxGroup>> levels_;  // of faces, of leaves, …, the last one of one group
+};
+
+}  // namespace edgegrad

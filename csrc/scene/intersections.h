@@ -1,0 +1,35 @@
+// Where faces pass through each other, of all meshes and of each with itself.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "core/parallel.h"
+#include "scene/face_tree.h"
+#include "scene/scene.h"
+
+namespace edgegrad {
+
+struct Intersection {
+    int32_t face[2];  // ascending
+    Vec3 a, b;        // the ends of the segment that both share, in the world
+};
+
+class Intersections {
+   public:
+    // Of these faces (F, 3) at these positions (V, 3). `order` is kept from time to time.
+    Intersections(const int32_t* faces, int64_t n_faces, const double* verts, const Spacing& spacing, FaceOrder& order,
+                  Team& team);
+
+    // By ascending faces.
+    const std::vector<Intersection>& all() const { return all_; }
+
+    // For how many each of them stands: more than 1 where there would be too many, and some are drawn.
+    double each_stands_for() const { return stands_for_; }
+
+   private:
+    std::vector<Intersection> all_;
+    double stands_for_ = 1;
+};
+
+}  // namespace edgegrad
