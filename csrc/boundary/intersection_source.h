@@ -35,11 +35,13 @@ struct IntersectionCurve {
     double nearest_depth() const { return std::min(a.z, b.z); }
 };
 
-// False where it is out of view, or a face is seen edge-on. `facing` (F,): see facing_of_faces.
+// False where it is out of view, where a face is seen edge-on, or where it is an edge that is a silhouette: that is a
+// curve by itself, and stands for it. `facing` (F,): see facing_of_faces.
 template <class T>
 bool find_intersection(const BackwardView<T>& view, const Array<int8_t>& facing, const Intersection& i,
                        IntersectionCurve& c) {
     if (facing[i.face[0]] == 0 || facing[i.face[1]] == 0) return false;
+    if (i.next >= 0 && facing[i.next] * facing[i.face[i.beside]] <= 0) return false;
     const Camera& camera = view.camera;
     const Vec3 a = camera.to_camera(i.a), b = camera.to_camera(i.b);
     double t0, t1;
@@ -149,7 +151,7 @@ class IntersectionSource {
         Curve curve;
         Plane plane[2];
         Vec2 gradient;  // ∇F, by the place in the image
-        double scale;   // length / |∇F|
+        double scale;   // length / |∇F|, times the weight of the intersection
         CurveFaces faces;
     };
 
@@ -174,7 +176,7 @@ class IntersectionSource {
             }
         }
         place.gradient = pixel_vjp(camera, slope);
-        place.scale = curve.length / length(place.gradient);
+        place.scale = curve.faces->weight() * curve.length / length(place.gradient);
     }
 
     const BackwardView<T>& view_;

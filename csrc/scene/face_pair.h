@@ -5,7 +5,8 @@
 //
 // Only what truly crosses counts: of either triangle a vertex lies before the other's plane and one behind it. A vertex
 // that lies on the plane up to the rounding of the input (contact.h) is on it, and so is one that both share. So faces
-// that share an edge, by index or by place, or that touch, have no segment; nor have coplanar ones.
+// that share an edge, by index or by place, or that touch, have no segment; nor have coplanar ones. Where a side of one
+// lies in the plane of the other, its surface may pass through there with the next face; that is told apart.
 #pragma once
 
 #include <algorithm>
@@ -43,31 +44,48 @@ class FacePair {
    public:
     Vec3 a, b;  // the ends of the segment
 
-    // False if they do not pass through each other.
-    bool set(const PlacedFace& f, const PlacedFace& g) {
+    // `along`: a side of one face lies in the other one, and the face on one side of it.
+    enum class Kind { none, through, along };
+
+    // Where `along`: which of the two, 0 or 1, lies on one side, the corner of it that does, and on which side.
+    int lies_beside = 0, corner = 0;
+    bool before = false;
+
+    Kind set(const PlacedFace& f, const PlacedFace& g) {
         for (int i = 0; i < 3; ++i) shared_[0][i] = shared_[1][i] = false;
         int shared = 0;
         for (int i = 0; i < 3; ++i)
             for (int j = 0; j < 3; ++j)
                 if (f.vertex[i] == g.vertex[j]) shared_[0][i] = shared_[1][j] = true, ++shared;
-        if (shared > 1) return false;
+        if (shared > 1) return Kind::none;
         const double size = std::max(f.coordinate, g.coordinate);
         const double tolerance =
             shared ? rounding_of_doubles * size : contact(std::max(f.spacing, g.spacing), size, size);
-        if (!crosses(f, g, shared_[1], tolerance, distance_[1])) return false;
-        if (!crosses(g, f, shared_[0], tolerance, distance_[0])) return false;
+        const Side second_side = side(f, g, shared_[1], tolerance, distance_[1]);
+        if (second_side == Side::one) return Kind::none;
+        const Side first_side = side(g, f, shared_[0], tolerance, distance_[0]);
+        if (first_side == Side::one || (first_side == Side::edge && second_side == Side::edge)) return Kind::none;
         Vec3 first[2], second[2];
         interval(f, distance_[0], first);
         interval(g, distance_[1], second);
-        return overlap(first, second);
+        if (!overlap(first, second)) return Kind::none;
+        if (first_side == Side::both && second_side == Side::both) return Kind::through;
+        lies_beside = first_side == Side::edge ? 0 : 1;
+        const auto& distance = distance_[lies_beside];
+        corner = distance[0] != 0 ? 0 : distance[1] != 0 ? 1 : 2;
+        before = distance[corner] > 0;
+        return Kind::along;
     }
 
    private:
-    // The distances of the vertices of g from the plane of f, times the length of its normal; 0 on the plane. False
-    // unless some lie on either side.
-    static bool crosses(const PlacedFace& f, const PlacedFace& g, const bool (&shared)[3], double tolerance,
-                        double (&distance)[3]) {
-        bool before = false, behind = false;
+    // Where the vertices of a face lie, seen from a plane: on both sides; on one side, but for a side of the face that
+    // lies in the plane; or else, all on one side or in the plane.
+    enum class Side { both, edge, one };
+
+    // Of the vertices of g from the plane of f, with their distances times the length of its normal; 0 on the plane.
+    static Side side(const PlacedFace& f, const PlacedFace& g, const bool (&shared)[3], double tolerance,
+                     double (&distance)[3]) {
+        int before = 0, behind = 0;
         for (int i = 0; i < 3; ++i) {
             distance[i] = 0;
             if (shared[i]) continue;
@@ -77,9 +95,9 @@ class FacePair {
                 std::fabs(d) <= rounding_of_triple_product(from, f.e1, f.e2))
                 continue;
             distance[i] = d;
-            (d > 0 ? before : behind) = true;
+            ++(d > 0 ? before : behind);
         }
-        return before && behind;
+        return before && behind ? Side::both : before + behind == 1 ? Side::edge : Side::one;
     }
 
     // Where the triangle meets the plane: its vertex there, or where a side passes through.

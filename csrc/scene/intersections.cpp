@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <atomic>
 #include <bit>
+#include <tuple>
 
 #include "core/sampler.h"
 #include "scene/face_pair.h"
@@ -11,9 +12,22 @@ namespace edgegrad {
 
 namespace {
 
-// Leaves of the tree that overlap: their faces may meet.
-struct LeafPair {
-    int32_t first, second;
+// A side of the face `beside` that lies in the face `through`, with that face itself on one side.
+struct AlongEdge {
+    int32_t through, beside;
+    int32_t edge[2];  // vertices, ascending
+    bool before;
+    Vec3 a, b;
+
+    bool on_same_edge(const AlongEdge& o) const {
+        return through == o.through && edge[0] == o.edge[0] && edge[1] == o.edge[1];
+    }
+};
+
+// What was found among some faces.
+struct Found {
+    std::vector<Intersection> through;
+    std::vector<AlongEdge> along;
 };
 
 // Pairs of leaves for each leaf at most, in the mean: a surface has some five, a tangle of noise twenty. A soup of
@@ -33,7 +47,7 @@ class PairFinder {
     }
 
     // Adds the pairs with a face of either leaf.
-    void add(int64_t leaf, int64_t other, std::vector<Intersection>& out) {
+    void add(int64_t leaf, int64_t other, Found& out) {
         if (leaf != leaf_) place(leaf);
         const BoxGroup &own = tree_.leaf(leaf), &others = tree_.leaf(other);
         for (unsigned hits = own.overlapping(others.bounds()); hits; hits &= hits - 1) {
@@ -60,28 +74,38 @@ class PairFinder {
         placed.set(verts_, v, spacing_.of(v[0]));
     }
 
-    // Whether vertices of the face g may lie on both sides of the plane of f. Of most pairs this says all.
+    // Whether vertices of the face g may lie on both sides of the plane of f, or a side of g in it (FacePair::Side). Of
+    // most pairs this says all.
     bool may_cross(const PlacedFace& f, int32_t g) const {
         const double tolerance = rounding_of_doubles * f.coordinate * f.normal_length;
-        double low = 0, high = 0;
+        int before = 0, behind = 0, shared = 0;
         for (int i = 0; i < 3; ++i) {
             const int32_t v = faces_[3 * int64_t(g) + i];
-            if (v == f.vertex[0] || v == f.vertex[1] || v == f.vertex[2]) continue;
+            if (v == f.vertex[0] || v == f.vertex[1] || v == f.vertex[2]) {
+                if (++shared == 2) return false;
+                continue;
+            }
             const double* q = verts_ + 3 * int64_t(v);
             const double d = dot(f.normal, Vec3{q[0], q[1], q[2]} - f.p[0]);
-            low = std::min(low, d), high = std::max(high, d);
+            before += d > tolerance, behind += d < -tolerance;
         }
-        return low < -tolerance && high > tolerance;
+        return (before && behind) || before + behind == 1;
     }
 
-    void add_pair(const PlacedFace& f, int32_t face, int32_t other, std::vector<Intersection>& out) {
+    void add_pair(const PlacedFace& f, int32_t face, int32_t other, Found& out) {
         PlacedFace g;
         place(g, other);
         FacePair pair;
-        // In the order of the faces, so that the same numbers are added whoever finds the pair.
+        // In the order of the faces, so that the same numbers are found whoever comes first.
         const bool ascending = face < other;
-        if (!pair.set(ascending ? f : g, ascending ? g : f)) return;
-        out.push_back({{std::min(face, other), std::max(face, other)}, pair.a, pair.b});
+        const int32_t faces[2] = {std::min(face, other), std::max(face, other)};
+        const FacePair::Kind kind = pair.set(ascending ? f : g, ascending ? g : f);
+        if (kind == FacePair::Kind::through)
+            out.through.push_back({.face = {faces[0], faces[1]}, .a = pair.a, .b = pair.b});
+        if (kind != FacePair::Kind::along) return;
+        const int32_t beside = faces[pair.lies_beside], *v = faces_ + 3 * int64_t(beside);
+        const auto [low, high] = std::minmax(v[(pair.corner + 1) % 3], v[(pair.corner + 2) % 3]);
+        out.along.push_back({faces[1 - pair.lies_beside], beside, {low, high}, pair.before, pair.a, pair.b});
     }
 
     const FaceTree& tree_;
@@ -92,6 +116,27 @@ class PairFinder {
     PlacedFace placed_[FaceTree::leaf_size];  // its faces
 };
 
+// Adds those at which a surface passes through: two faces of an edge, one on each side.
+void add_along(std::vector<AlongEdge>& along, std::vector<Intersection>& out) {
+    std::sort(along.begin(), along.end(), [](const AlongEdge& p, const AlongEdge& q) {
+        return std::tie(p.through, p.edge[0], p.edge[1], p.before, p.beside) <
+               std::tie(q.through, q.edge[0], q.edge[1], q.before, q.beside);
+    });
+    const auto add = [&](const AlongEdge& own, const AlongEdge& next) {
+        const bool ascending = own.through < own.beside;
+        out.push_back({.face = {std::min(own.through, own.beside), std::max(own.through, own.beside)},
+                       .next = next.beside,
+                       .beside = ascending,
+                       .a = own.a,
+                       .b = own.b});
+    };
+    for (size_t i = 0, end; i < along.size(); i = end) {
+        for (end = i + 1; end < along.size() && along[end].on_same_edge(along[i]);) ++end;
+        if (end - i == 2 && along[i].before != along[i + 1].before)
+            add(along[i], along[i + 1]), add(along[i + 1], along[i]);
+    }
+}
+
 }  // namespace
 
 Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double* verts, const Spacing& spacing,
@@ -99,7 +144,7 @@ Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double
     FaceTree tree(faces, n_faces, verts, order, team);
     const int64_t leaves = tree.n_leaves(), blocks = (leaves + leaves_in_block - 1) / leaves_in_block;
     const int64_t most = most_a_leaf * leaves + most_at_least;
-    std::vector<std::vector<Intersection>> found(blocks);
+    std::vector<Found> found(blocks);
     std::atomic<int64_t> total = 0;
     const auto each_leaf = [&](int64_t block, auto body) {
         for (int64_t i = block * leaves_in_block; i < std::min(leaves, (block + 1) * leaves_in_block); ++i) body(i);
@@ -119,7 +164,7 @@ Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double
         tree = FaceTree(faces, n_faces, verts, order, team);
         total = 0;
         team.each_with(blocks, finder, [&](PairFinder& pairs, int64_t block) {
-            found[block].clear();
+            found[block] = {};
             int64_t n = 0;
             each_leaf(block, [&](int64_t leaf) { pairs.each_overlapping(leaf, [&](int64_t) { ++n; }); });
             total.fetch_add(n, std::memory_order_relaxed);
@@ -140,9 +185,14 @@ Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double
         });
     }
     size_t n = 0;
-    for (const auto& part : found) n += part.size();
+    for (const Found& part : found) n += part.through.size();
     all_.reserve(n);
-    for (const auto& part : found) all_.insert(all_.end(), part.begin(), part.end());
+    std::vector<AlongEdge> along;
+    for (const Found& part : found) {
+        all_.insert(all_.end(), part.through.begin(), part.through.end());
+        along.insert(along.end(), part.along.begin(), part.along.end());
+    }
+    add_along(along, all_);
     team.check();
     std::sort(all_.begin(), all_.end(), [](const Intersection& p, const Intersection& q) {
         return p.face[0] != q.face[0] ? p.face[0] < q.face[0] : p.face[1] < q.face[1];

@@ -12,7 +12,13 @@ namespace edgegrad {
 
 struct Intersection {
     int32_t face[2];  // ascending
-    Vec3 a, b;        // the ends of the segment that both share, in the world
+    // Where the surface passes through a face exactly along an edge: face[beside] ends there, and `next` goes on on the
+    // other side. Moved one way, the one passes through, moved the other way, the other; so each counts half.
+    int32_t next = -1;
+    int32_t beside = 0;
+    Vec3 a, b;  // the ends of the segment that both share, in the world
+
+    double weight() const { return next < 0 ? 1 : 0.5; }
 };
 
 class Intersections {
