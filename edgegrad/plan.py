@@ -136,12 +136,13 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
     )
     _, profiles = backward_kernel(ones, hits, request, wanted, dry=True)
     counts = {name: int(sum(profile[name] for profile in profiles)) for name in _COUNTS}
-    surface, edge, silhouettes, creases = (
-        counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases")
+    surface, edge, silhouettes, creases, intersections = (
+        counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections")
     )
     needs = core.gradient_bytes(
         pass_size(request), motion=work.motion, boundary=work.boundary, wanted=list(wanted),
         surface_samples=surface, edge_samples=edge, curves=silhouettes + creases,
+        intersections=intersections,
     )  # fmt: skip
 
     def bytes_of(*parts: str) -> int:
@@ -170,7 +171,9 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
             bytes=bytes_of("faces in view", "controls", "surface samples"),
         ),
         "topology": Term(
-            work.boundary, no_boundary or "edges, found once for a set of faces", bytes=bytes_of("topology")
+            work.boundary,
+            no_boundary or "edges, found once for a set of faces; who passes through whom",
+            bytes=bytes_of("topology"),
         ),
         "boundary": Term(
             edge > 0,
@@ -191,6 +194,12 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
             no_boundary or (f"{creases:,} in view" if creases else "nothing jumps between neighbours"),
             bytes=bytes_of("creases"),
         ),
+        "intersections": Term(
+            intersections > 0,
+            no_boundary
+            or (f"{intersections:,} in view" if intersections else "no faces in view pass through each other"),
+            bytes=bytes_of("intersections"),
+        ),
     }
     for name in SLOTS:
         why = "required; summed in double" if name in wanted else "not required"
@@ -199,7 +208,10 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
 
 
 # What the kernel counts.
-_COUNTS = ("surface_samples", "edge_samples", "surface_wanted", "edge_wanted", "silhouettes", "creases")
+_CURVES = ("silhouettes", "creases", "intersections")
+_COUNTS = (
+    "surface_samples", "edge_samples", "surface_wanted", "edge_wanted", *_CURVES,
+)  # fmt: skip
 
 
 def _bound(samples: int, wanted: int) -> str:
@@ -231,7 +243,7 @@ _BAR = 24  # characters of a bar of 100 %
 class Profile(Mapping[str, float]):
     """Median seconds of each part of a step, by name, and `samples`, how many of each kind. Prints as a table.
 
-    update           the ray structure, and who meets at edges, for vertices that moved
+    update           for vertices that moved: the ray structure, who meets at edges, which faces pass through each other
     forward          the image
     view             vertices in the image, where the loss looks, and the background's gradient
     surface …        triangles laid end to end; samples and their rays; adding what they found
@@ -312,7 +324,7 @@ def profile(
     seconds = {part: statistics.median(run[part] for run in runs) for part in (*_PARTS, "python")}
     samples = {
         "image_samples": adjoint.shape[:-1].numel() * request.image.spp,
-        **{name: int(runs[-1][name]) for name in ("surface_samples", "edge_samples", "silhouettes", "creases")},
+        **{name: int(runs[-1][name]) for name in ("surface_samples", "edge_samples", *_CURVES)},
     }
     return Profile(seconds, samples)
 

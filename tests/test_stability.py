@@ -79,9 +79,7 @@ def own_differences(problem: Problem, name: str) -> list[float]:
 
 
 def references(names):
-    return [
-        name for name in names if name not in LARGE | {"through-each-other", "tangled"}
-    ]  # these have no exact image
+    return [name for name in names if name not in LARGE | {"tangled"}]  # which has no exact image
 
 
 @pytest.mark.slow

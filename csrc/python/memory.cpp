@@ -52,7 +52,7 @@ Bytes image_bytes(const PassSize& s, int64_t cameras) {
 // What of the gradient is wanted: that of what moves inside faces and at edges, and of the arrays of colours.
 struct GradientWork {
     bool motion, boundary, colors, uvs, texels;
-    int64_t surface_samples, edge_samples, curves;  // −1: not known
+    int64_t surface_samples, edge_samples, curves, intersections;  // −1: not known
 };
 
 Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
@@ -84,9 +84,10 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         const int64_t curves = w.curves < 0 ? s.edges() / (s.jumps ? 1 : 4) : w.curves;
         bytes["edges in view"] = s.faces + curves * bytes_per_curve();
         bytes["creases"] = s.jumps ? 2 * word * s.verts + MeetingParts::bytes_per_pixel * s.pixels : 0;
-        bytes["edge samples"] =
-            rows(w.edge_samples < 0 ? many : w.edge_samples, w.curves < 0 ? s.edges() : w.curves, 4, 3, s.verts);
-        bytes["topology"] = Topology::bytes(s.faces, s.edges());
+        bytes["edge samples"] = rows(w.edge_samples < 0 ? many : w.edge_samples,
+                                     w.curves < 0 ? s.edges() : w.curves + w.intersections, 6, 3, s.verts);
+        bytes["topology"] = Topology::bytes(s.faces, s.edges()) + FaceTree::bytes(s.faces);
+        bytes["intersections"] = Intersections::bytes(w.intersections < 0 ? s.faces / 4 : w.intersections);
     }
     return bytes;
 }
@@ -105,15 +106,15 @@ void bind_memory(nb::module_& m) {
     m.def(
         "gradient_bytes",
         [](const PassSize& size, bool motion, bool boundary, const std::vector<std::string>& wanted,
-           int64_t surface_samples, int64_t edge_samples, int64_t curves) {
+           int64_t surface_samples, int64_t edge_samples, int64_t curves, int64_t intersections) {
             const auto is = [&](const char* name) {
                 return std::find(wanted.begin(), wanted.end(), name) != wanted.end();
             };
-            return gradient_bytes(
-                size, {motion, boundary, is("colors"), is("uvs"), is("texels"), surface_samples, edge_samples, curves});
+            return gradient_bytes(size, {motion, boundary, is("colors"), is("uvs"), is("texels"), surface_samples,
+                                         edge_samples, curves, intersections});
         },
         "size"_a, nb::kw_only(), "motion"_a, "boundary"_a, "wanted"_a, "surface_samples"_a = -1, "edge_samples"_a = -1,
-        "curves"_a = -1);
+        "curves"_a = -1, "intersections"_a = -1);
     // What samples leave in the pixels around them: at most nine, of a Gaussian.
     m.def(
         "pixel_row_bytes",

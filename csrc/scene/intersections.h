@@ -33,6 +33,9 @@ class Intersections {
     // For how many each of them stands: more than 1 where there would be too many, and some are drawn.
     double each_stands_for() const { return stands_for_; }
 
+    // Of so many that are found, once in parts and once whole.
+    static int64_t bytes(int64_t found) { return 2 * found * int64_t(sizeof(Intersection)); }
+
    private:
     std::vector<Intersection> all_;
     double stands_for_ = 1;

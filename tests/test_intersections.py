@@ -1,0 +1,275 @@
+"""Lines where faces pass through each other: which there are, against exhaustion, and gradients along them, against exact
+images of the faces cut apart (edgegrad/report/crossing.py) and against finite differences."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from finite_differences import check_ratio, rotation
+from scenes import cube, front_camera, icosphere, smooth_adjoint, smooth_colors, soup
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad._kernel import core
+from edgegrad.report.crossing import cut_apart, faces_that_cross
+from edgegrad.report.exact import exact_image
+
+F64 = torch.float64
+BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)
+ALONG = torch.tensor([0.7, 0.6, -0.2], dtype=F64)
+PROJECTIONS = ("perspective", "orthographic")
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def joined(*meshes: eg.Mesh) -> tuple[Tensor, Tensor]:
+    """Vertices and faces of all."""
+    first = [sum(len(mesh.verts) for mesh in meshes[:k]) for k in range(len(meshes))]
+    return torch.cat([m.verts for m in meshes]), torch.cat([m.faces + k for m, k in zip(meshes, first, strict=True)])
+
+
+def found(verts: Tensor, faces: Tensor, threads: int = 1):
+    """(face, face, end, end) of each, and for how many each stands."""
+    spacing = torch.finfo(verts.dtype).eps
+    return core.for_tests.intersections(verts.double().numpy(), faces.int().numpy(), spacing, threads)
+
+
+# -- which there are --------------------------------------------------------------------------------------------------
+
+
+def random_triangles(n: int, seed: int, size: float = 1.0) -> tuple[Tensor, Tensor]:
+    middle = torch.rand((n, 1, 3), generator=generator(seed), dtype=F64)
+    verts = middle + size * (torch.rand((n, 3, 3), generator=generator(seed + 1), dtype=F64) - 0.5)
+    return verts.reshape(-1, 3), torch.arange(3 * n).reshape(n, 3)
+
+
+def tangle() -> tuple[Tensor, Tensor]:
+    ball = icosphere(3)
+    return ball.verts + 0.08 * torch.randn(ball.verts.shape, generator=generator(), dtype=F64), ball.faces
+
+
+@pytest.mark.parametrize("scene", [random_triangles(300, 1), random_triangles(1200, 2, 0.3), tangle()])
+def test_pairs_against_exhaustion(scene):
+    verts, faces = scene
+    corners = verts[faces]
+    expected = torch.nonzero(torch.triu(faces_that_cross(corners))).tolist()
+    pairs, each = found(verts, faces)
+    assert each == 1 and len(expected) > 50
+    assert [list(pair[:2]) for pair in pairs] == expected
+    assert found(verts, faces, threads=3)[0] == pairs
+    for f, g, *ends in pairs:  # on both planes, and no point
+        for face in (f, g):
+            origin, p, q = corners[face]
+            normal = torch.nn.functional.normalize(torch.linalg.cross(p - origin, q - origin), dim=0)
+            assert all(abs(float(normal @ (torch.tensor(end, dtype=F64) - origin))) < 1e-9 for end in ends)
+        assert ends[0] != ends[1]
+
+
+def on_the_ground(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """A box that stands on a sheet, both turned by what leaves rounding."""
+    box = soup(cube(0.5)).transformed(t=torch.tensor([0.1, 0.5, 0.2], dtype=F64))
+    sheet = eg.Mesh(
+        torch.tensor([[-2.0, 0.0, -2.0], [2.0, 0.0, -2.0], [0.0, 0.0, 3.0]], dtype=F64), torch.tensor([[0, 1, 2]])
+    )
+    verts, faces = joined(box, sheet)
+    return verts.to(dtype) @ rotation((0.48, 0.6, 0.64), torch.tensor(0.7, dtype=F64)).to(dtype).T, faces
+
+
+TOUCHING = {
+    "a closed sphere": (icosphere(3).verts, icosphere(3).faces),
+    "a box on a sheet": on_the_ground(F64),
+    "a box on a sheet in float32": on_the_ground(torch.float32),
+    "a vertex on a face": (
+        torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [0, 0, 0], [0.3, 0, 1], [-0.3, 0.1, 1]], dtype=F64),
+        torch.tensor([[0, 1, 2], [3, 4, 5]]),
+    ),
+    "an edge in a face, both its faces above": (
+        torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [-0.2, 0, 0], [0.2, 0, 0], [0, 1, 1], [0, -1, 1]], dtype=F64),
+        torch.tensor([[0, 1, 2], [3, 4, 5], [4, 3, 6]]),
+    ),
+    "a sheet through an open edge": (
+        torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [-0.2, -1, -1], [0.2, -1, -1], [0, -1, 1]], dtype=F64),
+        torch.tensor([[0, 1, 2], [3, 4, 5]]),
+    ),
+    "two in one plane": (
+        torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [-0.5, 0.2, 0], [0.9, 0.3, 0], [0, -2, 0]], dtype=F64),
+        torch.tensor([[0, 1, 2], [3, 4, 5]]),
+    ),
+    "without area": (
+        torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1], [0, 0, 0.5]], dtype=F64),
+        torch.tensor([[0, 1, 2], [3, 4, 5], [3, 3, 4], [5, 5, 5]]),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TOUCHING)
+def test_what_touches_does_not_pass_through(name):
+    assert found(*TOUCHING[name])[0] == []
+
+
+def test_many_pairs_are_drawn_from():
+    """A soup of large triangles: as many pairs as the square of its faces."""
+    fraction = {}
+    for n in (1200, 4000):
+        pairs, each = found(*random_triangles(n, 5))
+        fraction[n] = len(pairs) * each / n**2
+        assert (each > 1) == (n == 4000)
+    assert abs(fraction[4000] / fraction[1200] - 1) < 0.05
+
+
+# -- gradients against exact images -----------------------------------------------------------------------------------
+
+
+def roof() -> tuple[Tensor, Tensor]:
+    """A triangle through the edge between two faces."""
+    verts = torch.tensor(
+        [
+            [-0.6, 0.1, 0.2], [0.7, -0.1, 0.3], [0.1, 0.7, -0.5], [-0.1, -0.8, -0.4],
+            [0.5, 0.5, 0.9], [-0.4, 0.0, -0.8], [0.45, -0.45, 0.3],
+        ],
+        dtype=F64,
+    )  # fmt: skip
+    return verts, torch.tensor([[0, 1, 2], [1, 0, 3], [4, 5, 6]])
+
+
+def at_a_vertex() -> tuple[Tensor, Tensor]:
+    """Two faces that share a vertex and meet along a segment from it."""
+    verts = torch.tensor(
+        [[-0.7, 0.1, 0.2], [0.7, 0.6, 0.3], [0.6, -0.6, 0.1], [0.4, 0.2, 0.9], [0.5, -0.15, -0.8]], dtype=F64
+    )
+    return verts, torch.tensor([[0, 1, 2], [0, 3, 4]])
+
+
+SCENES = {
+    "two": random_triangles(2, 14, 1.5),
+    "three, through one point": random_triangles(3, 15, 2.0),
+    "eight": random_triangles(8, 13, 1.5),
+    "through an edge": roof(),
+    "at a vertex": at_a_vertex(),
+}
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+@pytest.mark.parametrize("name", SCENES)
+def test_gradient_against_the_exact_one(name, projection):
+    """Of all vertices and of the camera, each relative to its own size, and the intersections matter."""
+    verts, faces = SCENES[name]
+    verts = verts - (verts.mean(0) if name in ("two", "three, through one point", "eight") else 0)
+    camera, adjoint = front_camera(32, projection), smooth_adjoint(32, 32, 3).to(F64)
+    colors = torch.rand((len(verts), 3), generator=generator(4), dtype=F64)
+    assert len(found(verts, faces)[0]) >= {"three, through one point": 3, "eight": 8, "through an edge": 2}.get(name, 1)
+
+    def gradient(image) -> list[Tensor]:
+        leaves = [t.clone().requires_grad_() for t in (verts, camera.world_to_camera, camera.K)]
+        scene = eg.Scene([eg.Mesh(leaves[0], faces, colors=colors)], BACKGROUND)
+        loss = (image(scene, camera.replace(world_to_camera=leaves[1], K=leaves[2])) * adjoint).sum()
+        grads = torch.autograd.grad(loss, leaves)
+        return [grads[0], grads[1][:3], grads[2][:2]]
+
+    true = gradient(lambda scene, camera: exact_image(cut_apart(scene), camera))
+    options = {"surface_samples": 50_000, "edge_samples": 50_000}
+    estimates = [gradient(lambda s, c, k=k: eg.render(s, c, seed=k, **options)) for k in range(4)]
+    for k, exact in enumerate(true):
+        mean = torch.stack([e[k] for e in estimates]).mean(0)
+        assert float((mean - exact).norm()) < 0.004 * float(exact.norm())
+
+
+# -- gradients against finite differences -----------------------------------------------------------------------------
+
+SAMPLES = {"surface_samples": 40_000, "edge_samples": 40_000}
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_boxes_through_each_other(projection, dtype):
+    """0.20 in another renderer: it had no edge there. Two meshes, of which one moves."""
+    box = cube(0.45).transformed(rotation((0.6, 0.0, 0.8), torch.tensor(0.4, dtype=F64)))
+    other = box.transformed(
+        rotation((0.0, 1.0, 0.0), torch.tensor(0.9, dtype=F64)), torch.tensor([0.35, 0.2, 0.15], dtype=F64)
+    )
+
+    def one_moves(theta: Tensor):
+        moved = box.transformed(t=theta * ALONG)
+        return eg.Scene([moved.to(dtype), other.replace(colors=1 - other.colors).to(dtype)], BACKGROUND), camera
+
+    camera = front_camera(48, projection)
+    check_ratio(one_moves, 0.006, spp=2048, **SAMPLES)
+
+
+@pytest.mark.parametrize("mesh", ["itself", "another"])
+def test_a_sphere_sunk_to_edges_that_lie_in_a_sheet(mesh):
+    """Of an icosphere a third of its equator are edges. Which of their two faces passes through the sheet depends on the
+    direction of the motion, so the gradient is the mean."""
+    ball = icosphere(2).transformed(scale=0.7)
+    corners = torch.tensor([[-1.2, -1.1, 0.0], [1.2, -1.0, 0.0], [1.1, 1.2, 0.0], [-1.1, 1.0, 0.0]], dtype=F64)
+    colors = torch.tensor([[0.9, 0.1, 0.1], [0.8, 0.3, 0.1], [0.7, 0.1, 0.2], [0.9, 0.3, 0.3]], dtype=F64)
+    sheet = eg.Mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), colors=colors)
+    camera = eg.Camera.look_at((1.4, 1.9, 2.6), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (64, 64)).to(F64)
+    assert ball.colors is not None
+    both = eg.Mesh(*joined(ball, sheet), colors=torch.cat([ball.colors, colors]))
+
+    def shifted(theta: Tensor):
+        if mesh == "itself":
+            return eg.Scene([both.transformed(t=theta * ALONG)], BACKGROUND), camera
+        return eg.Scene([ball.transformed(t=theta * ALONG), sheet.transformed(t=theta * ALONG)], BACKGROUND), camera
+
+    check_ratio(shifted, 0.006, spp=2048, **SAMPLES)
+
+    def sunk(theta: Tensor):
+        t = theta * torch.tensor([0.0, 0.0, 1.0], dtype=F64)
+        return eg.Scene([ball.transformed(t=t), sheet], BACKGROUND), camera
+
+    check_ratio(sunk, 0.003, spp=2048, **SAMPLES)
+
+
+# -- what it costs ----------------------------------------------------------------------------------------------------
+
+
+def crossing() -> eg.Scene:
+    verts, faces = tangle()
+    return eg.Scene([eg.Mesh(verts, faces, colors=smooth_colors(verts))], BACKGROUND)
+
+
+def test_same_bits_at_any_number_of_threads():
+    camera, adjoint = front_camera(48), smooth_adjoint(48, 48, 3).to(F64)
+    (mesh,) = crossing().meshes
+    before, grads = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 5):
+            core.clear_geometry()
+            torch.set_num_threads(threads)
+            verts = mesh.verts.clone().requires_grad_()
+            grads.append(torch.autograd.grad(eg.render(mesh.replace(verts=verts), camera, spp=4), verts, adjoint)[0])
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(grads[0], grads[1]) and torch.equal(grads[0], grads[2])
+
+
+def test_where_the_vertices_were_before_changes_no_bit():
+    """The order in which pairs are found is kept while the vertices move."""
+    camera, adjoint = front_camera(48), smooth_adjoint(48, 48, 3).to(F64)
+    (mesh,) = crossing().meshes
+
+    def gradient(scale: float = 1.0) -> Tensor:
+        verts = (scale * mesh.verts).requires_grad_()
+        return torch.autograd.grad(eg.render(mesh.replace(verts=verts), camera, spp=4), verts, adjoint)[0]
+
+    core.clear_geometry()
+    first = gradient()
+    for scale in (1.1, 0.9):
+        gradient(scale)
+    assert torch.equal(gradient(), first)
+
+
+def test_plan_counts_them():
+    camera = front_camera(48)
+    apart = [cube(0.3).transformed(t=x * torch.tensor([1.0, 0.0, 0.0], dtype=F64)) for x in (-0.5, 0.5)]
+    together = [cube(0.3), cube(0.4).transformed(t=torch.tensor([0.2, 0.3, 0.1], dtype=F64))]
+    for meshes, on in ((apart, False), (together, True)):
+        moving = [mesh.replace(verts=mesh.verts.clone().requires_grad_()) for mesh in meshes]
+        plan = eg.plan(eg.Scene(moving), camera)
+        assert plan["intersections"].on == on and (plan["intersections"].bytes > 0) == on
+        assert (eg.profile(eg.Scene(moving), camera, repeats=1).samples["intersections"] > 0) == on
+    assert not eg.plan(eg.Scene(together), camera)["intersections"].on
