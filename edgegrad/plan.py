@@ -172,7 +172,7 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
         ),
         "topology": Term(
             work.boundary,
-            no_boundary or "edges, found once for a set of faces; who passes through whom",
+            no_boundary or "edges, found once for a set of faces",
             bytes=bytes_of("topology"),
         ),
         "boundary": Term(

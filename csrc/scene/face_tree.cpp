@@ -1,6 +1,7 @@
 #include "scene/face_tree.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 
@@ -12,23 +13,74 @@ namespace {
 
 constexpr float infinity = std::numeric_limits<float>::infinity();
 
-// What a float may lie below or above a double that was rounded to it.
-float below(double x) { return std::nextafter(float(x), -infinity); }
-float above(double x) { return std::nextafter(float(x), infinity); }
+// Corners of eight faces side by side.
+struct CornerLanes {
+    double p[3][3][BoxGroup::size];  // by corner and axis
 
-FaceBox box_of(const double* verts, const int32_t* v) {
-    FaceBox box;
-    for (int k = 0; k < 3; ++k) {
-        const double a = verts[3 * int64_t(v[0]) + k], b = verts[3 * int64_t(v[1]) + k],
-                     c = verts[3 * int64_t(v[2]) + k];
-        box.low[k] = below(std::min({a, b, c})), box.high[k] = above(std::max({a, b, c}));
+    void set(int lane, const double* verts, const int32_t* v) {
+        for (int i = 0; i < 3; ++i)
+            for (int k = 0; k < 3; ++k) p[i][k][lane] = verts[3 * int64_t(v[i]) + k];
     }
-    return box;
+};
+
+// Boxes in float that hold those in double: a float lies within half a spacing of the double that was rounded to it.
+EDGEGRAD_VECTORIZED void set_boxes(const CornerLanes& l, BoxGroup& boxes) {
+    constexpr double most = 0x1p127;  // the range of floats
+    for (int k = 0; k < 3; ++k) {
+        EDGEGRAD_ROLLED
+        for (int i = 0; i < BoxGroup::size; ++i) {
+            const double a = l.p[0][k][i], b = l.p[1][k][i], c = l.p[2][k][i];
+            const double low = std::min(std::min(a, b), c), high = std::max(std::max(a, b), c);
+            const float f = float(std::max(std::min(low, most), -most)),
+                        g = float(std::max(std::min(high, most), -most));
+            boxes.low[k][i] = f - (std::fabs(f) * 0x1p-23f + std::numeric_limits<float>::min());
+            boxes.high[k][i] = g + (std::fabs(g) * 0x1p-23f + std::numeric_limits<float>::min());
+        }
+    }
 }
 
-void include(FaceBox& all, const FaceBox& box) {
-    for (int k = 0; k < 3; ++k)
-        all.low[k] = std::min(all.low[k], box.low[k]), all.high[k] = std::max(all.high[k], box.high[k]);
+EDGEGRAD_VECTORIZED void set_corners(const CornerLanes& l, CornerGroup& g) {
+    const double origin[3] = {l.p[0][0][0], l.p[0][1][0], l.p[0][2][0]};
+    float reach = 0;
+    for (int c = 0; c < 3; ++c)
+        for (int k = 0; k < 3; ++k) {
+            float most = 0;
+            EDGEGRAD_ROLLED
+            for (int i = 0; i < BoxGroup::size; ++i) {
+                const float x = float(l.p[c][k][i] - origin[k]);
+                g.p[c][k][i] = x;
+                most = std::max(most, std::fabs(x));
+            }
+            reach = std::max(reach, most);
+        }
+    g.origin = {origin[0], origin[1], origin[2]}, g.reach = reach;
+}
+
+struct FloatPlane {
+    float x, y, z, offset, error;  // of x p.x + y p.y + z p.z + offset
+    int32_t vertex[3];
+};
+
+EDGEGRAD_VECTORIZED unsigned crossing_lanes(const CornerGroup& g, const FloatPlane& plane) {
+    constexpr int lanes = CornerGroup::size;
+    const float x = plane.x, y = plane.y, z = plane.z, offset = plane.offset, error = plane.error;
+    const int32_t v0 = plane.vertex[0], v1 = plane.vertex[1], v2 = plane.vertex[2];
+    int32_t hit[lanes];
+    EDGEGRAD_ROLLED
+    for (int i = 0; i < lanes; ++i) {
+        // 1 where a corner is one of the other face, where it lies before the plane, and where behind.
+        const auto same = [&](int32_t v) { return int32_t(v == v0) | int32_t(v == v1) | int32_t(v == v2); };
+        const auto at = [&](int c) { return x * g.p[c][0][i] + y * g.p[c][1][i] + z * g.p[c][2][i] + offset; };
+        const int32_t s0 = same(g.vertex[0][i]), s1 = same(g.vertex[1][i]), s2 = same(g.vertex[2][i]);
+        const float d0 = at(0), d1 = at(1), d2 = at(2);
+        const int32_t before = (s0 | (d0 > error)) & (s1 | (d1 > error)) & (s2 | (d2 > error));
+        const int32_t behind = (s0 | (d0 < -error)) & (s1 | (d1 < -error)) & (s2 | (d2 < -error));
+        hit[i] = (before | behind | int32_t(s0 + s1 + s2 > 1) | int32_t(g.vertex[0][i] < 0)) ? 0 : 1 << i;
+    }
+    unsigned hits = 0;
+    EDGEGRAD_ROLLED
+    for (int i = 0; i < lanes; ++i) hits |= hit[i];
+    return hits;
 }
 
 constexpr FaceBox empty{{infinity, infinity, infinity}, {-infinity, -infinity, -infinity}};
@@ -74,25 +126,65 @@ FaceBox BoxGroup::bounds() const {
     return all;
 }
 
+FaceBox BoxGroup::box(int lane) const {
+    FaceBox box;
+    for (int k = 0; k < 3; ++k) box.low[k] = low[k][lane], box.high[k] = high[k][lane];
+    return box;
+}
+
 unsigned BoxGroup::overlapping(const FaceBox& box) const { return overlapping_lanes(*this, box); }
+
+unsigned CornerGroup::may_cross(const FacePlane& plane) const {
+    const Vec3 N = plane.normal;
+    const double offset = dot(N, origin - plane.origin);
+    const double size = (std::fabs(N.x) + std::fabs(N.y) + std::fabs(N.z)) * reach + std::fabs(offset);
+    return crossing_lanes(*this, {.x = float(N.x),
+                                  .y = float(N.y),
+                                  .z = float(N.z),
+                                  .offset = float(offset),
+                                  // Four products and sums of rounded numbers, each to half a spacing; twice that. What
+                                  // floats cannot hold tells nothing.
+                                  .error = float(0x1p-20 * size + plane.slack) + std::numeric_limits<float>::min(),
+                                  .vertex = {plane.vertex[0], plane.vertex[1], plane.vertex[2]}});
+}
 
 FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, FaceOrder& order, Team& team) {
     for (int64_t n = n_faces; levels_.empty() || n > 1;) {
         n = (n + BoxGroup::size - 1) / BoxGroup::size;
         levels_.emplace_back(n);
     }
+    corners_ = Array<CornerGroup>(n_leaves());
     face_ = &order.face;
     if (int64_t(order.face.size()) == n_faces) {
         make_boxes(faces, verts, team);
         // Half as large again, and more than twice the pairs overlap.
         if (spread() <= 1.5 * order.spread) return;
     }
-    std::vector<FaceBox> parts(Team::blocks(n_faces), empty);
+    // Where their middles lie.
+    const auto middle = [&](int64_t f) {
+        const int32_t* v = faces + 3 * f;
+        Vec3 m;
+        for (int i = 0; i < 3; ++i) {
+            const double* p = verts + 3 * int64_t(v[i]);
+            m += (1.0 / 3) * Vec3{p[0], p[1], p[2]};
+        }
+        return m;
+    };
+    std::vector<std::array<Vec3, 2>> parts(Team::blocks(n_faces));
     team.each_block(n_faces, [&](int64_t k, int64_t first, int64_t last) {
-        for (int64_t f = first; f < last; ++f) include(parts[k], box_of(verts, faces + 3 * f));
+        Vec3 low = middle(first), high = low;
+        for (int64_t f = first; f < last; ++f) {
+            const Vec3 m = middle(f);
+            low = {std::min(low.x, m.x), std::min(low.y, m.y), std::min(low.z, m.z)};
+            high = {std::max(high.x, m.x), std::max(high.y, m.y), std::max(high.z, m.z)};
+        }
+        parts[k] = {low, high};
     });
-    FaceBox all = empty;
-    for (const FaceBox& part : parts) include(all, part);
+    Vec3 low = parts[0][0], high = parts[0][1];
+    for (const auto& [l, h] : parts) {
+        low = {std::min(low.x, l.x), std::min(low.y, l.y), std::min(low.z, l.z)};
+        high = {std::max(high.x, h.x), std::max(high.y, h.y), std::max(high.z, h.z)};
+    }
     struct Key {
         uint64_t code;
         int32_t face;
@@ -100,13 +192,11 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, F
     std::vector<Key> keys(n_faces);
     team.each_block(n_faces, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t f = first; f < last; ++f) {
-            const FaceBox box = box_of(verts, faces + 3 * f);
-            uint64_t code = 0;
-            for (int k = 0; k < 3; ++k) {
-                const double place = (0.5 * (double(box.low[k]) + box.high[k]) - all.low[k]) /
-                                     (double(all.high[k]) - all.low[k]) * 0x1p21;
-                code |= spread_bits(uint64_t(std::clamp(place, 0.0, 0x1p21 - 1))) << k;
-            }
+            const Vec3 m = middle(f) - low, size = high - low;
+            const auto bits = [](double place, double size) {
+                return spread_bits(size > 0 ? uint64_t(std::clamp(place / size * 0x1p21, 0.0, 0x1p21 - 1)) : 0);
+            };
+            const uint64_t code = bits(m.x, size.x) | bits(m.y, size.y) << 1 | bits(m.z, size.z) << 2;
             keys[f] = {code, int32_t(f)};
         }
     });
@@ -122,11 +212,20 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, F
 void FaceTree::make_boxes(const int32_t* faces, const double* verts, Team& team) {
     const int64_t n_faces = int64_t(face_->size());
     team.each_block(n_leaves(), [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t i = first; i < last; ++i)
+        CornerLanes lanes;
+        for (int64_t i = first; i < last; ++i) {
+            CornerGroup& corners = corners_[i];
+            const int n = int(std::min<int64_t>(BoxGroup::size, n_faces - BoxGroup::size * i));
             for (int lane = 0; lane < BoxGroup::size; ++lane) {
-                const int64_t k = BoxGroup::size * i + lane;
-                levels_[0][i].set(lane, k < n_faces ? box_of(verts, faces + 3 * int64_t((*face_)[k])) : empty);
+                // Where there are too few, the first one stands for them.
+                const int32_t* v = faces + 3 * int64_t((*face_)[BoxGroup::size * i + (lane < n ? lane : 0)]);
+                lanes.set(lane, verts, v);
+                for (int c = 0; c < 3; ++c) corners.vertex[c][lane] = lane < n ? v[c] : -1;
             }
+            set_boxes(lanes, levels_[0][i]);
+            set_corners(lanes, corners);
+            for (int lane = n; lane < BoxGroup::size; ++lane) levels_[0][i].set(lane, empty);
+        }
     });
     for (size_t level = 1; level < levels_.size(); ++level) {
         const Array<BoxGroup>& below = levels_[level - 1];

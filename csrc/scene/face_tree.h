@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "core/array.h"
+#include "core/math.h"
 #include "core/parallel.h"
 
 namespace edgegrad {
@@ -30,10 +31,31 @@ struct BoxGroup {
     float low[3][size], high[3][size];
 
     void set(int lane, const FaceBox& box);
+    FaceBox box(int lane) const;
     FaceBox bounds() const;
 
     // Bit i: box i overlaps this one.
     unsigned overlapping(const FaceBox& box) const;
+};
+
+// The plane of a face as its neighbours are compared with it.
+struct FacePlane {
+    const int32_t* vertex;  // 3, of the face
+    Vec3 origin, normal;
+    double slack;  // what doubles leave of normal · (p − origin)
+};
+
+// The corners of eight faces, relative to one of them, so that floats hold them well.
+struct CornerGroup {
+    static constexpr int size = BoxGroup::size;
+    Vec3 origin;
+    float reach;              // the largest of the numbers in p
+    float p[3][3][size];      // by corner and axis
+    int32_t vertex[3][size];  // −1: there is no face
+
+    // Bit i: face i shares at most one vertex with a face, and its others lie neither all before the plane of that face
+    // nor all behind it, as far as floats tell. Of most neighbours this says all.
+    unsigned may_cross(const FacePlane& plane) const;
 };
 
 class FaceTree {
@@ -45,6 +67,11 @@ class FaceTree {
 
     int64_t n_leaves() const { return levels_[0].size(); }
     const BoxGroup& leaf(int64_t i) const { return levels_[0][i]; }
+    FaceBox bounds(int64_t leaf) const {
+        return levels_.size() == 1 ? levels_[0][0].bounds()
+                                   : levels_[1][leaf / BoxGroup::size].box(int(leaf % BoxGroup::size));
+    }
+    const CornerGroup& corners(int64_t leaf) const { return corners_[leaf]; }
     // Of leaf and lane; −1: none.
     int32_t face(int64_t leaf, int lane) const {
         const int64_t i = leaf * leaf_size + lane;
@@ -62,7 +89,7 @@ class FaceTree {
     }
 
     static int64_t bytes(int64_t faces) {
-        return faces * int64_t(sizeof(int32_t) + sizeof(BoxGroup) / BoxGroup::size * 8 / 7);
+        return faces * int64_t(sizeof(int32_t) + (sizeof(BoxGroup) * 8 / 7 + sizeof(CornerGroup)) / BoxGroup::size);
     }
 
    private:
@@ -83,6 +110,7 @@ class FaceTree {
     }
 
     const std::vector<int32_t>* face_ = nullptr;
+    Array<CornerGroup> corners_{0};        // of each leaf
     std::vector<Array<BoxGroup>> levels_;  // of faces, of leaves, …, the last one of one group
 };
 

@@ -43,23 +43,20 @@ class PairFinder {
     // Calls found(other) for the leaves from this one on that overlap it.
     template <class Found>
     void each_overlapping(int64_t leaf, Found found) const {
-        tree_.each_leaf(tree_.leaf(leaf).bounds(), leaf, found);
+        tree_.each_leaf(tree_.bounds(leaf), leaf, found);
     }
 
     // Adds the pairs with a face of either leaf.
     void add(int64_t leaf, int64_t other, Found& out) {
         if (leaf != leaf_) place(leaf);
         const BoxGroup &own = tree_.leaf(leaf), &others = tree_.leaf(other);
-        for (unsigned hits = own.overlapping(others.bounds()); hits; hits &= hits - 1) {
+        for (unsigned hits = own.overlapping(tree_.bounds(other)); hits; hits &= hits - 1) {
             const int i = std::countr_zero(hits);
-            const FaceBox box = {{own.low[0][i], own.low[1][i], own.low[2][i]},
-                                 {own.high[0][i], own.high[1][i], own.high[2][i]}};
-            unsigned met = others.overlapping(box);
+            unsigned met = others.overlapping(own.box(i));
             if (leaf == other) met &= ~0u << (i + 1);
-            for (; met; met &= met - 1) {
-                const int32_t g = tree_.face(other, std::countr_zero(met));
-                if (may_cross(placed_[i], g)) add_pair(placed_[i], tree_.face(leaf, i), g, out);
-            }
+            if (met) met &= tree_.corners(other).may_cross(plane_[i]);
+            for (; met; met &= met - 1)
+                add_pair(placed_[i], tree_.face(leaf, i), tree_.face(other, std::countr_zero(met)), out);
         }
     }
 
@@ -67,29 +64,15 @@ class PairFinder {
     void place(int64_t leaf) {
         leaf_ = leaf;
         for (int i = 0; i < FaceTree::leaf_size; ++i)
-            if (const int32_t f = tree_.face(leaf, i); f >= 0) place(placed_[i], f);
+            if (const int32_t f = tree_.face(leaf, i); f >= 0) {
+                PlacedFace& p = placed_[i];
+                place(p, f);
+                plane_[i] = {p.vertex, p.p[0], p.normal, rounding_of_doubles * p.coordinate * p.normal_length};
+            }
     }
     void place(PlacedFace& placed, int32_t face) const {
         const int32_t* v = faces_ + 3 * int64_t(face);
         placed.set(verts_, v, spacing_.of(v[0]));
-    }
-
-    // Whether vertices of the face g may lie on both sides of the plane of f, or a side of g in it (FacePair::Side). Of
-    // most pairs this says all.
-    bool may_cross(const PlacedFace& f, int32_t g) const {
-        const double tolerance = rounding_of_doubles * f.coordinate * f.normal_length;
-        int before = 0, behind = 0, shared = 0;
-        for (int i = 0; i < 3; ++i) {
-            const int32_t v = faces_[3 * int64_t(g) + i];
-            if (v == f.vertex[0] || v == f.vertex[1] || v == f.vertex[2]) {
-                if (++shared == 2) return false;
-                continue;
-            }
-            const double* q = verts_ + 3 * int64_t(v);
-            const double d = dot(f.normal, Vec3{q[0], q[1], q[2]} - f.p[0]);
-            before += d > tolerance, behind += d < -tolerance;
-        }
-        return (before && behind) || before + behind == 1;
     }
 
     void add_pair(const PlacedFace& f, int32_t face, int32_t other, Found& out) {
@@ -114,6 +97,7 @@ class PairFinder {
     const Spacing& spacing_;
     int64_t leaf_ = -1;
     PlacedFace placed_[FaceTree::leaf_size];  // its faces
+    FacePlane plane_[FaceTree::leaf_size];    // theirs
 };
 
 // Adds those at which a surface passes through: two faces of an edge, one on each side.
