@@ -3,6 +3,8 @@ images of the faces cut apart (edgegrad/report/crossing.py) and against finite d
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from finite_differences import check_ratio, rotation
@@ -169,7 +171,7 @@ def test_gradient_against_the_exact_one(name, projection):
         return [grads[0], grads[1][:3], grads[2][:2]]
 
     true = gradient(lambda scene, camera: exact_image(cut_apart(scene), camera))
-    options = {"surface_samples": 50_000, "edge_samples": 50_000}
+    options: dict[str, Any] = {"surface_samples": 50_000, "edge_samples": 50_000}
     estimates = [gradient(lambda s, c, k=k: eg.render(s, c, seed=k, **options)) for k in range(4)]
     for k, exact in enumerate(true):
         mean = torch.stack([e[k] for e in estimates]).mean(0)
@@ -178,7 +180,7 @@ def test_gradient_against_the_exact_one(name, projection):
 
 # -- gradients against finite differences -----------------------------------------------------------------------------
 
-SAMPLES = {"surface_samples": 40_000, "edge_samples": 40_000}
+SAMPLES: dict[str, Any] = {"surface_samples": 40_000, "edge_samples": 40_000}
 
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
@@ -190,9 +192,12 @@ def test_boxes_through_each_other(projection, dtype):
         rotation((0.0, 1.0, 0.0), torch.tensor(0.9, dtype=F64)), torch.tensor([0.35, 0.2, 0.15], dtype=F64)
     )
 
+    assert other.colors is not None
+    other = other.replace(colors=1 - other.colors)
+
     def one_moves(theta: Tensor):
         moved = box.transformed(t=theta * ALONG)
-        return eg.Scene([moved.to(dtype), other.replace(colors=1 - other.colors).to(dtype)], BACKGROUND), camera
+        return eg.Scene([moved.to(dtype), other.to(dtype)], BACKGROUND), camera
 
     camera = front_camera(48, projection)
     check_ratio(one_moves, 0.006, spp=2048, **SAMPLES)
