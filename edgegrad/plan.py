@@ -197,7 +197,7 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
         "intersections": Term(
             intersections > 0,
             no_boundary
-            or (f"{intersections:,} in view" if intersections else "no faces in view pass through each other"),
+            or (f"{intersections:,} in view" if intersections else "none in view"),
             bytes=bytes_of("intersections"),
         ),
     }

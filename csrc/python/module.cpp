@@ -122,7 +122,7 @@ template <class T, class Work>
 void with_geometry(const SceneArrays<T>& arrays, bool boundary, int threads, Work work) {
     unlocked(threads, [&](Team& team) {
         GeometryWork done;
-        work(*arrays.geometry({boundary, true}, team, done), team);
+        work(*arrays.geometry({.topology = boundary, .parts = true, .intersections = boundary}, team, done), team);
     });
 }
 
