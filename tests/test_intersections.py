@@ -229,6 +229,27 @@ def test_a_sphere_sunk_to_edges_that_lie_in_a_sheet(mesh):
     check_ratio(sunk, 0.003, spp=2048, **SAMPLES)
 
 
+def test_copies_share_the_line():
+    """A box listed twice by index, or three times by place, through another: the line between them is there once."""
+    box = cube(0.45).transformed(rotation((0.6, 0.0, 0.8), torch.tensor(0.4, dtype=F64)))
+    other = box.transformed(
+        rotation((0.0, 1.0, 0.0), torch.tensor(0.9, dtype=F64)), torch.tensor([0.35, 0.2, 0.15], dtype=F64)
+    )
+    assert other.colors is not None
+    other = other.replace(colors=1 - other.colors)
+    twice = box.replace(faces=torch.cat([box.faces, box.faces[:, [1, 2, 0]]]))
+    camera, adjoint = front_camera(48), smooth_adjoint(48, 48, 3).to(F64)
+
+    def slope(*meshes: eg.Mesh) -> Tensor:
+        theta = torch.zeros((), dtype=F64, requires_grad=True)
+        scene = eg.Scene([*(mesh.transformed(t=theta * ALONG) for mesh in meshes), other], BACKGROUND)
+        return torch.autograd.grad((eg.render(scene, camera, **SAMPLES) * adjoint).sum(), theta)[0]
+
+    once = slope(box)
+    for meshes in ([twice], [box, box, box]):
+        torch.testing.assert_close(slope(*meshes), once, rtol=0.02, atol=0.0)
+
+
 # -- what it costs ----------------------------------------------------------------------------------------------------
 
 

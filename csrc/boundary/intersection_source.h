@@ -176,7 +176,7 @@ class IntersectionSource {
             }
         }
         place.gradient = pixel_vjp(camera, slope);
-        place.scale = curve.faces->weight() * curve.length / length(place.gradient);
+        place.scale = curve.faces->weight * curve.length / length(place.gradient);
     }
 
     const BackwardView<T>& view_;

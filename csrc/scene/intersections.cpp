@@ -1,6 +1,7 @@
 #include "scene/intersections.h"
 
 #include <algorithm>
+#include <array>
 #include <atomic>
 #include <bit>
 #include <tuple>
@@ -111,13 +112,48 @@ void add_along(std::vector<AlongEdge>& along, std::vector<Intersection>& out) {
         out.push_back({.face = {std::min(own.through, own.beside), std::max(own.through, own.beside)},
                        .next = next.beside,
                        .beside = ascending,
+                       .weight = 0.5,
                        .a = own.a,
                        .b = own.b});
     };
     for (size_t i = 0, end; i < along.size(); i = end) {
         for (end = i + 1; end < along.size() && along[end].on_same_edge(along[i]);) ++end;
-        if (end - i == 2 && along[i].before != along[i + 1].before)
-            add(along[i], along[i + 1]), add(along[i + 1], along[i]);
+        // Those behind come first. One of either, or copies of both.
+        const size_t behind =
+            std::count_if(along.begin() + i, along.begin() + end, [](const AlongEdge& e) { return !e.before; });
+        if (2 * behind != end - i) continue;
+        for (size_t k = 0; k < behind; ++k)
+            add(along[i + k], along[i + behind + k]), add(along[i + behind + k], along[i + k]);
+    }
+}
+
+// Divides what copies of faces have in common among them.
+void share_among_copies(std::vector<Intersection>& all, const int32_t* faces, const double* verts) {
+    struct Key {
+        uint64_t low, high;  // of the places of both faces
+        int64_t index;
+    };
+    const auto place = [&](int32_t face) {
+        std::array<std::array<double, 3>, 3> corner;
+        for (int i = 0; i < 3; ++i)
+            for (int k = 0; k < 3; ++k) corner[i][k] = verts[3 * int64_t(faces[3 * int64_t(face) + i]) + k] + 0.0;
+        std::sort(corner.begin(), corner.end());
+        uint64_t bits = 0;
+        for (const auto& c : corner)
+            for (const double x : c) bits = hash(bits, std::bit_cast<uint64_t>(x));
+        return bits;
+    };
+    std::vector<Key> keys;
+    keys.reserve(all.size());
+    for (const Intersection& i : all) {
+        const uint64_t first = place(i.face[0]), second = place(i.face[1]);
+        keys.push_back({std::min(first, second), std::max(first, second), int64_t(keys.size())});
+    }
+    std::sort(keys.begin(), keys.end(),
+              [](const Key& a, const Key& b) { return std::tie(a.low, a.high) < std::tie(b.low, b.high); });
+    for (size_t i = 0, end; i < keys.size(); i = end) {
+        for (end = i + 1; end < keys.size() && keys[end].low == keys[i].low && keys[end].high == keys[i].high;) ++end;
+        for (size_t k = i; k < end; ++k) all[keys[k].index].weight /= double(end - i);
     }
 }
 
@@ -181,6 +217,8 @@ Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double
     std::sort(all_.begin(), all_.end(), [](const Intersection& p, const Intersection& q) {
         return p.face[0] != q.face[0] ? p.face[0] < q.face[0] : p.face[1] < q.face[1];
     });
+    team.check();
+    share_among_copies(all_, faces, verts);
 }
 
 }  // namespace edgegrad

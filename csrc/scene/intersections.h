@@ -16,9 +16,9 @@ struct Intersection {
     // other side. Moved one way, the one passes through, moved the other way, the other; so each counts half.
     int32_t next = -1;
     int32_t beside = 0;
+    // The share of the gradient that goes to these two: copies of faces in the same place have the same segment.
+    double weight = 1;
     Vec3 a, b;  // the ends of the segment that both share, in the world
-
-    double weight() const { return next < 0 ? 1 : 0.5; }
 };
 
 class Intersections {

@@ -10,10 +10,10 @@ Which polygons there are is combinatorics, decided here without derivatives; eac
 two lines (edges of faces, borders of cells), so its position is computed once more from the scene, with derivatives. That
 one expression holds both terms of the gradient: radiance that changes at a point, and polygons whose sides move.
 
-It is right for faces that do not pass through each other (crossing.py cuts others apart), in front of a perspective camera, in general position. Edges
-and vertices that faces share are recognised, also when each face has its own copies. But where an edge lies on a cell's
-border the image is right and has no two-sided derivative, and where edges of two occluders that share no vertex lie on
-one line before a third face, the derivative may be that of the wrong edge.
+It is right for faces that do not pass through each other (crossing.py cuts others apart), in front of a perspective camera,
+in general position. Edges and vertices that faces share are recognised, also when each face has its own copies. But where an
+edge lies on a cell's border the image is right and has no two-sided derivative, and where edges of two occluders that share no
+vertex lie on one line before a third face, the derivative may be that of the wrong edge.
 Textures are cut into the cells in which they are bilinear, whose lines are straight in the image as well.
 """
 
