@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
@@ -63,8 +65,17 @@ def kernel_scene(scene: Flat) -> Any:
 
 
 def kernel_camera(camera: PackedCamera, index: int = 0) -> Any:
-    own = camera._replace(world_to_camera=camera.world_to_camera[index], K=camera.K[index])
-    return core.Camera(**{name: _array(v) if isinstance(v, Tensor) else v for name, v in own._asdict().items()})
+    return core.Camera(**{n: _array(v[index]) if isinstance(v, Tensor) else v for n, v in camera._asdict().items()})
+
+
+def _warn_of_fold(camera: Any) -> None:
+    if camera.fold is not None:
+        angle = math.degrees(math.atan(camera.fold))
+        warnings.warn(
+            f"distortion: the lens shows nothing beyond the radius {camera.fold:.4g} in normalised image coordinates, "
+            f"{angle:.4g}° from its axis, where it folds the image over or ends; what the image has there is background",
+            stacklevel=2,
+        )
 
 
 def kernel_hits(hits: Hits, index: int = 0) -> Any:
@@ -86,9 +97,11 @@ def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
         profiles = []
         for b in range(B):
             options["seed"] = _camera_seed(request.image.seed, b)
+            camera = kernel_camera(request.camera, b)
+            _warn_of_fold(camera)
             profiles.append(
                 scene.forward(
-                    camera=kernel_camera(request.camera, b),
+                    camera=camera,
                     options=core.ImageOptions(**options),
                     threads=torch.get_num_threads(),
                     image=image[b].numpy(),

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ._check import as_int, check_not_meta, check_positive_int, check_shape
 from ._kernel import core
+from ._lens import MOST
 from .camera import Camera
 from .mesh import Mesh
 from .scene import Flat, Scene, flatten
@@ -24,7 +25,9 @@ class PackedCamera(NamedTuple):
 
     world_to_camera: Tensor  # (B, 4, 4) float64
     K: Tensor  # (B, 3, 3) float64
+    distortion: Tensor  # (B, 8) float64, zeros after the coefficients that there are
     perspective: bool
+    lens: str
     height: int
     width: int
 
@@ -88,6 +91,7 @@ SCHEMA = ", ".join(f"{_NAMES[kind]} {field}" for field, kind in zip(FIELDS, _TYP
 SLOTS: tuple[str, ...] = core.GRADIENT_SLOTS
 POSITIONS = tuple(FIELDS.index(name) for name in SLOTS)
 _LABELS = {"texels": "texture"}
+MOVING = ("verts", *(name for name in SLOTS if name in PackedCamera._fields))  # slots that move the image
 
 
 def label(slot: str) -> str:
@@ -126,7 +130,7 @@ class Work(NamedTuple):
 
     @classmethod
     def of(cls, options: GradientOptions, wanted: Collection[str]) -> Work:
-        moves = any(name in wanted for name in ("verts", "world_to_camera", "K"))
+        moves = any(name in wanted for name in MOVING)
         appearance = any(name in wanted for name in ("colors", "uvs", "texels"))
         return cls(moves and options.radiance_varies, appearance, moves and options.visibility)
 
@@ -180,11 +184,15 @@ def make_request(
 def pack_camera(camera: Camera) -> PackedCamera:
     world_to_camera = camera.world_to_camera.cpu().double().reshape(-1, 4, 4)
     K = camera.K.cpu().double().reshape(-1, 3, 3)
-    B = max(world_to_camera.shape[0], K.shape[0])
+    distortion = camera.coefficients.cpu().double()
+    distortion = torch.nn.functional.pad(distortion, (0, MOST - distortion.shape[-1])).reshape(-1, MOST)
+    B = max(world_to_camera.shape[0], K.shape[0], distortion.shape[0])
     return PackedCamera(
         world_to_camera.expand(B, 4, 4).contiguous(),
         K.expand(B, 3, 3).contiguous(),
-        camera.projection == "perspective",
+        distortion.expand(B, MOST).contiguous(),
+        camera.projection != "orthographic",
+        camera.lens,
         *camera.size,
     )
 

@@ -3,7 +3,8 @@
 A point p in world units goes to camera coordinates `q = R p + t` (+X right, +Y down, +Z forward, as in OpenCV) and
 from there to the pixel position (x, y), x to the right and y down, the corner of the image at (0, 0), pixel centres at +0.5:
 
-    perspective   (x, y) = K[:2] (X/Z, Y/Z, 1)
+    perspective   (x, y) = K[:2] (X/Z, Y/Z, 1)    or through a lens that distorts: K[:2] (m, 1), with m a function of (X/Z, Y/Z)
+    fisheye       (x, y) = K[:2] (m, 1)           the distance from the middle is a polynomial of the angle to the axis
     orthographic  (x, y) = K[:2] (X, Y, 1)        everything on the line is seen, also behind the camera's position
 """
 
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +31,7 @@ from ._check import (
     check_shape,
     values_visible,
 )
+from ._lens import COUNTS, bend
 
 Vector = Tensor | Sequence[float]
 
@@ -41,7 +43,12 @@ class Camera:
     world_to_camera  (4, 4) or (B, 4, 4) float   rigid: a rotation and a translation, last row (0, 0, 0, 1)
     K                (3, 3) or (B, 3, 3) float   pixels (orthographic: pixels a world unit), last row (0, 0, 1); skew allowed
     size             (H, W)                      image size in pixels
-    projection       "perspective" or "orthographic"
+    projection       "perspective", "fisheye" or "orthographic"
+    distortion       (4,), (5,), (8,) or (B, ·)  of a perspective lens, Brown–Conrady: k1, k2, p1, p2, k3, k4, k5, k6, as OpenCV
+                     has them; of a fisheye (4,): k1, k2, k3, k4; None: a pinhole, or a fisheye without
+
+    A lens shows what lies less than 88° from its axis. Where its distortion folds the image over, nothing is seen either, and a
+    render warns with the radius.
 
     All tensors are differentiable. Numbers reach up to 3.4e38, the range of float32, also in float64, and so do those of
     the inverse of K. Raises TypeError for a wrong type, ValueError for a wrong shape or value.
@@ -51,6 +58,7 @@ class Camera:
     K: Tensor
     size: tuple[int, int]
     projection: str = "perspective"
+    distortion: Tensor | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "world_to_camera", as_tensor("world_to_camera", self.world_to_camera, floating=True))
@@ -65,9 +73,30 @@ class Camera:
                 "give one K (3, 3) for all or as many as cameras"
             )
         object.__setattr__(self, "size", _size(self.size))
-        if self.projection not in ("perspective", "orthographic"):
-            raise ValueError(f'projection: expected "perspective" or "orthographic", got {self.projection!r}')
+        if self.projection not in COUNTS:
+            raise ValueError(
+                f'projection: expected "perspective", "fisheye" or "orthographic", got {self.projection!r}'
+            )
+        if self.distortion is not None:
+            object.__setattr__(self, "distortion", as_tensor("distortion", self.distortion, like=self.K))
+            self._check_distortion(self.distortion)
         self._check_values()
+
+    def _check_distortion(self, distortion: Tensor) -> None:
+        counts = COUNTS[self.projection]
+        if not counts:
+            raise ValueError(
+                f"distortion: expected None for an {self.projection} camera, got {tuple(distortion.shape)}"
+            )
+        check_float("distortion", distortion)
+        check_shape("distortion", distortion, *((n,) for n in counts), *(("B", n) for n in counts))
+        check_finite("distortion", distortion)
+        for name, other in (("world_to_camera", self.world_to_camera), ("K", self.K)):
+            if distortion.dim() == 2 and other.dim() == 3 and len(other) != len(distortion):
+                raise ValueError(
+                    f"distortion: expected a batch of {len(other)} like {name}, got {len(distortion)}; "
+                    "give one for all or as many as cameras"
+                )
 
     def _check_values(self) -> None:
         for name, matrix, last in (
@@ -125,25 +154,19 @@ class Camera:
         return Camera(world_to_camera, _intrinsics(scale, scale, 0.5 * W, 0.5 * H), (H, W), "orthographic")
 
     @staticmethod
-    def from_opencv(R: Vector, t: Vector, K: Vector, size: tuple[int, int]) -> Camera:
-        """From OpenCV's extrinsics: R (3, 3) and t (3,) with `q = R p + t`, and K (3, 3) in pixels.
+    def from_opencv(R: Vector, t: Vector, K: Vector, size: tuple[int, int], distortion: Vector | None = None) -> Camera:
+        """From OpenCV's extrinsics: R (3, 3) and t (3,) with `q = R p + t`, K (3, 3) in pixels, and, of a lens that distorts,
+        k1, k2, p1, p2[, k3[, k4, k5, k6]], as cv2.calibrateCamera returns them.
 
         OpenCV puts the centre of the first pixel at 0, edgegrad at 0.5: K's principal point is shifted by half a pixel.
         """
-        R = as_tensor("R", R, floating=True)
-        check_float("R", R)
-        t = as_tensor("t", t, like=R)
-        K = as_tensor("K", K, like=R)
-        check_shape("R", R, (3, 3))
-        check_shape("K", K, (3, 3))
-        check_float("t", t)
-        if t.numel() != 3:
-            raise ValueError(f"t: expected 3 numbers, got shape {tuple(t.shape)}")
-        check_finite("t", t)
-        _check_rotation("R", R)
-        half = torch.zeros_like(K)
-        half[:2, 2] = 0.5
-        return Camera(_rigid(R, t.reshape(3)), K + half, size)
+        return _from_opencv(R, t, K, size, "perspective", distortion)
+
+    @staticmethod
+    def fisheye(R: Vector, t: Vector, K: Vector, size: tuple[int, int], distortion: Vector | None = None) -> Camera:
+        """A fisheye from OpenCV's R (3, 3), t (3,), K (3, 3) in pixels and k1, k2, k3, k4, as cv2.fisheye.calibrate returns
+        them; see from_opencv. It shows what lies less than 88° from the axis."""
+        return _from_opencv(R, t, K, size, "fisheye", distortion)
 
     @staticmethod
     def from_opengl(
@@ -182,15 +205,19 @@ class Camera:
         for i, camera in enumerate(cameras):
             if not isinstance(camera, Camera):
                 raise TypeError(f"cameras[{i}]: expected a Camera, got {type(camera).__name__}")
-            if camera.size != first.size or camera.projection != first.projection or camera.batch is not None:
+            same = (camera.size, camera.projection, _count(camera)) == (first.size, first.projection, _count(first))
+            if not same or camera.batch is not None:
                 raise ValueError(
-                    f"cameras[{i}]: expected a single {first.projection} camera of size {first.size}, got {camera!r}"
+                    f"cameras[{i}]: expected a single {first.projection} camera of size {first.size}"
+                    + (f" with {_count(first)} coefficients of distortion" if _count(first) else "")
+                    + f", got {camera!r}"
                 )
         return Camera(
             torch.stack([c.world_to_camera for c in cameras]),
             torch.stack([c.K for c in cameras]),
             first.size,
             first.projection,
+            None if first.distortion is None else torch.stack([c.coefficients for c in cameras]),
         )
 
     # -- what one can do with it ----------------------------------------------------------------------------------
@@ -198,9 +225,22 @@ class Camera:
     @property
     def batch(self) -> int | None:
         """B, or None for a single camera."""
-        if self.world_to_camera.dim() == 3:
-            return self.world_to_camera.shape[0]
-        return self.K.shape[0] if self.K.dim() == 3 else None
+        for tensor, single in ((self.world_to_camera, 2), (self.K, 2), (self.distortion, 1)):
+            if tensor is not None and tensor.dim() > single:
+                return tensor.shape[0]
+        return None
+
+    @property
+    def lens(self) -> str:
+        """What bends straight lines: "brown-conrady", "fisheye" or, where nothing does, "pinhole"."""
+        if self.projection == "fisheye":
+            return "fisheye"
+        return "pinhole" if self.distortion is None else "brown-conrady"
+
+    @property
+    def coefficients(self) -> Tensor:
+        """The distortion; zeros (4,) where there is none."""
+        return self.K.new_zeros(4) if self.distortion is None else self.distortion
 
     def crop(self, top: int, left: int, height: int, width: int) -> Camera:
         """The camera of a part of the image, in pixels; it may reach beyond the image. Raises TypeError or ValueError."""
@@ -223,7 +263,8 @@ class Camera:
     def project(self, points: Tensor) -> Tensor:
         """Pixel positions (…, 2) of world points (…, 3), differentiable; a single camera only.
 
-        Not finite in the plane of a perspective camera. Raises TypeError or ValueError.
+        Not finite in the plane of a perspective camera. What a lens does not show, beyond a fold or behind it, may have a
+        position too. Raises TypeError or ValueError.
         """
         points = as_tensor("points", points, like=self.K)
         check_float("points", points)
@@ -234,23 +275,54 @@ class Camera:
             raise ValueError(f"project: expected a single camera, got a batch of {self.batch}; call once for each")
         M, K = self.world_to_camera, self.K
         q = (M[:3, :3] * points[..., None, :]).sum(-1) + M[:3, 3]
-        uv = q[..., :2] / q[..., 2:] if self.projection == "perspective" else q[..., :2]
+        uv = q[..., :2] if self.projection == "orthographic" else q[..., :2] / q[..., 2:]
+        if self.lens != "pinhole":
+            uv = bend(self.projection, uv, self.coefficients)
         return (K[:2, :2] * uv[..., None, :]).sum(-1) + K[:2, 2]
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Tensors moved to a device or dtype, as `torch.Tensor.to`."""
-        return self.replace(
-            world_to_camera=self.world_to_camera.to(*args, **kwargs),
-            K=self.K.to(*args, **kwargs),
-        )
+        return self._map(lambda tensor: tensor.to(*args, **kwargs))
 
     def detach(self) -> Camera:
         """The same camera, cut from the autograd graph."""
-        return self.replace(world_to_camera=self.world_to_camera.detach(), K=self.K.detach())
+        return self._map(Tensor.detach)
+
+    def _map(self, f: Callable[[Tensor], Tensor]) -> Camera:
+        distortion = None if self.distortion is None else f(self.distortion)
+        return self.replace(world_to_camera=f(self.world_to_camera), K=f(self.K), distortion=distortion)
 
     def __repr__(self) -> str:
         many = "" if self.batch is None else f"{self.batch} × "
-        return f"Camera({many}{self.projection}, {self.size[0]} × {self.size[1]} pixels, {self.world_to_camera.dtype})"
+        kind = self.projection + (" with distortion" if self.lens == "brown-conrady" else "")
+        return f"Camera({many}{kind}, {self.size[0]} × {self.size[1]} pixels, {self.world_to_camera.dtype})"
+
+
+def _from_opencv(
+    R: Vector, t: Vector, K: Vector, size: tuple[int, int], projection: str, distortion: Vector | None
+) -> Camera:
+    R = as_tensor("R", R, floating=True)
+    check_float("R", R)
+    t = as_tensor("t", t, like=R)
+    K = as_tensor("K", K, like=R)
+    check_shape("R", R, (3, 3))
+    check_shape("K", K, (3, 3))
+    check_float("t", t)
+    if t.numel() != 3:
+        raise ValueError(f"t: expected 3 numbers, got shape {tuple(t.shape)}")
+    check_finite("t", t)
+    _check_rotation("R", R)
+    if distortion is not None:
+        distortion = as_tensor("distortion", distortion, like=R)
+        if distortion.dim() == 2 and 1 in distortion.shape:  # as OpenCV returns it
+            distortion = distortion.reshape(-1)
+    half = torch.zeros_like(K)
+    half[:2, 2] = 0.5
+    return Camera(_rigid(R, t.reshape(3)), K + half, size, projection, distortion)
+
+
+def _count(camera: Camera) -> int:
+    return 0 if camera.distortion is None else camera.distortion.shape[-1]
 
 
 def _size(size: tuple[int, int]) -> tuple[int, int]:

@@ -72,7 +72,8 @@ def load_scene(path: PathLike, materials: bool = True) -> Scene:
 
 
 def save_camera(path: PathLike, camera: Camera) -> None:
-    """Writes a camera, or a batch, as JSON: world_to_camera, K (rows, in pixels), size [H, W] and projection.
+    """Writes a camera, or a batch, as JSON: world_to_camera, K (rows, in pixels), size [H, W], projection, and
+    distortion if it has any.
 
     Raises ValueError (a name that does not end in .json), TypeError or FileNotFoundError (no such folder).
     """
@@ -85,26 +86,28 @@ def save_camera(path: PathLike, camera: Camera) -> None:
         "size": list(camera.size),
         "projection": camera.projection,
     }
+    if camera.distortion is not None:
+        fields["distortion"] = camera.distortion.tolist()
     with replacing(file) as temporary:
         temporary.write_text(json.dumps(fields, indent=1) + "\n", encoding="utf-8")
 
 
 def load_camera(path: PathLike, dtype: torch.dtype = torch.float32) -> Camera:
-    """A camera as save_camera writes it; "projection" may be left out (perspective).
+    """A camera as save_camera writes it; "projection" may be left out (perspective), and "distortion" (none).
 
     Raises FileNotFoundError, or ValueError that names the file and the key.
     """
     file = check_readable(path, (".json",))
-    known = {"world_to_camera", "K", "size", "projection"}
+    known = {"world_to_camera", "K", "size", "projection", "distortion"}
     try:
         fields = json.loads(file.read_text(encoding="utf-8"))
         if not isinstance(fields, dict):
             raise ValueError(f"expected a JSON object with {', '.join(sorted(known))}, got {type(fields).__name__}")
-        for key in sorted(known - {"projection"} - set(fields)):
+        for key in sorted(known - {"projection", "distortion"} - set(fields)):
             raise ValueError(f"{key}: expected this key, got only {', '.join(sorted(fields)) or 'an empty object'}")
         for key in sorted(set(fields) - known):
             raise ValueError(f"{key}: expected only the keys {', '.join(sorted(known))}; remove it")
-        for key in ("world_to_camera", "K"):
+        for key in ("world_to_camera", "K", "distortion")[: 3 if "distortion" in fields else 2]:
             try:
                 fields[key] = torch.tensor(fields[key], dtype=dtype)
             except (TypeError, ValueError) as error:

@@ -17,7 +17,7 @@ from . import _memory as memory
 from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
 from ._kernel import core
 from ._ops import Hits, backward_kernel, forward_kernel, image_room, pass_size
-from ._request import SLOTS, Request, Work, as_scene, label, make_request, required
+from ._request import MOVING, SLOTS, Request, Work, as_scene, label, make_request, required
 from .camera import Camera
 from .mesh import Mesh
 from .render import render
@@ -123,7 +123,7 @@ def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str
 def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term]:
     flat, camera, B = request.scene, request.camera, request.cameras
     work = Work.of(request.gradient, wanted)
-    moves = any(name in wanted for name in ("verts", "world_to_camera", "K"))
+    moves = any(name in wanted for name in MOVING)
 
     # The kernel counts them itself. It is asked whatever is wanted, for it also checks what render() leaves to it.
     with image_room(request):
@@ -196,8 +196,7 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
         ),
         "intersections": Term(
             intersections > 0,
-            no_boundary
-            or (f"{intersections:,} in view" if intersections else "none in view"),
+            no_boundary or (f"{intersections:,} in view" if intersections else "none in view"),
             bytes=bytes_of("intersections"),
         ),
     }

@@ -45,7 +45,7 @@ def radiance(scene: Scene, camera: Camera, points: Tensor, faces: Tensor | None 
     term need. Differentiable in vertices, colours, textures, texture coordinates, background and camera, at fixed
     points. A background image counts with the pixel around the point.
 
-    Raises ValueError for a batch of cameras.
+    Raises ValueError for a batch of cameras, or a lens that distorts.
     """
     points = points.double()
     if faces is None:
@@ -120,6 +120,8 @@ def _project(scene: Scene, camera: Camera) -> tuple[Tensor, Tensor]:
     """Homogeneous image positions P (F, 3 corners, 3) of all faces and the depths Z (F, 3) of their corners."""
     if camera.batch is not None:
         raise ValueError(f"camera: expected a single camera, got a batch of {camera.batch}; call once for each")
+    if camera.lens != "pinhole":
+        raise ValueError(f"camera: expected straight edges to stay straight, got {camera!r}; leave out the distortion")
     M, K = camera.world_to_camera.double(), camera.K.double()
     q = torch.cat([(mesh.verts.double() @ M[:3, :3].mT + M[:3, 3])[mesh.faces.long()] for mesh in scene.meshes])
     X, Y, Z = q.unbind(-1)

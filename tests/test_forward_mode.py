@@ -18,6 +18,7 @@ TRIANGLE = one_triangle()
 MESH, BACKGROUND = TRIANGLE.meshes[0], TRIANGLE.background
 CAMERA = front_camera(SIZE)
 ORTHOGRAPHIC = eg.Camera.orthographic((0.4, 0.3, 4.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.6, (SIZE, SIZE)).to(F64)
+BENT = CAMERA.replace(distortion=torch.tensor([-0.15, 0.05, 0.01, -0.02, 0.02], dtype=F64))
 ADJOINT = smooth_adjoint(SIZE, SIZE, 3)
 SAMPLES = {"surface_samples": 4000, "edge_samples": 4000}
 
@@ -60,6 +61,8 @@ def inputs(scene: eg.Scene, camera: eg.Camera) -> dict[str, list[tuple[Tensor, T
     turn = torch.tensor([[0, -0.3, 0.2, 0.1], [0.3, 0, -0.1, 0.2], [-0.2, 0.1, 0, 0.3], [0, 0, 0, 0]], dtype=F64)
     found["world_to_camera"] = [(camera.world_to_camera, turn)]
     found["K"] = [(camera.K, torch.tensor([[2.0, 0.5, 1.0], [0.3, 1.5, -0.7], [0, 0, 0]], dtype=F64))]
+    if camera.distortion is not None:
+        found["distortion"] = [(camera.distortion, smooth_direction(camera.distortion))]
     return found
 
 
@@ -96,8 +99,16 @@ def crossing_scene() -> eg.Scene:
         (mixed_scene, CAMERA.crop(3, 2, 12, 14), "tent"),
         (crossing_scene, CAMERA, "tent"),
         (crossing_scene, ORTHOGRAPHIC, "box"),
+        (crossing_scene, BENT, "gaussian"),
     ],
-    ids=["perspective box", "orthographic gaussian", "crop tent", "crossing perspective", "crossing orthographic"],
+    ids=[
+        "perspective box",
+        "orthographic gaussian",
+        "crop tent",
+        "crossing perspective",
+        "crossing orthographic",
+        "bent",
+    ],
 )
 def test_forward_is_the_adjoint_of_reverse(scene, camera, filter):
     scene = scene()
@@ -233,7 +244,7 @@ def test_tangents_that_do_not_fit(tangents, message):
 # -- the gradient by places in the image ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("camera", [CAMERA, ORTHOGRAPHIC], ids=["perspective", "orthographic"])
+@pytest.mark.parametrize("camera", [CAMERA, ORTHOGRAPHIC, BENT], ids=["perspective", "orthographic", "bent"])
 @pytest.mark.parametrize(("scene", "filter"), [(mixed_scene, "gaussian"), (crossing_scene, "box")])
 def test_screen_gradient_sums_to_that_of_moving_everything(camera, scene, filter):
     """By (1, 0) and (0, 1) px, as the principal point does."""

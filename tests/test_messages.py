@@ -255,9 +255,9 @@ CAMERAS = {
     "size zero": (lambda: camera(size=(0, 8)), V, "size: expected an int from 1 to 65536, got 0"),
     "size too large": (lambda: look_at(size=(8, 100_000)), V, "size: expected an int from 1 to 65536, got 100000"),
     "projection": (
-        lambda: camera(projection="fisheye"),
+        lambda: camera(projection="panorama"),
         V,
-        'projection: expected "perspective" or "orthographic", got \'fisheye\'',
+        'projection: expected "perspective", "fisheye" or "orthographic", got \'panorama\'',
     ),
     "eye in 2-D": (lambda: look_at(eye=(0.0, 1.0)), V, "eye: expected shape (3,), got (2,)"),
     "eye not finite": (lambda: look_at(eye=(0.0, NAN, 1.0)), V, "eye: expected finite numbers, got nan at [1]"),
@@ -451,7 +451,7 @@ SEEN = np.ones(24, np.uint8)  # the faces of kernel_scene
 
 
 def kernel_camera(pose: torch.Tensor = POSE, intrinsics: torch.Tensor = K) -> object:
-    return core.Camera(pose.contiguous().numpy(), intrinsics.contiguous().numpy(), True, 8, 8)
+    return core.Camera(pose.contiguous().numpy(), intrinsics.contiguous().numpy(), np.zeros(8), True, "pinhole", 8, 8)
 
 
 def pixels(coverage: np.ndarray) -> object:

@@ -51,9 +51,21 @@ K6 = np.array([80.0, 7.0, 33.0, -3.0, 90.0, 25.0])
 perspective = pytest.mark.parametrize("perspective", [True, False], ids=["perspective", "orthographic"])
 
 
-def kernel_camera(k: np.ndarray, perspective: bool) -> core.Camera:
+def kernel_camera(
+    k: np.ndarray, perspective: bool, lens: str = "pinhole", distortion: np.ndarray | None = None
+) -> core.Camera:
     K = np.concatenate([k.reshape(2, 3), [[0.0, 0.0, 1.0]]])
-    return core.Camera(np.eye(4), K, perspective, 64, 48)
+    return core.Camera(np.eye(4), K, np.zeros(8) if distortion is None else distortion, perspective, lens, 64, 48)
+
+
+# By lens: whether it is a perspective view, and coefficients of which each has a derivative.
+LENSES = {
+    "perspective": (True, "pinhole", np.zeros(8)),
+    "orthographic": (False, "pinhole", np.zeros(8)),
+    "brown-conrady": (True, "brown-conrady", np.array([-0.2, 0.07, 0.02, -0.03, 0.04, 0.1, -0.05, 0.03])),
+    "fisheye": (True, "fisheye", np.array([-0.05, 0.04, -0.02, 0.01, 0, 0, 0, 0])),
+}
+lenses = pytest.mark.parametrize("lens", LENSES)
 
 
 def test_cross_vjp():
@@ -64,29 +76,52 @@ def test_dot_vjp():
     check_vjp(lambda a, b: np.array(pieces.dot(a, b)), pieces.dot_vjp, [random(3), random(3, seed=2)])
 
 
-@perspective
-def test_project_vjp(perspective):
-    def forward(q, k):
-        return np.array(pieces.project(kernel_camera(k, perspective), q))
+@lenses
+@pytest.mark.parametrize(
+    "q", [[0.4, -0.7, 2.3], [-0.3, 0.1, 0.4], [0.0, 0.0, 1.3]], ids=["within", "aside", "on the axis"]
+)
+def test_project_vjp(lens, q):
+    perspective, name, distortion = LENSES[lens]
 
-    def vjp(q, k, bar):
-        return pieces.project_vjp(kernel_camera(k, perspective), q, bar)
+    def forward(q, k, d):
+        return np.array(pieces.project(kernel_camera(k, perspective, name, d), q))
 
-    check_vjp(forward, vjp, [np.array([0.4, -0.7, 2.3]), K6])
+    def vjp(q, k, d, bar):
+        return pieces.project_vjp(kernel_camera(k, perspective, name, d), q, bar)
+
+    check_vjp(forward, vjp, [np.array(q), K6, distortion])
 
 
-@perspective
-def test_normalised_vjp(perspective):
-    """In K; a pixel position is where one looks, and has no derivative."""
+@lenses
+def test_normalised_vjp(lens):
+    """In K and the distortion; a pixel position is where one looks, and has no derivative."""
     x = np.array([11.3, 40.2])
+    perspective, name, distortion = LENSES[lens]
 
-    def forward(k):
-        return np.array(pieces.normalised(kernel_camera(k, perspective), x))
+    def forward(k, d):
+        return np.array(pieces.normalised(kernel_camera(k, perspective, name, d), x))
 
-    def vjp(k, bar):
-        return [pieces.normalised_vjp(kernel_camera(k, perspective), x, bar)]
+    def vjp(k, d, bar):
+        return pieces.normalised_vjp(kernel_camera(k, perspective, name, d), x, bar)
 
-    check_vjp(forward, vjp, [K6])
+    check_vjp(forward, vjp, [K6, distortion])
+
+
+@lenses
+def test_bend_jvp_and_area_scale(lens):
+    """Of the straight image, against differences of the positions in the image."""
+    perspective, name, distortion = LENSES[lens]
+    camera, pinhole = kernel_camera(K6, perspective, name, distortion), kernel_camera(K6, perspective)
+    u = np.array(pieces.project(pinhole, [0.2, -0.3, 0.9]))
+
+    def bent(u):
+        return np.array(pieces.bend(camera, u, [0.0, 0.0])[0])
+
+    J = np.stack([(bent(u + h) - bent(u - h)) / 2e-4 for h in 1e-4 * np.eye(2)], 1)
+    tangent = np.array([0.7, -1.9])
+    _, area_scale, along = pieces.bend(camera, u, tangent)
+    np.testing.assert_allclose(along, J @ tangent, rtol=1e-7)
+    np.testing.assert_allclose(area_scale, np.linalg.det(J), rtol=1e-7)
 
 
 def seen_at(perspective: bool, n: np.ndarray, depth: float) -> np.ndarray:
@@ -94,12 +129,14 @@ def seen_at(perspective: bool, n: np.ndarray, depth: float) -> np.ndarray:
     return np.array([*(depth * n if perspective else n), depth])
 
 
-@perspective
-def test_normalised_and_project_are_inverse(perspective):
-    camera, x = kernel_camera(K6, perspective), np.array([11.3, 40.2])
+@lenses
+@pytest.mark.parametrize("x", [[11.3, 40.2], [33.0, 25.0], [0.0, 0.0], [64.0, 48.0]], ids=str)
+def test_normalised_and_project_are_inverse(lens, x):
+    perspective, name, distortion = LENSES[lens]
+    camera = kernel_camera(K6, perspective, name, distortion)
     n = np.array(pieces.normalised(camera, x))
     for depth in (0.5, 3.0):
-        np.testing.assert_allclose(pieces.project(camera, seen_at(perspective, n, depth)), x, rtol=1e-13)
+        np.testing.assert_allclose(pieces.project(camera, seen_at(perspective, n, depth)), x, rtol=1e-13, atol=1e-12)
 
 
 N = np.array([0.03, -0.12])  # inside the image of the triangle below
@@ -145,12 +182,16 @@ def check_jvp(jvp: Arrays | np.ndarray, vjp: Arrays, tangents: Arrays, bar: np.n
     np.testing.assert_allclose(np.sum(bar * np.asarray(jvp)), sum(products), rtol=1e-12)
 
 
-@perspective
-def test_forward_mode_is_the_adjoint(perspective):
-    camera, q, x = kernel_camera(K6, perspective), np.array([0.4, -0.7, 2.3]), np.array([11.3, 40.2])
-    q_dot, k_dot, bar = random(3), random(6, seed=2), random(2, seed=3)
-    check_jvp(pieces.project_jvp(camera, q, q_dot, k_dot), pieces.project_vjp(camera, q, bar), [q_dot, k_dot], bar)
-    check_jvp(pieces.normalised_jvp(camera, x, k_dot), [pieces.normalised_vjp(camera, x, bar)], [k_dot], bar)
+@lenses
+def test_forward_mode_is_the_adjoint(lens):
+    perspective, name, distortion = LENSES[lens]
+    camera = kernel_camera(K6, perspective, name, distortion)
+    q, x = np.array([0.4, -0.7, 2.3]), np.array([11.3, 40.2])
+    q_dot, k_dot, bar = random(3), random(14, seed=2), random(2, seed=3)
+    intrinsics_dot = [k_dot[:6], k_dot[6:]]
+    vjp = pieces.project_vjp(camera, q, bar)
+    check_jvp(pieces.project_jvp(camera, q, q_dot, k_dot), vjp, [q_dot, *intrinsics_dot], bar)
+    check_jvp(pieces.normalised_jvp(camera, x, k_dot), pieces.normalised_vjp(camera, x, bar), intrinsics_dot, bar)
     moved, map_bar = random(3, 3, seed=4), random(3, 3, seed=5)
     vjp = [pieces.face_map_vjp(camera, TRIANGLE, map_bar)]
     check_jvp(pieces.face_map_jvp(camera, TRIANGLE, moved), vjp, [moved], map_bar)

@@ -71,8 +71,8 @@ void with_view(const BackwardInput<T>& input, const GradientOptions& o, const Te
     const bool creases = terms.boundary && may_jump(scene, geometry.topology());
     std::optional<ImageHits> hits;
     if (!o.pixel_spp && (terms.interior() || creases))
-        hits.emplace(scene, vertices, occlusion, geometry.parts(), hit_buffers.seen, team);
-    const bool controls = hits && terms.interior() && o.controls;
+        hits.emplace(scene, camera, vertices, occlusion, geometry.parts(), hit_buffers.seen, team);
+    const bool controls = hits && terms.interior() && o.controls && camera.is_straight();
     const Array<T> vertex_adjoint =
         controls ? adjoint_at_vertices(filtered, vertices, *hits, scene.channels, team) : Array<T>(0);
     body(BackwardView<T>{.scene = scene,
@@ -193,7 +193,7 @@ BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOpt
     with_view(input, o, terms, team, [&](const BackwardView<T>& view) {
         profile.view = watch.lap();
         q_bar = zeros(grad.geometry() ? 3 * scene.n_verts : 0, team);
-        to.want_k = grad.K;
+        to.want_k = grad.K || grad.distortion;
         to.q = grad.geometry() ? q_bar.data() : nullptr;
         to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels;
         dispatch_channels(scene.channels, [&]<int N>() {
@@ -203,7 +203,9 @@ BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOpt
     watch.lap();
     if (grad.geometry()) add_world(camera, scene.verts, q_bar, team, grad);
     if (grad.K)
-        for (int i = 0; i < 6; ++i) grad.K[i] += to.k[i];
+        for (int i = 0; i < 6; ++i) grad.K[i] += to.k.k[i];
+    if (grad.distortion)
+        for (int i = 0; i < most_coefficients; ++i) grad.distortion[i] += to.k.distortion[i];
     profile.world = watch.lap();
     return profile;
 }

@@ -21,12 +21,15 @@ class ImageHits {
    public:
     // `seen` (F,): see HitBuffers.
     template <class T>
-    ImageHits(const SceneView<T>& scene, const VertexView& vertices, const OcclusionHint& occlusion, const Parts& parts,
-              const uint8_t* seen, Team& team)
+    ImageHits(const SceneView<T>& scene, const Camera& camera, const VertexView& vertices,
+              const OcclusionHint& occlusion, const Parts& parts, const uint8_t* seen, Team& team)
         : parts_(parts), at_(scene.n_verts), share_(2 * parts.size()) {
         team.each_block(scene.n_verts, [&](int64_t, int64_t first, int64_t last) {
             for (int64_t v = first; v < last; ++v)
-                at_[v] = !vertices.outcode[v] && occlusion.hides_around(vertices.x[v], vertices.q[v].z) ? behind : 0;
+                at_[v] = camera.is_straight() && !vertices.outcode[v] &&
+                                 occlusion.hides_around(vertices.x[v], vertices.q[v].z)
+                             ? behind
+                             : 0;
         });
         std::vector<int32_t> hits(2 * parts_.size(), 0);  // faces that were hit, by part and side
         const auto mark = [&](const int32_t* v, uint8_t bit) {

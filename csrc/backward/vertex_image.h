@@ -33,17 +33,17 @@ Array<T> adjoint_at_vertices(const FilteredAdjoint<T>& filtered, const VertexVie
 template <class T>
 void add_places(const BackwardView<T>& view, const Array<double>& x_bar, Destination& to) {
     const int64_t V = view.scene.n_verts, blocks = Team::blocks(V);
-    std::vector<double> k_bar(6 * blocks, 0.0);
+    std::vector<IntrinsicsGrad> intrinsics(blocks);
     view.team.each_block(V, [&](int64_t k, int64_t first, int64_t last) {
         for (int64_t v = first; v < last; ++v) {
             const Vec2 x{x_bar[2 * v], x_bar[2 * v + 1]};
             if (x.x == 0 && x.y == 0) continue;
             Vec3 q;
-            project_vjp(view.camera, view.vertices.q[v], x, q, k_bar.data() + 6 * k);
+            project_vjp(view.camera, view.vertices.q[v], x, q, intrinsics[k]);
             to.q[3 * v] += q.x, to.q[3 * v + 1] += q.y, to.q[3 * v + 2] += q.z;
         }
     });
-    for (int64_t i = 0; i < 6 * blocks; ++i) to.k[i % 6] += k_bar[i];
+    for (const IntrinsicsGrad& g : intrinsics) to.k += g;
 }
 
 }  // namespace edgegrad

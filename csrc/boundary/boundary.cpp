@@ -42,10 +42,12 @@ class CurveSamples {
     // The point at the fraction s of the curve.
     void add(const typename Source::Curve& curve, double s, double weight) {
         const int i = rays_.count;
-        const Vec2 x = source_.position(curve, s);
-        if (!contraction_.wants(i, x)) return;
+        const Vec2 u = source_.position(curve, s);
+        const auto [x, area_scale] = bend(view_.camera, u);
+        if (area_scale == 0 || !contraction_.wants(i, x)) return;
         typename Source::Sample& sample = sample_[i];
-        sample.x = x, sample.n = normalised(view_.camera, x), sample.weight = weight;
+        sample.u = u, sample.n = normalised(view_.camera, u), sample.weight = weight;
+        sample.x = x, sample.area_scale = area_scale;
         if (!source_.place(curve, s, sample)) return;
         rays_.n_x[i] = sample.n.x, rays_.n_y[i] = sample.n.y;
         ignored_[i] = sample.ignored;

@@ -94,7 +94,7 @@ class MeasuredEdges {
             Curve c;
             if (!finder_.find(e, c)) return;
             ++(c.is_crease() ? found.creases : found.silhouettes);
-            const Vec2 low = c.low(), high = c.high();
+            const auto [low, high] = view_.camera.image_box(c.low(), c.high());
             const Jump jump{int64_t(curves.size()), size_of_jump(c), view_.importance.mean(low, high)};
             if (!(jump.importance > 0) || !std::isfinite(c.length)) return;
             curves.push_back({.edge = int32_t(e)});
@@ -184,7 +184,7 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
             IntersectionCurve c;
             if (!find_intersection(view, out.finder.facing(), all[i], c)) continue;
             ++found[k].intersections;
-            const Vec2 low = c.low(), high = c.high();
+            const auto [low, high] = view.camera.image_box(c.low(), c.high());
             const double importance = view.importance.mean(low, high);
             if (!(importance > 0)) continue;
             const int64_t hiding = hiding_pixels(view.occlusion, low, high, c.nearest_depth());
@@ -219,7 +219,9 @@ std::vector<std::vector<ImageSegment>> silhouettes(const BackwardView<T>& view, 
 template <class T>
 Curves<T>::Curves(const BackwardView<T>& view, Array<int8_t> facing)
     : finder(view, std::move(facing)),
-      x_bar(zeros(view.hits && finder.finds_creases() && view.options.controls ? 2 * view.scene.n_verts : 0,
+      x_bar(zeros(view.hits && finder.finds_creases() && view.options.controls && view.camera.is_straight()
+                      ? 2 * view.scene.n_verts
+                      : 0,
                   view.team)) {}
 
 template <class T>

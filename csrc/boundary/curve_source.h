@@ -32,7 +32,9 @@ struct CurveFaces {
 };
 
 struct CurveSample {
-    Vec2 x, n;          // the pixel position, and its normalised image coordinates
+    Vec2 u, n;              // the place in the straight image, and its normalised coordinates
+    Vec2 x;                 // the pixel position
+    double area_scale = 1;  // how much larger an area is there than in the straight image
     Vec3 point;         // camera coordinates
     double weight = 0;  // inverse of the density of samples along the curve's fraction s
     SurfacePoint behind = {};

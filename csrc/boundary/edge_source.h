@@ -96,16 +96,16 @@ class EdgeSource {
 
     // δx ∧ τ = δx · (τ_y, −τ_x).
     Vec2 normal(const Sample& sample) const {
-        const Vec2 tangent = place_[sample.place].own.curve.tangent();
+        const Vec2 tangent = bent_tangent(sample);
         return {tangent.y, -tangent.x};
     }
 
     // δx ∧ τ of the point, with the vertices of the faces on either side in equal parts, as flush() has it.
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
         const Curve& curve = place_[sample.place].own.curve;
-        const Vec2 tangent = curve.tangent();
+        const Vec2 tangent = bent_tangent(sample);
         const auto velocity = [&](Vec3 point, Vec3 point_dot) {
-            return wedge(project_jvp(view_.camera, point, point_dot, direction.k.data()), tangent);
+            return wedge(project_jvp(view_.camera, point, point_dot, direction.intrinsics), tangent);
         };
         Vec3 point_dot;
         for (const HalfEdge* h : {&curve.minus, &curve.plus}) {
@@ -125,7 +125,7 @@ class EdgeSource {
     void add_motion(const Sample& sample, CurveJumps jumps, ChunkGrad& grad) {
         const Curve& curve = place_[sample.place].own.curve;
         const CoincidentShare& share = sample.share;
-        const Vec2 tangent = curve.tangent();
+        const Vec2 tangent = bent_tangent(sample);
         const auto move = [&](Vec3 point, double jump) {
             Vec3 point_bar;
             project_vjp(view_.camera, point, {jump * tangent.y, -jump * tangent.x}, point_bar, grad.k);
@@ -187,6 +187,11 @@ class EdgeSource {
         return others_[k] = coincidence_.on_line(c, line);
     }
 
+    // dx/ds at the pixel position.
+    Vec2 bent_tangent(const Sample& sample) const {
+        return bend_jvp(view_.camera, sample.n, place_[sample.place].own.curve.tangent());
+    }
+
     // What the curves that lie on this one leave to a sample of it; false if nothing. Gathers their faces.
     bool share(Place& place, Sample& sample) {
         const Curve curve = place.own.curve;
@@ -194,13 +199,13 @@ class EdgeSource {
         std::vector<int32_t>& ignored = sample.gathered;
         const auto begin = [&] {
             if (!place.with_faces) place.own = coincidence_.on_line(curve, curve), place.with_faces = true;
-            coincidence_.start(place.own, sample.x, sample.t);
+            coincidence_.start(place.own, sample.u, sample.t);
         };
         bool alone = true, visible = true;
         const auto add = [&](const ImageSegment& o) {
             if (alone) begin(), alone = false;
             const auto faces = topology.faces(o.edge);
-            const Vec2 along = o.b - o.a, from = sample.x - o.a;
+            const Vec2 along = o.b - o.a, from = sample.u - o.a;
             const double squared = along.x * along.x + along.y * along.y,
                          s = (from.x * along.x + from.y * along.y) / squared;
             const double apart = std::fabs(wedge(along, from)) / std::sqrt(squared);
@@ -220,7 +225,7 @@ class EdgeSource {
         };
         asked_.clear();
         for (const int32_t f : place.faces.faces) asked_.insert(f);
-        if (place.segment) coincident_.at(*place.segment, sample.x, add);
+        if (place.segment) coincident_.at(*place.segment, sample.u, add);
         if (!visible) return false;
         if (alone) {
             if (!place.edge_on) return true;

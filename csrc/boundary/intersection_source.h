@@ -9,6 +9,8 @@
 // x: on the plane with the normal N, through q_i, along the ray q(z) at x,
 //
 //     (N · dq/dz) δz = N · (Σ b_i δq_i − δq(z)).
+//
+// Where a lens bends the image, dℓ / |∇F| is that of the straight image times the area scale.
 #pragma once
 
 #include <algorithm>
@@ -93,13 +95,13 @@ class IntersectionSource {
     // The curve moves with δx as F does with −δx.
     Vec2 normal(const Sample& sample) const {
         const Place& place = place_[sample.place];
-        return (-place.scale) * place.gradient;
+        return (-place.scale * sample.area_scale) * pixel_vjp(view_.camera, sample.n, place.slope);
     }
 
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
         const Place& place = place_[sample.place];
         const double z = sample.point.z;
-        const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.k.data());
+        const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
         double F_dot = 0;
         for (int k = 0; k < 2; ++k) {
             const Vec3 N = place.plane[k].normal;
@@ -109,13 +111,13 @@ class IntersectionSource {
                          dot(N, direction.q[view_.scene.faces[3 * int64_t(place.curve.faces->face[k]) + i]]);
             F_dot += (k ? -1 : 1) * view_.camera.affine_depth_slope(z) * moved / view_.camera.along_ray(N, sample.n);
         }
-        return {place.scale * F_dot, 0};
+        return {place.scale * sample.area_scale * F_dot, 0};
     }
 
     void add_motion(const Sample& sample, CurveJumps jumps, ChunkGrad& grad) {
         const Place& place = place_[sample.place];
         if (current_ != place.curve.faces) finish(grad), current_ = place.curve.faces;
-        const double z = sample.point.z, F_bar = place.scale * jumps.first;
+        const double z = sample.point.z, F_bar = place.scale * sample.area_scale * jumps.first;
         Vec2 n_bar;
         for (int k = 0; k < 2; ++k) {
             const Vec3 N = place.plane[k].normal;
@@ -150,8 +152,8 @@ class IntersectionSource {
     struct Place {
         Curve curve;
         Plane plane[2];
-        Vec2 gradient;  // ∇F, by the place in the image
-        double scale;   // length / |∇F|, times the weight of the intersection
+        Vec2 slope;    // ∂F/∂n
+        double scale;  // length / |∇F| in the straight image, times the weight of the intersection
         CurveFaces faces;
     };
 
@@ -160,7 +162,7 @@ class IntersectionSource {
         const Camera& camera = view_.camera;
         const int32_t (&face)[2] = curve.faces->face;
         place.faces = {face, 0, 0};
-        Vec2 slope;  // ∂F/∂n
+        Vec2& slope = place.slope = {};
         for (int k = 0; k < 2; ++k) {
             const auto q = corners_of(view_, face[k]);
             Plane& plane = place.plane[k];
@@ -175,8 +177,7 @@ class IntersectionSource {
                         std::max(place.faces.coordinate, std::fabs(view_.scene.verts[3 * int64_t(v) + axis]));
             }
         }
-        place.gradient = pixel_vjp(camera, slope);
-        place.scale = curve.faces->weight * curve.length / length(place.gradient);
+        place.scale = curve.faces->weight * curve.length / length(place_vjp(camera, slope));
     }
 
     const BackwardView<T>& view_;

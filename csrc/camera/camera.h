@@ -1,18 +1,42 @@
 // Cameras: point → pixel and back, in camera coordinates q = R p + t; each with its _vjp.
 //
-// A camera is a projection to normalised image coordinates n (projection.h) and the affine map K of these. World
-// coordinates come in only at the ends: vertices are transformed once, and the cotangents of q are turned into those of
-// p, R and t once, when all samples are done.
+// A camera is a projection to normalised image coordinates n (projection.h), a lens that may bend these to m (lens.h),
+// and the affine map K of m. K n is the straight image; of a pinhole it is the image. World coordinates come in only at
+// the ends: vertices are transformed once, and the cotangents of q are turned into those of p, R and t once, when all
+// samples are done.
 #pragma once
 
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <utility>
 
+#include "camera/lens.h"
 #include "camera/projection.h"
 #include "core/math.h"
 
 namespace edgegrad {
+
+// Cotangents, or tangents, of what an image is made with.
+struct IntrinsicsGrad {
+    double k[6] = {};  // the upper rows of K
+    double distortion[most_coefficients] = {};
+
+    IntrinsicsGrad& operator+=(const IntrinsicsGrad& o) {
+        for (int i = 0; i < 6; ++i) k[i] += o.k[i];
+        for (int i = 0; i < most_coefficients; ++i) distortion[i] += o.distortion[i];
+        return *this;
+    }
+};
+
+// What is visible through a lens that bends: a disc, and the box of the straight image, px, in which all lies that a
+// pixel filter reaches; and how far bending moves places there, at most: |∂x/∂u| entry by entry.
+struct LensView {
+    LensDisc disc;
+    bool folds = false;  // whether the image reaches beyond the disc
+    Vec2 low, high;
+    Mat2 most = {1, 0, 0, 1};
+};
 
 struct Camera {
     Mat3 R;
@@ -24,10 +48,13 @@ struct Camera {
     double k_det;
     double k_inverse[4];     // of the 2 × 2 part of K, row by row
     double pixels_per_unit;  // at most, of normalised image coordinates
+    AnyLens lens;
+    LensView lens_view;
 
     // world_to_camera (4, 4) and K (3, 3), row by row.
-    Camera(const double* world_to_camera, const double* K, bool perspective_, int width_, int height_)
-        : perspective(perspective_), width(width_), height(height_) {
+    Camera(const double* world_to_camera, const double* K, bool perspective_, int width_, int height_,
+           const AnyLens& lens_ = StraightLens())
+        : perspective(perspective_), width(width_), height(height_), lens(lens_) {
         for (int i = 0; i < 3; ++i)
             R.row[i] = {world_to_camera[4 * i], world_to_camera[4 * i + 1], world_to_camera[4 * i + 2]};
         // An orthographic view is the same from any distance; from none, depths are rounded least.
@@ -38,7 +65,11 @@ struct Camera {
         k_det = k[0] * k[4] - k[1] * k[3];
         k_inverse[0] = k[4] / k_det, k_inverse[1] = -k[1] / k_det;
         k_inverse[2] = -k[3] / k_det, k_inverse[3] = k[0] / k_det;
+        if (!is_straight()) lens_view = view_through_lens();
     }
+
+    // Whether straight edges are straight in the image.
+    bool is_straight() const { return std::holds_alternative<StraightLens>(lens); }
 
     Vec3 to_camera(Vec3 p) const { return R * p + t; }
 
@@ -105,58 +136,155 @@ struct Camera {
     uint8_t side(Vec3 q0, Vec3 q1, Vec3 q2) const {
         return dot(view_direction(q0), cross(q1 - q0, q2 - q0)) > 0 ? 1 : 2;
     }
+
+    // A box of the image in which all of a box of the straight image is seen.
+    std::pair<Vec2, Vec2> image_box(Vec2 low, Vec2 high) const;
+
+   private:
+    LensView view_through_lens() const;
 };
 
-// Pixel position of q.
+// Position of q in the straight image, px.
 inline Vec2 project(const Camera& c, Vec3 q) {
     const double w = 1.0 / c.depth_weight(q);
     const Vec2 n{q.x * w, q.y * w};
     return {c.k[0] * n.x + c.k[1] * n.y + c.k[2], c.k[3] * n.x + c.k[4] * n.y + c.k[5]};
 }
 
-inline void project_vjp(const Camera& c, Vec3 q, Vec2 bar, Vec3& q_bar, double k_bar[6]) {
+// x = A m + c and its derivative; a place in m, or in n for the straight image.
+inline Vec2 to_pixels(const Camera& c, Vec2 m) {
+    return {c.k[0] * m.x + c.k[1] * m.y + c.k[2], c.k[3] * m.x + c.k[4] * m.y + c.k[5]};
+}
+inline void to_pixels_vjp(const Camera& c, Vec2 m, Vec2 bar, Vec2& m_bar, double k_bar[6]) {
+    k_bar[0] += bar.x * m.x, k_bar[1] += bar.x * m.y, k_bar[2] += bar.x;
+    k_bar[3] += bar.y * m.x, k_bar[4] += bar.y * m.y, k_bar[5] += bar.y;
+    m_bar += Vec2{c.k[0] * bar.x + c.k[3] * bar.y, c.k[1] * bar.x + c.k[4] * bar.y};
+}
+
+// Of bend(project(q)): the pixel position of q.
+inline void project_vjp(const Camera& c, Vec3 q, Vec2 bar, Vec3& q_bar, IntrinsicsGrad& intrinsics) {
     const double w = 1.0 / c.depth_weight(q);
     const Vec2 n{q.x * w, q.y * w};
-    k_bar[0] += bar.x * n.x, k_bar[1] += bar.x * n.y, k_bar[2] += bar.x;
-    k_bar[3] += bar.y * n.x, k_bar[4] += bar.y * n.y, k_bar[5] += bar.y;
-    const Vec2 n_bar{c.k[0] * bar.x + c.k[3] * bar.y, c.k[1] * bar.x + c.k[4] * bar.y};
+    Vec2 n_bar;
+    if (c.is_straight()) {
+        to_pixels_vjp(c, n, bar, n_bar, intrinsics.k);
+    } else {
+        Vec2 m_bar;
+        with_lens(c.lens, [&](const auto& lens) {
+            to_pixels_vjp(c, lens.bend(n), bar, m_bar, intrinsics.k);
+            lens.bend_vjp(n, m_bar, n_bar, intrinsics.distortion);
+        });
+    }
     const double w_bar = -(n_bar.x * n.x + n_bar.y * n.y) * w;
     q_bar += Vec3{n_bar.x * w, n_bar.y * w, c.projection([&](auto p) { return p.weight_vjp(w_bar); })};
 }
 
-inline Vec2 project_jvp(const Camera& c, Vec3 q, Vec3 q_dot, const double k_dot[6]) {
+// Tangents of the coefficients, as those of m at fixed n: the rows of what bend_vjp is the adjoint of.
+inline Vec2 bend_by_coefficients(const Camera& c, Vec2 n, const double* distortion_dot) {
+    const auto along = [&](Vec2 bar) {
+        Vec2 ignored;
+        double c_bar[most_coefficients] = {}, sum = 0;
+        with_lens(c.lens, [&](const auto& lens) { lens.bend_vjp(n, bar, ignored, c_bar); });
+        for (int i = 0; i < most_coefficients; ++i) sum += c_bar[i] * distortion_dot[i];
+        return sum;
+    };
+    return {along({1, 0}), along({0, 1})};
+}
+
+// δA m + δc, and A δm.
+inline Vec2 to_pixels_by_k(Vec2 m, const double k_dot[6]) {
+    return {k_dot[0] * m.x + k_dot[1] * m.y + k_dot[2], k_dot[3] * m.x + k_dot[4] * m.y + k_dot[5]};
+}
+inline Vec2 scaled_to_pixels(const Camera& c, Vec2 m_dot) {
+    return {c.k[0] * m_dot.x + c.k[1] * m_dot.y, c.k[3] * m_dot.x + c.k[4] * m_dot.y};
+}
+
+inline Vec2 project_jvp(const Camera& c, Vec3 q, Vec3 q_dot, const IntrinsicsGrad& intrinsics) {
     const double w = 1.0 / c.depth_weight(q);
     const Vec2 n{q.x * w, q.y * w};
     const double w_dot = c.projection([&](auto p) { return p.weight_jvp(q_dot); });
     const Vec2 n_dot{(q_dot.x - w_dot * n.x) * w, (q_dot.y - w_dot * n.y) * w};
-    return {c.k[0] * n_dot.x + c.k[1] * n_dot.y + k_dot[0] * n.x + k_dot[1] * n.y + k_dot[2],
-            c.k[3] * n_dot.x + c.k[4] * n_dot.y + k_dot[3] * n.x + k_dot[4] * n.y + k_dot[5]};
+    if (c.is_straight()) return scaled_to_pixels(c, n_dot) + to_pixels_by_k(n, intrinsics.k);
+    Vec2 m, m_dot = bend_by_coefficients(c, n, intrinsics.distortion);
+    with_lens(c.lens, [&](const auto& lens) { m = lens.bend(n), m_dot += lens.jacobian(n) * n_dot; });
+    return scaled_to_pixels(c, m_dot) + to_pixels_by_k(m, intrinsics.k);
 }
 
-// Normalised image coordinates of a pixel position: n = A⁻¹ (x − c), with A the 2 × 2 part of K and c its last column.
-inline Vec2 normalised(const Camera& c, Vec2 x) {
-    const double dx = x.x - c.k[2], dy = x.y - c.k[5], *A = c.k_inverse;
+// n = A⁻¹ (u − c) of a place in the straight image, with A the 2 × 2 part of K and c its last column.
+inline Vec2 normalised(const Camera& c, Vec2 u) {
+    const double dx = u.x - c.k[2], dy = u.y - c.k[5], *A = c.k_inverse;
     return {A[0] * dx + A[1] * dy, A[2] * dx + A[3] * dy};
 }
 
-// δn = −A⁻¹ (δA n + δc). A pixel position is where one looks, and has no derivative.
-inline void normalised_vjp(const Camera& c, Vec2 n, Vec2 bar, double k_bar[6]) {
+// Of what is seen at a pixel position x, A m(n) + c = x. Where one looks has no derivative: with J = ∂m/∂n,
+//
+//     δn = −J⁻¹ (A⁻¹ (δA m + δc) + ∂m/∂d δd).
+inline void normalised_vjp(const Camera& c, Vec2 n, Vec2 bar, IntrinsicsGrad& intrinsics) {
+    Vec2 m = n, m_bar{-bar.x, -bar.y};
+    if (!c.is_straight())
+        with_lens(c.lens, [&](const auto& lens) {
+            m = lens.bend(n);
+            const Mat2 inverse = edgegrad::inverse(lens.jacobian(n));
+            m_bar = transposed_times(inverse, m_bar);
+            Vec2 ignored;
+            lens.bend_vjp(n, m_bar, ignored, intrinsics.distortion);
+        });
+    const double *A = c.k_inverse, x = A[0] * m_bar.x + A[2] * m_bar.y, y = A[1] * m_bar.x + A[3] * m_bar.y;  // A⁻ᵀ m̄
+    double* k_bar = intrinsics.k;
+    k_bar[0] += x * m.x, k_bar[1] += x * m.y, k_bar[2] += x;
+    k_bar[3] += y * m.x, k_bar[4] += y * m.y, k_bar[5] += y;
+}
+
+// Where the place u of the straight image is seen, and how much larger an area is there; 0: nowhere.
+struct Bent {
+    Vec2 x;
+    double area_scale = 1;
+};
+inline Bent bend(const Camera& c, Vec2 u) {
+    if (c.is_straight()) return {u};
+    const Vec2 n = normalised(c, u);
+    if (!(length(n) < c.lens_view.disc.fold)) return {u, 0};
+    return with_lens(c.lens,
+                     [&](const auto& lens) { return Bent{to_pixels(c, lens.bend(n)), determinant(lens.jacobian(n))}; });
+}
+
+// ∂x/∂u · tangent, at the place n: A J A⁻¹.
+inline Vec2 bend_jvp(const Camera& c, Vec2 n, Vec2 tangent) {
+    if (c.is_straight()) return tangent;
+    const double *A = c.k, *I = c.k_inverse;
+    const Vec2 along{I[0] * tangent.x + I[1] * tangent.y, I[2] * tangent.x + I[3] * tangent.y};
+    const Vec2 m = with_lens(c.lens, [&](const auto& lens) { return lens.jacobian(n) * along; });
+    return {A[0] * m.x + A[1] * m.y, A[3] * m.x + A[4] * m.y};
+}
+
+// The place in the straight image of what is seen at x; not numbers where nothing is.
+inline Vec2 straighten(const Camera& c, Vec2 x) {
+    if (c.is_straight()) return x;
+    constexpr double nan = std::numeric_limits<double>::quiet_NaN();
+    const auto n = straighten(c.lens, c.lens_view.disc, normalised(c, x));
+    return n ? to_pixels(c, *n) : Vec2{nan, nan};
+}
+
+inline Vec2 normalised_jvp(const Camera& c, Vec2 n, const IntrinsicsGrad& intrinsics) {
     const double* A = c.k_inverse;
-    const Vec2 m{A[0] * bar.x + A[2] * bar.y, A[1] * bar.x + A[3] * bar.y};  // A⁻ᵀ n̄
-    k_bar[0] -= m.x * n.x, k_bar[1] -= m.x * n.y, k_bar[2] -= m.x;
-    k_bar[3] -= m.y * n.x, k_bar[4] -= m.y * n.y, k_bar[5] -= m.y;
+    const auto by_pixel = [&](Vec2 x) { return Vec2{A[0] * x.x + A[1] * x.y, A[2] * x.x + A[3] * x.y}; };
+    if (c.is_straight()) return -1 * by_pixel(to_pixels_by_k(n, intrinsics.k));
+    return with_lens(c.lens, [&](const auto& lens) {
+        const Vec2 m_dot = by_pixel(to_pixels_by_k(lens.bend(n), intrinsics.k)) +
+                           bend_by_coefficients(c, n, intrinsics.distortion);
+        return -1 * (inverse(lens.jacobian(n)) * m_dot);
+    });
 }
 
-inline Vec2 normalised_jvp(const Camera& c, Vec2 n, const double k_dot[6]) {
-    const double *A = c.k_inverse, x = k_dot[0] * n.x + k_dot[1] * n.y + k_dot[2],
-                 y = k_dot[3] * n.x + k_dot[4] * n.y + k_dot[5];
-    return {-(A[0] * x + A[1] * y), -(A[2] * x + A[3] * y)};
-}
-
-// ∂n/∂x, backwards: A⁻ᵀ n̄, the cotangent of the pixel position.
-inline Vec2 pixel_vjp(const Camera& c, Vec2 n_bar) {
+// ∂n/∂u, backwards: A⁻ᵀ n̄, the cotangent of the place in the straight image; and that of the pixel position.
+inline Vec2 place_vjp(const Camera& c, Vec2 n_bar) {
     const double* A = c.k_inverse;
     return {A[0] * n_bar.x + A[2] * n_bar.y, A[1] * n_bar.x + A[3] * n_bar.y};
+}
+inline Vec2 pixel_vjp(const Camera& c, Vec2 n, Vec2 n_bar) {
+    if (c.is_straight()) return place_vjp(c, n_bar);
+    return place_vjp(
+        c, with_lens(c.lens, [&](const auto& lens) { return transposed_times(inverse(lens.jacobian(n)), n_bar); }));
 }
 
 }  // namespace edgegrad

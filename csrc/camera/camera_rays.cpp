@@ -1,6 +1,7 @@
 #include "camera/camera_rays.h"
 
 #include <algorithm>
+#include <cmath>
 
 namespace edgegrad {
 
@@ -12,7 +13,8 @@ CameraFrame::CameraFrame(const RayCaster& caster, const Camera& camera)
       axis_z_(camera.R_inverse * Vec3{0, 0, 1}),
       eye_(frame_.position(camera.R_inverse * -camera.t)),
       perspective_(camera.perspective),
-      far_(!camera.perspective || frame_.is_far(eye_)) {}
+      far_(!camera.perspective || frame_.is_far(eye_)),
+      straight_(camera.is_straight()) {}
 
 double CameraFrame::error(Vec3 p) const {
     // Positions are rounded as far from the centre as they are; rays where they start: see prepare().
@@ -41,6 +43,10 @@ template <int W>
         const double *x = n_x + k, *y = n_y + k;
         EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.t_far[i] = std::numeric_limits<float>::infinity();
         EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.geometry[i] = RayPacket<W>::nothing;
+        // Where a lens shows nothing, there is no ray: one that ends before it starts.
+        if (!camera_.straight_)
+            for (int i = 0; i < W; ++i)
+                if (!std::isfinite(x[i])) p.t_far[i] = -1;
         if (!camera_.far_) {
             EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.direction_x[i] = float(x[i] * X.x + y[i] * Y.x + Z.x);
             EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.direction_y[i] = float(x[i] * X.y + y[i] * Y.y + Z.y);

@@ -29,7 +29,7 @@ class CameraFrame {
     RayFrame frame_;
     Vec3 axis_x_, axis_y_, axis_z_;  // of the camera, in world coordinates times whatever scale they have
     Vec3 eye_;
-    bool perspective_, far_;
+    bool perspective_, far_, straight_;
 };
 
 // Rays by where they go in the image.

@@ -9,7 +9,8 @@
 
 namespace edgegrad {
 
-// The image rectangle widened by the radius of the pixel filter, as four planes n · q + d ≥ 0 through the camera and
+// The rectangle of the straight image in which all lies that is seen, the image widened by the radius of the pixel
+// filter, as four planes n · q + d ≥ 0 through the camera and
 // the rectangle's sides. Whatever lies inside all four is in front of the camera (adding opposite planes gives
 // Z · width ≥ 0), so no near plane is needed.
 struct ViewVolume {
@@ -18,6 +19,7 @@ struct ViewVolume {
     Vec2 low, high;  // of the rectangle
 
     ViewVolume(const Camera& c, double margin) : low{-margin, -margin}, high{c.width + margin, c.height + margin} {
+        if (!c.is_straight()) low = c.lens_view.low, high = c.lens_view.high;
         const double bound[4] = {low.x, high.x, low.y, high.y};
         for (int i = 0; i < 4; ++i) {
             const double* row = c.k + (i < 2 ? 0 : 3);

@@ -22,7 +22,8 @@ void shade_at(const SceneView<T>& scene, const Camera& camera, int64_t n, const 
         const int32_t* v = scene.faces + 3 * int64_t(faces[i]);
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
         Barycentrics b;
-        barycentrics(face_map(camera, corner), normalised(camera, {points[2 * i], points[2 * i + 1]}), b);
+        barycentrics(face_map(camera, corner),
+                     normalised(camera, straighten(camera, {points[2 * i], points[2 * i + 1]})), b);
         shade<0>(scene, faces[i], b, radiance + i * scene.channels);
     }
 }
@@ -39,7 +40,7 @@ void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, co
     for (int64_t i = 0; i < n; ++i) {
         const int32_t *v = scene.faces + 3 * int64_t(faces[i]), *row = scene.corners + 3 * int64_t(faces[i]);
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
-        const Vec2 n = normalised(camera, {points[2 * i], points[2 * i + 1]});
+        const Vec2 n = normalised(camera, straighten(camera, {points[2 * i], points[2 * i + 1]}));
         const FaceMap map = face_map(camera, corner);
         const int width = is_textured(scene, faces[i]) ? 2 : scene.channels;
         Barycentrics b;
@@ -63,7 +64,7 @@ void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, co
     chunk.q.add_to(q_bar.data(), 0), chunk.colors.add_to(grad.colors, 0);
     chunk.uvs.add_to(grad.uvs, 0), chunk.texels.add_to(grad.texels, 0);
     add_world(camera, scene.verts, q_bar, team, grad);
-    for (int i = 0; i < 6; ++i) grad.K[i] += chunk.k[i];
+    for (int i = 0; i < 6; ++i) grad.K[i] += chunk.k.k[i];
 }
 
 void cast_rays(const RayCaster& caster, const RayArrays& rays, const IgnoredArrays& ignored, int32_t* face,

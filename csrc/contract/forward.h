@@ -1,7 +1,6 @@
 // Forward mode: derivatives in given directions. What a sample finds is added to the pixels around it.
 #pragma once
 
-#include <array>
 #include <span>
 #include <vector>
 
@@ -12,11 +11,11 @@
 
 namespace edgegrad {
 
-// One direction: the tangents of the arrays, and what follows from them for the vertices in the camera and for K.
+// One direction: the tangents of the arrays, and what follows from them for the vertices in the camera and for its intrinsics.
 struct Direction {
     Tangents tangents;
     Array<Vec3> q{0};           // (V,) camera coordinates; empty: nothing moves
-    std::array<double, 6> k{};  // the upper rows of K
+    IntrinsicsGrad intrinsics;
 
     bool moves() const { return !q.empty(); }
 };
@@ -26,7 +25,9 @@ inline Direction make_direction(const Tangents& tangents, const Camera& camera, 
                                 Team& team) {
     Direction out{.tangents = tangents};
     if (!tangents.geometry()) return out;
-    if (tangents.K) std::copy(tangents.K, tangents.K + 6, out.k.begin());
+    if (tangents.K) std::copy(tangents.K, tangents.K + 6, out.intrinsics.k);
+    if (tangents.distortion)
+        std::copy(tangents.distortion, tangents.distortion + most_coefficients, out.intrinsics.distortion);
     out.q = Array<Vec3>(n_verts);
     const auto at = [](const double* a) { return Vec3{a[0], a[1], a[2]}; };
     team.each_block(n_verts, [&](int64_t, int64_t first, int64_t last) {

@@ -10,6 +10,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "camera/camera.h"
 #include "core/parallel.h"
 #include "core/stopwatch.h"
 #include "scene/scene.h"
@@ -93,14 +94,14 @@ class RowBuffer {
 struct ChunkGrad {
     RowBuffer q, x, colors, uvs, texels;  // vertices: q in camera coordinates, x in the image
     RowBuffer pixels;                     // of what has the size of the image
-    double k[6] = {};                     // the upper rows of K
+    IntrinsicsGrad k;
 };
 
 // Where it goes; null where none is wanted.
 struct Destination {
     double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr, *pixels = nullptr;
     int pixel_width = 0;  // numbers a pixel
-    double k[6] = {};
+    IntrinsicsGrad k;
     bool want_k = false;
 };
 
@@ -164,8 +165,7 @@ class Scatter {
                     for (const RowSlot& slot : row_slots)
                         if (double* const there = to.*slot.to) (grads_[i].*slot.rows).add_to(there, int(owner));
             });
-            for (int64_t i = 0; i < chunks; ++i)
-                for (int c = 0; c < 6; ++c) to.k[c] += grads_[i].k[c];
+            for (int64_t i = 0; i < chunks; ++i) to.k += grads_[i].k;
             seconds[1] += watch.lap();
         }
     }
@@ -181,7 +181,7 @@ class Scatter {
             if (to.*slot.to) rows.prepare(width, owners);
             rows.clear();
         }
-        std::fill(g.k, g.k + 6, 0.0);
+        g.k = {};
     }
 
     Team& team_;

@@ -68,6 +68,20 @@ inline double rounding_of_triple_product(Vec3 a, Vec3 b, Vec3 c) {
     return 4 * std::numeric_limits<double>::epsilon() * sum(a) * sum(b) * sum(c);
 }
 
+struct Mat2 {
+    double xx, xy, yx, yy;
+};
+
+inline Vec2 operator*(const Mat2& m, Vec2 v) { return {m.xx * v.x + m.xy * v.y, m.yx * v.x + m.yy * v.y}; }
+inline Vec2 transposed_times(const Mat2& m, Vec2 v) { return {m.xx * v.x + m.yx * v.y, m.xy * v.x + m.yy * v.y}; }
+inline double determinant(const Mat2& m) { return m.xx * m.yy - m.xy * m.yx; }
+inline Mat2 inverse(const Mat2& m) {
+    const double s = 1 / determinant(m);
+    return {s * m.yy, -s * m.xy, -s * m.yx, s * m.xx};
+}
+// m⁻¹ v
+inline Vec2 solve(const Mat2& m, Vec2 v) { return inverse(m) * v; }
+
 struct Mat3 {
     Vec3 row[3];
 };

@@ -28,6 +28,7 @@ EDGEGRAD_VECTORIZED void place_in_pixel(const Camera& camera, const Filter& filt
         const double dx = n_x[i], dy = n_y[i];
         n_x[i] = n0.x + (a * dx + b * dy), n_y[i] = n0.y + (c * dx + d * dy);
     }
+    if (!camera.is_straight()) straighten_near(camera.lens, camera.lens_view.disc, n0, n, n_x, n_y);
 }
 
 EDGEGRAD_VECTORIZED void PixelRays::append(int x, int y, int first, int n, CameraRays& rays) const {
@@ -291,7 +292,7 @@ class PixelRow {
 };
 
 // The pixels whose samples may hit something: those in an octagon around the images of all vertices of faces, if these
-// lie before the eye. With a pixel more on each side, for Embree sees positions rounded to floats.
+// lie before the eye of a pinhole. With a pixel more on each side, for Embree sees positions rounded to floats.
 class ReachablePixels {
    public:
     ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius, Team& team)
@@ -303,7 +304,7 @@ class ReachablePixels {
                 if (!caster.uses(v)) continue;
                 const Vec2 x = project(camera, q[v]);
                 const double far = std::max(std::fabs(x.x), std::fabs(x.y));
-                if (!(camera.depth_weight(q[v]) > 0) || !std::isfinite(far)) {
+                if (!(camera.depth_weight(q[v]) > 0) || !std::isfinite(far) || !camera.is_straight()) {
                     b = Bounds::everything();
                     break;
                 }

@@ -9,11 +9,12 @@
 
 namespace edgegrad {
 
-// A sample at x, with barycentrics λ in the image, that stands for a share of the face's area; `weight`: px².
+// A sample at u in the straight image, with barycentrics λ there, that stands for a share of the face's area; it is seen
+// at x, where `weight` px² are its own.
 struct SurfaceSample {
     int32_t face;
     bool controlled;
-    Vec2 x;
+    Vec2 u, x;
     Barycentrics lambda;
     double share, weight;
 };
@@ -116,7 +117,7 @@ class ForwardInterior {
             if (direction.moves()) {
                 const Vec3 corner_dot[3] = {direction.q[v[0]], direction.q[v[1]], direction.q[v[2]]};
                 b_dot = barycentrics_jvp(map, n, b, face_map_jvp(view_.camera, corner.data(), corner_dot),
-                                         normalised_jvp(view_.camera, n, direction.k.data()));
+                                         normalised_jvp(view_.camera, n, direction.intrinsics));
             }
             shade_jvp(view_.scene, face, b, b_dot, direction.tangents, values_.data() + d * C_);
         }
@@ -170,7 +171,7 @@ class ScreenInterior {
         FaceMap map_bar;
         Vec2 n_bar;
         barycentrics_vjp(map, n, b, b_bar, map_bar, n_bar);
-        const Vec2 moved = -1 * pixel_vjp(view_.camera, n_bar);
+        const Vec2 moved = -1 * pixel_vjp(view_.camera, n, n_bar);
         grad_.pixels.template add<2>(pixel, &moved.x);
     }
 

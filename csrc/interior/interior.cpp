@@ -43,10 +43,12 @@ class InteriorChunk {
     InteriorChunk(const BackwardView<T>& view, Contraction contraction)
         : view_(view), contraction_(std::move(contraction)), rays_(view.frame) {}
 
-    void add(const SurfaceSample& sample) {
+    void add(SurfaceSample sample) {
         const int i = rays_.count;
-        if (!contraction_.wants(i, sample)) return;
-        const Vec2 n = normalised(view_.camera, sample.x);
+        const auto [x, area_scale] = bend(view_.camera, sample.u);
+        sample.x = x, sample.weight *= area_scale;
+        if (area_scale == 0 || !contraction_.wants(i, sample)) return;
+        const Vec2 n = normalised(view_.camera, sample.u);
         sample_[i] = sample, rays_.n_x[i] = n.x, rays_.n_y[i] = n.y;
         if (++rays_.count == RayBatch::size) cast();
     }
@@ -119,10 +121,11 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
                 sampler.set(polygon, 1 / share);
             }
             const double s = (position - systematic.begin_of(face)) / systematic.measure_of(face);
-            const Vec2 x = sampler(s, sequence(i));
+            const Vec2 u = sampler(s, sequence(i));
             chunk.add({.face = int32_t(face),
                        .controlled = surface.is_controlled[face] != 0,
-                       .x = x,
+                       .u = u,
+                       .x = {},
                        .lambda = sampler.lambda(),
                        .share = share,
                        .weight = share * polygon.area});

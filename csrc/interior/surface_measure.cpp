@@ -172,16 +172,17 @@ class MeasuredChunk {
         }
     }
 
-    // Puts a face that lies inside the view into the lanes, where all are looked at together; any other is laid out
-    // here.
+    // Puts a face that lies inside the view of a pinhole into the lanes, where all are looked at together; any other is
+    // laid out here.
     void gather(int64_t f) {
         const int32_t* v = view_.scene.faces + 3 * f;
         const VertexView& p = view_.vertices;
-        if (p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) {
+        if ((p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) || !view_.camera.is_straight()) {
             set_facing(f, 0, 0);
             if (!polygon_.set(view_.camera, view_.volume, p, v)) return;
-            const double importance = view_.importance.mean(polygon_.low, polygon_.high);
-            const Extent extent{polygon_.area, polygon_.longest, polygon_.low, polygon_.high, polygon_.nearest};
+            const auto [low, high] = view_.camera.image_box(polygon_.low, polygon_.high);
+            const double importance = view_.importance.mean(low, high);
+            const Extent extent{polygon_.area, polygon_.longest, low, high, polygon_.nearest};
             const double m = default_samples(f, extent, view_.hits->of(v), [&] { return side_of(view_, f); });
             if (importance > 0) lay_out(f, m, importance, extent);
             return;

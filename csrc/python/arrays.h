@@ -136,13 +136,24 @@ struct HitArrays {
     HitBuffers<T> view() const { return {coverage.data(), depth.data(), hit.data(), seen.data()}; }
 };
 
-inline Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, bool perspective, int width, int height) {
+inline AnyLens make_lens(const std::string& name, In<double, 1> distortion) {
+    if (distortion.size() != most_coefficients) refuse("distortion: expected 8 numbers");
+    check_finite("distortion", distortion.data(), most_coefficients, most_coefficients, 1);
+    if (name == "pinhole") return StraightLens();
+    if (name == "brown-conrady") return BrownConrady(distortion.data());
+    if (name == "fisheye") return Fisheye(distortion.data());
+    refuse("lens: expected \"pinhole\", \"brown-conrady\" or \"fisheye\", got \"" + name + "\"");
+}
+
+inline Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, In<double, 1> distortion, bool perspective,
+                          const std::string& lens, int width, int height) {
     if (world_to_camera.shape(0) != 4 || world_to_camera.shape(1) != 4)
         refuse("world_to_camera: expected shape (4, 4)");
     if (K.shape(0) != 3 || K.shape(1) != 3) refuse("K: expected shape (3, 3)");
     check_finite("world_to_camera", world_to_camera.data(), 16, 4, 1);
     check_finite("K", K.data(), 9, 3, 1);
-    const Camera camera(world_to_camera.data(), K.data(), perspective, width, height);
+    if (!perspective && lens != "pinhole") refuse("lens: expected a perspective view");
+    const Camera camera(world_to_camera.data(), K.data(), perspective, width, height, make_lens(lens, distortion));
     if (camera.k_det == 0) refuse("K: expected focal lengths that are not zero, got a singular matrix");
     return camera;
 }

@@ -33,7 +33,6 @@ namespace {
 
 using A2 = std::array<double, 2>;
 using A3 = std::array<double, 3>;
-using A6 = std::array<double, 6>;
 using A33 = std::array<A3, 3>;
 
 Vec2 vec(const A2& a) { return {a[0], a[1]}; }
@@ -41,6 +40,16 @@ Vec3 vec(const A3& a) { return {a[0], a[1], a[2]}; }
 FaceMap map(const A33& m) { return {{vec(m[0]), vec(m[1]), vec(m[2])}}; }
 A2 array(Vec2 a) { return {a.x, a.y}; }
 A3 array(Vec3 a) { return {a.x, a.y, a.z}; }
+template <size_t N>
+std::array<double, N> array(const double (&a)[N]) {
+    return std::to_array(a);
+}
+// Tangents of K and of the coefficients, one after the other.
+IntrinsicsGrad intrinsics(const std::array<double, 6 + most_coefficients>& dot) {
+    IntrinsicsGrad out;
+    std::copy(dot.begin(), dot.begin() + 6, out.k), std::copy(dot.begin() + 6, dot.end(), out.distortion);
+    return out;
+}
 A33 array(const FaceMap& m) { return {array(m.column[0]), array(m.column[1]), array(m.column[2])}; }
 
 FilterKind kind(const std::string& name) {
@@ -127,25 +136,34 @@ void bind_for_tests(nb::module_& m) {
     bind_scene_functions<float>(p);
     bind_scene_functions<double>(p);
 
-    p.def("project", [](const Camera& c, A3 q) { return array(project(c, vec(q))); });
+    p.def("project", [](const Camera& c, A3 q) { return array(bend(c, project(c, vec(q))).x); });
     p.def("project_vjp", [](const Camera& c, A3 q, A2 bar) {
         Vec3 q_bar;
-        A6 k_bar{};
-        project_vjp(c, vec(q), vec(bar), q_bar, k_bar.data());
-        return std::tuple(array(q_bar), k_bar);
+        IntrinsicsGrad grad;
+        project_vjp(c, vec(q), vec(bar), q_bar, grad);
+        return std::tuple(array(q_bar), array(grad.k), array(grad.distortion));
     });
-    p.def("normalised", [](const Camera& c, A2 x) { return array(normalised(c, vec(x))); });
+    p.def("normalised", [](const Camera& c, A2 x) { return array(normalised(c, straighten(c, vec(x)))); });
     p.def("normalised_vjp", [](const Camera& c, A2 x, A2 bar) {
-        A6 k_bar{};
-        normalised_vjp(c, normalised(c, vec(x)), vec(bar), k_bar.data());
-        return k_bar;
+        IntrinsicsGrad grad;
+        normalised_vjp(c, normalised(c, straighten(c, vec(x))), vec(bar), grad);
+        return std::tuple(array(grad.k), array(grad.distortion));
+    });
+    // By the bend of the straight image: where a place is seen, the area scale, and what becomes of a tangent there.
+    p.def("bend", [](const Camera& c, A2 u, A2 tangent) {
+        const Bent b = bend(c, vec(u));
+        return std::tuple(array(b.x), b.area_scale, array(bend_jvp(c, normalised(c, vec(u)), vec(tangent))));
+    });
+    p.def("image_box", [](const Camera& c, A2 low, A2 high) {
+        const auto [a, b] = c.image_box(vec(low), vec(high));
+        return std::tuple(array(a), array(b));
     });
     // In forward mode.
-    p.def("project_jvp", [](const Camera& c, A3 q, A3 q_dot, A6 k_dot) {
-        return array(project_jvp(c, vec(q), vec(q_dot), k_dot.data()));
+    p.def("project_jvp", [](const Camera& c, A3 q, A3 q_dot, std::array<double, 6 + most_coefficients> k_dot) {
+        return array(project_jvp(c, vec(q), vec(q_dot), intrinsics(k_dot)));
     });
-    p.def("normalised_jvp", [](const Camera& c, A2 x, A6 k_dot) {
-        return array(normalised_jvp(c, normalised(c, vec(x)), k_dot.data()));
+    p.def("normalised_jvp", [](const Camera& c, A2 x, std::array<double, 6 + most_coefficients> k_dot) {
+        return array(normalised_jvp(c, normalised(c, straighten(c, vec(x))), intrinsics(k_dot)));
     });
     p.def("face_map_jvp", [](const Camera& c, A33 q, A33 q_dot) {
         const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])},

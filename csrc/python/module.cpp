@@ -2,10 +2,12 @@
 // arrays that the caller made, and the interpreter's lock is released while the kernel works.
 
 #include <nanobind/stl/map.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/vector.h>
 
 #include <iterator>
 #include <map>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -212,8 +214,12 @@ NB_MODULE(_core, m) {
         },
         "child"_a);
     nb::class_<Camera>(m, "Camera")
-        .def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "perspective"_a, "width"_a,
-             "height"_a);
+        .def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "distortion"_a.noconvert(),
+             "perspective"_a, "lens"_a, "width"_a, "height"_a)
+        // Where the lens folds over in the image: the tangent of the angle to the axis; none if it does not.
+        .def_prop_ro("fold", [](const Camera& c) {
+            return c.lens_view.folds ? std::optional(c.lens_view.disc.fold) : std::nullopt;
+        });
     nb::class_<ImageOptions>(m, "ImageOptions").def(nb::new_(&make_image_options), "spp"_a, "filter"_a, "seed"_a);
     nb::class_<GradientOptions>(m, "GradientOptions")
         .def(nb::new_([](uint64_t seed, int64_t surface_samples, int64_t edge_samples, bool interior_geometry,

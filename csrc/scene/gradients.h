@@ -3,6 +3,7 @@
 
 #include <cstdint>
 
+#include "camera/lens.h"
 #include "scene/scene.h"
 
 namespace edgegrad {
@@ -17,8 +18,9 @@ struct Slots {
     Number* background = nullptr;
     Number* world_to_camera = nullptr;  // (4, 4)
     Number* K = nullptr;                // (3, 3)
+    Number* distortion = nullptr;       // (8,), see lens.h
 
-    bool geometry() const { return verts || world_to_camera || K; }
+    bool geometry() const { return verts || world_to_camera || K || distortion; }
     bool appearance() const { return colors || uvs || texels; }
 };
 
@@ -49,6 +51,8 @@ inline constexpr GradientSlot<T> gradient_slots[] = {
     {"world_to_camera", &Gradients::world_to_camera, &Tangents::world_to_camera,
      [](const SceneView<T>&, int64_t) { return int64_t(16); }},
     {"K", &Gradients::K, &Tangents::K, [](const SceneView<T>&, int64_t) { return int64_t(9); }},
+    {"distortion", &Gradients::distortion, &Tangents::distortion,
+     [](const SceneView<T>&, int64_t) { return int64_t(most_coefficients); }},
 };
 
 }  // namespace edgegrad

@@ -79,6 +79,7 @@ class PoseFit:
                     "K": self.camera.K.tolist(),
                     "size": list(self.camera.size),
                     "projection": self.camera.projection,
+                    "distortion": None if self.camera.distortion is None else self.camera.distortion.tolist(),
                 },
                 "loss": self.loss if math.isfinite(self.loss) else None,  # none yet when interrupted at once
                 "steps": self.steps,
@@ -97,7 +98,7 @@ class PoseFit:
         try:
             camera = data["camera"]
             M, K = (torch.tensor(camera[key], dtype=torch.float64) for key in ("world_to_camera", "K"))
-            view = Camera(M, K, camera["size"], camera["projection"])
+            view = Camera(M, K, camera["size"], camera["projection"], camera.get("distortion"))
             loss = math.nan if data["loss"] is None else float(data["loss"])
             steps, seconds = int(data["steps"]), float(data["seconds"])
         except (KeyError, TypeError, ValueError) as error:

@@ -95,7 +95,7 @@ class PoseTask:
                 "mesh: expected vertices apart from one another, got all in one place; check the file's units"
             )
         # One picture tells size from distance only together, and a parallel projection shows no distance at all.
-        depth = camera.projection == "perspective" and not fit_scale
+        depth = camera.projection != "orthographic" and not fit_scale
         if fit_scale and fit_focal and camera.projection == "orthographic":
             raise ValueError("fit_focal: expected False with fit_scale and an orthographic camera, where both are one")
         free = [0, 1, 2, 3, 4] + [5] * depth + [GROW] * fit_scale + [ZOOM] * fit_focal
@@ -109,7 +109,7 @@ class PoseTask:
         finest = min(1.0, max_size / max(H, W))
         view = self.camera.world_to_camera
         depth = float((view[:3, :3] @ (start.matrix[:3, :3] @ self.center + start.t) + view[:3, 3])[2])
-        perspective = self.camera.projection == "perspective"
+        perspective = self.camera.projection != "orthographic"
         if perspective and depth <= 0:
             raise ValueError(f"init: expected the object in front of the camera, got its centre at depth {depth:.3g}")
         focal = float(torch.linalg.det(self.camera.K[:2, :2]).abs().sqrt())
@@ -144,7 +144,7 @@ class PoseTask:
             view[:3, :3] @ (pose.scale * (pose.R @ self.center) + pose.t) + view[:3, 3] + self.size * step[SHIFT:GROW]
         )
         scale, zoom = pose.scale * step[GROW].exp(), step[ZOOM].exp()
-        if ZOOM in free and self.camera.projection == "perspective":
+        if ZOOM in free and self.camera.projection != "orthographic":
             # A longer lens enlarges the object. Undone by distance, or by scale where that is sought, what is left of
             # the zoom is the change of perspective, and the entries of the step hardly disturb one another.
             if GROW in free:

@@ -169,7 +169,7 @@ def _resized(scene: Scene, camera: Camera) -> tuple[Scene, Camera, float]:
 
 
 def _sensor(mi: Any, scene: Scene, camera: Camera) -> dict[str, Any]:
-    if camera.projection != "perspective" or camera.batch is not None:
+    if camera.projection != "perspective" or camera.lens != "pinhole" or camera.batch is not None:
         raise ValueError(f"camera: expected a single perspective camera, got {camera!r}; not supported by this peer")
     K, (H, W) = camera.K.detach().cpu().double(), camera.size
     if not torch.allclose(K[0, 0], K[1, 1], rtol=1e-6) or K[0, 1] != 0 or K[1, 0] != 0:

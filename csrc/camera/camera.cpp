@@ -1,0 +1,67 @@
+#include "camera/camera.h"
+
+#include <algorithm>
+
+namespace edgegrad {
+
+LensView Camera::view_through_lens() const {
+    LensView view;
+    view.disc = disc_of(lens);
+    // The border of the image, widened by as much as a filter may reach: what is seen within it lies within its image.
+    constexpr double margin = 1;
+    constexpr int points = 256;  // a side
+    constexpr double infinite = std::numeric_limits<double>::infinity();
+    Vec2 low{infinite, infinite}, high{-infinite, -infinite};
+    const auto add = [&](Vec2 u) {
+        low = {std::min(low.x, u.x), std::min(low.y, u.y)}, high = {std::max(high.x, u.x), std::max(high.y, u.y)};
+    };
+    for (int i = 0; i < points && !view.folds; ++i) {
+        const double s = double(i) / points, w = width + 2 * margin, h = height + 2 * margin;
+        for (const Vec2 x : {Vec2{s * w, 0}, Vec2{w, s * h}, Vec2{(1 - s) * w, h}, Vec2{0, (1 - s) * h}}) {
+            const auto n = edgegrad::straighten(lens, view.disc, normalised(*this, x - Vec2{margin, margin}));
+            if (!n) view.folds = true;
+            else add(to_pixels(*this, *n));
+        }
+    }
+    double radius = view.disc.fold;
+    if (view.folds) {
+        // The whole disc: K takes it to an ellipse.
+        const Vec2 reach{std::hypot(k[0], k[1]) * radius, std::hypot(k[3], k[4]) * radius};
+        low = Vec2{k[2], k[5]} - reach, high = Vec2{k[2], k[5]} + reach;
+    } else {
+        // Between its points the border is bent by less than a hundredth of their distance, or so.
+        const Vec2 more = (1.0 / points) * (high - low);
+        low = low - more, high += more;
+        double farthest = 0;
+        for (const Vec2 u : {low, {high.x, low.y}, high, {low.x, high.y}})
+            farthest = std::max(farthest, length(normalised(*this, u)));
+        radius = std::min(radius, farthest);
+    }
+    view.low = low, view.high = high;
+    // The derivatives are smooth: a twentieth is more than they change between neighbours of these.
+    constexpr int radii = 64, angles = 16;
+    for (int i = 0; i <= radii; ++i)
+        for (int j = 0; j < angles; ++j) {
+            const double r = std::tan(std::atan(radius) * i / radii) * (1 - 1e-12), a = 2 * M_PI * j / angles;
+            const Vec2 n{r * std::cos(a), r * std::sin(a)};
+            const Vec2 x = bend_jvp(*this, n, {1, 0}), y = bend_jvp(*this, n, {0, 1});
+            const auto raise = [](double& most, double value) { most = std::max(most, 1.05 * std::fabs(value)); };
+            raise(view.most.xx, x.x), raise(view.most.yx, x.y), raise(view.most.xy, y.x), raise(view.most.yy, y.y);
+        }
+    return view;
+}
+
+// By the mean value theorem, from a place of the box, or the nearest that is seen at all.
+std::pair<Vec2, Vec2> Camera::image_box(Vec2 low, Vec2 high) const {
+    if (is_straight()) return {low, high};
+    Vec2 n = normalised(*this, 0.5 * (low + high));
+    const double radius = length(n), fold = lens_view.disc.fold * (1 - 1e-9);
+    if (radius > fold) n = (fold / radius) * n;
+    const Vec2 u = to_pixels(*this, n), x = bend(*this, u).x;
+    const Vec2 half{std::max(high.x - u.x, u.x - low.x), std::max(high.y - u.y, u.y - low.y)};
+    const Vec2 reach{lens_view.most.xx * half.x + lens_view.most.xy * half.y,
+                     lens_view.most.yx * half.x + lens_view.most.yy * half.y};
+    return {x - reach, x + reach};
+}
+
+}  // namespace edgegrad

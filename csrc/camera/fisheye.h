@@ -1,0 +1,50 @@
+// OpenCV's fisheye (Kannala and Brandt 2006): how far from the middle of the image something is seen is a polynomial of
+// its angle to the axis.
+#pragma once
+
+#include <cmath>
+
+#include "core/math.h"
+
+namespace edgegrad {
+
+// With θ = atan |n| and θ' = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸): m = θ' n / |n|.
+struct Fisheye {
+    static constexpr int coefficients = 4;
+    double k[4];
+
+    explicit Fisheye(const double* c) : k{c[0], c[1], c[2], c[3]} {}
+
+    Vec2 bend(Vec2 n) const {
+        const double r = length(n);
+        return (r > tiny ? radius(r) / r : 1) * n;
+    }
+
+    // g I + (g'/r) n nᵀ with g = θ'/r.
+    Mat2 jacobian(Vec2 n) const {
+        const double r = length(n), g = r > tiny ? radius(r) / r : 1;
+        const double h = r > tiny ? (radius_slope(r) - g) / (r * r) : 0;
+        return {g + h * n.x * n.x, h * n.x * n.y, h * n.x * n.y, g + h * n.y * n.y};
+    }
+
+    void bend_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const {
+        n_bar += transposed_times(jacobian(n), bar);
+        const double r = length(n), angle = std::atan(r);
+        double power = r > tiny ? (bar.x * n.x + bar.y * n.y) / r * angle : 0;
+        for (int i = 0; i < 4; ++i) c_bar[i] += power *= angle * angle;
+    }
+
+    double radius(double r) const {
+        const double angle = std::atan(r), s = angle * angle;
+        return angle * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))));
+    }
+    double radius_slope(double r) const {
+        const double angle = std::atan(r), s = angle * angle;
+        return (1 + s * (3 * k[0] + s * (5 * k[1] + s * (7 * k[2] + s * 9 * k[3])))) / (1 + r * r);
+    }
+
+   private:
+    static constexpr double tiny = 1e-9;  // below it θ' is r, as far as doubles can tell
+};
+
+}  // namespace edgegrad

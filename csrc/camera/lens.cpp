@@ -1,0 +1,156 @@
+#include "camera/lens.h"
+
+#include <algorithm>
+#include <limits>
+
+namespace edgegrad {
+
+namespace {
+
+// Least det ∂m/∂n on the circle |n| = r; what is not a number counts as a fold.
+template <Lens L>
+double least_area_scale(const L& lens, double r) {
+    constexpr int angles = 16;
+    double least = std::numeric_limits<double>::infinity();
+    for (int i = 0; i < angles; ++i) {
+        const double a = 2 * M_PI * i / angles, det = determinant(lens.jacobian({r * std::cos(a), r * std::sin(a)}));
+        if (!(det > 0)) return 0;
+        least = std::min(least, det);
+    }
+    return least;
+}
+
+// r in [0, fold] with lens.radius(r) = m, or the fold: Newton's steps, with bisection where they leave the bracket.
+template <Lens L>
+double straight_radius(const L& lens, double fold, double m) {
+    double low = 0, high = fold, r = std::min(m, fold);
+    for (int i = 0; i < 64; ++i) {
+        const double error = lens.radius(r) - m;
+        (error < 0 ? low : high) = r;
+        const double next = r - error / lens.radius_slope(r);
+        const double step = next > low && next < high ? next : 0.5 * (low + high);
+        if (std::fabs(step - r) <= 1e-12 * (1 + r)) return step;
+        r = step;
+    }
+    return r;
+}
+
+// Newton's steps from the solution without what is not radial.
+template <Lens L>
+std::optional<Vec2> straighten(const L& lens, const LensDisc& disc, Vec2 m) {
+    const double size = length(m), fold = disc.fold;
+    if (size > disc.reach) return {};
+    if (size == 0 && length(lens.bend(m)) == 0) return m;
+    Vec2 n = size > 0 ? (straight_radius(lens, fold, size) / size) * m : m;
+    for (int i = 0; i < 32; ++i) {
+        const Vec2 step = solve(lens.jacobian(n), m - lens.bend(n));
+        if (!std::isfinite(step.x + step.y)) return {};
+        // Near the fold a step may lead far away.
+        const double far = length(step), most = 0.25 * (1 + length(n));
+        n += std::min(1.0, most / std::max(far, 1e-300)) * step;
+        if (far <= 1e-14 * (1 + length(n))) break;
+    }
+    // What has not converged by then lies on the fold, where it is seen infinitely small.
+    if (!(length(lens.bend(n) - m) <= 1e-10 * (1 + size)) || !(length(n) < disc.fold)) return {};
+    return n;
+}
+
+// Points of one pixel: where they are seen, m, and where they come from, n.
+struct Points {
+    static constexpr int size = 64;
+    int count = 0;
+    double m_x[size], m_y[size], n_x[size], n_y[size], error[size];
+};
+
+// A step n + J⁻¹ (m − bend(n)) of all, with J where the pixel's middle is: over a pixel it changes by a hundredth or
+// less, and so much smaller is each error than the last. Returns the greatest before the step.
+template <Lens L>
+[[gnu::always_inline]] inline double chord_step(const L lens, const Mat2 inverse, Points& p) {
+    for (int i = 0; i < p.count; ++i) {
+        const Vec2 m = lens.bend({p.n_x[i], p.n_y[i]}), error{p.m_x[i] - m.x, p.m_y[i] - m.y}, step = inverse * error;
+        p.n_x[i] += step.x, p.n_y[i] += step.y;
+        p.error[i] = std::fabs(error.x) + std::fabs(error.y);
+    }
+    return *std::max_element(p.error, p.error + p.count);
+}
+
+EDGEGRAD_VECTORIZED double chord_step(const AnyLens& lens, Mat2 inverse, Points& p) {
+    if (const auto* l = std::get_if<BrownConrady>(&lens)) return chord_step(*l, inverse, p);
+    return chord_step(*std::get_if<Fisheye>(&lens), inverse, p);
+}
+
+}  // namespace
+
+namespace {
+
+double radius_of_fold(const AnyLens& lens) {
+    return with_lens(lens, [](const auto& l) {
+        constexpr int radii = 256;
+        const double step = std::atan(greatest_radius) / radii;
+        double low = 0;
+        for (int i = 1; i <= radii; ++i) {
+            double high = std::tan(i * step);
+            if (least_area_scale(l, high) > 0) {
+                low = high;
+                continue;
+            }
+            for (int j = 0; j < 40; ++j) {
+                const double middle = 0.5 * (low + high);
+                (least_area_scale(l, middle) > 0 ? low : high) = middle;
+            }
+            return low;
+        }
+        return greatest_radius;
+    });
+}
+
+}  // namespace
+
+// The disc is taken one to one, so the rim of its image is that of the disc; and a hundredth for what lies between
+// points of it.
+LensDisc disc_of(const AnyLens& lens) {
+    LensDisc disc{radius_of_fold(lens), 0};
+    constexpr int points = 64;
+    for (int i = 0; i < points; ++i) {
+        const double a = 2 * M_PI * i / points;
+        const Vec2 n{disc.fold * std::cos(a), disc.fold * std::sin(a)};
+        disc.reach = std::max(disc.reach, 1.01 * length(with_lens(lens, [&](const auto& l) { return l.bend(n); })));
+    }
+    return disc;
+}
+
+std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m) {
+    return with_lens(lens, [&](const auto& l) { return straighten(l, disc, m); });
+}
+
+void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, double* x, double* y) {
+    const std::optional<Vec2> n0 = straighten(lens, disc, m0);
+    const Mat2 inverse =
+        edgegrad::inverse(with_lens(lens, [&](const auto& l) { return l.jacobian(n0.value_or(Vec2{})); }));
+    // The last error but for a hundredth is taken away.
+    constexpr double small = 1e-10;
+    constexpr int most_steps = 12;
+    Points p;
+    for (int first = 0; first < k; first += Points::size) {
+        p.count = std::min(Points::size, k - first);
+        std::copy(x + first, x + first + p.count, p.m_x), std::copy(y + first, y + first + p.count, p.m_y);
+        std::fill(p.error, p.error + p.count, 1.0);
+        if (n0) {
+            for (int i = 0; i < p.count; ++i) {
+                const Vec2 n = *n0 + inverse * (Vec2{p.m_x[i], p.m_y[i]} - m0);
+                p.n_x[i] = n.x, p.n_y[i] = n.y;
+            }
+            for (int i = 0; i < most_steps && !(chord_step(lens, inverse, p) < small);) ++i;
+        }
+        for (int i = 0; i < p.count; ++i) {
+            Vec2 n{p.n_x[i], p.n_y[i]};
+            if (!(p.error[i] < small && length(n) < disc.fold)) {
+                constexpr double nan = std::numeric_limits<double>::quiet_NaN();
+                n = straighten(lens, disc, {p.m_x[i], p.m_y[i]}).value_or(Vec2{nan, nan});
+            }
+            x[first + i] = n.x, y[first + i] = n.y;
+        }
+    }
+}
+
+}  // namespace edgegrad

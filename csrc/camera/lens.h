@@ -1,0 +1,59 @@
+// What a lens does to the straight image of a pinhole: it bends normalised image coordinates n to m, and K takes m to
+// pixels. What is straight in n is a curve in m; an area grows by det ∂m/∂n. So all that is made of straight lines
+// (faces, edges, the view volume) is worked on in the straight image, K n, and samples alone are bent.
+#pragma once
+
+#include <cmath>
+#include <concepts>
+#include <limits>
+#include <optional>
+#include <variant>
+
+#include "camera/brown_conrady.h"
+#include "camera/fisheye.h"
+#include "core/math.h"
+
+namespace edgegrad {
+
+// A pinhole.
+struct StraightLens {};
+
+template <class L>
+concept Lens = requires(const L lens, Vec2 n, double r, Vec2& n_bar, double* coefficients_bar) {
+    { L::coefficients } -> std::convertible_to<int>;
+    { lens.bend(n) } -> std::same_as<Vec2>;
+    { lens.jacobian(n) } -> std::same_as<Mat2>;  // ∂m/∂n
+    lens.bend_vjp(n, n, n_bar, coefficients_bar);
+    // |m| at |n| = r but for what is not radial, and its derivative.
+    { lens.radius(r) } -> std::same_as<double>;
+    { lens.radius_slope(r) } -> std::same_as<double>;
+};
+static_assert(Lens<BrownConrady> && Lens<Fisheye>);
+
+// A new lens is a file of its own, and a place in this list.
+using AnyLens = std::variant<StraightLens, BrownConrady, Fisheye>;
+constexpr int most_coefficients = 8;
+static_assert(BrownConrady::coefficients <= most_coefficients && Fisheye::coefficients <= most_coefficients);
+
+// f(lens), of one that is not straight.
+template <class F>
+auto with_lens(const AnyLens& lens, F f) {
+    if (const auto* l = std::get_if<BrownConrady>(&lens)) return f(*l);
+    return f(*std::get_if<Fisheye>(&lens));
+}
+
+// The disc in which every m has one n: what lies beyond is not seen.
+struct LensDisc {
+    double fold = std::numeric_limits<double>::infinity();  // the least |n| with det ∂m/∂n ≤ 0; or greatest_radius
+    double reach = fold;                                    // no |m| from within is greater
+};
+LensDisc disc_of(const AnyLens& lens);
+constexpr double greatest_radius = 30;  // 88° from the axis
+
+// The n in the disc that is bent to m; none if there is none.
+std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m);
+
+// The same for k points near m0, in place; not numbers where there is none.
+void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, double* x, double* y);
+
+}  // namespace edgegrad

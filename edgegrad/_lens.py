@@ -1,0 +1,40 @@
+"""What lenses do to the image of a pinhole: they bend normalised image coordinates n = (X/Z, Y/Z) to m, and K takes m to pixels.
+
+The kernel has the same maps (csrc/camera/brown_conrady.h, fisheye.h).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+COUNTS = {"perspective": (4, 5, 8), "fisheye": (4,), "orthographic": ()}  # of coefficients, by projection
+MOST = 8  # what the kernel takes
+
+
+def bend(projection: str, n: Tensor, distortion: Tensor) -> Tensor:
+    """m (…, 2) of n (…, 2), with the coefficients (4,), (5,) or (8,) in OpenCV's order."""
+    return _fisheye(n, distortion) if projection == "fisheye" else _brown_conrady(n, distortion)
+
+
+def _brown_conrady(n: Tensor, distortion: Tensor) -> Tensor:
+    """Brown 1966 and Conrady 1919, with OpenCV's rational radial part: coefficients k1, k2, p1, p2, k3, k4, k5, k6."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = torch.nn.functional.pad(distortion, (0, MOST - len(distortion))).unbind()
+    x, y = n.unbind(-1)
+    s = x * x + y * y
+    g = (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
+    return torch.stack(
+        [g * x + 2 * p1 * x * y + p2 * (s + 2 * x * x), g * y + p1 * (s + 2 * y * y) + 2 * p2 * x * y], -1
+    )
+
+
+def _fisheye(n: Tensor, distortion: Tensor) -> Tensor:
+    """OpenCV's fisheye (Kannala and Brandt 2006): coefficients k1, k2, k3, k4 of the angle to the axis."""
+    s = (n * n).sum(-1, keepdim=True)
+    on_axis = s == 0
+    r = torch.where(on_axis, torch.ones_like(s), s).sqrt()  # its square root has no derivative at zero
+    a = torch.atan(r)
+    k1, k2, k3, k4 = distortion.unbind()
+    t = a * a
+    angle = a * (1 + t * (k1 + t * (k2 + t * (k3 + t * k4))))
+    return torch.where(on_axis, torch.ones_like(s), angle / r) * n

@@ -1,0 +1,350 @@
+"""Lenses that bend straight lines: positions against OpenCV, gradients against finite differences of the image."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from finite_differences import Case, finite_difference, gradient, loss, right_ratio, rotation
+from scenes import icosphere, smooth_adjoint
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad._kernel import core
+from edgegrad._lens import bend
+from edgegrad._ops import kernel_camera
+from edgegrad._request import pack_camera
+
+F64 = torch.float64
+DISTORTION = {
+    "four": [-0.25, 0.08, 0.01, -0.02],
+    "five": [-0.25, 0.08, 0.01, -0.02, 0.03],
+    "eight": [0.3, 0.05, 0.01, -0.02, 0.02, 0.4, 0.1, 0.03],
+    "fisheye": [-0.05, 0.04, -0.02, 0.01],
+}
+lenses = pytest.mark.parametrize("lens", DISTORTION)
+SIZE = (40, 48)
+
+
+def camera(lens: str, skew: float = 1.5, size: tuple[int, int] = SIZE) -> eg.Camera:
+    """A camera whose corners look 40° aside."""
+    H, W = size
+    K = torch.tensor([[0.94 * W, skew, 0.5 * W - 0.5], [0.0, 1.24 * H, 0.49 * H - 0.5], [0.0, 0.0, 1.0]], dtype=F64)
+    make = eg.Camera.fisheye if lens == "fisheye" else eg.Camera.from_opencv
+    R = rotation((0.0, 0.6, 0.8), torch.tensor(0.4, dtype=F64))
+    return make(R, torch.tensor([0.1, -0.05, 3.0], dtype=F64), K, size, torch.tensor(DISTORTION[lens], dtype=F64))
+
+
+# -- positions ----------------------------------------------------------------------------------------------------------
+
+
+@lenses
+def test_points_agree_with_opencv(lens: str) -> None:
+    # projectPoints reads no skew; fisheye's takes it as a share of the focal length.
+    view = camera(lens, skew=1.5 if lens == "fisheye" else 0.0)
+    points = np.random.default_rng(0).uniform(-1.5, 1.5, (200, 1, 3))
+    M, K, d = (t.numpy() for t in (view.world_to_camera, view.K, view.coefficients))
+    K = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # its first pixel's centre is at 0
+    turn = cv2.Rodrigues(M[:3, :3])[0]
+    if lens == "fisheye":
+        expected, _ = cv2.fisheye.projectPoints(points, turn, M[:3, 3], K, d, alpha=K[0, 1] / K[0, 0])
+    else:
+        expected, _ = cv2.projectPoints(points, turn, M[:3, 3], K, d)
+    expected = expected[:, 0] + 0.5
+    np.testing.assert_allclose(view.project(torch.from_numpy(points[:, 0])).numpy(), expected, atol=1e-9)
+    kernel = kernel_camera(pack_camera(view))
+    q = points[:, 0] @ M[:3, :3].T + M[:3, 3]
+    np.testing.assert_allclose([core.for_tests.project(kernel, p) for p in q], expected, atol=1e-9)
+
+
+@lenses
+def test_position_gradient(lens: str) -> None:
+    view = camera(lens)
+    inputs = [t.clone().requires_grad_() for t in (view.world_to_camera, view.K, view.coefficients)]
+    points = torch.tensor([[0.3, 0.2, 0.1], [-0.8, 0.9, 0.5]], dtype=F64)
+
+    def positions(M: Tensor, K: Tensor, d: Tensor) -> Tensor:
+        M = torch.cat([M[:3], view.world_to_camera[3:]])
+        K = torch.cat([K[:2], view.K[2:]])
+        return view.replace(world_to_camera=M.detach() + (M - M.detach()), K=K, distortion=d).project(points)
+
+    assert torch.autograd.gradcheck(lambda K, d: positions(inputs[0].detach(), K, d), inputs[1:])
+
+
+@lenses
+def test_boxes_hold_what_they_say(lens: str) -> None:
+    """All of a box of the straight image is seen in the box that the kernel names, also where that reaches far outside."""
+    kernel = kernel_camera(pack_camera(camera(lens)))
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        middle, half = rng.uniform(-30, 80, 2), rng.uniform(0, 20, 2) ** 2 / 10
+        low, high = core.for_tests.image_box(kernel, middle - half, middle + half)
+        for u in rng.uniform(middle - half, middle + half, (30, 2)):
+            x, area_scale, _ = core.for_tests.bend(kernel, u, [0.0, 0.0])
+            if area_scale > 0 and (np.array(x) > -1).all() and x[0] < SIZE[1] + 1 and x[1] < SIZE[0] + 1:
+                assert (np.array(x) >= np.array(low) - 1e-9).all() and (np.array(x) <= np.array(high) + 1e-9).all()
+
+
+# -- images -------------------------------------------------------------------------------------------------------------
+
+
+def test_no_distortion_is_a_pinhole() -> None:
+    """Coefficients of zero: every pixel is right; the last digits may differ."""
+    mesh, view = colored_sphere(), camera("four").replace(distortion=None)
+    zero = view.replace(distortion=torch.zeros(5, dtype=F64))
+    torch.testing.assert_close(eg.render(mesh, zero, 64), eg.render(mesh, view, 64), rtol=0, atol=1e-9)
+
+
+TRIANGLE = torch.tensor([[-0.6, -0.5, 0.3], [0.8, -0.2, -0.6], [-0.1, 0.7, 0.2]], dtype=F64)
+
+
+def area(view: eg.Camera, corners: Tensor) -> Tensor:
+    """Pixels that a triangle covers: its sides bent point by point, chord by chord. Differentiable."""
+    steps = torch.linspace(0, 1, 4001, dtype=F64)[:-1, None]
+    sides = [(1 - steps) * corners[i] + steps * corners[(i + 1) % 3] for i in range(3)]
+    outline = view.project(torch.cat(sides))
+    H, W = view.size
+    assert bool(((outline > 0) & (outline < torch.tensor([W, H]))).all()), "it must lie within the image"
+    x, y = outline.unbind(-1)
+    return 0.5 * (x * y.roll(-1) - y * x.roll(-1)).sum().abs()
+
+
+def check_area(view: eg.Camera, corners: Tensor) -> None:
+    """The image of a white triangle before black, summed: the area, and its derivative in everything that moves it."""
+    leaves = [t.clone().requires_grad_() for t in (corners, view.world_to_camera, view.K, view.coefficients)]
+    corners, M, K, d = leaves
+    white = eg.Mesh(corners, torch.tensor([[0, 1, 2]]), colors=torch.ones((3, 1), dtype=F64))
+    view = view.replace(world_to_camera=M, K=K, distortion=d)
+    expected = area(view, corners)
+    image = eg.render(eg.Scene([white], torch.zeros(1, dtype=F64)), view, 1024, edge_samples=200_000)
+    assert float(image.detach().sum()) == pytest.approx(float(expected.detach()), rel=1e-3)
+    truth, found = (torch.autograd.grad(value, leaves) for value in (expected, image.sum()))
+    for name, a, b in zip(("corners", "world_to_camera", "K", "distortion"), truth, found, strict=True):
+        # Samples lie evenly on the sides: their error falls as 1 / n.
+        torch.testing.assert_close(b, a, rtol=2e-3, atol=1e-3 * float(a.abs().max()), msg=lambda m, n=name: f"{n}: {m}")
+
+
+@lenses
+def test_area_of_a_triangle(lens: str) -> None:
+    view = camera(lens)
+    check_area(view, TRIANGLE)
+    straight = area(view.replace(distortion=None, projection="perspective"), TRIANGLE)
+    assert abs(float(straight / area(view, TRIANGLE)) - 1) > 0.01, "a pinhole would pass as well"
+
+
+@pytest.mark.filterwarnings("ignore:distortion")
+@pytest.mark.parametrize("degrees", [0, 40, 70, 80])
+def test_area_in_a_wide_fisheye(degrees: int) -> None:
+    """The image reaches beyond 88°, where a fisheye ends."""
+    K = torch.tensor([[14.0, 0.0, 23.5], [0.0, 14.0, 19.5], [0.0, 0.0, 1.0]], dtype=F64)
+    view = eg.Camera.fisheye(torch.eye(3, dtype=F64), torch.zeros(3, dtype=F64), K, SIZE, torch.zeros(4, dtype=F64))
+    ahead = torch.tensor([[-0.2, -0.2, 1.0], [0.1, -0.1, 1.0], [0.0, 0.2, 1.0]], dtype=F64)
+    turn = rotation((0.0, 1.0, 0.0), torch.tensor(math.radians(degrees), dtype=F64))
+    check_area(view, ahead @ turn.mT)
+
+
+@lenses
+def test_wall(lens: str) -> None:
+    """A triangle that fills the view has an interior term alone: against quadrature in double, differentiated by autograd."""
+    view = camera(lens)
+    wall = scene("interior").meshes[0]
+    assert wall.colors is not None
+    leaves = [t.clone().requires_grad_() for t in (wall.verts, view.world_to_camera, view.K, view.coefficients)]
+    verts, M, K, d = leaves
+    view = view.replace(world_to_camera=M, K=K, distortion=d)
+    H, W = SIZE
+    grid = 6
+    x, y = ((torch.arange(n * grid, dtype=F64) + 0.5) / grid for n in (W, H))
+    points = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
+    n = straightened(view, points)
+    q = verts @ M[:3, :3].mT + M[:3, 3]
+    b = torch.linalg.solve(q.mT, torch.cat([n, torch.ones_like(n[:, :1])], 1).mT).mT
+    assert bool((b > 0).all()), "it must fill the view"
+    radiance = (b / b.sum(1, keepdim=True)) @ wall.colors
+    expected = radiance.reshape(H, grid, W, grid, 3).mean((1, 3))
+    image = eg.render(wall.replace(verts=verts), view, 1024, surface_samples=400_000)
+    torch.testing.assert_close(image, expected, rtol=0, atol=2e-3)
+    adjoint = smooth_adjoint(H, W, 3)
+    truth, found = (torch.autograd.grad((value * adjoint).sum(), leaves) for value in (expected, image))
+    for name, a, b in zip(("verts", "world_to_camera", "K", "distortion"), truth, found, strict=True):
+        torch.testing.assert_close(b, a, rtol=5e-3, atol=5e-3 * float(a.abs().max()), msg=lambda m, n=name: f"{n}: {m}")
+
+
+def straightened(view: eg.Camera, x: Tensor) -> Tensor:
+    """n (N, 2) of what is seen at the pixels x (N, 2): Newton's method, its last step differentiable."""
+    m = torch.linalg.solve(view.K[:2, :2], (x - view.K[:2, 2])[..., None])[..., 0]
+    n = m.detach()
+    for _ in range(30):
+        n = n.detach().requires_grad_()
+        bent = bend(view.projection, n, view.coefficients)
+        rows = [torch.autograd.grad(bent[:, i].sum(), n, retain_graph=True)[0] for i in (0, 1)]
+        n = n.detach() + torch.linalg.solve(torch.stack(rows, 1), (m - bent)[..., None])[..., 0]
+    return n
+
+
+def colored_sphere(dx: Tensor | float = 0.0, one_colour: bool = False) -> eg.Mesh:
+    sphere = icosphere(2)
+    shift = torch.as_tensor(dx, dtype=F64) * torch.tensor([1.0, 0.0, 0.0], dtype=F64)
+    verts = sphere.verts * torch.tensor([1.0, 0.8, 0.9], dtype=F64) + shift
+    colors = None if one_colour else torch.rand(verts.shape, generator=torch.Generator().manual_seed(1), dtype=F64)
+    return eg.Mesh(verts, sphere.faces, colors=colors)
+
+
+# -- gradients ----------------------------------------------------------------------------------------------------------
+
+
+def scene(kind: str, dx: Tensor | float = 0.0) -> eg.Scene:
+    """boundary: one colour, before an image; interior: a triangle beyond the whole view; both: a sphere before that."""
+    background = torch.tensor([0.1, 0.3, 0.2], dtype=F64)
+    if kind == "boundary":
+        return eg.Scene([colored_sphere(dx, one_colour=True)], background)
+    shift = torch.as_tensor(dx, dtype=F64) * torch.tensor([0.0, 1.0, 0.5], dtype=F64)
+    corners = torch.tensor([[-19.0, -11.0, 1.5], [19.0, -12.5, 2.5], [1.0, 19.0, 2.0]], dtype=F64) + shift
+    colors = torch.tensor([[0.0, 1.0, 0.3], [1.0, 0.2, 0.6], [0.4, 0.5, 1.0]], dtype=F64)
+    wall = eg.Mesh(corners, torch.tensor([[0, 1, 2]]), colors=colors)
+    return eg.Scene([wall] if kind == "interior" else [colored_sphere(dx), wall], background)
+
+
+def moved(kind: str, view: eg.Camera, what: str) -> Case:
+    """A case in which one number of vertices, pose, K or distortion moves."""
+
+    def vertices(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
+        return scene(kind, theta), view
+
+    def pose(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
+        M = view.world_to_camera
+        R = rotation((0.0, 0.8, 0.6), theta) @ M[:3, :3]
+        t = M[:3, 3] + theta * torch.tensor([0.5, 0.0, 0.2], dtype=F64)
+        return scene(kind), view.replace(world_to_camera=torch.cat([torch.cat([R, t[:, None]], 1), M[3:]]))
+
+    def intrinsics(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
+        change = torch.zeros((3, 3), dtype=F64)
+        change[int(what[1]), int(what[2])] = view.size[1] if what[2] != "2" else 0.5 * view.size[1]
+        return scene(kind), view.replace(K=view.K + theta * change)
+
+    def distortion(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
+        change = torch.zeros_like(view.coefficients)
+        change[int(what[1:])] = 1.0
+        return scene(kind), view.replace(distortion=view.coefficients + theta * change)
+
+    makers: dict[str, Callable[[Tensor], tuple[eg.Scene, eg.Camera]]] = {"vertices": vertices, "pose": pose}
+    return makers.get(what) or (intrinsics if what[0] == "K" else distortion)
+
+
+# Steps move edges by less than a tenth of a pixel, and errors of second order are a thousandth.
+STEP = {"vertices": 0.005, "pose": 0.002, "K": 0.002, "d": 0.005}
+# Of these the derivative is as small as chance, by symmetry or since terms cancel.
+FAINT = 0.02
+
+
+def check_gradient(kind: str, view: eg.Camera, what: str, spp: int = 4096, seeds: int = 4) -> None:
+    case, step = moved(kind, view, what), STEP[what if what in STEP else what[0]]
+    fd = finite_difference(case, step, spp, seeds)
+    found = gradient(case, 4, surface_samples=100_000, edge_samples=50_000)
+    size = gradient_size(case)
+    if abs(fd.mean) < FAINT * size:
+        assert abs(found.mean - fd.mean) < 0.01 * size
+    else:
+        right_ratio(fd, found)
+
+
+def gradient_size(case: Case) -> float:
+    """Of what the derivative is a sum: |adjoint| · |image| change, about."""
+    high, low = (eg.render(*case(torch.tensor(h, dtype=F64)), spp=256) for h in (0.01, -0.01))
+    return float((high - low).abs().sum()) / 0.02
+
+
+WHAT = ["vertices", "pose", "K00", "K11", "K01", "K02", "K12"]
+
+
+@lenses
+@pytest.mark.parametrize("what", ["vertices", "K00", "d0"])
+def test_gradient(lens: str, what: str) -> None:
+    """Of a crop that reaches beyond the image, where the lens bends most."""
+    check_gradient("both", camera(lens).crop(-5, 15, 25, 30), what)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("crop", [False, True], ids=["whole", "crop"])
+@lenses
+@pytest.mark.parametrize("kind", ["boundary", "interior", "both"])
+def test_every_gradient(lens: str, kind: str, crop: bool) -> None:
+    view = camera(lens, size=(80, 96))
+    if crop:
+        view = view.crop(-10, 30, 50, 60)  # reaches beyond the image, where the lens bends most
+    for what in [*WHAT, *(f"d{i}" for i in range(len(DISTORTION[lens])))]:
+        check_gradient(kind, view, what, seeds=6)
+
+
+# -- where a lens ends --------------------------------------------------------------------------------------------------
+
+
+FOLD = 1 / math.sqrt(3 * 0.3)  # of r (1 − 0.3 r²)
+
+
+def folding_camera() -> eg.Camera:
+    """Its fold lies at 46°, within the image: m = ⅔ FOLD there, 0.7 of the image's half width."""
+    K = torch.tensor([[24.0, 0.0, 23.5], [0.0, 24.0, 19.5], [0.0, 0.0, 1.0]], dtype=F64)
+    t = torch.tensor([0.0, 0.0, 3.0], dtype=F64)
+    return eg.Camera.from_opencv(torch.eye(3, dtype=F64), t, K, SIZE, torch.tensor([-0.3, 0.0, 0.0, 0.0], dtype=F64))
+
+
+def test_beyond_a_fold_there_is_background() -> None:
+    wall = scene("interior").meshes[0]
+    wall = wall.replace(verts=10 * wall.verts, colors=torch.ones((3, 3), dtype=F64))
+    with pytest.warns(UserWarning, match=rf"radius {FOLD:.4g} .* {math.degrees(math.atan(FOLD)):.4g}°"):
+        image = eg.render(eg.Scene([wall], torch.zeros(3, dtype=F64)), folding_camera(), 256)
+    area = float(image[..., 0].sum())
+    assert area == pytest.approx(math.pi * (24 * FOLD * 2 / 3) ** 2, rel=2e-3)
+
+
+@pytest.mark.filterwarnings("ignore:distortion")
+@pytest.mark.parametrize("what", ["vertices", "pose"])
+def test_gradient_before_a_fold(what: str) -> None:
+    """The sphere passes the fold: what of it lies beyond is not seen, and has no gradient."""
+    view = folding_camera()
+    M = view.world_to_camera.clone()
+    M[0, 3], M[2, 3] = 1.4, 2.0
+    check_gradient("boundary", view.replace(world_to_camera=M), what)
+
+
+def test_no_warning_where_the_fold_lies_outside() -> None:
+    eg.render(colored_sphere(), camera("four"), 1)  # pytest turns warnings into errors
+
+
+# -- cameras ------------------------------------------------------------------------------------------------------------
+
+
+@lenses
+def test_batches_and_files(lens: str, tmp_path: Path) -> None:
+    one = camera(lens)
+    other = one.replace(distortion=0.5 * one.coefficients)
+    many = eg.Camera.stack([one, other])
+    images = eg.render(colored_sphere(), many, 16)
+    torch.testing.assert_close(images[0], eg.render(colored_sphere(), one, 16), rtol=0, atol=0)
+    shared = one.replace(distortion=many.distortion)
+    assert shared.batch == 2 and torch.equal(eg.render(colored_sphere(), shared, 16), images)
+    d = many.coefficients.clone().requires_grad_()
+    loss(eg.Scene([colored_sphere()]), one.replace(distortion=d[1]), spp=16).backward()
+    assert d.grad is not None and (d.grad[1] != 0).all() and (d.grad[0] == 0).all()
+    eg.save_camera(tmp_path / "camera.json", one)
+    back = eg.load_camera(tmp_path / "camera.json", F64)
+    assert torch.equal(back.coefficients, one.coefficients) and back.projection == one.projection
+    assert one.detach().to(torch.float32).coefficients.dtype == torch.float32
+
+
+def test_what_is_refused() -> None:
+    view = camera("four")
+    with pytest.raises(ValueError, match=r"distortion: expected shape .*4.*5.*8.*got \(6,\)"):
+        view.replace(distortion=torch.zeros(6, dtype=F64))
+    with pytest.raises(ValueError, match=r"distortion: .*finite"):
+        view.replace(distortion=torch.full((4,), math.nan, dtype=F64))
+    with pytest.raises(ValueError, match="distortion: expected None for an orthographic camera"):
+        view.replace(projection="orthographic")
+    with pytest.raises(ValueError, match="distortion: expected a batch of 2 like K, got 3"):
+        view.replace(K=view.K.repeat(2, 1, 1), distortion=torch.zeros((3, 4), dtype=F64))
