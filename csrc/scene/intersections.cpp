@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <array>
-#include <atomic>
 #include <bit>
 #include <tuple>
 
@@ -31,10 +30,11 @@ struct Found {
     std::vector<AlongEdge> along;
 };
 
-// Pairs of leaves for each leaf at most, in the mean: a surface has some five, a tangle of noise twenty. A soup of
-// large triangles has as many as there are leaves, and is drawn from.
-constexpr int64_t most_a_leaf = 24, most_at_least = 1 << 15;
-constexpr int64_t leaves_in_block = 64;
+// A tangle of noise, or a soup of large triangles, has so many intersections that finding them all would take longer
+// than all else, and most of them are hidden. So from one for each face on, some are drawn, by pairs of leaves. How
+// many there are is estimated from so many leaves; where there are not much more of these, all are searched.
+constexpr int64_t enough_intersections = 1 << 15, leaves_in_pilot = 128, most_in_pilot = 128;
+constexpr int64_t leaves_in_block = 16;
 
 class PairFinder {
    public:
@@ -161,49 +161,50 @@ void share_among_copies(std::vector<Intersection>& all, const int32_t* faces, co
 
 Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double* verts, const Spacing& spacing,
                              FaceOrder& order, Team& team) {
+    const bool kept_order = !order.face.empty();
     FaceTree tree(faces, n_faces, verts, order, team);
-    const int64_t leaves = tree.n_leaves(), blocks = (leaves + leaves_in_block - 1) / leaves_in_block;
-    const int64_t most = most_a_leaf * leaves + most_at_least;
-    std::vector<Found> found(blocks);
-    std::atomic<int64_t> total = 0;
-    const auto each_leaf = [&](int64_t block, auto body) {
-        for (int64_t i = block * leaves_in_block; i < std::min(leaves, (block + 1) * leaves_in_block); ++i) body(i);
-    };
     const auto finder = [&] { return std::make_unique<PairFinder>(tree, faces, verts, spacing); };
-    team.each_with(blocks, finder, [&](PairFinder& pairs, int64_t block) {
-        each_leaf(block, [&](int64_t leaf) {
-            if (total.load(std::memory_order_relaxed) > most) return;
-            int64_t n = 0;
-            pairs.each_overlapping(leaf, [&](int64_t other) { pairs.add(leaf, other, found[block]), ++n; });
-            total.fetch_add(n, std::memory_order_relaxed);
+    const int64_t leaves = tree.n_leaves();
+    const auto share_to_draw = [&] {
+        const int64_t step = leaves / leaves_in_pilot;
+        if (step < 2) return 1.0;
+        std::vector<double> expected(leaves_in_pilot);  // of the leaves for which each of them stands
+        team.each_with(leaves_in_pilot, finder, [&](PairFinder& pairs, int64_t i) {
+            const int64_t leaf = i * step;
+            int64_t others = 0;
+            pairs.each_overlapping(leaf, [&](int64_t) { ++others; });
+            const double part = std::min(1.0, double(most_in_pilot) / double(others));
+            Found found;
+            pairs.each_overlapping(leaf, [&](int64_t other) {
+                if (part == 1 || to_unit(hash(1, uint64_t(leaf), uint64_t(other))) < part)
+                    pairs.add(leaf, other, found);
+            });
+            expected[i] = double(step) * double(found.through.size()) / part;
         });
-    });
-    if (total > most) {
+        double all = 0;
+        for (const double e : expected) all += e;
+        return std::min(1.0, double(n_faces + enough_intersections) / all);
+    };
+    double share = share_to_draw();
+    if (share < 1 && kept_order) {
         // What is drawn depends on the leaves, and must not on where the vertices were before.
         order = {};
         tree = FaceTree(faces, n_faces, verts, order, team);
-        total = 0;
-        team.each_with(blocks, finder, [&](PairFinder& pairs, int64_t block) {
-            found[block] = {};
-            int64_t n = 0;
-            each_leaf(block, [&](int64_t leaf) { pairs.each_overlapping(leaf, [&](int64_t) { ++n; }); });
-            total.fetch_add(n, std::memory_order_relaxed);
-        });
-        // Others where the vertices are elsewhere, so that the mean over the steps of a fit is right.
-        uint64_t seed = 0;
-        for (int i = 0; i < 9; ++i)
-            seed = hash(seed, std::bit_cast<uint64_t>(verts[3 * int64_t(faces[i / 3]) + i % 3]));
-        const double share = double(most) / double(total);
-        stands_for_ = 1 / share;
-        team.each_with(blocks, finder, [&](PairFinder& pairs, int64_t block) {
-            each_leaf(block, [&](int64_t leaf) {
-                pairs.each_overlapping(leaf, [&](int64_t other) {
-                    if (to_unit(hash(seed, uint64_t(leaf), uint64_t(other))) < share)
-                        pairs.add(leaf, other, found[block]);
-                });
-            });
-        });
+        share = share_to_draw();
     }
+    stands_for_ = 1 / share;
+    // Others where the vertices are elsewhere, so that the mean over the steps of a fit is right.
+    uint64_t seed = 0;
+    for (int i = 0; i < 9; ++i) seed = hash(seed, std::bit_cast<uint64_t>(verts[3 * int64_t(faces[i / 3]) + i % 3]));
+    const int64_t blocks = (leaves + leaves_in_block - 1) / leaves_in_block;
+    std::vector<Found> found(blocks);
+    team.each_with(blocks, finder, [&](PairFinder& pairs, int64_t block) {
+        for (int64_t leaf = block * leaves_in_block; leaf < std::min(leaves, (block + 1) * leaves_in_block); ++leaf)
+            pairs.each_overlapping(leaf, [&](int64_t other) {
+                if (share == 1 || to_unit(hash(seed, uint64_t(leaf), uint64_t(other))) < share)
+                    pairs.add(leaf, other, found[block]);
+            });
+    });
     size_t n = 0;
     for (const Found& part : found) n += part.through.size();
     all_.reserve(n);
