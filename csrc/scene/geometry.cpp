@@ -5,8 +5,6 @@
 #include <list>
 #include <mutex>
 
-#include "core/stopwatch.h"
-
 namespace edgegrad {
 
 Geometry::Geometry(const int32_t* faces, int64_t n_faces, int64_t n_verts)
@@ -50,9 +48,7 @@ class KeptGeometry {
         if (make_parts_) parts_ = std::make_unique<Parts>(faces, n_faces_, n_verts_, team);
         if (find_intersections_) {
             work.intersections = true;
-            Stopwatch watch;
             intersections_ = std::make_unique<Intersections>(faces, n_faces_, verts_, spacing_, order_, team);
-            work.seconds_of_intersections = watch.lap();
         }
         keep(moved);
         return geometry_;

@@ -19,10 +19,9 @@ struct GeometryWanted {
 
 // What it had to do.
 struct GeometryWork {
-    bool rays = false;   // built or updated the ray structure
-    bool edges = false;  // found or welded the edges
-    bool intersections = false;
-    double seconds_of_intersections = 0;
+    bool rays = false;           // built or updated the ray structure
+    bool edges = false;          // found or welded the edges
+    bool intersections = false;  // found where faces pass through each other
 };
 
 class Geometry {
