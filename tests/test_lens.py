@@ -242,15 +242,21 @@ STEP = {"vertices": 0.005, "pose": 0.002, "K": 0.002, "d": 0.005}
 FAINT = 0.02
 
 
-def check_gradient(kind: str, view: eg.Camera, what: str, spp: int = 4096, seeds: int = 4) -> None:
+def check_gradient(
+    kind: str, view: eg.Camera, what: str, spp: int = 4096, seeds: int = 4, most_noise: float = 0.01
+) -> None:
     case, step = moved(kind, view, what), STEP[what if what in STEP else what[0]]
     fd = finite_difference(case, step, spp, seeds)
     found = gradient(case, 4, surface_samples=100_000, edge_samples=50_000)
     size = gradient_size(case)
     if abs(fd.mean) < FAINT * size:
         assert abs(found.mean - fd.mean) < 0.01 * size
-    else:
+    elif most_noise == 0.01:
         right_ratio(fd, found)
+    else:
+        noise = math.hypot(fd.error, found.error) / abs(fd.mean)
+        assert noise < most_noise, f"{what}: too noisy to tell: {fd}, {found}"
+        assert abs(found.mean / fd.mean - 1) <= 0.02 + 3 * noise, f"{what}: finite difference {fd}, gradient {found}"
 
 
 def gradient_size(case: Case) -> float:
@@ -278,7 +284,8 @@ def test_every_gradient(lens: str, kind: str, crop: bool) -> None:
     if crop:
         view = view.crop(-10, 30, 50, 60)  # reaches beyond the image, where the lens bends most
     for what in [*WHAT, *(f"d{i}" for i in range(len(DISTORTION[lens])))]:
-        check_gradient(kind, view, what, seeds=6)
+        # Coefficients of high powers move little, so differences say less of them; test_area_of_a_triangle is exact.
+        check_gradient(kind, view, what, seeds=6, most_noise=0.05)
 
 
 # -- where a lens ends --------------------------------------------------------------------------------------------------
