@@ -1,7 +1,8 @@
 // Where the image jumps along an edge: silhouettes, open borders and creases, for any number of faces on the edge.
 //
-// On each side of the edge in the image, what is seen next to it is the incident face on that side that lies in front,
-// or, if there is none, what lies behind. If both sides carry the same radiance by construction, there is no curve.
+// On each side of the edge in the image one surface is visible next to it: of the incident faces on that side the one
+// in front, or, if there is none, what lies behind. If both sides have the same radiance by construction, there is no
+// curve.
 #pragma once
 
 #include <algorithm>
@@ -18,7 +19,7 @@ namespace edgegrad {
 
 struct Curve {
     int64_t edge = -1;
-    HalfEdge minus, plus;   // the faces next to the curve; face −1: none, what lies behind is seen
+    HalfEdge minus, plus;   // the faces next to the curve; face −1: none, what lies behind is visible
     Vec3 a, b;              // ends of the edge, camera coordinates
     double t0 = 0, t1 = 0;  // its part within the view
     double w0 = 1, w1 = 1;  // denominators of the projection at t0 and t1

@@ -35,8 +35,8 @@ struct CurveSample {
     Vec2 u, n;              // the place in the straight image, and its normalised coordinates
     Vec2 x;                 // the pixel position
     double area_scale = 1;  // how much larger an area is there than in the straight image
-    Vec3 point;         // camera coordinates
-    double weight = 0;  // inverse of the density of samples along the curve's fraction s
+    Vec3 point;             // camera coordinates
+    double weight = 0;      // inverse of the density of samples along the curve's fraction s
     SurfacePoint behind = {};
 
     // What the ray does not see; ascends if it is more than 16. `gathered` keeps them where they are not listed
@@ -61,8 +61,8 @@ struct CurveJumps {
 // `place` sets where the fraction s of a curve lies, of a sample that has its x, n and weight; false if no ray is
 // needed to know that nothing shows there. `faces_of` serves the test whether what the ray meets hides the point.
 // `jumps` takes one number, linear in the radiance, of each of the surfaces. `add_motion` takes the jumps of the loss;
-// `velocities` is what it is the adjoint of, in one direction, and `normal` that of places x in the image. `finish` adds what was summed for
-// the latest curve. `cast` tells that no sample waits any more.
+// `velocities` is what it is the adjoint of, in one direction, and `normal` that of places x in the image. `finish`
+// adds what was summed for the latest curve. `cast` tells that no sample waits any more.
 template <class S>
 concept CurveSource =
     std::derived_from<typename S::Sample, CurveSample> &&

@@ -270,8 +270,8 @@ inline Vec2 normalised_jvp(const Camera& c, Vec2 n, const IntrinsicsGrad& intrin
     const auto by_pixel = [&](Vec2 x) { return Vec2{A[0] * x.x + A[1] * x.y, A[2] * x.x + A[3] * x.y}; };
     if (c.is_straight()) return -1 * by_pixel(to_pixels_by_k(n, intrinsics.k));
     return with_lens(c.lens, [&](const auto& lens) {
-        const Vec2 m_dot = by_pixel(to_pixels_by_k(lens.bend(n), intrinsics.k)) +
-                           bend_by_coefficients(c, n, intrinsics.distortion);
+        const Vec2 m_dot =
+            by_pixel(to_pixels_by_k(lens.bend(n), intrinsics.k)) + bend_by_coefficients(c, n, intrinsics.distortion);
         return -1 * (inverse(lens.jacobian(n)) * m_dot);
     });
 }

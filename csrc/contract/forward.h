@@ -11,10 +11,11 @@
 
 namespace edgegrad {
 
-// One direction: the tangents of the arrays, and what follows from them for the vertices in the camera and for its intrinsics.
+// One direction: the tangents of the arrays, and what follows from them for the vertices in the camera and for its
+// intrinsics.
 struct Direction {
     Tangents tangents;
-    Array<Vec3> q{0};           // (V,) camera coordinates; empty: nothing moves
+    Array<Vec3> q{0};  // (V,) camera coordinates; empty: nothing moves
     IntrinsicsGrad intrinsics;
 
     bool moves() const { return !q.empty(); }

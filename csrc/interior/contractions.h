@@ -9,8 +9,8 @@
 
 namespace edgegrad {
 
-// A sample at u in the straight image, with barycentrics λ there, that stands for a share of the face's area; it is seen
-// at x, where `weight` px² are its own.
+// A sample at u in the straight image, with barycentrics λ there, that stands for a share of the face's area; it is
+// seen at x, where `weight` px² are its own.
 struct SurfaceSample {
     int32_t face;
     bool controlled;

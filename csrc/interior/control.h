@@ -1,5 +1,5 @@
-// A control variate for the interior term: what a small face that is seen whole would give if everything on it were
-// affine in the image.
+// A control variate for the interior term: what a small face that is visible as a whole would give if radiance and
+// adjoint were affine on its image.
 //
 // Let λ_i be the barycentrics of a point within the image of the face, x_i and c_i the places and the colours of its
 // corners, and A_i the filtered adjoint there. If radiance and adjoint were L(x) = Σ λ_i c_i and Ã(x) = Σ λ_i A_i, then
@@ -8,11 +8,10 @@
 //     T_i = ∫ λ_i Ã dx = area / 12 · (A_i + Σ_j A_j)        (C numbers)
 //
 // the interior term of the face would be T_i for the colour c_i, and −∇L · T_i for the place x_i, with ∇L constant.
-// λ_i(x) Ã(x) at a sample, in place of the integral, says what the control is at that sample. The integral plus the sum
-// over samples of (what is seen − the control) has the same mean as the sum over samples of what is seen, whatever the
-// control is worth; and where it is good, which is where a face is small, nothing hides it and the adjoint is nearly
-// affine on it, what is left to chance is a small part of the whole, and few samples do. A hidden face that is taken
-// for a seen one adds noise of mean zero where there was none.
+// The integrand at a sample, λ_i(x) Ã(x), is the control there. The integral plus the sum over samples of (integrand −
+// control) has the same mean as the sum over samples of the integrand, however good the control is. It is good where a
+// face is small, visible, and has a nearly affine adjoint: there few samples are enough. A hidden face that is taken
+// for a visible one adds noise of mean zero.
 #pragma once
 
 #include <algorithm>

@@ -16,8 +16,9 @@ namespace edgegrad {
 
 namespace {
 
-// How few samples a triangle gets if it lies behind what the image hit (occlusion.h), and neither it nor a neighbour
-// was hit; and what its measure is multiplied by if a neighbour was. Never zero, for it may be visible all the same.
+// What the density of a triangle is multiplied by if it lies behind what the image hit (occlusion.h): one of which no
+// neighbour was hit either, and one beside a face that was hit. Never zero, for the triangle may be visible all the
+// same.
 constexpr OcclusionHint::Few occluded{.rays = 2, .share = 1.0 / 64, .least = 1.0 / 64};
 constexpr double occluded_beside_hits = 1.0 / 8;
 
@@ -117,7 +118,7 @@ class MeasuredChunk {
             if (!lanes_) lanes_.emplace(C_);
             lanes_->count = 0;
             for (int i = 0; i < n_others_; ++i) gather(others_[i]);
-            look();
+            lay_out_lanes();
         }
     }
 
@@ -172,8 +173,7 @@ class MeasuredChunk {
         }
     }
 
-    // Puts a face that lies inside the view of a pinhole into the lanes, where all are looked at together; any other is
-    // laid out here.
+    // Puts a face that lies inside the view of a pinhole into the lanes; any other is laid out here.
     void gather(int64_t f) {
         const int32_t* v = view_.scene.faces + 3 * f;
         const VertexView& p = view_.vertices;
@@ -242,7 +242,7 @@ class MeasuredChunk {
     }
 
     // Lays out the faces in the lanes.
-    void look() {
+    void lay_out_lanes() {
         FaceLanes& l = *lanes_;
         if (!l.count) return;
         l.bound(view_.camera.width, view_.camera.height, view_.importance.radius());
