@@ -68,11 +68,13 @@ def kernel_camera(camera: PackedCamera, index: int = 0) -> Any:
     return core.Camera(**{n: _array(v[index]) if isinstance(v, Tensor) else v for n, v in camera._asdict().items()})
 
 
-def _warn_of_fold(camera: Any) -> None:
-    if camera.fold is not None:
-        angle = math.degrees(math.atan(camera.fold))
+def _warn_of_folds(cameras: Sequence[Any]) -> None:
+    """Once for a batch, of the lens that shows least."""
+    folds = [camera.fold for camera in cameras if camera.fold is not None]
+    if folds:
+        angle = math.degrees(math.atan(min(folds)))
         warnings.warn(
-            f"distortion: the lens shows nothing beyond the radius {camera.fold:.4g} in normalised image coordinates, "
+            f"distortion: the lens shows nothing beyond the radius {min(folds):.4g} in normalised image coordinates, "
             f"{angle:.4g}° from its axis, where it folds the image over or ends; what the image has there is background",
             stacklevel=2,
         )
@@ -94,14 +96,14 @@ def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
         B, height, width = request.cameras, request.camera.height, request.camera.width
         image = request.scene.colors.new_empty((B, height, width, request.channels))
         hits = Hits.empty(request)
+        cameras = [kernel_camera(request.camera, b) for b in range(B)]
+        _warn_of_folds(cameras)
         profiles = []
         for b in range(B):
             options["seed"] = _camera_seed(request.image.seed, b)
-            camera = kernel_camera(request.camera, b)
-            _warn_of_fold(camera)
             profiles.append(
                 scene.forward(
-                    camera=camera,
+                    camera=cameras[b],
                     options=core.ImageOptions(**options),
                     threads=torch.get_num_threads(),
                     image=image[b].numpy(),
@@ -443,7 +445,7 @@ class _RenderJvp(torch.autograd.Function):
     def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, int]:
         *rest, tangents = _with_tangents(args)
         dims = in_dims[len(rest) :]
-        if any(dim is not None for dim in in_dims[: len(rest)]):  # scenes of their own
+        if any(isinstance(dim, int) for dim in in_dims[: len(rest)]):  # scenes of their own
             return _one_by_one(_RenderJvp, info.batch_size, in_dims, args)
         tangents = [
             None if t is None else t.expand(info.batch_size, *t.shape) if dim is None else t.movedim(dim, 0)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ._check import as_tensor, check_finite, check_float, check_shape
+from ._check import as_tensor, check_finite, check_float, check_not_meta, check_shape
 from ._ops import forward_kernel, render_image, screen_gradient_kernel
 from ._request import as_scene, make_request
 from .camera import Camera
@@ -76,28 +76,32 @@ def jvp(
                direction: `{mesh.verts: dv, camera.K: dK}`; those of all others are zero
 
     All directions share the samples of one pass. The other arguments are those of render(); samples go by area and length
-    alone, for no loss says where it looks. The same as torch.func.jvp of render(), under torch.vmap. Raises what render()
-    raises.
+    alone, for no loss says where it looks. The same as torch.func.jvp of render(), under torch.vmap; what it returns is not in
+    the graph. Raises what render() raises.
     """
+    make_request(scene, camera, spp, seed, **options)  # checks them
+    scene = as_scene(scene)
     if not isinstance(tangents, Mapping) or not tangents:
         raise TypeError("tangents: expected a mapping of tensors of the scene and the camera to their tangents")
-    scene = as_scene(scene)
-    things = [*scene.meshes, scene, camera]
-    owned = {id(value) for thing in things for value in vars(thing).values() if isinstance(value, Tensor)}
-    directions = {len(tangent) for tangent in tangents.values()}
-    if len(directions) > 1:
-        raise ValueError(f"tangents: expected as many directions of all, got {sorted(directions)}")
-    (D,) = directions
-    leaves = list(tangents)
+    owned = {id(v) for thing in (*scene.meshes, scene, camera) for v in vars(thing).values() if isinstance(v, Tensor)}
+    leaves, values = [], []
     for leaf, tangent in tangents.items():
-        if id(leaf) not in owned:
+        if not isinstance(leaf, Tensor) or id(leaf) not in owned or not leaf.is_floating_point():
+            got = f"a tensor of shape {tuple(leaf.shape)}" if isinstance(leaf, Tensor) else type(leaf).__name__
             raise ValueError(
-                f"tangents: expected tensors that the scene or the camera holds, got one of shape {tuple(leaf.shape)} that "
-                "neither does; give mesh.verts of the mesh itself, say"
+                f"tangents: expected floating-point tensors that the scene or the camera holds as keys, got {got}; "
+                "give mesh.verts of the mesh itself, say"
             )
-        check_float("tangents", tangent)
-        check_shape("tangents", tangent, (D, *leaf.shape), fix="the first axis counts directions")
-        check_finite("tangents", tangent)
+        value = as_tensor("tangents", tangent, like=leaf, floating=True).detach()
+        check_not_meta("tangents", value)
+        fix = "the first axis counts directions: tangent[None] is one"
+        check_shape("tangents", value, ("D", *leaf.shape), fix=fix)
+        leaves.append(leaf)
+        values.append(value.to(leaf))
+        check_finite("tangents", values[-1])
+    counts = sorted({len(value) for value in values})
+    if len(counts) > 1:
+        raise ValueError(f"tangents: expected as many directions of all, got {counts}")
 
     def image(*values: Tensor) -> Tensor:
         moved = dict(zip(map(id, leaves), values, strict=True))
@@ -113,10 +117,9 @@ def jvp(
         return torch.func.jvp(image, tuple(leaves), values)
 
     with torch.no_grad():
-        values = tuple(tangent.to(leaf) for leaf, tangent in tangents.items())
         out_dims: Any = (None, 0)  # the image does not depend on the direction
         primal, image_dot = torch.func.vmap(direction, out_dims=out_dims)(*values)
-        return primal, image_dot
+        return primal.detach(), image_dot.detach()
 
 
 def screen_gradient(

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 import edgegrad as eg
+from edgegrad import _memory, _ops
 from edgegrad.report.exact import exact_image
 
 F64 = torch.float64
@@ -167,6 +168,33 @@ def test_directions_share_samples_and_each_is_what_it_is_alone():
         torch.testing.assert_close(eg.jvp(scene, camera, {x: v[None]}, 4, 7)[1][0], dots[d], rtol=1e-12, atol=1e-12)
 
 
+def test_all_directions_take_one_pass(monkeypatch):
+    calls = []
+
+    def watched(hits, request, tangents, directions):
+        calls.append(directions)
+        return jvp_kernel(hits, request, tangents, directions)
+
+    jvp_kernel = _ops.jvp_kernel
+    monkeypatch.setattr(_ops, "jvp_kernel", watched)
+    eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(40, 3, 3, dtype=F64)}, 4)
+    torch.func.jacfwd(lambda t: eg.render(MESH.transformed(t=t), CAMERA, 4))(torch.zeros(3, dtype=F64))
+    assert calls == [40, 3]
+
+
+def test_more_directions_than_memory(monkeypatch):
+    monkeypatch.setattr(_memory, "LOOK_FROM", 0)
+    monkeypatch.setattr(_memory, "available", lambda: 20_000_000)
+    with pytest.raises(MemoryError, match=r"jvp: .*\(samples in pixels 3.* GB.*ask for fewer directions"):
+        eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(2000, 3, 3, dtype=F64)}, 4)
+
+
+def test_derivatives_are_not_in_the_graph():
+    verts = MESH.verts.clone().requires_grad_()
+    image, dots = eg.jvp(MESH.replace(verts=verts), CAMERA, {verts: torch.ones(1, 3, 3, dtype=F64)}, 4)
+    assert not image.requires_grad and not dots.requires_grad
+
+
 def test_through_torch():
     """torch.func.jvp, jacfwd and dual numbers, also of what the vertices are computed from; and a batch of cameras."""
     cameras = eg.Camera.stack([CAMERA, CAMERA.replace(K=CAMERA.K * torch.tensor([[1.1], [1.1], [1.0]], dtype=F64))])
@@ -229,11 +257,15 @@ def test_same_bits_at_any_number_of_threads(call):
     ("tangents", "message"),
     [
         ({}, "tangents: expected a mapping"),
-        ({MESH.verts.clone(): torch.ones(1, 3, 3)}, "tangents: expected tensors that the scene or the camera holds"),
-        ({MESH.verts: torch.ones(3, 3)}, "tangents: expected shape"),
+        ({MESH.verts.clone(): torch.ones(1, 3, 3)}, "tangents: expected .* that the scene or the camera holds"),
+        ({MESH.faces: torch.ones(1, 1, 3)}, "tangents: expected floating-point tensors"),
+        ({"verts": torch.ones(1, 3, 3)}, "tangents: expected .* got str"),
+        ({MESH.verts: torch.ones(3, 3)}, r"tangents: expected shape .*tangent\[None\]"),
+        ({MESH.verts: torch.ones(())}, "tangents: expected shape"),
+        ({MESH.verts: None}, "tangents: expected a tensor"),
+        ({MESH.verts: torch.ones(0, 3, 3)}, "tangents: expected shape"),
         ({MESH.verts: torch.ones(2, 3, 3), CAMERA.K: torch.ones(1, 3, 3)}, "tangents: expected as many directions"),
         ({MESH.verts: torch.full((1, 3, 3), torch.nan)}, "tangents: expected finite"),
-        ({MESH.verts: torch.ones(1, 3, 3, dtype=torch.int64)}, "tangents: expected"),
     ],
 )
 def test_tangents_that_do_not_fit(tangents, message):

@@ -320,6 +320,17 @@ def test_gradient_before_a_fold(what: str) -> None:
     check_gradient("boundary", view.replace(world_to_camera=M), what)
 
 
+def test_a_telephoto_lens_may_fold_near_its_axis() -> None:
+    """r (1 + k1 r² + k2 r⁴) is greatest at a thousandth, and rises again soon after."""
+    k1, k2 = 1e6, -1e12
+    fold = math.sqrt((3 * k1 + math.sqrt(9 * k1**2 - 20 * k2)) / (-10 * k2))
+    K = torch.tensor([[24e3, 0, 24], [0, 24e3, 24], [0, 0, 1]], dtype=F64)
+    distortion = torch.tensor([k1, k2, 0, 0], dtype=F64)
+    view = eg.Camera.from_opencv(torch.eye(3, dtype=F64), torch.zeros(3, dtype=F64), K, (48, 48), distortion)
+    with pytest.warns(UserWarning, match=rf"radius {fold:.4g} "):
+        eg.render(colored_sphere(), view, 1)
+
+
 def test_no_warning_where_the_fold_lies_outside() -> None:
     eg.render(colored_sphere(), camera("four"), 1)  # pytest turns warnings into errors
 

@@ -85,11 +85,12 @@ namespace {
 
 double radius_of_fold(const AnyLens& lens) {
     return with_lens(lens, [](const auto& l) {
-        constexpr int radii = 256;
+        // Equal angles, and below the first of these a geometric row: a telephoto lens may fold at a thousandth.
+        constexpr int radii = 256, small_radii = 96;
         const double step = std::atan(greatest_radius) / radii;
         double low = 0;
-        for (int i = 1; i <= radii; ++i) {
-            double high = std::tan(i * step);
+        for (int i = 1 - small_radii; i <= radii; ++i) {
+            double high = i > 0 ? std::tan(i * step) : std::tan(step) * std::pow(1.1, i - 1);
             if (least_area_scale(l, high) > 0) {
                 low = high;
                 continue;
