@@ -43,6 +43,11 @@ struct BackwardInput {
     HitBuffers<T> hits;         // of that image
 };
 
+// The geometry that the terms of a derivative need.
+inline GeometryWanted geometry_for(bool interior, bool boundary) {
+    return {.topology = boundary, .parts = interior || boundary, .intersections = boundary};
+}
+
 // Adds the gradient to what `grad` points to.
 template <class T>
 BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOptions& options, Team& team,

@@ -131,8 +131,8 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
         texels(scene.texels.size()), background(scene.background.size()), pose(16), K(9);
     const Gradients grad{verts.data(),      colors.data(), uvs.data(), texels.data(),
                          background.data(), pose.data(),   K.data()};
-    const auto geometry =
-        acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, spacing, {true, true}, team, work);
+    const auto geometry = acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, spacing,
+                                           geometry_for(true, true), team, work);
     render_backward(BackwardInput<T>{view, camera, *geometry, options, image.data(), hits}, {.seed = 2}, team, grad);
     std::vector<double> all(image.begin(), image.end());
     for (const auto* values : {&verts, &colors, &uvs, &texels, &background, &pose, &K}) {

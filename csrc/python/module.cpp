@@ -92,8 +92,7 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Image
         Stopwatch watch;
         const bool boundary = grad.geometry() && options.boundary;
         const bool interior = (grad.geometry() && options.interior_geometry) || grad.appearance();
-        const auto geometry = arrays.geometry(
-            {.topology = boundary, .parts = interior || boundary, .intersections = boundary}, team, work);
+        const auto geometry = arrays.geometry(geometry_for(interior, boundary), team, work);
         update = watch.lap();
         return render_backward(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view()}, options,
                                team, grad);
@@ -124,7 +123,7 @@ template <class T, class Work>
 void with_geometry(const SceneArrays<T>& arrays, bool boundary, int threads, Work work) {
     unlocked(threads, [&](Team& team) {
         GeometryWork done;
-        work(*arrays.geometry({.topology = boundary, .parts = true, .intersections = boundary}, team, done), team);
+        work(*arrays.geometry(geometry_for(true, boundary), team, done), team);
     });
 }
 
