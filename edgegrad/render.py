@@ -76,7 +76,8 @@ def jvp(
                direction: `{mesh.verts: dv, camera.K: dK}`; those of all others are zero
 
     All directions share the samples of one pass. The other arguments are those of render(); samples go by area and length
-    alone, for no loss says where it looks. The same as torch.func.jvp of render(), under torch.vmap; what it returns is not in
+    alone, for no loss says where it looks. The first call in a process takes some seconds, in which torch loads its own rules of
+    forward mode. The same as torch.func.jvp of render(), under torch.vmap; what it returns is not in
     the graph. Raises what render() raises.
     """
     make_request(scene, camera, spp, seed, **options)  # checks them

@@ -4,21 +4,20 @@ A loss Σr² with the residual r(p) = render − picture falls along the step δ
 
     (JᵀJ + damping) δp = −Jᵀr        (Levenberg 1944, Marquardt 1963)
 
-Forward mode gives all columns of J in one pass, for p has few entries, together with r, whose samples are others. Where every
-render has a seed of its own, Jᵀr is unbiased, and steps that shrink as 1/k average its noise away. JᵀJ is not: noise adds to its
-diagonal, which damps the step.
+Reverse mode gives Jᵀv for one image v at a time. Jᵀr is one backward pass, and JᵀJ the mean of (Jᵀv)(Jᵀv)ᵀ over random
+images v of independent signs, since E[vvᵀ] = 1 (Hutchinson 1990). Few will do when p has few entries.
+Where every render has a seed of its own, Jᵀr is unbiased, and steps that shrink as 1/k average its noise away.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
 
-MEMORY = 0.9  # weight of JᵀJ at all earlier points
+FIRST_PROBES, PROBES = 24, 4  # images v at the first point, and at every later one
+MEMORY = 0.9  # weight of all earlier probes when new ones come
 FIRST_DAMPING, LEAST_DAMPING = 0.1, 0.005  # relative to the diagonal of JᵀJ
 LONGEST = 0.07  # of any entry of a step: JᵀJ says little about poses further away
 FULL_STEPS, DECAY = 10, 0.5  # so many steps at full length, then 1 / (1 + DECAY k)
@@ -28,29 +27,32 @@ NOISE = 1.03  # a loss that rises by a smaller factor may have risen by the nois
 class GaussNewton:
     """Steps for a parameter p that is zero at the point where one stands: its entries should be of order one."""
 
-    def __init__(self) -> None:
+    def __init__(self, generator: torch.Generator) -> None:
+        self.generator = generator
         self.loss = math.inf  # mean r² at the last accepted point
-        self.tried = math.inf  # … at the last one
         self.seen = self.accepted = 0  # points
         self.damping = FIRST_DAMPING
         self._gradient = self._curvature = torch.empty(0)
 
-    def observe(self, residual: Callable[[Tensor], Tensor], n: int) -> bool:
-        """Takes in r, a function of p (n,), at a new point, p = 0. False if the loss rose: go back to the last accepted."""
+    def observe(self, p: Tensor, residual: Tensor) -> bool:
+        """Takes in r, a function of p (n,), at a new point. False when the loss rose: then go back to the last accepted."""
         self.seen += 1
-        r, J = _with_jacobian(residual, n)
-        self.tried = float(r.square().mean())
+        loss = float(residual.detach().square().mean())
         # not <=, so that a loss that is NaN is turned down
-        if not self.tried <= NOISE * self.loss:
+        if not loss <= NOISE * self.loss:
             self.damping *= 5.0
             return False
-        rows = J.reshape(n, -1).double()
-        fresh = rows @ rows.T
+        probes = PROBES if self.accepted else FIRST_PROBES
+        rows = []
+        for _ in range(probes):
+            signs = torch.randint(0, 2, residual.shape, generator=self.generator).to(residual) * 2.0 - 1.0
+            rows.append(_pulled_back(residual, p, signs))
+        fresh = torch.stack(rows).T @ torch.stack(rows) / probes
         self._curvature = MEMORY * self._curvature + (1.0 - MEMORY) * fresh if self.accepted else fresh
-        self._gradient = rows @ r.reshape(-1).double()
+        self._gradient = _pulled_back(residual, p, residual.detach())
         if self.accepted:
             self.damping = max(self.damping / 3.0, LEAST_DAMPING)
-        self.loss = self.tried
+        self.loss = loss
         self.accepted += 1
         return True
 
@@ -69,14 +71,7 @@ class GaussNewton:
         return step * shrink / (1.0 + DECAY * max(0, self.accepted - FULL_STEPS))
 
 
-@torch.no_grad()
-def _with_jacobian(residual: Callable[[Tensor], Tensor], n: int) -> tuple[Tensor, Tensor]:
-    """r, and its derivatives (n, …) by p at p = 0."""
-    zero = torch.zeros(n, dtype=torch.float64)
-
-    def along(direction: Tensor) -> tuple[Tensor, ...]:
-        return torch.func.jvp(residual, (zero,), (direction,))
-
-    out_dims: Any = (None, 0)  # r does not depend on the direction
-    r, J = torch.func.vmap(along, out_dims=out_dims)(torch.eye(n, dtype=torch.float64))
-    return r, J
+def _pulled_back(residual: Tensor, p: Tensor, image: Tensor) -> Tensor:
+    """Jᵀ image (n,)."""
+    # Of a sum, because torch imports SymPy, for more than a second, when it is handed an image as grad_outputs.
+    return torch.autograd.grad((residual * image).sum(), p, retain_graph=True)[0]

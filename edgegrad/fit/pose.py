@@ -20,8 +20,8 @@ from ..camera import Camera
 from ..mesh import Mesh
 from ..scene import Scene
 from .gauss_newton import NOISE, GaussNewton
-from .result import Pose, PoseFit, Step, pose_from_matrix
-from .task import TURN, Level, PoseTask, zoomed
+from .result import PoseFit, Step, pose_from_matrix
+from .task import TURN, PoseTask, zoomed
 
 ASIDE, ASIDE_STEPS = 0.2, 20  # radians between the starts on the coarsest level, and steps from each
 FINAL_SPP = 64  # samples a pixel when start and end are compared
@@ -89,6 +89,7 @@ def fit_pose(
     start = best = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
     task = PoseTask.of(mesh, target, camera, mask, background, start, fit_scale, fit_focal)
     levels = task.pyramid(start, max_size, spp)
+    generator = torch.Generator().manual_seed(seed)
     history: list[Step] = []
     loss, converged, interrupted = math.nan, False, False
 
@@ -109,15 +110,13 @@ def fit_pose(
         for level in levels:
             first, size, lowest = level is levels[0], level.camera.size, math.inf
             for origin in starts if first else [best]:
-                search, pose, here = GaussNewton(), origin, origin
+                search, pose, here = GaussNewton(generator), origin, origin
                 most = min(steps, ASIDE_STEPS) if first else steps
                 while search.seen < most:
-                    number = seed + len(history)
-
-                    def residual(p: Tensor, pose: Pose = pose, number: int = number, level: Level = level) -> Tensor:
-                        return task.image(level, task.moved(pose, level.free, p), level.spp, number) - level.target
-
-                    if search.observe(residual, len(level.free)):
+                    p = torch.zeros(len(level.free), dtype=torch.float64, requires_grad=True)
+                    moved = task.moved(pose, level.free, p)
+                    residual = task.image(level, moved, level.spp, seed + len(history)) - level.target
+                    if search.observe(p, residual):
                         here = pose
                         if search.loss <= NOISE * lowest:
                             best, loss, lowest = pose, search.loss, search.loss
@@ -125,7 +124,7 @@ def fit_pose(
                         break
                     step = search.step()
                     converged = float(step.abs().max()) < tolerance * level.coarseness
-                    history.append(Step(size, search.tried, pose, pose is best))
+                    history.append(Step(size, float(residual.detach().square().mean()), pose, pose is best))
                     bar.set_postfix_str(f"{size[1]} × {size[0]} px, loss {loss:.2e}", refresh=False)
                     bar.update()
                     if callback is not None:
