@@ -1,4 +1,4 @@
-"""The kernel's two passes as operators of torch, and the autograd.Functions over them."""
+"""The kernel's passes, whether they fit into memory, and the operators of torch that run them."""
 
 from __future__ import annotations
 
@@ -16,17 +16,13 @@ from . import _memory as memory
 from ._check import check_finite
 from ._kernel import core
 from ._request import (
-    POSITIONS,
     SCHEMA,
     SLOTS,
     PackedCamera,
     Request,
     Work,
     derived_seed,
-    join,
     label,
-    others_of,
-    tensors_of,
 )
 from .scene import Flat
 
@@ -350,154 +346,3 @@ def _render_jvp_fake(*args: Any) -> Tensor:
 def _nothing(adjoint: Tensor) -> Tensor:
     """What an operator returns for a gradient that is not wanted."""
     return adjoint.new_empty(0, dtype=torch.float32)
-
-
-# -- autograd -----------------------------------------------------------------------------------------------------------
-
-FIRST_ORDER = (
-    "second derivatives of a rendered image are not available (its gradient is an estimate whose own derivative is not "
-    "computed); for curvature use Gauss-Newton, JᵀJ from backward passes over the image, as edgegrad.fit.fit_pose does"
-)
-
-
-def render_image(request: Request, batched: bool) -> Tensor:
-    """The image (B, H, W, C), or (H, W, C) unless `batched`, as a function of the request's tensors."""
-    function = _Render if torch.compiler.is_compiling() else _RenderEager
-    image, *_ = function.apply(batched, *request.pack())
-    return image
-
-
-class _Render(torch.autograd.Function):
-    """edgegrad::render, differentiated by edgegrad::render_backward. The image of a single camera loses its batch axis."""
-
-    @staticmethod
-    def forward(batched: bool, *args: Any) -> tuple[Tensor, ...]:
-        image, *hits = torch.ops.edgegrad.render(*args)
-        return image if batched else image.squeeze(0), *hits
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        _, *hits = output
-        ctx.batched, *packed = inputs
-        ctx.mark_non_differentiable(*hits)
-        ctx.save_for_backward(*hits, *tensors_of(packed))
-        ctx.save_for_forward(*hits, *tensors_of(packed))
-        ctx.others = others_of(packed)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        coverage, depth, hit, seen, *tensors = ctx.saved_tensors
-        wanted = [ctx.needs_input_grad[1 + i] for i in POSITIONS]
-        packed = join(tensors, ctx.others)
-        arguments = (grad_outputs[0], coverage, depth, hit, seen, *packed)
-        if torch.compiler.is_compiling():  # which refuses second derivatives itself
-            grads = torch.ops.edgegrad.render_backward(*arguments, wanted)
-        else:
-            grads = _RenderBackward.apply(*arguments, *wanted)
-        out: list[Tensor | None] = [None] * (1 + len(packed))
-        for i, want, grad in zip(POSITIONS, wanted, grads, strict=True):
-            if want:
-                out[1 + i] = grad
-        return tuple(out)
-
-
-class _RenderEager(_Render):
-    """_Render with what torch.compile does not trace: inference tensors, and the transforms of torch.func."""
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        # A tensor that was made in torch.inference_mode() cannot be kept for later, but a copy of it can.
-        later = not torch.is_inference_mode_enabled()
-        kept = (a.clone() if later and isinstance(a, Tensor) and a.is_inference() else a for a in inputs)
-        _Render.setup_context(ctx, tuple(kept), output)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        return _one_by_one(_RenderEager, info.batch_size, in_dims, args)
-
-    @staticmethod
-    def jvp(ctx: Any, batched: Any, *tangents: Any) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        coverage, depth, hit, seen, *tensors = ctx.saved_tensors
-        given = [tangents[i] for i in POSITIONS]
-        packed = join(tensors, ctx.others)
-        image_dot = _RenderJvp.apply(coverage, depth, hit, seen, *packed, *given)
-        return image_dot if ctx.batched else image_dot.squeeze(0), None, None, None, None
-
-
-class _RenderJvp(torch.autograd.Function):
-    """edgegrad::render_jvp in one direction; torch.vmap over tangents takes all of theirs in one pass."""
-
-    @staticmethod
-    def forward(*args: Any) -> Tensor:
-        *rest, tangents = _with_tangents(args)
-        tangents = [None if t is None else t[None] for t in tangents]
-        return torch.ops.edgegrad.render_jvp(*rest, tangents, 1)[0]
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, int]:
-        *rest, tangents = _with_tangents(args)
-        dims = in_dims[len(rest) :]
-        if any(isinstance(dim, int) for dim in in_dims[: len(rest)]):  # scenes of their own
-            return _one_by_one(_RenderJvp, info.batch_size, in_dims, args)
-        tangents = [
-            None if t is None else t.expand(info.batch_size, *t.shape) if dim is None else t.movedim(dim, 0)
-            for t, dim in zip(tangents, dims, strict=True)
-        ]
-        return torch.ops.edgegrad.render_jvp(*rest, tangents, info.batch_size), 0
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)
-
-
-def _with_tangents(args: Sequence[Any]) -> list[Any]:
-    """The last arguments, a tangent for each slot, as one list."""
-    return [*args[: -len(SLOTS)], list(args[-len(SLOTS) :])]
-
-
-class _RenderBackward(torch.autograd.Function):
-    """edgegrad::render_backward. A function of its own, so that whoever asks for its derivative hears that there is none:
-    once_differentiable takes it for zero where the adjoint is a constant, as it is for a loss linear in the image."""
-
-    @staticmethod
-    def forward(*args: Any) -> tuple[Tensor, ...]:
-        many = len(SLOTS)
-        return torch.ops.edgegrad.render_backward(*args[:-many], list(args[-many:]))
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        return _one_by_one(_RenderBackward, info.batch_size, in_dims, args)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)
-
-
-def _one_by_one(
-    function: type[torch.autograd.Function], count: int, in_dims: tuple[int | None, ...], args: tuple[Any, ...]
-) -> Any:
-    """torch.vmap of a function, call by call. What is no tensor has no batch axis."""
-    results = [
-        function.apply(*(a.select(dim, i) if isinstance(dim, int) else a for a, dim in zip(args, in_dims, strict=True)))
-        for i in range(count)
-    ]
-    if isinstance(results[0], Tensor):
-        return torch.stack(results), 0
-    outputs = tuple(torch.stack(parts) for parts in zip(*results, strict=True))
-    return outputs, (0,) * len(outputs)

@@ -12,8 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ._autograd import render_image
 from ._check import as_tensor, check_finite, check_float, check_not_meta, check_shape
-from ._ops import forward_kernel, render_image, screen_gradient_kernel
+from ._ops import forward_kernel, screen_gradient_kernel
 from ._request import as_scene, make_request
 from .camera import Camera
 from .mesh import Mesh

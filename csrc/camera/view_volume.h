@@ -9,10 +9,9 @@
 
 namespace edgegrad {
 
-// The rectangle of the straight image in which all lies that is seen, the image widened by the radius of the pixel
-// filter, as four planes n · q + d ≥ 0 through the camera and
-// the rectangle's sides. Whatever lies inside all four is in front of the camera (adding opposite planes gives
-// Z · width ≥ 0), so no near plane is needed.
+// The rectangle of the straight image that holds all that is visible, the image widened by the radius of the pixel
+// filter, as four planes n · q + d ≥ 0 through the camera and the rectangle's sides. Whatever lies inside all four is
+// in front of the camera (adding opposite planes gives Z · width ≥ 0), so no near plane is needed.
 struct ViewVolume {
     Vec3 normal[4];
     double offset[4];
