@@ -32,10 +32,12 @@ def joined(*meshes: eg.Mesh) -> tuple[Tensor, Tensor]:
     return torch.cat([m.verts for m in meshes]), torch.cat([m.faces + k for m, k in zip(meshes, first, strict=True)])
 
 
-def found(verts: Tensor, faces: Tensor, threads: int = 1):
+def found(verts: Tensor, faces: Tensor, threads: int = 1, windings: Tensor | None = None):
     """(face, face, end, end) of each, and for how many each stands."""
+    windings = faces if windings is None else windings
     spacing = torch.finfo(verts.dtype).eps
-    return core.for_tests.intersections(verts.double().numpy(), faces.int().numpy(), spacing, threads)
+    arrays = verts.double().numpy(), faces.int().numpy(), windings.int().numpy()
+    return core.for_tests.intersections(*arrays, spacing, threads)
 
 
 # -- which there are --------------------------------------------------------------------------------------------------
@@ -67,6 +69,94 @@ def test_pairs_against_exhaustion(scene):
             normal = torch.nn.functional.normalize(torch.linalg.cross(p - origin, q - origin), dim=0)
             assert all(abs(float(normal @ (torch.tensor(end, dtype=F64) - origin))) < 1e-9 for end in ends)
         assert ends[0] != ends[1]
+
+
+def sheet(n: int, m: int, closed: bool, place) -> tuple[Tensor, Tensor]:
+    """A grid of n x m cells at place(u, v) in [0, 1)², closed in both directions or in none."""
+    i = torch.arange(n)[:, None].expand(n, m).reshape(-1)
+    k = torch.arange(m)[None, :].expand(n, m).reshape(-1)
+    rows, columns = (n, m) if closed else (n + 1, m + 1)
+
+    def at(i: Tensor, k: Tensor) -> Tensor:
+        return (i % rows) * columns + k % columns
+
+    quads = [at(i, k), at(i + 1, k), at(i + 1, k + 1), at(i, k + 1)]
+    faces = torch.cat([torch.stack([quads[c] for c in half], 1) for half in ((0, 1, 2), (0, 2, 3))])
+    u, v = torch.meshgrid(torch.arange(rows) / n, torch.arange(columns) / m, indexing="ij")
+    return torch.stack(place(u.double().reshape(-1), v.double().reshape(-1)), 1), faces
+
+
+def torus(wave: float, times: int) -> tuple[Tensor, Tensor]:
+    """Whose tube is as thick as its hole is wide, but for waves of it."""
+    turn = 2 * torch.pi
+
+    def place(u: Tensor, v: Tensor) -> list[Tensor]:
+        tube = 0.5 + wave * torch.sin(times * turn * u) * torch.cos(times * turn * v)
+        ring = 0.5 + tube * torch.cos(turn * v)
+        return [ring * torch.cos(turn * u), ring * torch.sin(turn * u), tube * torch.sin(turn * v)]
+
+    return sheet(160, 80, True, place)
+
+
+def spiral(rise: float) -> tuple[Tensor, Tensor]:
+    """A ramp of two turns whose width rises, so that at the outside the lower turn reaches the upper one. All of it faces
+    up, and only its outline says that it passes through itself."""
+
+    def place(u: Tensor, v: Tensor) -> list[Tensor]:
+        angle, radius = 4 * torch.pi * u, 0.4 + v
+        return [radius * torch.cos(angle), radius * torch.sin(angle), 0.2 * u + rise * v * (1 - u) ** 2]
+
+    return sheet(400, 40, False, place)
+
+
+def shells(apart: float, wave: float) -> tuple[Tensor, Tensor]:
+    """Two spheres one within the other, as near as their waves or farther."""
+    ball = icosphere(5)
+    waves = 1 + wave * torch.sin(20 * ball.verts[:, :1]) * torch.sin(17 * ball.verts[:, 1:2])
+    inner = ball.replace(verts=(1 - apart) * ball.verts)
+    return joined(ball.replace(verts=ball.verts * waves), inner)
+
+
+def split(verts: Tensor, faces: Tensor, every: int = 7) -> tuple[Tensor, Tensor]:
+    """The same surface with vertices of its own for each block of faces, as along the seams of a texture."""
+    block = torch.arange(len(faces)) * every // len(faces)
+    keys, index = torch.unique(
+        torch.stack([faces, block[:, None].expand(-1, 3)], -1).reshape(-1, 2), dim=0, return_inverse=True
+    )
+    return verts[keys[:, 0]], index.reshape(-1, 3)
+
+
+SMOOTH = {
+    "torus": torus(0.0, 1),
+    "torus with waves": torus(0.05, 3),
+    "a rough torus": torus(0.01, 20),
+    "spiral": spiral(0.0),
+    "spiral through itself": spiral(0.25),
+    "spheres": joined(icosphere(5), (other := icosphere(4)).replace(verts=0.8 * other.verts + 0.4)),
+    "shells": shells(0.002, 0.001),
+    "shells through each other": shells(0.002, 0.004),
+    "texture seams": split(*shells(0.002, 0.004)),
+    "far away": ((scene := shells(0.01, 0.02))[0] + 30.0, scene[1]),
+    "large beside small": joined(icosphere(5), (other := icosphere(1)).replace(verts=40 * other.verts + 40.2)),
+}
+
+
+# Those of them that pass through something.
+THROUGH = set(SMOOTH) - {"torus", "spiral", "shells", "large beside small"}
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+@pytest.mark.parametrize("turned", [0.0, 1.0])
+def test_height_fields_hide_no_pair(name, turned):
+    """Where a closed surface is a height field no pairs are compared. With every second face turned round there is no
+    surface that goes on, so all are; and which faces pass through each other is the same."""
+    verts, faces = SMOOTH[name]
+    verts = (verts @ rotation((0.48, -0.6, 0.64), torch.tensor(turned)).T).float()
+    reversed_faces = torch.where(torch.arange(len(faces))[:, None] % 2 == 0, faces, faces.flip(1))
+    pairs, each = found(verts, faces)
+    expected = found(verts, faces, windings=reversed_faces)
+    assert (pairs, each) == expected
+    assert bool(pairs) == (name in THROUGH)
 
 
 def on_the_ground(dtype: torch.dtype) -> tuple[Tensor, Tensor]:

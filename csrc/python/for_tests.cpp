@@ -295,11 +295,15 @@ void bind_for_tests(nb::module_& m) {
             for (const HalfEdge& h : topology.half_edges(e)) out[e].emplace_back(h.face, h.corner, h.backwards);
         return out;
     });
-    // Where faces pass through each other, as (face, face, end, end), and for how many each of them stands.
-    p.def("intersections", [](Verts verts, Faces faces, double spacing, int threads) {
+    // Where faces pass through each other, as (face, face, end, end), and for how many each of them stands. How the
+    // surface goes on is told from `windings`, the same faces as they are or turned round.
+    p.def("intersections", [](Verts verts, Faces faces, Faces windings, double spacing, int threads) {
         Team team(threads);
         FaceOrder order;
-        const Intersections found(faces.data(), faces.shape(0), verts.data(), {{0}, {spacing}}, order, team);
+        const Spacing all{{0}, {spacing}};
+        Topology topology(windings.data(), faces.shape(0), verts.shape(0), team);
+        topology.weld(verts.data(), all, team);
+        const Intersections found(faces.data(), faces.shape(0), verts.data(), all, topology, order, team);
         std::vector<std::tuple<int, int, A3, A3>> out;
         for (const Intersection& i : found.all())
             out.emplace_back(i.face[0], i.face[1], A3{i.a.x, i.a.y, i.a.z}, A3{i.b.x, i.b.y, i.b.z});

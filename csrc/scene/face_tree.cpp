@@ -4,12 +4,16 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <tuple>
 
 #include "core/math.h"
 
 namespace edgegrad {
 
 namespace {
+
+// Faces from which on a surface has nodes of its own.
+constexpr int32_t large_surface = 512;
 
 constexpr float infinity = std::numeric_limits<float>::infinity();
 
@@ -112,6 +116,35 @@ EDGEGRAD_VECTORIZED unsigned overlapping_lanes(const BoxGroup& g, const FaceBox&
     return hits;
 }
 
+EDGEGRAD_VECTORIZED unsigned overlapping_lanes(const BoxGroup& g, const AskewBox& box) {
+    float middle[3][BoxGroup::size], half[3][BoxGroup::size];
+    for (int j = 0; j < 3; ++j) {
+        EDGEGRAD_ROLLED
+        for (int i = 0; i < BoxGroup::size; ++i) {
+            // Halves first: the sum of the two may be too large for a float.
+            const float low = 0.5f * g.low[j][i], high = 0.5f * g.high[j][i];
+            middle[j][i] = (low + high) - box.middle[j], half[j][i] = high - low;
+        }
+    }
+    int32_t hit[BoxGroup::size];
+    EDGEGRAD_ROLLED
+    for (int i = 0; i < BoxGroup::size; ++i) hit[i] = 1 << i;
+    for (int k = 0; k < 3; ++k) {
+        const float x = box.axis[k][0], y = box.axis[k][1], z = box.axis[k][2], most = box.half[k];
+        const float ax = std::fabs(x), ay = std::fabs(y), az = std::fabs(z);
+        EDGEGRAD_ROLLED
+        for (int i = 0; i < BoxGroup::size; ++i) {
+            const float d = x * middle[0][i] + y * middle[1][i] + z * middle[2][i];
+            const float reach = ax * half[0][i] + ay * half[1][i] + az * half[2][i] + most;
+            hit[i] = (d <= reach) & (-d <= reach) ? hit[i] : 0;  // of what is empty, both are NaN
+        }
+    }
+    unsigned hits = 0;
+    EDGEGRAD_ROLLED
+    for (int i = 0; i < BoxGroup::size; ++i) hits |= hit[i];
+    return hits;
+}
+
 }  // namespace
 
 void BoxGroup::set(int lane, const FaceBox& box) {
@@ -133,6 +166,7 @@ FaceBox BoxGroup::box(int lane) const {
 }
 
 unsigned BoxGroup::overlapping(const FaceBox& box) const { return overlapping_lanes(*this, box); }
+unsigned BoxGroup::overlapping(const AskewBox& box) const { return overlapping_lanes(*this, box); }
 
 unsigned CornerGroup::may_cross(const FacePlane& plane) const {
     const Vec3 N = plane.normal;
@@ -148,7 +182,8 @@ unsigned CornerGroup::may_cross(const FacePlane& plane) const {
                                   .vertex = {plane.vertex[0], plane.vertex[1], plane.vertex[2]}});
 }
 
-FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, FaceOrder& order, Team& team) {
+FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, const Topology& topology,
+                   FaceOrder& order, Team& team) {
     for (int64_t n = n_faces; levels_.empty() || n > 1;) {
         n = (n + BoxGroup::size - 1) / BoxGroup::size;
         levels_.emplace_back(n);
@@ -157,6 +192,7 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, F
     face_ = &order.face;
     if (int64_t(order.face.size()) == n_faces) {
         make_boxes(faces, verts, team);
+        find_surfaces(topology, team);
         // Half as large again, and more than twice the pairs overlap.
         if (spread() <= 1.5 * order.spread) return;
     }
@@ -186,26 +222,32 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, F
         high = {std::max(high.x, h.x), std::max(high.y, h.y), std::max(high.z, h.z)};
     }
     struct Key {
-        uint64_t code;
+        int32_t surface;  // −1: a small one
         int32_t face;
+        uint64_t code;
     };
+    std::vector<int32_t> size(n_faces, 0);  // of surfaces
+    for (int64_t f = 0; f < n_faces; ++f) ++size[topology.surface(int32_t(f))];
     std::vector<Key> keys(n_faces);
     team.each_block(n_faces, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t f = first; f < last; ++f) {
-            const Vec3 m = middle(f) - low, size = high - low;
+            const Vec3 m = middle(f) - low, all = high - low;
             const auto bits = [](double place, double size) {
                 return spread_bits(size > 0 ? uint64_t(std::clamp(place / size * 0x1p21, 0.0, 0x1p21 - 1)) : 0);
             };
-            const uint64_t code = bits(m.x, size.x) | bits(m.y, size.y) << 1 | bits(m.z, size.z) << 2;
-            keys[f] = {code, int32_t(f)};
+            const uint64_t code = bits(m.x, all.x) | bits(m.y, all.y) << 1 | bits(m.z, all.z) << 2;
+            const int32_t surface = topology.surface(int32_t(f));
+            keys[f] = {size[surface] < large_surface ? -1 : surface, int32_t(f), code};
         }
     });
     team.check();
-    std::sort(keys.begin(), keys.end(),
-              [](const Key& a, const Key& b) { return a.code != b.code ? a.code < b.code : a.face < b.face; });
+    std::sort(keys.begin(), keys.end(), [](const Key& a, const Key& b) {
+        return std::tie(a.surface, a.code, a.face) < std::tie(b.surface, b.code, b.face);
+    });
     order.face.resize(n_faces);
     for (int64_t i = 0; i < n_faces; ++i) order.face[i] = keys[i].face;
     make_boxes(faces, verts, team);
+    find_surfaces(topology, team);
     order.spread = spread();
 }
 
@@ -237,6 +279,28 @@ void FaceTree::make_boxes(const int32_t* faces, const double* verts, Team& team)
                 }
         });
     }
+}
+
+void FaceTree::find_surfaces(const Topology& topology, Team& team) {
+    constexpr int size = BoxGroup::size;
+    surface_.clear();
+    for (size_t level = 0; level < levels_.size(); ++level) surface_.emplace_back(levels_[level].size());
+    team.each_block(n_leaves(), [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i) {
+            int32_t all = topology.surface(face(i, 0));
+            for (int lane = 1; lane < size && all >= 0; ++lane)
+                if (const int32_t f = face(i, lane); f >= 0 && topology.surface(f) != all) all = -1;
+            surface_[0][i] = all;
+        }
+    });
+    for (size_t level = 1; level < levels_.size(); ++level)
+        for (int64_t i = 0; i < surface_[level].size(); ++i) {
+            const Array<int32_t>& below = surface_[level - 1];
+            int32_t all = below[size * i];
+            for (int64_t k = size * i + 1; k < std::min(below.size(), size * (i + 1)); ++k)
+                if (below[k] != all) all = -1;
+            surface_[level][i] = all;
+        }
 }
 
 // Mean size of a leaf's box relative to that of all.

@@ -48,7 +48,8 @@ class KeptGeometry {
         if (make_parts_) parts_ = std::make_unique<Parts>(faces, n_faces_, n_verts_, team);
         if (find_intersections_) {
             work.intersections = true;
-            intersections_ = std::make_unique<Intersections>(faces, n_faces_, verts_, spacing_, order_, team);
+            const Topology& topology = topology_ ? *topology_ : *geometry_->topology_;
+            intersections_ = std::make_unique<Intersections>(faces, n_faces_, verts_, spacing_, topology, order_, team);
         }
         keep(moved);
         return geometry_;

@@ -7,6 +7,7 @@
 
 #include "core/sampler.h"
 #include "scene/face_pair.h"
+#include "scene/height_field.h"
 
 namespace edgegrad {
 
@@ -38,13 +39,18 @@ constexpr int64_t leaves_in_block = 16;
 
 class PairFinder {
    public:
-    PairFinder(const FaceTree& tree, const int32_t* faces, const double* verts, const Spacing& spacing)
-        : tree_(tree), faces_(faces), verts_(verts), spacing_(spacing) {}
+    PairFinder(const FaceTree& tree, const HeightFields& fields, const int32_t* faces, const double* verts,
+               const Spacing& spacing)
+        : tree_(tree), fields_(fields), faces_(faces), verts_(verts), spacing_(spacing) {}
 
-    // Calls found(other) for the leaves from this one on that overlap it.
+    // Calls found(other) for the leaves from this one on that overlap it, where faces may pass through each other.
     template <class Found>
     void each_overlapping(int64_t leaf, Found found) const {
-        tree_.each_leaf(tree_.bounds(leaf), leaf, found);
+        if (!fields_.crossed(leaf)) return;
+        tree_.each_leaf(tree_.bounds(leaf), leaf, fields_.but(leaf), [&](int64_t other) {
+            if (fields_.crossed(leaf, other)) found(other);
+            return true;
+        });
     }
 
     // Adds the pairs with a face of either leaf.
@@ -93,6 +99,7 @@ class PairFinder {
     }
 
     const FaceTree& tree_;
+    const HeightFields& fields_;
     const int32_t* const faces_;
     const double* const verts_;
     const Spacing& spacing_;
@@ -160,10 +167,11 @@ void share_among_copies(std::vector<Intersection>& all, const int32_t* faces, co
 }  // namespace
 
 Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double* verts, const Spacing& spacing,
-                             FaceOrder& order, Team& team) {
+                             const Topology& topology, FaceOrder& order, Team& team) {
     const bool kept_order = !order.face.empty();
-    FaceTree tree(faces, n_faces, verts, order, team);
-    const auto finder = [&] { return std::make_unique<PairFinder>(tree, faces, verts, spacing); };
+    FaceTree tree(faces, n_faces, verts, topology, order, team);
+    HeightFields fields(tree, topology, team);
+    const auto finder = [&] { return std::make_unique<PairFinder>(tree, fields, faces, verts, spacing); };
     const int64_t leaves = tree.n_leaves();
     const auto share_to_draw = [&] {
         const int64_t step = leaves / leaves_in_pilot;
@@ -173,7 +181,7 @@ Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double
             const int64_t leaf = i * step;
             int64_t others = 0;
             pairs.each_overlapping(leaf, [&](int64_t) { ++others; });
-            const double part = std::min(1.0, double(most_in_pilot) / double(others));
+            const double part = std::min(1.0, double(most_in_pilot) / double(std::max<int64_t>(1, others)));
             Found found;
             pairs.each_overlapping(leaf, [&](int64_t other) {
                 if (part == 1 || to_unit(hash(1, uint64_t(leaf), uint64_t(other))) < part)
@@ -189,7 +197,8 @@ Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double
     if (share < 1 && kept_order) {
         // What is drawn depends on the leaves, and must not on where the vertices were before.
         order = {};
-        tree = FaceTree(faces, n_faces, verts, order, team);
+        tree = FaceTree(faces, n_faces, verts, topology, order, team);
+        fields = HeightFields(tree, topology, team);
         share = share_to_draw();
     }
     stands_for_ = 1 / share;

@@ -7,6 +7,7 @@
 #include "core/parallel.h"
 #include "scene/face_tree.h"
 #include "scene/scene.h"
+#include "scene/topology.h"
 
 namespace edgegrad {
 
@@ -23,9 +24,9 @@ struct Intersection {
 
 class Intersections {
    public:
-    // Of these faces (F, 3) at these positions (V, 3). `order` is kept from time to time.
-    Intersections(const int32_t* faces, int64_t n_faces, const double* verts, const Spacing& spacing, FaceOrder& order,
-                  Team& team);
+    // Of these faces (F, 3) at these positions (V, 3), with the edges there. `order` is kept from time to time.
+    Intersections(const int32_t* faces, int64_t n_faces, const double* verts, const Spacing& spacing,
+                  const Topology& topology, FaceOrder& order, Team& team);
 
     // By ascending faces.
     const std::vector<Intersection>& all() const { return all_; }

@@ -82,22 +82,36 @@ class PlaceGrid {
     std::vector<Place> place_;
 };
 
+// Sets of 0 … n − 1 that are joined one by one, each named after its least member (Galler and Fischer 1964).
+class DisjointSets {
+   public:
+    explicit DisjointSets(int64_t n) : up_(n) { std::iota(up_.begin(), up_.end(), 0); }
+
+    int32_t first(int32_t i) {
+        while (up_[i] != i) i = up_[i] = up_[up_[i]];
+        return i;
+    }
+    void join(int32_t i, int32_t k) {
+        const int32_t a = first(i), b = first(k);
+        up_[std::max(a, b)] = std::min(a, b);
+    }
+
+   private:
+    std::vector<int32_t> up_;
+};
+
 }  // namespace
 
 Parts::Parts(const int32_t* faces, int64_t n_faces, int64_t n_verts, Team& team) : part_(n_verts) {
-    // Disjoint sets, each named after its first vertex.
-    std::vector<int32_t> up(n_verts);
-    std::iota(up.begin(), up.end(), 0);
-    const auto first_of = [&](int32_t v) {
-        while (up[v] != v) v = up[v] = up[up[v]];
-        return v;
-    };
+    DisjointSets sets(n_verts);
     for (int64_t i = 0; i < 3 * n_faces; ++i) {
         if (i % check_every == 0) team.check();
-        const int32_t a = first_of(faces[i]), b = first_of(faces[i - i % 3]);
-        up[std::max(a, b)] = std::min(a, b);
+        sets.join(faces[i], faces[i - i % 3]);
     }
-    for (int64_t v = 0; v < n_verts; ++v) part_[v] = up[v] == v ? size_++ : part_[up[v]];
+    for (int64_t v = 0; v < n_verts; ++v) {
+        const int32_t first = sets.first(int32_t(v));
+        part_[v] = first == v ? size_++ : part_[first];
+    }
     of_block_.resize(Team::blocks(n_faces));
     team.each_block(n_faces, [&](int64_t k, int64_t first, int64_t last) {
         int32_t part = part_[faces[3 * first]];
@@ -198,13 +212,20 @@ void Topology::build(Team& team) {
         }
     }
     joins_two_.resize(n_edges());
+    goes_on_.assign(n_faces_, 1);
+    DisjointSets sets(n_faces_);
     // The direction of an edge is that of its first half-edge.
     for (int64_t e = 0; e < n_edges(); ++e) {
         if (e % check_every == 0) team.check();
         const bool flip = half_edge_[offset_[e]].backwards;
         for (int64_t i = offset_[e]; i < offset_[e + 1]; ++i) half_edge_[i].backwards ^= flip;
         joins_two_[e] = offset_[e + 1] - offset_[e] == 2 && half_edge_[offset_[e] + 1].backwards;
+        if (joins_two_[e]) sets.join(half_edges(e)[0].face, half_edges(e)[1].face);
+        else
+            for (const HalfEdge& h : half_edges(e)) goes_on_[h.face] = 0;
     }
+    surface_.resize(n_faces_);
+    for (int64_t f = 0; f < n_faces_; ++f) surface_[f] = sets.first(int32_t(f));
 }
 
 }  // namespace edgegrad

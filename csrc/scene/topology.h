@@ -63,6 +63,11 @@ class Topology {
     // Whether an edge has two faces, which run along it in opposite directions, as where a surface goes on.
     bool joins_two(int64_t edge) const { return joins_two_[edge]; }
 
+    // Whether all edges of a face do.
+    bool goes_on(int32_t face) const { return goes_on_[face]; }
+    // The connected surface that a face belongs to, across such edges, by one of its faces.
+    int32_t surface(int32_t face) const { return surface_[face]; }
+
     // Of so many faces and edges.
     static int64_t bytes(int64_t faces, int64_t edges) {
         return 3 * faces * int64_t(sizeof(HalfEdge) + sizeof(int32_t)) + edges * int64_t(sizeof(int64_t) + 1);
@@ -81,7 +86,9 @@ class Topology {
     std::vector<int64_t> offset_;
     std::vector<HalfEdge> half_edge_;
     std::vector<int32_t> face_;
-    std::vector<uint8_t> joins_two_;
+    std::vector<uint8_t> joins_two_;  // by edge
+    std::vector<uint8_t> goes_on_;    // by face
+    std::vector<int32_t> surface_;    // by face
 };
 
 }  // namespace edgegrad
