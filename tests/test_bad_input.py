@@ -225,7 +225,7 @@ BAD_OPTIONS: dict[str, list[object]] = {
     "visibility": [0, 1, "yes", None, torch.tensor(True)],
     "filter": ["sinc", "", None, 3, b"box", [], ("box",)],
     "size": [(0, 4), (-1, 4), (4, 0), (4,), (4, 4, 4), 4, None, "ab", (4.0, 4), (4, 2**17), (2**70, 4), (True, 4), (None, 4)],
-    "projection": ["fisheye", None, 3, "Perspective", b"perspective"],
+    "projection": ["pinhole", None, 3, "Perspective", b"perspective"],
 }  # fmt: skip
 
 

@@ -319,6 +319,31 @@ def test_a_sphere_sunk_to_edges_that_lie_in_a_sheet(mesh):
     check_ratio(sunk, 0.003, spp=2048, **SAMPLES)
 
 
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_a_face_seen_edge_on_contributes_nothing(projection):
+    """A blade through a sheet whose plane holds the eye: it has no image, and its line no gradient that is not finite."""
+    verts = torch.tensor(
+        [[-1.0, -1, 0], [1, -1, 0], [0, 1.3, 0], [0, -0.4, -0.5], [0, -0.3, 0.5], [0, 0.5, 0.1]], dtype=F64
+    )
+    faces = torch.tensor([[0, 1, 2], [3, 4, 5]])
+    world_to_camera = torch.eye(4, dtype=F64)
+    world_to_camera[2, 3] = 3.0
+    K = torch.tensor([[40.0, 0, 16], [0, 40, 16], [0, 0, 1]], dtype=F64)
+    K[:2, :2] /= 1 if projection == "perspective" else 3
+    camera = eg.Camera(world_to_camera, K, (32, 32), projection)
+
+    def gradient(verts: Tensor, faces: Tensor) -> Tensor:
+        verts = verts.clone().requires_grad_()
+        mesh = eg.Mesh(verts, faces, colors=torch.arange(3.0 * len(verts), dtype=F64).reshape(-1, 3) / 10)
+        image = eg.render(mesh, camera, seed=1)
+        return torch.autograd.grad(image, verts, smooth_adjoint(32, 32, 3))[0]
+
+    assert [pair[:2] for pair in found(verts, faces)[0]] == [(0, 1)]
+    with_blade, alone = gradient(verts, faces), gradient(verts[:3], faces[:1])
+    assert bool(with_blade.isfinite().all())
+    assert float((with_blade[:3] - alone).norm()) < 0.02 * float(alone.norm())
+
+
 def test_copies_share_the_line():
     """A box listed twice by index, or three times by place, through another: the line between them is there once."""
     box = cube(0.45).transformed(rotation((0.6, 0.0, 0.8), torch.tensor(0.4, dtype=F64)))

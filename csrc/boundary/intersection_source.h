@@ -72,16 +72,22 @@ class IntersectionSource {
     Vec2 position(const Curve& curve, double s) const { return curve.x0 + s * (curve.x1 - curve.x0); }
 
     bool place(const Curve& curve, double s, Sample& sample) {
-        if (places_ == 0 || place_[places_ - 1].curve.faces != curve.faces) start(place_[places_++], curve);
+        const bool another = places_ == 0 || place_[places_ - 1].curve.faces != curve.faces;
+        if (another) start(place_[places_++], curve);
         Place& place = place_[places_ - 1];
         const double t = s * curve.w0 / ((1 - s) * curve.w1 + s * curve.w0);
         sample.place = places_ - 1;
         sample.point = (1 - t) * curve.a + t * curve.b;
         sample.behind = {};
         sample.ignored = place.faces.faces;
-        for (int k = 0; k < 2; ++k)
+        for (int k = 0; k < 2; ++k) {
             sample.side[k] = {curve.faces->face[k], barycentrics_of_hit(place.plane[k].map, sample.n), sample.point.z};
-        return true;
+        }
+        // A face seen edge-on has no image.
+        bool visible = std::isfinite(place.scale);
+        for (const Plane& plane : place.plane) visible &= view_.camera.along_ray(plane.normal, sample.n) != 0;
+        if (!visible) places_ -= another;
+        return visible;
     }
 
     const CurveFaces& faces_of(const Sample& sample) const { return place_[sample.place].faces; }
