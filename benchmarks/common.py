@@ -44,7 +44,7 @@ class Kernel:
         self.scene, self.camera = kernel_scene(flat), kernel_camera(request.camera)
         self.adjoint = adjoint.to(flat.colors.dtype).contiguous()
         self.image = torch.empty_like(self.adjoint)
-        self.interior = request.gradient.radiance_varies
+        self.interior = request.gradient.channels_vary
         self.hits = kernel_hits(Hits.empty(request))
         appearance = ("uvs", "texels") if len(flat.textures) else ("colors",)
         self.grads = {

@@ -1,5 +1,6 @@
 """edgegrad: a PyTorch layer that renders triangle meshes on the CPU and returns correct gradients, also at silhouettes."""
 
+from .aovs import render_aovs
 from .camera import Camera
 from .io import load_camera, load_mesh, load_scene, read_image, save_camera, write_image
 from .mesh import Mesh
@@ -22,6 +23,7 @@ __all__ = [
     "profile",
     "read_image",
     "render",
+    "render_aovs",
     "save_camera",
     "screen_gradient",
     "write_image",

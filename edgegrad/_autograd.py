@@ -115,6 +115,32 @@ class _RenderJvp(torch.autograd.Function):
         raise RuntimeError(FIRST_ORDER)
 
 
+def faces_at_centers(request: Request, batched: bool) -> Tensor:
+    """The face seen through the centre of each pixel, as the flat scene counts them: (B, H, W) int32, −1: none."""
+    return _FacesAtCenters.apply(batched, *request.pack())  # pyright: ignore[reportReturnType]
+
+
+class _FacesAtCenters(torch.autograd.Function):
+    """edgegrad::faces_at_centers, which has no derivative."""
+
+    @staticmethod
+    def forward(batched: bool, *args: Any) -> Tensor:
+        faces = torch.ops.edgegrad.faces_at_centers(*args)
+        return faces if batched else faces.squeeze(0)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.mark_non_differentiable(output)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, int]:
+        return _one_by_one(_FacesAtCenters, info.batch_size, in_dims, args)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> None:
+        return None
+
+
 def _with_tangents(args: Sequence[Any]) -> list[Any]:
     """The last arguments, a tangent for each slot, as one list."""
     return [*args[: -len(SLOTS)], list(args[-len(SLOTS) :])]

@@ -16,6 +16,7 @@ from . import _memory as memory
 from ._check import check_finite
 from ._kernel import core
 from ._request import (
+    PER_CAMERA,
     SCHEMA,
     SLOTS,
     PackedCamera,
@@ -64,6 +65,11 @@ def kernel_camera(camera: PackedCamera, index: int = 0) -> Any:
     return core.Camera(**{n: _array(v[index]) if isinstance(v, Tensor) else v for n, v in camera._asdict().items()})
 
 
+def kernel_channels(request: Request, index: int = 0) -> Any:
+    arrays = request.beside._replace(vertex_attributes=request.beside.vertex_attributes[index])._asdict()
+    return core.Channels(**{name: _array(value) if isinstance(value, Tensor) else value for name, value in arrays.items()})
+
+
 def _warn_of_folds(cameras: Sequence[Any]) -> None:
     """Once for a batch, of the lens that shows least."""
     folds = [camera.fold for camera in cameras if camera.fold is not None]
@@ -100,6 +106,7 @@ def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
             profiles.append(
                 scene.forward(
                     camera=cameras[b],
+                    channels=kernel_channels(request, b),
                     options=core.ImageOptions(**options),
                     threads=torch.get_num_threads(),
                     image=image[b].numpy(),
@@ -126,13 +133,14 @@ def backward_kernel(
             profiles = [
                 scene.backward(
                     camera=kernel_camera(request.camera, b),
+                    channels=kernel_channels(request, b),
                     image=image,
                     options=_gradient_options(request, wanted, b, dry),
                     threads=torch.get_num_threads(),
                     adjoint=images[b].numpy(),
                     hits=kernel_hits(hits, b),
                     # Each camera has a gradient of its own.
-                    gradients={n: g[b] if n in PackedCamera._fields else g for n, g in grads.items()},
+                    gradients={n: g[b] if n in PER_CAMERA else g for n, g in grads.items()},
                 )
                 for b in range(request.cameras)
             ]
@@ -149,23 +157,35 @@ def jvp_kernel(hits: Hits, request: Request, tangents: Mapping[str, Tensor], dir
     with derivatives_room(request, tangents, directions):
         scene, image = kernel_scene(request.scene), core.ImageOptions(**request.image._asdict())
         given = {name: np.ascontiguousarray(t.detach().double().numpy()) for name, t in tangents.items()}
-        adjoint = request.scene.colors.new_ones((request.camera.height, request.camera.width, request.channels))
+        adjoint = _channel_weights(request).expand(request.camera.height, request.camera.width, -1).contiguous()
         out = np.zeros((request.cameras, *adjoint.shape[:2], directions, request.channels))
         for b in range(request.cameras):
             scene.jvp(
                 camera=kernel_camera(request.camera, b),
+                channels=kernel_channels(request, b),
                 image=image,
                 options=_gradient_options(request, tangents, b),
                 threads=torch.get_num_threads(),
                 adjoint=adjoint.numpy(),
                 hits=kernel_hits(hits, b),
                 tangents=[
-                    {name: t[d, b] if name in PackedCamera._fields else t[d] for name, t in given.items()}
+                    {name: t[d, b] if name in PER_CAMERA else t[d] for name, t in given.items()}
                     for d in range(directions)
                 ],
                 image_dot=out[b],
             )
         return torch.from_numpy(out).permute(3, 0, 1, 2, 4).to(request.scene.colors.dtype).contiguous()
+
+
+def _channel_weights(request: Request) -> Tensor:
+    """(C,) how much each channel matters for where samples of a derivative of all of them go: as much as any other,
+    whatever its unit."""
+    weights = request.scene.colors.new_ones(request.channels)
+    values = request.beside.vertex_attributes.detach()
+    first = request.scene.colors.shape[1] + request.beside.alpha
+    size = values.abs().mean((0, 1)).to(weights)
+    weights[first : first + len(size)] = torch.where(size > 0, 1.0 / size, 1.0)
+    return weights
 
 
 def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Tensor:
@@ -176,6 +196,7 @@ def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Ten
         for b in range(request.cameras):
             scene.screen_gradient(
                 camera=kernel_camera(request.camera, b),
+                channels=kernel_channels(request, b),
                 image=image,
                 options=_gradient_options(request, ["verts"], b),
                 threads=torch.get_num_threads(),
@@ -208,7 +229,8 @@ def _camera_seed(seed: int, camera: int) -> int:
 
 def pass_size(request: Request) -> Any:
     """What the kernel's needs depend on."""
-    flat, camera = request.scene, request.camera
+    flat, camera, beside = request.scene, request.camera, request.beside
+    jumps = flat.corners.data_ptr() != flat.faces.data_ptr() or beside.barycentrics or beside.face_attributes.shape[-1] > 0
     return core.PassSize(
         verts=len(flat.verts),
         faces=len(flat.faces),
@@ -216,10 +238,13 @@ def pass_size(request: Request) -> Any:
         uvs=len(flat.uvs),
         texels=len(flat.texels),
         pixels=camera.height * camera.width,
+        radiance=flat.colors.shape[1],
+        vertex_attributes=beside.vertex_attributes.shape[-1],
+        face_attributes=beside.face_attributes.shape[-1],
         channels=request.channels,
         number=flat.colors.element_size(),
         textured=len(flat.textures) > 0,
-        jumps=flat.corners.data_ptr() != flat.faces.data_ptr(),
+        jumps=jumps,
         threads=torch.get_num_threads(),
     )
 
@@ -286,6 +311,8 @@ torch.library.define(
 )
 
 
+# Which face is seen through the centre of each pixel, (B, H, W) int32; −1: none.
+torch.library.define("edgegrad::faces_at_centers", f"({SCHEMA}) -> Tensor")
 torch.library.define(
     "edgegrad::render_jvp",
     f"(Tensor coverage, Tensor depth, Tensor hit, Tensor seen, {SCHEMA}, Tensor?[] tangents, int directions) -> Tensor",
@@ -303,6 +330,28 @@ def _render_fake(*args: Any) -> tuple[Tensor, ...]:
     request = Request.unpack(args)
     size = request.cameras, request.camera.height, request.camera.width, request.channels
     return request.scene.colors.new_empty(size), *Hits.empty(request)
+
+
+@torch.library.impl("edgegrad::faces_at_centers", "CPU")
+def _faces_at_centers_cpu(*args: Any) -> Tensor:
+    request = Request.unpack(args)
+    with image_room(request):
+        scene = kernel_scene(request.scene)
+        faces = _faces_at_centers_fake(*args)
+        for b in range(request.cameras):
+            scene.faces_at_centers(
+                camera=kernel_camera(request.camera, b),
+                channels=kernel_channels(request, b),
+                threads=torch.get_num_threads(),
+                face=faces[b].numpy(),
+            )
+        return faces
+
+
+@torch.library.register_fake("edgegrad::faces_at_centers")
+def _faces_at_centers_fake(*args: Any) -> Tensor:
+    request = Request.unpack(args)
+    return request.scene.faces.new_empty(request.cameras, request.camera.height, request.camera.width)
 
 
 def _arguments(args: Sequence[Any]) -> tuple[Tensor, Hits, Request, list[bool]]:

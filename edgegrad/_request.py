@@ -32,6 +32,17 @@ class PackedCamera(NamedTuple):
     width: int
 
 
+class Channels(NamedTuple):
+    """What the image has beside the radiance, in this order (csrc/shading/attributes.h)."""
+
+    alpha: bool  # 1 wherever a face is seen
+    vertex_attributes: Tensor  # (B, V, n) float64, interpolated over the faces
+    unit: int  # the first of three of these that are a direction, given the length 1 once interpolated; −1: none
+    face_attributes: Tensor  # (F, m) float64, of whole faces
+    barycentrics: bool  # 3 channels
+    uv: bool  # 2 channels; all faces are textured
+
+
 class ImageOptions(NamedTuple):
     spp: int
     filter: str
@@ -42,7 +53,7 @@ class GradientOptions(NamedTuple):
     surface_samples: int  # −1: the default
     edge_samples: int  # −1: the default
     grad_seed: int
-    radiance_varies: bool  # over a face; if not, moving it changes nothing inside
+    channels_vary: bool  # over a face; if not, moving it changes nothing inside
     visibility: bool  # whether what moves at silhouettes and other jumps counts
 
 
@@ -51,11 +62,12 @@ class Request(NamedTuple):
 
     scene: Flat
     camera: PackedCamera
+    beside: Channels
     image: ImageOptions
     gradient: GradientOptions
 
     def pack(self) -> tuple[Any, ...]:
-        return (*self.scene, *self.camera, *self.image, *self.gradient)
+        return (*self.scene, *self.camera, *self.beside, *self.image, *self.gradient)
 
     @classmethod
     def unpack(cls, values: Sequence[Any]) -> Request:
@@ -76,10 +88,10 @@ class Request(NamedTuple):
 
     def slot(self, name: str) -> Tensor:
         """The tensor of a gradient slot."""
-        return getattr(self.scene if name in Flat._fields else self.camera, name)
+        return getattr(next(record for record in self if name in record._fields), name)
 
 
-RECORDS: tuple[Any, ...] = (Flat, PackedCamera, ImageOptions, GradientOptions)
+RECORDS: tuple[Any, ...] = (Flat, PackedCamera, Channels, ImageOptions, GradientOptions)
 FIELDS = tuple(field for record in RECORDS for field in record._fields)
 _TYPES = tuple(get_type_hints(record)[field] for record in RECORDS for field in record._fields)
 IS_TENSOR = tuple(kind is Tensor for kind in _TYPES)
@@ -91,7 +103,9 @@ SCHEMA = ", ".join(f"{_NAMES[kind]} {field}" for field, kind in zip(FIELDS, _TYP
 SLOTS: tuple[str, ...] = core.GRADIENT_SLOTS
 POSITIONS = tuple(FIELDS.index(name) for name in SLOTS)
 _LABELS = {"texels": "texture"}
+PER_CAMERA = (*PackedCamera._fields, "vertex_attributes")  # slots with a row for each camera
 MOVING = ("verts", *(name for name in SLOTS if name in PackedCamera._fields))  # slots that move the image
+APPEARANCE = ("colors", "uvs", "texels", "vertex_attributes", "face_attributes")
 
 
 def label(slot: str) -> str:
@@ -131,8 +145,8 @@ class Work(NamedTuple):
     @classmethod
     def of(cls, options: GradientOptions, wanted: Collection[str]) -> Work:
         moves = any(name in wanted for name in MOVING)
-        appearance = any(name in wanted for name in ("colors", "uvs", "texels"))
-        return cls(moves and options.radiance_varies, appearance, moves and options.visibility)
+        appearance = any(name in wanted for name in APPEARANCE)
+        return cls(moves and options.channels_vary, appearance, moves and options.visibility)
 
 
 # -- from what the user gives -------------------------------------------------------------------------------------------
@@ -173,9 +187,12 @@ def make_request(
     if torch.compiler.is_compiling():
         # Dynamo does not trace a function that is given one tensor twice; corners of vertex colours are the faces.
         flat = flat._replace(corners=flat.corners.clone())
+    packed = pack_camera(camera)
+    cameras, V, F = len(packed.K), len(flat.verts), len(flat.faces)
     return Request(
         flat,
-        pack_camera(camera),
+        packed,
+        Channels(False, flat.verts.new_empty((cameras, V, 0)), -1, flat.verts.new_empty((F, 0)), False, False),
         ImageOptions(spp, filter, seed),
         GradientOptions(surface, edge, grad_seed, _radiance_varies(scene), visibility),
     )

@@ -154,15 +154,19 @@ def _vertex_spacing(scene: Scene) -> list[float]:
     return pairs
 
 
+def image_dtype(scene: Scene) -> torch.dtype:
+    """That of the colours, or, if there are none, of the vertices; float32 or float64."""
+    floats = [t for m in scene.meshes for t in (m.colors, m.face_colors, m.corner_colors, m.texture) if t is not None]
+    floats += [scene.background] if scene.background is not None else []
+    floats = floats or [scene.meshes[0].verts]
+    return torch.float64 if any(t.dtype == torch.float64 for t in floats) else torch.float32
+
+
 def flatten(scene: Scene) -> Flat:
     """The arrays of a scene; every step is a differentiable torch operation, so gradients find their way back."""
     C = scene.channels
     cpu = torch.device("cpu")  # said everywhere, for a user may have set another default device
-    floats = [t for m in scene.meshes for t in (m.colors, m.face_colors, m.corner_colors, m.texture) if t is not None]
-    floats += [scene.background] if scene.background is not None else []
-    dtype = torch.float64 if any(t.dtype == torch.float64 for t in floats) else torch.float32
-    if not floats and scene.meshes[0].verts.dtype == torch.float64:
-        dtype = torch.float64
+    dtype = image_dtype(scene)
     any_texture = any(mesh.texture is not None for mesh in scene.meshes)
 
     def empty(width: int, kind: torch.dtype) -> Tensor:

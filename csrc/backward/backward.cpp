@@ -66,7 +66,7 @@ void with_view(const BackwardInput<T>& input, const GradientOptions& o, const Te
     const Importance importance(adjoint, camera.width, camera.height, scene.channels, margin, team);
     const OcclusionHint occlusion(hit_buffers.depth, camera.width, camera.height, team);
     const CameraFrame frame(geometry.caster(), camera);
-    Scatter scatter(team, scene.channels);
+    Scatter scatter(team, {scene.radiance, scene.attributes.vertex_width, scene.attributes.face_width});
     // What the controls need, of faces and of creases.
     const bool creases = terms.boundary && may_jump(scene, geometry.topology());
     std::optional<ImageHits> hits;
@@ -196,7 +196,8 @@ BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOpt
         to.want_k = grad.K || grad.distortion;
         to.q = grad.geometry() ? q_bar.data() : nullptr;
         to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels;
-        dispatch_channels(scene.channels, [&]<int N>() {
+        to.vertex_attributes = grad.vertex_attributes, to.face_attributes = grad.face_attributes;
+        dispatch_channels(scene.channels, scene.channels > scene.radiance, [&]<int N>() {
             add_terms<N>(view, terms, hits.coverage, Reverse{terms.motion}, to, profile);
         });
     });

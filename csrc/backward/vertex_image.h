@@ -16,7 +16,7 @@ Array<T> adjoint_at_vertices(const FilteredAdjoint<T>& filtered, const VertexVie
                              int C, Team& team) {
     const int64_t V = vertices.q.size();
     Array<T> adjoint(V * C);
-    dispatch_channels(C, [&]<int N>() {
+    dispatch_channels(C, false, [&]<int N>() {
         team.each_block(V, [&](int64_t, int64_t first, int64_t last) {
             std::vector<double> A(C);
             for (int64_t v = first; v < last; ++v) {

@@ -19,7 +19,7 @@ template <int N, class T>
 class AdjointRadiance {
    public:
     explicit AdjointRadiance(const BackwardView<T>& view)
-        : view_(view), C_(N ? N : view.scene.channels), adjoint_(RayBatch::size * C_), radiance_(C_) {}
+        : view_(view), C_(channels_of<N>(view.scene)), adjoint_(RayBatch::size * C_), radiance_(C_) {}
 
     bool wants(int i, Vec2 x) { return view_.adjoint.template at<N>(x, adjoint_.data() + i * C_); }
 

@@ -12,32 +12,49 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cmath>
+#include <type_traits>
 #include <vector>
 
 #include "backward/view.h"
 #include "boundary/curve.h"
+#include "shading/shade.h"
 
 namespace edgegrad {
 
-// Rows of the colours on both sides of a crease at its ends.
-template <class T>
-struct CreaseColors {
-    const T *minus[2], *plus[2];
-
-    CreaseColors(const SceneView<T>& scene, const Curve& c) {
-        const auto row = [&](const HalfEdge& h, int corner) {
-            return scene.colors + int64_t(scene.corners[3 * int64_t(h.face) + corner]) * scene.channels;
-        };
-        minus[0] = row(c.minus, c.minus.first()), minus[1] = row(c.minus, c.minus.second());
-        plus[0] = row(c.plus, c.plus.first()), plus[1] = row(c.plus, c.plus.second());
+// What differs between the sides of a crease of faces without texture: all channels, at its ends.
+template <int N, class T>
+class CreaseJumps {
+   public:
+    explicit CreaseJumps(const SceneView<T>& scene) : scene_(scene), C_(channels_of<N>(scene)) {
+        if constexpr (N == 0) value_.resize(2 * C_);
     }
-    double jump(int end, int channel) const { return double(minus[end][channel]) - plus[end][channel]; }
-    double size(int end, int channels) const {
+
+    void set(const Curve& curve) {
+        std::fill(value_.begin(), value_.end(), 0.0);
+        add(curve.minus, 1), add(curve.plus, -1);
+    }
+    double at(int end, int channel) const { return value_[end * C_ + channel]; }
+    // Σ_c weight_c |jump_c|.
+    double size(int end, const std::vector<double>& weights) const {
         double sum = 0;
-        for (int c = 0; c < channels; ++c) sum += std::fabs(jump(end, c));
+        for (int c = 0; c < C_; ++c) sum += weights[c] * std::fabs(at(end, c));
         return sum;
     }
+
+   private:
+    void add(const HalfEdge& h, double sign) {
+        const int first = h.first(), second = h.second();
+        each_corner_value<N>(scene_, h.face, [&](int c, double c0, double c1, double c2) {
+            const double value[3] = {c0, c1, c2};
+            value_[c] += sign * value[first], value_[C_ + c] += sign * value[second];
+        });
+    }
+
+    const SceneView<T>& scene_;
+    const int C_;
+    std::conditional_t<N == 0, std::vector<double>, std::array<double, 2 * all_channels<N>>> value_{};
 };
 
 template <class T>
@@ -48,7 +65,8 @@ bool joins_colors(const SceneView<T>& scene, const Curve& c) {
 template <int N, class T>
 class CreaseControl {
    public:
-    explicit CreaseControl(const BackwardView<T>& view) : view_(view), C_(N ? N : view.scene.channels), A_(C_) {}
+    explicit CreaseControl(const BackwardView<T>& view)
+        : view_(view), C_(channels_of<N>(view.scene)), jumps_(view.scene), A_(C_) {}
 
     // Begins with a curve; false where there is no control.
     bool set(const Curve& curve) {
@@ -58,6 +76,7 @@ class CreaseControl {
         bend_ = std::fabs(curve.w1 - curve.w0) / (curve.w0 + curve.w1);
         if (!(bend_ < 1.0 / 3)) return false;
         curve_ = &curve, tangent_ = curve.tangent();
+        jumps_.set(curve);
         for (int k = 0; k < 2; ++k) {
             vertex_[0][k] = vertex(scene, curve.minus, k ? curve.minus.second() : curve.minus.first());
             vertex_[1][k] = vertex(scene, curve.plus, k ? curve.plus.second() : curve.plus.first());
@@ -70,13 +89,12 @@ class CreaseControl {
     double density(double least) const { return std::clamp(std::max(curve_->length / wide, bend_), least, 1.0); }
 
     void add_integral() {
-        const CreaseColors<T> colors(view_.scene, *curve_);
         // Gauss-Legendre with three points, exact up to degree 5.
         constexpr double node[3] = {-0.7745966692414834, 0, 0.7745966692414834},
                          weight[3] = {5. / 18, 8. / 18, 5. / 18};
         for (double begin = 0; begin < 1;) {
             const double end = end_of_piece(begin);
-            const Piece piece(*this, begin, end, colors);
+            const Piece piece(*this, begin, end);
             for (int j = 0; j < 3; ++j) {
                 const double s = 0.5 * ((begin + end) + node[j] * (end - begin));
                 const double value = weight[j] * (end - begin) * piece.at(s);
@@ -88,10 +106,9 @@ class CreaseControl {
 
     // At the fraction s of the curve, of a sample with this weight.
     void subtract(double s, double weight) {
-        const CreaseColors<T> colors(view_.scene, *curve_);
         double begin = 0, end = end_of_piece(0);
         while (end < s) begin = end, end = end_of_piece(begin);
-        const double value = weight * Piece(*this, begin, end, colors).at(s);
+        const double value = weight * Piece(*this, begin, end).at(s);
         at_a_ -= (1 - s) * value, at_b_ -= s * value;
     }
 
@@ -109,14 +126,14 @@ class CreaseControl {
     // Ã · ΔL between two lines of the filter: Ã by its values at the ends and in the middle, constant for a box.
     class Piece {
        public:
-        Piece(CreaseControl& control, double begin, double end, const CreaseColors<T>& colors)
+        Piece(CreaseControl& control, double begin, double end)
             : middle_(0.5 * (begin + end)), half_(0.5 * (end - begin)) {
             const bool box = control.view_.image.filter.is_box();
             for (int k = box ? 1 : 0; k < (box ? 2 : 3); ++k) {
                 control.view_.adjoint.template at<N>(control.curve_->position(middle_ + (k - 1) * half_),
                                                      control.A_.data());
                 for (int c = 0; c < control.C_; ++c)
-                    a_[k] += control.A_[c] * colors.jump(0, c), b_[k] += control.A_[c] * colors.jump(1, c);
+                    a_[k] += control.A_[c] * control.jumps_.at(0, c), b_[k] += control.A_[c] * control.jumps_.at(1, c);
             }
             if (box) a_[0] = a_[2] = a_[1], b_[0] = b_[2] = b_[1];
         }
@@ -156,6 +173,7 @@ class CreaseControl {
     double bend_ = 0;
     int32_t vertex_[2][2];  // of minus and plus; a and b
     double at_a_ = 0, at_b_ = 0;
+    CreaseJumps<N, T> jumps_;
     std::vector<double> A_;
 };
 

@@ -62,7 +62,20 @@ bool in_front(const BackwardView<T>& view, const HalfEdge& first, const HalfEdge
     return other == 0 || (viewer > 0) != (other > 0);
 }
 
-// Whether two faces may differ in radiance along the edge they share: their values at its ends are compared.
+// Whether two faces may differ in attributes along the edge they share: barycentrics are of each face alone; texture
+// coordinates are compared below.
+template <class T>
+bool attributes_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
+    const Attributes& a = scene.attributes;
+    const auto differ = [](const double* values, int width, int64_t i, int64_t j) {
+        return i != j && !std::equal(values + width * i, values + width * (i + 1), values + width * j);
+    };
+    return a.barycentrics || differ(a.face, a.face_width, m.face, p.face) ||
+           differ(a.vertex, a.vertex_width, vertex(scene, m, m.first()), vertex(scene, p, p.first())) ||
+           differ(a.vertex, a.vertex_width, vertex(scene, m, m.second()), vertex(scene, p, p.second()));
+}
+
+// Whether two faces may differ along the edge they share: their values at its ends are compared.
 template <class T>
 bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
     const bool textured = is_textured(scene, m.face);
@@ -75,18 +88,19 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
     for (const auto& [i, j] : ends) {
         if (i == j) continue;
         if (textured && !std::equal(scene.uvs + 2 * i, scene.uvs + 2 * i + 2, scene.uvs + 2 * j)) return true;
-        const int C = scene.channels;
+        const int C = scene.radiance;
         if (!textured && !std::equal(scene.colors + C * i, scene.colors + C * (i + 1), scene.colors + C * j))
             return true;
     }
-    return false;
+    return scene.channels > scene.radiance && attributes_jump(scene, m, p);
 }
 
-// Whether neighbouring faces may differ in radiance at their common edge. Attributes that are indexed like the vertices
+// Whether neighbouring faces may differ at their common edge. Attributes that are indexed like the vertices
 // are the same on both sides of an edge, unless it joins copies.
 template <class T>
 bool may_jump(const SceneView<T>& scene, const Topology& topology) {
-    return scene.corners != scene.faces || topology.welds();
+    const Attributes& a = scene.attributes;
+    return scene.corners != scene.faces || topology.welds() || a.face_width > 0 || a.barycentrics;
 }
 
 // A face that turns clockwise in the image (x right, y down) lies to the right of its sides, where the normal

@@ -36,16 +36,57 @@ double reach_of_rays(const BackwardView<T>& view, const Curve& c) {
                     std::min(view.camera.pixels_per_unit / std::min(c.w0, c.w1) * error, Crossings::float_reach));
 }
 
-// Mean of Σ_c |L| over all colours: the size of a jump of which nothing is known.
-template <class T>
-double mean_radiance(const SceneView<T>& scene, Team& team) {
-    std::vector<double> sum(Team::blocks(scene.n_colors), 0.0);
-    team.each_block(scene.n_colors, [&](int64_t k, int64_t first, int64_t last) {
-        for (int64_t i = first * scene.channels; i < last * scene.channels; ++i) sum[k] += std::fabs(scene.colors[i]);
+// What the sizes of jumps in all channels are compared by.
+struct JumpScale {
+    std::vector<double> weights;  // of the channels
+    double unknown = 0;           // the size of a jump of which nothing is known: Σ_c weight_c · (mean |L_c|)
+};
+
+// Mean of Σ_c weight_c |value_c| over all rows.
+template <class Number>
+double mean_size(const Number* values, int64_t rows, const double* weights, int width, Team& team) {
+    if (rows == 0 || width == 0) return 0;
+    std::vector<double> sum(Team::blocks(rows), 0.0);
+    team.each_block(rows, [&](int64_t k, int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i)
+            for (int c = 0; c < width; ++c) sum[k] += weights[c] * std::fabs(values[i * width + c]);
     });
     double all = 0;
     for (const double s : sum) all += s;
-    return scene.n_colors ? all / double(scene.n_colors) : 0;
+    return all / double(rows);
+}
+
+// The channels of radiance have one unit. Attributes have units of their own, so there a channel counts as much as the
+// loss looks at it.
+template <class T>
+JumpScale jump_scale(const BackwardView<T>& view) {
+    const SceneView<T>& scene = view.scene;
+    const int C = scene.channels, R = scene.radiance;
+    JumpScale out{std::vector<double>(C, 1.0)};
+    if (C > R) {
+        const int64_t pixels = int64_t(view.camera.width) * view.camera.height;
+        std::vector<double> sum(Team::blocks(pixels) * C, 0.0);
+        view.team.each_block(pixels, [&](int64_t k, int64_t first, int64_t last) {
+            for (int64_t p = first; p < last; ++p)
+                for (int c = 0; c < C; ++c) sum[k * C + c] += std::fabs(view.adjoint.of(p)[c]);
+        });
+        std::fill(out.weights.begin(), out.weights.end(), 0.0);
+        for (size_t i = 0; i < sum.size(); ++i) out.weights[i % C] += sum[i] / double(pixels);
+    }
+    const double* weights = out.weights.data();
+    out.unknown = mean_size(scene.colors, scene.n_colors, weights, R, view.team);
+    if (C > R) {
+        const Attributes& a = scene.attributes;
+        weights += R;
+        if (a.alpha) out.unknown += *weights++;
+        out.unknown += mean_size(a.vertex, scene.n_verts, weights, a.vertex_width, view.team);
+        weights += a.vertex_width;
+        out.unknown += mean_size(a.face, scene.n_faces, weights, a.face_width, view.team);
+        weights += a.face_width;
+        for (int i = 0; i < 3 * a.barycentrics; ++i) out.unknown += *weights++ / 3;
+        if (a.uv) out.unknown += mean_size(scene.uvs, scene.n_uvs, weights, 2, view.team);
+    }
+    return out;
 }
 
 template <class T>
@@ -79,9 +120,9 @@ class MeasuredEdges {
 
    public:
     // `hints`, and `x`, where controls go: null if there are no controls.
-    MeasuredEdges(const BackwardView<T>& view, const CurveFinder<T>& finder, double radiance, const CreaseHints* hints,
-                  RowBuffer* x)
-        : view_(view), finder_(finder), radiance_(radiance), x_(x), control_(view) {
+    MeasuredEdges(const BackwardView<T>& view, const CurveFinder<T>& finder, const JumpScale& scale,
+                  const CreaseHints* hints, RowBuffer* x)
+        : view_(view), finder_(finder), scale_(scale), x_(x), jumps_(view.scene), control_(view) {
         if (hints) visibility_.emplace(view, hints->crossings, hints->meeting);
     }
 
@@ -153,19 +194,20 @@ class MeasuredEdges {
         measure(c, jump, control_.density(expected.samples));
     }
 
-    // Relative to a jump of the size of the mean radiance, which is taken where nothing is known.
+    // Relative to a jump of the size of the mean, which is taken where nothing is known.
     double size_of_jump(const Curve& c) {
         if (!joins_colors(view_.scene, c)) return 1;
-        const CreaseColors<T> colors(view_.scene, c);
-        const int C = view_.scene.channels;
-        return std::min(0.5 * (colors.size(0, C) + colors.size(1, C)) / radiance_, largest);
+        jumps_.set(c);
+        const double size = 0.5 * (jumps_.size(0, scale_.weights) + jumps_.size(1, scale_.weights));
+        return std::min(size / scale_.unknown, largest);
     }
 
     static constexpr double largest = 2;  // so that a bright face among dark ones does not take all samples
     const BackwardView<T>& view_;
     const CurveFinder<T>& finder_;
-    const double radiance_;
+    const JumpScale& scale_;
     RowBuffer* x_;
+    CreaseJumps<N, T> jumps_;
     CreaseControl<N, T> control_;
     std::optional<CreaseVisibility<T>> visibility_;
     Jump asked_[CreaseVisibility<T>::most];
@@ -234,7 +276,7 @@ template <int N, class T>
 Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing) {
     Curves<T> out(view, std::move(facing));
     const int64_t E = view.geometry.topology().n_edges();
-    const double radiance = out.finder.finds_creases() ? mean_radiance(view.scene, view.team) : 0;
+    const JumpScale scale = out.finder.finds_creases() ? jump_scale(view) : JumpScale{};
     const int width = view.camera.width, height = view.camera.height;
     std::optional<CreaseHints> hints;
     if (!out.x_bar.empty())
@@ -243,7 +285,7 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing) {
     std::vector<CurvesFound> found;
     std::vector<std::vector<MeasuredCurve>> curves;
     const auto measure = [&](int64_t k, int64_t first, int64_t last, RowBuffer* x) {
-        MeasuredEdges<N, T> part(view, out.finder, radiance, hints ? &*hints : nullptr, x);
+        MeasuredEdges<N, T> part(view, out.finder, scale, hints ? &*hints : nullptr, x);
         part.add(first, last);
         found[k] = part.found, curves[k] = std::move(part.curves), out.segments[k] = std::move(part.segments);
     };

@@ -38,14 +38,13 @@ void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, co
     chunk.colors.prepare(scene.channels, 1), chunk.texels.prepare(scene.channels, 1);
     CornerGrad rows;
     for (int64_t i = 0; i < n; ++i) {
-        const int32_t *v = scene.faces + 3 * int64_t(faces[i]), *row = scene.corners + 3 * int64_t(faces[i]);
+        const int32_t* v = scene.faces + 3 * int64_t(faces[i]);
         const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
         const Vec2 n = normalised(camera, straighten(camera, {points[2 * i], points[2 * i + 1]}));
         const FaceMap map = face_map(camera, corner);
-        const int width = is_textured(scene, faces[i]) ? 2 : scene.channels;
         Barycentrics b;
         barycentrics(map, n, b);
-        rows.reset(width);
+        rows.reset(scene, faces[i]);
         const Barycentrics b_bar =
             shade_vjp<0>(scene, faces[i], b, radiance_bar + i * scene.channels, true, rows, chunk);
         FaceMap map_bar;
@@ -54,11 +53,8 @@ void shade_at_vjp(const SceneView<T>& scene, const Camera& camera, int64_t n, co
         barycentrics_vjp(map, n, b, b_bar, map_bar, n_bar);
         face_map_vjp(camera, corner, map_bar, corner_bar);
         normalised_vjp(camera, n, n_bar, chunk.k);
-        for (int j = 0; j < 3; ++j) {
-            chunk.q.add(v[j], &corner_bar[j].x);
-            (width == 2 && is_textured(scene, faces[i]) ? chunk.uvs : chunk.colors)
-                .add(row[j], rows.value.data() + j * width);
-        }
+        for (int j = 0; j < 3; ++j) chunk.q.add(v[j], &corner_bar[j].x);
+        rows.add_to(scene, faces[i], {.colors = grad.colors, .uvs = grad.uvs}, chunk);
     }
     Array<double> q_bar = zeros(3 * scene.n_verts, team);
     chunk.q.add_to(q_bar.data(), 0), chunk.colors.add_to(grad.colors, 0);

@@ -129,8 +129,13 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
     }
     std::vector<double> verts(scene.verts.size()), colors(scene.colors.size()), uvs(scene.uvs.size()),
         texels(scene.texels.size()), background(scene.background.size()), pose(16), K(9);
-    const Gradients grad{verts.data(),      colors.data(), uvs.data(), texels.data(),
-                         background.data(), pose.data(),   K.data()};
+    const Gradients grad{.verts = verts.data(),
+                         .colors = colors.data(),
+                         .uvs = uvs.data(),
+                         .texels = texels.data(),
+                         .background = background.data(),
+                         .world_to_camera = pose.data(),
+                         .K = K.data()};
     const auto geometry = acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, spacing,
                                            geometry_for(true, true), team, work);
     render_backward(BackwardInput<T>{view, camera, *geometry, options, image.data(), hits}, {.seed = 2}, team, grad);

@@ -23,6 +23,7 @@ struct Screen {};
     EDGEGRAD_FOR_CONTRACTIONS_OF(X, float) \
     EDGEGRAD_FOR_CONTRACTIONS_OF(X, double)
 #define EDGEGRAD_FOR_CONTRACTIONS_OF(X, T) \
-    X(0, Reverse, T) X(1, Reverse, T) X(3, Reverse, T) X(4, Reverse, T) X(0, Forward, T) X(0, Screen, T)
+    X(0, Reverse, T)                       \
+    X(1, Reverse, T) X(3, Reverse, T) X(4, Reverse, T) X(-4, Reverse, T) X(0, Forward, T) X(0, Screen, T)
 
 }  // namespace edgegrad

@@ -93,20 +93,22 @@ class RowBuffer {
 // What the samples of one chunk give.
 struct ChunkGrad {
     RowBuffer q, x, colors, uvs, texels;  // vertices: q in camera coordinates, x in the image
-    RowBuffer pixels;                     // of what has the size of the image
+    RowBuffer vertex_attributes, face_attributes;
+    RowBuffer pixels;  // of what has the size of the image
     IntrinsicsGrad k;
 };
 
 // Where it goes; null where none is wanted.
 struct Destination {
-    double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr, *pixels = nullptr;
+    double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr;
+    double *vertex_attributes = nullptr, *face_attributes = nullptr, *pixels = nullptr;
     int pixel_width = 0;  // numbers a pixel
-    IntrinsicsGrad k;
+    IntrinsicsGrad k = {};
     bool want_k = false;
 };
 
 // The rows of both, and their width.
-constexpr int as_channels = 0, as_pixels = -1;
+constexpr int as_radiance = 0, as_pixels = -1, as_vertex_attributes = -2, as_face_attributes = -3;
 struct RowSlot {
     RowBuffer ChunkGrad::* rows;
     double* Destination::* to;
@@ -114,9 +116,11 @@ struct RowSlot {
 };
 constexpr RowSlot row_slots[] = {{&ChunkGrad::q, &Destination::q, 3},
                                  {&ChunkGrad::x, &Destination::x, 2},
-                                 {&ChunkGrad::colors, &Destination::colors, as_channels},
+                                 {&ChunkGrad::colors, &Destination::colors, as_radiance},
                                  {&ChunkGrad::uvs, &Destination::uvs, 2},
-                                 {&ChunkGrad::texels, &Destination::texels, as_channels},
+                                 {&ChunkGrad::texels, &Destination::texels, as_radiance},
+                                 {&ChunkGrad::vertex_attributes, &Destination::vertex_attributes, as_vertex_attributes},
+                                 {&ChunkGrad::face_attributes, &Destination::face_attributes, as_face_attributes},
                                  {&ChunkGrad::pixels, &Destination::pixels, as_pixels}};
 
 // Samples in a chunk, chunks that are in memory at a time for each thread, and owners at most: more would only split
@@ -138,8 +142,10 @@ inline int64_t RowBuffer::bytes(const Load& load, int threads) {
 // The buffers of one backward pass, whose parts use them one after the other.
 class Scatter {
    public:
-    // `channels`: of colours and texels.
-    Scatter(Team& team, int channels) : team_(team), channels_(channels) {}
+    struct Widths {
+        int radiance, vertex_attributes, face_attributes;
+    };
+    Scatter(Team& team, Widths widths) : team_(team), widths_(widths) {}
 
     // Calls body(first, last, ChunkGrad&) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
     // samples and of the adding.
@@ -175,17 +181,30 @@ class Scatter {
     void prepare(ChunkGrad& g, const Destination& to, int owners) const {
         for (const RowSlot& slot : row_slots) {
             RowBuffer& rows = g.*slot.rows;
-            const int width = slot.width == as_channels ? channels_
-                              : slot.width == as_pixels ? to.pixel_width
-                                                        : slot.width;
+            const int width = width_of(slot, to);
             if (to.*slot.to) rows.prepare(width, owners);
             rows.clear();
         }
         g.k = {};
     }
 
+    int width_of(const RowSlot& slot, const Destination& to) const {
+        switch (slot.width) {
+            case as_radiance:
+                return widths_.radiance;
+            case as_pixels:
+                return to.pixel_width;
+            case as_vertex_attributes:
+                return widths_.vertex_attributes;
+            case as_face_attributes:
+                return widths_.face_attributes;
+            default:
+                return slot.width;
+        }
+    }
+
     Team& team_;
-    const int channels_;
+    const Widths widths_;
     std::vector<ChunkGrad> grads_;
 };
 

@@ -3,9 +3,16 @@
 
 namespace edgegrad {
 
-// Calls f.template operator()<N>() with N = C where code for a fixed number of channels is compiled, else with 0.
+// N > 0: so many channels, all of radiance. N < 0: −N channels, some of them attributes (shading/attributes.h). 0: any.
+template <int N>
+inline constexpr int all_channels = N < 0 ? -N : N;
+template <int N>
+inline constexpr int radiance_channels = N < 0 ? 0 : N;  // 0: not known
+
+// Calls f.template operator()<N>() with the N that code is compiled for.
 template <class F>
-void dispatch_channels(int channels, F f) {
+void dispatch_channels(int channels, bool attributes, F f) {
+    if (attributes) return channels == 4 ? f.template operator()<-4>() : f.template operator()<0>();
     switch (channels) {
         case 1:
             return f.template operator()<1>();
@@ -19,6 +26,6 @@ void dispatch_channels(int channels, F f) {
 }
 
 // Of those numbers, for explicit instantiations.
-#define EDGEGRAD_FOR_CHANNELS(X) X(0) X(1) X(3) X(4)
+#define EDGEGRAD_FOR_CHANNELS(X) X(0) X(1) X(3) X(4) X(-4)
 
 }  // namespace edgegrad

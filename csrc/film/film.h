@@ -8,6 +8,7 @@
 #include <cmath>
 #include <cstdint>
 
+#include "core/channels.h"
 #include "core/math.h"
 #include "scene/scene.h"
 
@@ -99,7 +100,7 @@ class FilteredAdjoint {
     // Ã(x), C numbers; false where it is zero in all channels.
     template <int N>
     bool at(Vec2 x, double* out) const {
-        const int C = N ? N : scene_.channels;
+        const int C = N ? all_channels<N> : scene_.channels;
         for (int c = 0; c < C; ++c) out[c] = 0;
         pixels_.around(x, [&](int64_t pixel, double weight) {
             const T* A = A_ + pixel * C;
@@ -114,7 +115,7 @@ class FilteredAdjoint {
     // so this is not Ã(x) times something.
     template <int N>
     double times_background(Vec2 x) const {
-        const int C = N ? N : scene_.channels;
+        const int C = N ? all_channels<N> : scene_.channels;
         double sum = 0;
         pixels_.around(x, [&](int64_t pixel, double weight) {
             const T *A = A_ + pixel * C, *B = scene_.background_at(pixel);

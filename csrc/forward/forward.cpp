@@ -87,7 +87,7 @@ class PixelRow {
           q_(q),
           image_(image),
           out_(out),
-          C_(N ? N : scene.channels),
+          C_(channels_of<N>(scene)),
           reach_{options.filter.radius() * (std::fabs(camera.k_inverse[0]) + std::fabs(camera.k_inverse[1])),
                  options.filter.radius() * (std::fabs(camera.k_inverse[2]) + std::fabs(camera.k_inverse[3]))},
           rays_(frame),
@@ -138,7 +138,7 @@ class PixelRow {
     // in the next one.
     struct alignas(N ? 256 : 8) Shaded {
         int32_t face = -1;
-        bool textured = false, unseen = false;
+        bool affine = true, unseen = false;
         FaceMap map;
         DepthBound depth;
         AffineRadiance<N> radiance;
@@ -168,7 +168,7 @@ class PixelRow {
                     const unsigned same = on_face(rays_.face + i, face);
                     left &= ~same;
                     Barycentrics b;
-                    if ((same & (same - 1)) && !s.textured &&
+                    if ((same & (same - 1)) && s.affine &&
                         add_barycentrics(s.map, rays_.n_x + i, rays_.n_y + i, rays_.face + i, face, b)) {
                         const int n = std::popcount(same);
                         s.radiance.add_to(sum, b, n);
@@ -203,11 +203,11 @@ class PixelRow {
         const Shaded& s = shaded(face);
         note_hit(s, column);
         const Barycentrics b = barycentrics_of_hit(s.map, rays_.n(i));
-        if (s.textured) {
+        if (s.affine) {
+            s.radiance.add_to(sum, b, 1);
+        } else {
             shade<N>(scene_, face, b, radiance_.data());
             for (int c = 0; c < C_; ++c) sum[c] += radiance_[c];
-        } else {
-            s.radiance.add_to(sum, b, 1);
         }
         return 1;
     }
@@ -231,7 +231,7 @@ class PixelRow {
                 for (int k = 0; k < 3; ++k) {
                     prefetch(&q_[scene_.faces[3 * face + k]]);
                     if (!is_textured(scene_, face))
-                        prefetch(scene_.colors + int64_t(scene_.corners[3 * face + k]) * C_);
+                        prefetch(scene_.colors + int64_t(scene_.corners[3 * face + k]) * scene_.radiance);
                 }
     }
 
@@ -249,14 +249,14 @@ class PixelRow {
 
     void keep(Shaded& s, int32_t face) {
         s.face = face;
-        s.textured = is_textured(scene_, face);
+        s.affine = is_affine(scene_, face);
         const int32_t* v = scene_.faces + 3 * int64_t(face);
         const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
         s.map = face_map(camera_, corner);
         s.unseen = camera_.passes_through_eye(corner);
         if (s.unseen) return;
         s.depth.set(camera_, corner, s.map);
-        if (!s.textured) s.radiance.set(scene_, face);
+        if (s.affine) s.radiance.set(scene_, face);
         // Threads may write the same byte, always with the same value; reading first keeps its cache line shared.
         std::atomic_ref<uint8_t> seen(out_.seen[face]);
         if (!seen.load(std::memory_order_relaxed))
@@ -385,7 +385,7 @@ void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCa
                     Team& team, T* image, const HitBuffers<T>& out) {
     const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
     std::fill(out.seen, out.seen + scene.n_faces, uint8_t(0));
-    dispatch_channels(scene.channels,
+    dispatch_channels(scene.channels, scene.channels > scene.radiance,
                       [&]<int N>() { render_pixels<N>(scene, camera, caster, o, team, q, image, out); });
 }
 

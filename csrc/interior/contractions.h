@@ -28,7 +28,7 @@ class ReverseInterior {
    public:
     ReverseInterior(const BackwardView<T>& view, bool geometry, const Destination& to, ChunkGrad& grad)
         : view_(view),
-          C_(N ? N : view.scene.channels),
+          C_(channels_of<N>(view.scene)),
           run_(view, geometry, to, grad),
           weighted_(RayBatch::size * C_),
           in_pixel_(C_) {}
@@ -166,7 +166,7 @@ class ScreenInterior {
         const FaceMap map = face_map(view_.camera, corner.data());
         Barycentrics b;
         if (!barycentrics(map, n, b)) return;
-        corners_.reset(std::max(2, view_.scene.channels));
+        corners_.reset(view_.scene, face);
         const Barycentrics b_bar = shade_vjp<0>(view_.scene, face, b, radiance_bar, false, corners_, grad_);
         FaceMap map_bar;
         Vec2 n_bar;

@@ -23,7 +23,7 @@
 
 #include "camera/vertices.h"
 #include "scene/scene.h"
-#include "shading/surface.h"
+#include "shading/shade.h"
 
 namespace edgegrad {
 
@@ -33,14 +33,14 @@ class Control {
    public:
     // `adjoint`: Ã at the vertices, (V, C).
     Control(const SceneView<T>& scene, const VertexView& vertices, const T* adjoint)
-        : scene_(scene), vertices_(vertices), adjoint_(adjoint), C_(N ? N : scene.channels) {
+        : scene_(scene), vertices_(vertices), adjoint_(adjoint), C_(channels_of<N>(scene)) {
         if constexpr (N == 0) A_.resize(3 * C_), T_.resize(3 * C_);
     }
 
     // Of a face that lies inside the view.
     void start(int64_t face) {
         const int C = channels();
-        v_ = scene_.faces + 3 * face, row_ = scene_.corners + 3 * face;
+        face_ = face, v_ = scene_.faces + 3 * face;
         for (int i = 0; i < 3; ++i)
             for (int c = 0; c < C; ++c) A_[i * C + c] = adjoint_[int64_t(v_[i]) * C + c];
         std::fill(T_.begin(), T_.end(), 0.0);
@@ -64,24 +64,26 @@ class Control {
         const int C = channels();
         const Vec2 x0 = vertices_.x[v_[0]], e1 = vertices_.x[v_[1]] - x0, e2 = vertices_.x[v_[2]] - x0;
         const double half = wedge(e1, e2) < 0 ? -0.5 : 0.5;
-        const auto color = [&](int i) { return scene_.colors + int64_t(row_[i]) * C; };
-        const T *c0 = color(0), *c1 = color(1), *c2 = color(2);
-        for (int c = 0; c < C; ++c) {
-            const double d1 = half * (double(c1[c]) - c0[c]), d2 = half * (double(c2[c]) - c0[c]);
+        const auto add = [&](int c, double c0, double c1, double c2) {
+            const double d1 = half * (c1 - c0), d2 = half * (c2 - c0);
             const Vec2 gradient{d1 * e2.y - d2 * e1.y, d2 * e1.x - d1 * e2.x};  // times the area
             for (int i = 0; i < 3; ++i) x_bar[i] += -T_[i * C + c] * gradient;
+        };
+        each_corner_value<N>(scene_, face_, add);
+    }
+
+    // Adds to those of the values at the corners.
+    void add_to_corners(CornerGrad& bar) const {
+        const int C = channels(), R = radiance_of<N>(scene_);
+        const double a = area();
+        for (int i = 0; i < 3; ++i) {
+            for (int c = 0; c < R; ++c) bar.value[i * R + c] += a * T_[i * C + c];
+            for (int c = R; c < C; ++c) bar.attributes[i * (C - R) + c - R] += a * T_[i * C + c];
         }
     }
 
-    // Adds to those of the colours: (3, C), or a row for each.
-    void add_to_colors(double* color_bar) const {
-        const int C = channels();
-        const double a = area();
-        for (int k = 0; k < 3 * C; ++k) color_bar[k] += a * T_[k];
-    }
-
    private:
-    int channels() const { return N ? N : C_; }
+    int channels() const { return N ? all_channels<N> : C_; }
     double area() const {
         const Vec2 x0 = vertices_.x[v_[0]];
         return 0.5 * std::fabs(wedge(vertices_.x[v_[1]] - x0, vertices_.x[v_[2]] - x0));
@@ -92,8 +94,9 @@ class Control {
     const T* adjoint_;
     const int C_;
 
-    const int32_t *v_ = nullptr, *row_ = nullptr;
-    using Numbers = std::conditional_t<N == 0, std::vector<double>, std::array<double, 3 * N>>;
+    int64_t face_ = -1;
+    const int32_t* v_ = nullptr;
+    using Numbers = std::conditional_t<N == 0, std::vector<double>, std::array<double, 3 * all_channels<N>>>;
     Numbers A_{}, T_{};  // (3, C); T over the area
 };
 

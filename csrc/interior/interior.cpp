@@ -94,7 +94,7 @@ void prefetch_face(const BackwardView<T>& view, int64_t face) {
     const int32_t *v = view.scene.faces + 3 * face, *row = view.scene.corners + 3 * face;
     for (int i = 0; i < 3; ++i) {
         prefetch(&view.vertices.q[v[i]]);
-        if (!is_textured(view.scene, face)) prefetch(view.scene.colors + int64_t(row[i]) * view.scene.channels);
+        if (!is_textured(view.scene, face)) prefetch(view.scene.colors + int64_t(row[i]) * view.scene.radiance);
     }
 }
 

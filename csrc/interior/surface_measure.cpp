@@ -98,15 +98,15 @@ class MeasuredChunk {
         : view_(view),
           importance_around_(importance_around),
           want_places_(geometry),
-          want_colors_(to.colors),
+          to_(to),
           facing_(facing),
           want_facing_(!facing.empty()),
           out_(out),
           mask_(mask),
           grad_(grad),
-          C_(N ? N : view.scene.channels),
+          C_(channels_of<N>(view.scene)),
           rough_(2 * view.importance.roughness() * view.importance.roughness()),
-          colors_(C_) {}
+          want_values_(to.colors || to.vertex_attributes || to.face_attributes) {}
 
     double total() const { return total_; }
     double of_large() const { return of_large_; }
@@ -276,9 +276,9 @@ class MeasuredChunk {
     }
 
     void gather_control(int i) {
-        const int C = N ? N : C_;
+        const int C = N ? all_channels<N> : C_;
         const int64_t f = lanes_->face[i];
-        const int32_t *v = view_.scene.faces + 3 * f, *row = view_.scene.corners + 3 * f;
+        const int32_t* v = view_.scene.faces + 3 * f;
         constexpr int next = FaceLanes::size;
         double *adjoint = lanes_->adjoint.data() + i, *color = lanes_->color.data() + i;
         for (int k = 0; k < 3; ++k) {
@@ -290,33 +290,36 @@ class MeasuredChunk {
                 view_.adjoint.of(int64_t(lanes_->inside[1][k][i]) * view_.camera.width + lanes_->inside[0][k][i]);
             for (int c = 0; c < C; ++c) adjoint[(7 * c + 3 + k) * next] = A[c];
         }
-        const auto color_of = [&](int k) { return view_.scene.colors + int64_t(row[k]) * C; };
-        const T *c0 = color_of(0), *c1 = color_of(1), *c2 = color_of(2);
-        for (int c = 0; c < C; ++c) {
-            color[2 * c * next] = double(c1[c]) - c0[c];
-            color[(2 * c + 1) * next] = double(c2[c]) - c0[c];
-        }
+        each_corner_value<N>(view_.scene, f, [&](int c, double c0, double c1, double c2) {
+            color[2 * c * next] = c1 - c0;
+            color[(2 * c + 1) * next] = c2 - c0;
+        });
     }
 
     void add_controls() {
-        const int C = N ? N : C_;
+        const int C = N ? all_channels<N> : C_, R = radiance_of<N>(view_.scene);
         FaceLanes& l = *lanes_;
         l.integrate();
         for (int i = 0; i < l.count; ++i) {
             if (!controlled_[i]) continue;
             const int64_t f = l.face[i];
-            const int32_t *v = view_.scene.faces + 3 * f, *row = view_.scene.corners + 3 * f;
+            const int32_t* v = view_.scene.faces + 3 * f;
             if (want_places_)
                 for (int k = 0; k < 3; ++k) {
                     const Vec2 x_bar{l.x_bar[k][i], l.y_bar[k][i]};
                     grad_.x.template add<2>(v[k], &x_bar.x);
                 }
-            if (want_colors_)
+            if (want_values_) {
+                const auto T_of = [&](int c, int k) {
+                    return 0.5 * std::fabs(l.wedge[i]) * l.T[(3 * c + k) * FaceLanes::size + i];
+                };
+                rows_.reset(view_.scene, f);
                 for (int k = 0; k < 3; ++k) {
-                    for (int c = 0; c < C; ++c)
-                        colors_[c] = 0.5 * std::fabs(l.wedge[i]) * l.T[(3 * c + k) * FaceLanes::size + i];
-                    grad_.colors.template add<N>(row[k], colors_.data());
+                    for (int c = 0; c < R; ++c) rows_.value[k * R + c] = T_of(c, k);
+                    for (int c = R; c < C; ++c) rows_.attributes[k * (C - R) + c - R] = T_of(c, k);
                 }
+                rows_.add_to(view_.scene, f, to_, grad_);
+            }
             double m = samples_[i];
             const double rough = 2 * variation(i);
             if (rough > 1) m *= more_if_rough(rough * rough, l.longest[i]);
@@ -340,7 +343,8 @@ class MeasuredChunk {
     static constexpr int ahead = 32;
     const BackwardView<T>& view_;
     const std::vector<double>& importance_around_;  // of what lies within two tiles of a point, by its own
-    const bool want_places_, want_colors_;
+    const bool want_places_;
+    const Destination& to_;
     Array<int8_t>& facing_;
     const bool want_facing_;
     SurfaceMeasure<T>& out_;
@@ -358,7 +362,8 @@ class MeasuredChunk {
     const double hidden_by_all_around_ = hidden(OcclusionHint::pixels_around);
     double importance_[FaceLanes::size], samples_[FaceLanes::size];
     bool controlled_[FaceLanes::size], clear_[FaceLanes::size];
-    std::vector<double> colors_;
+    const bool want_values_;
+    CornerGrad rows_;
 };
 
 }  // namespace
@@ -374,6 +379,7 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
     Array<double> x_bar = zeros(geometry ? 2 * view.scene.n_verts : 0, view.team);
     Destination whole;
     whole.x = geometry ? x_bar.data() : nullptr, whole.colors = to.colors;
+    whole.vertex_attributes = to.vertex_attributes, whole.face_attributes = to.face_attributes;
     std::vector<double> total(chunks), of_large(chunks);
     const int columns = view.occlusion.columns(), rows = view.occlusion.rows();
     std::vector<double> importance_around(size_t(columns) * rows);

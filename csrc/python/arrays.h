@@ -25,6 +25,21 @@ inline Spacing make_spacing(const std::vector<double>& pairs) {
     return spacing;
 }
 
+// What is rendered beside the radiance, for one camera.
+struct ChannelArrays {
+    In<double, 2> vertex, face;  // (V, Kv), (F, Kf)
+    Attributes view;
+
+    ChannelArrays(In<double, 2> vertex_, In<double, 2> face_, bool alpha, bool barycentrics, bool uv, int unit)
+        : vertex(vertex_),
+          face(face_),
+          view{alpha, vertex.data(), int(vertex.shape(1)), unit, face.data(), int(face.shape(1)), barycentrics, uv} {
+        if (face.shape(1) > Attributes::most_of_face) refuse("face_attributes: expected at most 4 columns");
+        if (unit < -1 || (unit >= 0 && unit + 3 > view.vertex_width))
+            refuse("unit: expected -1, or the first of three columns of vertex_attributes");
+    }
+};
+
 // The arrays of a scene, kept alive, checked, and seen as the kernel sees them.
 template <class T>
 struct SceneArrays {
@@ -57,17 +72,17 @@ struct SceneArrays {
                 refuse(std::string(name) + ": expected " + std::to_string(expected) + " columns, got " +
                        std::to_string(got));
         };
-        const size_t C = background.shape(2);
+        const size_t R = colors.shape(1);
         width("verts", verts.shape(1), 3), width("faces", faces.shape(1), 3), width("corners", corners.shape(1), 3);
-        width("colors", colors.shape(1), C), width("uvs", uvs.shape(1), 2), width("texels", texels.shape(1), C);
+        width("uvs", uvs.shape(1), 2), width("texels", texels.shape(1), R);
         width("textures", textures.shape(1), 3);
         if (corners.shape(0) != faces.shape(0)) refuse("corners: expected one row a face");
         if (faces.shape(0) == 0 || verts.shape(0) == 0) refuse("faces: expected at least one face, got none");
         check_finite("verts", verts.data(), verts.size(), 3, threads);
-        check_finite("colors", colors.data(), colors.size(), C, threads);
+        check_finite("colors", colors.data(), colors.size(), R, threads);
         check_finite("uvs", uvs.data(), uvs.size(), 2, threads);
-        check_finite("texture", texels.data(), texels.size(), C, threads);
-        check_finite("background", background.data(), background.size(), C, threads);
+        check_finite("texture", texels.data(), texels.size(), R, threads);
+        check_finite("background", background.data(), background.size(), background.shape(2), threads);
         check_indices("faces", faces.data(), faces.size(), verts.shape(0), "verts", threads);
         const bool textured = textures.shape(0) > 0;
         if (!textured) {
@@ -94,7 +109,32 @@ struct SceneArrays {
         }
     }
 
-    SceneView<T> view() const {
+    SceneView<T> view() const { return view_of(Attributes()); }
+    SceneView<T> view(const ChannelArrays& channels, int threads) const {
+        const Attributes& a = channels.view;
+        if (a.vertex_width && channels.vertex.shape(0) != verts.shape(0))
+            refuse("vertex_attributes: expected one row a vertex");
+        if (a.face_width && channels.face.shape(0) != faces.shape(0))
+            refuse("face_attributes: expected one row a face");
+        check_finite("vertex_attributes", a.vertex, channels.vertex.size(), a.vertex_width, threads);
+        check_finite("face_attributes", a.face, channels.face.size(), a.face_width, threads);
+        bool all_textured = textures.shape(0) > 0;
+        if (a.uv && all_textured)
+            all_textured = std::all_of(face_texture.data(), face_texture.data() + face_texture.size(),
+                                       [](int32_t texture) { return texture >= 0; });
+        if (a.uv && !all_textured) refuse("uv: expected a texture on all faces");
+        return view_of(a);
+    }
+
+    std::shared_ptr<const Geometry> geometry(GeometryWanted wanted, Team& team, GeometryWork& work) const {
+        return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, wanted, team,
+                                work);
+    }
+
+   private:
+    SceneView<T> view_of(const Attributes& attributes) const {
+        if (background.shape(2) != colors.shape(1) + attributes.channels())
+            refuse("background: expected one number for each channel");
         return {verts.data(),
                 int64_t(verts.shape(0)),
                 faces.data(),
@@ -111,12 +151,9 @@ struct SceneArrays {
                 background.data(),
                 background.shape(0) * background.shape(1) > 1,
                 int(background.shape(2)),
-                &spacing};
-    }
-
-    std::shared_ptr<const Geometry> geometry(GeometryWanted wanted, Team& team, GeometryWork& work) const {
-        return acquire_geometry(faces.data(), faces.shape(0), verts.data(), verts.shape(0), spacing, wanted, team,
-                                work);
+                &spacing,
+                attributes,
+                int(colors.shape(1))};
     }
 };
 

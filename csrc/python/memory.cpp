@@ -29,7 +29,8 @@ using Bytes = std::map<std::string, int64_t>;
 // Rows of the arrays of a scene, the image of one camera, and who works.
 struct PassSize {
     int64_t verts, faces, colors, uvs, texels, pixels;
-    int channels, number;  // bytes of one number of the image
+    int radiance, vertex_attributes, face_attributes;  // widths
+    int channels, number;                              // of the image; bytes of one number
     bool textured;
     bool jumps;  // whether neighbouring faces may differ where they meet
     int threads;
@@ -51,13 +52,14 @@ Bytes image_bytes(const PassSize& s, int64_t cameras) {
 
 // What of the gradient is wanted: that of what moves inside faces and at edges, and of the arrays of colours.
 struct GradientWork {
-    bool motion, boundary, colors, uvs, texels;
+    bool motion, boundary, colors, uvs, texels, vertex_attributes, face_attributes;
     int64_t surface_samples, edge_samples, curves, intersections;  // −1: not known
 };
 
 Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
     constexpr int64_t many = int64_t(1) << 62, word = sizeof(double);
-    const bool moves = w.motion || w.boundary, interior = w.motion || w.colors || w.uvs || w.texels;
+    const bool moves = w.motion || w.boundary,
+               interior = w.motion || w.colors || w.uvs || w.texels || w.vertex_attributes || w.face_attributes;
     const auto rows = [&](int64_t samples, int64_t primitives, int64_t each, int width, int64_t destinations) {
         return RowBuffer::bytes({samples, primitives, each, destinations, width}, s.threads);
     };
@@ -75,9 +77,11 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         int64_t& samples = bytes["surface samples"];
         if (w.motion) samples += rows(n, s.faces, 3, 3, s.verts);
         // A face has a texture or colours: a run of samples leaves rows of one kind.
-        if (w.colors) samples += rows(n, s.faces, 3, s.channels, s.colors);
+        if (w.colors) samples += rows(n, s.faces, 3, s.radiance, s.colors);
         else if (w.uvs) samples += rows(n, s.faces, 3, 2, s.uvs);
-        if (w.texels) samples += rows(n, -1, 4, s.channels, s.texels);
+        if (w.texels) samples += rows(n, -1, 4, s.radiance, s.texels);
+        if (w.vertex_attributes) samples += rows(n, s.faces, 3, s.vertex_attributes, s.verts);
+        if (w.face_attributes) samples += rows(n, s.faces, 1, s.face_attributes, s.faces);
     }
     if (w.boundary) {
         // Where all attributes are indexed like the vertices, curves are silhouettes: a quarter of a tangled mesh.
@@ -97,11 +101,15 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
 void bind_memory(nb::module_& m) {
     nb::class_<PassSize>(m, "PassSize")
         .def(nb::new_([](int64_t verts, int64_t faces, int64_t colors, int64_t uvs, int64_t texels, int64_t pixels,
-                         int channels, int number, bool textured, bool jumps, int threads) {
-                 return PassSize{verts, faces, colors, uvs, texels, pixels, channels, number, textured, jumps, threads};
+                         int radiance, int vertex_attributes, int face_attributes, int channels, int number,
+                         bool textured, bool jumps, int threads) {
+                 return PassSize{
+                     verts,           faces,    colors, uvs,      texels, pixels, radiance, vertex_attributes,
+                     face_attributes, channels, number, textured, jumps,  threads};
              }),
-             nb::kw_only(), "verts"_a, "faces"_a, "colors"_a, "uvs"_a, "texels"_a, "pixels"_a, "channels"_a, "number"_a,
-             "textured"_a, "jumps"_a, "threads"_a);
+             nb::kw_only(), "verts"_a, "faces"_a, "colors"_a, "uvs"_a, "texels"_a, "pixels"_a, "radiance"_a,
+             "vertex_attributes"_a, "face_attributes"_a, "channels"_a, "number"_a, "textured"_a, "jumps"_a,
+             "threads"_a);
     m.def("image_bytes", &image_bytes, "size"_a, "cameras"_a);
     m.def(
         "gradient_bytes",
@@ -110,8 +118,9 @@ void bind_memory(nb::module_& m) {
             const auto is = [&](const char* name) {
                 return std::find(wanted.begin(), wanted.end(), name) != wanted.end();
             };
-            return gradient_bytes(size, {motion, boundary, is("colors"), is("uvs"), is("texels"), surface_samples,
-                                         edge_samples, curves, intersections});
+            return gradient_bytes(size,
+                                  {motion, boundary, is("colors"), is("uvs"), is("texels"), is("vertex_attributes"),
+                                   is("face_attributes"), surface_samples, edge_samples, curves, intersections});
         },
         "size"_a, nb::kw_only(), "motion"_a, "boundary"_a, "wanted"_a, "surface_samples"_a = -1, "edge_samples"_a = -1,
         "curves"_a = -1, "intersections"_a = -1);

@@ -13,6 +13,7 @@
 
 #include "backward/backward.h"
 #include "core/stopwatch.h"
+#include "forward/centers.h"
 #include "python/arrays.h"
 #include "python/unlocked.h"
 
@@ -44,18 +45,31 @@ void check_background(const SceneArrays<T>& scene, const Camera& camera) {
 using Profile = std::map<std::string, double>;
 
 template <class T>
-Profile forward(const SceneArrays<T>& scene, const Camera& camera, const ImageOptions& options, int threads,
-                Out<T, 3> image, const HitArrays<T>& hits) {
+Profile forward(const SceneArrays<T>& scene, const Camera& camera, const ChannelArrays& channels,
+                const ImageOptions& options, int threads, Out<T, 3> image, const HitArrays<T>& hits) {
     check_background(scene, camera);
     check_image("image", image, camera, scene.background.shape(2));
     hits.check(scene, camera);
+    const SceneView<T> view = scene.view(channels, threads);
     return unlocked(threads, [&](Team& team) -> Profile {
         Stopwatch watch;
         GeometryWork work;
         const auto geometry = scene.geometry({}, team, work);
         const double update = watch.lap();
-        render_forward(scene.view(), camera, geometry->caster(), options, team, image.data(), hits.view());
+        render_forward(view, camera, geometry->caster(), options, team, image.data(), hits.view());
         return {{"update", update}, {"forward", watch.lap()}, {"built rays", work.rays}};
+    });
+}
+
+template <class T>
+void find_faces(const SceneArrays<T>& scene, const Camera& camera, const ChannelArrays& channels, int threads,
+                Out<int32_t, 2> face) {
+    if (int(face.shape(0)) != camera.height || int(face.shape(1)) != camera.width)
+        refuse("face: expected one number a pixel");
+    const SceneView<T> view = scene.view(channels, threads);
+    unlocked(threads, [&](Team& team) {
+        GeometryWork work;
+        faces_at_centers(view, camera, scene.geometry({}, team, work)->caster(), team, face.data());
     });
 }
 
@@ -77,14 +91,14 @@ Gradients make_gradients(const GradientArrays& arrays, const SceneView<T>& scene
 }
 
 template <class T>
-Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
-                 const GradientOptions& options, int threads, Out<T, 3> adjoint, const HitArrays<T>& hits,
-                 const GradientArrays& gradients) {
+Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const ChannelArrays& channels,
+                 const ImageOptions& image, const GradientOptions& options, int threads, Out<T, 3> adjoint,
+                 const HitArrays<T>& hits, const GradientArrays& gradients) {
     check_background(arrays, camera);
     check_image("adjoint", adjoint, camera, arrays.background.shape(2));
     hits.check(arrays, camera);
     check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2), threads);
-    const SceneView<T> scene = arrays.view();
+    const SceneView<T> scene = arrays.view(channels, threads);
     const Gradients grad = make_gradients(gradients, scene, camera);
     GeometryWork work;
     double update = 0;
@@ -129,13 +143,13 @@ void with_geometry(const SceneArrays<T>& arrays, bool boundary, int threads, Wor
 
 // Of several directions: what each moves, by slot.
 template <class T>
-void jvp(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image, const GradientOptions& options,
-         int threads, Out<T, 3> adjoint, const HitArrays<T>& hits, const std::vector<GradientArrays>& tangents,
-         Out<double, 4> image_dot) {
+void jvp(const SceneArrays<T>& arrays, const Camera& camera, const ChannelArrays& channels, const ImageOptions& image,
+         const GradientOptions& options, int threads, Out<T, 3> adjoint, const HitArrays<T>& hits,
+         const std::vector<GradientArrays>& tangents, Out<double, 4> image_dot) {
     check_background(arrays, camera);
     check_image("adjoint", adjoint, camera, arrays.background.shape(2));
     hits.check(arrays, camera);
-    const SceneView<T> scene = arrays.view();
+    const SceneView<T> scene = arrays.view(channels, threads);
     std::vector<Tangents> directions;
     for (const GradientArrays& given : tangents) {
         const Gradients slots = make_gradients(given, scene, camera);
@@ -151,15 +165,15 @@ void jvp(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions&
 }
 
 template <class T>
-void screen_gradient(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
-                     const GradientOptions& options, int threads, Out<T, 3> adjoint, const HitArrays<T>& hits,
-                     Out<double, 3> gradient) {
+void screen_gradient(const SceneArrays<T>& arrays, const Camera& camera, const ChannelArrays& channels,
+                     const ImageOptions& image, const GradientOptions& options, int threads, Out<T, 3> adjoint,
+                     const HitArrays<T>& hits, Out<double, 3> gradient) {
     check_background(arrays, camera);
     check_image("adjoint", adjoint, camera, arrays.background.shape(2));
     hits.check(arrays, camera);
     check_finite("the gradient of the image", adjoint.data(), adjoint.size(), adjoint.shape(2), threads);
     if (gradient.size() != size_t(2) * camera.width * camera.height) refuse("gradient: expected two numbers a pixel");
-    const SceneView<T> scene = arrays.view();
+    const SceneView<T> scene = arrays.view(channels, threads);
     with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
         render_screen_gradient(BackwardInput<T>{scene, camera, geometry, image, adjoint.data(), hits.view()}, options,
                                team, gradient.data());
@@ -180,12 +194,14 @@ void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
              "verts"_a.noconvert(), "faces"_a.noconvert(), "corners"_a.noconvert(), "colors"_a.noconvert(),
              "uvs"_a.noconvert(), "texels"_a.noconvert(), "textures"_a.noconvert(), "face_texture"_a.noconvert(),
              "background"_a.noconvert(), "spacing"_a, "threads"_a)
-        .def("forward", &forward<T>, "camera"_a, "options"_a, "threads"_a, "image"_a.noconvert(), "hits"_a)
-        .def("backward", &backward<T>, "camera"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(),
-             "hits"_a, "gradients"_a)
-        .def("jvp", &jvp<T>, "camera"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a,
-             "tangents"_a, "image_dot"_a.noconvert())
-        .def("screen_gradient", &screen_gradient<T>, "camera"_a, "image"_a, "options"_a, "threads"_a,
+        .def("forward", &forward<T>, "camera"_a, "channels"_a, "options"_a, "threads"_a, "image"_a.noconvert(),
+             "hits"_a)
+        .def("faces_at_centers", &find_faces<T>, "camera"_a, "channels"_a, "threads"_a, "face"_a.noconvert())
+        .def("backward", &backward<T>, "camera"_a, "channels"_a, "image"_a, "options"_a, "threads"_a,
+             "adjoint"_a.noconvert(), "hits"_a, "gradients"_a)
+        .def("jvp", &jvp<T>, "camera"_a, "channels"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(),
+             "hits"_a, "tangents"_a, "image_dot"_a.noconvert())
+        .def("screen_gradient", &screen_gradient<T>, "camera"_a, "channels"_a, "image"_a, "options"_a, "threads"_a,
              "adjoint"_a.noconvert(), "hits"_a, "gradient"_a.noconvert());
 }
 
@@ -219,6 +235,9 @@ NB_MODULE(_core, m) {
         .def_prop_ro("fold", [](const Camera& c) {
             return c.lens_view.folds ? std::optional(c.lens_view.disc.fold) : std::nullopt;
         });
+    nb::class_<ChannelArrays>(m, "Channels")
+        .def(nb::init<In<double, 2>, In<double, 2>, bool, bool, bool, int>(), "vertex_attributes"_a.noconvert(),
+             "face_attributes"_a.noconvert(), "alpha"_a, "barycentrics"_a, "uv"_a, "unit"_a);
     nb::class_<ImageOptions>(m, "ImageOptions").def(nb::new_(&make_image_options), "spp"_a, "filter"_a, "seed"_a);
     nb::class_<GradientOptions>(m, "GradientOptions")
         .def(nb::new_([](uint64_t seed, int64_t surface_samples, int64_t edge_samples, bool interior_geometry,

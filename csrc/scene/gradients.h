@@ -15,13 +15,15 @@ struct Slots {
     Number* colors = nullptr;
     Number* uvs = nullptr;
     Number* texels = nullptr;
+    Number* vertex_attributes = nullptr;
+    Number* face_attributes = nullptr;
     Number* background = nullptr;
     Number* world_to_camera = nullptr;  // (4, 4)
     Number* K = nullptr;                // (3, 3)
     Number* distortion = nullptr;       // (8,), see lens.h
 
     bool geometry() const { return verts || world_to_camera || K || distortion; }
-    bool appearance() const { return colors || uvs || texels; }
+    bool appearance() const { return colors || uvs || texels || vertex_attributes || face_attributes; }
 };
 
 // Where gradients are added, in double whatever the arrays hold; null where none is wanted.
@@ -42,10 +44,14 @@ template <class T>
 inline constexpr GradientSlot<T> gradient_slots[] = {
     {"verts", &Gradients::verts, &Tangents::verts, [](const SceneView<T>& s, int64_t) { return 3 * s.n_verts; }},
     {"colors", &Gradients::colors, &Tangents::colors,
-     [](const SceneView<T>& s, int64_t) { return s.channels * s.n_colors; }},
+     [](const SceneView<T>& s, int64_t) { return s.radiance * s.n_colors; }},
     {"uvs", &Gradients::uvs, &Tangents::uvs, [](const SceneView<T>& s, int64_t) { return 2 * s.n_uvs; }},
     {"texels", &Gradients::texels, &Tangents::texels,
-     [](const SceneView<T>& s, int64_t) { return s.channels * s.n_texels; }},
+     [](const SceneView<T>& s, int64_t) { return s.radiance * s.n_texels; }},
+    {"vertex_attributes", &Gradients::vertex_attributes, &Tangents::vertex_attributes,
+     [](const SceneView<T>& s, int64_t) { return s.attributes.vertex_width * s.n_verts; }},
+    {"face_attributes", &Gradients::face_attributes, &Tangents::face_attributes,
+     [](const SceneView<T>& s, int64_t) { return s.attributes.face_width * s.n_faces; }},
     {"background", &Gradients::background, &Tangents::background,
      [](const SceneView<T>& s, int64_t pixels) { return s.channels * (s.background_is_image ? pixels : 1); }},
     {"world_to_camera", &Gradients::world_to_camera, &Tangents::world_to_camera,

@@ -23,6 +23,22 @@ struct Spacing {
     bool operator==(const Spacing&) const = default;
 };
 
+// What a face shows beside its radiance (shading/attributes.h), one number a channel, in this order.
+struct Attributes {
+    bool alpha = false;              // 1 wherever a face is seen
+    const double* vertex = nullptr;  // (V, vertex_width) values at the vertices
+    int vertex_width = 0;
+    int unit = -1;                 // the first of three columns of `vertex` that are a direction, of length 1; −1: none
+    const double* face = nullptr;  // (F, face_width) values of whole faces
+    int face_width = 0;            // at most most_of_face
+    bool barycentrics = false;     // 3
+    bool uv = false;               // 2, of textured faces
+
+    static constexpr int most_of_face = 4;
+
+    int channels() const { return alpha + vertex_width + face_width + 3 * barycentrics + 2 * uv; }
+};
+
 // A corner of a face refers to a row of `colors`, or, where the face carries a texture, to a row of `uvs`.
 // Colours of vertices, faces and corners differ only in that index. T is float or double.
 template <class T>
@@ -32,18 +48,20 @@ struct SceneView {
     const int32_t* faces;  // (F, 3) rows of verts
     int64_t n_faces;
     const int32_t* corners;  // (F, 3) rows of colors or of uvs
-    const T* colors;         // (A, C) linear radiance
+    const T* colors;         // (A, R) linear radiance
     int64_t n_colors;
     const double* uvs;  // (T, 2), v running up
     int64_t n_uvs;
-    const T* texels;  // (X, C) all textures, row by row
+    const T* texels;  // (X, R) all textures, row by row
     int64_t n_texels;
     const int64_t* textures;      // (N, 3) first texel, height, width
     const int32_t* face_texture;  // (F,) row of textures, −1 for none; null when the scene has no texture
     const T* background;          // (C,) or (H, W, C)
     bool background_is_image;
-    int channels;  // C
+    int channels;  // C of the image: R of radiance, then the attributes
     const Spacing* spacing;
+    Attributes attributes = {};
+    int radiance = channels;  // R
 
     const T* background_at(int64_t pixel) const {
         return background_is_image ? background + pixel * channels : background;

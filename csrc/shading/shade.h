@@ -1,4 +1,5 @@
-// Radiance of a face at given barycentrics: interpolated colours, or a texture at interpolated coordinates.
+// Radiance of a face at given barycentrics, interpolated colours or a texture at interpolated coordinates; and after it
+// the face's attributes.
 // A new light or material is one more file here and one more line in shade and shade_vjp.
 #pragma once
 
@@ -7,8 +8,10 @@
 #include <vector>
 
 #include "contract/scatter.h"
+#include "core/channels.h"
 #include "scene/gradients.h"
 #include "scene/scene.h"
+#include "shading/attributes.h"
 #include "shading/surface.h"
 #include "shading/texture.h"
 
@@ -33,13 +36,28 @@ Vec2 interpolated_uv(const SceneView<T>& scene, int64_t face, Barycentrics b) {
     return uv0 + b.u * (uv(1) - uv0) + b.v * (uv(2) - uv0);
 }
 
-// Radiance, C numbers. N is C at compile time, or 0.
+// How many channels there are, and how many of radiance. N: see core/channels.h.
+template <int N, class T>
+int channels_of(const SceneView<T>& scene) {
+    return N ? all_channels<N> : scene.channels;
+}
+template <int N, class T>
+int radiance_of(const SceneView<T>& scene) {
+    return N > 0 ? N : scene.radiance;
+}
+template <int N, class T>
+bool has_attributes(const SceneView<T>& scene) {
+    return N < 0 || (N == 0 && scene.channels > scene.radiance);
+}
+
+// All channels.
 template <int N, class T>
 void shade(const SceneView<T>& scene, int64_t face, Barycentrics b, double* out) {
-    const int C = N ? N : scene.channels;
+    const int C = radiance_of<N>(scene);
+    if (has_attributes<N>(scene)) shade_attributes(scene, face, b, out + C);
     if (is_textured(scene, face)) {
         const Texture<T> texture = texture_of(scene, face);
-        eval<N>(texture, footprint(texture, interpolated_uv(scene, face, b)), C, out);
+        eval<radiance_channels<N>>(texture, footprint(texture, interpolated_uv(scene, face, b)), C, out);
         return;
     }
     const int32_t* row = scene.corners + 3 * face;
@@ -49,24 +67,42 @@ void shade(const SceneView<T>& scene, int64_t face, Barycentrics b, double* out)
     for (int c = 0; c < C; ++c) out[c] = c0[c] + b.u * (double(c1[c]) - c0[c]) + b.v * (double(c2[c]) - c0[c]);
 }
 
-// The radiance of a face without texture, affine in the barycentrics, kept for a run of points.
+// Calls visit(c, c0, c1, c2) for each channel c of a face without texture, with its values at the corners.
+template <int N, class T, class Visit>
+void each_corner_value(const SceneView<T>& scene, int64_t face, Visit visit) {
+    const int C = radiance_of<N>(scene);
+    const int32_t* row = scene.corners + 3 * face;
+    const T *c0 = scene.colors + int64_t(row[0]) * C, *c1 = scene.colors + int64_t(row[1]) * C,
+            *c2 = scene.colors + int64_t(row[2]) * C;
+    for (int c = 0; c < C; ++c) visit(c, double(c0[c]), double(c1[c]), double(c2[c]));
+    if (has_attributes<N>(scene))
+        each_attribute(scene, attribute_arrays(scene), face,
+                       [&](int k, double c0, double c1, double c2) { visit(C + k, c0, c1, c2); });
+}
+
+// Whether all channels of a face are affine in its barycentrics.
+template <class T>
+bool is_affine(const SceneView<T>& scene, int64_t face) {
+    return !is_textured(scene, face) && scene.attributes.unit < 0;
+}
+
+// The channels of such a face, kept for a run of points.
 template <int N>
 class AffineRadiance {
    public:
     // One number a channel; in pairs, which processors add at once.
-    struct Fixed : std::array<double, (N + 1) / 2 * 2> {
+    struct Fixed : std::array<double, (all_channels<N> + 1) / 2 * 2> {
         explicit Fixed(int) { this->fill(0); }
     };
     using Sum = std::conditional_t<N == 0, std::vector<double>, Fixed>;
 
     template <class T>
     void set(const SceneView<T>& scene, int64_t face) {
-        const int C = N ? N : scene.channels;
-        if constexpr (N == 0) value_.resize(C), d_u_.resize(C), d_v_.resize(C);
-        const int32_t* row = scene.corners + 3 * face;
-        const T *c0 = scene.colors + int64_t(row[0]) * C, *c1 = scene.colors + int64_t(row[1]) * C,
-                *c2 = scene.colors + int64_t(row[2]) * C;
-        for (int c = 0; c < C; ++c) value_[c] = c0[c], d_u_[c] = double(c1[c]) - c0[c], d_v_[c] = double(c2[c]) - c0[c];
+        if constexpr (N == 0)
+            for (Sum* numbers : {&value_, &d_u_, &d_v_}) numbers->resize(scene.channels);
+        each_corner_value<N>(scene, face, [&](int c, double c0, double c1, double c2) {
+            value_[c] = c0, d_u_[c] = c1 - c0, d_v_[c] = c2 - c0;
+        });
     }
 
     // Adds the radiance of n points, given the sum of their barycentrics.
@@ -78,23 +114,39 @@ class AffineRadiance {
     Sum value_ = Sum(0), d_u_ = Sum(0), d_v_ = Sum(0);
 };
 
-// Cotangents of the three corners of one face (colours, or texture coordinates), summed over a run of samples.
+// Cotangents of the three corners of one face (colours, or texture coordinates; attributes), summed over a run of
+// samples.
 struct CornerGrad {
-    std::vector<double> value;  // (3, width)
-    void reset(int width) { value.assign(3 * size_t(width), 0.0); }
+    int width = 0;
+    std::vector<double> value, attributes;  // (3, width), (3, attributes)
+
+    template <class T>
+    void reset(const SceneView<T>& scene, int64_t face) {
+        width = is_textured(scene, face) ? 2 : scene.radiance;
+        value.assign(3 * size_t(width), 0.0), attributes.assign(3 * size_t(scene.channels - scene.radiance), 0.0);
+    }
+    template <class T>
+    void add_to(const SceneView<T>& scene, int64_t face, const Destination& to, ChunkGrad& grad) const {
+        const bool textured = is_textured(scene, face);
+        if (textured ? to.uvs : to.colors)
+            for (int i = 0; i < 3; ++i)
+                (textured ? grad.uvs : grad.colors).add(scene.corners[3 * face + i], value.data() + i * width);
+        if (!attributes.empty()) add_attribute_rows(scene, face, attributes.data(), to, grad);
+    }
 };
 
 // Returns the cotangent of the barycentrics; adds those of the corners to `corners`, those of texels to `grad`.
 template <int N, class T>
 Barycentrics shade_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, const double* bar, bool want_texels,
                        CornerGrad& corners, ChunkGrad& grad) {
-    const int C = N ? N : scene.channels;
+    const int C = radiance_of<N>(scene);
     const int32_t* row = scene.corners + 3 * face;
     Barycentrics b_bar;
+    if (has_attributes<N>(scene)) b_bar = shade_attributes_vjp(scene, face, b, bar + C, corners.attributes.data());
     if (is_textured(scene, face)) {
         const Texture<T> texture = texture_of(scene, face);
         const Footprint f = footprint(texture, interpolated_uv(scene, face, b));
-        const Vec2 uv_bar = eval_vjp<N>(texture, f, C, bar);
+        const Vec2 uv_bar = eval_vjp<radiance_channels<N>>(texture, f, C, bar);
         if (want_texels) {
             double stack[16];
             std::vector<double> heap(C > 16 ? C : 0);
@@ -108,8 +160,8 @@ Barycentrics shade_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, 
             corners.value[2 * i] += b[i] * uv_bar.x, corners.value[2 * i + 1] += b[i] * uv_bar.y;
         const double* uv[3];
         for (int i = 0; i < 3; ++i) uv[i] = scene.uvs + 2 * int64_t(row[i]);
-        b_bar.u = uv_bar.x * (uv[1][0] - uv[0][0]) + uv_bar.y * (uv[1][1] - uv[0][1]);
-        b_bar.v = uv_bar.x * (uv[2][0] - uv[0][0]) + uv_bar.y * (uv[2][1] - uv[0][1]);
+        b_bar.u += uv_bar.x * (uv[1][0] - uv[0][0]) + uv_bar.y * (uv[1][1] - uv[0][1]);
+        b_bar.v += uv_bar.x * (uv[2][0] - uv[0][0]) + uv_bar.y * (uv[2][1] - uv[0][1]);
         return b_bar;
     }
     const T *c0 = scene.colors + int64_t(row[0]) * C, *c1 = scene.colors + int64_t(row[1]) * C,
@@ -124,12 +176,13 @@ Barycentrics shade_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, 
     return b_bar;
 }
 
-// The derivative of the radiance, C numbers, for tangents of the barycentrics and of the arrays.
+// The derivative of all channels, for tangents of the barycentrics and of the arrays.
 template <class T>
 void shade_jvp(const SceneView<T>& scene, int64_t face, Barycentrics b, Barycentrics b_dot, const Tangents& tangents,
                double* out) {
-    const int C = scene.channels;
+    const int C = scene.radiance;
     const int32_t* row = scene.corners + 3 * face;
+    if (has_attributes<0>(scene)) shade_attributes_jvp(scene, face, b, b_dot, tangents, out + C);
     if (is_textured(scene, face)) {
         const Texture<T> texture = texture_of(scene, face);
         const Footprint f = footprint(texture, interpolated_uv(scene, face, b));

@@ -1,0 +1,18 @@
+// What is seen through the centre of each pixel.
+#pragma once
+
+#include <cstdint>
+
+#include "camera/camera.h"
+#include "camera/camera_rays.h"
+#include "core/parallel.h"
+#include "scene/scene.h"
+
+namespace edgegrad {
+
+// Writes the face that the ray through the centre of each pixel hits to `face` (H, W); −1: none.
+template <class T>
+void faces_at_centers(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, Team& team,
+                      int32_t* face);
+
+}  // namespace edgegrad

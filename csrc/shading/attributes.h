@@ -1,0 +1,144 @@
+// What a face shows beside its radiance: alpha, values at its vertices or of all of it, barycentrics, texture
+// coordinates. All are affine in the barycentrics b, but for a direction m that is given the length 1 after it is
+// interpolated: n = m / |m|, δn = (δm − n (n · δm)) / |m|.
+#pragma once
+
+#include "contract/scatter.h"
+#include "scene/gradients.h"
+#include "scene/scene.h"
+#include "shading/surface.h"
+
+namespace edgegrad {
+
+// The arrays that attributes are read from, or their tangents: there null is zero, and `one`, which alpha and
+// barycentrics are made of, is zero too.
+struct AttributeArrays {
+    const double *vertex, *face, *uvs, one;
+};
+
+template <class T>
+AttributeArrays attribute_arrays(const SceneView<T>& scene) {
+    return {scene.attributes.vertex, scene.attributes.face, scene.uvs, 1};
+}
+inline AttributeArrays attribute_arrays(const Tangents& t) {
+    return {t.vertex_attributes, t.face_attributes, t.uvs, 0};
+}
+
+// Calls visit(k, c0, c1, c2) for each attribute k of a face, with its values at the corners.
+template <class T, class Visit>
+void each_attribute(const SceneView<T>& scene, const AttributeArrays& from, int64_t face, Visit visit) {
+    const Attributes& a = scene.attributes;
+    int k = 0;
+    if (a.alpha) visit(k++, from.one, from.one, from.one);
+    if (const int n = a.vertex_width; n > 0) {
+        const int32_t* v = scene.faces + 3 * face;
+        for (int i = 0; i < n; ++i) {
+            const auto at = [&](int corner) { return from.vertex ? from.vertex[int64_t(v[corner]) * n + i] : 0; };
+            visit(k++, at(0), at(1), at(2));
+        }
+    }
+    for (int i = 0; i < a.face_width; ++i) {
+        const double value = from.face ? from.face[face * a.face_width + i] : 0;
+        visit(k++, value, value, value);
+    }
+    if (a.barycentrics)
+        for (int i = 0; i < 3; ++i) visit(k++, i == 0 ? from.one : 0, i == 1 ? from.one : 0, i == 2 ? from.one : 0);
+    if (a.uv) {
+        const int32_t* row = scene.corners + 3 * face;
+        for (int i = 0; i < 2; ++i) {
+            const auto at = [&](int corner) { return from.uvs ? from.uvs[2 * int64_t(row[corner]) + i] : 0; };
+            visit(k++, at(0), at(1), at(2));
+        }
+    }
+}
+
+// The place of the direction among the attributes; −1: there is none.
+inline int direction_of(const Attributes& a) { return a.unit < 0 ? -1 : a.alpha + a.unit; }
+
+// Zero where there is no direction.
+inline Vec3 unit(Vec3 m) {
+    const double size = length(m);
+    return size > 0 ? 1 / size * m : Vec3{};
+}
+// Symmetric, so this is the _vjp and the _jvp.
+inline Vec3 unit_jvp(Vec3 m, Vec3 m_dot) {
+    const double size = length(m);
+    if (!(size > 0)) return {};
+    const Vec3 n = 1 / size * m;
+    return 1 / size * (m_dot - dot(n, m_dot) * n);
+}
+
+template <class T>
+void shade_attributes(const SceneView<T>& scene, int64_t face, Barycentrics b, double* out) {
+    each_attribute(scene, attribute_arrays(scene), face,
+                   [&](int k, double c0, double c1, double c2) { out[k] = c0 + b.u * (c1 - c0) + b.v * (c2 - c0); });
+    if (const int d = direction_of(scene.attributes); d >= 0) {
+        const Vec3 n = unit({out[d], out[d + 1], out[d + 2]});
+        out[d] = n.x, out[d + 1] = n.y, out[d + 2] = n.z;
+    }
+}
+
+// The direction before it is given the length 1.
+template <class T>
+Vec3 interpolated_direction(const SceneView<T>& scene, int64_t face, Barycentrics b) {
+    const int32_t* v = scene.faces + 3 * face;
+    Vec3 m;
+    for (int i = 0; i < 3; ++i) {
+        const double* c =
+            scene.attributes.vertex + int64_t(v[i]) * scene.attributes.vertex_width + scene.attributes.unit;
+        m += b[i] * Vec3{c[0], c[1], c[2]};
+    }
+    return m;
+}
+
+// Returns the cotangent of the barycentrics; adds those of the values at the corners to `rows` (3, attributes).
+template <class T>
+Barycentrics shade_attributes_vjp(const SceneView<T>& scene, int64_t face, Barycentrics b, const double* bar,
+                                  double* rows) {
+    const int n = scene.channels - scene.radiance, d = direction_of(scene.attributes);
+    double m_bar[3] = {};
+    if (d >= 0) {
+        const Vec3 moved = unit_jvp(interpolated_direction(scene, face, b), {bar[d], bar[d + 1], bar[d + 2]});
+        m_bar[0] = moved.x, m_bar[1] = moved.y, m_bar[2] = moved.z;
+    }
+    Barycentrics b_bar;
+    each_attribute(scene, attribute_arrays(scene), face, [&](int k, double c0, double c1, double c2) {
+        const double own = d >= 0 && k >= d && k < d + 3 ? m_bar[k - d] : bar[k];
+        for (int i = 0; i < 3; ++i) rows[i * n + k] += b[i] * own;
+        b_bar.u += own * (c1 - c0), b_bar.v += own * (c2 - c0);
+    });
+    return b_bar;
+}
+
+template <class T>
+void shade_attributes_jvp(const SceneView<T>& scene, int64_t face, Barycentrics b, Barycentrics b_dot,
+                          const Tangents& tangents, double* out) {
+    each_attribute(scene, attribute_arrays(scene), face,
+                   [&](int k, double c0, double c1, double c2) { out[k] = b_dot.u * (c1 - c0) + b_dot.v * (c2 - c0); });
+    each_attribute(scene, attribute_arrays(tangents), face,
+                   [&](int k, double c0, double c1, double c2) { out[k] += b[0] * c0 + b[1] * c1 + b[2] * c2; });
+    if (const int d = direction_of(scene.attributes); d >= 0) {
+        const Vec3 n_dot = unit_jvp(interpolated_direction(scene, face, b), {out[d], out[d + 1], out[d + 2]});
+        out[d] = n_dot.x, out[d + 1] = n_dot.y, out[d + 2] = n_dot.z;
+    }
+}
+
+// Adds cotangents of the values at the corners of a face, (3, attributes), to those of the arrays.
+template <class T>
+void add_attribute_rows(const SceneView<T>& scene, int64_t face, const double* rows, const Destination& to,
+                        ChunkGrad& grad) {
+    const Attributes& a = scene.attributes;
+    const int n = scene.channels - scene.radiance, of_face = a.alpha + a.vertex_width;
+    if (to.vertex_attributes)
+        for (int i = 0; i < 3; ++i) grad.vertex_attributes.add(scene.faces[3 * face + i], rows + i * n + a.alpha);
+    if (to.face_attributes) {
+        double sum[Attributes::most_of_face];
+        for (int i = 0; i < a.face_width; ++i)
+            sum[i] = rows[of_face + i] + rows[n + of_face + i] + rows[2 * n + of_face + i];
+        grad.face_attributes.add(face, sum);
+    }
+    if (to.uvs && a.uv)
+        for (int i = 0; i < 3; ++i) grad.uvs.template add<2>(scene.corners[3 * face + i], rows + (i + 1) * n - 2);
+}
+
+}  // namespace edgegrad

@@ -1,0 +1,183 @@
+"""render_aovs(): several channels of a scene from the samples of one image, differentiable (arbitrary output variables).
+
+Each channel is one number of the surface points that the rays find, and a pixel is its filtered sum, as the image is one of
+radiance. What follows from vertices and camera is made here, by torch operations, so their derivatives are autograd's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ._autograd import faces_at_centers, render_image
+from ._request import Channels, Request, as_scene, make_request
+from .camera import Camera
+from .mesh import Mesh
+from .scene import Scene, image_dtype
+
+IDS = ("mesh_id", "face_id")
+# In the order in which the kernel has them (csrc/scene/scene.h).
+AOVS = ("image", "alpha", "position", "depth", "shading_normal", "normal", "barycentrics", "uv", *IDS)
+CONSTANT = ("alpha", "normal")  # over a face
+
+
+def render_aovs(
+    scene: Scene | Mesh,
+    camera: Camera,
+    aovs: Sequence[str],
+    spp: int = 16,
+    seed: int = 0,
+    *,
+    surface_samples: int | None = None,
+    edge_samples: int | None = None,
+    visibility: bool = True,
+    filter: str = "box",
+    grad_seed: int | None = None,
+) -> dict[str, Tensor]:
+    """Channels of a scene by name, (H, W, c) each, or (B, H, W, c) for a batch of cameras, all from the same samples.
+
+    aovs    names, each once, in any order; c is
+        image           C  render()'s, to the bit
+        alpha           1  the share of the pixel that is covered: the soft mask for silhouette losses
+        depth           1  along the optical axis, +Z of the camera, in world units; not the distance from the eye
+        position        3  of the surface point, world coordinates
+        normal          3  of the face, world axes, length 1, on the side from which its corners run anticlockwise
+        shading_normal  3  interpolated from the vertices and given the length 1 at each point, on that side; at a vertex the
+                           mean of the faces around it by area. Vertices with an index of their own keep an edge sharp
+        uv              2  texture coordinates; all meshes need uvs
+        barycentrics    3  weights of the face's three corners
+        mesh_id         1  int64, place in scene.meshes of what is seen through the pixel's centre; −1: nothing
+        face_id         1  int64, row of that mesh's faces; −1: nothing
+
+    The other arguments are those of render(). A pixel holds the filtered sum over its samples, with zero where a sample hits
+    nothing (the image: its background): values are premultiplied with alpha. Where a surface ends within a pixel, or two meet,
+    `depth / alpha` is the mean depth of what is seen there, and a mean normal is shorter than 1. Ids come from the one ray
+    through the centre.
+
+    All but the ids are differentiable, as render() is, in every tensor of scene and camera that they depend on, with what moves
+    at silhouettes, and at the creases where a channel jumps: of `normal` at all edges that are not flat, of `barycentrics` at all
+    edges. Channels have the dtype of the image. Raises what render() raises, and ValueError for a name that is unknown or
+    given twice, and for "uv" of a mesh without uvs.
+    """
+    names = _checked(aovs)
+    scene = as_scene(scene)
+    if "uv" in names:
+        _check_uvs(scene)
+    request = make_request(
+        scene if "image" in names else _without_radiance(scene, "uv" in names), camera, spp, seed,
+        surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility, filter=filter,
+        grad_seed=grad_seed,
+    )  # fmt: skip
+    batched, device = camera.batch is not None, scene.meshes[0].verts.device
+    found: dict[str, Tensor] = {}
+    if any(name in IDS for name in names):
+        found = {name: ids.to(device) for name, ids in _ids(scene, faces_at_centers(request, batched)).items()}
+    rendered = [name for name in AOVS if name in names and name not in IDS]
+    if rendered:
+        if rendered != ["image"]:
+            request = _with_channels(request, rendered)
+        widths = [{"image": scene.channels, "alpha": 1, "depth": 1, "uv": 2}.get(n, 3) for n in rendered]
+        parts = render_image(request, batched).to(device).split(widths, dim=-1)
+        found |= dict(zip(rendered, parts, strict=True))
+    return {name: found[name] for name in names}
+
+
+def _checked(aovs: Sequence[str]) -> list[str]:
+    """Raises TypeError or ValueError."""
+    if isinstance(aovs, str) or not isinstance(aovs, Sequence):
+        raise TypeError(f'aovs: expected a list of names, such as ["image", "alpha"], got {aovs!r}')
+    if not aovs:
+        raise ValueError(f"aovs: expected at least one of {', '.join(AOVS)}, got none")
+    for i, name in enumerate(aovs):
+        if name not in AOVS:
+            raise ValueError(f"aovs: expected names among {', '.join(AOVS)}, got {name!r}")
+        if name in aovs[:i]:
+            raise ValueError(f"aovs: expected each name once, got {name!r} twice")
+    return list(aovs)
+
+
+def _check_uvs(scene: Scene) -> None:
+    """Raises ValueError."""
+    for i, mesh in enumerate(scene.meshes):
+        if mesh.uvs is None:
+            raise ValueError(
+                f"aovs: expected uvs of all meshes for 'uv', got none of meshes[{i}]; "
+                "give it a texture with uvs and uv_faces, or leave 'uv' out"
+            )
+
+
+def _without_radiance(scene: Scene, keep_uvs: bool) -> Scene:
+    """The same surfaces with one channel of radiance that nobody sees, in the image's dtype."""
+    dtype = image_dtype(scene)
+
+    def bare(mesh: Mesh) -> Mesh:
+        if keep_uvs and mesh.texture is not None:
+            return mesh.replace(texture=mesh.texture.detach()[..., :1].to(dtype))
+        return mesh.replace(colors=mesh.verts.detach().new_zeros((len(mesh.verts), 1), dtype=dtype))
+
+    return Scene([bare(mesh) for mesh in scene.meshes])
+
+
+def _with_channels(request: Request, names: Sequence[str]) -> Request:
+    """The request of an image with these channels, in the order of AOVS."""
+    flat, camera = request.scene, request.camera
+    if "image" not in names:
+        flat = flat._replace(
+            colors=flat.colors[:, :0], texels=flat.texels[:, :0], background=flat.background[..., :0]
+        )
+    faces = flat.faces.long()
+    across = _cross(flat.verts, faces) if "normal" in names or "shading_normal" in names else flat.verts
+    of_vertices = []
+    if "position" in names:
+        of_vertices.append(flat.verts.expand(request.cameras, -1, -1))
+    if "depth" in names:
+        axis = camera.world_to_camera[:, 2]  # (B, 4)
+        of_vertices.append((axis[:, :3] @ flat.verts.T + axis[:, 3:])[..., None])
+    unit = -1
+    if "shading_normal" in names:
+        unit = sum(part.shape[-1] for part in of_vertices)
+        around = flat.verts.new_zeros(flat.verts.shape)
+        for corner in range(3):
+            around = around.index_add(0, faces[:, corner], across)
+        of_vertices.append(_unit(around).expand(request.cameras, -1, -1))
+    beside = Channels(
+        "alpha" in names,
+        torch.cat(of_vertices, -1).contiguous() if of_vertices else request.beside.vertex_attributes,
+        unit,
+        _unit(across) if "normal" in names else request.beside.face_attributes,
+        "barycentrics" in names,
+        "uv" in names,
+    )
+    width = beside.alpha + beside.vertex_attributes.shape[-1] + beside.face_attributes.shape[-1]
+    width += 3 * beside.barycentrics + 2 * beside.uv
+    background = torch.nn.functional.pad(flat.background, (0, width))
+    vary = any(name not in CONSTANT for name in names if name != "image")
+    vary = vary or ("image" in names and request.gradient.channels_vary)
+    return request._replace(
+        scene=flat._replace(background=background), beside=beside, gradient=request.gradient._replace(channels_vary=vary)
+    )
+
+
+def _cross(verts: Tensor, faces: Tensor) -> Tensor:
+    """(F, 3) normals of faces, as long as twice their areas."""
+    a, b, c = (verts.index_select(0, faces[:, corner]) for corner in range(3))
+    return torch.linalg.cross(b - a, c - a)
+
+
+def _unit(v: Tensor) -> Tensor:
+    """Vectors (n, 3) with the length 1; zero, without a gradient, where there is no direction."""
+    size = v.detach().abs().amax(-1, keepdim=True)  # so that squares neither overflow nor vanish
+    v = torch.where(size > 0, v / torch.where(size > 0, size, 1.0), 0.0)
+    squared = (v * v).sum(-1, keepdim=True)
+    return v / torch.where(squared > 0, squared, 1.0).sqrt()
+
+
+def _ids(scene: Scene, face: Tensor) -> dict[str, Tensor]:
+    """From faces as the flat scene counts them, (…, H, W)."""
+    ends = torch.tensor([len(mesh.faces) for mesh in scene.meshes], device="cpu").cumsum(0)
+    face = face.long()[..., None]
+    mesh = torch.bucketize(face, ends, right=True)
+    first = torch.nn.functional.pad(ends, (1, 0))[mesh]
+    return {"mesh_id": torch.where(face < 0, -1, mesh), "face_id": torch.where(face < 0, -1, face - first)}
