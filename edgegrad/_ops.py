@@ -67,7 +67,9 @@ def kernel_camera(camera: PackedCamera, index: int = 0) -> Any:
 
 def kernel_channels(request: Request, index: int = 0) -> Any:
     arrays = request.beside._replace(vertex_attributes=request.beside.vertex_attributes[index])._asdict()
-    return core.Channels(**{name: _array(value) if isinstance(value, Tensor) else value for name, value in arrays.items()})
+    return core.Channels(
+        **{name: _array(value) if isinstance(value, Tensor) else value for name, value in arrays.items()}
+    )
 
 
 def _warn_of_folds(cameras: Sequence[Any]) -> None:
@@ -230,7 +232,9 @@ def _camera_seed(seed: int, camera: int) -> int:
 def pass_size(request: Request) -> Any:
     """What the kernel's needs depend on."""
     flat, camera, beside = request.scene, request.camera, request.beside
-    jumps = flat.corners.data_ptr() != flat.faces.data_ptr() or beside.barycentrics or beside.face_attributes.shape[-1] > 0
+    jumps = (
+        flat.corners.data_ptr() != flat.faces.data_ptr() or beside.barycentrics or beside.face_attributes.shape[-1] > 0
+    )
     return core.PassSize(
         verts=len(flat.verts),
         faces=len(flat.faces),

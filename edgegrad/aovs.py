@@ -61,7 +61,7 @@ def render_aovs(
     edges. Channels have the dtype of the image. Raises what render() raises, and ValueError for a name that is unknown or
     given twice, and for "uv" of a mesh without uvs.
     """
-    names = _checked(aovs)
+    names = check_aovs(aovs)
     scene = as_scene(scene)
     if "uv" in names:
         _check_uvs(scene)
@@ -84,7 +84,7 @@ def render_aovs(
     return {name: found[name] for name in names}
 
 
-def _checked(aovs: Sequence[str]) -> list[str]:
+def check_aovs(aovs: Sequence[str]) -> list[str]:
     """Raises TypeError or ValueError."""
     if isinstance(aovs, str) or not isinstance(aovs, Sequence):
         raise TypeError(f'aovs: expected a list of names, such as ["image", "alpha"], got {aovs!r}')
@@ -124,9 +124,7 @@ def _with_channels(request: Request, names: Sequence[str]) -> Request:
     """The request of an image with these channels, in the order of AOVS."""
     flat, camera = request.scene, request.camera
     if "image" not in names:
-        flat = flat._replace(
-            colors=flat.colors[:, :0], texels=flat.texels[:, :0], background=flat.background[..., :0]
-        )
+        flat = flat._replace(colors=flat.colors[:, :0], texels=flat.texels[:, :0], background=flat.background[..., :0])
     faces = flat.faces.long()
     across = _cross(flat.verts, faces) if "normal" in names or "shading_normal" in names else flat.verts
     of_vertices = []
@@ -156,7 +154,9 @@ def _with_channels(request: Request, names: Sequence[str]) -> Request:
     vary = any(name not in CONSTANT for name in names if name != "image")
     vary = vary or ("image" in names and request.gradient.channels_vary)
     return request._replace(
-        scene=flat._replace(background=background), beside=beside, gradient=request.gradient._replace(channels_vary=vary)
+        scene=flat._replace(background=background),
+        beside=beside,
+        gradient=request.gradient._replace(channels_vary=vary),
     )
 
 

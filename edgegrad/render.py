@@ -6,16 +6,18 @@ the derivative of the expected image.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, overload
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from ._autograd import render_image
 from ._check import as_tensor, check_finite, check_float, check_not_meta, check_shape
 from ._ops import forward_kernel, screen_gradient_kernel
 from ._request import as_scene, make_request
+from .aovs import IDS, check_aovs, render_aovs
 from .camera import Camera
 from .mesh import Mesh
 from .scene import Scene
@@ -68,13 +70,31 @@ def render(
     return image.to(as_scene(scene).meshes[0].verts.device)
 
 
+@overload
 def jvp(
-    scene: Scene | Mesh, camera: Camera, tangents: Mapping[Tensor, Tensor], spp: int = 16, seed: int = 0, **options: Any
-) -> tuple[Tensor, Tensor]:
+    scene: Scene | Mesh, camera: Camera, tangents: Mapping[Tensor, Tensor], spp: int = 16, seed: int = 0,
+    *, aovs: None = None, **options: Any,
+) -> tuple[Tensor, Tensor]: ...  # fmt: skip
+@overload
+def jvp(
+    scene: Scene | Mesh, camera: Camera, tangents: Mapping[Tensor, Tensor], spp: int = 16, seed: int = 0,
+    *, aovs: Sequence[str], **options: Any,
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]: ...  # fmt: skip
+def jvp(
+    scene: Scene | Mesh,
+    camera: Camera,
+    tangents: Mapping[Tensor, Tensor],
+    spp: int = 16,
+    seed: int = 0,
+    *,
+    aovs: Sequence[str] | None = None,
+    **options: Any,
+) -> Any:
     """The image, and its derivatives in D directions: (D, H, W, C), or (D, B, H, W, C) for a batch of cameras.
 
     tangents   for tensors of the scene or the camera, the very ones that these hold, their derivatives (D, *shape) in each
                direction: `{mesh.verts: dv, camera.K: dK}`; those of all others are zero
+    aovs       names of channels, but for ids, as render_aovs() has them: then both are dicts of these
 
     All directions share the samples of one pass. The other arguments are those of render(); samples go by area and length
     alone, for no loss says where it looks. The first call in a process takes some seconds, in which torch loads its own rules of
@@ -83,6 +103,9 @@ def jvp(
     """
     make_request(scene, camera, spp, seed, **options)  # checks them
     scene = as_scene(scene)
+    for name in IDS if aovs is not None else ():
+        if name in check_aovs(aovs):
+            raise ValueError(f"aovs: expected channels with derivatives, got {name!r}; ask render_aovs() for ids")
     if not isinstance(tangents, Mapping) or not tangents:
         raise TypeError("tangents: expected a mapping of tensors of the scene and the camera to their tangents")
     owned = {id(v) for thing in (*scene.meshes, scene, camera) for v in vars(thing).values() if isinstance(v, Tensor)}
@@ -105,7 +128,7 @@ def jvp(
     if len(counts) > 1:
         raise ValueError(f"tangents: expected as many directions of all, got {counts}")
 
-    def image(*values: Tensor) -> Tensor:
+    def image(*values: Tensor) -> Any:
         moved = dict(zip(map(id, leaves), values, strict=True))
 
         def replaced(thing: Any, **fields: Any) -> Any:
@@ -113,15 +136,18 @@ def jvp(
             return thing.replace(**fields, **own) if own or fields else thing
 
         meshes = [replaced(mesh) for mesh in scene.meshes]
-        return render(replaced(scene, meshes=meshes), replaced(camera), spp, seed, **options)
+        there = replaced(scene, meshes=meshes), replaced(camera)
+        if aovs is not None:
+            return render_aovs(*there, aovs, spp, seed, **options)
+        return render(*there, spp, seed, **options)
 
-    def direction(*values: Tensor) -> tuple[Tensor, ...]:
+    def direction(*values: Tensor) -> Any:
         return torch.func.jvp(image, tuple(leaves), values)
 
     with torch.no_grad():
         out_dims: Any = (None, 0)  # the image does not depend on the direction
         primal, image_dot = torch.func.vmap(direction, out_dims=out_dims)(*values)
-        return primal.detach(), image_dot.detach()
+        return tree_map(torch.Tensor.detach, (primal, image_dot))
 
 
 def screen_gradient(

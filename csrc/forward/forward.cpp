@@ -88,6 +88,7 @@ class PixelRow {
           image_(image),
           out_(out),
           C_(channels_of<N>(scene)),
+          direction_(scene.attributes.unit < 0 ? -1 : scene.radiance + direction_of(scene.attributes)),
           reach_{options.filter.radius() * (std::fabs(camera.k_inverse[0]) + std::fabs(camera.k_inverse[1])),
                  options.filter.radius() * (std::fabs(camera.k_inverse[2]) + std::fabs(camera.k_inverse[3]))},
           rays_(frame),
@@ -138,7 +139,7 @@ class PixelRow {
     // in the next one.
     struct alignas(N ? 256 : 8) Shaded {
         int32_t face = -1;
-        bool affine = true, unseen = false;
+        bool textured = false, unseen = false;
         FaceMap map;
         DepthBound depth;
         AffineRadiance<N> radiance;
@@ -168,10 +169,13 @@ class PixelRow {
                     const unsigned same = on_face(rays_.face + i, face);
                     left &= ~same;
                     Barycentrics b;
-                    if ((same & (same - 1)) && s.affine &&
+                    if ((same & (same - 1)) && !s.textured &&
                         add_barycentrics(s.map, rays_.n_x + i, rays_.n_y + i, rays_.face + i, face, b)) {
                         const int n = std::popcount(same);
                         s.radiance.add_to(sum, b, n);
+                        if (direction_ >= 0)
+                            for (unsigned one = same; one; one &= one - 1)
+                                add_direction(s, barycentrics_of_hit(s.map, rays_.n(i + std::countr_zero(one))), sum);
                         hits += n;
                         note_hit(s, part_[p].column);
                     } else {
@@ -203,13 +207,19 @@ class PixelRow {
         const Shaded& s = shaded(face);
         note_hit(s, column);
         const Barycentrics b = barycentrics_of_hit(s.map, rays_.n(i));
-        if (s.affine) {
-            s.radiance.add_to(sum, b, 1);
-        } else {
+        if (s.textured) {
             shade<N>(scene_, face, b, radiance_.data());
             for (int c = 0; c < C_; ++c) sum[c] += radiance_[c];
+        } else {
+            s.radiance.add_to(sum, b, 1);
+            if (direction_ >= 0) add_direction(s, b, sum);
         }
         return 1;
+    }
+
+    void add_direction(const Shaded& s, Barycentrics b, typename AffineRadiance<N>::Sum& sum) const {
+        const Vec3 n = unit(interpolated_direction(scene_, s.face, b));
+        sum[direction_] += n.x, sum[direction_ + 1] += n.y, sum[direction_ + 2] += n.z;
     }
 
     Shaded& shaded(int32_t face) {
@@ -249,14 +259,14 @@ class PixelRow {
 
     void keep(Shaded& s, int32_t face) {
         s.face = face;
-        s.affine = is_affine(scene_, face);
+        s.textured = is_textured(scene_, face);
         const int32_t* v = scene_.faces + 3 * int64_t(face);
         const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
         s.map = face_map(camera_, corner);
         s.unseen = camera_.passes_through_eye(corner);
         if (s.unseen) return;
         s.depth.set(camera_, corner, s.map);
-        if (s.affine) s.radiance.set(scene_, face);
+        if (!s.textured) s.radiance.set(scene_, face);
         // Threads may write the same byte, always with the same value; reading first keeps its cache line shared.
         std::atomic_ref<uint8_t> seen(out_.seen[face]);
         if (!seen.load(std::memory_order_relaxed))
@@ -274,7 +284,8 @@ class PixelRow {
     T* const image_;  // (H, W, C)
     const HitBuffers<T>& out_;
     const int C_;
-    const Vec2 reach_;  // of the filter around a pixel, in normalised image coordinates
+    const int direction_;  // the channel where a direction begins; −1: there is none
+    const Vec2 reach_;     // of the filter around a pixel, in normalised image coordinates
 
     struct Part {
         int column, n;

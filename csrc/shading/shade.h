@@ -80,13 +80,8 @@ void each_corner_value(const SceneView<T>& scene, int64_t face, Visit visit) {
                        [&](int k, double c0, double c1, double c2) { visit(C + k, c0, c1, c2); });
 }
 
-// Whether all channels of a face are affine in its barycentrics.
-template <class T>
-bool is_affine(const SceneView<T>& scene, int64_t face) {
-    return !is_textured(scene, face) && scene.attributes.unit < 0;
-}
-
-// The channels of such a face, kept for a run of points.
+// The channels of a face without texture that are affine in the barycentrics, kept for a run of points; zero for a
+// direction, which is not.
 template <int N>
 class AffineRadiance {
    public:
@@ -103,6 +98,8 @@ class AffineRadiance {
         each_corner_value<N>(scene, face, [&](int c, double c0, double c1, double c2) {
             value_[c] = c0, d_u_[c] = c1 - c0, d_v_[c] = c2 - c0;
         });
+        if (const int d = direction_of(scene.attributes); has_attributes<N>(scene) && d >= 0)
+            for (Sum* numbers : {&value_, &d_u_, &d_v_}) std::fill_n(numbers->begin() + scene.radiance + d, 3, 0.0);
     }
 
     // Adds the radiance of n points, given the sum of their barycentrics.
