@@ -22,7 +22,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -318,6 +318,50 @@ def textures(bench: Bench) -> list[Row]:
     ]
 
 
+@dataclass(frozen=True)
+class Channels:
+    """The image of a sphere, or channels beside it, and perhaps the gradient of all of them by the vertices."""
+
+    mesh: eg.Mesh
+    camera: eg.Camera
+    names: Sequence[str] | None  # None: render()
+    gradient: bool
+
+    def seconds(self) -> float:
+        mesh = self.mesh.replace(verts=self.mesh.verts.detach().clone().requires_grad_(self.gradient))
+        return seconds_of(partial(self.run, mesh))
+
+    def run(self, mesh: eg.Mesh) -> None:
+        if self.names is None:
+            found = [eg.render(mesh, self.camera)]
+        else:
+            found = list(eg.render_aovs(mesh, self.camera, self.names).values())
+        if self.gradient:
+            torch.autograd.backward(found, [smooth_channels(x.shape[-1]) for x in found])
+
+
+@cache
+def smooth_channels(channels: int) -> Tensor:
+    return smooth_adjoint(256, 256, channels).float()
+
+
+def aovs(bench: Bench) -> list[Row]:
+    rows = []
+    _, camera, _ = sphere(256)
+    for subdivisions, names, most in (
+        (6, ["image", "alpha"], 1.1), (6, ["image", "alpha", "depth"], 1.5),
+        (6, ["image", "alpha", "depth", "normal"], 1.5), (4, ["image", "alpha", "depth", "normal"], 1.5),
+    ):  # fmt: skip
+        mesh = single(icosphere(subdivisions))
+        for gradient in (False, True):
+            one, all_ = (Channels(mesh, camera, chosen, gradient).seconds for chosen in (None, names))
+            alone, together = bench.interleaved(15, one, all_)
+            what = f"{', '.join(names)} over the image, {'with gradient' if gradient else 'forward'}"
+            note = f"{milliseconds(together)} over {milliseconds(alone)}, {len(mesh.faces):,} faces at 256² × 16"
+            rows.append(ratio_row(what, together, alone, must=most, note=note))
+    return rows
+
+
 def sparse(bench: Bench) -> list[Row]:
     mesh, camera, adjoint = sphere(512)
     window = torch.zeros_like(adjoint)
@@ -582,6 +626,7 @@ ROWS: dict[str, Callable[[Bench], list[Row]]] = {
     "order": order,
     "bits": bits,
     "textures": textures,
+    "aovs": aovs,
     "sparse": sparse,
     "deep": deep,
     "tangled": tangled,

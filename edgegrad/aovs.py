@@ -168,10 +168,11 @@ def _cross(verts: Tensor, faces: Tensor) -> Tensor:
 
 def _unit(v: Tensor) -> Tensor:
     """Vectors (n, 3) with the length 1; zero, without a gradient, where there is no direction."""
-    size = v.detach().abs().amax(-1, keepdim=True)  # so that squares neither overflow nor vanish
-    v = torch.where(size > 0, v / torch.where(size > 0, size, 1.0), 0.0)
-    squared = (v * v).sum(-1, keepdim=True)
-    return v / torch.where(squared > 0, squared, 1.0).sqrt()
+    # Of areas: the squares of all that a mesh may have neither overflow nor vanish in double.
+    x, y, z = v.unbind(-1)
+    squared = x * x + y * y + z * z
+    some = squared > 0
+    return v * torch.where(some, torch.where(some, squared, 1.0).rsqrt(), 0.0)[:, None]
 
 
 def _ids(scene: Scene, face: Tensor) -> dict[str, Tensor]:

@@ -103,8 +103,8 @@ def jvp(
     """
     make_request(scene, camera, spp, seed, **options)  # checks them
     scene = as_scene(scene)
-    for name in IDS if aovs is not None else ():
-        if name in check_aovs(aovs):
+    for name in check_aovs(aovs) if aovs is not None else ():
+        if name in IDS:
             raise ValueError(f"aovs: expected channels with derivatives, got {name!r}; ask render_aovs() for ids")
     if not isinstance(tangents, Mapping) or not tangents:
         raise TypeError("tangents: expected a mapping of tensors of the scene and the camera to their tangents")

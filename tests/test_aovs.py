@@ -4,6 +4,7 @@ finite differences."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
 import torch
@@ -86,9 +87,9 @@ def moved(scene: eg.Scene, camera: eg.Camera, theta: Tensor) -> tuple[eg.Scene, 
         m.replace(verts=m.verts * (1 + theta[0] * (1.0 + 0.5 * torch.sin(3 * m.verts.roll(1, -1)))))
         for m in scene.meshes
     ]
-    M = torch.eye(4, dtype=F64)
-    M[:3, :3] = rotation((0.48, 0.6, 0.64), theta[1])
-    M[:3, 3] = theta[1] * torch.tensor([0.7, -0.5, 0.4], dtype=F64)
+    shift = theta[1] * torch.tensor([[0.7], [-0.5], [0.4]], dtype=F64)
+    M = torch.cat([rotation((0.48, 0.6, 0.64), theta[1]), shift], 1)
+    M = torch.cat([M, torch.eye(4, dtype=F64)[3:]])
     lens = torch.zeros_like(camera.K)
     lens[:2, :2] = camera.K[:2, :2]
     camera = camera.replace(world_to_camera=M @ camera.world_to_camera, K=camera.K + theta[2] * lens)
@@ -235,7 +236,7 @@ def finite_difference_ratio(lens: str, k: int, names: list[str], step: float = 5
             differences[name].append(((high[name] - low[name]) / (2 * step)).item())
     for seed in range(8):
         theta = torch.zeros(3, dtype=F64, requires_grad=True)
-        options = {"surface_samples": 20_000, "edge_samples": 40_000}
+        options: dict[str, Any] = {"surface_samples": 20_000, "edge_samples": 40_000}
         for name, product in products(eg.render_aovs(*moved(scene, camera, theta), names, 16, seed, **options)).items():
             gradients[name].append(torch.autograd.grad(product, theta, retain_graph=True)[0][k].item())
     for name in names:
@@ -268,7 +269,7 @@ def test_channels_that_jump_between_faces_have_creases(name: str) -> None:
     patch = torch.zeros((*camera.size, 1), dtype=F64)
     patch[y - 2 : y + 3, x - 2 : x + 3] = 1.0
 
-    def gradient(visibility: bool, **options: int) -> Tensor:
+    def gradient(visibility: bool, **options: Any) -> Tensor:
         verts = mesh.verts.clone().requires_grad_()
         found = eg.render_aovs(mesh.replace(verts=verts), camera, [name], visibility=visibility, **options)[name]
         return torch.autograd.grad((found * patch * torch.tensor([1.0, 0.3, -0.6][: found.shape[-1]])).sum(), verts)[0]
@@ -290,7 +291,7 @@ def test_sharp_shading_normals_of_split_vertices() -> None:
         for name in ("normal", "shading_normal"):
             verts = mesh.verts.clone().requires_grad_()
             split = eg.Mesh(verts[mesh.faces.reshape(-1)], torch.arange(mesh.faces.numel()).reshape(-1, 3))
-            options = {"visibility": visibility, "surface_samples": 20_000, "edge_samples": 20_000}
+            options: dict[str, Any] = {"visibility": visibility, "surface_samples": 20_000, "edge_samples": 20_000}
             found = eg.render_aovs(split, camera, [name], **options)[name]
             out += [found.detach(), torch.autograd.grad(products({name: found})[name], verts)[0]]
         return out
@@ -332,7 +333,7 @@ def test_a_batch_of_cameras_and_float32() -> None:
     # The gradient by each camera is that of its own channels.
     world = both.world_to_camera.clone().requires_grad_()
     found = eg.render_aovs(scene, both.replace(world_to_camera=world), ["depth", "alpha"], 16)
-    (grad,) = torch.autograd.grad(sum(products({n: x[0] for n, x in found.items()}).values()), world)
+    (grad,) = torch.autograd.grad(cast(Tensor, sum(products({n: x[0] for n, x in found.items()}).values())), world)
     assert (grad[1] == 0).all() and (grad[0] != 0).any()
 
 
@@ -340,13 +341,13 @@ def test_transforms() -> None:
     """Forward mode and reverse mode give one number, and torch.vmap is a loop."""
     scene, camera = two_meshes(), front_camera(SIZE)
     names = ["alpha", "depth", "normal", "shading_normal", "uv", "position", "barycentrics"]
-    many = {"surface_samples": 20_000, "edge_samples": 40_000}
+    many: dict[str, Any] = {"surface_samples": 20_000, "edge_samples": 40_000}
     direction = torch.tensor([0.3, 1.0, 0.2], dtype=F64)
 
     def channels(theta: Tensor) -> dict[str, Tensor]:
         return eg.render_aovs(*moved(scene, camera, theta), names, 16, **many)
 
-    primal, tangent = torch.func.jvp(channels, (torch.zeros(3, dtype=F64),), (direction,))
+    primal, tangent = cast(Any, torch.func.jvp)(channels, (torch.zeros(3, dtype=F64),), (direction,))
     theta = torch.zeros(3, dtype=F64, requires_grad=True)
     for name, product in products(channels(theta)).items():
         assert torch.equal(primal[name], channels(torch.zeros(3, dtype=F64))[name])
@@ -377,6 +378,7 @@ def test_jvp_of_channels() -> None:
 def test_a_texture_gets_the_images_gradient() -> None:
     """Channels beside the image change nothing about what the image's own loss does to it."""
     mesh, camera = textured(icosphere(1)), front_camera(SIZE)
+    assert mesh.texture is not None
     texture = mesh.texture.clone().requires_grad_()
     found = eg.render_aovs(mesh.replace(texture=texture), camera, ["image", "uv", "alpha"], surface_samples=50_000)
     (grad,) = torch.autograd.grad(products(found)["image"], texture)
@@ -413,5 +415,5 @@ def test_faces_without_area() -> None:
     found = eg.render_aovs(eg.Mesh(verts, faces), front_camera(SIZE), names)
     plain = eg.render_aovs(eg.Mesh(mesh.verts, mesh.faces), front_camera(SIZE), names)
     assert all(torch.equal(found[name], plain[name]) for name in names)
-    (grad,) = torch.autograd.grad(sum(products(found).values()), verts)
+    (grad,) = torch.autograd.grad(cast(Tensor, sum(products(found).values())), verts)
     assert grad.isfinite().all()

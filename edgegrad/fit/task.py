@@ -11,9 +11,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .._check import as_tensor, check_finite, check_float, check_shape
+from ..aovs import render_aovs
 from ..camera import Camera
-from ..mesh import PLAIN, Mesh
-from ..render import render
+from ..mesh import Mesh
 from ..scene import Scene
 from .result import Pose
 
@@ -32,7 +32,7 @@ class Level(NamedTuple):
 
     camera: Camera
     target: Tensor  # (h, w, C), blurred
-    background: Tensor  # (C,) or (h, w, C), not blurred: that comes after the render
+    background: Tensor | None  # (C,) or (h, w, C), not blurred: that comes after the render
     blur: float  # pixels
     coarseness: float  # size of a pixel, relative to the finest level's
     spp: int
@@ -43,9 +43,10 @@ class Level(NamedTuple):
 class PoseTask:
     """What is compared, and how a pose moves. Geometry is float64."""
 
-    scene: Scene  # with the mask as its last channel when there is one
-    target: Tensor  # (H, W, C)
-    background: Tensor  # (C,) or (H, W, C)
+    scene: Scene
+    aovs: tuple[str, ...]  # what is compared, one after the other: "image", "alpha" or both
+    target: Tensor  # (H, W, C) the same of the picture
+    background: Tensor | None  # (C,) or (H, W, C) of the picture; None with a mask
     camera: Camera
     center: Tensor  # (3,) of the bounding box, in the mesh's units
     size: float  # its diagonal at the start, world units
@@ -80,14 +81,14 @@ class PoseTask:
                 raise ValueError("background: expected None with a mask, got both; the mask leaves no background")
             shape = _image("mask", mask, camera.size)
             check_shape("mask", shape, (*camera.size, 1))
+            aovs = ("alpha",) if plain else ("image", "alpha")
             picture = shape if plain else torch.cat([picture * shape, shape], -1)
-            meshes = [_with_ones(part, picture.shape[-1] - 1) for part in scene.meshes]
-            behind = torch.zeros(picture.shape[-1])
+            behind = None
         else:
-            meshes = list(scene.meshes)
+            aovs = ("image",)
             behind = _background(background if background is not None else scene.background, picture)
 
-        double = [part.replace(verts=part.verts.detach().double()) for part in meshes]
+        double = [part.replace(verts=part.verts.detach().double()) for part in scene.meshes]
         low, high = torch.cat([part.verts for part in double]).aminmax(dim=0)
         size = float((high - low).norm() * start.scale)
         if size == 0.0:
@@ -100,7 +101,14 @@ class PoseTask:
             raise ValueError("fit_focal: expected False with fit_scale and an orthographic camera, where both are one")
         free = [0, 1, 2, 3, 4] + [5] * depth + [GROW] * fit_scale + [ZOOM] * fit_focal
         return PoseTask(
-            Scene(double), picture, behind, camera.to("cpu", torch.float64, copy=True), (low + high) / 2, size, free
+            Scene(double),
+            aovs,
+            picture,
+            behind,
+            camera.to("cpu", torch.float64, copy=True),
+            (low + high) / 2,
+            size,
+            free,
         )
 
     def pyramid(self, start: Pose, max_size: int, spp: int) -> list[Level]:
@@ -132,7 +140,9 @@ class PoseTask:
         H, W = self.camera.size
         size = max(1, round(H * factor)), max(1, round(W * factor))
         target = _blurred(_resized(self.target, size), blur)
-        behind = _resized(self.background, size) if self.background.dim() == 3 else self.background
+        behind = self.background
+        if behind is not None and behind.dim() == 3:
+            behind = _resized(behind, size)
         return Level(self.camera.resized(size), target, behind, blur, coarseness, spp, free)
 
     def moved(self, pose: Pose, free: list[int], p: Tensor) -> Pose:
@@ -160,7 +170,8 @@ class PoseTask:
         camera = level.camera
         if ZOOM in self.free:
             camera = camera.replace(K=zoomed(camera.K, pose.focal))
-        return _blurred(render(scene, camera, spp=spp, seed=seed), level.blur)
+        channels = render_aovs(scene, camera, self.aovs, spp=spp, seed=seed)
+        return _blurred(torch.cat([channels[name] for name in self.aovs], -1), level.blur)
 
 
 def _image(name: str, value: Tensor, size: tuple[int, int]) -> Tensor:
@@ -187,16 +198,6 @@ def _background(value: Tensor | float | None, picture: Tensor) -> Tensor:
     check_shape("background", behind, (C,), (H, W, C), fix="it needs the picture's size and channels")
     check_finite("background", behind)
     return behind.float()
-
-
-def _with_ones(mesh: Mesh, colors: int) -> Mesh:
-    """The mesh with a channel of ones behind its colours: over black, the render's last channel is the mask."""
-    for kind in ("colors", "face_colors", "corner_colors", "texture"):
-        value = getattr(mesh, kind)
-        if value is not None:
-            return mesh.replace(**{kind: torch.cat([value.detach(), torch.ones_like(value[..., :1])], -1)})
-    look = torch.cat([torch.full((colors,), PLAIN), torch.ones(1)])
-    return mesh.replace(face_colors=look.expand(mesh.faces.shape[0], -1))
 
 
 def zoomed(K: Tensor, factor: Tensor) -> Tensor:
