@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -429,7 +430,7 @@ FLAT = flatten(eg.Scene([textured(), mesh(colors=VERTS)]))
         ({"verts": torch.zeros(4, 2, dtype=F64)}, ["verts: expected 3 columns, got 2"]),
         ({"faces": FLAT.faces[:, :2]}, ["faces: expected 3 columns, got 2"]),
         ({"corners": FLAT.corners[:, :1]}, ["corners: expected 3 columns, got 1"]),
-        ({"colors": FLAT.colors[:, :2]}, ["colors: expected 3 columns, got 2"]),
+        ({"colors": FLAT.colors[:, :2]}, ["texels: expected 2 columns, got 3"]),
         ({"uvs": torch.zeros(8, 3, dtype=F64)}, ["uvs: expected 2 columns, got 3"]),
         ({"texels": FLAT.texels[:, :1]}, ["texels: expected 3 columns, got 1"]),
         ({"textures": FLAT.textures[:, :2]}, ["textures: expected 3 columns, got 2"]),
@@ -459,16 +460,22 @@ def pixels(coverage: np.ndarray) -> object:
     return core.HitsFloat(coverage, coverage.copy(), np.stack([coverage] * 2, -1).astype(np.int32), SEEN)
 
 
-def kernel_forward(channels: int = 3, height: int = 8, filter: str = "box") -> None:
+def kernel_channels(vertex: int = 0, face: int = 0, missing: int = 0, uv: bool = False, unit: int = -1) -> object:
+    """So many attributes of vertices and of faces, for that many vertices and faces too few."""
+    arrays = np.zeros((len(FLAT.verts) - missing, vertex)), np.zeros((len(FLAT.faces) - missing, face))
+    return core.Channels(*arrays, alpha=False, barycentrics=False, uv=uv, unit=unit)
+
+
+def kernel_forward(channels: int = 3, height: int = 8, filter: str = "box", **attributes: Any) -> None:
     image, coverage = np.zeros((height, 8, channels), np.float32), np.zeros((height, 8), np.float32)
     options = core.ImageOptions(spp=1, filter=filter, seed=0)
-    kernel_scene().forward(kernel_camera(), options, 1, image, pixels(coverage))
+    kernel_scene().forward(kernel_camera(), kernel_channels(**attributes), options, 1, image, pixels(coverage))
 
 
 def kernel_backward(**gradients: np.ndarray) -> None:
     image, coverage = np.zeros((8, 8, 3), np.float32), np.zeros((8, 8), np.float32)
     options = core.ImageOptions(spp=1, filter="box", seed=0), core.GradientOptions(seed=0)
-    kernel_scene().backward(kernel_camera(), *options, 1, image, pixels(coverage), gradients)
+    kernel_scene().backward(kernel_camera(), kernel_channels(), *options, 1, image, pixels(coverage), gradients)
 
 
 @pytest.mark.parametrize(
@@ -482,6 +489,12 @@ def kernel_backward(**gradients: np.ndarray) -> None:
         ),
         (lambda: kernel_forward(height=7), ["image: expected an image of the camera's size"]),
         (lambda: kernel_forward(filter="sinc"), ['filter: expected "box", "tent" or "gaussian", got "sinc"']),
+        (lambda: kernel_forward(vertex=1), ["background: expected one number for each channel"]),
+        (lambda: kernel_forward(vertex=1, missing=1), ["vertex_attributes: expected one row a vertex"]),
+        (lambda: kernel_forward(face=1, missing=1), ["face_attributes: expected one row a face"]),
+        (lambda: kernel_forward(uv=True), ["uv: expected a texture on all faces"]),
+        (lambda: kernel_channels(face=5), ["face_attributes: expected at most 4 columns"]),
+        (lambda: kernel_channels(vertex=3, unit=1), ["unit: expected -1, or the first of three columns"]),
         (lambda: kernel_backward(verts=np.zeros((3, 3))), ["gradient of verts: expected the size of verts"]),
         (lambda: kernel_backward(texels=np.zeros((3, 3))), ["gradient of texels: expected the size of texels"]),
         (lambda: kernel_backward(lights=np.zeros(3)), ["gradients: there is none of lights"]),

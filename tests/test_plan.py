@@ -289,6 +289,7 @@ def test_nothing_but_the_plan_is_kept_for_the_backward_pass():
     )
     flat = [t for t in flatten(scene) if isinstance(t, torch.Tensor)] + [camera.world_to_camera[None], camera.K[None]]
     flat.append(torch.zeros(1, 8))  # distortion
+    flat += [torch.zeros(1, 8, 0), torch.zeros(12, 0)]  # attributes of vertices and of faces: none
     assert [tuple(t.shape) for t in inputs] == [tuple(t.shape) for t in flat]
     assert eg.render(cube(), CAMERA, spp=4).grad_fn is None
     assert eg.plan(cube(), CAMERA)["kept for backward"].bytes == 0

@@ -18,6 +18,7 @@ from edgegrad import reference
 from edgegrad._kernel import core
 from edgegrad._ops import Hits, kernel_camera, kernel_channels, kernel_hits, kernel_scene
 from edgegrad._request import SLOTS, make_request, pack_camera
+from edgegrad.aovs import _with_channels
 from edgegrad.scene import flatten
 
 F32, F64 = torch.float32, torch.float64
@@ -96,6 +97,19 @@ def operator_inputs(scene: eg.Scene) -> tuple:
 
 
 SCENES = {"colors": lambda: TRIANGLE, "mixed": mixed_scene, "float32": lambda: TRIANGLE.to(F32)}
+
+
+@pytest.mark.parametrize("wanted", ["1111111111", "1000110000"])
+def test_opcheck_of_channels_beside_the_image(wanted):
+    names = ["image", "alpha", "position", "depth", "shading_normal", "normal", "barycentrics"]
+    inputs = _with_channels(make_request(TRIANGLE, CAMERA, 4, surface_samples=200, edge_samples=200), names).pack()
+    image, *forward = torch.ops.edgegrad.render(*inputs)
+    assert image.shape == (1, SIZE, SIZE, 17)
+    torch.library.opcheck(torch.ops.edgegrad.render.default, inputs)
+    torch.library.opcheck(torch.ops.edgegrad.faces_at_centers.default, inputs)
+    adjoint = torch.ones_like(image)
+    arguments = (adjoint, *forward, *inputs, [w == "1" for w in wanted])
+    torch.library.opcheck(torch.ops.edgegrad.render_backward.default, arguments)
 
 
 @pytest.mark.parametrize("scene", SCENES)
