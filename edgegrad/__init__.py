@@ -2,6 +2,7 @@
 
 from .aovs import render_aovs
 from .camera import Camera
+from .hits import Hits
 from .io import load_camera, load_mesh, load_scene, read_image, save_camera, write_image
 from .mesh import Mesh
 from .plan import Plan, plan, profile
@@ -12,6 +13,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Camera",
+    "Hits",
     "Mesh",
     "Plan",
     "Scene",

@@ -104,7 +104,7 @@ def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
         _warn_of_folds(cameras)
         profiles = []
         for b in range(B):
-            options["seed"] = _camera_seed(request.image.seed, b)
+            options["seed"] = camera_seed(request.image.seed, b)
             profiles.append(
                 scene.forward(
                     camera=cameras[b],
@@ -212,7 +212,7 @@ def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Ten
 def _gradient_options(request: Request, wanted: Collection[str], camera: int, dry: bool = False) -> Any:
     options, work = request.gradient, Work.of(request.gradient, wanted)
     return core.GradientOptions(
-        seed=_camera_seed(options.grad_seed, camera),
+        seed=camera_seed(options.grad_seed, camera),
         surface_samples=options.surface_samples,
         edge_samples=options.edge_samples,
         interior_geometry=work.motion,
@@ -221,7 +221,7 @@ def _gradient_options(request: Request, wanted: Collection[str], camera: int, dr
     )
 
 
-def _camera_seed(seed: int, camera: int) -> int:
+def camera_seed(seed: int, camera: int) -> int:
     """Cameras of a batch get samples of their own."""
     return seed if camera == 0 else derived_seed(seed, camera + 1)
 

@@ -21,6 +21,7 @@ from .aovs import IDS, check_aovs, render_aovs
 from .camera import Camera
 from .mesh import Mesh
 from .scene import Scene
+from .shader import Shader, render_shaded
 
 
 def render(
@@ -34,6 +35,9 @@ def render(
     visibility: bool = True,
     filter: str = "box",
     grad_seed: int | None = None,
+    shader: Shader | None = None,
+    creases: bool | str = "auto",
+    check_shader: bool = False,
 ) -> Tensor:
     """The image (H, W, C) of a scene, or (B, H, W, C) for a batch of cameras: linear radiance, row 0 on top.
 
@@ -54,6 +58,13 @@ def render(
     filter           "box" (1 px wide), "tent" (2 px) or "gaussian" (σ ½ px, 3 px)
     grad_seed        seed of the gradient's samples; derived from `seed` when None. They also depend on the image by which
                      faces it hit, which says where to put them
+    shader           a function or module of Hits that gives the radiance (N, C) of N points, in place of the meshes' colours
+                     and textures: any PyTorch, as long as each point is by itself. It is asked once for each face in a
+                     pixel, in parts of at most 131,072 points
+    creases          at which edges between two visible faces the shader may jump: "auto", where a property of the hits
+                     jumps that it asked for (normals; texture coordinates at seams; attributes of interpolate(); all
+                     edges if it asked for `face` or `barycentrics`); True, at all; False, at none
+    check_shader     asks the shader twice, the second time with half of the points in another order, and compares
 
     Differentiable once, in reverse and in forward mode, in every floating-point tensor of the scene and the camera; torch.vmap
     and torch.func's transforms work, one element of the batch at a time, all with the same seed; tangents of one image
@@ -66,6 +77,8 @@ def render(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
         filter=filter, grad_seed=grad_seed,
     )  # fmt: skip
+    if shader is not None:
+        return render_shaded(as_scene(scene), camera, shader, request, creases, check_shader)
     image = render_image(request, batched=camera.batch is not None)
     return image.to(as_scene(scene).meshes[0].verts.device)
 
@@ -101,7 +114,8 @@ def jvp(
     forward mode. The same as torch.func.jvp of render(), under torch.vmap; what it returns is not in
     the graph. Raises what render() raises.
     """
-    make_request(scene, camera, spp, seed, **options)  # checks them
+    own = {n: v for n, v in options.items() if n not in ("shader", "creases", "check_shader")}
+    make_request(scene, camera, spp, seed, **own)  # checks them
     scene = as_scene(scene)
     for name in check_aovs(aovs) if aovs is not None else ():
         if name in IDS:

@@ -246,12 +246,28 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, Te
     });
 }
 
+template <class T>
+Records record_samples(const BackwardInput<T>& input, GradientOptions o, Team& team) {
+    Records records;
+    const Terms terms{.motion = o.interior_geometry, .appearance = false, .boundary = o.boundary};
+    if (!terms.any()) return records;
+    o.controls = false;
+    Destination to;
+    to.records = &records;
+    BackwardProfile profile;
+    with_view(input, o, terms, team, [&](const BackwardView<T>& view) {
+        add_terms<0>(view, terms, input.hits.coverage, Record{}, to, profile);
+    });
+    return records;
+}
+
 #define EDGEGRAD_INSTANTIATE(T)                                                                                  \
     template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,             \
                                              const Gradients&);                                                  \
     template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&, \
                                   double*);                                                                      \
-    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);
+    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);              \
+    template Records record_samples(const BackwardInput<T>&, GradientOptions, Team&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)
 #undef EDGEGRAD_INSTANTIATE

@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "contract/record.h"
 #include "forward/forward.h"
 #include "scene/geometry.h"
 #include "scene/gradients.h"
@@ -63,6 +64,10 @@ void render_tangents(const BackwardInput<T>& input, GradientOptions options, Tea
 // moves right and down, per pixel that it moves.
 template <class T>
 void render_screen_gradient(const BackwardInput<T>& input, GradientOptions options, Team& team, double* gradient);
+
+// The samples of both terms, for shaders written in PyTorch. Creases are the edges at which the scene's colours jump.
+template <class T>
+Records record_samples(const BackwardInput<T>& input, GradientOptions options, Team& team);
 
 // q = R p + t, backwards: p̄ = Rᵀ q̄, R̄ = Σ q̄ pᵀ, t̄ = Σ q̄, for q_bar (V, 3).
 void add_world(const Camera& camera, const double* verts, const Array<double>& q_bar, Team& team,

@@ -32,6 +32,11 @@ ScreenBoundary<T> contract(const BackwardView<T>& view, const Screen&, ChunkGrad
     return {view, grad};
 }
 
+template <int N, class T>
+RecordBoundary contract(const BackwardView<T>&, const Record&, ChunkGrad& grad) {
+    return RecordBoundary(grad.records.curves);
+}
+
 // Samples of one source, in batches of rays.
 template <class Contraction, class T, CurveSource Source>
 class CurveSamples {

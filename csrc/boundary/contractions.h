@@ -2,6 +2,7 @@
 // moves with, in forward mode a derivative of the pixels around it, or the gradient by its place in the image.
 #pragma once
 
+#include <algorithm>
 #include <vector>
 
 #include "backward/view.h"
@@ -130,6 +131,58 @@ class ScreenBoundary {
     const BackwardView<T>& view_;
     AdjointRadiance<0, T> radiance_;
     ChunkGrad& grad_;
+};
+
+class RecordBoundary {
+   public:
+    explicit RecordBoundary(CurveRecords& records) : records_(records) { form_.q.prepare(3, 1); }
+
+    bool wants(int, Vec2) const { return true; }
+
+    template <CurveSource Source>
+    void add(int, Source& source, typename Source::Sample& sample) {
+        const SampleSurfaces surfaces = source.surfaces(sample);
+        double first[CurveRecords::surfaces] = {}, second[CurveRecords::surfaces] = {};
+        for (int k = 0; k < surfaces.count; ++k) {
+            double radiance[SampleSurfaces::most] = {};
+            radiance[k] = 1;
+            const CurveJumps jumps = source.jumps(sample, radiance);
+            first[k] = jumps.first, second[k] = jumps.second;
+        }
+        add(source, sample, surfaces, {1, 0}, first), add(source, sample, surfaces, {0, 1}, second);
+    }
+
+   private:
+    static_assert(CurveRecords::surfaces == SampleSurfaces::most);
+
+    // One of the curves. Its velocity is what its motion is the adjoint of.
+    template <CurveSource Source>
+    void add(Source& source, const typename Source::Sample& sample, const SampleSurfaces& surfaces, CurveJumps curve,
+             const double* factor) {
+        if (std::all_of(factor, factor + CurveRecords::surfaces, [](double f) { return f == 0; })) return;
+        form_.q.clear(), form_.k = {};
+        source.add_motion(sample, curve, form_);
+        source.finish(form_);
+        const int64_t sample_index = records_.size();
+        append(records_.x, {sample.x.x, sample.x.y});
+        for (int k = 0; k < CurveRecords::surfaces; ++k) {
+            const SurfacePoint p = k < surfaces.count ? surfaces.at[k] : SurfacePoint();
+            records_.face.push_back(k < surfaces.count ? int32_t(p.face) : -2);
+            append(records_.b, {p.b.u, p.b.v});
+            records_.factor.push_back(factor[k]);
+        }
+        records_.by_k.insert(records_.by_k.end(), form_.k.k, form_.k.k + 6);
+        records_.by_k.insert(records_.by_k.end(), form_.k.distortion, form_.k.distortion + most_coefficients);
+        form_.q.each([&](int64_t vertex, const double* by_q) {
+            if (by_q[0] == 0 && by_q[1] == 0 && by_q[2] == 0) return;
+            records_.row_of.push_back(sample_index);
+            records_.vertex.push_back(int32_t(vertex));
+            records_.by_q.insert(records_.by_q.end(), by_q, by_q + 3);
+        });
+    }
+
+    CurveRecords& records_;
+    ChunkGrad form_;
 };
 
 }  // namespace edgegrad

@@ -1,8 +1,10 @@
-// The three contractions of samples: reverse mode, forward mode, and the gradient by places in the image. What each
+// The contractions of samples: reverse mode, forward mode, the gradient by places in the image, and the samples
+// themselves, for whoever contracts them elsewhere (record.h). What each
 // does with a sample inside a face or on a curve stands where these are sampled.
 #pragma once
 
 #include "contract/forward.h"
+#include "contract/record.h"
 
 namespace edgegrad {
 
@@ -24,6 +26,7 @@ struct Screen {};
     EDGEGRAD_FOR_CONTRACTIONS_OF(X, double)
 #define EDGEGRAD_FOR_CONTRACTIONS_OF(X, T) \
     X(0, Reverse, T)                       \
-    X(1, Reverse, T) X(3, Reverse, T) X(4, Reverse, T) X(-4, Reverse, T) X(0, Forward, T) X(0, Screen, T)
+    X(1, Reverse, T)                       \
+    X(3, Reverse, T) X(4, Reverse, T) X(-4, Reverse, T) X(0, Forward, T) X(0, Screen, T) X(0, Record, T)
 
 }  // namespace edgegrad

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "camera/camera.h"
+#include "contract/record.h"
 #include "core/parallel.h"
 #include "core/stopwatch.h"
 #include "scene/scene.h"
@@ -59,6 +60,12 @@ class RowBuffer {
         std::copy(values, values + width, r.value.begin() + r.count * width);
         ++r.count;
     }
+    // Calls visit(index, values) for each row.
+    template <class Visit>
+    void each(Visit visit) const {
+        for (const Rows& r : rows_)
+            for (size_t k = 0; k < r.count; ++k) visit(r.index[k], r.value.data() + k * width_);
+    }
     void add_to(double* destination, int owner) const {
         if (width_ == 2) add_to<2>(destination, rows_[owner]);
         else if (width_ == 3) add_to<3>(destination, rows_[owner]);
@@ -96,6 +103,7 @@ struct ChunkGrad {
     RowBuffer vertex_attributes, face_attributes;
     RowBuffer pixels;  // of what has the size of the image
     IntrinsicsGrad k;
+    Records records;
 };
 
 // Where it goes; null where none is wanted.
@@ -105,6 +113,7 @@ struct Destination {
     int pixel_width = 0;  // numbers a pixel
     IntrinsicsGrad k = {};
     bool want_k = false;
+    Records* records = nullptr;
 };
 
 // The rows of both, and their width.
@@ -172,6 +181,10 @@ class Scatter {
                         if (double* const there = to.*slot.to) (grads_[i].*slot.rows).add_to(there, int(owner));
             });
             for (int64_t i = 0; i < chunks; ++i) to.k += grads_[i].k;
+            if (to.records)
+                for (int64_t i = 0; i < chunks; ++i)
+                    to.records->surface.add(grads_[i].records.surface),
+                        to.records->curves.add(grads_[i].records.curves);
             seconds[1] += watch.lap();
         }
     }
@@ -186,6 +199,7 @@ class Scatter {
             rows.clear();
         }
         g.k = {};
+        if (to.records) g.records = {};
     }
 
     int width_of(const RowSlot& slot, const Destination& to) const {

@@ -182,4 +182,39 @@ class ScreenInterior {
     int64_t pixel_ = 0;
 };
 
+template <class T>
+class RecordInterior {
+   public:
+    RecordInterior(const BackwardView<T>& view, SurfaceRecords& records) : view_(view), records_(records) {}
+
+    bool wants(int, const SurfaceSample&) const { return true; }
+
+    void add(int, const SurfaceSample& s, Vec2 n, bool visible) {
+        if (visible) add(s.face, s.x, n, s.weight);
+    }
+
+    // A sample of a pixel was drawn in proportion to its filter k; as one of the plane it has the weight 1 / (spp k).
+    // Only textured faces, and large ones under a loss as rough as noise, are sampled so; here there are neither.
+    bool begin_pixel(int64_t, int) const { return false; }
+    void add_in_pixel(int32_t, Vec2) const {}
+
+    void finish() {}
+
+   private:
+    void add(int32_t face, Vec2 x, Vec2 n, double weight) {
+        records_.face.push_back(face);
+        append(records_.x, {x.x, x.y}), append(records_.n, {n.x, n.y});
+        for (const Vec2 along : {Vec2{1, 0}, Vec2{0, 1}}) {
+            IntrinsicsGrad by_k;
+            normalised_vjp(view_.camera, n, along, by_k);
+            records_.n_by_k.insert(records_.n_by_k.end(), by_k.k, by_k.k + 6);
+            records_.n_by_k.insert(records_.n_by_k.end(), by_k.distortion, by_k.distortion + most_coefficients);
+        }
+        records_.weight.push_back(weight);
+    }
+
+    const BackwardView<T>& view_;
+    SurfaceRecords& records_;
+};
+
 }  // namespace edgegrad

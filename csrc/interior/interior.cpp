@@ -36,6 +36,11 @@ ScreenInterior<T> contract(const BackwardView<T>& view, const Screen&, const Des
     return {view, grad};
 }
 
+template <int N, class T>
+RecordInterior<T> contract(const BackwardView<T>& view, const Record&, const Destination&, ChunkGrad& grad) {
+    return {view, grad.records.surface};
+}
+
 // The samples of one chunk.
 template <class Contraction, class T>
 class InteriorChunk {

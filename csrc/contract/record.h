@@ -1,0 +1,68 @@
+// The samples themselves, for shaders written in PyTorch: what each shows, and how what it shows moves.
+//
+// Nothing here depends on radiance. Inside a face the caller differentiates its shader at barycentrics that move with
+// the vertices and the intrinsics while the pixel position stays. On a curve he evaluates it on both sides, and the
+// velocity of the curve is a linear form in what moves: rows of vertices in camera coordinates, and the intrinsics.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "camera/camera.h"
+#include "core/math.h"
+
+namespace edgegrad {
+
+struct Record {};
+
+constexpr int intrinsics_width = 6 + most_coefficients;  // K in rows, then the distortion
+
+// Samples inside faces. Arrays side by side, one entry or row for each.
+struct SurfaceRecords {
+    std::vector<int32_t> face;
+    std::vector<double> x;       // (S, 2) pixel position
+    std::vector<double> n;       // (S, 2) normalised image coordinates
+    std::vector<double> n_by_k;  // (S, 2, 14) ∂n/∂intrinsics at fixed x
+    std::vector<double> weight;  // px² that it stands for
+
+    void add(const SurfaceRecords& o);
+};
+
+// Samples on curves. One on which two curves lie at a time has an entry for each that moves.
+struct CurveRecords {
+    static constexpr int surfaces = 3;  // at most
+    std::vector<double> x;              // (S, 2) pixel position
+    std::vector<int32_t> face;          // (S, 3) of its surfaces; −1: the background, −2: none
+    std::vector<double> b;              // (S, 3, 2) where on them
+    std::vector<double> factor;         // (S, 3): the jump, times what the sample stands for, is Σ factor · radiance
+    std::vector<double> by_k;           // (S, 14) velocity of the curve by the intrinsics
+    std::vector<int64_t> row_of;        // (R,): the sample of each row
+    std::vector<int32_t> vertex;        // (R,)
+    std::vector<double> by_q;           // (R, 3) velocity by the vertex in camera coordinates
+
+    int64_t size() const { return int64_t(x.size()) / 2; }
+    void add(const CurveRecords& o);
+};
+
+struct Records {
+    SurfaceRecords surface;
+    CurveRecords curves;
+};
+
+template <class T>
+void append(std::vector<T>& to, const std::vector<T>& from) {
+    to.insert(to.end(), from.begin(), from.end());
+}
+
+inline void SurfaceRecords::add(const SurfaceRecords& o) {
+    append(face, o.face), append(x, o.x), append(n, o.n), append(n_by_k, o.n_by_k), append(weight, o.weight);
+}
+
+inline void CurveRecords::add(const CurveRecords& o) {
+    const int64_t before = size();
+    append(x, o.x), append(face, o.face), append(b, o.b), append(factor, o.factor), append(by_k, o.by_k);
+    for (const int64_t i : o.row_of) row_of.push_back(before + i);
+    append(vertex, o.vertex), append(by_q, o.by_q);
+}
+
+}  // namespace edgegrad
