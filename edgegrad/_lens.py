@@ -1,6 +1,7 @@
-"""What lenses do to the image of a pinhole: they bend normalised image coordinates n = (X/Z, Y/Z) to m, and K takes m to pixels.
+"""What lenses do to the image of a pinhole: they bend normalised image coordinates n = (X/Z, Y/Z) to m, and K takes m to pixels;
+and where a panorama sees a point.
 
-The kernel has the same maps (csrc/camera/brown_conrady.h, fisheye.h).
+The kernel has the same maps (csrc/camera/brown_conrady.h, fisheye.h, equirectangular.h).
 """
 
 from __future__ import annotations
@@ -8,13 +9,21 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-COUNTS = {"perspective": (4, 5, 8), "fisheye": (4,), "orthographic": ()}  # of coefficients, by projection
+COUNTS = {"perspective": (4, 5, 8), "fisheye": (4,), "panorama": (), "orthographic": ()}  # of coefficients, by projection
 MOST = 8  # what the kernel takes
+TURNS = 4  # how often a panorama may reach around, either way
 
 
 def bend(projection: str, n: Tensor, distortion: Tensor) -> Tensor:
     """m (…, 2) of n (…, 2), with the coefficients (4,), (5,) or (8,) in OpenCV's order."""
     return _fisheye(n, distortion) if projection == "fisheye" else _brown_conrady(n, distortion)
+
+
+def longitude_latitude(q: Tensor) -> Tensor:
+    """(…, 2) radians of q (…, 3), in camera coordinates: to the right in (−π, π], and downwards. Neither has a derivative on
+    the vertical axis."""
+    x, y, z = q.unbind(-1)
+    return torch.stack([torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))], -1)
 
 
 def _brown_conrady(n: Tensor, distortion: Tensor) -> Tensor:

@@ -250,6 +250,7 @@ def pass_size(request: Request) -> Any:
         textured=len(flat.textures) > 0,
         jumps=jumps,
         threads=torch.get_num_threads(),
+        lens=camera.lens,
     )
 
 

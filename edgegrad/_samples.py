@@ -30,8 +30,8 @@ class SurfaceSamples(NamedTuple):
 
     face: Tensor  # (S,) int64
     x: Tensor  # (S, 2) float64, pixel positions
-    n: Tensor  # (S, 2) float64, normalised image coordinates there
-    n_by_k: Tensor  # (S, 2, 14) float64, their derivatives by K in rows and the distortion, at fixed x
+    along: Tensor  # (S, 3) float64, where the ray goes in camera coordinates; in an orthographic view the place it goes through
+    along_by_k: Tensor  # (S, 3, 14) float64, its derivatives by K in rows and the distortion, at fixed x
     weight: Tensor  # (S,) float64, px² that a sample stands for
 
 

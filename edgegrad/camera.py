@@ -5,6 +5,7 @@ from there to the pixel position (x, y), x to the right and y down, the corner o
 
     perspective   (x, y) = K[:2] (X/Z, Y/Z, 1)    or through a lens that distorts: K[:2] (m, 1), with m a function of (X/Z, Y/Z)
     fisheye       (x, y) = K[:2] (m, 1)           the distance from the middle is a polynomial of the angle to the axis
+    panorama      (x, y) = K[:2] (λ, φ, 1)        longitude λ = atan2(X, Z), latitude φ = atan2(Y, √(X² + Z²)): all around
     orthographic  (x, y) = K[:2] (X, Y, 1)        everything on the line is seen, also behind the camera's position
 """
 
@@ -31,7 +32,7 @@ from ._check import (
     check_shape,
     values_visible,
 )
-from ._lens import COUNTS, bend
+from ._lens import COUNTS, TURNS, bend, longitude_latitude
 
 Vector = Tensor | Sequence[float]
 
@@ -41,9 +42,10 @@ class Camera:
     """One camera, or a batch of B that look at one scene.
 
     world_to_camera  (4, 4) or (B, 4, 4) float   rigid: a rotation and a translation, last row (0, 0, 0, 1)
-    K                (3, 3) or (B, 3, 3) float   pixels (orthographic: pixels a world unit), last row (0, 0, 1); skew allowed
+    K                (3, 3) or (B, 3, 3) float   pixels (orthographic: pixels a world unit; panorama: pixels a radian), last row
+                                                 (0, 0, 1); skew allowed
     size             (H, W)                      image size in pixels
-    projection       "perspective", "fisheye" or "orthographic"
+    projection       "perspective", "fisheye", "panorama" or "orthographic"
     distortion       (4,), (5,), (8,) or (B, ·)  of a perspective lens, Brown–Conrady: k1, k2, p1, p2, k3, k4, k5, k6, as OpenCV
                      has them; of a fisheye (4,): k1, k2, k3, k4; None: a pinhole, or a fisheye without
 
@@ -75,7 +77,7 @@ class Camera:
         object.__setattr__(self, "size", _size(self.size))
         if self.projection not in COUNTS:
             raise ValueError(
-                f'projection: expected "perspective", "fisheye" or "orthographic", got {self.projection!r}'
+                f"projection: expected one of {', '.join(map(repr, COUNTS))}, got {self.projection!r}"
             )
         if self.distortion is not None:
             object.__setattr__(self, "distortion", as_tensor("distortion", self.distortion, like=self.K))
@@ -85,8 +87,9 @@ class Camera:
     def _check_distortion(self, distortion: Tensor) -> None:
         counts = COUNTS[self.projection]
         if not counts:
+            article = "an" if self.projection == "orthographic" else "a"
             raise ValueError(
-                f"distortion: expected None for an {self.projection} camera, got {tuple(distortion.shape)}"
+                f"distortion: expected None for {article} {self.projection} camera, got {tuple(distortion.shape)}"
             )
         check_float("distortion", distortion)
         check_shape("distortion", distortion, *((n,) for n in counts), *(("B", n) for n in counts))
@@ -115,6 +118,21 @@ class Camera:
                 "K: expected focal lengths that are not zero, got a singular matrix"
                 + (f" (its inverse reaches {float(inverse.max()):.3g})" if bool(torch.isfinite(inverse).all()) else "")
                 + "; give a focal length in pixels to each axis"
+            )
+        if self.projection == "panorama":
+            self._check_turns()
+
+    def _check_turns(self) -> None:
+        """What the kernel draws of a panorama, it draws once for each turn."""
+        H, W = self.size
+        K = self.K.detach().double().reshape(-1, 3, 3)
+        corners = K.new_tensor([[x, y] for x in (-1.0, W + 1.0) for y in (-1.0, H + 1.0)])
+        angles = torch.linalg.solve(K[:, None, :2, :2], (corners - K[:, None, :2, 2])[..., None])
+        turns = float(angles.abs().max()) / math.tau
+        if not turns <= TURNS:
+            raise ValueError(
+                f"K: expected a panorama that reaches no more than {TURNS} turns from its axis, got {turns:.4g}; "
+                "K is in pixels a radian: width / 2π for all around, height / π from pole to pole"
             )
 
     # -- how to make one ------------------------------------------------------------------------------------------
@@ -167,6 +185,25 @@ class Camera:
         """A fisheye from OpenCV's R (3, 3), t (3,), K (3, 3) in pixels and k1, k2, k3, k4, as cv2.fisheye.calibrate returns
         them; see from_opencv. It shows what lies less than 88° from the axis."""
         return _from_opencv(R, t, K, size, "fisheye", distortion)
+
+    @staticmethod
+    def panorama(world_to_camera: Vector, size: tuple[int, int], K: Vector | None = None) -> Camera:
+        """All around the camera (equirectangular): longitude to the right, latitude downwards, +Z in the middle.
+
+        world_to_camera  (4, 4)   rigid, +X right, +Y down, +Z forward
+        size             (H, W)   pixels
+        K                (3, 3)   pixels a radian and the pixel where +Z is seen, for a part of it, or for several turns; None: 360°
+                                  from left to right, 180° from top to bottom
+
+        It goes on beyond ±180°, and over the poles along the opposite meridian, so what crosses the image's border comes back at
+        the other. Raises TypeError or ValueError.
+        """
+        pose = as_tensor("world_to_camera", world_to_camera, floating=True)
+        check_float("world_to_camera", pose)
+        H, W = _size(size)
+        if K is None:
+            K = pose.new_tensor([[W / math.tau, 0.0, 0.5 * W], [0.0, H / math.pi, 0.5 * H], [0.0, 0.0, 1.0]])
+        return Camera(pose, as_tensor("K", K, like=pose), (H, W), "panorama")
 
     @staticmethod
     def from_opengl(
@@ -232,9 +269,9 @@ class Camera:
 
     @property
     def lens(self) -> str:
-        """What bends straight lines: "brown-conrady", "fisheye" or, where nothing does, "pinhole"."""
-        if self.projection == "fisheye":
-            return "fisheye"
+        """What bends straight lines: "brown-conrady", "fisheye", "panorama" or, where nothing does, "pinhole"."""
+        if self.projection in ("fisheye", "panorama"):
+            return self.projection
         return "pinhole" if self.distortion is None else "brown-conrady"
 
     @property
@@ -264,7 +301,7 @@ class Camera:
         """Pixel positions (…, 2) of world points (…, 3), differentiable; a single camera only.
 
         Not finite in the plane of a perspective camera. What a lens does not show, beyond a fold or behind it, may have a
-        position too. Raises TypeError or ValueError.
+        position too. Of all positions in a panorama, the one within ±180°. Raises TypeError or ValueError.
         """
         points = as_tensor("points", points, like=self.K)
         check_float("points", points)
@@ -275,9 +312,14 @@ class Camera:
             raise ValueError(f"project: expected a single camera, got a batch of {self.batch}; call once for each")
         M, K = self.world_to_camera, self.K
         q = (M[:3, :3] * points[..., None, :]).sum(-1) + M[:3, 3]
-        uv = q[..., :2] if self.projection == "orthographic" else q[..., :2] / q[..., 2:]
-        if self.lens != "pinhole":
-            uv = bend(self.projection, uv, self.coefficients)
+        if self.projection == "panorama":
+            uv = longitude_latitude(q)
+        elif self.projection == "orthographic":
+            uv = q[..., :2]
+        else:
+            uv = q[..., :2] / q[..., 2:]
+            if self.lens != "pinhole":
+                uv = bend(self.projection, uv, self.coefficients)
         return (K[:2, :2] * uv[..., None, :]).sum(-1) + K[:2, 2]
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:

@@ -72,13 +72,15 @@ class Surfaces:
         """World points (..., 3) in camera coordinates, float64."""
         return points.double() @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
 
-    def barycentrics(self, face: Tensor, n: Tensor) -> Tensor:
-        """(N, 3) where the rays at the normalised image coordinates n (N, 2) meet the planes of faces: differentiable
-        functions of vertices and camera (Möller and Trumbore 1997)."""
+    def barycentrics(self, face: Tensor, along: Tensor) -> Tensor:
+        """(N, 3) where rays meet the planes of faces: differentiable functions of vertices and camera (Möller and Trumbore
+        1997). `along` (N, 3): the directions of rays from the eye in camera coordinates, or, in an orthographic view, points
+        that rays along the axis go through."""
         q = self.in_camera(self.verts[self.faces[face]])
-        one, zero = torch.ones_like(n[:, :1]), torch.zeros_like(n)
-        origin, along = (zero, torch.cat([n, one], 1)) if self.perspective else (n, torch.cat([zero, one], 1))
-        origin = torch.cat([origin, 0 * one], 1) - q[:, 0]
+        if self.perspective:
+            origin = -q[:, 0]
+        else:
+            origin, along = along - q[:, 0], along.new_tensor([0.0, 0.0, 1.0]).expand_as(along)
         e1, e2 = q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
         p, s = torch.linalg.cross(along, e2), torch.linalg.cross(origin, e1)
         scale = 1 / (e1 * p).sum(-1)

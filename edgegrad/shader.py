@@ -120,9 +120,9 @@ class _Image:
 
             def radiance(some: SurfaceSamples = some) -> Tensor:
                 moved = self._intrinsics - self._intrinsics.detach()
-                n = some.n + (some.n_by_k @ moved if _moves(self._intrinsics) else 0)
-                face, n = self._here(some.face), self._here(n)
-                b = self._surfaces.barycentrics(face, n)
+                along = some.along + (some.along_by_k @ moved if _moves(self._intrinsics) else 0)
+                face, along = self._here(some.face), self._here(along)
+                b = self._surfaces.barycentrics(face, along)
                 return self._shade(Hits(self._surfaces, face, b, self._here(some.x)))
 
             # So that memory is that of some points, not of all.

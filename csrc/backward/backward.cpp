@@ -10,6 +10,7 @@
 #include "boundary/boundary.h"
 #include "boundary/curve.h"
 #include "boundary/curve_measure.h"
+#include "camera/windows.h"
 #include "core/channels.h"
 #include "interior/interior.h"
 #include "interior/surface_measure.h"
@@ -55,16 +56,31 @@ Terms terms_of(const Slots<Number>& slots, const GradientOptions& o) {
     return {moves && o.interior_geometry, slots.appearance(), moves && o.boundary};
 }
 
-// Calls body(view) with what all terms look at.
+// What the image and its adjoint say, through whichever window of the camera one looks.
+template <class T>
+struct InImage {
+    FilteredAdjoint<T> filtered;
+    Importance importance;
+    OcclusionHint occlusion;
+
+    InImage(const BackwardInput<T>& input, Team& team)
+        : filtered(input.adjoint, input.scene, input.image.filter, input.camera.width, input.camera.height),
+          importance(input.adjoint, input.camera.width, input.camera.height, input.scene.channels,
+                     margin_of(input.image), team),
+          occlusion(input.hits.depth, input.camera.width, input.camera.height, team) {}
+
+    // By which the pixel filter reaches beyond the image.
+    static double margin_of(const ImageOptions& image) { return image.filter.radius() - 0.5; }
+};
+
+// Calls body(view) with what all terms look at through one window.
 template <class T, class Body>
-void with_view(const BackwardInput<T>& input, const GradientOptions& o, const Terms& terms, Team& team, Body body) {
-    const auto& [scene, camera, geometry, image, adjoint, hit_buffers] = input;
-    const double margin = image.filter.radius() - 0.5;
-    const ViewVolume volume(camera, margin);
+void with_view(const BackwardInput<T>& input, const Camera& camera, const InImage<T>& in_image,
+               const GradientOptions& o, const Terms& terms, Team& team, Body body) {
+    const auto& [scene, whole, geometry, image, adjoint, hit_buffers] = input;
+    const auto& [filtered, importance, occlusion] = in_image;
+    const ViewVolume volume(camera, InImage<T>::margin_of(image));
     const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, team);
-    const FilteredAdjoint<T> filtered(adjoint, scene, image.filter, camera.width, camera.height);
-    const Importance importance(adjoint, camera.width, camera.height, scene.channels, margin, team);
-    const OcclusionHint occlusion(hit_buffers.depth, camera.width, camera.height, team);
     const CameraFrame frame(geometry.caster(), camera);
     Scatter scatter(team, {scene.radiance, scene.attributes.vertex_width, scene.attributes.face_width});
     // What the controls need, of faces and of creases.
@@ -94,58 +110,122 @@ void with_view(const BackwardInput<T>& input, const GradientOptions& o, const Te
                          .vertex_adjoint = vertex_adjoint});
 }
 
+// Where the terms are to sample, and how often.
+template <class T>
+struct Measured {
+    std::optional<SurfaceMeasure<T>> surface;
+    std::optional<Curves<T>> curves;
+    SampleCounts wanted;
+};
+
+template <int N, class T>
+Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Destination& to, BackwardProfile& profile) {
+    const GradientOptions& o = view.options;
+    Stopwatch watch;
+    Measured<T> out;
+    Array<int8_t> facing(terms.boundary ? view.scene.n_faces : 0);
+    if (terms.interior()) {
+        out.surface.emplace(measure_surface<N>(view, terms.motion, facing, to));
+        out.wanted.surface = out.surface->wanted(o.surface_samples);
+        profile.surface_wanted = out.surface->pixel_samples() + out.wanted.surface;
+        profile.measure = watch.lap();
+    }
+    if (terms.boundary) {
+        if (!terms.interior()) facing = facing_of_faces(view);
+        const Curves<T>& curves = out.curves.emplace(measure_curves<N>(view, std::move(facing)));
+        out.wanted.edge = profile.edge_wanted = curves.wanted(o.edge_samples);
+        profile.silhouettes = curves.silhouettes, profile.creases = curves.creases;
+        profile.intersections = curves.intersections;
+        profile.curves = watch.lap();
+    }
+    return out;
+}
+
+// At most so many samples as the budget of the image allows, but for those that the user asks for.
+template <class T>
+SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions& o, SampleCounts wanted, Team& team) {
+    const int64_t pixels = int64_t(input.camera.width) * input.camera.height;
+    const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, team);
+    SampleCounts n = budget.share(wanted);
+    if (o.surface_samples >= 0) n.surface = wanted.surface;
+    if (o.edge_samples >= 0) n.edge = wanted.edge;
+    return n;
+}
+
 // Measures what the terms sample, draws the samples and contracts them.
 template <int N, class Contraction, class T>
-void add_terms(const BackwardView<T>& view, const Terms& terms, const T* coverage, const Contraction& contraction,
-               Destination& to, BackwardProfile& profile) {
+void add_terms(const BackwardInput<T>& input, const BackwardView<T>& view, const Terms& terms,
+               const Contraction& contraction, Destination& to, BackwardProfile& profile) {
     const GradientOptions& o = view.options;
-    const int64_t pixels = int64_t(view.camera.width) * view.camera.height;
-    Stopwatch watch;
     if (o.pixel_spp) {
-        std::vector<int64_t> all(pixels);
+        std::vector<int64_t> all(int64_t(view.camera.width) * view.camera.height);
         std::iota(all.begin(), all.end(), 0);
         add_pixel_samples<N>(view, {all, o.pixel_spp, o.seed, nullptr}, contraction, to, profile.surface);
         return;
     }
     // Both terms are measured before samples are drawn, since they share a budget.
-    SampleCounts wanted;
-    std::optional<SurfaceMeasure<T>> surface;
-    Array<int8_t> facing(terms.boundary ? view.scene.n_faces : 0);
-    if (terms.interior()) {
-        surface.emplace(measure_surface<N>(view, terms.motion, facing, to));
-        wanted.surface = surface->wanted(o.surface_samples);
-        profile.surface_wanted = surface->pixel_samples() + wanted.surface;
-        profile.measure = watch.lap();
-    }
-    std::optional<Curves<T>> curves;
-    if (terms.boundary) {
-        if (!terms.interior()) facing = facing_of_faces(view);
-        curves.emplace(measure_curves<N>(view, std::move(facing)));
-        wanted.edge = profile.edge_wanted = curves->wanted(o.edge_samples);
-        profile.silhouettes = curves->silhouettes, profile.creases = curves->creases;
-        profile.intersections = curves->intersections;
-        profile.curves = watch.lap();
-    }
-    const SampleBudget budget(coverage, pixels, view.image.spp, view.team);
-    SampleCounts n = budget.share(wanted);
-    if (o.surface_samples >= 0) n.surface = wanted.surface;
-    if (o.edge_samples >= 0) n.edge = wanted.edge;
-    if (surface) add_interior<N>(view, *surface, n.surface, contraction, to, profile);
-    if (curves) {
+    Measured<T> measured = measure_terms<N>(view, terms, to, profile);
+    const SampleCounts n = within_budget(input, o, measured.wanted, view.team);
+    if (measured.surface) add_interior<N>(view, *measured.surface, n.surface, contraction, to, profile);
+    if (Curves<T>* curves = measured.curves ? &*measured.curves : nullptr) {
         add_boundary<N>(view, *curves, n.edge, contraction, to, profile);
         if (!curves->x_bar.empty()) add_places(view, curves->x_bar, to);
     }
 }
 
+// The options for each of several windows: samples in proportion to what each wants, as many as one image would get.
+// Where one wants any it gets some, for it alone shows what it shows.
+template <class T>
+std::vector<GradientOptions> options_of_windows(const BackwardInput<T>& input, const std::vector<Camera>& windows,
+                                                const InImage<T>& in_image, const GradientOptions& o,
+                                                const Terms& terms, Team& team) {
+    std::vector<GradientOptions> options(windows.size(), o);
+    for (size_t k = 1; k < windows.size(); ++k) options[k].seed = hash(o.seed, k, gradient_stream + 1);
+    if (windows.size() == 1 || o.pixel_spp) return options;
+    GradientOptions counted = o;
+    counted.surface_samples = counted.edge_samples = -1;
+    std::vector<SampleCounts> wanted(windows.size());
+    SampleCounts all;
+    for (size_t k = 0; k < windows.size(); ++k)
+        with_view(input, windows[k], in_image, counted, terms, team, [&](const BackwardView<T>& view) {
+            Destination none;
+            BackwardProfile profile;
+            measure_terms<0>(view, terms, none, profile);
+            wanted[k] = {profile.surface_wanted, profile.edge_wanted};
+            all.surface += wanted[k].surface, all.edge += wanted[k].edge;
+        });
+    SampleCounts n = within_budget(input, counted, all, team);
+    if (o.surface_samples >= 0) n.surface = o.surface_samples;
+    if (o.edge_samples >= 0) n.edge = o.edge_samples;
+    const auto share = [](int64_t n, int64_t wanted, int64_t all) {
+        return wanted ? std::max<int64_t>(1, std::llround(double(n) * (double(wanted) / double(all)))) : 0;
+    };
+    for (size_t k = 0; k < windows.size(); ++k) {
+        options[k].surface_samples = share(n.surface, wanted[k].surface, all.surface);
+        options[k].edge_samples = share(n.edge, wanted[k].edge, all.edge);
+    }
+    return options;
+}
+
+// Calls body(view) for each window of the camera.
+template <class T, class Body>
+void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Terms& terms, Team& team, Body body) {
+    const std::vector<Camera> windows = windows_of(input.camera, InImage<T>::margin_of(input.image));
+    const InImage<T> in_image(input, team);
+    const std::vector<GradientOptions> options = options_of_windows(input, windows, in_image, o, terms, team);
+    for (size_t k = 0; k < windows.size(); ++k) with_view(input, windows[k], in_image, options[k], terms, team, body);
+}
+
 // δI = (1 − coverage) δbackground of direction d, for pixels (H, W, D, C).
 template <class T>
-void add_background_tangent(const BackwardInput<T>& input, Directions directions, Team& team, double* image_dot) {
+void add_background_tangent(const BackwardInput<T>& input, const std::vector<Tangents>& directions, Team& team,
+                            double* image_dot) {
     const int C = input.scene.channels;
     const int64_t pixels = int64_t(input.camera.width) * input.camera.height, D = int64_t(directions.size());
     team.each_block(pixels, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t p = first; p < last; ++p)
             for (int64_t d = 0; d < D; ++d)
-                if (const double* dot = directions[d].tangents.background)
+                if (const double* dot = directions[d].background)
                     for (int c = 0; c < C; ++c)
                         image_dot[(p * D + d) * C + c] += (1 - double(input.hits.coverage[p])) *
                                                           dot[(input.scene.background_is_image ? p * C : 0) + c];
@@ -154,7 +234,16 @@ void add_background_tangent(const BackwardInput<T>& input, Directions directions
 
 }  // namespace
 
-void add_world(const Camera& camera, const double* verts, const Array<double>& q_bar, Team& team,
+BackwardProfile& BackwardProfile::operator+=(const BackwardProfile& o) {
+    surface_samples += o.surface_samples, edge_samples += o.edge_samples;
+    surface_wanted += o.surface_wanted, edge_wanted += o.edge_wanted;
+    silhouettes += o.silhouettes, creases += o.creases, intersections += o.intersections;
+    measure += o.measure, curves += o.curves, view += o.view, world += o.world;
+    for (int i = 0; i < 2; ++i) surface[i] += o.surface[i], edge[i] += o.edge[i];
+    return *this;
+}
+
+void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,
                const Gradients& grad) {
     const int64_t V = q_bar.size() / 3, blocks = Team::blocks(V);
     std::vector<double> sum(grad.world_to_camera ? 12 * blocks : 0, 0.0);
@@ -163,7 +252,7 @@ void add_world(const Camera& camera, const double* verts, const Array<double>& q
             const double *q = q_bar.data() + 3 * v, *p = verts + 3 * v;
             if (q[0] == 0 && q[1] == 0 && q[2] == 0) continue;
             if (grad.verts) {
-                const Vec3 p_bar = transposed_times(camera.R, {q[0], q[1], q[2]});
+                const Vec3 p_bar = transposed_times(window.R, {q[0], q[1], q[2]});
                 grad.verts[3 * v] += p_bar.x, grad.verts[3 * v + 1] += p_bar.y, grad.verts[3 * v + 2] += p_bar.z;
             }
             if (grad.world_to_camera)
@@ -175,7 +264,12 @@ void add_world(const Camera& camera, const double* verts, const Array<double>& q
     });
     if (grad.world_to_camera)
         for (int64_t k = 0; k < blocks; ++k)
-            for (int i = 0; i < 12; ++i) grad.world_to_camera[i] += sum[12 * k + i];
+            for (int j = 0; j < 4; ++j) {
+                const double* column = sum.data() + 12 * k + j;
+                const Vec3 m = transposed_times(window.turn, {column[0], column[4], column[8]});
+                double* to = grad.world_to_camera + j;
+                to[0] += m.x, to[4] += m.y, to[8] += m.z;
+            }
 }
 
 template <class T>
@@ -188,48 +282,45 @@ BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOpt
         add_background(scene, int64_t(camera.width) * camera.height, adjoint, hits.coverage, team, grad.background);
     const Terms terms = terms_of(grad, o);
     if (!terms.any()) return profile;
-    Array<double> q_bar{0};
-    Destination to;
-    with_view(input, o, terms, team, [&](const BackwardView<T>& view) {
-        profile.view = watch.lap();
-        q_bar = zeros(grad.geometry() ? 3 * scene.n_verts : 0, team);
+    each_view(input, o, terms, team, [&](const BackwardView<T>& view) {
+        BackwardProfile own{.view = watch.lap()};
+        Array<double> q_bar = zeros(grad.geometry() ? 3 * scene.n_verts : 0, team);
+        Destination to;
         to.want_k = grad.K || grad.distortion;
         to.q = grad.geometry() ? q_bar.data() : nullptr;
         to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels;
         to.vertex_attributes = grad.vertex_attributes, to.face_attributes = grad.face_attributes;
-        dispatch_channels(scene.channels, scene.channels > scene.radiance, [&]<int N>() {
-            add_terms<N>(view, terms, hits.coverage, Reverse{terms.motion}, to, profile);
-        });
+        dispatch_channels(scene.channels, scene.channels > scene.radiance,
+                          [&]<int N>() { add_terms<N>(input, view, terms, Reverse{terms.motion}, to, own); });
+        watch.lap();
+        if (grad.geometry()) add_world(view.camera, scene.verts, q_bar, team, grad);
+        add_intrinsics(view.camera, to.k, grad.K, grad.distortion);
+        own.world = watch.lap();
+        profile += own;
     });
-    watch.lap();
-    if (grad.geometry()) add_world(camera, scene.verts, q_bar, team, grad);
-    if (grad.K)
-        for (int i = 0; i < 6; ++i) grad.K[i] += to.k.k[i];
-    if (grad.distortion)
-        for (int i = 0; i < most_coefficients; ++i) grad.distortion[i] += to.k.distortion[i];
-    profile.world = watch.lap();
     return profile;
 }
 
 template <class T>
 void render_tangents(const BackwardInput<T>& input, GradientOptions o, Team& team,
                      const std::vector<Tangents>& tangents, double* image_dot) {
-    const auto& [scene, camera, geometry, image, adjoint, hits] = input;
-    std::vector<Direction> directions;
+    const SceneView<T>& scene = input.scene;
     Terms terms{};
     for (const Tangents& t : tangents) {
-        directions.push_back(make_direction(t, camera, scene.verts, scene.n_verts, team));
         const Terms own = terms_of(t, o);
         terms = {terms.motion || own.motion, terms.appearance || own.appearance, terms.boundary || own.boundary};
     }
-    add_background_tangent(input, directions, team, image_dot);
+    add_background_tangent(input, tangents, team, image_dot);
     if (!terms.any()) return;
     o.controls = false;
     Destination to;
-    to.pixels = image_dot, to.pixel_width = int(directions.size()) * scene.channels;
+    to.pixels = image_dot, to.pixel_width = int(tangents.size()) * scene.channels;
     BackwardProfile profile;
-    with_view(input, o, terms, team, [&](const BackwardView<T>& view) {
-        add_terms<0>(view, terms, hits.coverage, Forward{directions}, to, profile);
+    each_view(input, o, terms, team, [&](const BackwardView<T>& view) {
+        std::vector<Direction> directions;
+        for (const Tangents& t : tangents)
+            directions.push_back(make_direction(t, view.camera, scene.verts, scene.n_verts, team));
+        add_terms<0>(input, view, terms, Forward{directions}, to, profile);
     });
 }
 
@@ -241,9 +332,8 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, Te
     Destination to;
     to.pixels = gradient, to.pixel_width = 2;
     BackwardProfile profile;
-    with_view(input, o, terms, team, [&](const BackwardView<T>& view) {
-        add_terms<0>(view, terms, input.hits.coverage, Screen{}, to, profile);
-    });
+    each_view(input, o, terms, team,
+              [&](const BackwardView<T>& view) { add_terms<0>(input, view, terms, Screen{}, to, profile); });
 }
 
 template <class T>
@@ -255,9 +345,8 @@ Records record_samples(const BackwardInput<T>& input, GradientOptions o, Team& t
     Destination to;
     to.records = &records;
     BackwardProfile profile;
-    with_view(input, o, terms, team, [&](const BackwardView<T>& view) {
-        add_terms<0>(view, terms, input.hits.coverage, Record{}, to, profile);
-    });
+    each_view(input, o, terms, team,
+              [&](const BackwardView<T>& view) { add_terms<0>(input, view, terms, Record{}, to, profile); });
     return records;
 }
 

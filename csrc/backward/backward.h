@@ -31,6 +31,9 @@ struct BackwardProfile {
     double measure = 0, curves = 0;                           // triangles and curves laid end to end
     double surface[2] = {0, 0}, edge[2] = {0, 0};             // samples with their rays; adding what they found
     double world = 0;                                         // from camera coordinates to the user's arrays
+
+    // Of another window of the camera.
+    BackwardProfile& operator+=(const BackwardProfile& o);
 };
 
 // What a gradient is taken of.
@@ -69,8 +72,8 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions optio
 template <class T>
 Records record_samples(const BackwardInput<T>& input, GradientOptions options, Team& team);
 
-// q = R p + t, backwards: p̄ = Rᵀ q̄, R̄ = Σ q̄ pᵀ, t̄ = Σ q̄, for q_bar (V, 3).
-void add_world(const Camera& camera, const double* verts, const Array<double>& q_bar, Team& team,
+// q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a window.
+void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,
                const Gradients& grad);
 
 }  // namespace edgegrad

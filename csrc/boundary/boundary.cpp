@@ -33,8 +33,8 @@ ScreenBoundary<T> contract(const BackwardView<T>& view, const Screen&, ChunkGrad
 }
 
 template <int N, class T>
-RecordBoundary contract(const BackwardView<T>&, const Record&, ChunkGrad& grad) {
-    return RecordBoundary(grad.records.curves);
+RecordBoundary contract(const BackwardView<T>& view, const Record&, ChunkGrad& grad) {
+    return {view.camera, grad.records.curves};
 }
 
 // Samples of one source, in batches of rays.

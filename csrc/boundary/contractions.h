@@ -135,7 +135,9 @@ class ScreenBoundary {
 
 class RecordBoundary {
    public:
-    explicit RecordBoundary(CurveRecords& records) : records_(records) { form_.q.prepare(3, 1); }
+    RecordBoundary(const Camera& camera, CurveRecords& records) : camera_(camera), records_(records) {
+        form_.q.prepare(3, 1);
+    }
 
     bool wants(int, Vec2) const { return true; }
 
@@ -171,16 +173,18 @@ class RecordBoundary {
             append(records_.b, {p.b.u, p.b.v});
             records_.factor.push_back(factor[k]);
         }
-        records_.by_k.insert(records_.by_k.end(), form_.k.k, form_.k.k + 6);
-        records_.by_k.insert(records_.by_k.end(), form_.k.distortion, form_.k.distortion + most_coefficients);
+        append_intrinsics(records_.by_k, camera_, form_.k);
         form_.q.each([&](int64_t vertex, const double* by_q) {
             if (by_q[0] == 0 && by_q[1] == 0 && by_q[2] == 0) return;
             records_.row_of.push_back(sample_index);
             records_.vertex.push_back(int32_t(vertex));
-            records_.by_q.insert(records_.by_q.end(), by_q, by_q + 3);
+            // From the frame of the window to that of the camera.
+            const Vec3 q = transposed_times(camera_.turn, {by_q[0], by_q[1], by_q[2]});
+            append(records_.by_q, {q.x, q.y, q.z});
         });
     }
 
+    const Camera& camera_;
     CurveRecords& records_;
     ChunkGrad form_;
 };

@@ -158,7 +158,7 @@ class MeasuredEdges {
     };
 
     void measure(const Curve& c, const Jump& jump, double samples) {
-        const double pixels = c.length * jump.size * samples;
+        const double pixels = c.length * view_.camera.stretch(c.low(), c.high()) * jump.size * samples;
         curves[jump.curve].measure = pixels * jump.importance;
         found.pixels += pixels;
     }
@@ -230,7 +230,8 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
             const double importance = view.importance.mean(low, high);
             if (!(importance > 0)) continue;
             const int64_t hiding = hiding_pixels(view.occlusion, low, high, c.nearest_depth());
-            const double pixels = c.length * (hiding ? view.occlusion.factor(occluded, hiding, view.image.spp) : 1);
+            const double pixels = c.length * view.camera.stretch(c.low(), c.high()) *
+                                  (hiding ? view.occlusion.factor(occluded, hiding, view.image.spp) : 1);
             found[k].pixels += pixels;
             parts[k].push_back({pixels * importance, int32_t(i)});
         }

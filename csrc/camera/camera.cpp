@@ -51,9 +51,32 @@ LensView Camera::view_through_lens() const {
     return view;
 }
 
+namespace {
+
+// Of a camera without skew.
+Box2 normalised_box(const Camera& c, Vec2 low, Vec2 high) {
+    const Vec2 a = normalised(c, low), b = normalised(c, high);
+    return {{std::min(a.x, b.x), std::min(a.y, b.y)}, {std::max(a.x, b.x), std::max(a.y, b.y)}};
+}
+
+}  // namespace
+
+double Camera::stretch(Vec2 low, Vec2 high) const {
+    if (!lens_view.uneven) return 1;
+    return std::get_if<Equirectangular>(&lens)->stretch(normalised_box(*this, low, high));
+}
+
+bool Camera::is_uneven(Vec2 low, Vec2 high) const {
+    return lens_view.uneven && std::get_if<Equirectangular>(&lens)->is_uneven(normalised_box(*this, low, high));
+}
+
 // By the mean value theorem, from a place of the box, or the nearest that is seen at all.
 std::pair<Vec2, Vec2> Camera::image_box(Vec2 low, Vec2 high) const {
     if (is_straight()) return {low, high};
+    if (const auto* panorama = std::get_if<Equirectangular>(&lens)) {
+        const Box2 box = panorama->image_box(normalised_box(*this, low, high));
+        return {box.low, box.high};
+    }
     Vec2 n = normalised(*this, 0.5 * (low + high));
     const double radius = length(n), fold = lens_view.disc.fold * (1 - 1e-9);
     if (radius > fold) n = (fold / radius) * n;

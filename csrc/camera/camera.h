@@ -6,6 +6,7 @@
 // samples are done.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <limits>
@@ -30,15 +31,20 @@ struct IntrinsicsGrad {
 };
 
 // What is visible through a lens that bends: a disc, and the box of the straight image, px, in which all lies that a
-// pixel filter reaches; and how far bending moves places there, at most: |∂x/∂u| entry by entry.
+// pixel filter reaches; and how far bending moves places there, at most: |∂x/∂u| entry by entry. Of a window
+// (windows.h): which borders of its box, in the order of ViewVolume, belong to its neighbours, and whether it shows a
+// pole.
 struct LensView {
     LensDisc disc;
     bool folds = false;  // whether the image reaches beyond the disc
     Vec2 low, high;
     Mat2 most = {1, 0, 0, 1};
+    bool open[4] = {};
+    bool uneven = false;
 };
 
 struct Camera {
+    Mat3 turn{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};  // from the frame of world_to_camera to that of this window
     Mat3 R;
     Vec3 t;
     double k[6];  // the upper two rows of K: x = k0 n.x + k1 n.y + k2, y = k3 n.x + k4 n.y + k5
@@ -59,13 +65,20 @@ struct Camera {
             R.row[i] = {world_to_camera[4 * i], world_to_camera[4 * i + 1], world_to_camera[4 * i + 2]};
         // An orthographic view is the same from any distance; from none, depths are rounded least.
         t = {world_to_camera[3], world_to_camera[7], perspective ? world_to_camera[11] : 0.0};
-        for (int i = 0; i < 6; ++i) k[i] = K[i];
+        std::copy(K, K + 6, k);
+        const auto* panorama = std::get_if<Equirectangular>(&lens);
+        if (panorama) std::fill(k, k + 6, 0.0), k[0] = panorama->scale().x, k[4] = panorama->scale().y;
+        set_inverses();
+        if (!is_straight() && !panorama) lens_view = view_through_lens();
+    }
+
+    // Of R and k, where these are set.
+    void set_inverses() {
         R_inverse = inverse(R);
         pixels_per_unit = std::fabs(k[0]) + std::fabs(k[1]) + std::fabs(k[3]) + std::fabs(k[4]);
         k_det = k[0] * k[4] - k[1] * k[3];
         k_inverse[0] = k[4] / k_det, k_inverse[1] = -k[1] / k_det;
         k_inverse[2] = -k[3] / k_det, k_inverse[3] = k[0] / k_det;
-        if (!is_straight()) lens_view = view_through_lens();
     }
 
     // Whether straight edges are straight in the image.
@@ -139,6 +152,23 @@ struct Camera {
 
     // A box of the image in which all of a box of the straight image is seen.
     std::pair<Vec2, Vec2> image_box(Vec2 low, Vec2 high) const;
+
+    // Of a box of the straight image: how much longer what lies there may be in the image, where that is far from one;
+    // and whether points uniform over it would be of little use, so unevenly do areas grow.
+    double stretch(Vec2 low, Vec2 high) const;
+    bool is_uneven(Vec2 low, Vec2 high) const;
+
+    // Whether a window may show something within `reach` px of x.
+    bool may_show(Vec2 x, double reach) const {
+        const auto* panorama = std::get_if<Equirectangular>(&lens);
+        return !panorama || panorama->may_show(x, reach);
+    }
+
+    // No point of a face has a greater depth, in no window that shows it.
+    double greatest_depth(const Vec3 q[3]) const {
+        if (!std::holds_alternative<Equirectangular>(lens)) return std::max({q[0].z, q[1].z, q[2].z});
+        return std::max({length(q[0]), length(q[1]), length(q[2])});
+    }
 
    private:
     LensView view_through_lens() const;

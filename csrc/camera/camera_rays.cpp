@@ -22,7 +22,10 @@ double CameraFrame::error(Vec3 p) const {
     return 4 * std::numeric_limits<float>::epsilon() * (length(p - frame_.centre) + start);
 }
 
-CameraRays::CameraRays(const CameraFrame& frame, int width) : RayBatch(width), camera_(frame) {
+CameraRays::CameraRays(const CameraFrame& frame, int width) : RayBatch(width) { look_through(frame); }
+
+void CameraRays::look_through(const CameraFrame& frame) {
+    camera_ = &frame;
     std::visit(
         [&](auto& packets) {
             for (auto& p : packets) {
@@ -37,17 +40,18 @@ CameraRays::CameraRays(const CameraFrame& frame, int width) : RayBatch(width), c
 // Always inlined, so that it is compiled for each of the processors that prepare() below is for.
 template <int W>
 [[gnu::always_inline]] inline void CameraRays::prepare(Packets<W>& packets) const {
-    const Vec3 X = camera_.axis_x_, Y = camera_.axis_y_, Z = camera_.axis_z_;
+    const CameraFrame& camera = *camera_;
+    const Vec3 X = camera.axis_x_, Y = camera.axis_y_, Z = camera.axis_z_;
     for (int k = 0; k < count; k += W) {
         RayPacket<W>& p = packets[k / W];
         const double *x = n_x + k, *y = n_y + k;
         EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.t_far[i] = std::numeric_limits<float>::infinity();
         EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.geometry[i] = RayPacket<W>::nothing;
         // Where a lens shows nothing, there is no ray: one that ends before it starts.
-        if (!camera_.straight_)
+        if (!camera.straight_)
             for (int i = 0; i < W; ++i)
                 if (!std::isfinite(x[i])) p.t_far[i] = -1;
-        if (!camera_.far_) {
+        if (!camera.far_) {
             EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.direction_x[i] = float(x[i] * X.x + y[i] * Y.x + Z.x);
             EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.direction_y[i] = float(x[i] * X.y + y[i] * Y.y + Z.y);
             EDGEGRAD_ROLLED for (int i = 0; i < W; ++i) p.direction_z[i] = float(x[i] * X.z + y[i] * Y.z + Z.z);
@@ -55,13 +59,13 @@ template <int W>
         }
         for (int i = 0; i < W; ++i) {
             const Vec3 across = x[i] * X + y[i] * Y;
-            Vec3 o = camera_.eye_, d = Z;
-            if (camera_.perspective_) d += across;
-            else o += (1 / camera_.frame_.unit) * across;
+            Vec3 o = camera.eye_, d = Z;
+            if (camera.perspective_) d += across;
+            else o += (1 / camera.frame_.unit) * across;
             // Float positions of a far origin would be coarser than the scene, so the ray starts just before it,
             // computed here in double; never behind the eye.
-            const double start = camera_.frame_.start(o, d);
-            o += (camera_.perspective_ && start < 0 ? 0 : start) * d;
+            const double start = camera.frame_.start(o, d);
+            o += (camera.perspective_ && start < 0 ? 0 : start) * d;
             p.origin_x[i] = float(o.x), p.origin_y[i] = float(o.y), p.origin_z[i] = float(o.z);
             p.direction_x[i] = float(d.x), p.direction_y[i] = float(d.y), p.direction_z[i] = float(d.z);
         }

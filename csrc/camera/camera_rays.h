@@ -37,6 +37,9 @@ class CameraRays : public RayBatch {
    public:
     explicit CameraRays(const CameraFrame& frame, int width = packet_width());
 
+    // From now on.
+    void look_through(const CameraFrame& frame);
+
     // Normalised image coordinates; the caller fills them from `count` on.
     double n_x[size] = {}, n_y[size] = {};
 
@@ -49,7 +52,7 @@ class CameraRays : public RayBatch {
     template <int W>
     void prepare(Packets<W>& packets) const;
 
-    const CameraFrame& camera_;
+    const CameraFrame* camera_;
 };
 
 template <class Meets>

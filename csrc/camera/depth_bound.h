@@ -14,7 +14,7 @@ namespace edgegrad {
 class DepthBound {
    public:
     void set(const Camera& camera, const Vec3 q[3], const FaceMap& map) {
-        const auto [low, high] = std::minmax({q[0].z, q[1].z, q[2].z});
+        const double low = std::min({q[0].z, q[1].z, q[2].z}), high = camera.greatest_depth(q);
         camera_ = &camera, farthest_ = high;
         // A face whose depth changes by no more than two pixels' width needs no plane: its corners will do. Through a
         // lens that bends, a pixel is no box in n.

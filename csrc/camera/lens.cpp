@@ -8,7 +8,7 @@ namespace edgegrad {
 namespace {
 
 // Least det ∂m/∂n on the circle |n| = r; what is not a number counts as a fold.
-template <Lens L>
+template <RadialLens L>
 double least_area_scale(const L& lens, double r) {
     constexpr int angles = 16;
     double least = std::numeric_limits<double>::infinity();
@@ -21,7 +21,7 @@ double least_area_scale(const L& lens, double r) {
 }
 
 // r in [0, fold] with lens.radius(r) = m, or the fold: Newton's steps, with bisection where they leave the bracket.
-template <Lens L>
+template <RadialLens L>
 double straight_radius(const L& lens, double fold, double m) {
     double low = 0, high = fold, r = std::min(m, fold);
     for (int i = 0; i < 64; ++i) {
@@ -36,7 +36,7 @@ double straight_radius(const L& lens, double fold, double m) {
 }
 
 // Newton's steps from the solution without what is not radial.
-template <Lens L>
+template <RadialLens L>
 std::optional<Vec2> straighten(const L& lens, const LensDisc& disc, Vec2 m) {
     const double size = length(m), fold = disc.fold;
     if (size > disc.reach) return {};
@@ -64,7 +64,7 @@ struct Points {
 
 // A step n + J⁻¹ (m − bend(n)) of all, with J where the pixel's middle is: over a pixel it changes by a hundredth or
 // less, and so much smaller is each error than the last. Returns the greatest before the step.
-template <Lens L>
+template <RadialLens L>
 [[gnu::always_inline]] inline double chord_step(const L lens, const Mat2 inverse, Points& p) {
     for (int i = 0; i < p.count; ++i) {
         const Vec2 m = lens.bend({p.n_x[i], p.n_y[i]}), error{p.m_x[i] - m.x, p.m_y[i] - m.y}, step = inverse * error;
@@ -84,7 +84,7 @@ EDGEGRAD_VECTORIZED double chord_step(const AnyLens& lens, Mat2 inverse, Points&
 namespace {
 
 double radius_of_fold(const AnyLens& lens) {
-    return with_lens(lens, [](const auto& l) {
+    return with_radial_lens(lens, [](const auto& l) {
         // Equal angles, and below the first of these a geometric row: a telephoto lens may fold at a thousandth.
         constexpr int radii = 256, small_radii = 96;
         const double step = std::atan(greatest_radius) / radii;
@@ -115,19 +115,29 @@ LensDisc disc_of(const AnyLens& lens) {
     for (int i = 0; i < points; ++i) {
         const double a = 2 * M_PI * i / points;
         const Vec2 n{disc.fold * std::cos(a), disc.fold * std::sin(a)};
-        disc.reach = std::max(disc.reach, 1.01 * length(with_lens(lens, [&](const auto& l) { return l.bend(n); })));
+        disc.reach =
+            std::max(disc.reach, 1.01 * length(with_radial_lens(lens, [&](const auto& l) { return l.bend(n); })));
     }
     return disc;
 }
 
 std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m) {
-    return with_lens(lens, [&](const auto& l) { return straighten(l, disc, m); });
+    if (const auto* panorama = std::get_if<Equirectangular>(&lens)) return panorama->straighten(m);
+    return with_radial_lens(lens, [&](const auto& l) { return straighten(l, disc, m); });
 }
 
 void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, double* x, double* y) {
+    constexpr double nan = std::numeric_limits<double>::quiet_NaN();
+    if (const auto* panorama = std::get_if<Equirectangular>(&lens)) {
+        for (int i = 0; i < k; ++i) {
+            const Vec2 n = panorama->straighten({x[i], y[i]}).value_or(Vec2{nan, nan});
+            x[i] = n.x, y[i] = n.y;
+        }
+        return;
+    }
     const std::optional<Vec2> n0 = straighten(lens, disc, m0);
     const Mat2 inverse =
-        edgegrad::inverse(with_lens(lens, [&](const auto& l) { return l.jacobian(n0.value_or(Vec2{})); }));
+        edgegrad::inverse(with_radial_lens(lens, [&](const auto& l) { return l.jacobian(n0.value_or(Vec2{})); }));
     // The last error but for a hundredth is taken away.
     constexpr double small = 1e-10;
     constexpr int most_steps = 12;

@@ -10,6 +10,7 @@
 #include <variant>
 
 #include "camera/brown_conrady.h"
+#include "camera/equirectangular.h"
 #include "camera/fisheye.h"
 #include "core/math.h"
 
@@ -19,30 +20,41 @@ namespace edgegrad {
 struct StraightLens {};
 
 template <class L>
-concept Lens = requires(const L lens, Vec2 n, double r, Vec2& n_bar, double* coefficients_bar) {
+concept Lens = requires(const L lens, Vec2 n, Vec2& n_bar, double* coefficients_bar) {
     { L::coefficients } -> std::convertible_to<int>;
     { lens.bend(n) } -> std::same_as<Vec2>;
     { lens.jacobian(n) } -> std::same_as<Mat2>;  // ∂m/∂n
     lens.bend_vjp(n, n, n_bar, coefficients_bar);
-    // |m| at |n| = r but for what is not radial, and its derivative.
+};
+static_assert(Lens<Equirectangular>);
+
+// One that is radial, nearly: |m| at |n| = r but for what is not, and its derivative.
+template <class L>
+concept RadialLens = Lens<L> && requires(const L lens, double r) {
     { lens.radius(r) } -> std::same_as<double>;
     { lens.radius_slope(r) } -> std::same_as<double>;
 };
-static_assert(Lens<BrownConrady> && Lens<Fisheye>);
+static_assert(RadialLens<BrownConrady> && RadialLens<Fisheye>);
 
 // A new lens is a file of its own, and a place in this list.
-using AnyLens = std::variant<StraightLens, BrownConrady, Fisheye>;
+using AnyLens = std::variant<StraightLens, BrownConrady, Fisheye, Equirectangular>;
 constexpr int most_coefficients = 8;
-static_assert(BrownConrady::coefficients <= most_coefficients && Fisheye::coefficients <= most_coefficients);
+static_assert(BrownConrady::coefficients <= most_coefficients && Fisheye::coefficients <= most_coefficients &&
+              Equirectangular::coefficients <= most_coefficients);
 
-// f(lens), of one that is not straight.
+// f(lens), of one that is nearly radial; of any that is not straight.
 template <class F>
-auto with_lens(const AnyLens& lens, F f) {
+auto with_radial_lens(const AnyLens& lens, F f) {
     if (const auto* l = std::get_if<BrownConrady>(&lens)) return f(*l);
     return f(*std::get_if<Fisheye>(&lens));
 }
+template <class F>
+auto with_lens(const AnyLens& lens, F f) {
+    if (const auto* l = std::get_if<Equirectangular>(&lens)) return f(*l);
+    return with_radial_lens(lens, f);
+}
 
-// The disc in which every m has one n: what lies beyond is not seen.
+// The disc in which every m of a radial lens has one n: what lies beyond is not seen.
 struct LensDisc {
     double fold = std::numeric_limits<double>::infinity();  // the least |n| with det ∂m/∂n ≤ 0; or greatest_radius
     double reach = fold;                                    // no |m| from within is greater

@@ -27,12 +27,12 @@ EDGEGRAD_VECTORIZED void view_lanes(VertexLanes& l, const Camera& camera, const 
     for (int i = 0; i < lanes; ++i) l.outcode[i] = l.q[2][i] <= eye ? 16 : 0;
     for (int k = 0; k < 4; ++k) {
         const Vec3 n = volume.normal[k];
-        const double offset = volume.offset[k];
+        const double offset = volume.offset[k], least = volume.least[k];
         const int32_t bit = 1 << k;
         EDGEGRAD_ROLLED
         for (int i = 0; i < lanes; ++i) {
             const double distance = (n.x * l.q[0][i] + n.y * l.q[1][i] + n.z * l.q[2][i]) + offset;
-            l.outcode[i] |= distance < 0 ? bit : 0;
+            l.outcode[i] |= distance < least ? bit : 0;
         }
     }
     const double *k = camera.k, flat = camera.perspective ? 0 : 1;

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 
 #include "camera/camera.h"
 
@@ -15,7 +16,8 @@ namespace edgegrad {
 struct ViewVolume {
     Vec3 normal[4];
     double offset[4];
-    Vec2 low, high;  // of the rectangle
+    Vec2 low, high;   // of the rectangle
+    double least[4];  // of the distance to each plane: zero, or what is greater, where the plane belongs to a neighbour
 
     ViewVolume(const Camera& c, double margin) : low{-margin, -margin}, high{c.width + margin, c.height + margin} {
         if (!c.is_straight()) low = c.lens_view.low, high = c.lens_view.high;
@@ -25,6 +27,7 @@ struct ViewVolume {
             const double sign = i % 2 ? -1.0 : 1.0, constant = sign * (row[2] - bound[i]);
             normal[i] = {sign * row[0], sign * row[1], c.perspective ? constant : 0.0};
             offset[i] = c.perspective ? 0.0 : constant;
+            least[i] = c.lens_view.open[i] ? std::numeric_limits<double>::denorm_min() : 0.0;
         }
     }
 
@@ -33,7 +36,7 @@ struct ViewVolume {
     // Bit i set: outside plane i.
     uint8_t outcode(Vec3 q) const {
         uint8_t code = 0;
-        for (int i = 0; i < 4; ++i) code |= (distance(i, q) < 0) << i;
+        for (int i = 0; i < 4; ++i) code |= (distance(i, q) < least[i]) << i;
         return code;
     }
 
@@ -45,7 +48,7 @@ struct ViewVolume {
         t0 = 0, t1 = 1;
         for (int i = 0; i < 4; ++i) {
             const double da = distance(i, a), db = distance(i, b);
-            if (da < 0 && db < 0) return false;
+            if (da < least[i] && db < least[i]) return false;
             if (da < 0) t0 = std::fmax(t0, da / (da - db));
             if (db < 0) t1 = std::fmin(t1, da / (da - db));
         }

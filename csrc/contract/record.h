@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "camera/camera.h"
+#include "camera/windows.h"
 #include "core/math.h"
 
 namespace edgegrad {
@@ -20,10 +21,11 @@ constexpr int intrinsics_width = 6 + most_coefficients;  // K in rows, then the 
 // Samples inside faces. Arrays side by side, one entry or row for each.
 struct SurfaceRecords {
     std::vector<int32_t> face;
-    std::vector<double> x;       // (S, 2) pixel position
-    std::vector<double> n;       // (S, 2) normalised image coordinates
-    std::vector<double> n_by_k;  // (S, 2, 14) ∂n/∂intrinsics at fixed x
-    std::vector<double> weight;  // px² that it stands for
+    std::vector<double> x;  // (S, 2) pixel position
+    // (S, 3) where the ray goes, in camera coordinates; of an orthographic view, the place that it goes through.
+    std::vector<double> along;
+    std::vector<double> along_by_k;  // (S, 3, 14) ∂along/∂intrinsics at fixed x
+    std::vector<double> weight;      // px² that it stands for
 
     void add(const SurfaceRecords& o);
 };
@@ -54,8 +56,16 @@ void append(std::vector<T>& to, const std::vector<T>& from) {
     to.insert(to.end(), from.begin(), from.end());
 }
 
+// A cotangent of a window's intrinsics as one of the camera's.
+inline void append_intrinsics(std::vector<double>& to, const Camera& window, const IntrinsicsGrad& bar) {
+    double of_camera[intrinsics_width] = {};
+    add_intrinsics(window, bar, of_camera, of_camera + 6);
+    to.insert(to.end(), of_camera, of_camera + intrinsics_width);
+}
+
 inline void SurfaceRecords::add(const SurfaceRecords& o) {
-    append(face, o.face), append(x, o.x), append(n, o.n), append(n_by_k, o.n_by_k), append(weight, o.weight);
+    append(face, o.face), append(x, o.x), append(along, o.along), append(along_by_k, o.along_by_k),
+        append(weight, o.weight);
 }
 
 inline void CurveRecords::add(const CurveRecords& o) {

@@ -2,40 +2,42 @@
 
 #include <algorithm>
 
-#include "camera/vertices.h"
-#include "forward/forward.h"
+#include "forward/side.h"
 
 namespace edgegrad {
 
 template <class T>
 void faces_at_centers(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, Team& team,
                       int32_t* face) {
-    const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
-    const CameraFrame frame(caster, camera);
-    // A face whose plane holds the eye is not seen; the image looks through it, too.
-    const auto is_seen = [&](int32_t f) {
-        const int32_t* v = scene.faces + 3 * int64_t(f);
-        const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
-        return !camera.passes_through_eye(corner);
-    };
-    team.each(camera.height, [&](int64_t y) {
-        team.check();
-        CameraRays rays(frame);
-        for (int x = 0; x < camera.width; x += RayBatch::size) {
-            rays.count = std::min(RayBatch::size, camera.width - x);
-            for (int i = 0; i < rays.count; ++i) {
-                rays.n_x[i] = rays.n_y[i] = 0.5;
-                place_in_pixel(camera, Filter(FilterKind::box), x + i, int(y), 1, rays.n_x + i, rays.n_y + i);
-            }
-            rays.prepare();
-            caster.cast(rays);
-            if (std::any_of(rays.face, rays.face + rays.count, [&](int32_t f) { return f >= 0 && !is_seen(f); })) {
+    const ImageOptions one{.spp = 1, .filter = Filter(FilterKind::box), .seed = 0};
+    std::fill(face, face + int64_t(camera.width) * camera.height, -1);
+    for (const Side& side : make_sides(camera, scene.verts, scene.n_verts, caster, one, team)) {
+        // A face whose plane holds the eye is not seen; the image looks through it, too.
+        const auto is_seen = [&](int32_t f) {
+            const int32_t* v = scene.faces + 3 * int64_t(f);
+            const Vec3 corner[3] = {side.q[v[0]], side.q[v[1]], side.q[v[2]]};
+            return !side.camera.passes_through_eye(corner);
+        };
+        team.each(camera.height, [&](int64_t y) {
+            team.check();
+            CameraRays rays(side.frame);
+            for (int x = 0; x < camera.width; x += RayBatch::size) {
+                rays.count = std::min(RayBatch::size, camera.width - x);
+                for (int i = 0; i < rays.count; ++i) {
+                    rays.n_x[i] = rays.n_y[i] = 0.5;
+                    place_in_pixel(side.camera, one.filter, x + i, int(y), 1, rays.n_x + i, rays.n_y + i);
+                }
                 rays.prepare();
-                caster.cast_through(rays, nullptr, is_seen);
+                caster.cast(rays);
+                if (std::any_of(rays.face, rays.face + rays.count, [&](int32_t f) { return f >= 0 && !is_seen(f); })) {
+                    rays.prepare();
+                    caster.cast_through(rays, nullptr, is_seen);
+                }
+                for (int i = 0; i < rays.count; ++i)
+                    if (rays.face[i] >= 0) face[y * camera.width + x + i] = rays.face[i];
             }
-            std::copy(rays.face, rays.face + rays.count, face + y * camera.width + x);
-        }
-    });
+        });
+    }
 }
 
 template void faces_at_centers(const SceneView<float>&, const Camera&, const RayCaster&, Team&, int32_t*);

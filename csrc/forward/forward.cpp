@@ -6,14 +6,17 @@
 #include <atomic>
 #include <bit>
 #include <cmath>
+#include <deque>
 #include <limits>
 #include <numeric>
 #include <vector>
 
 #include "camera/depth_bound.h"
 #include "camera/vertices.h"
+#include "camera/windows.h"
 #include "core/channels.h"
 #include "core/sampler.h"
+#include "forward/side.h"
 #include "shading/shade.h"
 
 namespace edgegrad {
@@ -75,23 +78,20 @@ constexpr int tile = 16;
 template <int N, class T>
 class PixelRow {
    public:
-    PixelRow(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const CameraFrame& frame,
-             const ImageOptions& options, Team& team, const Array<Vec3>& q, T* image, const HitBuffers<T>& out)
+    PixelRow(const SceneView<T>& scene, const std::deque<Side>& sides, const RayCaster& caster,
+             const ImageOptions& options, Team& team, T* image, const HitBuffers<T>& out)
         : scene_(scene),
-          camera_(camera),
+          sides_(sides),
+          side_(&sides.front()),
           caster_(caster),
-          frame_(frame),
-          pixel_rays_(camera, options),
           spp_(options.spp),
+          radius_(options.filter.radius()),
           team_(team),
-          q_(q),
           image_(image),
           out_(out),
           C_(channels_of<N>(scene)),
           direction_(scene.attributes.unit < 0 ? -1 : scene.radiance + direction_of(scene.attributes)),
-          reach_{options.filter.radius() * (std::fabs(camera.k_inverse[0]) + std::fabs(camera.k_inverse[1])),
-                 options.filter.radius() * (std::fabs(camera.k_inverse[2]) + std::fabs(camera.k_inverse[3]))},
-          rays_(frame),
+          rays_(side_->frame),
           sum_(tile * C_),
           radiance_(C_) {}
 
@@ -102,17 +102,9 @@ class PixelRow {
         std::fill(last_, last_ + tile, -1);
         std::fill(farthest_, farthest_ + tile, -std::numeric_limits<double>::infinity());
         x0_ = x0, y_ = y;
-        for (int x = x0; x < x1; ++x)
-            for (int done = 0; done < spp_;) {
-                const int n = std::min(spp_ - done, RayBatch::size - rays_.count);
-                pixel_rays_.append(x, y, done, n, rays_);
-                part_[parts_++] = {x - x0, n};
-                done += n;
-                if (rays_.count == RayBatch::size) trace();
-            }
-        trace();
+        for (const Side& side : sides_) add_side(side, x0, x1);
         for (int x = 0; x < x1 - x0; ++x) {
-            const int64_t pixel = int64_t(y) * camera_.width + x0 + x;
+            const int64_t pixel = pixel_at(x0 + x, y);
             const double share = double(hits_[x]) / spp_;
             const T* behind = scene_.background_at(pixel);
             for (int c = 0; c < C_; ++c) image_[pixel * C_ + c] = T(sum_[x * C_ + c] / spp_ + (1 - share) * behind[c]);
@@ -125,7 +117,7 @@ class PixelRow {
     // The same where no ray can hit anything.
     void leave_out(int x0, int x1, int y) {
         for (int x = x0; x < x1; ++x) {
-            const int64_t pixel = int64_t(y) * camera_.width + x;
+            const int64_t pixel = pixel_at(x, y);
             const T* behind = scene_.background_at(pixel);
             std::copy(behind, behind + C_, image_ + pixel * C_);
             out_.coverage[pixel] = 0;
@@ -145,6 +137,29 @@ class PixelRow {
         AffineRadiance<N> radiance;
     };
     static constexpr unsigned n_kept = 64;
+
+    int64_t pixel_at(int x, int y) const { return int64_t(y) * side_->camera.width + x; }
+
+    // What the pixels of the row see through one side.
+    void add_side(const Side& side, int x0, int x1) {
+        const Camera& camera = side.camera;
+        if (!camera.may_show({0.5 * (x0 + x1), y_ + 0.5}, 0.5 * (x1 - x0) + radius_)) return;
+        if (&side != side_) {
+            side_ = &side, rays_.look_through(side.frame);
+            for (Shaded& s : kept_) s.face = -1;
+        }
+        for (int x = x0; x < x1; ++x) {
+            if (!camera.may_show({x + 0.5, y_ + 0.5}, radius_)) continue;
+            for (int done = 0; done < spp_;) {
+                const int n = std::min(spp_ - done, RayBatch::size - rays_.count);
+                side.pixel_rays.append(x, y_, done, n, rays_);
+                part_[parts_++] = {x - x0, n};
+                done += n;
+                if (rays_.count == RayBatch::size) trace();
+            }
+        }
+        trace();
+    }
 
     void trace() {
         if (++traced_ % 16 == 0) team_.check();
@@ -197,8 +212,8 @@ class PixelRow {
     // What a pixel hits, and how far away.
     void note_hit(const Shaded& s, int column) {
         first_[column] = std::min(first_[column], s.face), last_[column] = std::max(last_[column], s.face);
-        const Vec2 middle = normalised(camera_, {x0_ + column + 0.5, y_ + 0.5});
-        farthest_[column] = std::max(farthest_[column], s.depth.farthest(middle, reach_));
+        const Vec2 middle = normalised(side_->camera, {x0_ + column + 0.5, y_ + 0.5});
+        farthest_[column] = std::max(farthest_[column], s.depth.farthest(middle, side_->reach));
     }
 
     // Adds what ray i, of a pixel in this column, sees to the sum: one sample.
@@ -239,7 +254,7 @@ class PixelRow {
         for (int i = 0; i < rays_.count; ++i)
             if (const int64_t face = rays_.face[i]; face >= 0)
                 for (int k = 0; k < 3; ++k) {
-                    prefetch(&q_[scene_.faces[3 * face + k]]);
+                    prefetch(&side_->q[scene_.faces[3 * face + k]]);
                     if (!is_textured(scene_, face))
                         prefetch(scene_.colors + int64_t(scene_.corners[3 * face + k]) * scene_.radiance);
                 }
@@ -253,39 +268,40 @@ class PixelRow {
 
     bool is_unseen(int32_t face) const {
         const int32_t* v = scene_.faces + 3 * int64_t(face);
-        const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
-        return camera_.passes_through_eye(corner);
+        const Array<Vec3>& q = side_->q;
+        const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
+        return side_->camera.passes_through_eye(corner);
     }
 
     void keep(Shaded& s, int32_t face) {
         s.face = face;
         s.textured = is_textured(scene_, face);
         const int32_t* v = scene_.faces + 3 * int64_t(face);
-        const Vec3 corner[3] = {q_[v[0]], q_[v[1]], q_[v[2]]};
-        s.map = face_map(camera_, corner);
-        s.unseen = camera_.passes_through_eye(corner);
+        const Camera& camera = side_->camera;
+        const Array<Vec3>& q = side_->q;
+        const Vec3 corner[3] = {q[v[0]], q[v[1]], q[v[2]]};
+        s.map = face_map(camera, corner);
+        s.unseen = camera.passes_through_eye(corner);
         if (s.unseen) return;
-        s.depth.set(camera_, corner, s.map);
+        s.depth.set(camera, corner, s.map);
         if (!s.textured) s.radiance.set(scene_, face);
         // Threads may write the same byte, always with the same value; reading first keeps its cache line shared.
         std::atomic_ref<uint8_t> seen(out_.seen[face]);
         if (!seen.load(std::memory_order_relaxed))
-            seen.store(camera_.side(corner[0], corner[1], corner[2]), std::memory_order_relaxed);
+            seen.store(camera.side(corner[0], corner[1], corner[2]), std::memory_order_relaxed);
     }
 
     const SceneView<T>& scene_;
-    const Camera& camera_;
+    const std::deque<Side>& sides_;
+    const Side* side_;  // of the rays
     const RayCaster& caster_;
-    const CameraFrame& frame_;
-    const PixelRays pixel_rays_;
     const int spp_;
+    const double radius_;  // of the filter
     Team& team_;
-    const Array<Vec3>& q_;
     T* const image_;  // (H, W, C)
     const HitBuffers<T>& out_;
     const int C_;
     const int direction_;  // the channel where a direction begins; −1: there is none
-    const Vec2 reach_;     // of the filter around a pixel, in normalised image coordinates
 
     struct Part {
         int column, n;
@@ -364,19 +380,19 @@ class ReachablePixels {
 };
 
 template <int N, class T>
-void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o,
-                   Team& team, const Array<Vec3>& q, T* image, const HitBuffers<T>& out) {
+void render_pixels(const SceneView<T>& scene, const std::deque<Side>& sides, const RayCaster& caster,
+                   const ImageOptions& o, Team& team, T* image, const HitBuffers<T>& out) {
+    const Camera& camera = sides.front().camera;
     // Tiles are lower where a pixel has many samples, so that the threads end together.
     const int rows = std::clamp((1 << 16) / o.spp, 1, tile);
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + rows - 1) / rows;
     // So many pixels fill batches of rays. Only whole ones are left out: which rays lie in a packet decides which of
     // two faces at one depth wins, and how sums are rounded.
     const int unit = std::min(tile, RayBatch::size / std::gcd(RayBatch::size, o.spp));
-    const CameraFrame frame(caster, camera);
-    const ReachablePixels reachable(camera, caster, q, o.filter.radius() - 0.5, team);
+    const ReachablePixels reachable(camera, caster, sides.front().q, o.filter.radius() - 0.5, team);
     team.each_with(
         int64_t(tiles_x) * tiles_y,
-        [&] { return std::make_unique<PixelRow<N, T>>(scene, camera, caster, frame, o, team, q, image, out); },
+        [&] { return std::make_unique<PixelRow<N, T>>(scene, sides, caster, o, team, image, out); },
         [&](PixelRow<N, T>& row, int64_t t) {
             const int x0 = int(t % tiles_x) * tile, x1 = std::min(x0 + tile, camera.width);
             const int y0 = int(t / tiles_x) * rows, y1 = std::min(y0 + rows, camera.height);
@@ -394,10 +410,10 @@ void render_pixels(const SceneView<T>& scene, const Camera& camera, const RayCas
 template <class T>
 void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o,
                     Team& team, T* image, const HitBuffers<T>& out) {
-    const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
+    const std::deque<Side> sides = make_sides(camera, scene.verts, scene.n_verts, caster, o, team);
     std::fill(out.seen, out.seen + scene.n_faces, uint8_t(0));
     dispatch_channels(scene.channels, scene.channels > scene.radiance,
-                      [&]<int N>() { render_pixels<N>(scene, camera, caster, o, team, q, image, out); });
+                      [&]<int N>() { render_pixels<N>(scene, sides, caster, o, team, image, out); });
 }
 
 template void render_forward(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&, Team&,

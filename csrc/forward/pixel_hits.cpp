@@ -5,10 +5,9 @@
 #include <atomic>
 #include <limits>
 
-#include "camera/camera_rays.h"
 #include "camera/depth_bound.h"
-#include "camera/vertices.h"
 #include "contract/record.h"
+#include "forward/side.h"
 #include "shading/surface.h"
 
 namespace edgegrad {
@@ -19,29 +18,43 @@ namespace {
 template <class T>
 class HitRow {
    public:
-    HitRow(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const CameraFrame& frame,
-           const ImageOptions& options, const Array<Vec3>& q, const HitBuffers<T>& out, Team& team)
+    HitRow(const SceneView<T>& scene, const std::deque<Side>& sides, const RayCaster& caster,
+           const ImageOptions& options, const HitBuffers<T>& out, Team& team)
         : scene_(scene),
-          camera_(camera),
+          sides_(sides),
+          side_(&sides.front()),
           caster_(caster),
           options_(options),
-          pixel_rays_(camera, options),
-          q_(q),
           out_(out),
           team_(team),
-          rays_(frame),
-          reach_{options.filter.radius() * (std::fabs(camera.k_inverse[0]) + std::fabs(camera.k_inverse[1])),
-                 options.filter.radius() * (std::fabs(camera.k_inverse[2]) + std::fabs(camera.k_inverse[3]))} {}
+          rays_(side_->frame) {}
 
     void find(int y, PixelHits& to) {
-        for (int x = 0; x < camera_.width; ++x)
-            for (int done = 0; done < options_.spp;) {
-                const int n = std::min(options_.spp - done, RayBatch::size - rays_.count);
-                pixel_rays_.append(x, y, done, n, rays_);
-                part_[parts_++] = {x, n};
-                done += n;
-                if (rays_.count == RayBatch::size || (x + 1 == camera_.width && done == options_.spp)) cast(y, to);
+        const int width = side_->camera.width;
+        row_.assign(width, {});
+        y_ = y;
+        for (const Side& side : sides_) {
+            if (&side != side_) side_ = &side, rays_.look_through(side.frame), known_ = filled();
+            for (int x = 0; x < width; ++x) {
+                if (!side.camera.may_show({x + 0.5, y + 0.5}, options_.filter.radius())) continue;
+                for (int done = 0; done < options_.spp;) {
+                    const int n = std::min(options_.spp - done, RayBatch::size - rays_.count);
+                    side.pixel_rays.append(x, y, done, n, rays_);
+                    part_[parts_++] = {x, n};
+                    done += n;
+                    if (rays_.count == RayBatch::size) cast(to);
+                }
             }
+            cast(to);
+        }
+        for (int x = 0; x < width; ++x) {
+            const int64_t pixel = int64_t(y) * width + x;
+            const Pixel& p = row_[x];
+            const bool whole = p.hits == options_.spp;
+            out_.coverage[pixel] = T(double(p.hits) / options_.spp);
+            out_.depth[pixel] = whole ? rounded_up(p.farthest) : std::numeric_limits<float>::infinity();
+            out_.hit[2 * pixel] = p.hits ? p.first : -1, out_.hit[2 * pixel + 1] = p.last;
+        }
     }
 
    private:
@@ -52,8 +65,13 @@ class HitRow {
         uint64_t key;
         Vec2 n;
     };
+    struct Pixel {
+        int hits = 0;
+        double farthest = -std::numeric_limits<double>::infinity();
+        int32_t first = std::numeric_limits<int32_t>::max(), last = -1;
+    };
 
-    void cast(int y, PixelHits& to) {
+    void cast(PixelHits& to) {
         team_.check();
         rays_.prepare();
         caster_.cast(rays_);
@@ -66,16 +84,16 @@ class HitRow {
         for (int p = 0; p < parts_; ++p) {
             if (part_[p].x != x_) groups_.clear(), x_ = part_[p].x, samples_ = 0;
             for (const int end = i + part_[p].n; i < end; ++i, ++samples_)
-                if (rays_.face[i] >= 0) add(rays_.face[i], rays_.n(i), y);
-            if (samples_ == options_.spp) finish(y, to);
+                if (rays_.face[i] >= 0) add(rays_.face[i], rays_.n(i));
+            if (samples_ == options_.spp) finish(to);
         }
         rays_.count = parts_ = 0;
     }
 
     // The sample with the least random number stands for all. So where one more or one less hits the face, it mostly
     // stays the same, and images of scenes that differ a little do.
-    void add(int32_t face, Vec2 n, int y) {
-        const uint64_t key = hash(options_.seed, hash(5, uint64_t(y) * camera_.width + x_), samples_);
+    void add(int32_t face, Vec2 n) {
+        const uint64_t key = hash(options_.seed, hash(5, uint64_t(y_) * side_->camera.width + x_), samples_);
         auto group = std::find_if(groups_.begin(), groups_.end(), [&](const Group& g) { return g.face == face; });
         if (group == groups_.end()) {
             groups_.push_back({face, 1, key, n});
@@ -85,40 +103,36 @@ class HitRow {
         if (key < group->key) group->key = key, group->n = n;
     }
 
-    void finish(int y, PixelHits& to) {
-        const int64_t pixel = int64_t(y) * camera_.width + x_;
-        const Vec2 middle = normalised(camera_, {x_ + 0.5, y + 0.5});
-        int hits = 0;
-        double farthest = -std::numeric_limits<double>::infinity();
-        int32_t first = std::numeric_limits<int32_t>::max(), last = -1;
+    // Hands over what a pixel shows through this side.
+    void finish(PixelHits& to) {
+        const Camera& camera = side_->camera;
+        const Vec2 middle = normalised(camera, {x_ + 0.5, y_ + 0.5});
+        Pixel& pixel = row_[x_];
         for (const Group& g : groups_) {
             const auto corner = corners(g.face);
-            const FaceMap map = face_map(camera_, corner.data());
+            const FaceMap map = face_map(camera, corner.data());
             const Barycentrics b = barycentrics_of_hit(map, g.n);
-            to.pixel.push_back(int32_t(pixel)), to.face.push_back(g.face);
-            const Vec2 x = bend(camera_, to_pixels(camera_, g.n)).x;
+            const Vec2 x = bend(camera, to_pixels(camera, g.n)).x;
+            to.pixel.push_back(int32_t(int64_t(y_) * camera.width + x_)), to.face.push_back(g.face);
             append(to.b, {b.u, b.v}), append(to.x, {x.x, x.y});
             to.weight.push_back(double(g.count) / options_.spp);
-            hits += g.count;
             DepthBound depth;
-            depth.set(camera_, corner.data(), map);
-            farthest = std::max(farthest, depth.farthest(middle, reach_));
-            first = std::min(first, g.face), last = std::max(last, g.face);
+            depth.set(camera, corner.data(), map);
+            pixel.hits += g.count;
+            pixel.farthest = std::max(pixel.farthest, depth.farthest(middle, side_->reach));
+            pixel.first = std::min(pixel.first, g.face), pixel.last = std::max(pixel.last, g.face);
             std::atomic_ref<uint8_t> seen(out_.seen[g.face]);
             if (!seen.load(std::memory_order_relaxed))
-                seen.store(camera_.side(corner[0], corner[1], corner[2]), std::memory_order_relaxed);
+                seen.store(camera.side(corner[0], corner[1], corner[2]), std::memory_order_relaxed);
         }
-        out_.coverage[pixel] = T(double(hits) / options_.spp);
-        out_.depth[pixel] = hits == options_.spp ? rounded_up(farthest) : std::numeric_limits<float>::infinity();
-        out_.hit[2 * pixel] = hits ? first : -1, out_.hit[2 * pixel + 1] = last;
         groups_.clear(), x_ = -1;
     }
 
     std::array<Vec3, 3> corners(int32_t face) const {
         const int32_t* v = scene_.faces + 3 * int64_t(face);
-        return {q_[v[0]], q_[v[1]], q_[v[2]]};
+        return {side_->q[v[0]], side_->q[v[1]], side_->q[v[2]]};
     }
-    bool is_unseen(int32_t face) const { return camera_.passes_through_eye(corners(face).data()); }
+    bool is_unseen(int32_t face) const { return side_->camera.passes_through_eye(corners(face).data()); }
     // Whether a face shows something, kept for those that come again.
     bool is_known(int32_t face) {
         int32_t& known = known_[unsigned(face) % known_.size()];
@@ -127,11 +141,10 @@ class HitRow {
     }
 
     const SceneView<T>& scene_;
-    const Camera& camera_;
+    const std::deque<Side>& sides_;
+    const Side* side_;  // the one that is looked through
     const RayCaster& caster_;
     const ImageOptions& options_;
-    const PixelRays pixel_rays_;
-    const Array<Vec3>& q_;
     const HitBuffers<T>& out_;
     Team& team_;
 
@@ -146,7 +159,8 @@ class HitRow {
     CameraRays rays_;
     Part part_[RayBatch::size];  // of which pixels the rays are
     int parts_ = 0;
-    const Vec2 reach_;  // of the filter around a pixel, in normalised image coordinates
+    std::vector<Pixel> row_;
+    int y_ = 0;
     std::array<int32_t, 256> known_ = filled();
     std::vector<Group> groups_;
     int x_ = -1, samples_ = 0;  // the pixel that they are of, and how many of its samples came
@@ -157,11 +171,10 @@ class HitRow {
 template <class T>
 PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                           const ImageOptions& options, int first, int end, Team& team, const HitBuffers<T>& out) {
-    const Array<Vec3> q = camera_vertices(camera, scene.verts, scene.n_verts, team);
-    const CameraFrame frame(caster, camera);
+    const std::deque<Side> sides = make_sides(camera, scene.verts, scene.n_verts, caster, options, team);
     std::vector<PixelHits> rows(end - first);
     team.each_with(
-        end - first, [&] { return std::make_unique<HitRow<T>>(scene, camera, caster, frame, options, q, out, team); },
+        end - first, [&] { return std::make_unique<HitRow<T>>(scene, sides, caster, options, out, team); },
         [&](HitRow<T>& row, int64_t k) { row.find(first + int(k), rows[k]); });
     PixelHits all;
     size_t n = 0;

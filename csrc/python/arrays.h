@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "camera/windows.h"
 #include "forward/forward.h"
 #include "python/checks.h"
 #include "scene/geometry.h"
@@ -173,13 +174,14 @@ struct HitArrays {
     HitBuffers<T> view() const { return {coverage.data(), depth.data(), hit.data(), seen.data()}; }
 };
 
-inline AnyLens make_lens(const std::string& name, In<double, 1> distortion) {
+inline AnyLens make_lens(const std::string& name, In<double, 2> K, In<double, 1> distortion) {
     if (distortion.size() != most_coefficients) refuse("distortion: expected 8 numbers");
     check_finite("distortion", distortion.data(), most_coefficients, most_coefficients, 1);
     if (name == "pinhole") return StraightLens();
     if (name == "brown-conrady") return BrownConrady(distortion.data());
     if (name == "fisheye") return Fisheye(distortion.data());
-    refuse("lens: expected \"pinhole\", \"brown-conrady\" or \"fisheye\", got \"" + name + "\"");
+    if (name == "panorama") return Equirectangular(K.data(), {}, {});
+    refuse("lens: expected \"pinhole\", \"brown-conrady\", \"fisheye\" or \"panorama\", got \"" + name + "\"");
 }
 
 inline Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, In<double, 1> distortion, bool perspective,
@@ -190,8 +192,9 @@ inline Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, In<dou
     check_finite("world_to_camera", world_to_camera.data(), 16, 4, 1);
     check_finite("K", K.data(), 9, 3, 1);
     if (!perspective && lens != "pinhole") refuse("lens: expected a perspective view");
-    const Camera camera(world_to_camera.data(), K.data(), perspective, width, height, make_lens(lens, distortion));
+    const Camera camera(world_to_camera.data(), K.data(), perspective, width, height, make_lens(lens, K, distortion));
     if (camera.k_det == 0) refuse("K: expected focal lengths that are not zero, got a singular matrix");
+    if (is_too_wide(camera)) refuse("K: expected a panorama that reaches around no more than 4 times");
     return camera;
 }
 

@@ -4,6 +4,7 @@
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
 #include <array>
 #include <optional>
@@ -12,6 +13,7 @@
 
 #include "backward/backward.h"
 #include "camera/camera.h"
+#include "camera/windows.h"
 #include "checks/probe.h"
 #include "core/sampler.h"
 #include "core/sobol.h"
@@ -158,6 +160,15 @@ void bind_for_tests(nb::module_& m) {
         const auto [a, b] = c.image_box(vec(low), vec(high));
         return std::tuple(array(a), array(b));
     });
+    // What a camera sees through, with the turn into its frame.
+    p.def("windows", [](const Camera& c, double reach) {
+        std::vector<std::tuple<Camera, A33>> out;
+        for (const Camera& w : windows_of(c, reach))
+            out.emplace_back(w, A33{array(w.turn.row[0]), array(w.turn.row[1]), array(w.turn.row[2])});
+        return out;
+    });
+    // The box of its straight image.
+    p.def("view_box", [](const Camera& c) { return std::tuple(array(c.lens_view.low), array(c.lens_view.high)); });
     // In forward mode.
     p.def("project_jvp", [](const Camera& c, A3 q, A3 q_dot, std::array<double, 6 + most_coefficients> k_dot) {
         return array(project_jvp(c, vec(q), vec(q_dot), intrinsics(k_dot)));

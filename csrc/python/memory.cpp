@@ -14,6 +14,7 @@
 #include "boundary/curve_measure.h"
 #include "boundary/meeting_parts.h"
 #include "camera/vertices.h"
+#include "camera/windows.h"
 #include "contract/scatter.h"
 #include "scene/geometry.h"
 
@@ -34,6 +35,7 @@ struct PassSize {
     bool textured;
     bool jumps;  // whether neighbouring faces may differ where they meet
     int threads;
+    int sides;  // of the camera (windows.h)
 
     // Of a closed mesh.
     int64_t edges() const { return 3 * faces / 2; }
@@ -46,7 +48,7 @@ Bytes image_bytes(const PassSize& s, int64_t cameras) {
             {"depth", pixels * int64_t(sizeof(float))},
             {"faces hit", pixels * 2 * int64_t(sizeof(int32_t))},
             {"faces seen", cameras * s.faces},
-            {"vertices in view", s.verts * int64_t(sizeof(Vec3))},
+            {"vertices in view", s.sides * s.verts * int64_t(sizeof(Vec3))},
             {"ray structure", RayCaster::bytes(s.faces, s.verts)}};
 }
 
@@ -102,14 +104,26 @@ void bind_memory(nb::module_& m) {
     nb::class_<PassSize>(m, "PassSize")
         .def(nb::new_([](int64_t verts, int64_t faces, int64_t colors, int64_t uvs, int64_t texels, int64_t pixels,
                          int radiance, int vertex_attributes, int face_attributes, int channels, int number,
-                         bool textured, bool jumps, int threads) {
-                 return PassSize{
-                     verts,           faces,    colors, uvs,      texels, pixels, radiance, vertex_attributes,
-                     face_attributes, channels, number, textured, jumps,  threads};
+                         bool textured, bool jumps, int threads, const std::string& lens) {
+                 return PassSize{verts,
+                                 faces,
+                                 colors,
+                                 uvs,
+                                 texels,
+                                 pixels,
+                                 radiance,
+                                 vertex_attributes,
+                                 face_attributes,
+                                 channels,
+                                 number,
+                                 textured,
+                                 jumps,
+                                 threads,
+                                 lens == "panorama" ? most_sides : 1};
              }),
              nb::kw_only(), "verts"_a, "faces"_a, "colors"_a, "uvs"_a, "texels"_a, "pixels"_a, "radiance"_a,
-             "vertex_attributes"_a, "face_attributes"_a, "channels"_a, "number"_a, "textured"_a, "jumps"_a,
-             "threads"_a);
+             "vertex_attributes"_a, "face_attributes"_a, "channels"_a, "number"_a, "textured"_a, "jumps"_a, "threads"_a,
+             "lens"_a);
     m.def("image_bytes", &image_bytes, "size"_a, "cameras"_a);
     m.def(
         "gradient_bytes",

@@ -226,8 +226,8 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
     CurveRecords& c = found.curves;
     nb::dict surface, curves;
     surface["face"] = rows(std::move(s.face)), surface["x"] = rows(std::move(s.x), {2});
-    surface["n"] = rows(std::move(s.n), {2}), surface["weight"] = rows(std::move(s.weight));
-    surface["n_by_k"] = rows(std::move(s.n_by_k), {2, intrinsics_width});
+    surface["along"] = rows(std::move(s.along), {3}), surface["weight"] = rows(std::move(s.weight));
+    surface["along_by_k"] = rows(std::move(s.along_by_k), {3, intrinsics_width});
     curves["x"] = rows(std::move(c.x), {2}), curves["face"] = rows(std::move(c.face), {CurveRecords::surfaces});
     curves["b"] = rows(std::move(c.b), {CurveRecords::surfaces, 2});
     curves["factor"] = rows(std::move(c.factor), {CurveRecords::surfaces});

@@ -1,0 +1,118 @@
+#include "camera/windows.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace edgegrad {
+
+namespace {
+
+// Ahead, right, behind, left; below, above. Signs and exchanges alone, so that sides agree on what lies between them.
+constexpr Equirectangular::Side sides[most_sides] = {
+    {{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}}, false},   {{{{0, 0, -1}, {0, 1, 0}, {1, 0, 0}}}, false},
+    {{{{-1, 0, 0}, {0, 1, 0}, {0, 0, -1}}}, false}, {{{{0, 0, 1}, {0, 1, 0}, {-1, 0, 0}}}, false},
+    {{{{1, 0, 0}, {0, 0, -1}, {0, 1, 0}}}, true},   {{{{1, 0, 0}, {0, 0, 1}, {0, -1, 0}}}, true},
+};
+
+const Equirectangular* panorama(const Camera& camera) { return std::get_if<Equirectangular>(&camera.lens); }
+
+// The image, widened.
+Box2 frame(const Camera& camera, double reach) {
+    return {{-reach, -reach}, {camera.width + reach, camera.height + reach}};
+}
+
+Camera window(const Camera& camera, const Equirectangular& lens, Box2 n) {
+    Camera out = camera;
+    const Mat3& turn = lens.side().turn;
+    out.turn = turn;
+    for (int i = 0; i < 3; ++i) out.R.row[i] = transposed_times(camera.R, turn.row[i]);
+    out.t = turn * camera.t;
+    out.lens = lens;
+    const Vec2 scale = lens.scale();
+    out.k[4] = scale.y;
+    out.set_inverses();
+    const double y[2] = {scale.y * n.low.y, scale.y * n.high.y};
+    out.lens_view = {};
+    out.lens_view.low = {scale.x * n.low.x, std::min(y[0], y[1])};
+    out.lens_view.high = {scale.x * n.high.x, std::max(y[0], y[1])};
+    out.lens_view.uneven = lens.side().pole();
+    if (!lens.side().closed)
+        for (int i = 1; i < 4; ++i) out.lens_view.open[i] = true;
+    return out;
+}
+
+// The integers k with an interval [π (k − half), π (k + half)] of more than nothing, here a millionth of a pixel,
+// within [low, high]; at least one.
+struct Range {
+    int first, last;
+};
+Range covering(double low, double high, double half, double least) {
+    const int first = int(std::floor((low + least) / M_PI - half)) + 1,
+              last = int(std::ceil((high - least) / M_PI + half)) - 1;
+    return {std::min(first, last), std::max(first, last)};
+}
+
+}  // namespace
+
+std::vector<Camera> sides_of(const Camera& camera) {
+    const Equirectangular* lens = panorama(camera);
+    if (!lens) return {camera};
+    std::vector<Camera> out;
+    for (const auto& side : sides) out.push_back(window(camera, {lens->K(), side, {}}, {{-1, -1}, {1, 1}}));
+    return out;
+}
+
+std::vector<Camera> windows_of(const Camera& camera, double reach) {
+    const Equirectangular* lens = panorama(camera);
+    if (!lens) return {camera};
+    constexpr double infinite = std::numeric_limits<double>::infinity();
+    const Box2 image = frame(camera, reach), angles = Equirectangular::angles(lens->K(), image);
+    const double least = 1e-6 / std::fabs(lens->scale().x);
+    std::vector<Camera> out;
+    const auto [over_first, over_last] = covering(angles.low.y, angles.high.y, 0.5, least);
+    for (int over = over_first; over <= over_last; ++over) {
+        // Of those that go around, which λ' = λ + j π has for j of the parity of `over`.
+        auto [first, last] = covering(angles.low.x, angles.high.x, 1, least);
+        if ((first - over) % 2) ++first;
+        if ((last - over) % 2) --last;
+        if (last < first) --first, last = first;
+        for (int across = first; across <= last; across += 2) {
+            const Equirectangular::Place place{
+                across,
+                over,
+                {across == first ? -infinite : M_PI * (across - 1),
+                 over == over_first ? -infinite : M_PI * (over - 0.5)},
+                {across == last ? infinite : M_PI * (across + 1), over == over_last ? infinite : M_PI * (over + 0.5)}};
+            for (const auto& side : sides) {
+                const Equirectangular of_side(lens->K(), side, place);
+                if (const auto box = of_side.side_box(image)) out.push_back(window(camera, of_side, *box));
+            }
+        }
+    }
+    return out;
+}
+
+bool is_too_wide(const Camera& camera) {
+    const Equirectangular* lens = panorama(camera);
+    if (!lens) return false;
+    const Box2 angles = Equirectangular::angles(lens->K(), frame(camera, 1));
+    const double most = std::max({-angles.low.x, -angles.low.y, angles.high.x, angles.high.y});
+    return !(most <= 2 * M_PI * most_turns);
+}
+
+void add_intrinsics(const Camera& window, const IntrinsicsGrad& bar, double* K, double* distortion) {
+    const double* of_k = panorama(window) ? bar.distortion : bar.k;
+    if (K)
+        for (int i = 0; i < 6; ++i) K[i] += of_k[i];
+    if (distortion && !panorama(window))
+        for (int i = 0; i < most_coefficients; ++i) distortion[i] += bar.distortion[i];
+}
+
+IntrinsicsGrad window_intrinsics(const Camera& window, const double* K, const double* distortion) {
+    IntrinsicsGrad out;
+    if (K) std::copy(K, K + 6, panorama(window) ? out.distortion : out.k);
+    if (distortion && !panorama(window)) std::copy(distortion, distortion + most_coefficients, out.distortion);
+    return out;
+}
+
+}  // namespace edgegrad
