@@ -9,7 +9,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-COUNTS = {"perspective": (4, 5, 8), "fisheye": (4,), "panorama": (), "orthographic": ()}  # of coefficients, by projection
+COUNTS = {
+    "perspective": (4, 5, 8),
+    "fisheye": (4,),
+    "panorama": (),
+    "orthographic": (),
+}  # of coefficients, by projection
 MOST = 8  # what the kernel takes
 TURNS = 4  # how often a panorama may reach around, either way
 

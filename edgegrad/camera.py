@@ -76,9 +76,7 @@ class Camera:
             )
         object.__setattr__(self, "size", _size(self.size))
         if self.projection not in COUNTS:
-            raise ValueError(
-                f"projection: expected one of {', '.join(map(repr, COUNTS))}, got {self.projection!r}"
-            )
+            raise ValueError(f"projection: expected one of {', '.join(map(repr, COUNTS))}, got {self.projection!r}")
         if self.distortion is not None:
             object.__setattr__(self, "distortion", as_tensor("distortion", self.distortion, like=self.K))
             self._check_distortion(self.distortion)
@@ -192,8 +190,8 @@ class Camera:
 
         world_to_camera  (4, 4)   rigid, +X right, +Y down, +Z forward
         size             (H, W)   pixels
-        K                (3, 3)   pixels a radian and the pixel where +Z is seen, for a part of it, or for several turns; None: 360°
-                                  from left to right, 180° from top to bottom
+        K                (3, 3)   pixels a radian and the pixel where +Z is seen, for a part of it or for several turns; None:
+                                  360° from left to right, 180° from top to bottom
 
         It goes on beyond ±180°, and over the poles along the opposite meridian, so what crosses the image's border comes back at
         the other. Raises TypeError or ValueError.

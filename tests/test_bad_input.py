@@ -71,7 +71,7 @@ def good_case(draw: st.DrawFn) -> Case:
     batch = draw(st.sampled_from([None, None, 2]))
     pose = camera.world_to_camera if batch is None else camera.world_to_camera.repeat(batch, 1, 1)
     values |= {"world_to_camera": pose, "K": camera.K, "size": (H, W)}
-    values["projection"] = draw(st.sampled_from(["perspective", "orthographic"]))
+    values["projection"] = draw(st.sampled_from(["perspective", "orthographic", "panorama"]))
     values |= {"spp": draw(st.integers(1, 3)), "seed": draw(st.integers(0, 2**63 - 1))}
     for name, choices in (
         ("surface_samples", st.sampled_from([None, 1, 30])),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from finite_differences import Estimate, estimate
@@ -21,6 +23,17 @@ CAMERA = front_camera(SIZE)
 ORTHOGRAPHIC = eg.Camera.orthographic((0.4, 0.3, 4.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.6, (SIZE, SIZE)).to(F64)
 BENT = CAMERA.replace(distortion=torch.tensor([-0.15, 0.05, 0.01, -0.02, 0.02], dtype=F64))
 ADJOINT = smooth_adjoint(SIZE, SIZE, 3)
+
+
+def panorama() -> eg.Camera:
+    """With what CAMERA sees behind it, across the seam; the middle of the image is turned to there."""
+    M = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=F64)) @ CAMERA.world_to_camera
+    f = 0.8 * float(CAMERA.K[0, 0])
+    K = torch.tensor([[f, 0.3, SIZE / 2 - math.pi * f + 1.3], [0.0, f, SIZE / 2 + 0.2], [0.0, 0.0, 1.0]], dtype=F64)
+    return eg.Camera.panorama(M, (SIZE, SIZE), K)
+
+
+PANORAMA = panorama()
 SAMPLES = {"surface_samples": 4000, "edge_samples": 4000}
 
 
@@ -101,6 +114,8 @@ def crossing_scene() -> eg.Scene:
         (crossing_scene, CAMERA, "tent"),
         (crossing_scene, ORTHOGRAPHIC, "box"),
         (crossing_scene, BENT, "gaussian"),
+        (crossing_scene, PANORAMA, "box"),
+        (mixed_scene, PANORAMA, "tent"),
     ],
     ids=[
         "perspective box",
@@ -109,6 +124,8 @@ def crossing_scene() -> eg.Scene:
         "crossing perspective",
         "crossing orthographic",
         "bent",
+        "crossing panorama",
+        "panorama",
     ],
 )
 def test_forward_is_the_adjoint_of_reverse(scene, camera, filter):
@@ -276,7 +293,9 @@ def test_tangents_that_do_not_fit(tangents, message):
 # -- the gradient by places in the image ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("camera", [CAMERA, ORTHOGRAPHIC, BENT], ids=["perspective", "orthographic", "bent"])
+@pytest.mark.parametrize(
+    "camera", [CAMERA, ORTHOGRAPHIC, BENT, PANORAMA], ids=["perspective", "orthographic", "bent", "panorama"]
+)
 @pytest.mark.parametrize(("scene", "filter"), [(mixed_scene, "gaussian"), (crossing_scene, "box")])
 def test_screen_gradient_sums_to_that_of_moving_everything(camera, scene, filter):
     """By (1, 0) and (0, 1) px, as the principal point does."""

@@ -256,9 +256,9 @@ CAMERAS = {
     "size zero": (lambda: camera(size=(0, 8)), V, "size: expected an int from 1 to 65536, got 0"),
     "size too large": (lambda: look_at(size=(8, 100_000)), V, "size: expected an int from 1 to 65536, got 100000"),
     "projection": (
-        lambda: camera(projection="panorama"),
+        lambda: camera(projection="cylinder"),
         V,
-        'projection: expected "perspective", "fisheye" or "orthographic", got \'panorama\'',
+        "projection: expected one of 'perspective', 'fisheye', 'panorama', 'orthographic', got 'cylinder'",
     ),
     "eye in 2-D": (lambda: look_at(eye=(0.0, 1.0)), V, "eye: expected shape (3,), got (2,)"),
     "eye not finite": (lambda: look_at(eye=(0.0, NAN, 1.0)), V, "eye: expected finite numbers, got nan at [1]"),

@@ -62,12 +62,8 @@ Box2 normalised_box(const Camera& c, Vec2 low, Vec2 high) {
 }  // namespace
 
 double Camera::stretch(Vec2 low, Vec2 high) const {
-    if (!lens_view.uneven) return 1;
-    return std::get_if<Equirectangular>(&lens)->stretch(normalised_box(*this, low, high));
-}
-
-bool Camera::is_uneven(Vec2 low, Vec2 high) const {
-    return lens_view.uneven && std::get_if<Equirectangular>(&lens)->is_uneven(normalised_box(*this, low, high));
+    const auto* panorama = std::get_if<Equirectangular>(&lens);
+    return panorama ? panorama->stretch(normalised_box(*this, low, high)) : 1;
 }
 
 // By the mean value theorem, from a place of the box, or the nearest that is seen at all.

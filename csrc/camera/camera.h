@@ -32,15 +32,13 @@ struct IntrinsicsGrad {
 
 // What is visible through a lens that bends: a disc, and the box of the straight image, px, in which all lies that a
 // pixel filter reaches; and how far bending moves places there, at most: |∂x/∂u| entry by entry. Of a window
-// (windows.h): which borders of its box, in the order of ViewVolume, belong to its neighbours, and whether it shows a
-// pole.
+// (windows.h): which borders of its box, in the order of ViewVolume, belong to its neighbours.
 struct LensView {
     LensDisc disc;
     bool folds = false;  // whether the image reaches beyond the disc
     Vec2 low, high;
     Mat2 most = {1, 0, 0, 1};
     bool open[4] = {};
-    bool uneven = false;
 };
 
 struct Camera {
@@ -153,10 +151,14 @@ struct Camera {
     // A box of the image in which all of a box of the straight image is seen.
     std::pair<Vec2, Vec2> image_box(Vec2 low, Vec2 high) const;
 
-    // Of a box of the straight image: how much longer what lies there may be in the image, where that is far from one;
-    // and whether points uniform over it would be of little use, so unevenly do areas grow.
+    // How much longer what lies in a box of the straight image may be in the image, where that is far from one.
     double stretch(Vec2 low, Vec2 high) const;
-    bool is_uneven(Vec2 low, Vec2 high) const;
+
+    // The place in the straight image around which areas grow as 1 / distance; none for most.
+    std::optional<Vec2> pole() const {
+        const auto* panorama = std::get_if<Equirectangular>(&lens);
+        return panorama && panorama->side().pole() ? std::optional(Vec2{k[2], k[5]}) : std::nullopt;
+    }
 
     // Whether a window may show something within `reach` px of x.
     bool may_show(Vec2 x, double reach) const {

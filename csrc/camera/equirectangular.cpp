@@ -16,15 +16,13 @@ void add(Box2& box, Vec2 p) {
     box.high = {std::max(box.high.x, p.x), std::max(box.high.y, p.y)};
 }
 
-Vec2 middle(Box2 b) { return 0.5 * (b.low + b.high); }
-
-// Of the point of a box that is nearest to the origin.
+// Of the point of a box that is nearest to the origin, and of the corner that is farthest from it.
 double nearest_radius(Box2 b) {
     return length(Vec2{std::clamp(0.0, b.low.x, b.high.x), std::clamp(0.0, b.low.y, b.high.y)});
 }
-
-// Of the corner that is farthest from it.
 double farthest_radius(Box2 b) { return length(Vec2{std::max(-b.low.x, b.high.x), std::max(-b.low.y, b.high.y)}); }
+
+Vec2 middle(Box2 b) { return 0.5 * (b.low + b.high); }
 
 }  // namespace
 
@@ -197,13 +195,12 @@ std::optional<Box2> Equirectangular::side_box(Box2 x) const {
     return out;
 }
 
-// Parallels are drawn as long as the equator: 1 / cos φ. No nearer to the pole than a pixel.
+// Parallels are drawn as long as the equator: 1 / cos φ, which is 1 / r next to a pole, and 2 / r in the mean over a
+// disc around it.
 double Equirectangular::stretch(Box2 n) const {
     if (!side_.pole()) return 1;
-    const double r = length(middle(n));
-    return 1 / std::max(r / std::sqrt(1 + r * r), 1 / (1 + scale_.x));
+    const double r = std::max(length(middle(n)), 0.5 * farthest_radius(n));
+    return r > 0 ? std::sqrt(1 + 1 / (r * r)) : 1;
 }
-
-bool Equirectangular::is_uneven(Box2 n) const { return side_.pole() && nearest_radius(n) < 0.25; }
 
 }  // namespace edgegrad

@@ -64,10 +64,9 @@ class Equirectangular {
     // A box of n that holds all of this side and place that is seen in a box of pixel positions; none if nothing is.
     std::optional<Box2> side_box(Box2 x) const;
 
-    // How much longer what lies at the middle of a box of n is in the image than in the straight image, at most, and
-    // whether areas in the box grow so unevenly, next to a pole, that points uniform over it are of little use.
+    // How much longer what lies in a box of n is in the image than in the straight image, about and at most, and how
+    // much larger its area.
     double stretch(Box2 n) const;
-    bool is_uneven(Box2 n) const;
 
     // λ' and φ' over a box of pixel positions, with those of its corners.
     static Box2 angles(const double* K, Box2 x);

@@ -6,6 +6,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <optional>
 
 #include "camera/view_volume.h"
 #include "core/sierpinski.h"
@@ -15,11 +16,12 @@ namespace edgegrad {
 
 // A convex polygon in the image.
 struct VisiblePolygon {
-    Vec2 corner[ViewVolume::most_corners];
+    Vec2 corner[ViewVolume::most_corners + 2];
     int n = 0;
-    double area = 0;     // px²
-    double longest = 0;  // px
-    double nearest = 0;  // depth
+    bool starred = false;  // the first corner is the point nearest to the pole of the camera, which may lie within
+    double area = 0;       // px²
+    double longest = 0;    // px
+    double nearest = 0;    // depth
     Vec2 low, high;
 
     // Of the face with the vertices v; false when there is none.
@@ -63,15 +65,47 @@ struct VisiblePolygon {
             if (i >= 2) area += 0.5 * std::fabs(wedge(corner[i - 1] - corner[0], a - corner[0]));
         }
         longest = std::sqrt(longest_squared);
+        starred = false;
+        if (const std::optional<Vec2> pole = camera.pole(); pole && area > 0) star(*pole);
         return area > 0;
+    }
+
+   private:
+    // Makes the point nearest to the pole the first corner, unless all corners are about as far away.
+    void star(Vec2 pole) {
+        int side = 0, inside = 0;
+        double least = std::numeric_limits<double>::infinity(), most = 0;
+        Vec2 nearest;
+        for (int i = 0; i < n; ++i) {
+            const Vec2 a = corner[i], along = corner[i + 1 < n ? i + 1 : 0] - a, to = pole - a;
+            const double squared = along.x * along.x + along.y * along.y;
+            const double t = squared > 0 ? std::clamp((along.x * to.x + along.y * to.y) / squared, 0.0, 1.0) : 0;
+            const double distance = length(to - t * along);
+            if (distance < least) least = distance, nearest = a + t * along, side = i;
+            most = std::max(most, length(to));
+            inside += wedge(along, to) > 0 ? 1 : -1;
+        }
+        if (std::abs(inside) == n) least = 0, nearest = pole;
+        if (!(4 * least < most)) return;
+        Vec2 out[ViewVolume::most_corners + 2];
+        int m = 0;
+        out[m++] = nearest;
+        for (int i = 1; i <= n; ++i) out[m++] = corner[(side + i) % n];
+        if (std::abs(inside) == n) out[m++] = out[1];
+        n = std::copy(out, out + m, corner) - corner;
+        starred = true;
     }
 };
 
-// Points uniform over a polygon, along a curve that fills its triangles one after the other.
+// Points uniform over a polygon, along a curve that fills its triangles one after the other; of one that is starred,
+// with a density of 1 / distance to its first corner in each triangle, as areas grow there. No point of a convex
+// polygon is nearer to the pole than to the point of it that is nearest to the pole.
 class PolygonSampler {
    public:
     // About n points will be drawn.
-    void set(const VisiblePolygon& polygon, double n) { polygon_ = &polygon, n_ = n, triangle_ = 0, end_ = 0; }
+    void set(const VisiblePolygon& polygon, double n) {
+        polygon_ = &polygon, n_ = n, triangle_ = 0, end_ = 0, weight_ = 1;
+    }
 
     // s in [0, 1) goes along the curve, u is a point of the unit square. Fast where s ascends.
     Vec2 operator()(double s, Vec2 u) {
@@ -90,11 +124,19 @@ class PolygonSampler {
         const double t = share_ > 0 ? std::clamp((s - begin_) / share_, 0.0, 1 - 0x1p-53) : 0;
         const Vec2 p = curve_.point(uint32_t(t * (1u << levels_)), u);
         lambda_ = {p.x, p.y};
-        return corner[0] + p.x * (corner[triangle_ - 1] - corner[0]) + p.y * (corner[triangle_] - corner[0]);
+        // The triangle is scaled from its first corner: of a point uniform over it the share ρ = x + y of the way to
+        // the far side has a density of 2 ρ, and its square is uniform.
+        const Vec2 e1 = corner[triangle_ - 1] - corner[0], e2 = corner[triangle_] - corner[0];
+        if (!polygon_->starred) return corner[0] + p.x * e1 + p.y * e2;
+        const double rho = p.x + p.y;
+        weight_ = 2 * rho * rho;
+        return corner[0] + rho * (p.x * e1 + p.y * e2);
     }
 
-    // Where the last point lies in its triangle.
+    // Where the last point lies in its triangle, if the polygon is not starred.
     Barycentrics lambda() const { return lambda_; }
+    // The mean density of points over that at the last one.
+    double weight() const { return weight_; }
 
    private:
     const VisiblePolygon* polygon_ = nullptr;
@@ -102,6 +144,7 @@ class PolygonSampler {
     int triangle_ = 0, levels_ = 0;
     SierpinskiCurve curve_;
     Barycentrics lambda_;
+    double weight_ = 1;
 };
 
 }  // namespace edgegrad

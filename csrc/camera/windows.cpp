@@ -35,7 +35,6 @@ Camera window(const Camera& camera, const Equirectangular& lens, Box2 n) {
     out.lens_view = {};
     out.lens_view.low = {scale.x * n.low.x, std::min(y[0], y[1])};
     out.lens_view.high = {scale.x * n.high.x, std::max(y[0], y[1])};
-    out.lens_view.uneven = lens.side().pole();
     if (!lens.side().closed)
         for (int i = 1; i < 4; ++i) out.lens_view.open[i] = true;
     return out;

@@ -133,7 +133,7 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
                        .x = {},
                        .lambda = sampler.lambda(),
                        .share = share,
-                       .weight = share * polygon.area});
+                       .weight = share * polygon.area * sampler.weight()});
         }
         chunk.finish();
     });

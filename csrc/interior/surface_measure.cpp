@@ -35,8 +35,8 @@ double more_if_rough(double rough, double longest) {
 }
 
 // From this area in the image on, px², a triangle with a texture, or under a rough adjoint, is left to samples of the
-// pixels; and any that areas grow too unevenly on (Camera::is_uneven). Each triangle's integral is estimated in exactly
-// one way, chosen before any sample is drawn, so the sum stays unbiased.
+// pixels. Each triangle's
+// integral is estimated in exactly one way, chosen before any sample is drawn, so the sum stays unbiased.
 constexpr double large = 256;
 
 // A face with a control is sampled the less the better that is likely to be: the adjoint changes little, and the face
@@ -183,11 +183,9 @@ class MeasuredChunk {
             const auto [low, high] = view_.camera.image_box(polygon_.low, polygon_.high);
             const double importance = view_.importance.mean(low, high);
             const double stretch = view_.camera.stretch(polygon_.low, polygon_.high);
-            uneven_ = view_.camera.is_uneven(polygon_.low, polygon_.high);
             const Extent extent{polygon_.area * stretch, polygon_.longest * stretch, low, high, polygon_.nearest};
             const double m = default_samples(f, extent, view_.hits->of(v), [&] { return side_of(view_, f); });
             if (importance > 0) lay_out(f, m, importance, extent);
-            uneven_ = false;
             return;
         }
         const int i = lanes_->count++;
@@ -234,7 +232,7 @@ class MeasuredChunk {
         if (!std::isfinite(m)) return;  // coordinates beyond 1e150 cannot be sampled
         const bool textured = is_textured(view_.scene, f);
         if (!textured) m *= more_if_rough(rough_, e.longest);
-        if (((textured || rough_ > 1) && e.area >= large) || uneven_) {
+        if ((textured || rough_ > 1) && e.area >= large) {
             out_.is_large[f] = 1;
             mask_.mark(e.low, e.high);
             of_large_ += m;
@@ -358,7 +356,6 @@ class MeasuredChunk {
     const double rounding_ = 16 * view_.camera.rounding_of_positions();  // of a wedge, over the longer side
     double total_ = 0, of_large_ = 0;
     VisiblePolygon polygon_;
-    bool uneven_ = false;             // Camera::is_uneven, of the face that is laid out
     std::optional<FaceLanes> lanes_;  // none before there is a face for them
     HiddenFaces hidden_;
     int64_t others_[FaceLanes::size];
@@ -377,8 +374,7 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
     const GradientOptions& o = view.options;
     const int64_t F = view.scene.n_faces, chunks = (F + scatter_chunk - 1) / scatter_chunk;
     SurfaceMeasure<T> out{Array<double>(F), Array<uint8_t>(F), {}, {}};
-    if (view.scene.face_texture || 2 * std::pow(view.importance.roughness(), 2) > 1 || view.camera.lens_view.uneven)
-        out.is_large.assign(F, 0);
+    if (view.scene.face_texture || 2 * std::pow(view.importance.roughness(), 2) > 1) out.is_large.assign(F, 0);
     PixelMask mask(view.camera, view.image.filter.radius() - 0.5);
     // What the controls are of all of their faces, summed by the places of vertices in the image.
     Array<double> x_bar = zeros(geometry ? 2 * view.scene.n_verts : 0, view.team);

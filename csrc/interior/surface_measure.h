@@ -17,7 +17,7 @@ template <class T>
 struct SurfaceMeasure {
     Array<double> of_face;           // (F,) m
     Array<uint8_t> is_controlled;    // (F,)
-    std::vector<uint8_t> is_large;   // (F,) faces left to samples of the pixels; empty where there are none
+    std::vector<uint8_t> is_large;   // (F,) faces left to samples of the pixels; empty without textures
     std::vector<int64_t> pixels;     // which those may touch
     int pixel_spp = 0;               // samples in each of them
     double total = 0, of_large = 0;  // default samples: of the faces laid out, of the large ones

@@ -139,6 +139,7 @@ void bind_for_tests(nb::module_& m) {
     bind_scene_functions<double>(p);
 
     p.def("project", [](const Camera& c, A3 q) { return array(bend(c, project(c, vec(q))).x); });
+    p.def("project_straight", [](const Camera& c, A3 q) { return array(project(c, vec(q))); });
     p.def("project_vjp", [](const Camera& c, A3 q, A2 bar) {
         Vec3 q_bar;
         IntrinsicsGrad grad;
