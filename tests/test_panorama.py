@@ -23,7 +23,7 @@ F64 = torch.float64
 SIZE = (24, 48)
 BACKGROUND = torch.tensor([0.1, 0.3, 0.2], dtype=F64)
 # Where things are: before the camera, behind it, below and above.
-PLACES = {"ahead": (0.3, 0.2, 2.5), "seam": (0.2, -0.4, -2.5), "pole": (0.4, 2.5, -0.3), "above": (-0.2, -2.4, 0.5)}
+PLACES = {"ahead": (0.9, 0.7, 2.0), "seam": (0.2, -0.4, -2.5), "pole": (0.4, 2.5, -0.3), "above": (-0.2, -2.4, 0.5)}
 places = pytest.mark.parametrize("place", PLACES)
 
 
@@ -340,16 +340,18 @@ WHAT = ["vertices", "turn", "shift", "K00", "K01", "K02", "K10", "K11", "K12"]
 FAINT = 0.02
 
 
-def check_gradient(case: Case, spp: int = 2048, seeds: int = 4) -> None:
-    step = 0.005  # edges move by less than a tenth of a pixel
-    fd = finite_difference(case, step, spp, seeds)
-    found = gradient(case, 4, surface_samples=400_000, edge_samples=50_000)
+def check_gradient(case: Case, spp: int = 2048, seeds: int = 4, step: float = 0.005, filter: str = "box") -> None:
+    fd = finite_difference(case, step, spp, seeds, filter=filter)
+    found = gradient(case, 4, surface_samples=400_000, edge_samples=50_000, filter=filter)
     high, low = (eg.render(*case(torch.tensor(h, dtype=F64)), spp=256) for h in (0.01, -0.01))
     size = float((high - low).abs().sum()) / 0.02
+    noise = math.hypot(fd.error, found.error)
     if abs(fd.mean) < FAINT * size:
-        assert abs(found.mean - fd.mean) < 0.01 * size + 4 * math.hypot(fd.error, found.error)
-    else:
-        right_ratio(fd, found)
+        assert abs(found.mean - fd.mean) < 0.01 * size + 4 * noise
+        return
+    # No more than 4 %, so that a gradient that is 5 % off does not pass.
+    assert noise < 0.015 * abs(fd.mean), f"too noisy to tell: {fd}, {found}"
+    assert abs(found.mean - fd.mean) <= 0.01 * abs(fd.mean) + 2 * noise, f"finite difference {fd}, gradient {found}"
 
 
 @pytest.mark.parametrize(
@@ -365,9 +367,13 @@ def test_gradient(place: str, what: str) -> None:
 @pytest.mark.parametrize("kind", [boundary, both])
 @places
 def test_every_gradient(place: str, kind: Callable[..., eg.Scene], view: str, what: str) -> None:
+    """With a filter through which the loss is smooth: a box filter has kinks where edges pass the borders of pixels, and small
+    steps have noise."""
     if view == "crop" and place == "ahead":
         pytest.skip("not in view")
-    check_gradient(moved(lambda dx=0.0: kind(place, dx), CAMERAS[view], what), spp=4096, seeds=8)
+    check_gradient(
+        moved(lambda dx=0.0: kind(place, dx), CAMERAS[view], what), spp=4096, seeds=6, step=0.02, filter="tent"
+    )
 
 
 @pytest.mark.parametrize("what", ["vertices", pytest.param("K00", marks=pytest.mark.slow)])
