@@ -14,7 +14,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad._files import replacing
 from edgegrad._kernel import core
-from edgegrad._ops import Hits, Profile, kernel_camera, kernel_hits, kernel_scene
+from edgegrad._ops import Hits, Profile, kernel_camera, kernel_channels, kernel_hits, kernel_scene
 from edgegrad._request import make_request
 from edgegrad.report.methods import differentiate
 from edgegrad.report.references import standard_error
@@ -42,6 +42,7 @@ class Kernel:
         request = make_request(scene, camera, spp)
         flat, self.options = request.scene, core.ImageOptions(**request.image._asdict())
         self.scene, self.camera = kernel_scene(flat), kernel_camera(request.camera)
+        self.channels = kernel_channels(request)
         self.adjoint = adjoint.to(flat.colors.dtype).contiguous()
         self.image = torch.empty_like(self.adjoint)
         self.interior = request.gradient.channels_vary
@@ -57,7 +58,7 @@ class Kernel:
         """Seconds; writes `image`."""
         threads = threads or torch.get_num_threads()
         begin = time.perf_counter()
-        self.profile = self.scene.forward(self.camera, self.options, threads, self.image.numpy(), self.hits)
+        self.profile = self.scene.forward(self.camera, self.channels, self.options, threads, self.image.numpy(), self.hits)
         return time.perf_counter() - begin
 
     def backward(
@@ -83,7 +84,7 @@ class Kernel:
         threads = threads or torch.get_num_threads()
         begin = time.perf_counter()
         self.profile = self.scene.backward(
-            self.camera, self.options, options, threads, self.adjoint.numpy(), self.hits, wanted
+            self.camera, self.channels, self.options, options, threads, self.adjoint.numpy(), self.hits, wanted
         )
         return time.perf_counter() - begin
 
