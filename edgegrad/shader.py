@@ -131,8 +131,7 @@ class _Image:
             assert isinstance(L, Tensor)
             feet = Footprints.of(some.x, self._request)
             weight = self._here(some.weight[feet.point] * feet.weight).to(L.dtype)[:, None]
-            splat = total.index_add(0, self._here(feet.pixel), weight * L[self._here(feet.point)])
-            total = splat
+            total = total.index_add(0, self._here(feet.pixel), weight * L[self._here(feet.point)])
         return total - total.detach()
 
     def _boundary(self, samples: CurveSamples) -> Tensor:

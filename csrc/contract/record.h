@@ -14,6 +14,7 @@
 
 namespace edgegrad {
 
+// The contraction that keeps samples (contraction.h).
 struct Record {};
 
 constexpr int intrinsics_width = 6 + most_coefficients;  // K in rows, then the distortion
