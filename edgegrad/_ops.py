@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
@@ -25,6 +24,7 @@ from ._request import (
     derived_seed,
     label,
 )
+from ._warnings import warn
 from .scene import Flat
 
 Profile = dict[str, float]
@@ -72,16 +72,18 @@ def kernel_channels(request: Request, index: int = 0) -> Any:
     )
 
 
-def _warn_of_folds(cameras: Sequence[Any]) -> None:
+def warn_of_folds(cameras: Sequence[Any]) -> None:
     """Once for a batch, of the lens that shows least."""
     folds = [camera.fold for camera in cameras if camera.fold is not None]
-    if folds:
-        angle = math.degrees(math.atan(min(folds)))
-        warnings.warn(
-            f"distortion: the lens shows nothing beyond the radius {min(folds):.4g} in normalised image coordinates, "
-            f"{angle:.4g}° from its axis, where it folds the image over or ends; what the image has there is background",
-            stacklevel=2,
-        )
+    if not folds:
+        return
+    angle = min(folds)
+    radius = f"the radius {math.tan(angle):.4g} in normalised image coordinates, " if angle < math.pi / 2 else ""
+    warn(
+        "where a lens ends",
+        f"distortion: the lens shows nothing beyond {radius}{math.degrees(angle):.4g}° from its axis, where it folds the image "
+        "over or ends; what the image has there is background",
+    )
 
 
 def kernel_hits(hits: Hits, index: int = 0) -> Any:
@@ -101,7 +103,7 @@ def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
         image = request.scene.colors.new_empty((B, height, width, request.channels))
         hits = Hits.empty(request)
         cameras = [kernel_camera(request.camera, b) for b in range(B)]
-        _warn_of_folds(cameras)
+        warn_of_folds(cameras)
         profiles = []
         for b in range(B):
             options["seed"] = camera_seed(request.image.seed, b)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ._kernel import core
 from ._ops import Hits as ImageHits
-from ._ops import camera_seed, kernel_camera, kernel_hits, kernel_scene
+from ._ops import camera_seed, kernel_camera, kernel_hits, kernel_scene, warn_of_folds
 from ._request import Request
 
 
@@ -125,8 +125,11 @@ class Sampler:
 
             def compute(request: Request, first: int = first, end: int = end) -> PixelHits:
                 options = request.image._replace(seed=camera_seed(request.image.seed, self._camera))
+                camera = kernel_camera(request.camera, self._camera)
+                if first == 0:
+                    warn_of_folds([camera])
                 found = kernel_scene(request.scene).pixel_hits(
-                    camera=kernel_camera(request.camera, self._camera),
+                    camera=camera,
                     options=core.ImageOptions(**options._asdict()),
                     threads=torch.get_num_threads(),
                     first=first,

@@ -47,7 +47,7 @@ class Camera:
     size             (H, W)                      image size in pixels
     projection       "perspective", "fisheye", "panorama" or "orthographic"
     distortion       (4,), (5,), (8,) or (B, ·)  of a perspective lens, Brown–Conrady: k1, k2, p1, p2, k3, k4, k5, k6, as OpenCV
-                     has them; of a fisheye (4,): k1, k2, k3, k4; None: a pinhole, or a fisheye without
+                     has them (12 or 14 if zeros follow); of a fisheye (4,): k1, k2, k3, k4; None: a pinhole, or a fisheye without
 
     A lens shows what lies less than 88° from its axis. Where its distortion folds the image over, nothing is seen either, and a
     render warns with the radius.
@@ -78,7 +78,10 @@ class Camera:
         if self.projection not in COUNTS:
             raise ValueError(f"projection: expected one of {', '.join(map(repr, COUNTS))}, got {self.projection!r}")
         if self.distortion is not None:
-            object.__setattr__(self, "distortion", as_tensor("distortion", self.distortion, like=self.K))
+            distortion = as_tensor("distortion", self.distortion, like=self.K)
+            if self.projection == "perspective" and distortion.dim() > 0:
+                distortion = _without_zeros(distortion)
+            object.__setattr__(self, "distortion", distortion)
             self._check_distortion(self.distortion)
         self._check_values()
 
@@ -359,6 +362,26 @@ def _from_opencv(
     half = torch.zeros_like(K)
     half[:2, 2] = 0.5
     return Camera(_rigid(R, t.reshape(3)), K + half, size, projection, distortion)
+
+
+def _without_zeros(distortion: Tensor) -> Tensor:
+    """The first eight of OpenCV's 12 or 14 coefficients, where the others are zero. Raises ValueError where they are not."""
+    count, most = distortion.shape[-1], max(COUNTS["perspective"])
+    if count not in (12, 14):
+        return distortion
+    if not values_visible(distortion):
+        raise ValueError(
+            f"distortion: expected 4, 5 or 8 coefficients in a transform of torch, got {count}; leave out the zeros"
+        )
+    thin_prism, tilt = distortion.detach()[..., most:12], distortion.detach()[..., 12:]
+    if not bool(thin_prism.any() or tilt.any()):
+        return distortion[..., :most]
+    which = "a thin prism (s1 to s4)" if bool(thin_prism.any()) else "a tilt of the sensor (τx, τy)"
+    raise ValueError(
+        f"distortion: expected OpenCV's 4, 5 or 8 coefficients, or zeros after them, got {count} with {which}; calibrate "
+        "without cv2.CALIB_THIN_PRISM_MODEL and cv2.CALIB_TILTED_MODEL, or undistort the images with cv2.undistort and leave "
+        "the distortion out"
+    )
 
 
 def _count(camera: Camera) -> int:

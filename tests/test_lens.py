@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -332,6 +333,48 @@ def test_a_telephoto_lens_may_fold_near_its_axis() -> None:
         eg.render(colored_sphere(), view, 1)
 
 
+@pytest.mark.parametrize("gap", [1e-3, 1e-6, -1e-3, -1e-6])
+def test_a_rational_lens_may_fold_in_a_narrow_ring(gap: float) -> None:
+    """A pole at r = 1.2 and a zero beside it, apart from which the lens is nearly a pinhole: the slope's numerator by NumPy."""
+    A, B = np.polynomial.Polynomial([1, -1 / (1.44 * (1 + gap))]), np.polynomial.Polynomial([1, -1 / 1.44])
+    s = np.polynomial.Polynomial([0, 1])
+    slope = A * B + 2 * s * (A.deriv() * B - A * B.deriv())
+    turns = [x.real for p in (A, B, slope) for x in p.roots() if abs(x.imag) < 1e-9 and x.real > 0]
+    K = torch.tensor([[12.0, 0, 24], [0, 12, 24], [0, 0, 1]], dtype=F64)
+    distortion = torch.tensor([A.coef[1], 0, 0, 0, 0, B.coef[1], 0, 0], dtype=F64)
+    view = eg.Camera.from_opencv(torch.eye(3, dtype=F64), torch.zeros(3, dtype=F64), K, (48, 48), distortion)
+    kernel = kernel_camera(pack_camera(view))
+    assert math.tan(kernel.fold) == pytest.approx(math.sqrt(min(turns)), rel=1e-9)
+
+
+def test_the_warning_comes_once_a_line_and_points_there() -> None:
+    """Through operators, modules and whatever else lies between: fits that move the distortion are not told at each step."""
+    view, sphere = folding_camera(), colored_sphere()
+    d = view.coefficients.clone().requires_grad_()
+
+    class Renders(torch.nn.Module):
+        def forward(self, view: eg.Camera) -> Tensor:
+            return eg.render(sphere, view, 1)  # the first line
+
+    def sample(view: eg.Camera) -> Tensor:
+        return eg.render(sphere, view, 1, shader=lambda hits: hits.normal)  # the second
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("default")
+        for step in range(3):
+            bent = view.replace(distortion=d * (1 - 0.01 * step))
+            Renders()(bent).sum().backward(retain_graph=True)
+            sample(bent).sum().backward()
+    first = Renders.forward.__code__.co_firstlineno
+    assert [w.filename for w in told] == [__file__] * 2
+    assert [w.lineno for w in told] == [first + 1, sample.__code__.co_firstlineno + 1]
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        for part in (1.0, 0.9):
+            Renders()(view.replace(distortion=part * view.coefficients))
+    assert [f"radius {FOLD / math.sqrt(part):.4g} " in str(w.message) for w, part in zip(told, (1, 0.9), strict=True)]
+
+
 def test_no_warning_where_the_fold_lies_outside() -> None:
     eg.render(colored_sphere(), camera("four"), 1)  # pytest turns warnings into errors
 
@@ -355,6 +398,20 @@ def test_batches_and_files(lens: str, tmp_path: Path) -> None:
     back = eg.load_camera(tmp_path / "camera.json", F64)
     assert torch.equal(back.coefficients, one.coefficients) and back.projection == one.projection
     assert one.detach().to(torch.float32).coefficients.dtype == torch.float32
+
+
+@pytest.mark.parametrize("count", [12, 14])
+def test_longer_lists_of_opencv(count: int) -> None:
+    """Coefficients of models that edgegrad does not have must be zero."""
+    view = camera("eight")
+    longer = torch.nn.functional.pad(view.coefficients, (0, count - 8))
+    assert torch.equal(view.replace(distortion=longer).coefficients, view.coefficients)
+    longer[-1] = 0.01
+    what = "thin prism" if count == 12 else "tilt"
+    with pytest.raises(ValueError, match=rf"distortion: expected .*4, 5 or 8.* got {count}.*{what}.*cv2.undistort"):
+        view.replace(distortion=longer)
+    with pytest.raises(ValueError, match=rf"distortion: expected 4, 5 or 8 .* got {count}; leave out the zeros"):
+        torch.func.vmap(lambda d: view.replace(distortion=d).K)(longer[None])
 
 
 def test_what_is_refused() -> None:

@@ -2,8 +2,10 @@
 #pragma once
 
 #include <cmath>
+#include <vector>
 
 #include "core/math.h"
+#include "core/polynomial.h"
 
 namespace edgegrad {
 
@@ -42,6 +44,18 @@ struct BrownConrady {
     double radius_slope(double r) const {
         const double s = r * r, g = above(s) / below(s);
         return g + 2 * s * slope(s, g);
+    }
+
+    // With g = A / B, and since r' = (A B + 2 s (A' B − A B')) / B²: the zeros of that numerator, of A, and the poles.
+    std::vector<double> turning_radii(double most) const {
+        const Polynomial A{1, k1, k2, k3}, B{1, k4, k5, k6}, AB = product(A, B);
+        Polynomial rise = AB;
+        const Polynomial a = product({0, 2}, product(derivative(A), B)), b = product({0, 2}, product(A, derivative(B)));
+        for (size_t i = 0; i < a.size(); ++i) rise[i] += a[i] - b[i];
+        std::vector<double> out;
+        for (const Polynomial& p : {rise, A, B})
+            for (const double s : sign_changes(p, 0, most * most)) out.push_back(std::sqrt(s));
+        return out;
     }
 
    private:

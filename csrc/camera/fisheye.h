@@ -3,8 +3,10 @@
 #pragma once
 
 #include <cmath>
+#include <vector>
 
 #include "core/math.h"
+#include "core/polynomial.h"
 
 namespace edgegrad {
 
@@ -34,13 +36,27 @@ struct Fisheye {
         for (int i = 0; i < 4; ++i) c_bar[i] += power *= angle * angle;
     }
 
-    double radius(double r) const {
-        const double angle = std::atan(r), s = angle * angle;
+    double radius(double r) const { return at_angle(std::atan(r)); }
+    double radius_slope(double r) const { return slope_at_angle(std::atan(r)) / (1 + r * r); }
+    std::vector<double> turning_radii(double most) const {
+        std::vector<double> out = turning_angles(std::atan(most));
+        for (double& angle : out) angle = std::tan(angle);
+        return out;
+    }
+
+    // θ', its derivative by θ, and where that changes its sign.
+    double at_angle(double angle) const {
+        const double s = angle * angle;
         return angle * (1 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))));
     }
-    double radius_slope(double r) const {
-        const double angle = std::atan(r), s = angle * angle;
-        return (1 + s * (3 * k[0] + s * (5 * k[1] + s * (7 * k[2] + s * 9 * k[3])))) / (1 + r * r);
+    double slope_at_angle(double angle) const {
+        const double s = angle * angle;
+        return 1 + s * (3 * k[0] + s * (5 * k[1] + s * (7 * k[2] + s * 9 * k[3])));
+    }
+    std::vector<double> turning_angles(double most) const {
+        std::vector<double> out = sign_changes({1, 3 * k[0], 5 * k[1], 7 * k[2], 9 * k[3]}, 0, most * most);
+        for (double& s : out) s = std::sqrt(s);
+        return out;
     }
 
    private:

@@ -79,18 +79,20 @@ EDGEGRAD_VECTORIZED double chord_step(const AnyLens& lens, Mat2 inverse, Points&
     return chord_step(*std::get_if<Fisheye>(&lens), inverse, p);
 }
 
-}  // namespace
-
-namespace {
-
 double radius_of_fold(const AnyLens& lens) {
     return with_radial_lens(lens, [](const auto& l) {
-        // Equal angles, and below the first of these a geometric row: a telephoto lens may fold at a thousandth.
+        // Equal angles, and below the first of these a geometric row: a telephoto lens may fold at a thousandth. And
+        // between the radii where the radial part turns, however near these are to one another.
         constexpr int radii = 256, small_radii = 96;
         const double step = std::atan(greatest_radius) / radii;
+        std::vector<double> tested = l.turning_radii(greatest_radius);
+        std::sort(tested.begin(), tested.end());
+        for (size_t i = 1; i < tested.size(); ++i) tested[i - 1] = 0.5 * (tested[i - 1] + tested[i]);
+        for (int i = 1 - small_radii; i <= radii; ++i)
+            tested.push_back(i > 0 ? std::tan(i * step) : std::tan(step) * std::pow(1.1, i - 1));
+        std::sort(tested.begin(), tested.end());
         double low = 0;
-        for (int i = 1 - small_radii; i <= radii; ++i) {
-            double high = i > 0 ? std::tan(i * step) : std::tan(step) * std::pow(1.1, i - 1);
+        for (double high : tested) {
             if (least_area_scale(l, high) > 0) {
                 low = high;
                 continue;

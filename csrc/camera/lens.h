@@ -8,6 +8,7 @@
 #include <limits>
 #include <optional>
 #include <variant>
+#include <vector>
 
 #include "camera/brown_conrady.h"
 #include "camera/equirectangular.h"
@@ -28,11 +29,13 @@ concept Lens = requires(const L lens, Vec2 n, Vec2& n_bar, double* coefficients_
 };
 static_assert(Lens<Equirectangular>);
 
-// One that is radial, nearly: |m| at |n| = r but for what is not, and its derivative.
+// One that is radial, nearly: |m| at |n| = r but for what is not, its derivative, and the radii up to a greatest at
+// which one of these changes its sign.
 template <class L>
 concept RadialLens = Lens<L> && requires(const L lens, double r) {
     { lens.radius(r) } -> std::same_as<double>;
     { lens.radius_slope(r) } -> std::same_as<double>;
+    { lens.turning_radii(r) } -> std::same_as<std::vector<double>>;
 };
 static_assert(RadialLens<BrownConrady> && RadialLens<Fisheye>);
 

@@ -305,9 +305,9 @@ NB_MODULE(_core, m) {
     nb::class_<Camera>(m, "Camera")
         .def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "distortion"_a.noconvert(),
              "perspective"_a, "lens"_a, "width"_a, "height"_a)
-        // Where the lens folds over in the image: the tangent of the angle to the axis; none if it does not.
+        // Where the lens folds over or ends in the image: the angle to the axis; none if it does not.
         .def_prop_ro("fold", [](const Camera& c) {
-            return c.lens_view.folds ? std::optional(c.lens_view.disc.fold) : std::nullopt;
+            return c.lens_view.folds ? std::optional(std::atan(c.lens_view.disc.fold)) : std::nullopt;
         });
     nb::class_<ChannelArrays>(m, "Channels")
         .def(nb::init<In<double, 2>, In<double, 2>, bool, bool, bool, int>(), "vertex_attributes"_a.noconvert(),
