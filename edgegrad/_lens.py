@@ -1,7 +1,7 @@
 """What lenses do to the image of a pinhole: they bend normalised image coordinates n = (X/Z, Y/Z) to m, and K takes m to pixels;
 and where a panorama sees a point.
 
-The kernel has the same maps (csrc/camera/brown_conrady.h, fisheye.h, equirectangular.h).
+The kernel has the same maps (csrc/camera/brown_conrady.h, fisheye.h, wide_fisheye.h, equirectangular.h).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ MOST = 8  # what the kernel takes
 TURNS = 4  # how often a panorama may reach around, either way
 
 
-def bend(projection: str, n: Tensor, distortion: Tensor) -> Tensor:
-    """m (…, 2) of n (…, 2), with the coefficients (4,), (5,) or (8,) in OpenCV's order."""
-    return _fisheye(n, distortion) if projection == "fisheye" else _brown_conrady(n, distortion)
+def bend(projection: str, q: Tensor, distortion: Tensor) -> Tensor:
+    """m (…, 2) of q (…, 3), in camera coordinates, with the coefficients (4,), (5,) or (8,) in OpenCV's order."""
+    return _fisheye(q, distortion) if projection == "fisheye" else _brown_conrady(q[..., :2] / q[..., 2:], distortion)
 
 
 def longitude_latitude(q: Tensor) -> Tensor:
@@ -42,13 +42,16 @@ def _brown_conrady(n: Tensor, distortion: Tensor) -> Tensor:
     )
 
 
-def _fisheye(n: Tensor, distortion: Tensor) -> Tensor:
-    """OpenCV's fisheye (Kannala and Brandt 2006): coefficients k1, k2, k3, k4 of the angle to the axis."""
-    s = (n * n).sum(-1, keepdim=True)
+def _fisheye(q: Tensor, distortion: Tensor) -> Tensor:
+    """OpenCV's fisheye (Kannala and Brandt 2006): coefficients k1, k2, k3, k4 of the angle to the axis. Also behind the camera,
+    where OpenCV gives what is mirrored in the eye; not a number on the axis there."""
+    across, z = q[..., :2], q[..., 2:]
+    s = (across * across).sum(-1, keepdim=True)
     on_axis = s == 0
     r = torch.where(on_axis, torch.ones_like(s), s).sqrt()  # its square root has no derivative at zero
-    a = torch.atan(r)
+    a = torch.atan2(r, z)
     k1, k2, k3, k4 = distortion.unbind()
     t = a * a
     angle = a * (1 + t * (k1 + t * (k2 + t * (k3 + t * k4))))
-    return torch.where(on_axis, torch.ones_like(s), angle / r) * n
+    ahead = torch.where(z > 0, 1 / z, torch.full_like(z, torch.nan))
+    return torch.where(on_axis, ahead, angle / r) * across

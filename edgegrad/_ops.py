@@ -72,12 +72,12 @@ def kernel_channels(request: Request, index: int = 0) -> Any:
     )
 
 
-def warn_of_folds(cameras: Sequence[Any]) -> None:
+def warn_of_ends(cameras: Sequence[Any]) -> None:
     """Once for a batch, of the lens that shows least."""
-    folds = [camera.fold for camera in cameras if camera.fold is not None]
-    if not folds:
+    ends = [camera.end for camera in cameras if camera.end is not None]
+    if not ends:
         return
-    angle = min(folds)
+    angle = min(ends)
     radius = f"the radius {math.tan(angle):.4g} in normalised image coordinates, " if angle < math.pi / 2 else ""
     warn(
         "where a lens ends",
@@ -103,7 +103,7 @@ def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
         image = request.scene.colors.new_empty((B, height, width, request.channels))
         hits = Hits.empty(request)
         cameras = [kernel_camera(request.camera, b) for b in range(B)]
-        warn_of_folds(cameras)
+        warn_of_ends(cameras)
         profiles = []
         for b in range(B):
             options["seed"] = camera_seed(request.image.seed, b)
@@ -231,6 +231,13 @@ def camera_seed(seed: int, camera: int) -> int:
 # -- memory -------------------------------------------------------------------------------------------------------------
 
 
+def _sides(camera: PackedCamera) -> int:
+    """Of how many pinholes the widest of the cameras is made."""
+    if camera.lens not in ("fisheye", "panorama"):
+        return 1
+    return max(kernel_camera(camera, b).sides for b in range(len(camera.K)))
+
+
 def pass_size(request: Request) -> Any:
     """What the kernel's needs depend on."""
     flat, camera, beside = request.scene, request.camera, request.beside
@@ -252,7 +259,7 @@ def pass_size(request: Request) -> Any:
         textured=len(flat.textures) > 0,
         jumps=jumps,
         threads=torch.get_num_threads(),
-        lens=camera.lens,
+        sides=_sides(camera),
     )
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ._kernel import core
 from ._ops import Hits as ImageHits
-from ._ops import camera_seed, kernel_camera, kernel_hits, kernel_scene, warn_of_folds
+from ._ops import camera_seed, kernel_camera, kernel_hits, kernel_scene, warn_of_ends
 from ._request import Request
 
 
@@ -127,7 +127,7 @@ class Sampler:
                 options = request.image._replace(seed=camera_seed(request.image.seed, self._camera))
                 camera = kernel_camera(request.camera, self._camera)
                 if first == 0:
-                    warn_of_folds([camera])
+                    warn_of_ends([camera])
                 found = kernel_scene(request.scene).pixel_hits(
                     camera=camera,
                     options=core.ImageOptions(**options._asdict()),

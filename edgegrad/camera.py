@@ -49,8 +49,9 @@ class Camera:
     distortion       (4,), (5,), (8,) or (B, ·)  of a perspective lens, Brown–Conrady: k1, k2, p1, p2, k3, k4, k5, k6, as OpenCV
                      has them (12 or 14 if zeros follow); of a fisheye (4,): k1, k2, k3, k4; None: a pinhole, or a fisheye without
 
-    A lens shows what lies less than 88° from its axis. Where its distortion folds the image over, nothing is seen either, and a
-    render warns with the radius.
+    A fisheye shows up to all around, 180° from its axis, a perspective lens what lies less than 88° from it. Where the distortion
+    folds the image over, it ends: beyond there is background, and a render warns with the radius. Where that lies within the
+    image, how it moves with the distortion and with K has no gradient.
 
     All tensors are differentiable. Numbers reach up to 3.4e38, the range of float32, also in float64, and so do those of
     the inverse of K. Raises TypeError for a wrong type, ValueError for a wrong shape or value.
@@ -184,7 +185,7 @@ class Camera:
     @staticmethod
     def fisheye(R: Vector, t: Vector, K: Vector, size: tuple[int, int], distortion: Vector | None = None) -> Camera:
         """A fisheye from OpenCV's R (3, 3), t (3,), K (3, 3) in pixels and k1, k2, k3, k4, as cv2.fisheye.calibrate returns
-        them; see from_opencv. It shows what lies less than 88° from the axis."""
+        them; see from_opencv. It may show more than a half space, up to 180° from the axis."""
         return _from_opencv(R, t, K, size, "fisheye", distortion)
 
     @staticmethod
@@ -301,8 +302,8 @@ class Camera:
     def project(self, points: Tensor) -> Tensor:
         """Pixel positions (…, 2) of world points (…, 3), differentiable; a single camera only.
 
-        Not finite in the plane of a perspective camera. What a lens does not show, beyond a fold or behind it, may have a
-        position too. Of all positions in a panorama, the one within ±180°. Raises TypeError or ValueError.
+        Not finite in the plane of a perspective camera, nor right behind a fisheye. What a lens does not show, beyond a fold or
+        behind it, may have a position too. Of all positions in a panorama, the one within ±180°. Raises TypeError or ValueError.
         """
         points = as_tensor("points", points, like=self.K)
         check_float("points", points)
@@ -317,10 +318,10 @@ class Camera:
             uv = longitude_latitude(q)
         elif self.projection == "orthographic":
             uv = q[..., :2]
+        elif self.lens != "pinhole":
+            uv = bend(self.projection, q, self.coefficients)
         else:
             uv = q[..., :2] / q[..., 2:]
-            if self.lens != "pinhole":
-                uv = bend(self.projection, uv, self.coefficients)
         return (K[:2, :2] * uv[..., None, :]).sum(-1) + K[:2, 2]
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:

@@ -163,7 +163,7 @@ class _Image:
         jumps = jump[point] + to_background[point, None] * behind
         weight = self._here(feet.weight).to(jump.dtype)
         values = (weight * velocity[point])[:, None] * jumps
-        return torch.zeros_like(jump[:1]).expand(self._pixels, -1).index_add(0, pixel, values)
+        return torch.zeros_like(jump.sum(0, keepdim=True)).expand(self._pixels, -1).index_add(0, pixel, values)
 
     def _with_creases(self) -> Request:
         """The request with colours that jump where the shader may."""

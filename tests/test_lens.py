@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from around import area, check_area
 from finite_differences import Case, finite_difference, gradient, loss, right_ratio, rotation
 from scenes import icosphere, smooth_adjoint
 from torch import Tensor
@@ -104,32 +105,6 @@ def test_no_distortion_is_a_pinhole() -> None:
 TRIANGLE = torch.tensor([[-0.6, -0.5, 0.3], [0.8, -0.2, -0.6], [-0.1, 0.7, 0.2]], dtype=F64)
 
 
-def area(view: eg.Camera, corners: Tensor) -> Tensor:
-    """Pixels that a triangle covers: its sides bent point by point, chord by chord. Differentiable."""
-    steps = torch.linspace(0, 1, 4001, dtype=F64)[:-1, None]
-    sides = [(1 - steps) * corners[i] + steps * corners[(i + 1) % 3] for i in range(3)]
-    outline = view.project(torch.cat(sides))
-    H, W = view.size
-    assert bool(((outline > 0) & (outline < torch.tensor([W, H]))).all()), "it must lie within the image"
-    x, y = outline.unbind(-1)
-    return 0.5 * (x * y.roll(-1) - y * x.roll(-1)).sum().abs()
-
-
-def check_area(view: eg.Camera, corners: Tensor) -> None:
-    """The image of a white triangle before black, summed: the area, and its derivative in everything that moves it."""
-    leaves = [t.clone().requires_grad_() for t in (corners, view.world_to_camera, view.K, view.coefficients)]
-    corners, M, K, d = leaves
-    white = eg.Mesh(corners, torch.tensor([[0, 1, 2]]), colors=torch.ones((3, 1), dtype=F64))
-    view = view.replace(world_to_camera=M, K=K, distortion=d)
-    expected = area(view, corners)
-    image = eg.render(eg.Scene([white], torch.zeros(1, dtype=F64)), view, 1024, edge_samples=200_000)
-    assert float(image.detach().sum()) == pytest.approx(float(expected.detach()), rel=1e-3)
-    truth, found = (torch.autograd.grad(value, leaves) for value in (expected, image.sum()))
-    for name, a, b in zip(("corners", "world_to_camera", "K", "distortion"), truth, found, strict=True):
-        # Samples lie evenly on the sides: their error falls as 1 / n.
-        torch.testing.assert_close(b, a, rtol=2e-3, atol=1e-3 * float(a.abs().max()), msg=lambda m, n=name: f"{n}: {m}")
-
-
 @lenses
 def test_area_of_a_triangle(lens: str) -> None:
     view = camera(lens)
@@ -182,7 +157,7 @@ def straightened(view: eg.Camera, x: Tensor) -> Tensor:
     n = m.detach()
     for _ in range(30):
         n = n.detach().requires_grad_()
-        bent = bend(view.projection, n, view.coefficients)
+        bent = bend(view.projection, torch.cat([n, torch.ones_like(n[:, :1])], 1), view.coefficients)
         rows = [torch.autograd.grad(bent[:, i].sum(), n, retain_graph=True)[0] for i in (0, 1)]
         n = n.detach() + torch.linalg.solve(torch.stack(rows, 1), (m - bent)[..., None])[..., 0]
     return n
@@ -344,7 +319,7 @@ def test_a_rational_lens_may_fold_in_a_narrow_ring(gap: float) -> None:
     distortion = torch.tensor([A.coef[1], 0, 0, 0, 0, B.coef[1], 0, 0], dtype=F64)
     view = eg.Camera.from_opencv(torch.eye(3, dtype=F64), torch.zeros(3, dtype=F64), K, (48, 48), distortion)
     kernel = kernel_camera(pack_camera(view))
-    assert math.tan(kernel.fold) == pytest.approx(math.sqrt(min(turns)), rel=1e-9)
+    assert math.tan(kernel.end) == pytest.approx(math.sqrt(min(turns)), rel=1e-9)
 
 
 def test_the_warning_comes_once_a_line_and_points_there() -> None:

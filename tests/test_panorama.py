@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from finite_differences import Case, estimate, finite_difference, gradient, right_ratio, rotation
-from scenes import cube, icosphere, smooth_adjoint
+from around import BACKGROUND, ball, both, boundary, check_gradient, moved, pose, room, traced, world
+from finite_differences import estimate, finite_difference, gradient, right_ratio, rotation
+from scenes import cube, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
@@ -22,23 +23,9 @@ from edgegrad._request import make_request, pack_camera
 
 F64 = torch.float64
 SIZE = (24, 48)
-BACKGROUND = torch.tensor([0.1, 0.3, 0.2], dtype=F64)
 # Where things are: before the camera, behind it, below and above.
 PLACES = {"ahead": (0.9, 0.7, 2.0), "seam": (0.2, -0.4, -2.5), "pole": (0.4, 2.5, -0.3), "above": (-0.2, -2.4, 0.5)}
 places = pytest.mark.parametrize("place", PLACES)
-
-
-def pose() -> Tensor:
-    M = torch.eye(4, dtype=F64)
-    M[:3, :3] = rotation((0.0, 0.6, 0.8), torch.tensor(0.4, dtype=F64))
-    M[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
-    return M
-
-
-def world(q: Tensor) -> Tensor:
-    """Of points in the coordinates of the camera at pose()."""
-    M = pose()
-    return (q - M[:3, 3]) @ M[:3, :3]
 
 
 def camera(size: tuple[int, int] = SIZE, skew: float = 0.0) -> eg.Camera:
@@ -161,54 +148,14 @@ def test_position_gradient() -> None:
 # -- images -------------------------------------------------------------------------------------------------------------
 
 
-def ball(place: str, radius: float = 1.0, one_colour: bool = False) -> eg.Mesh:
-    """At a place before the camera, in the world."""
-    sphere = icosphere(1)
-    verts = sphere.verts * torch.tensor([1.0, 0.8, 0.9], dtype=F64) * radius + torch.tensor(PLACES[place], dtype=F64)
-    colors = torch.rand(verts.shape, generator=torch.Generator().manual_seed(1), dtype=F64)
-    return eg.Mesh(world(verts), sphere.faces, colors=torch.ones_like(verts) if one_colour else colors)
-
-
-def room(dx: Tensor | float = 0.0) -> eg.Mesh:
-    """Around the camera, of few large faces; moved askew by dx."""
-    box = cube(4.0)
-    verts = box.verts @ rotation((0.6, 0.0, 0.8), torch.tensor(0.7, dtype=F64)).mT
-    colors = torch.rand(verts.shape, generator=torch.Generator().manual_seed(2), dtype=F64)
-    return eg.Mesh(
-        verts + torch.as_tensor(dx, dtype=F64) * torch.tensor([0.5, 1.0, 0.7], dtype=F64), box.faces, colors=colors
-    )
-
-
-def balls(one_colour: bool = False) -> list[eg.Mesh]:
-    return [ball(place, one_colour=one_colour) for place in PLACES]
-
-
-def traced(scene: eg.Scene, view: eg.Camera, grid: int) -> Tensor:
-    """The image of vertex colours from grid × grid rays a pixel, in double: Möller and Trumbore 1997."""
-    H, W = view.size
-    x, y = ((np.arange(n * grid) + 0.5) / grid for n in (W, H))
-    d = directions(view, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2))
-    M = view.world_to_camera.numpy()
-    eye = -M[:3, :3].T @ M[:3, 3]
-    radiance, nearest = np.tile(BACKGROUND.numpy(), (len(d), 1)), np.full(len(d), np.inf)
-    for mesh in scene.meshes:
-        assert mesh.colors is not None
-        for face in mesh.faces.tolist():
-            (a, b, c), colors = mesh.verts[face].numpy(), mesh.colors[face].numpy()
-            e1, e2, s = b - a, c - a, eye - a
-            p, q = np.cross(d, e2), np.cross(s, e1)
-            det = p @ e1
-            u, v, t = p @ s / det, d @ q / det, (e2 @ q) / det
-            hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < nearest)
-            nearest[hit] = t[hit]
-            radiance[hit] = np.stack([1 - u - v, u, v], -1)[hit] @ colors
-    return torch.from_numpy(radiance).reshape(H, grid, W, grid, 3).mean((1, 3))
+def balls() -> list[eg.Mesh]:
+    return [ball(place) for place in PLACES.values()]
 
 
 @cameras
 def test_image_against_traced_rays(view: eg.Camera) -> None:
     scene = eg.Scene([*balls(), room()], BACKGROUND)
-    expected, image = traced(scene, view, 3), eg.render(scene, view, 256)
+    expected, image = traced(scene, view, 3, lambda x: directions(view, x)), eg.render(scene, view, 256)
     # The rim of a face may pass anywhere between the rays of the grid.
     assert float((image - expected).abs().mean()) < 0.01
     assert float((image - expected).abs().max()) < 0.3
@@ -299,67 +246,14 @@ def test_area_by_intrinsics(place: str) -> None:
 # -- gradients ----------------------------------------------------------------------------------------------------------
 
 
-def boundary(place: str, dx: Tensor | float = 0.0) -> eg.Scene:
-    one = ball(place, one_colour=True)
-    shift = torch.as_tensor(dx, dtype=F64) * torch.tensor([1.0, 0.4, 0.6], dtype=F64)
-    return eg.Scene([one.replace(verts=one.verts + shift)], BACKGROUND)
-
-
-def both(place: str, dx: Tensor | float = 0.0) -> eg.Scene:
-    one = ball(place)
-    shift = torch.as_tensor(dx, dtype=F64) * torch.tensor([1.0, 0.4, 0.6], dtype=F64)
-    return eg.Scene([one.replace(verts=one.verts + shift), room(dx)], BACKGROUND)
-
-
-def moved(scene: Callable[..., eg.Scene], view: eg.Camera, what: str) -> Case:
-    """A case in which one number of vertices, pose or K moves."""
-
-    def vertices(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
-        return scene(dx=theta), view
-
-    def turned(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
-        M = view.world_to_camera
-        R = rotation((0.48, 0.6, 0.64), theta)
-        return scene(), view.replace(world_to_camera=torch.cat([R @ M[:3], M[3:]]))
-
-    def shifted(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
-        M = view.world_to_camera
-        t = M[:3, 3:] + theta * torch.tensor([[0.8], [0.3], [0.5]], dtype=F64)
-        return scene(), view.replace(world_to_camera=torch.cat([torch.cat([M[:3, :3], t], 1), M[3:]]))
-
-    def intrinsics(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
-        change = torch.zeros((3, 3), dtype=F64)
-        change[int(what[1]), int(what[2])] = 4.0 if what[2] != "2" else 8.0
-        return scene(), view.replace(K=view.K + theta * change)
-
-    makers = {"vertices": vertices, "turn": turned, "shift": shifted}
-    return makers.get(what, intrinsics)
-
-
 WHAT = ["vertices", "turn", "shift", "K00", "K01", "K02", "K10", "K11", "K12"]
-# Of these the derivative is as small as chance, by symmetry or since terms cancel.
-FAINT = 0.02
-
-
-def check_gradient(case: Case, spp: int = 2048, seeds: int = 4, step: float = 0.005, filter: str = "box") -> None:
-    fd = finite_difference(case, step, spp, seeds, filter=filter)
-    found = gradient(case, 4, surface_samples=400_000, edge_samples=50_000, filter=filter)
-    high, low = (eg.render(*case(torch.tensor(h, dtype=F64)), spp=256) for h in (0.01, -0.01))
-    size = float((high - low).abs().sum()) / 0.02
-    noise = math.hypot(fd.error, found.error)
-    if abs(fd.mean) < FAINT * size:
-        assert abs(found.mean - fd.mean) < 0.01 * size + 4 * noise
-        return
-    # No more than 4 %, so that a gradient that is 5 % off does not pass.
-    assert noise < 0.015 * abs(fd.mean), f"too noisy to tell: {fd}, {found}"
-    assert abs(found.mean - fd.mean) <= 0.01 * abs(fd.mean) + 2 * noise, f"finite difference {fd}, gradient {found}"
 
 
 @pytest.mark.parametrize(
     ("place", "what"), [("ahead", "turn"), ("seam", "vertices"), ("pole", "turn"), ("above", "K11")]
 )
 def test_gradient(place: str, what: str) -> None:
-    check_gradient(moved(lambda dx=0.0: both(place, dx), camera(), what), seeds=3)
+    check_gradient(moved(lambda dx=0.0: both(PLACES[place], dx), camera(), what), seeds=3)
 
 
 VIEWS = ["whole", "skewed", "crop", "several turns"]
@@ -375,7 +269,7 @@ def test_gradients(place: str, kind: Callable[..., eg.Scene], view: str, what: s
     if view == "crop" and place == "ahead":
         pytest.skip("not in view")
     check_gradient(
-        moved(lambda dx=0.0: kind(place, dx), CAMERAS[view], what), spp=4096, seeds=6, step=0.02, filter="tent"
+        moved(lambda dx=0.0: kind(PLACES[place], dx), CAMERAS[view], what), spp=4096, seeds=6, step=0.02, filter="tent"
     )
 
 
@@ -408,7 +302,7 @@ def test_edges_between_windows_count_once(filter: str) -> None:
 
 def test_the_seam_is_nowhere() -> None:
     """The gradient of a scene is that of the same scene with the camera turned and the loss shifted as far."""
-    scene = both("seam")
+    scene = both(PLACES["seam"])
     adjoint = smooth_adjoint(*SIZE, 3)
     along = torch.tensor([0.5, 1.0, 0.7], dtype=F64)
     sums: list[list[float]] = [[], []]
@@ -452,7 +346,7 @@ def test_batches_and_files(tmp_path: Path) -> None:
 
 
 def test_same_bits_at_any_number_of_threads() -> None:
-    scene, view = both("pole"), camera().crop(-3, -5, 30, 50)
+    scene, view = both(PLACES["pole"]), camera().crop(-3, -5, 30, 50)
     K = view.K.clone().requires_grad_()
     found = []
     threads = torch.get_num_threads()
@@ -468,7 +362,7 @@ def test_same_bits_at_any_number_of_threads() -> None:
 
 def test_plan() -> None:
     """What it counts is what is done; samples that are asked for are shared out between the frames."""
-    scene = both("seam")
+    scene = both(PLACES["seam"])
     for mesh in scene.meshes:
         mesh.verts.requires_grad_()
     plan = eg.plan(scene, camera())
@@ -484,7 +378,7 @@ def test_plan() -> None:
 
 
 def test_nothing_in_view() -> None:
-    one = boundary("ahead").meshes[0]
+    one = boundary(PLACES["ahead"]).meshes[0]
     one.verts.requires_grad_()
     view = camera((96, 192)).crop(60, -20, 30, 30)
     image = eg.render(eg.Scene([one], BACKGROUND), view, 4)

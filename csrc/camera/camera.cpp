@@ -4,27 +4,42 @@
 
 namespace edgegrad {
 
+namespace {
+
+constexpr double margin = 1;  // px, by which a filter may reach over the border of the image
+
+}  // namespace
+
+void Camera::look_through_lens() {
+    lens_view = view_through_lens();
+    const auto* fisheye = std::get_if<Fisheye>(&lens);
+    if (!fisheye || !lens_view.end || lens_view.disc.fold < greatest_radius) return;
+    const WideFisheye wide(k, *fisheye);
+    lens_view = {};
+    if (wide.ends_in({{-margin, -margin}, {width + margin, height + margin}})) lens_view.end = wide.rim();
+    lens = wide;
+}
+
 LensView Camera::view_through_lens() const {
     LensView view;
     view.disc = disc_of(lens);
-    // The border of the image, widened by as much as a filter may reach: what is seen within it lies within its image.
-    constexpr double margin = 1;
+    // The border of the image: what is seen within it lies within its image.
     constexpr int points = 256;  // a side
     constexpr double infinite = std::numeric_limits<double>::infinity();
     Vec2 low{infinite, infinite}, high{-infinite, -infinite};
     const auto add = [&](Vec2 u) {
         low = {std::min(low.x, u.x), std::min(low.y, u.y)}, high = {std::max(high.x, u.x), std::max(high.y, u.y)};
     };
-    for (int i = 0; i < points && !view.folds; ++i) {
+    for (int i = 0; i < points && !view.end; ++i) {
         const double s = double(i) / points, w = width + 2 * margin, h = height + 2 * margin;
         for (const Vec2 x : {Vec2{s * w, 0}, Vec2{w, s * h}, Vec2{(1 - s) * w, h}, Vec2{0, (1 - s) * h}}) {
             const auto n = edgegrad::straighten(lens, view.disc, normalised(*this, x - Vec2{margin, margin}));
-            if (!n) view.folds = true;
+            if (!n) view.end = std::atan(view.disc.fold);
             else add(to_pixels(*this, *n));
         }
     }
     double radius = view.disc.fold;
-    if (view.folds) {
+    if (view.end) {
         // The whole disc: K takes it to an ellipse.
         const Vec2 reach{std::hypot(k[0], k[1]) * radius, std::hypot(k[3], k[4]) * radius};
         low = Vec2{k[2], k[5]} - reach, high = Vec2{k[2], k[5]} + reach;
@@ -62,15 +77,15 @@ Box2 normalised_box(const Camera& c, Vec2 low, Vec2 high) {
 }  // namespace
 
 double Camera::stretch(Vec2 low, Vec2 high) const {
-    const auto* panorama = std::get_if<Equirectangular>(&lens);
-    return panorama ? panorama->stretch(normalised_box(*this, low, high)) : 1;
+    return with_side_lens(lens, 1.0, [&](const auto& l) { return l.stretch(normalised_box(*this, low, high)); });
 }
 
 // By the mean value theorem, from a place of the box, or the nearest that is seen at all.
 std::pair<Vec2, Vec2> Camera::image_box(Vec2 low, Vec2 high) const {
     if (is_straight()) return {low, high};
-    if (const auto* panorama = std::get_if<Equirectangular>(&lens)) {
-        const Box2 box = panorama->image_box(normalised_box(*this, low, high));
+    if (has_sides(lens)) {
+        const Box2 n = normalised_box(*this, low, high);
+        const Box2 box = with_side_lens(lens, n, [&](const auto& l) { return l.image_box(n); });
         return {box.low, box.high};
     }
     Vec2 n = normalised(*this, 0.5 * (low + high));

@@ -20,12 +20,12 @@ namespace edgegrad {
 
 // Cotangents, or tangents, of what an image is made with.
 struct IntrinsicsGrad {
-    double k[6] = {};  // the upper rows of K
-    double distortion[most_coefficients] = {};
+    double k[6] = {};                         // the upper rows of K
+    double distortion[most_parameters] = {};  // of the lens
 
     IntrinsicsGrad& operator+=(const IntrinsicsGrad& o) {
         for (int i = 0; i < 6; ++i) k[i] += o.k[i];
-        for (int i = 0; i < most_coefficients; ++i) distortion[i] += o.distortion[i];
+        for (int i = 0; i < most_parameters; ++i) distortion[i] += o.distortion[i];
         return *this;
     }
 };
@@ -35,7 +35,8 @@ struct IntrinsicsGrad {
 // (windows.h): which borders of its box, in the order of ViewVolume, belong to its neighbours.
 struct LensView {
     LensDisc disc;
-    bool folds = false;  // whether the image reaches beyond the disc
+    // The angle to the axis, radians, where the image ends; none if it does not.
+    std::optional<double> end;
     Vec2 low, high;
     Mat2 most = {1, 0, 0, 1};
     bool open[4] = {};
@@ -64,10 +65,15 @@ struct Camera {
         // An orthographic view is the same from any distance; from none, depths are rounded least.
         t = {world_to_camera[3], world_to_camera[7], perspective ? world_to_camera[11] : 0.0};
         std::copy(K, K + 6, k);
-        const auto* panorama = std::get_if<Equirectangular>(&lens);
-        if (panorama) std::fill(k, k + 6, 0.0), k[0] = panorama->scale().x, k[4] = panorama->scale().y;
         set_inverses();
-        if (!is_straight() && !panorama) lens_view = view_through_lens();
+        if (!is_straight() && !has_sides(lens)) look_through_lens();
+        with_side_lens(lens, 0, [&](const auto& l) { return set_scale(l.scale()), 0; });
+    }
+
+    // Of the straight image of a side.
+    void set_scale(Vec2 scale) {
+        std::fill(k, k + 6, 0.0), k[0] = scale.x, k[4] = scale.y;
+        set_inverses();
     }
 
     // Of R and k, where these are set.
@@ -156,23 +162,24 @@ struct Camera {
 
     // The place in the straight image around which areas grow as 1 / distance; none for most.
     std::optional<Vec2> pole() const {
-        const auto* panorama = std::get_if<Equirectangular>(&lens);
-        return panorama && panorama->side().pole() ? std::optional(Vec2{k[2], k[5]}) : std::nullopt;
+        const bool there = with_side_lens(lens, false, [](const auto& l) { return l.has_pole(); });
+        return there ? std::optional(Vec2{k[2], k[5]}) : std::nullopt;
     }
 
     // Whether a window may show something within `reach` px of x.
     bool may_show(Vec2 x, double reach) const {
-        const auto* panorama = std::get_if<Equirectangular>(&lens);
-        return !panorama || panorama->may_show(x, reach);
+        return with_side_lens(lens, true, [&](const auto& l) { return l.may_show(x, reach); });
     }
 
     // No point of a face has a greater depth, in no window that shows it.
     double greatest_depth(const Vec3 q[3]) const {
-        if (!std::holds_alternative<Equirectangular>(lens)) return std::max({q[0].z, q[1].z, q[2].z});
+        if (!has_sides(lens)) return std::max({q[0].z, q[1].z, q[2].z});
         return std::max({length(q[0]), length(q[1]), length(q[2])});
     }
 
    private:
+    // Finds out what is visible; a fisheye that shows more than one side becomes a wide one.
+    void look_through_lens();
     LensView view_through_lens() const;
 };
 
@@ -215,9 +222,9 @@ inline void project_vjp(const Camera& c, Vec3 q, Vec2 bar, Vec3& q_bar, Intrinsi
 inline Vec2 bend_by_coefficients(const Camera& c, Vec2 n, const double* distortion_dot) {
     const auto along = [&](Vec2 bar) {
         Vec2 ignored;
-        double c_bar[most_coefficients] = {}, sum = 0;
+        double c_bar[most_parameters] = {}, sum = 0;
         with_lens(c.lens, [&](const auto& lens) { lens.bend_vjp(n, bar, ignored, c_bar); });
-        for (int i = 0; i < most_coefficients; ++i) sum += c_bar[i] * distortion_dot[i];
+        for (int i = 0; i < most_parameters; ++i) sum += c_bar[i] * distortion_dot[i];
         return sum;
     };
     return {along({1, 0}), along({0, 1})};

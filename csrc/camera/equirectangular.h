@@ -6,14 +6,10 @@
 #include <limits>
 #include <optional>
 
+#include "camera/cube_side.h"
 #include "core/math.h"
 
 namespace edgegrad {
-
-// A box of two coordinates.
-struct Box2 {
-    Vec2 low, high;
-};
 
 // A panorama sees through the six sides of a cube around the eye (windows.h). Each has a frame of its own, in which it
 // is a pinhole with |n.x|, |n.y| ≤ 1; this lens takes n to the panorama. Of the direction d = turnᵀ (n, 1) in the
@@ -29,25 +25,21 @@ struct Box2 {
 class Equirectangular {
    public:
     static constexpr int coefficients = 6;  // the upper two rows of K
-    // Of the frame of a side, to the camera's, and which of its borders are its own, for each direction has one side:
-    // either the borders are closed, or all but the one at the least n.x are open.
-    struct Side {
-        Mat3 turn{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
-        bool closed = false;
-        bool pole() const { return turn.row[2].y != 0; }
-    };
     // One of the places, and the angles (λ', φ') that this lens is for: below `to`, and not below `from`.
     struct Place {
         int across = 0, over = 0;  // j, i
         Vec2 from{-infinite, -infinite}, to{infinite, infinite};
     };
 
-    Equirectangular(const double* K, const Side& side, const Place& place);
+    Equirectangular(const double* K, const CubeSide& side, const Place& place);
 
     // The focal lengths of the straight image, px: positive areas stay positive.
     Vec2 scale() const { return scale_; }
     const double* K() const { return k_; }
-    const Side& side() const { return side_; }
+    const CubeSide& side() const { return side_; }
+    Mat3 turn() const { return side_.turn; }  // from the camera's frame to the side's
+    // Whether there is a place around which areas grow as 1 / distance.
+    bool has_pole() const { return side_.pole(); }
 
     Vec2 bend(Vec2 n) const;
     Mat2 jacobian(Vec2 n) const;
@@ -74,13 +66,11 @@ class Equirectangular {
    private:
     static constexpr double infinite = std::numeric_limits<double>::infinity();
 
-    Vec3 direction(Vec2 n) const { return transposed_times(side_.turn, {n.x, n.y, 1}); }
     Vec2 angles_at(Vec3 d) const;
     Vec2 angles_of_pixel(Vec2 x) const;
-    Box2 base_box(Box2 n) const;
 
     double k_[6], inverse_[4];
-    Side side_;
+    CubeSide side_;
     Place place_;
     Vec2 scale_;
 };

@@ -124,19 +124,21 @@ LensDisc disc_of(const AnyLens& lens) {
 }
 
 std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m) {
-    if (const auto* panorama = std::get_if<Equirectangular>(&lens)) return panorama->straighten(m);
+    if (has_sides(lens))
+        return with_side_lens(lens, std::optional<Vec2>(), [&](const auto& l) { return l.straighten(m); });
     return with_radial_lens(lens, [&](const auto& l) { return straighten(l, disc, m); });
 }
 
 void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, double* x, double* y) {
     constexpr double nan = std::numeric_limits<double>::quiet_NaN();
-    if (const auto* panorama = std::get_if<Equirectangular>(&lens)) {
+    const bool done = with_side_lens(lens, false, [&](const auto& l) {
         for (int i = 0; i < k; ++i) {
-            const Vec2 n = panorama->straighten({x[i], y[i]}).value_or(Vec2{nan, nan});
+            const Vec2 n = l.straighten({x[i], y[i]}).value_or(Vec2{nan, nan});
             x[i] = n.x, y[i] = n.y;
         }
-        return;
-    }
+        return true;
+    });
+    if (done) return;
     const std::optional<Vec2> n0 = straighten(lens, disc, m0);
     const Mat2 inverse =
         edgegrad::inverse(with_radial_lens(lens, [&](const auto& l) { return l.jacobian(n0.value_or(Vec2{})); }));
@@ -158,7 +160,6 @@ void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, 
         for (int i = 0; i < p.count; ++i) {
             Vec2 n{p.n_x[i], p.n_y[i]};
             if (!(p.error[i] < small && length(n) < disc.fold)) {
-                constexpr double nan = std::numeric_limits<double>::quiet_NaN();
                 n = straighten(lens, disc, {p.m_x[i], p.m_y[i]}).value_or(Vec2{nan, nan});
             }
             x[first + i] = n.x, y[first + i] = n.y;

@@ -13,6 +13,7 @@
 #include "camera/brown_conrady.h"
 #include "camera/equirectangular.h"
 #include "camera/fisheye.h"
+#include "camera/wide_fisheye.h"
 #include "core/math.h"
 
 namespace edgegrad {
@@ -27,7 +28,21 @@ concept Lens = requires(const L lens, Vec2 n, Vec2& n_bar, double* coefficients_
     { lens.jacobian(n) } -> std::same_as<Mat2>;  // ∂m/∂n
     lens.bend_vjp(n, n, n_bar, coefficients_bar);
 };
-static_assert(Lens<Equirectangular>);
+
+// One that sees through the sides of a cube (cube_side.h), each of which is a window (windows.h).
+template <class L>
+concept SideLens = Lens<L> && requires(const L lens, Vec2 x, double reach, Box2 box) {
+    { lens.scale() } -> std::same_as<Vec2>;
+    { lens.side() } -> std::same_as<const CubeSide&>;
+    { lens.turn() } -> std::same_as<Mat3>;
+    { lens.has_pole() } -> std::same_as<bool>;
+    { lens.straighten(x) } -> std::same_as<std::optional<Vec2>>;
+    { lens.may_show(x, reach) } -> std::same_as<bool>;
+    { lens.image_box(box) } -> std::same_as<Box2>;
+    { lens.side_box(box) } -> std::same_as<std::optional<Box2>>;
+    { lens.stretch(box) } -> std::same_as<double>;
+};
+static_assert(SideLens<Equirectangular> && SideLens<WideFisheye>);
 
 // One that is radial, nearly: |m| at |n| = r but for what is not, its derivative, and the radii up to a greatest at
 // which one of these changes its sign.
@@ -40,21 +55,34 @@ concept RadialLens = Lens<L> && requires(const L lens, double r) {
 static_assert(RadialLens<BrownConrady> && RadialLens<Fisheye>);
 
 // A new lens is a file of its own, and a place in this list.
-using AnyLens = std::variant<StraightLens, BrownConrady, Fisheye, Equirectangular>;
-constexpr int most_coefficients = 8;
-static_assert(BrownConrady::coefficients <= most_coefficients && Fisheye::coefficients <= most_coefficients &&
-              Equirectangular::coefficients <= most_coefficients);
+using AnyLens = std::variant<StraightLens, BrownConrady, Fisheye, Equirectangular, WideFisheye>;
+constexpr int most_coefficients = 8;  // that a camera is given
+static_assert(BrownConrady::coefficients <= most_coefficients && Fisheye::coefficients <= most_coefficients);
+constexpr int most_parameters = 10;  // of a lens: where it sees through a side, K comes first
+static_assert(most_coefficients <= most_parameters && Equirectangular::coefficients <= most_parameters &&
+              WideFisheye::coefficients <= most_parameters);
 
-// f(lens), of one that is nearly radial; of any that is not straight.
+// f(lens), of one that is nearly radial; of one that sees through a side, or something else; of any that is not
+// straight.
 template <class F>
 auto with_radial_lens(const AnyLens& lens, F f) {
     if (const auto* l = std::get_if<BrownConrady>(&lens)) return f(*l);
     return f(*std::get_if<Fisheye>(&lens));
 }
+template <class Result, class F>
+Result with_side_lens(const AnyLens& lens, Result otherwise, F f) {
+    if (const auto* l = std::get_if<Equirectangular>(&lens)) return f(*l);
+    if (const auto* l = std::get_if<WideFisheye>(&lens)) return f(*l);
+    return otherwise;
+}
 template <class F>
 auto with_lens(const AnyLens& lens, F f) {
     if (const auto* l = std::get_if<Equirectangular>(&lens)) return f(*l);
+    if (const auto* l = std::get_if<WideFisheye>(&lens)) return f(*l);
     return with_radial_lens(lens, f);
+}
+inline bool has_sides(const AnyLens& lens) {
+    return with_side_lens(lens, false, [](const auto&) { return true; });
 }
 
 // The disc in which every m of a radial lens has one n: what lies beyond is not seen.
@@ -63,7 +91,7 @@ struct LensDisc {
     double reach = fold;                                    // no |m| from within is greater
 };
 LensDisc disc_of(const AnyLens& lens);
-constexpr double greatest_radius = 30;  // 88° from the axis
+constexpr double greatest_radius = 30;  // 88° from the axis; what shows more sees through sides
 
 // The n in the disc that is bent to m; none if there is none.
 std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m);

@@ -7,13 +7,6 @@ namespace edgegrad {
 
 namespace {
 
-// Ahead, right, behind, left; below, above. Signs and exchanges alone, so that sides agree on what lies between them.
-constexpr Equirectangular::Side sides[most_sides] = {
-    {{{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}}, false},   {{{{0, 0, -1}, {0, 1, 0}, {1, 0, 0}}}, false},
-    {{{{-1, 0, 0}, {0, 1, 0}, {0, 0, -1}}}, false}, {{{{0, 0, 1}, {0, 1, 0}, {-1, 0, 0}}}, false},
-    {{{{1, 0, 0}, {0, 0, -1}, {0, 1, 0}}}, true},   {{{{1, 0, 0}, {0, 0, 1}, {0, -1, 0}}}, true},
-};
-
 const Equirectangular* panorama(const Camera& camera) { return std::get_if<Equirectangular>(&camera.lens); }
 
 // The image, widened.
@@ -21,16 +14,15 @@ Box2 frame(const Camera& camera, double reach) {
     return {{-reach, -reach}, {camera.width + reach, camera.height + reach}};
 }
 
-Camera window(const Camera& camera, const Equirectangular& lens, Box2 n) {
+template <SideLens L>
+Camera window(const Camera& camera, const L& lens, Box2 n) {
     Camera out = camera;
-    const Mat3& turn = lens.side().turn;
-    out.turn = turn;
-    for (int i = 0; i < 3; ++i) out.R.row[i] = transposed_times(camera.R, turn.row[i]);
-    out.t = turn * camera.t;
+    out.turn = lens.turn();
+    for (int i = 0; i < 3; ++i) out.R.row[i] = transposed_times(camera.R, out.turn.row[i]);
+    out.t = out.turn * camera.t;
     out.lens = lens;
     const Vec2 scale = lens.scale();
-    out.k[4] = scale.y;
-    out.set_inverses();
+    out.set_scale(scale);
     const double y[2] = {scale.y * n.low.y, scale.y * n.high.y};
     out.lens_view = {};
     out.lens_view.low = {scale.x * n.low.x, std::min(y[0], y[1])};
@@ -54,20 +46,37 @@ Range covering(double low, double high, double half, double least) {
 }  // namespace
 
 std::vector<Camera> sides_of(const Camera& camera) {
-    const Equirectangular* lens = panorama(camera);
-    if (!lens) return {camera};
+    const Box2 whole{{-1, -1}, {1, 1}};
     std::vector<Camera> out;
-    for (const auto& side : sides) out.push_back(window(camera, {lens->K(), side, {}}, {{-1, -1}, {1, 1}}));
-    return out;
+    if (const Equirectangular* lens = panorama(camera)) {
+        for (const auto& side : cube_sides) out.push_back(window(camera, Equirectangular(lens->K(), side, {}), whole));
+        return out;
+    }
+    if (const auto* fisheye = std::get_if<WideFisheye>(&camera.lens)) {
+        for (const auto& side : cube_sides)
+            if (const WideFisheye lens = fisheye->through(side); lens.side_box(frame(camera, 1)))
+                out.push_back(window(camera, lens, whole));
+        if (out.empty()) out.push_back(window(camera, *fisheye, whole));  // the image lies beyond the rim
+        return out;
+    }
+    return {camera};
 }
 
 std::vector<Camera> windows_of(const Camera& camera, double reach) {
+    const Box2 image = frame(camera, reach);
+    std::vector<Camera> out;
+    if (const auto* fisheye = std::get_if<WideFisheye>(&camera.lens)) {
+        for (const auto& side : cube_sides) {
+            const WideFisheye lens = fisheye->through(side);
+            if (const auto box = lens.side_box(image)) out.push_back(window(camera, lens, *box));
+        }
+        return out;
+    }
     const Equirectangular* lens = panorama(camera);
     if (!lens) return {camera};
     constexpr double infinite = std::numeric_limits<double>::infinity();
-    const Box2 image = frame(camera, reach), angles = Equirectangular::angles(lens->K(), image);
+    const Box2 angles = Equirectangular::angles(lens->K(), image);
     const double least = 1e-6 / std::fabs(lens->scale().x);
-    std::vector<Camera> out;
     const auto [over_first, over_last] = covering(angles.low.y, angles.high.y, 0.5, least);
     for (int over = over_first; over <= over_last; ++over) {
         // Of those that go around, which λ' = λ + j π has for j of the parity of `over`.
@@ -82,7 +91,7 @@ std::vector<Camera> windows_of(const Camera& camera, double reach) {
                 {across == first ? -infinite : M_PI * (across - 1),
                  over == over_first ? -infinite : M_PI * (over - 0.5)},
                 {across == last ? infinite : M_PI * (across + 1), over == over_last ? infinite : M_PI * (over + 0.5)}};
-            for (const auto& side : sides) {
+            for (const auto& side : cube_sides) {
                 const Equirectangular of_side(lens->K(), side, place);
                 if (const auto box = of_side.side_box(image)) out.push_back(window(camera, of_side, *box));
             }
@@ -100,17 +109,21 @@ bool is_too_wide(const Camera& camera) {
 }
 
 void add_intrinsics(const Camera& window, const IntrinsicsGrad& bar, double* K, double* distortion) {
-    const double* of_k = panorama(window) ? bar.distortion : bar.k;
+    const bool side = has_sides(window.lens);
+    const double *of_k = side ? bar.distortion : bar.k, *of_lens = bar.distortion + (side ? 6 : 0);
     if (K)
         for (int i = 0; i < 6; ++i) K[i] += of_k[i];
-    if (distortion && !panorama(window))
-        for (int i = 0; i < most_coefficients; ++i) distortion[i] += bar.distortion[i];
+    if (distortion)
+        for (int i = 0; i < (side ? most_parameters - 6 : most_coefficients); ++i) distortion[i] += of_lens[i];
 }
 
 IntrinsicsGrad window_intrinsics(const Camera& window, const double* K, const double* distortion) {
     IntrinsicsGrad out;
-    if (K) std::copy(K, K + 6, panorama(window) ? out.distortion : out.k);
-    if (distortion && !panorama(window)) std::copy(distortion, distortion + most_coefficients, out.distortion);
+    const bool side = has_sides(window.lens);
+    if (K) std::copy(K, K + 6, side ? out.distortion : out.k);
+    if (distortion)
+        std::copy(distortion, distortion + (side ? most_parameters - 6 : most_coefficients),
+                  out.distortion + (side ? 6 : 0));
     return out;
 }
 

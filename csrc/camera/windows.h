@@ -1,6 +1,6 @@
-// What a camera sees through: one image plane, or, for a panorama, the sides of a cube around its eye. Each is a camera
-// with a frame of its own and a lens that takes its straight image to the one image; together they see each direction
-// once. Who draws an image or differentiates it goes from window to window.
+// What a camera sees through: one image plane, or, for a panorama or a wide fisheye, the sides of a cube around its
+// eye. Each is a camera with a frame of its own and a lens that takes its straight image to the one image; together
+// they see each direction once. Who draws an image or differentiates it goes from window to window.
 #pragma once
 
 #include <vector>
@@ -11,7 +11,6 @@ namespace edgegrad {
 
 // For rays: each pixel position is seen through one of them.
 std::vector<Camera> sides_of(const Camera& camera);
-constexpr int most_sides = 6;
 
 // For points: each has one place in the image through one of them, as often as the image, widened by `reach` px, shows
 // it. The rectangle of each holds no more than what the image shows.

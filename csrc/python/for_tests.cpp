@@ -46,11 +46,16 @@ template <size_t N>
 std::array<double, N> array(const double (&a)[N]) {
     return std::to_array(a);
 }
-// Tangents of K and of the coefficients, one after the other.
-IntrinsicsGrad intrinsics(const std::array<double, 6 + most_coefficients>& dot) {
-    IntrinsicsGrad out;
-    std::copy(dot.begin(), dot.begin() + 6, out.k), std::copy(dot.begin() + 6, dot.end(), out.distortion);
-    return out;
+// Tangents of K and of the coefficients, one after the other; and cotangents, side by side.
+IntrinsicsGrad intrinsics(const Camera& c, const std::array<double, 6 + most_coefficients>& dot) {
+    return window_intrinsics(c, dot.data(), dot.data() + 6);
+}
+std::tuple<std::array<double, 6>, std::array<double, most_coefficients>> of_camera(const Camera& c,
+                                                                                   const IntrinsicsGrad& bar) {
+    std::array<double, 6> k{};
+    std::array<double, most_coefficients> distortion{};
+    add_intrinsics(c, bar, k.data(), distortion.data());
+    return {k, distortion};
 }
 A33 array(const FaceMap& m) { return {array(m.column[0]), array(m.column[1]), array(m.column[2])}; }
 
@@ -144,13 +149,14 @@ void bind_for_tests(nb::module_& m) {
         Vec3 q_bar;
         IntrinsicsGrad grad;
         project_vjp(c, vec(q), vec(bar), q_bar, grad);
-        return std::tuple(array(q_bar), array(grad.k), array(grad.distortion));
+        const auto [k, distortion] = of_camera(c, grad);
+        return std::tuple(array(q_bar), k, distortion);
     });
     p.def("normalised", [](const Camera& c, A2 x) { return array(normalised(c, straighten(c, vec(x)))); });
     p.def("normalised_vjp", [](const Camera& c, A2 x, A2 bar) {
         IntrinsicsGrad grad;
         normalised_vjp(c, normalised(c, straighten(c, vec(x))), vec(bar), grad);
-        return std::tuple(array(grad.k), array(grad.distortion));
+        return of_camera(c, grad);
     });
     // By the bend of the straight image: where a place is seen, the area scale, and what becomes of a tangent there.
     p.def("bend", [](const Camera& c, A2 u, A2 tangent) {
@@ -172,10 +178,10 @@ void bind_for_tests(nb::module_& m) {
     p.def("view_box", [](const Camera& c) { return std::tuple(array(c.lens_view.low), array(c.lens_view.high)); });
     // In forward mode.
     p.def("project_jvp", [](const Camera& c, A3 q, A3 q_dot, std::array<double, 6 + most_coefficients> k_dot) {
-        return array(project_jvp(c, vec(q), vec(q_dot), intrinsics(k_dot)));
+        return array(project_jvp(c, vec(q), vec(q_dot), intrinsics(c, k_dot)));
     });
     p.def("normalised_jvp", [](const Camera& c, A2 x, std::array<double, 6 + most_coefficients> k_dot) {
-        return array(normalised_jvp(c, normalised(c, straighten(c, vec(x))), intrinsics(k_dot)));
+        return array(normalised_jvp(c, normalised(c, straighten(c, vec(x))), intrinsics(c, k_dot)));
     });
     p.def("face_map_jvp", [](const Camera& c, A33 q, A33 q_dot) {
         const Vec3 corner[3] = {vec(q[0]), vec(q[1]), vec(q[2])},

@@ -104,26 +104,14 @@ void bind_memory(nb::module_& m) {
     nb::class_<PassSize>(m, "PassSize")
         .def(nb::new_([](int64_t verts, int64_t faces, int64_t colors, int64_t uvs, int64_t texels, int64_t pixels,
                          int radiance, int vertex_attributes, int face_attributes, int channels, int number,
-                         bool textured, bool jumps, int threads, const std::string& lens) {
-                 return PassSize{verts,
-                                 faces,
-                                 colors,
-                                 uvs,
-                                 texels,
-                                 pixels,
-                                 radiance,
-                                 vertex_attributes,
-                                 face_attributes,
-                                 channels,
-                                 number,
-                                 textured,
-                                 jumps,
-                                 threads,
-                                 lens == "panorama" ? most_sides : 1};
+                         bool textured, bool jumps, int threads, int sides) {
+                 return PassSize{
+                     verts,           faces,    colors, uvs,      texels, pixels,  radiance, vertex_attributes,
+                     face_attributes, channels, number, textured, jumps,  threads, sides};
              }),
              nb::kw_only(), "verts"_a, "faces"_a, "colors"_a, "uvs"_a, "texels"_a, "pixels"_a, "radiance"_a,
              "vertex_attributes"_a, "face_attributes"_a, "channels"_a, "number"_a, "textured"_a, "jumps"_a, "threads"_a,
-             "lens"_a);
+             "sides"_a);
     m.def("image_bytes", &image_bytes, "size"_a, "cameras"_a);
     m.def(
         "gradient_bytes",

@@ -306,9 +306,9 @@ NB_MODULE(_core, m) {
         .def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "distortion"_a.noconvert(),
              "perspective"_a, "lens"_a, "width"_a, "height"_a)
         // Where the lens folds over or ends in the image: the angle to the axis; none if it does not.
-        .def_prop_ro("fold", [](const Camera& c) {
-            return c.lens_view.folds ? std::optional(std::atan(c.lens_view.disc.fold)) : std::nullopt;
-        });
+        .def_prop_ro("end", [](const Camera& c) { return c.lens_view.end; })
+        // How many pinholes it sees through.
+        .def_prop_ro("sides", [](const Camera& c) { return sides_of(c).size(); });
     nb::class_<ChannelArrays>(m, "Channels")
         .def(nb::init<In<double, 2>, In<double, 2>, bool, bool, bool, int>(), "vertex_attributes"_a.noconvert(),
              "face_attributes"_a.noconvert(), "alpha"_a, "barycentrics"_a, "uv"_a, "unit"_a);

@@ -1,0 +1,201 @@
+#include "camera/wide_fisheye.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace edgegrad {
+
+namespace {
+
+constexpr int steps = 512;
+
+double rim_of(const Fisheye& fisheye) {
+    const std::vector<double> turns = fisheye.turning_angles(M_PI);
+    return turns.empty() ? M_PI : turns.front();
+}
+
+// θ in [low, high] with θ' = m: Newton's steps, with bisection where they leave the bracket.
+double angle_between(const Fisheye& fisheye, double low, double high, double m) {
+    double angle = 0.5 * (low + high);
+    for (int i = 0; i < 64; ++i) {
+        const double error = fisheye.at_angle(angle) - m;
+        (error < 0 ? low : high) = angle;
+        const double next = angle - error / fisheye.slope_at_angle(angle);
+        const double step = next > low && next < high ? next : 0.5 * (low + high);
+        if (std::fabs(step - angle) <= 1e-15) return step;
+        angle = step;
+    }
+    return angle;
+}
+
+std::vector<double> angles_at_steps(const Fisheye& fisheye, double rim, double reach) {
+    std::vector<double> out{0};
+    for (int i = 1; i < steps; ++i) out.push_back(angle_between(fisheye, out.back(), rim, reach * i / steps));
+    out.push_back(rim);
+    return out;
+}
+
+}  // namespace
+
+WideFisheye::WideFisheye(const double* K, const Fisheye& fisheye)
+    : fisheye_(fisheye),
+      side_(cube_sides[5]),
+      rim_(rim_of(fisheye)),
+      reach_(fisheye.at_angle(rim_)),
+      angles_(std::make_shared<const std::vector<double>>(angles_at_steps(fisheye, rim_, reach_))) {
+    std::copy(K, K + 6, k_);
+    const double det = k_[0] * k_[4] - k_[1] * k_[3], size = std::sqrt(std::fabs(det));
+    inverse_[0] = k_[4] / det, inverse_[1] = -k_[1] / det, inverse_[2] = -k_[3] / det, inverse_[3] = k_[0] / det;
+    scale_ = {size, det < 0 ? -size : size};
+}
+
+WideFisheye WideFisheye::through(const CubeSide& side) const {
+    WideFisheye out = *this;
+    out.side_ = side;
+    return out;
+}
+
+Mat3 WideFisheye::turn() const {
+    Mat3 out;
+    for (int i = 0; i < 3; ++i) {
+        const Vec3 d = side_.turn.row[i];
+        out.row[i] = {d.x, d.z, -d.y};
+    }
+    return out;
+}
+
+WideFisheye::Polar WideFisheye::polar(Vec3 d) {
+    const double sine = std::hypot(d.x, d.z);
+    return {std::atan2(sine, -d.y), sine, sine > 0 ? Vec2{d.x / sine, d.z / sine} : Vec2{}};
+}
+
+Vec3 WideFisheye::direction_of(double angle, Vec2 along) {
+    const double s = std::sin(angle);
+    return {s * along.x, -std::cos(angle), s * along.y};
+}
+
+Vec2 WideFisheye::m_of_pixel(Vec2 x) const {
+    const double dx = x.x - k_[2], dy = x.y - k_[5];
+    return {inverse_[0] * dx + inverse_[1] * dy, inverse_[2] * dx + inverse_[3] * dy};
+}
+
+Vec2 WideFisheye::scaled(Vec2 m) const {
+    return {(k_[0] * m.x + k_[1] * m.y) / scale_.x, (k_[3] * m.x + k_[4] * m.y) / scale_.y};
+}
+
+Vec2 WideFisheye::bend(Vec2 n) const {
+    const Polar p = polar(side_.direction(n));
+    return scaled(fisheye_.at_angle(p.angle) * p.along) + Vec2{k_[2] / scale_.x, k_[5] / scale_.y};
+}
+
+// With e = m / |m| and ρ = |(d.x, d.z)|: δm = e ∂θ'/∂θ δθ + θ'/ρ (1 − e eᵀ) (δd.x, δd.z), where
+// δθ = (ρ δd.y − d.y e · (δd.x, δd.z)) / |d|². On the axis δm = (δd.x, δd.z) / −d.y.
+Mat2 WideFisheye::jacobian(Vec2 n) const {
+    const Vec3 d = side_.direction(n);
+    const Polar p = polar(d);
+    if (!(p.angle < rim_)) return {0, 0, 0, 0};
+    const auto column = [&](Vec3 dot) {
+        const Vec2 across{dot.x, dot.z};
+        if (!(p.sine > 0)) return scaled((-1 / d.y) * across);
+        const double outwards = p.along.x * across.x + p.along.y * across.y;
+        const double angle_dot = (p.sine * dot.y - d.y * outwards) / edgegrad::dot(d, d);
+        return scaled((fisheye_.slope_at_angle(p.angle) * angle_dot) * p.along +
+                      (fisheye_.at_angle(p.angle) / p.sine) * (across - outwards * p.along));
+    };
+    const Vec2 x = column(side_.turn.row[0]), y = column(side_.turn.row[1]);  // ∂d/∂n
+    return {x.x, y.x, x.y, y.y};
+}
+
+void WideFisheye::bend_vjp(Vec2 n, Vec2 bar, Vec2& n_bar, double* c_bar) const {
+    n_bar += transposed_times(jacobian(n), bar);
+    const Polar p = polar(side_.direction(n));
+    const Vec2 m = fisheye_.at_angle(p.angle) * p.along;
+    const double x = bar.x / scale_.x, y = bar.y / scale_.y;
+    c_bar[0] += x * m.x, c_bar[1] += x * m.y, c_bar[2] += x;
+    c_bar[3] += y * m.x, c_bar[4] += y * m.y, c_bar[5] += y;
+    double power = ((k_[0] * x + k_[3] * y) * p.along.x + (k_[1] * x + k_[4] * y) * p.along.y) * p.angle;
+    for (int i = 0; i < Fisheye::coefficients; ++i) c_bar[6 + i] += power *= p.angle * p.angle;
+}
+
+double WideFisheye::angle_below(double m) const {
+    const double i = std::floor(m / reach_ * steps) - 1;
+    return (*angles_)[int(std::clamp(i, 0.0, double(steps)))];
+}
+double WideFisheye::angle_above(double m) const {
+    const double i = std::ceil(m / reach_ * steps) + 1;
+    return (*angles_)[int(std::clamp(i, 0.0, double(steps)))];
+}
+double WideFisheye::angle(double m) const {
+    return m < reach_ ? angle_between(fisheye_, angle_below(m), angle_above(m), m) : rim_;
+}
+
+std::optional<Vec2> WideFisheye::straighten(Vec2 m) const {
+    const Vec2 at = m_of_pixel({scale_.x * m.x, scale_.y * m.y});
+    const double size = length(at);
+    if (!(size < reach_)) return {};
+    return side_.place(direction_of(angle(size), size > 0 ? (1 / size) * at : Vec2{}));
+}
+
+// No direction within the circle is farther from the one between its nearest and its farthest angle than half of what
+// lies between these, and the arc around the axis.
+bool WideFisheye::may_show(Vec2 x, double reach) const {
+    const Vec2 m = m_of_pixel(x);
+    const double size = length(m), step = reach * length(Vec2{std::fabs(inverse_[0]) + std::fabs(inverse_[1]),
+                                                              std::fabs(inverse_[2]) + std::fabs(inverse_[3])});
+    if (!(size - step < reach_)) return false;
+    const double low = angle_below(std::max(0.0, size - step)), high = angle_above(size + step);
+    const double arc = step < size ? std::asin(step / size) : M_PI;
+    const double far = 0.5 * (high - low) + arc * std::min(high, 1.0);
+    return side_.outside(direction_of(0.5 * (low + high), size > 0 ? (1 / size) * m : Vec2{0, 1})) <= 2 * far + 1e-9;
+}
+
+Box2 WideFisheye::image_box(Box2 n) const {
+    const Box2 a = side_.angles(n);
+    const auto radius = [&](double latitude) {
+        return fisheye_.at_angle(std::clamp(latitude + 0.5 * M_PI, 0.0, rim_));
+    };
+    const Box2 m = sector_box(radius(a.low.y), radius(a.high.y), a.low.x, a.high.x);
+    Box2 out = Box2::empty();
+    for (const double x : {m.low.x, m.high.x})
+        for (const double y : {m.low.y, m.high.y})
+            out.add({k_[0] * x + k_[1] * y + k_[2], k_[3] * x + k_[4] * y + k_[5]});
+    return out;
+}
+
+std::optional<Box2> WideFisheye::side_box(Box2 x) const {
+    const Vec2 corner[4] = {m_of_pixel(x.low), m_of_pixel({x.high.x, x.low.y}), m_of_pixel(x.high),
+                            m_of_pixel({x.low.x, x.high.y})};
+    const bool around = k_[2] >= x.low.x && k_[2] <= x.high.x && k_[5] >= x.low.y && k_[5] <= x.high.y;
+    // |m|, and λ from that of the first corner on.
+    double nearest = std::numeric_limits<double>::infinity(), farthest = 0, before = 0, after = 0;
+    const double first = std::atan2(corner[0].x, corner[0].y);
+    for (int i = 0; i < 4; ++i) {
+        const Vec2 a = corner[i], side = corner[(i + 1) % 4] - a;
+        const double t = std::clamp(-(a.x * side.x + a.y * side.y) / (side.x * side.x + side.y * side.y), 0.0, 1.0);
+        nearest = std::min(nearest, length(a + t * side)), farthest = std::max(farthest, length(a));
+        const double turn = std::remainder(std::atan2(a.x, a.y) - first, 2 * M_PI);
+        before = std::min(before, turn), after = std::max(after, turn);
+    }
+    if (around) nearest = 0;
+    if (!(nearest < reach_)) return {};
+    constexpr double rounding = 1e-12;  // of angles, generous
+    Vec2 from{first + before, angle_below(nearest) - 0.5 * M_PI}, to{first + after, angle_above(farthest) - 0.5 * M_PI};
+    if (around || from.x <= -M_PI || to.x >= M_PI) from.x = -M_PI, to.x = M_PI;
+    return side_.box({from.x - rounding, from.y - rounding}, {to.x + rounding, to.y + rounding});
+}
+
+// Of an arc around the axis, as far from the antipode as half of what the box holds.
+double WideFisheye::stretch(Box2 n) const {
+    const Polar p = polar(side_.direction(middle(n)));
+    const double least = has_pole() ? 0.5 * farthest_radius(n) : 1e-9;
+    return std::max(1.0, fisheye_.at_angle(std::min(p.angle, rim_)) / std::max(p.sine, least));
+}
+
+bool WideFisheye::ends_in(Box2 x) const {
+    double farthest = 0;
+    for (const Vec2 corner : {x.low, {x.high.x, x.low.y}, x.high, {x.low.x, x.high.y}})
+        farthest = std::max(farthest, length(m_of_pixel(corner)));
+    return !(farthest < reach_);
+}
+
+}  // namespace edgegrad
