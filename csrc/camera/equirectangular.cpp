@@ -68,6 +68,82 @@ std::optional<Vec2> Equirectangular::straighten(Vec2 m) const {
     return side_.place(direction_of(a));
 }
 
+namespace {
+
+// Of the steps from the middle of a pixel to its samples, the greatest: beyond, the series below would lose digits.
+constexpr double small_step = 0.06;
+
+// What all samples of a pixel share.
+struct Near {
+    double to_angles[4];    // from m − m0
+    Vec2 m0, sine, cosine;  // of both angles at m0
+    Vec2 from, to;          // the angles, less those at m0, between which this place is
+    CubeSide side;
+};
+
+// sin δ and cos δ, by their series.
+[[gnu::always_inline]] inline double small_sine(double d) {
+    const double s = d * d;
+    return d * (1 - s * (1.0 / 6) * (1 - s * (1.0 / 20) * (1 - s * (1.0 / 42))));
+}
+[[gnu::always_inline]] inline double small_cosine(double d) {
+    const double s = d * d;
+    return 1 - s * 0.5 * (1 - s * (1.0 / 12) * (1 - s * (1.0 / 30) * (1 - s * (1.0 / 56))));
+}
+
+EDGEGRAD_VECTORIZED void straighten_samples(const Near& p, int k, double* x, double* y) {
+    const Near l = p;
+    const Mat3 turn = l.side.turn;
+    const double open = l.side.closed ? 0 : 1;
+    constexpr double nan = std::numeric_limits<double>::quiet_NaN();
+    for (int i = 0; i < k; ++i) {
+        const double dx = x[i] - l.m0.x, dy = y[i] - l.m0.y;
+        const double across = l.to_angles[0] * dx + l.to_angles[1] * dy;
+        const double over = l.to_angles[2] * dx + l.to_angles[3] * dy;
+        const double sx = small_sine(across), cx = small_cosine(across), sy = small_sine(over), cy = small_cosine(over);
+        const double c = l.cosine.y * cy - l.sine.y * sy;
+        const double d0 = c * (l.sine.x * cx + l.cosine.x * sx), d1 = l.sine.y * cy + l.cosine.y * sy,
+                     d2 = c * (l.cosine.x * cx - l.sine.x * sx);
+        const double q0 = turn.row[0].x * d0 + turn.row[0].y * d1 + turn.row[0].z * d2;
+        const double q1 = turn.row[1].x * d0 + turn.row[1].y * d1 + turn.row[1].z * d2;
+        const double q2 = turn.row[2].x * d0 + turn.row[2].y * d1 + turn.row[2].z * d2;
+        // As CubeSide::place.
+        const bool within = (q2 > 0) & (std::fabs(q0) <= q2) & (std::fabs(q1) <= q2);
+        const bool foreign = (open > 0) & ((q0 == q2) | (std::fabs(q1) == q2));
+        const bool here = (across >= l.from.x) & (across < l.to.x) & (over >= l.from.y) & (over < l.to.y);
+        const bool seen = within & !foreign & here;
+        x[i] = seen ? q0 / q2 : nan, y[i] = seen ? q1 / q2 : nan;
+    }
+}
+
+}  // namespace
+
+void Equirectangular::straighten_near(Vec2 m0, int k, double* x, double* y) const {
+    Near near{{inverse_[0] * scale_.x, inverse_[1] * scale_.y, inverse_[2] * scale_.x, inverse_[3] * scale_.y},
+              m0,
+              {},
+              {},
+              {},
+              {},
+              side_};
+    const double* A = near.to_angles;
+    double farthest = 0;
+    for (int i = 0; i < k; ++i) farthest = std::max({farthest, std::fabs(x[i] - m0.x), std::fabs(y[i] - m0.y)});
+    const double step = farthest * std::max(std::fabs(A[0]) + std::fabs(A[1]), std::fabs(A[2]) + std::fabs(A[3]));
+    if (!(step < small_step)) {
+        constexpr double nan = std::numeric_limits<double>::quiet_NaN();
+        for (int i = 0; i < k; ++i) {
+            const Vec2 n = straighten({x[i], y[i]}).value_or(Vec2{nan, nan});
+            x[i] = n.x, y[i] = n.y;
+        }
+        return;
+    }
+    const Vec2 a = angles_of_pixel({scale_.x * m0.x, scale_.y * m0.y});
+    near.sine = {std::sin(a.x), std::sin(a.y)}, near.cosine = {std::cos(a.x), std::cos(a.y)};
+    near.from = place_.from - a, near.to = place_.to - a;
+    straighten_samples(near, k, x, y);
+}
+
 // A step in the angles turns a direction by no more than its length.
 bool Equirectangular::may_show(Vec2 x, double reach) const {
     const Vec2 a = angles_of_pixel(x), from = place_.from, to = place_.to;

@@ -48,6 +48,9 @@ class Equirectangular {
     // The n that is seen at m, if it belongs to this side and place.
     std::optional<Vec2> straighten(Vec2 m) const;
 
+    // The same for k points near m0, in place; not numbers where there is none.
+    void straighten_near(Vec2 m0, int k, double* x, double* y) const;
+
     // False if no place within `reach` px of x belongs to this side and place.
     bool may_show(Vec2 x, double reach) const;
 

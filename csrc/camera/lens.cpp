@@ -131,14 +131,14 @@ std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m
 
 void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, double* x, double* y) {
     constexpr double nan = std::numeric_limits<double>::quiet_NaN();
-    const bool done = with_side_lens(lens, false, [&](const auto& l) {
+    if (const auto* panorama = std::get_if<Equirectangular>(&lens)) return panorama->straighten_near(m0, k, x, y);
+    if (const auto* fisheye = std::get_if<WideFisheye>(&lens)) {
         for (int i = 0; i < k; ++i) {
-            const Vec2 n = l.straighten({x[i], y[i]}).value_or(Vec2{nan, nan});
+            const Vec2 n = fisheye->straighten({x[i], y[i]}).value_or(Vec2{nan, nan});
             x[i] = n.x, y[i] = n.y;
         }
-        return true;
-    });
-    if (done) return;
+        return;
+    }
     const std::optional<Vec2> n0 = straighten(lens, disc, m0);
     const Mat2 inverse =
         edgegrad::inverse(with_radial_lens(lens, [&](const auto& l) { return l.jacobian(n0.value_or(Vec2{})); }));
