@@ -100,6 +100,18 @@ def test_the_same_as_the_kernels_own(kind: str, view: str, filter: str):
         )
 
 
+def test_a_wall_without_curves():
+    """All that is seen is one face: there are no curves to sample, and the interior is the kernel's own."""
+    verts = torch.tensor([[-40.0, -40.0, 0.0], [40.0, -40.0, 0.5], [0.0, 60.0, -0.5]], dtype=F64, requires_grad=True)
+    wall = eg.Mesh(verts, torch.tensor([[0, 1, 2]]), colors=smooth_colors(verts.detach()))
+    found = []
+    for shader in (None, lambda hits: hits.interpolate(wall.colors, "vertex")):
+        image = eg.render(wall, front_camera(SIZE), 16, surface_samples=100_000, shader=shader)
+        found.append(torch.autograd.grad((image * smooth_adjoint(SIZE, SIZE, 3)).sum(), verts)[0])
+    assert found[0].abs().max() > 0
+    torch.testing.assert_close(found[1], found[0], rtol=0.02, atol=0.01 * float(found[0].abs().max()))
+
+
 def test_tensors_that_only_the_shader_uses_get_no_boundary_and_no_kernel_gradient():
     scene, camera = colored()
     gain = torch.ones(3, dtype=F64, requires_grad=True)
