@@ -139,9 +139,9 @@ def moved(scene: Callable[..., eg.Scene], view: eg.Camera, what: str) -> Case:
         return scene(), view.replace(K=view.K + theta * change)
 
     def distortion(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
-        # Of a wide fisheye, at about 100°.
+        # Of a wide fisheye, at about 125°.
         change = torch.zeros(4, dtype=F64)
-        change[int(what[1])] = 0.25 * 1.8 ** (-2 * int(what[1]) - 2)
+        change[int(what[1])] = 0.25 * 2.2 ** (-2 * int(what[1]) - 2)
         return scene(), view.replace(distortion=view.coefficients + theta * change)
 
     makers = {"vertices": vertices, "turn": turned, "shift": shifted}

@@ -193,7 +193,7 @@ SHADERS = {
     "by mesh": by_mesh,
     "its own parameter": of_itself,
 }
-STEPS = {"pose": 0.01, "focal": 0.3, "shape": 0.03}
+STEPS = {"pose": 0.01, "focal": 0.3, "shape": 0.02}
 
 
 def case(name: str, of: str) -> Case:
@@ -283,7 +283,7 @@ def test_against_finite_differences(name: str):
 @pytest.mark.parametrize("of", STEPS)
 @pytest.mark.parametrize("name", SHADERS)
 def test_all_against_finite_differences(name: str, of: str):
-    check(name, of, 40)
+    check(name, of, 60 if of == "shape" else 40)  # whose step is short, for its second-order error is large
 
 
 # -- as any PyTorch ---------------------------------------------------------------------------------------------------
