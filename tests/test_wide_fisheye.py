@@ -276,7 +276,10 @@ SOME = [
     for i, place in enumerate(PLACES)
     for j, kind in enumerate((boundary, both))
     for k, what in enumerate(WHAT)
-    if (i + j + k) % 2 and (place, view := VIEWS[(i + j + k) // 2 % 3]) != ("beside", "crop")  # not in view
+    if (i + j + k) % 2
+    and (place, view := VIEWS[(i + j + k) // 2 % 3]) != ("beside", "crop")  # not in view
+    # High powers of the angle move what is far from the axis alone.
+    and (place == "behind" or what not in ("d2", "d3"))
 ]
 
 
