@@ -239,6 +239,15 @@ def check_int(name: str, value: object, least: int, most: int) -> int:
     return number
 
 
+def check_positive(name: str, value: object, *, least: float, most: float) -> float:
+    """A number from `least` to `most`. Raises TypeError or ValueError."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{name}: expected a number, got {type(value).__name__} ({value!r})")
+    if not least <= value <= most:  # nor where it is none
+        raise ValueError(f"{name}: expected a number from {least:g} to {most:g}, got {value!r}")
+    return float(value)
+
+
 def check_positive_int(name: str, value: object, *, most: int = 2**31 - 1) -> int:
     """An int ≥ 1. Raises TypeError or ValueError."""
     return check_int(name, value, 1, most)

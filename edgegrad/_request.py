@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, get_type_hints
 import torch
 from torch import Tensor
 
-from ._check import as_int, check_not_meta, check_positive_int, check_shape
+from ._check import as_int, check_not_meta, check_positive, check_positive_int, check_shape
 from ._kernel import core
 from ._lens import MOST
 from .camera import Camera
@@ -55,6 +55,7 @@ class GradientOptions(NamedTuple):
     grad_seed: int
     channels_vary: bool  # over a face; if not, moving it changes nothing inside
     visibility: bool  # whether what moves at silhouettes and other jumps counts
+    step_spacing: float  # px between the lines along which steps are looked for
 
 
 class Request(NamedTuple):
@@ -95,7 +96,7 @@ RECORDS: tuple[Any, ...] = (Flat, PackedCamera, Channels, ImageOptions, Gradient
 FIELDS = tuple(field for record in RECORDS for field in record._fields)
 _TYPES = tuple(get_type_hints(record)[field] for record in RECORDS for field in record._fields)
 IS_TENSOR = tuple(kind is Tensor for kind in _TYPES)
-_NAMES = {Tensor: "Tensor", bool: "bool", int: "int", str: "str", list[float]: "float[]"}
+_NAMES = {Tensor: "Tensor", bool: "bool", int: "int", float: "float", str: "str", list[float]: "float[]"}
 # The arguments of the operators.
 SCHEMA = ", ".join(f"{_NAMES[kind]} {field}" for field, kind in zip(FIELDS, _TYPES, strict=True))
 
@@ -163,6 +164,7 @@ def make_request(
     visibility: bool = True,
     filter: str = "box",
     grad_seed: int | None = None,
+    step_spacing: float = 1.0,
 ) -> Request:
     """The arguments of render(), checked. Raises TypeError or ValueError."""
     scene = as_scene(scene)
@@ -179,6 +181,7 @@ def make_request(
         raise TypeError(f"visibility: expected True or False, got {type(visibility).__name__} ({visibility!r})")
     if filter not in FILTERS:
         raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {filter!r}")
+    step_spacing = check_positive("step_spacing", step_spacing, least=1 / 64, most=64)
     if scene.background is not None and scene.background.dim() == 3:
         check_shape("background", scene.background, (*camera.size, "C"), fix="give it the camera's size")
     _check_devices(scene, camera)
@@ -194,7 +197,7 @@ def make_request(
         packed,
         Channels(False, flat.verts.new_empty((cameras, V, 0)), -1, flat.verts.new_empty((F, 0)), False, False),
         ImageOptions(spp, filter, seed),
-        GradientOptions(surface, edge, grad_seed, _radiance_varies(scene), visibility),
+        GradientOptions(surface, edge, grad_seed, _radiance_varies(scene), visibility, step_spacing),
     )
 
 

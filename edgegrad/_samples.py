@@ -1,4 +1,4 @@
-"""The kernel's samples for shaders written in PyTorch, as records of tensors, and what becomes of values at them."""
+"""The kernel's samples for shaders written in PyTorch, as records of tensors, whatever transforms of torch.func are under way."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from ._kernel import core
 from ._ops import Hits as ImageHits
 from ._ops import camera_seed, kernel_camera, kernel_hits, kernel_scene, warn_of_ends
 from ._request import Request
+from .scene import Flat, Scene, flatten
 
 
-class PixelHits(NamedTuple):
+class PixelRecords(NamedTuple):
     """Some of an image's hits: all samples of a pixel on one face, at one of them."""
 
     pixel: Tensor  # (N,) int64, row by row
@@ -25,7 +26,7 @@ class PixelHits(NamedTuple):
     weight: Tensor  # (N,) float64, the share of the pixel's samples
 
 
-class SurfaceSamples(NamedTuple):
+class SurfaceRecords(NamedTuple):
     """Samples inside faces."""
 
     face: Tensor  # (S,) int64
@@ -35,7 +36,7 @@ class SurfaceSamples(NamedTuple):
     weight: Tensor  # (S,) float64, px² that a sample stands for
 
 
-class CurveSamples(NamedTuple):
+class CurveRecords(NamedTuple):
     """Samples on curves where the image may jump."""
 
     x: Tensor  # (S, 2) float64, pixel positions
@@ -46,6 +47,34 @@ class CurveSamples(NamedTuple):
     row_of: Tensor  # (R,) int64, the sample of a row
     vertex: Tensor  # (R,) int64
     by_q: Tensor  # (R, 3) float64, the curve's velocity by a vertex in camera coordinates
+
+
+class PlaceRecords(NamedTuple):
+    """What is seen at places in the image."""
+
+    face: Tensor  # (N,) int64, −1: none
+    part: Tensor  # (N,) int64 of the surface that is connected, −1: none
+    b: Tensor  # (N, 2) float64
+
+
+class RayRecords(NamedTuple):
+    """Rays to places in the image; see SurfaceRecords."""
+
+    along: Tensor  # (N, 3) float64
+    along_by_x: Tensor  # (N, 3, 2) float64, by the place
+    along_by_k: Tensor  # (N, 3, 14) float64
+
+
+class TraceRecords(NamedTuple):
+    """What rays hit."""
+
+    face: Tensor  # (N,) int64, −1: none
+    b: Tensor  # (N, 2) float64
+
+
+def barycentrics(b: Tensor) -> Tensor:
+    """(N, 3) from the last two."""
+    return torch.cat([1 - b.sum(-1, keepdim=True), b], -1)
 
 
 def _record(kind: Any, arrays: dict[str, np.ndarray]) -> Any:
@@ -84,17 +113,79 @@ class _Values(torch.autograd.Function):
         return output, (None,) * len(output)
 
 
-def _of_values(request: Request, compute: Callable[[Request], Sequence[Tensor]]) -> tuple[Tensor, ...]:
-    packed = request.pack()
+def _of_values(packed: Sequence[Any], compute: Callable[..., Sequence[Tensor]], *more: Tensor) -> tuple[Tensor, ...]:
+    """compute(values, *more) of the values of tensors, in a list of these and others."""
     places = [i for i, value in enumerate(packed) if isinstance(value, Tensor)]
 
     def with_values(*tensors: Tensor) -> Sequence[Tensor]:
         values = list(packed)
-        for i, tensor in zip(places, tensors, strict=True):
+        for i, tensor in zip(places, tensors[: len(places)], strict=True):
             values[i] = tensor.detach()
-        return compute(Request.unpack(values))
+        return compute(values, *(tensor.detach() for tensor in tensors[len(places) :]))
 
-    return _Values.apply(with_values, *(packed[i] for i in places))
+    return _Values.apply(with_values, *(packed[i] for i in places), *more)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.cpu().double().contiguous().numpy()
+
+
+def _bare(scene: Scene) -> Flat:
+    """The surfaces of a scene alone."""
+    return without_colors(flatten(scene))
+
+
+def without_colors(flat: Flat, attributes: Tensor | None = None) -> Flat:
+    """The geometry of a scene with these numbers (F, 3, K) for colours."""
+    F = len(flat.faces)
+    if attributes is not None and attributes.numel():
+        colors = attributes.reshape(3 * F, -1).to(flat.colors.dtype).contiguous()
+        corners = torch.arange(3 * F, dtype=torch.int32).reshape(F, 3)
+    else:
+        colors, corners = torch.zeros((1, 1), dtype=flat.colors.dtype), torch.zeros((F, 3), dtype=torch.int32)
+    return flat._replace(
+        corners=corners,
+        colors=colors,
+        uvs=flat.uvs.new_zeros((0, 2)),
+        texels=colors.new_zeros((0, colors.shape[1])),
+        textures=flat.textures.new_zeros((0, 3)),
+        face_texture=flat.face_texture.new_zeros(0),
+        background=colors.new_zeros(colors.shape[1]),
+    )
+
+
+# -- any rays -----------------------------------------------------------------------------------------------------------
+
+
+def trace(scene: Scene, origins: Tensor, directions: Tensor) -> TraceRecords:
+    """The nearest hits of rays (N, 3)."""
+
+    def compute(values: list[Any], origins: Tensor, directions: Tensor) -> Sequence[Tensor]:
+        found = kernel_scene(Flat(*values)).trace(
+            origins=_array(origins), directions=_array(directions), threads=torch.get_num_threads()
+        )
+        return _record(TraceRecords, found)
+
+    return TraceRecords(*_of_values(_bare(scene), compute, origins, directions))
+
+
+def visible(scene: Scene, face: Tensor, b: Tensor, to: Tensor, contact: Tensor) -> Tensor:
+    """(N,) bool: whether nothing lies between points of faces and others (N, 3), further than `contact` (N,) from both."""
+
+    def compute(values: list[Any], face: Tensor, b: Tensor, to: Tensor, contact: Tensor) -> Sequence[Tensor]:
+        found = kernel_scene(Flat(*values)).visible(
+            face=face.cpu().int().contiguous().numpy(),
+            b=_array(b),
+            to=_array(to),
+            contact=_array(contact),
+            threads=torch.get_num_threads(),
+        )
+        return (torch.from_numpy(found).bool(),)
+
+    return _of_values(_bare(scene), compute, face, b, to, contact)[0].to(face.device)
+
+
+# -- of a camera --------------------------------------------------------------------------------------------------------
 
 
 class Sampler:
@@ -116,14 +207,27 @@ class Sampler:
         """(H, W), once all pixel hits were taken."""
         return self._hits.coverage[0]
 
-    def pixel_hits(self, at_once: int) -> Iterator[PixelHits]:
+    @property
+    def grad_seed(self) -> int:
+        return camera_seed(self._request.gradient.grad_seed, self._camera)
+
+    def _compute(self, request: Request, compute: Callable[..., Sequence[Tensor]], *more: Tensor) -> tuple[Tensor, ...]:
+        """compute(request, camera of the kernel, *more) of values."""
+
+        def with_request(values: list[Any], *more: Tensor) -> Sequence[Tensor]:
+            values_of = Request.unpack(values)
+            return compute(values_of, kernel_camera(values_of.camera, self._camera), *more)
+
+        return _of_values(request.pack(), with_request, *more)
+
+    def pixel_hits(self, at_once: int) -> Iterator[PixelRecords]:
         """Those of the image, some `at_once` rows of pixels after another."""
         height, width = self._request.camera.height, self._request.camera.width
         rows = max(1, at_once // (width * min(self._request.image.spp, 4)))
         for first in range(0, height, rows):
             end = min(height, first + rows)
 
-            def compute(request: Request, first: int = first, end: int = end) -> PixelHits:
+            def compute(request: Request, camera: Any, first: int = first, end: int = end) -> PixelRecords:
                 options = request.image._replace(seed=camera_seed(request.image.seed, self._camera))
                 camera = kernel_camera(request.camera, self._camera)
                 if first == 0:
@@ -136,20 +240,20 @@ class Sampler:
                     end=end,
                     hits=kernel_hits(self._hits),
                 )
-                return _record(PixelHits, found)
+                return _record(PixelRecords, found)
 
-            yield PixelHits(*_of_values(self._request, compute))
+            yield PixelRecords(*self._compute(self._request, compute))
 
-    def samples(self, scene: Request, interior: bool, boundary: bool) -> tuple[SurfaceSamples, CurveSamples]:
-        """Of the gradient, after all pixel hits were taken; `scene` has colours that jump where creases are."""
+    def samples(self, request: Request, interior: bool, boundary: bool) -> tuple[SurfaceRecords, CurveRecords]:
+        """Of the gradient, after all pixel hits were taken; the scene of `request` has colours that jump where creases are."""
 
-        def compute(request: Request) -> Sequence[Tensor]:
+        def compute(request: Request, camera: Any) -> Sequence[Tensor]:
             flat, options = request.scene, request.gradient
             surface, curves = kernel_scene(flat).samples(
-                camera=kernel_camera(request.camera, self._camera),
+                camera=camera,
                 image=core.ImageOptions(**request.image._asdict()),
                 options=core.GradientOptions(
-                    seed=camera_seed(options.grad_seed, self._camera),
+                    seed=self.grad_seed,
                     surface_samples=options.surface_samples,
                     edge_samples=options.edge_samples,
                     interior_geometry=interior,
@@ -159,11 +263,29 @@ class Sampler:
                 adjoint=np.ones((*self.coverage.shape, flat.background.shape[-1]), self.coverage.numpy().dtype),
                 hits=kernel_hits(self._hits),
             )
-            return (*_record(SurfaceSamples, surface), *_record(CurveSamples, curves))
+            return (*_record(SurfaceRecords, surface), *_record(CurveRecords, curves))
 
-        parts = _of_values(scene, compute)
-        count = len(SurfaceSamples._fields)
-        return SurfaceSamples(*parts[:count]), CurveSamples(*parts[count:])
+        parts = self._compute(request, compute)
+        count = len(SurfaceRecords._fields)
+        return SurfaceRecords(*parts[:count]), CurveRecords(*parts[count:])
+
+    def hits_at(self, x: Tensor) -> PlaceRecords:
+        """What is seen at places (N, 2) in the image."""
+
+        def compute(request: Request, camera: Any, x: Tensor) -> PlaceRecords:
+            found = kernel_scene(request.scene).hits_at(camera=camera, x=_array(x), threads=torch.get_num_threads())
+            return _record(PlaceRecords, found)
+
+        return PlaceRecords(*self._compute(self._request, compute, x))
+
+    def rays_at(self, x: Tensor) -> RayRecords:
+        """The rays to places (N, 2) in the image."""
+
+        def compute(request: Request, camera: Any, x: Tensor) -> RayRecords:
+            found = core.rays_at(camera=camera, x=_array(x), threads=torch.get_num_threads())
+            return _record(RayRecords, found)
+
+        return RayRecords(*(part.to(x.device) for part in self._compute(self._request, compute, x)))
 
 
 class Footprints(NamedTuple):

@@ -10,88 +10,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ._check import as_tensor, check_float, check_shape
-from .scene import Scene
+from ._check import as_tensor, check_finite, check_float, check_shape
+from ._samples import RayRecords, visible
+from ._steps import Steps
+from ._surfaces import Rays, Surfaces, View, every_face
 
-
-class Surfaces:
-    """The surfaces of a scene before one camera, meshes laid end to end, as functions of the scene's tensors.
-
-    It also notes which properties that may jump at an edge a shader asks for: there the shader may jump too.
-    """
-
-    def __init__(self, scene: Scene, world_to_camera: Tensor, perspective: bool) -> None:
-        meshes = scene.meshes
-        first = [sum(len(m.verts) for m in meshes[:k]) for k in range(len(meshes))]
-        dtype = max((m.verts.dtype for m in meshes), key=lambda t: torch.finfo(t).bits)
-        self.verts = torch.cat([m.verts.to(dtype) for m in meshes])
-        self.faces = torch.cat([m.faces.long() + k for m, k in zip(meshes, first, strict=True)])
-        counts = torch.tensor([len(m.faces) for m in meshes])
-        self.mesh_of_face = torch.repeat_interleave(torch.arange(len(meshes)), counts).to(self.verts.device)
-        self.world_to_camera = world_to_camera.to(self.verts.device, torch.float64)
-        self.perspective = perspective
-        self._scene = scene
-        self.jumping: dict[Any, Callable[[], Tensor]] = {}  # (F, 3, K) at corners, of what may jump
-
-    def detach(self) -> Surfaces:
-        """The same without derivatives; what it notes is noted for both."""
-        other = Surfaces.__new__(Surfaces)
-        other.__dict__.update(self.__dict__)
-        for name in ("corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
-            other.__dict__.pop(name, None)
-        other.verts, other.world_to_camera = self.verts.detach(), self.world_to_camera.detach()
-        other._scene = self._scene.detach()
-        return other
-
-    @cached_property
-    def corner_uvs(self) -> Tensor:
-        """(F, 3, 2) texture coordinates of corners."""
-        parts = []
-        for i, mesh in enumerate(self._scene.meshes):
-            if mesh.uvs is None or mesh.uv_faces is None:
-                raise ValueError(
-                    f"hits.uv: meshes[{i}] has no texture coordinates; give it a texture with uvs and uv_faces, or choose "
-                    "another mesh by hits.mesh"
-                )
-            parts.append(mesh.uvs.to(self.verts.dtype)[mesh.uv_faces.long()])
-        return torch.cat(parts)
-
-    @cached_property
-    def vertex_normals(self) -> Tensor:
-        """(V, 3) unit normals: the mean of the incident faces' by area, of vertices as they are indexed."""
-        corner = self.verts[self.faces]
-        area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        index = self.faces.reshape(-1)
-        return normalize(torch.zeros_like(self.verts).index_add(0, index, area.repeat_interleave(3, 0)), dim=-1)
-
-    def face_normals(self, face: Tensor) -> Tensor:
-        corner = self.verts[self.faces[face]]
-        return normalize(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=-1)
-
-    def in_camera(self, points: Tensor) -> Tensor:
-        """World points (..., 3) in camera coordinates, float64."""
-        return points.double() @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
-
-    def barycentrics(self, face: Tensor, along: Tensor) -> Tensor:
-        """(N, 3) where rays meet the planes of faces: differentiable functions of vertices and camera (Möller and Trumbore
-        1997). `along` (N, 3): the directions of rays from the eye in camera coordinates, or, in an orthographic view, points
-        that rays along the axis go through."""
-        q = self.in_camera(self.verts[self.faces[face]])
-        if self.perspective:
-            origin = -q[:, 0]
-        else:
-            origin, along = along - q[:, 0], along.new_tensor([0.0, 0.0, 1.0]).expand_as(along)
-        e1, e2 = q[:, 1] - q[:, 0], q[:, 2] - q[:, 0]
-        p, s = torch.linalg.cross(along, e2), torch.linalg.cross(origin, e1)
-        scale = 1 / (e1 * p).sum(-1)
-        u, v = (origin * p).sum(-1) * scale, (along * s).sum(-1) * scale
-        return torch.stack([1 - u - v, u, v], 1)
-
-    def crease_attributes(self) -> Tensor:
-        """(F, 3, K) of all that was asked for and may jump, each scaled to its largest number."""
-        parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
-        parts = [p / p.abs().max().clamp(min=1e-30) for p in parts]
-        return torch.cat(parts, -1) if parts else self.verts.new_zeros((len(self.faces), 3, 0))
+WRAPS = ("repeat", "clamp", "mirror")
+FILTERS = ("linear", "nearest")
 
 
 class Hits:
@@ -99,33 +24,59 @@ class Hits:
 
     Where the renderer differentiates a shader, they are differentiable functions of the vertices and the camera at fixed
     places in the image; elsewhere they have no derivatives. A shader must be a function of each point by itself.
+
+    render() makes them for its shader, trace() for any rays, primary_hits() for those of an image.
     """
 
-    def __init__(self, surfaces: Surfaces, face: Tensor, barycentrics: Tensor, pixel: Tensor) -> None:
-        self._surfaces = surfaces
-        self._face, self._barycentrics = face, barycentrics.to(surfaces.verts.dtype)
-        self.pixel = pixel.to(surfaces.verts.dtype)  # (N, 2) where in the image, px: x right, y down
+    def __init__(
+        self,
+        surfaces: Surfaces,
+        view: View | Rays,
+        face: Tensor,
+        barycentrics: Tensor,  # (N, 3) float64
+        pixel: Tensor | None = None,  # (N, 2)
+        rays_at: Callable[[Tensor], RayRecords] | None = None,  # those of the camera
+        steps: Steps | None = None,
+    ) -> None:
+        self._surfaces, self._view, self._rays_at = surfaces, view, rays_at
+        self._face, self._exact = face, barycentrics
+        self._barycentrics = barycentrics.to(surfaces.verts.dtype)
+        self._pixel, self._steps = pixel, steps or Steps()
 
     def __len__(self) -> int:
         return len(self._face)
 
+    def __repr__(self) -> str:
+        return f"Hits({len(self)} points)"
+
     def select(self, index: Tensor) -> Hits:
-        """Some of the points, or all in another order."""
-        return Hits(self._surfaces, self._face[index], self._barycentrics[index], self.pixel[index])
+        """Some of the points, or all in another order: `index` (M,) int64, or a mask (N,)."""
+        if index.dtype == torch.bool:
+            index = index.nonzero()[:, 0]
+        view = self._view.select(index) if isinstance(self._view, Rays) else self._view
+        pixel = None if self._pixel is None else self._pixel[index]
+        return Hits(self._surfaces, view, self._face[index], self._exact[index], pixel, self._rays_at)
+
+    @property
+    def pixel(self) -> Tensor:
+        """(N, 2) where in the image, px: x right, y down."""
+        if self._pixel is None:
+            raise ValueError("hits.pixel: expected hits of a camera, these are of rays; see hits.ray")
+        return self._pixel.to(self._surfaces.verts.dtype)
+
+    @property
+    def ray(self) -> Tensor:
+        """(N,) int64: of hits that trace() found, the row of the ray."""
+        if not isinstance(self._view, Rays):
+            raise ValueError("hits.ray: expected hits of trace(), these are of a camera; see hits.pixel")
+        return self._view.ray
 
     def _note(self, key: Any, corners: Callable[[], Tensor]) -> None:
         self._surfaces.jumping.setdefault(key, corners)
 
     def _note_faces(self) -> None:
-        # Numbers of their own, of which neighbours differ: multiples of the golden ratio, without their whole part.
-        count = len(self._surfaces.faces)
-        at = self._surfaces.verts.device
-        self._note(
-            "face",
-            lambda: (torch.arange(count, device=at).double() * 0.6180339887498949 % 1 + 0.5)[:, None, None].expand(
-                -1, 3, 1
-            ),
-        )
+        s = self._surfaces
+        self._note("face", lambda: every_face(len(s.faces)).to(s.verts.device))
 
     @property
     def face(self) -> Tensor:
@@ -154,8 +105,8 @@ class Hits:
 
     @cached_property
     def depth(self) -> Tensor:
-        """(N,) along the camera's axis."""
-        return self._surfaces.in_camera(self.position)[:, 2].to(self.position.dtype)
+        """(N,) along the camera's axis, world units; of trace(), how many times its direction a ray went."""
+        return self._view.depth(self.position).to(self.position.dtype)
 
     @cached_property
     def normal(self) -> Tensor:
@@ -182,13 +133,8 @@ class Hits:
 
     @cached_property
     def view(self) -> Tensor:
-        """(N, 3) unit direction to the eye."""
-        s = self._surfaces
-        back = torch.linalg.inv(s.world_to_camera[:3, :3])
-        if s.perspective:
-            eye = -back @ s.world_to_camera[:3, 3]
-            return normalize(eye - self.position.double(), dim=-1).to(self.position.dtype)
-        return normalize(-back[:, 2], dim=0).to(self._barycentrics).expand(len(self), 3)
+        """(N, 3) unit direction to the eye, or back along the ray."""
+        return self._view.to_viewer(self.position).to(self.position.dtype)
 
     def interpolate(self, attribute: Tensor, per: str | None = None) -> Tensor:
         """(N, K): an attribute of the scene's vertices (V, K), faces (F, K) or corners of faces (F, 3, K).
@@ -227,29 +173,172 @@ class Hits:
         values = attribute[s.faces[self._face]] if per == "vertex" else attribute[self._face]
         return (self._barycentrics.to(values.dtype)[:, :, None] * values).sum(1)
 
-    def sample(self, texture: Tensor, uv: Tensor | None = None, wrap: str = "repeat") -> Tensor:
+    def sample(
+        self,
+        texture: Tensor,
+        uv: Tensor | None = None,
+        wrap: str | tuple[str, str] = "repeat",
+        mipmap: bool = False,
+        filter: str = "linear",
+    ) -> Tensor:
         """(N, K): a texture (h, w, K), row 0 on top, at texture coordinates uv (N, 2), v running up; those of the surface when
-        None. Bilinear between the centres of texels; beyond the rim `wrap` says "repeat" or "clamp".
+        None.
+
+        wrap     beyond the rim: "repeat", "clamp" or "mirror", or two of these, for u and for v
+        filter   "linear" between the centres of texels; "nearest", the texel itself, whose borders are steps: see where()
+        mipmap   True: texels are averaged over squares of 2, 4, 8 … so that neighbouring pixels are about a texel apart, linear
+                 between two such levels (Williams 1983). The level itself has no derivative. Only for hits of a camera
 
         Raises TypeError or ValueError that names the argument.
         """
         texture = as_tensor("texture", texture, floating=True)
         check_float("texture", texture)
         check_shape("texture", texture, ("h", "w", "K"))
-        if wrap not in ("repeat", "clamp"):
-            raise ValueError(f'wrap: expected "repeat" or "clamp", got {wrap!r}')
-        uv = self.uv if uv is None else as_tensor("uv", uv, floating=True)
+        wraps = (wrap, wrap) if isinstance(wrap, str) else tuple(wrap)
+        if len(wraps) != 2 or any(w not in WRAPS for w in wraps):
+            raise ValueError(f'wrap: expected "repeat", "clamp" or "mirror", or two of these, got {wrap!r}')
+        if filter not in FILTERS:
+            raise ValueError(f'filter: expected "linear" or "nearest", got {filter!r}')
+        if mipmap and filter == "nearest":
+            raise ValueError('mipmap: expected filter="linear" with it, got "nearest"')
+        if uv is None:
+            uv, of_uv = self.uv, None
+        else:
+            of_uv = uv = as_tensor("uv", uv, floating=True)
         check_shape("uv", uv, (len(self), 2))
-        h, w = texture.shape[:2]
-        x, y = uv[:, 0].double() * w - 0.5, (1 - uv[:, 1].double()) * h - 0.5
-        x0, y0 = x.detach().floor(), y.detach().floor()
-        fx, fy = (x - x0).to(texture.dtype)[:, None], (y - y0).to(texture.dtype)[:, None]
+        if filter == "nearest":
+            h, w = texture.shape[:2]
+            cell = self.floor(torch.stack([uv[:, 0].double() * w, (1 - uv[:, 1].double()) * h], 1))
+            return texture[_wrapped(cell[:, 1], h, wraps[1]), _wrapped(cell[:, 0], w, wraps[0])]
+        if not mipmap:
+            return _bilinear(texture, uv, wraps)
+        levels = self._pyramid(texture)
+        level = self._level(texture, of_uv).clamp(0, len(levels) - 1)
+        below = level.floor()
+        value: Any = 0
+        for k, image in enumerate(levels):
+            weight = torch.where(below == k, 1 - (level - below), torch.where(below == k - 1, level - below, 0.0))
+            value = value + weight.to(texture.dtype)[:, None] * _bilinear(image, uv, wraps)
+        return value
 
-        def texels(dy: int, dx: int) -> Tensor:
-            i, j = (y0 + dy).long(), (x0 + dx).long()
-            i, j = (i % h, j % w) if wrap == "repeat" else (i.clamp(0, h - 1), j.clamp(0, w - 1))
-            return texture.reshape(h * w, -1)[i * w + j]
+    def _pyramid(self, texture: Tensor) -> list[Tensor]:
+        """The texture, and its means over squares of 2, 4, 8 … texels."""
+        kept = self._surfaces.pyramids
+        if not torch.is_grad_enabled() and id(texture) in kept:
+            return kept[id(texture)][1]
+        levels = [texture]
+        while max(levels[-1].shape[:2]) > 1:
+            image = levels[-1].movedim(-1, 0)[None]
+            size = max(1, image.shape[2] // 2), max(1, image.shape[3] // 2)
+            levels.append(torch.nn.functional.adaptive_avg_pool2d(image, size)[0].movedim(0, -1))
+        if not torch.is_grad_enabled():
+            kept[id(texture)] = texture, levels
+        return levels
 
-        top = (1 - fx) * texels(0, 0) + fx * texels(0, 1)
-        bottom = (1 - fx) * texels(1, 0) + fx * texels(1, 1)
-        return (1 - fy) * top + fy * bottom
+    def _level(self, texture: Tensor, of_uv: Tensor | None) -> Tensor:
+        """(N,) the logarithm of how many texels neighbouring pixels are apart, at most; without derivatives."""
+        if self._rays_at is None or self._pixel is None or isinstance(self._view, Rays):
+            raise ValueError("mipmap: expected hits of a camera, for rays of trace() have no neighbours; leave it out")
+        if of_uv is not None:
+            raise ValueError(
+                "mipmap: expected the surface's own texture coordinates, for how others change from pixel to pixel is not "
+                "known; leave uv out, or mipmap"
+            )
+        with torch.no_grad():
+            corners = self._surfaces.corner_uvs.detach()[self._face].double()
+            size = torch.tensor([texture.shape[1], texture.shape[0]], dtype=torch.float64, device=corners.device)
+            rays, surfaces, view = self._rays_at(self._pixel), self._surfaces.detach(), self._view.detach()
+            step = 1 / 64  # px, within which the face's plane is as good as straight
+
+            def apart(axis: int) -> Tensor:
+                moved = step * rays.along_by_x[:, :, axis]
+                b = [view.barycentrics(surfaces, self._face, rays.along + sign * moved) for sign in (1, -1)]
+                return (((b[0] - b[1])[:, :, None] * corners).sum(1) * size).norm(dim=1) / (2 * step)
+
+            most = torch.maximum(apart(0), apart(1))
+            return torch.nan_to_num(most, nan=1.0, posinf=1e9).clamp(1, 1e9).log2()
+
+    # -- steps ---------------------------------------------------------------------------------------------------------
+
+    def where(self, s: Tensor, a: Tensor | float, b: Tensor | float) -> Tensor:
+        """(N, C): `a` where s > 0 and `b` elsewhere, a declared step: where it lies in the image has a gradient.
+
+        s      (N,) or (N, 1), any differentiable function of the point: s = 0 is the border
+        a, b   rows (N, C), a colour (C,), or a number
+
+        torch.where() gives the same image, but no gradient for the border. Borders are found along lines through the image,
+        a pixel apart unless render() is given another step_spacing; two that lie closer may be missed. A shader must call
+        where(), floor() and nearest lookups equally often, in the same order, whatever its points. Raises TypeError or
+        ValueError that names the argument.
+        """
+        s = as_tensor("s", s, floating=True)
+        check_float("s", s)
+        check_shape("s", s, (len(self),), (len(self), 1))
+        up = self._steps.above_zero(s.reshape(-1))[:, None]
+        sides = []
+        for name, side in (("a", a), ("b", b)):
+            value = as_tensor(name, side, like=s, floating=True)
+            if value.dim() > 2 or (value.dim() == 2 and value.shape[0] not in (1, len(self))):
+                raise ValueError(f"{name}: expected rows (N, C), a colour (C,) or a number, got {tuple(value.shape)}")
+            if value.dim() == 1 and value.shape[0] > 1024:
+                raise ValueError(
+                    f"{name}: expected rows (N, C), a colour (C,) or a number, got shape {tuple(value.shape)}; a number a point "
+                    "is value[:, None]"
+                )
+            sides.append(value)
+        return torch.where(up, *sides)
+
+    def floor(self, t: Tensor) -> Tensor:
+        """The largest integers not above t (N,) or (N, K), whose jumps are declared steps: see where(). For checkerboards,
+        stripes, tables. Raises TypeError or ValueError that names the argument."""
+        t = as_tensor("t", t, floating=True)
+        check_float("t", t)
+        check_shape("t", t, (len(self),), (len(self), "K"))
+        if t.dim() == 1:
+            return self._steps.floor(t)
+        return torch.stack([self._steps.floor(column) for column in t.unbind(1)], 1)
+
+    # -- shadows -------------------------------------------------------------------------------------------------------
+
+    def visible(self, points: Tensor) -> Tensor:
+        """(N,) bool: whether nothing lies between each point and another, `points` (N, 3) or (3,) in world coordinates.
+
+        Shadow rays: the face of the point itself hides nothing, nor does what touches either end as far as the numbers'
+        spacing tells. It has no derivative, and a shadow's border is not a step: what moves there has no gradient. Raises
+        TypeError or ValueError that names the argument.
+        """
+        s = self._surfaces
+        points = as_tensor("points", points, like=s.verts, floating=True)
+        check_float("points", points)
+        check_shape("points", points, (3,), (len(self), 3))
+        check_finite("points", points)
+        points = points.detach().expand(len(self), 3)
+        size = torch.maximum(points.abs().amax(1), self.position.detach().abs().amax(1)).double()
+        spacing = max(torch.finfo(t.dtype).eps for t in (points, s.verts))
+        return visible(s.scene, self._face, self._exact[:, 1:], points.double(), 16 * spacing * size)
+
+
+def _wrapped(cell: Tensor, count: int, wrap: str) -> Tensor:
+    """Texels as they are counted in the texture, int64."""
+    i = cell.detach().long()
+    if wrap == "repeat":
+        return i % count
+    if wrap == "clamp":
+        return i.clamp(0, count - 1)
+    i = i % (2 * count)
+    return torch.minimum(i, 2 * count - 1 - i)
+
+
+def _bilinear(texture: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
+    h, w = texture.shape[:2]
+    x, y = uv[:, 0].double() * w - 0.5, (1 - uv[:, 1].double()) * h - 0.5
+    x0, y0 = x.detach().floor(), y.detach().floor()
+    fx, fy = (x - x0).to(texture.dtype)[:, None], (y - y0).to(texture.dtype)[:, None]
+    flat = texture.reshape(h * w, -1)
+
+    def texels(dy: int, dx: int) -> Tensor:
+        return flat[_wrapped(y0 + dy, h, wraps[1]) * w + _wrapped(x0 + dx, w, wraps[0])]
+
+    top = (1 - fx) * texels(0, 0) + fx * texels(0, 1)
+    bottom = (1 - fx) * texels(1, 0) + fx * texels(1, 1)
+    return (1 - fy) * top + fy * bottom

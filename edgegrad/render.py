@@ -38,6 +38,7 @@ def render(
     shader: Shader | None = None,
     creases: bool | str = "auto",
     check_shader: bool = False,
+    step_spacing: float = 1.0,
 ) -> Tensor:
     """The image (H, W, C) of a scene, or (B, H, W, C) for a batch of cameras: linear radiance, row 0 on top.
 
@@ -60,11 +61,13 @@ def render(
                      faces it hit, which says where to put them
     shader           a function or module of Hits that gives the radiance (N, C) of N points, in place of the meshes' colours
                      and textures: any PyTorch, as long as each point is by itself. It is asked once for each face in a
-                     pixel, in parts of some 131,072 points. Where it jumps within a face, that has no gradient
+                     pixel, in parts of some 131,072 points. Where it jumps within a face, that has a gradient if it says so by
+                     hits.where(), hits.floor() or a nearest lookup
     creases          at which edges between two visible faces the shader may jump: "auto", where a property of the hits
                      jumps that it asked for (normals; texture coordinates at seams; attributes of interpolate(); all
                      edges if it asked for `face` or `barycentrics`); True, at all; False, at none
     check_shader     asks the shader twice, the second time with half of the points in another order, and compares
+    step_spacing     px between the lines along which steps are looked for; two borders that lie closer may be missed
 
     Differentiable once, in reverse and in forward mode, in every floating-point tensor of the scene and the camera; torch.vmap
     and torch.func's transforms work, one element of the batch at a time, all with the same seed; tangents of one image
@@ -75,7 +78,7 @@ def render(
     """
     request = make_request(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
-        filter=filter, grad_seed=grad_seed,
+        filter=filter, grad_seed=grad_seed, step_spacing=step_spacing,
     )  # fmt: skip
     if shader is not None:
         return render_shaded(as_scene(scene), camera, shader, request, creases, check_shader)

@@ -1,9 +1,9 @@
-"""Images of shaders written in PyTorch, with gradients of what moves at silhouettes.
+"""Images of shaders written in PyTorch, with gradients of what moves at silhouettes and at declared steps.
 
-The value of the image and its gradient come from different samples. Those of the image are shaded without a graph. To it two
+The value of the image and its gradient come from different samples. Those of the image are shaded without a graph. To it
 terms are added whose value is exactly zero: samples inside faces, shaded with a graph at points that move with the scene while
-their pixel stays; and samples on curves, shaded without one on both sides, whose jump multiplies the curve's velocity. All of
-it is PyTorch, so whatever the shader uses gets its gradient by itself.
+their pixel stays; samples on curves, shaded without one on both sides, whose jump multiplies the curve's velocity; and, where
+the shader declares steps, samples on these. All of it is PyTorch, so whatever the shader uses gets its gradient by itself.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from ._autograd import FIRST_ORDER
 from ._check import values_visible
 from ._request import Request
-from ._samples import CurveSamples, Footprints, Sampler, SurfaceSamples
+from ._samples import RayRecords, without_colors
+from ._steps import UNEQUAL, Crossings, Points, Steps, find_crossings
+from ._surfaces import every_face
 from .camera import Camera
-from .hits import Hits, Surfaces
-from .scene import Flat, Scene
+from .hits import Hits
+from .samples import EdgeSamples, Frame, SurfaceSamples, boundary, differentiates, moves, once, transformed
+from .scene import Scene
 
 Shader = Callable[[Hits], Tensor]
 
@@ -38,147 +40,183 @@ def render_shaded(
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
-    images = [
-        _Image(scene, camera, shader, request, creases, check, index).render() for index in range(request.cameras)
-    ]
+    images = [_Image(Frame(scene, request, k), shader, creases, check).render() for k in range(request.cameras)]
     return images[0] if camera.batch is None else torch.stack(images)
 
 
 class _Image:
     """The image of one camera of a batch."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        camera: Camera,
-        shader: Shader,
-        request: Request,
-        creases: bool | str,
-        check: bool,
-        index: int,
-    ) -> None:
-        self._scene, self._shader, self._creases, self._check = scene, shader, creases, check
-        packed = request.camera
-        self._request = request._replace(scene=_with_attributes(request.scene, request.scene.verts.new_zeros(0)))
-        self._sampler = Sampler(self._request, index)
-        self._surfaces = Surfaces(scene, packed.world_to_camera[index], packed.perspective)
-        self._fixed = self._surfaces.detach()
-        self._intrinsics = torch.cat([packed.K[index, :2].reshape(6), packed.distortion[index]])
-        self._pixels = packed.height * packed.width
+    def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool) -> None:
+        self._frame, self._shader, self._creases, self._check = frame, shader, creases, check
         self._channels: int | None = None
+        self._kinds: list[str] | None = None  # of the steps that the shader declares
 
     def render(self) -> Tensor:
         image = self._values()
-        if not _differentiates():
+        if not differentiates():
             return image
-        moving = self._request.gradient.visibility and _moves(
-            *(mesh.verts for mesh in self._scene.meshes), self._surfaces.world_to_camera, self._intrinsics
-        )
-        surface, curves = self._sampler.samples(self._with_creases(), interior=True, boundary=moving)
-        zero = self._interior(surface)
+        frame = self._frame
+        visibility = frame.request.gradient.visibility
+        moving = visibility and moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
+        surface, curves = frame.sampler.samples(self._with_creases(), interior=True, boundary=moving)
+        zero = self._interior(SurfaceSamples(frame, surface))
         if moving:
-            zero = zero + self._boundary(curves)
-        return image + _FirstOrder.apply(zero.reshape(image.shape))
+            zero = zero + self._boundary(EdgeSamples(frame, curves))
+        if visibility and self._kinds:
+            zero = zero + self._steps()
+        return image + once(zero.reshape(image.shape))
 
     # -- the image -----------------------------------------------------------------------------------------------------
 
     def _values(self) -> Tensor:
         """The image, without a graph."""
+        frame = self._frame
         with torch.no_grad():
             image: Any = 0
-            for found in self._sampler.pixel_hits(AT_ONCE):
-                b = torch.cat([1 - found.b.sum(1, keepdim=True), found.b], 1)
-                hits = Hits(self._fixed, self._here(found.face), self._here(b), self._here(found.x))
+            for found in frame.sampler.pixel_hits(AT_ONCE):
+                hits = frame.fixed_hits(found.face, found.b, found.x)
                 radiance = self._shade(hits).detach()
-                weighted = radiance * self._here(found.weight).to(radiance.dtype)[:, None]
-                if isinstance(image, int):
-                    image = radiance.new_zeros((self._pixels, radiance.shape[1]))
-                image = image.index_add(0, self._here(found.pixel), weighted)
-        height, width = self._request.camera.height, self._request.camera.width
-        coverage = self._here(self._sampler.coverage).to(image.dtype)
-        return image.reshape(height, width, -1) + (1 - coverage)[:, :, None] * self._background()
+                weighted = radiance * frame.here(found.weight).to(radiance.dtype)[:, None]
+                image = image + frame.image(found.pixel, weighted)
+        return frame.composed(image, self._background())
 
-    def _background(self) -> Tensor:
+    def _background(self) -> Tensor | None:
         """(C,) or (H, W, C)."""
-        assert self._channels is not None
-        background = self._scene.background
-        if background is None:
-            return self._fixed.verts.new_zeros(self._channels)
-        if background.shape[-1] != self._channels:
+        background = self._frame.surfaces.scene.background
+        if background is not None and background.shape[-1] != self._channels:
             raise ValueError(
                 f"shader: expected as many channels as the background has, {background.shape[-1]}, got {self._channels}"
             )
-        return background.to(self._fixed.verts)
+        return None if background is None else background.to(self._frame.dtype)
 
     # -- what is added to it, of the value zero -----------------------------------------------------------------------
 
     def _interior(self, samples: SurfaceSamples) -> Tensor:
         """(H · W, C): Σ k(x − c) L px² over samples inside faces, less its own value."""
-        total = self._fixed.verts.new_zeros((self._pixels, self._channels or 1))
-        for first in range(0, len(samples.face), AT_ONCE):
-            some = SurfaceSamples(*(part[first : first + AT_ONCE] for part in samples))
+        frame = self._frame
+        total = frame.fixed.verts.new_zeros((frame.height, frame.width, self._channels or 1))
+        for first in range(0, len(samples), AT_ONCE):
+            some = samples.part(first, first + AT_ONCE)
 
             def radiance(some: SurfaceSamples = some) -> Tensor:
-                moved = self._intrinsics - self._intrinsics.detach()
-                along = some.along + (some.along_by_k @ moved if _moves(self._intrinsics) else 0)
-                face, along = self._here(some.face), self._here(along)
-                b = self._surfaces.barycentrics(face, along)
-                return self._shade(Hits(self._surfaces, face, b, self._here(some.x)))
+                return self._shade(some.hits)
 
             # So that memory is that of some points, not of all.
-            many = len(samples.face) > AT_ONCE and not _transformed()
+            many = len(samples) > AT_ONCE and not transformed()
             L = checkpoint(radiance, use_reentrant=False) if many else radiance()
             assert isinstance(L, Tensor)
-            feet = Footprints.of(some.x, self._request)
-            weight = self._here(some.weight[feet.point] * feet.weight).to(L.dtype)[:, None]
-            total = total.index_add(0, self._here(feet.pixel), weight * L[self._here(feet.point)])
+            total = total + some.image(L)
+        total = total.reshape(frame.pixels, -1)
         return total - total.detach()
 
-    def _boundary(self, samples: CurveSamples) -> Tensor:
+    def _boundary(self, samples: EdgeSamples) -> Tensor:
         """(H · W, C): Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
-        count = len(samples.x)
-        known = samples.face >= 0
-        sample, which = known.nonzero(as_tuple=True)
-        b = samples.b[sample, which]
-        b = torch.cat([1 - b.sum(1, keepdim=True), b], 1)
-        face, x = samples.face[sample, which], samples.x[sample]
-        jump = self._fixed.verts.new_zeros((count, self._channels or 1))
-        factor = samples.factor.to(jump.dtype)
+        jump = self._frame.fixed.verts.new_zeros((len(samples), self._channels or 1))
         with torch.no_grad():
-            for first in range(0, len(face), AT_ONCE):
-                part = slice(first, first + AT_ONCE)
-                hits = Hits(self._fixed, self._here(face[part]), self._here(b[part]), self._here(x[part]))
-                weighted = self._shade(hits).detach() * self._here(factor[sample[part], which[part]])[:, None]
-                jump = jump.index_add(0, self._here(sample[part]), weighted)
-        q = self._surfaces.in_camera(self._surfaces.verts)
-        q = q - q.detach()
-        rows = (self._here(samples.by_q) * q[self._here(samples.vertex)]).sum(1)
-        moved = self._intrinsics - self._intrinsics.detach()
-        velocity = self._here(samples.by_k @ moved).index_add(0, self._here(samples.row_of), rows).to(jump.dtype)
-        feet = Footprints.of(samples.x, self._request)
-        point, pixel = self._here(feet.point), self._here(feet.pixel)
-        background = self._background().detach()
-        behind = background.reshape(self._pixels, -1)[pixel] if background.dim() == 3 else background
-        to_background = self._here(torch.where(samples.face == -1, factor, 0).sum(1))
-        jumps = jump[point] + to_background[point, None] * behind
-        weight = self._here(feet.weight).to(jump.dtype)
-        values = (weight * velocity[point])[:, None] * jumps
-        return torch.zeros_like(jump.sum(0, keepdim=True)).expand(self._pixels, -1).index_add(0, pixel, values)
+            for first in range(0, len(samples.hits), AT_ONCE):
+                end = min(first + AT_ONCE, len(samples.hits))
+                points = samples.hits.select(torch.arange(first, end, device=self._frame.device))
+                jump = jump + samples.jump_of(first, end, self._shade(points).detach())
+        return boundary(self._frame, samples.x, samples.velocity, jump, samples.to_background, self._background())
+
+    def _steps(self) -> Tensor:
+        """(H · W, C): Σ k(x − c) [L₊ − L₋] δs / |∇ₓs| · weight over where lines cross steps s = 0 of the shader."""
+        frame = self._frame
+        found = self._crossings()
+        rays = frame.sampler.rays_at(found.x)
+        step = frame.here(found.step)[:, None]
+        gradient = torch.cat([self._by_place(found, rays, part) for part in _parts(found)])
+        with torch.no_grad():
+            jumps = []
+            for part in _parts(found):
+                sides = [
+                    self._shade(frame.fixed_hits(found.face[part], found.b[part], found.x[part], Steps(states[part])))
+                    for states in (found.before, found.after)
+                ]
+                jumps.append((sides[1] - sides[0]).detach())
+            jump = torch.cat(jumps) * torch.where(frame.here(found.rises), 1.0, -1.0).to(frame.dtype)[:, None]
+            # |n_x| / |∇s|, and none where s has no direction.
+            length = gradient.norm(dim=1)
+            across = gradient.gather(1, frame.here(found.axis)[:, None])[:, 0].abs()
+            weight = frame.here(found.weight) * torch.where(length > 0, across / length**2, 0.0)
+            weight = torch.nan_to_num(weight, nan=0.0, posinf=0.0)
+        values = []
+        for part in _parts(found):
+
+            def of_scene(part: slice = part) -> Tensor:
+                here = RayRecords(*(field[part] for field in rays))
+                hits = frame.moving_hits(found.face[part], here, found.x[part])
+                return self._step_values(hits).gather(1, step[part])[:, 0]
+
+            many = len(found.x) > AT_ONCE and not transformed()
+            s = checkpoint(of_scene, use_reentrant=False) if many else of_scene()
+            assert isinstance(s, Tensor)
+            values.append(s)
+        s = torch.cat(values)
+        return boundary(frame, found.x, weight * (s - s.detach()), jump, None, None)
+
+    def _crossings(self) -> Crossings:
+        frame, options = self._frame, self._frame.request.gradient
+        kinds = self._kinds or []
+
+        def at(x: Tensor) -> Points:
+            places = [frame.sampler.hits_at(x[k : k + AT_ONCE]) for k in range(0, max(len(x), 1), AT_ONCE)]
+            face, part, b = (torch.cat(field) for field in zip(*places, strict=True))
+            values = torch.full((len(x), len(kinds)), torch.nan, dtype=torch.float64)
+            there = (face >= 0).nonzero()[:, 0]
+            for some in there.split(AT_ONCE):
+                hits = frame.fixed_hits(face[some], b[some], x[some])
+                values[some] = self._step_values(hits).detach().cpu()
+            return Points(x, face, part, b, values)
+
+        with torch.no_grad():
+            margin = {"box": 0.0, "tent": 0.5, "gaussian": 1.0}[frame.request.image.filter]
+            size = frame.height, frame.width
+            return find_crossings(at, kinds, size, margin, options.step_spacing, frame.sampler.grad_seed)
+
+    def _by_place(self, found: Crossings, rays: RayRecords, part: slice) -> Tensor:
+        """(M, 2): ∇ₓs of each crossing's step, without derivatives of its own."""
+        frame = self._frame
+        step = frame.here(found.step[part])[:, None]
+        face, along, by_x = (frame.here(t[part]) for t in (found.face, rays.along, rays.along_by_x))
+
+        def sum_of_steps(x: Tensor) -> Tensor:
+            b = frame.fixed_view.barycentrics(frame.fixed, face, along + (by_x * x[:, None]).sum(-1))
+            hits = Hits(frame.fixed, frame.fixed_view, face, b, frame.here(found.x[part]) + x, frame.sampler.rays_at)
+            return self._step_values(hits).gather(1, step).sum()
+
+        zero = along.new_zeros((len(along), 2))
+        if transformed():
+            return torch.func.grad(sum_of_steps)(zero).detach()
+        with torch.enable_grad():
+            zero.requires_grad_()
+            return torch.autograd.grad(sum_of_steps(zero), zero)[0].detach()
+
+    def _step_values(self, hits: Hits) -> Tensor:
+        """(N, K) the functions of all steps."""
+        self._shade(hits)
+        return torch.stack([values.double() for values in hits._steps.values], 1)
 
     def _with_creases(self) -> Request:
         """The request with colours that jump where the shader may."""
-        if self._creases is True:
-            self._fixed.jumping.clear()
-            _ = Hits(self._fixed, *(self._fixed.faces.new_zeros((0, k)) for k in (1, 3, 2))).face
+        frame = self._frame
         with torch.no_grad():
-            attributes = self._fixed.crease_attributes() if self._creases else self._fixed.verts.new_zeros(0)
-        return self._request._replace(scene=_with_attributes(self._request.scene, attributes.cpu()))
+            if self._creases is True:
+                attributes = every_face(len(frame.fixed.faces))
+            else:
+                attributes = frame.fixed.crease_attributes().cpu() if self._creases else None
+        return frame.request._replace(scene=without_colors(frame.request.scene, attributes))
 
     # -- the shader ----------------------------------------------------------------------------------------------------
 
     def _shade(self, hits: Hits) -> Tensor:
         """(N, C), checked."""
         radiance = self._checked(self._shader(hits), len(hits))
+        kinds = list(hits._steps.kinds)
+        if self._kinds not in (None, kinds):
+            raise ValueError(UNEQUAL)
+        self._kinds = kinds
         if self._check and len(hits) > 1:
             order = torch.randperm(len(hits), generator=torch.Generator().manual_seed(0)).to(radiance.device)
             order = order[: (len(hits) + 1) // 2]
@@ -212,88 +250,8 @@ class _Image:
                 f"shader: expected finite numbers, got {radiance.detach()[row].tolist()} at one of {count} hits; look for "
                 "divisions by zero and powers of negative numbers"
             )
-        return radiance.to(self._fixed.verts.dtype)
-
-    def _here(self, tensor: Tensor) -> Tensor:
-        """On the device of the scene."""
-        return tensor.to(self._fixed.verts.device)
+        return radiance.to(self._frame.dtype)
 
 
-def _with_attributes(flat: Flat, attributes: Tensor) -> Flat:
-    """The geometry of a scene with these numbers (F, 3, K) for colours."""
-    F = len(flat.faces)
-    if attributes.numel():
-        colors = attributes.reshape(3 * F, -1).to(flat.colors.dtype).contiguous()
-        corners = torch.arange(3 * F, dtype=torch.int32).reshape(F, 3)
-    else:
-        colors, corners = torch.zeros((1, 1), dtype=flat.colors.dtype), torch.zeros((F, 3), dtype=torch.int32)
-    return flat._replace(
-        corners=corners,
-        colors=colors,
-        uvs=flat.uvs.new_zeros((0, 2)),
-        texels=colors.new_zeros((0, colors.shape[1])),
-        textures=flat.textures.new_zeros((0, 3)),
-        face_texture=flat.face_texture.new_zeros(0),
-        background=colors.new_zeros(colors.shape[1]),
-    )
-
-
-def _transformed() -> bool:
-    """Whether a transform of torch.func is under way."""
-    functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
-    return functorch.peek_interpreter_stack() is not None
-
-
-def _differentiates() -> bool:
-    return torch.is_grad_enabled() or _transformed() or torch.autograd.forward_ad._current_level >= 0
-
-
-def _moves(*tensors: Tensor) -> bool:
-    """Whether a derivative by one of them may be asked for."""
-    if _transformed():
-        return True
-    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
-        return True
-    dual = torch.autograd.forward_ad
-    return dual._current_level >= 0 and any(dual.unpack_dual(t).tangent is not None for t in tensors)
-
-
-class _FirstOrder(torch.autograd.Function):
-    """The identity, whose derivative has none: that of the samples' places and of their visibility is not known."""
-
-    @staticmethod
-    def forward(value: Tensor) -> Tensor:
-        return value.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        # With the value, so that a derivative of the gradient by what the image depends on comes by here.
-        return _Last.apply(*grad_outputs, *ctx.saved_tensors)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, Any]:
-        return _FirstOrder.apply(*args), in_dims[0]
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        return tangents[0].clone()
-
-
-class _Last(torch.autograd.Function):
-    """The first of its arguments, which has no derivative."""
-
-    @staticmethod
-    def forward(grad: Tensor, value: Tensor) -> Tensor:
-        return grad.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)
+def _parts(found: Crossings) -> list[slice]:
+    return [slice(first, first + AT_ONCE) for first in range(0, max(len(found.x), 1), AT_ONCE)]

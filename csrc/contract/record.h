@@ -31,6 +31,13 @@ struct SurfaceRecords {
     void add(const SurfaceRecords& o);
 };
 
+// Rays of a camera as functions of where they go and of its intrinsics; see SurfaceRecords.
+struct RayRecords {
+    std::vector<double> along;       // (N, 3)
+    std::vector<double> along_by_x;  // (N, 3, 2)
+    std::vector<double> along_by_k;  // (N, 3, 14)
+};
+
 // Samples on curves. One on which two curves lie at a time has an entry for each that moves.
 struct CurveRecords {
     static constexpr int surfaces = 3;  // at most
@@ -62,6 +69,23 @@ inline void append_intrinsics(std::vector<double>& to, const Camera& window, con
     double of_camera[intrinsics_width] = {};
     add_intrinsics(window, bar, of_camera, of_camera + 6);
     to.insert(to.end(), of_camera, of_camera + intrinsics_width);
+}
+
+// Appends the ray that goes to n in a window's image: in the frame of the camera, with its derivatives at fixed x.
+inline void append_ray(const Camera& window, Vec2 n, std::vector<double>& along, std::vector<double>& along_by_k,
+                       std::vector<double>* along_by_x = nullptr) {
+    const Mat3& turn = window.turn;
+    const Vec3 direction = transposed_times(turn, {n.x, n.y, 1});
+    append(along, {direction.x, direction.y, direction.z});
+    for (const Vec2 by_n :
+         {Vec2{turn.row[0].x, turn.row[1].x}, Vec2{turn.row[0].y, turn.row[1].y}, Vec2{turn.row[0].z, turn.row[1].z}}) {
+        IntrinsicsGrad bar;
+        normalised_vjp(window, n, by_n, bar);
+        append_intrinsics(along_by_k, window, bar);
+        if (!along_by_x) continue;
+        const Vec2 by_x = pixel_vjp(window, n, by_n);
+        append(*along_by_x, {by_x.x, by_x.y});
+    }
 }
 
 inline void SurfaceRecords::add(const SurfaceRecords& o) {

@@ -204,16 +204,7 @@ class RecordInterior {
     void add(int32_t face, Vec2 x, Vec2 n, double weight) {
         records_.face.push_back(face);
         append(records_.x, {x.x, x.y});
-        // From the frame of the window to that of the camera.
-        const Mat3& turn = view_.camera.turn;
-        const Vec3 along = transposed_times(turn, {n.x, n.y, 1});
-        append(records_.along, {along.x, along.y, along.z});
-        for (const Vec3 column : {Vec3{turn.row[0].x, turn.row[1].x, 0}, Vec3{turn.row[0].y, turn.row[1].y, 0},
-                                  Vec3{turn.row[0].z, turn.row[1].z, 0}}) {
-            IntrinsicsGrad bar;
-            normalised_vjp(view_.camera, n, {column.x, column.y}, bar);
-            append_intrinsics(records_.along_by_k, view_.camera, bar);
-        }
+        append_ray(view_.camera, n, records_.along, records_.along_by_k);
         records_.weight.push_back(weight);
     }
 

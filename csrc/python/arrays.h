@@ -8,9 +8,11 @@
 #include <string>
 #include <vector>
 
+#include "backward/backward.h"
 #include "camera/windows.h"
 #include "forward/forward.h"
 #include "python/checks.h"
+#include "python/unlocked.h"
 #include "scene/geometry.h"
 
 namespace edgegrad {
@@ -173,6 +175,21 @@ struct HitArrays {
     }
     HitBuffers<T> view() const { return {coverage.data(), depth.data(), hit.data(), seen.data()}; }
 };
+
+template <class T>
+void check_image(const char* name, const Out<T, 3>& image, const Camera& camera, size_t channels) {
+    if (int(image.shape(0)) != camera.height || int(image.shape(1)) != camera.width || image.shape(2) != channels)
+        refuse(std::string(name) + ": expected an image of the camera's size and the scene's channels");
+}
+
+// Geometry as the terms of a derivative want it.
+template <class T, class Work>
+void with_geometry(const SceneArrays<T>& arrays, bool boundary, int threads, Work work) {
+    unlocked(threads, [&](Team& team) {
+        GeometryWork done;
+        work(*arrays.geometry(geometry_for(true, boundary), team, done), team);
+    });
+}
 
 inline AnyLens make_lens(const std::string& name, In<double, 2> K, In<double, 1> distortion) {
     if (distortion.size() != most_coefficients) refuse("distortion: expected 8 numbers");

@@ -14,7 +14,6 @@
 #include "backward/backward.h"
 #include "core/stopwatch.h"
 #include "forward/centers.h"
-#include "forward/pixel_hits.h"
 #include "python/arrays.h"
 #include "python/unlocked.h"
 
@@ -22,16 +21,13 @@ using namespace nanobind::literals;
 
 namespace edgegrad {
 
-void bind_memory(nb::module_& m);     // memory.cpp
+void bind_memory(nb::module_& m);       // memory.cpp
+void bind_for_shaders(nb::module_& m);  // for_shaders.cpp
+template <class T>
+void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene);
 void bind_for_tests(nb::module_& m);  // for_tests.cpp
 
 namespace {
-
-template <class T>
-void check_image(const char* name, const Out<T, 3>& image, const Camera& camera, size_t channels) {
-    if (int(image.shape(0)) != camera.height || int(image.shape(1)) != camera.width || image.shape(2) != channels)
-        refuse(std::string(name) + ": expected an image of the camera's size and the scene's channels");
-}
 
 template <class T>
 void check_background(const SceneArrays<T>& scene, const Camera& camera) {
@@ -133,15 +129,6 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Chann
             {"world", p.world}};
 }
 
-// Geometry as the terms of a derivative want it.
-template <class T, class Work>
-void with_geometry(const SceneArrays<T>& arrays, bool boundary, int threads, Work work) {
-    unlocked(threads, [&](Team& team) {
-        GeometryWork done;
-        work(*arrays.geometry(geometry_for(true, boundary), team, done), team);
-    });
-}
-
 // Of several directions: what each moves, by slot.
 template <class T>
 void jvp(const SceneArrays<T>& arrays, const Camera& camera, const ChannelArrays& channels, const ImageOptions& image,
@@ -181,76 +168,6 @@ void screen_gradient(const SceneArrays<T>& arrays, const Camera& camera, const C
     });
 }
 
-// A vector as an array of rows of this shape, without a copy.
-template <class X>
-nb::object rows(std::vector<X>&& values, std::vector<size_t> row = {}) {
-    size_t width = 1;
-    for (const size_t n : row) width *= n;
-    auto* kept = new std::vector<X>(std::move(values));
-    const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<X>*>(p); });
-    row.insert(row.begin(), kept->size() / width);
-    return nb::cast(nb::ndarray<nb::numpy, X>(kept->data(), row.size(), row.data(), owner));
-}
-
-template <class T>
-nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& options, int threads,
-                    int first, int end, const HitArrays<T>& hits) {
-    hits.check(arrays, camera);
-    if (first < 0 || first > end || end > camera.height) refuse("rows: expected rows of the image");
-    PixelHits found;
-    unlocked(threads, [&](Team& team) {
-        GeometryWork work;
-        const auto geometry = arrays.geometry({}, team, work);
-        found = find_pixel_hits(arrays.view(), camera, geometry->caster(), options, first, end, team, hits.view());
-    });
-    nb::dict out;
-    out["pixel"] = rows(std::move(found.pixel)), out["face"] = rows(std::move(found.face));
-    out["b"] = rows(std::move(found.b), {2}), out["x"] = rows(std::move(found.x), {2});
-    out["weight"] = rows(std::move(found.weight));
-    return out;
-}
-
-// The samples of the terms inside faces and on curves, as records of arrays.
-template <class T>
-nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
-                  const GradientOptions& options, int threads, Out<T, 3> adjoint, const HitArrays<T>& hits) {
-    check_image("adjoint", adjoint, camera, arrays.background.shape(2));
-    hits.check(arrays, camera);
-    const SceneView<T> scene = arrays.view();
-    Records found;
-    with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
-        found = record_samples(BackwardInput<T>{scene, camera, geometry, image, adjoint.data(), hits.view()}, options,
-                               team);
-    });
-    SurfaceRecords& s = found.surface;
-    CurveRecords& c = found.curves;
-    nb::dict surface, curves;
-    surface["face"] = rows(std::move(s.face)), surface["x"] = rows(std::move(s.x), {2});
-    surface["along"] = rows(std::move(s.along), {3}), surface["weight"] = rows(std::move(s.weight));
-    surface["along_by_k"] = rows(std::move(s.along_by_k), {3, intrinsics_width});
-    curves["x"] = rows(std::move(c.x), {2}), curves["face"] = rows(std::move(c.face), {CurveRecords::surfaces});
-    curves["b"] = rows(std::move(c.b), {CurveRecords::surfaces, 2});
-    curves["factor"] = rows(std::move(c.factor), {CurveRecords::surfaces});
-    curves["by_k"] = rows(std::move(c.by_k), {intrinsics_width});
-    curves["row_of"] = rows(std::move(c.row_of)), curves["vertex"] = rows(std::move(c.vertex));
-    curves["by_q"] = rows(std::move(c.by_q), {3});
-    return nb::make_tuple(surface, curves);
-}
-
-// The pixels whose filter reaches points of the image: for each pair the point, the pixel, and the filter's weight
-// there.
-nb::tuple footprints(In<double, 2> x, const std::string& filter, int width, int height) {
-    if (x.shape(1) != 2) refuse("x: expected rows of two numbers");
-    const FilteredPixels pixels(make_filter(filter), width, height);
-    std::vector<int64_t> point, pixel;
-    std::vector<double> weight;
-    for (size_t i = 0; i < x.shape(0); ++i)
-        pixels.around({x(i, 0), x(i, 1)}, [&](int64_t p, double w) {
-            point.push_back(int64_t(i)), pixel.push_back(p), weight.push_back(w);
-        });
-    return nb::make_tuple(rows(std::move(point)), rows(std::move(pixel)), rows(std::move(weight)));
-}
-
 template <class T>
 void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
     using Scene = SceneArrays<T>;
@@ -259,7 +176,8 @@ void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
                  return HitArrays<T>{coverage, depth, hit, seen};
              }),
              "coverage"_a.noconvert(), "depth"_a.noconvert(), "hit"_a.noconvert(), "seen"_a.noconvert());
-    nb::class_<Scene>(m, scene_name)
+    nb::class_<Scene> scene(m, scene_name);
+    scene
         .def(nb::init<In<double, 2>, In<int32_t, 2>, In<int32_t, 2>, In<T, 2>, In<double, 2>, In<T, 2>, In<int64_t, 2>,
                       In<int32_t, 1>, In<T, 3>, const std::vector<double>&, int>(),
              "verts"_a.noconvert(), "faces"_a.noconvert(), "corners"_a.noconvert(), "colors"_a.noconvert(),
@@ -273,10 +191,8 @@ void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
         .def("jvp", &jvp<T>, "camera"_a, "channels"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(),
              "hits"_a, "tangents"_a, "image_dot"_a.noconvert())
         .def("screen_gradient", &screen_gradient<T>, "camera"_a, "channels"_a, "image"_a, "options"_a, "threads"_a,
-             "adjoint"_a.noconvert(), "hits"_a, "gradient"_a.noconvert())
-        .def("pixel_hits", &pixel_hits<T>, "camera"_a, "options"_a, "threads"_a, "first"_a, "end"_a, "hits"_a)
-        .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(),
-             "hits"_a);
+             "adjoint"_a.noconvert(), "hits"_a, "gradient"_a.noconvert());
+    bind_scene_for_shaders(scene);
 }
 
 }  // namespace
@@ -323,7 +239,7 @@ NB_MODULE(_core, m) {
     std::vector<std::string> slots;
     for (const auto& slot : gradient_slots<double>) slots.push_back(slot.name);
     m.attr("GRADIENT_SLOTS") = nb::tuple(nb::cast(slots));
-    m.def("footprints", &footprints, "x"_a.noconvert(), "filter"_a, "width"_a, "height"_a);
+    bind_for_shaders(m);
     bind_scene<float>(m, "SceneFloat", "HitsFloat");
     bind_scene<double>(m, "SceneDouble", "HitsDouble");
     bind_memory(m);

@@ -1,0 +1,144 @@
+"""The surfaces of a scene as functions of its tensors, and how a camera or rays look at them: what hits are computed from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from .scene import Scene
+
+
+class Surfaces:
+    """Meshes laid end to end.
+
+    It also notes which properties that may jump at an edge a shader asks for: there the shader may jump too.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        meshes = scene.meshes
+        first = [sum(len(m.verts) for m in meshes[:k]) for k in range(len(meshes))]
+        dtype = max((m.verts.dtype for m in meshes), key=lambda t: torch.finfo(t).bits)
+        self.verts = torch.cat([m.verts.to(dtype) for m in meshes])
+        self.faces = torch.cat([m.faces.long() + k for m, k in zip(meshes, first, strict=True)])
+        counts = torch.tensor([len(m.faces) for m in meshes])
+        self.mesh_of_face = torch.repeat_interleave(torch.arange(len(meshes)), counts).to(self.verts.device)
+        self.scene = scene
+        self.jumping: dict[Any, Callable[[], Tensor]] = {}  # (F, 3, K) at corners, of what may jump
+        self.pyramids: dict[int, tuple[Tensor, list[Tensor]]] = {}  # of textures, by their ids
+
+    def detach(self) -> Surfaces:
+        """The same without derivatives; what it notes is noted for both."""
+        other = Surfaces.__new__(Surfaces)
+        other.__dict__.update(self.__dict__)
+        for name in ("corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
+            other.__dict__.pop(name, None)
+        other.verts, other.scene, other.pyramids = self.verts.detach(), self.scene.detach(), {}
+        return other
+
+    @cached_property
+    def corner_uvs(self) -> Tensor:
+        """(F, 3, 2) texture coordinates of corners."""
+        parts = []
+        for i, mesh in enumerate(self.scene.meshes):
+            if mesh.uvs is None or mesh.uv_faces is None:
+                raise ValueError(
+                    f"hits.uv: meshes[{i}] has no texture coordinates; give it a texture with uvs and uv_faces, or choose "
+                    "another mesh by hits.mesh"
+                )
+            parts.append(mesh.uvs.to(self.verts.dtype)[mesh.uv_faces.long()])
+        return torch.cat(parts)
+
+    @cached_property
+    def vertex_normals(self) -> Tensor:
+        """(V, 3) unit normals: the mean of the incident faces' by area, of vertices as they are indexed."""
+        corner = self.verts[self.faces]
+        area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        index = self.faces.reshape(-1)
+        return normalize(torch.zeros_like(self.verts).index_add(0, index, area.repeat_interleave(3, 0)), dim=-1)
+
+    def face_normals(self, face: Tensor) -> Tensor:
+        corner = self.verts[self.faces[face]]
+        return normalize(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=-1)
+
+    def crease_attributes(self) -> Tensor:
+        """(F, 3, K) of all that was asked for and may jump, each scaled to its largest number."""
+        parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
+        parts = [p / p.abs().max().clamp(min=1e-30) for p in parts]
+        return torch.cat(parts, -1) if parts else self.verts.new_zeros((len(self.faces), 3, 0))
+
+
+def every_face(count: int) -> Tensor:
+    """(F, 3, 1): a number for each face, of which neighbours differ: multiples of the golden ratio, less their whole part."""
+    return (torch.arange(count).double() * 0.6180339887498949 % 1 + 0.5)[:, None, None].expand(-1, 3, 1)
+
+
+def meet(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
+    """(N, 3) barycentrics of where rays meet the planes of faces with corners (N, 3, 3) (Möller and Trumbore 1997)."""
+    e1, e2, s = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
+    p, q = torch.linalg.cross(direction, e2), torch.linalg.cross(s, e1)
+    scale = 1 / (e1 * p).sum(-1)
+    u, v = (s * p).sum(-1) * scale, (direction * q).sum(-1) * scale
+    return torch.stack([1 - u - v, u, v], 1)
+
+
+class View:
+    """How one camera looks."""
+
+    def __init__(self, world_to_camera: Tensor, perspective: bool) -> None:
+        self.world_to_camera, self.perspective = world_to_camera, perspective  # (4, 4) float64
+
+    def detach(self) -> View:
+        return View(self.world_to_camera.detach(), self.perspective)
+
+    def in_camera(self, points: Tensor) -> Tensor:
+        """World points (..., 3) in camera coordinates, float64."""
+        return points.double() @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+
+    def barycentrics(self, surfaces: Surfaces, face: Tensor, along: Tensor) -> Tensor:
+        """(N, 3) where rays meet the planes of faces. `along` (N, 3): the directions of rays from the eye in camera coordinates,
+        or, in an orthographic view, points that rays along the axis go through."""
+        corners = self.in_camera(surfaces.verts[surfaces.faces[face]])
+        if self.perspective:
+            return meet(corners, torch.zeros_like(along), along)
+        return meet(corners, along, along.new_tensor([0.0, 0.0, 1.0]).expand_as(along))
+
+    def depth(self, points: Tensor) -> Tensor:
+        """(N,) along the axis."""
+        return self.in_camera(points)[:, 2]
+
+    def to_viewer(self, points: Tensor) -> Tensor:
+        """(N, 3) unit directions, float64."""
+        back = torch.linalg.inv(self.world_to_camera[:3, :3])
+        if self.perspective:
+            eye = -back @ self.world_to_camera[:3, 3]
+            return normalize(eye - points.double(), dim=-1)
+        return normalize(-back[:, 2], dim=0).expand(len(points), 3)
+
+
+class Rays(NamedTuple):
+    """How rays of the user's look, each at one point."""
+
+    ray: Tensor  # (N,) int64, that of each point
+    origin: Tensor  # (N, 3) world coordinates, float64
+    direction: Tensor  # (N, 3)
+
+    def select(self, index: Tensor) -> Rays:
+        return Rays(*(part[index] for part in self))
+
+    def barycentrics(self, corners: Tensor, b: Tensor) -> Tensor:
+        """Those of the hits b (N, 3), as functions of the corners (N, 3, 3) and the rays."""
+        moved = meet(corners, self.origin, self.direction)
+        return b + (moved - moved.detach())
+
+    def depth(self, points: Tensor) -> Tensor:
+        """(N,) in lengths of the direction."""
+        d = self.direction
+        return ((points.double() - self.origin) * d).sum(-1) / (d * d).sum(-1)
+
+    def to_viewer(self, points: Tensor) -> Tensor:
+        return -normalize(self.direction, dim=-1)

@@ -1,0 +1,431 @@
+"""Parts of a renderer to build others from: rays, the hits of an image, samples inside faces and on edges.
+
+render(…, shader=fn) is made of them:
+
+    primary = primary_hits(scene, camera)
+    with torch.no_grad():
+        image = primary.image(fn(primary.hits), background)
+    inside = surface_samples(primary)
+    image = image + zero_of(inside.image(fn(inside.hits)))       # x − x.detach(): the gradient inside faces
+    edges = edge_samples(primary)
+    with torch.no_grad():
+        jump = edges.jump(fn(edges.hits))
+    image = attach_boundary(image, edges, jump, background)      # the gradient of what moves at silhouettes
+
+Or with less: the image of primary_hits with a graph has the gradient inside faces by itself.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ._autograd import FIRST_ORDER
+from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
+from ._request import Request, as_scene, make_request
+from ._samples import CurveRecords, Footprints, RayRecords, Sampler, SurfaceRecords, barycentrics, without_colors
+from ._samples import trace as trace_records
+from ._steps import Steps
+from ._surfaces import Rays, Surfaces, View, every_face
+from .camera import Camera
+from .hits import Hits
+from .mesh import Mesh
+from .scene import Scene
+
+ALL_AT_ONCE = 1 << 40
+
+
+class Frame:
+    """One image of a scene: what all its samples share."""
+
+    def __init__(self, scene: Scene, request: Request, index: int = 0) -> None:
+        packed = request.camera
+        self.request = request._replace(scene=without_colors(request.scene))
+        self.sampler = Sampler(self.request, index)
+        self.surfaces = Surfaces(scene)
+        self.device, self.dtype = self.surfaces.verts.device, self.surfaces.verts.dtype
+        self.view = View(packed.world_to_camera[index].to(self.device, torch.float64), packed.perspective)
+        self.fixed, self.fixed_view = self.surfaces.detach(), self.view.detach()
+        self.intrinsics = torch.cat([packed.K[index, :2].reshape(6), packed.distortion[index]])
+        self.height, self.width = packed.height, packed.width
+
+    @property
+    def pixels(self) -> int:
+        return self.height * self.width
+
+    def here(self, tensor: Tensor) -> Tensor:
+        """On the device of the scene."""
+        return tensor.to(self.device)
+
+    def fixed_hits(self, face: Tensor, b: Tensor, x: Tensor, steps: Steps | None = None) -> Hits:
+        """Without derivatives; b (N, 2)."""
+        place = self.here(face), self.here(barycentrics(b)), self.here(x)
+        return Hits(self.fixed, self.fixed_view, *place, rays_at=self.sampler.rays_at, steps=steps)
+
+    def moving_hits(self, face: Tensor, rays: RayRecords | SurfaceRecords, x: Tensor) -> Hits:
+        """Functions of vertices and camera, at fixed places in the image."""
+        face, along = self.here(face), rays.along
+        if moves(self.intrinsics):
+            along = along + rays.along_by_k @ (self.intrinsics - self.intrinsics.detach())
+        b = self.view.barycentrics(self.surfaces, face, self.here(along))
+        return Hits(self.surfaces, self.view, face, b, self.here(x), self.sampler.rays_at)
+
+    def image(self, pixel: Tensor, values: Tensor) -> Tensor:
+        """(H · W, C): the sums of rows of values (N, C) by pixel."""
+        return values.new_zeros((self.pixels, values.shape[1])).index_add(0, self.here(pixel), values)
+
+    def splat(self, x: Tensor, values: Tensor) -> Tensor:
+        """(H · W, C): Σ k(x − c) · value over points x (S, 2) with values (S, C), for pixels with centres c."""
+        feet = Footprints.of(x, self.request)
+        weight = self.here(feet.weight).to(values.dtype)[:, None]
+        return self.image(feet.pixel, weight * values[self.here(feet.point)])
+
+    def composed(self, image: Tensor, background: Tensor | None) -> Tensor:
+        """(H, W, C), before a background (C,) or (H, W, C)."""
+        image = image.reshape(self.height, self.width, -1)
+        if background is None:
+            return image
+        coverage = self.here(self.sampler.coverage).to(image.dtype)
+        return image + (1 - coverage)[:, :, None] * background.to(image)
+
+
+class PrimaryHits:
+    """What the rays of an image hit: all samples of a pixel on one face are one hit, at one of them drawn at random.
+
+    hits      Hits, N points, differentiable functions of vertices and camera at fixed places in the image
+    index     (N,) int64, the pixel of each, row by row
+    weight    (N,) the share of the pixel's samples on that face
+    coverage  (H, W) the share of each pixel that is covered
+    """
+
+    def __init__(self, scene: Scene, request: Request) -> None:
+        self.frame = frame = Frame(scene, request)
+        (found,) = frame.sampler.pixel_hits(ALL_AT_ONCE)
+        self.hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x)
+        self.index, self.weight = frame.here(found.pixel), frame.here(found.weight).to(frame.dtype)
+        self.coverage = frame.here(frame.sampler.coverage)
+
+    def __repr__(self) -> str:
+        return f"PrimaryHits({len(self.hits)} points in {self.frame.height} x {self.frame.width} pixels)"
+
+    def image(self, radiance: Tensor, background: Tensor | None = None) -> Tensor:
+        """(H, W, C) from the radiance (N, C) of the hits, before a background (C,) or (H, W, C).
+
+        Its gradient by the radiance, and so inside faces, is right; that of what moves at edges is not in it. Raises TypeError
+        or ValueError that names the argument.
+        """
+        radiance = _rows("radiance", radiance, len(self.hits))
+        background = _background(background, radiance, self.frame)
+        sums = self.frame.image(self.index, self.weight.to(radiance.dtype)[:, None] * radiance)
+        return self.frame.composed(sums, background)
+
+
+class SurfaceSamples:
+    """Samples inside faces, where the image sees them.
+
+    hits    Hits, S points, differentiable functions of vertices and camera at fixed places in the image
+    weight  (S,) px² that each stands for
+    """
+
+    def __init__(self, frame: Frame, records: SurfaceRecords) -> None:
+        self.frame, self._records = frame, records
+        self.weight = frame.here(records.weight)
+        self._hits: Hits | None = None
+
+    def __len__(self) -> int:
+        return len(self._records.face)
+
+    def __repr__(self) -> str:
+        return f"SurfaceSamples({len(self)} points)"
+
+    def part(self, first: int, end: int) -> SurfaceSamples:
+        """Some of them."""
+        return SurfaceSamples(self.frame, SurfaceRecords(*(part[first:end] for part in self._records)))
+
+    @property
+    def hits(self) -> Hits:
+        if self._hits is None:
+            self._hits = self.frame.moving_hits(self._records.face, self._records, self._records.x)
+        return self._hits
+
+    def image(self, radiance: Tensor) -> Tensor:
+        """(H, W, C) from the radiance (S, C) of the samples: an estimate of the image before black whose gradient is that inside
+        faces, for its weights stand for areas of the image and not for shares of a pixel's samples. Raises TypeError or
+        ValueError that names the argument."""
+        radiance = _rows("radiance", radiance, len(self))
+        values = self.weight.to(radiance.dtype)[:, None] * radiance
+        return self.frame.composed(self.frame.splat(self._records.x, values), None)
+
+
+class EdgeSamples:
+    """Samples on the curves where the image jumps: silhouettes, borders, intersections and creases.
+
+    hits      Hits, the N points on their surfaces, at most three a sample; without derivatives
+    sample    (N,) int64, whose each is
+    x         (S, 2) places in the image, px
+    velocity  (S,) of the curve across itself, times the length that a sample stands for: its value is zero, its derivative is
+              that of the place by vertices and camera
+    """
+
+    def __init__(self, frame: Frame, records: CurveRecords) -> None:
+        self.frame, self._records = frame, records
+        self.x = frame.here(records.x)
+        sample, which = (records.face >= 0).nonzero(as_tuple=True)
+        self.sample, self._factor = frame.here(sample), frame.here(records.factor[sample, which])
+        self.hits = frame.fixed_hits(records.face[sample, which], records.b[sample, which], records.x[sample])
+        self.to_background = frame.here(torch.where(records.face == -1, records.factor, 0).sum(1))
+        q = frame.view.in_camera(frame.surfaces.verts)
+        rows = (frame.here(records.by_q) * (q - q.detach())[frame.here(records.vertex)]).sum(1)
+        by_k = records.by_k @ (frame.intrinsics - frame.intrinsics.detach())
+        self.velocity = frame.here(by_k).index_add(0, frame.here(records.row_of), rows)
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __repr__(self) -> str:
+        return f"EdgeSamples({len(self)} samples, {len(self.hits)} points)"
+
+    def jump(self, radiance: Tensor) -> Tensor:
+        """(S, C) how the image jumps at each sample, from the radiance (N, C) of the hits; a background comes in by
+        attach_boundary(). Raises TypeError or ValueError that names the argument."""
+        radiance = _rows("radiance", radiance, len(self.hits))
+        return self.sum(self.sample, self._factor, radiance)
+
+    def jump_of(self, first: int, end: int, radiance: Tensor) -> Tensor:
+        """What some of the hits add to it."""
+        return self.sum(self.sample[first:end], self._factor[first:end], radiance)
+
+    def sum(self, sample: Tensor, factor: Tensor, radiance: Tensor) -> Tensor:
+        weighted = factor.to(radiance.dtype)[:, None] * radiance
+        return radiance.new_zeros((len(self), radiance.shape[1])).index_add(0, sample, weighted)
+
+
+# -- what users call ----------------------------------------------------------------------------------------------------
+
+
+def trace(scene: Scene | Mesh, origins: Tensor, directions: Tensor) -> Hits:
+    """The nearest hits of any rays: Hits of those that hit something, with the row of each in `hits.ray`.
+
+    origins, directions  (N, 3) or (3,) world coordinates, directions of any length
+
+    Positions, normals, texture coordinates and the rest are differentiable functions of the vertices, the origins and the
+    directions, while each ray meets the same face; what moves at silhouettes is not in them. `hits.depth` is in lengths of the
+    direction; there is no `hits.pixel`. Raises TypeError or ValueError that names the argument.
+    """
+    scene = as_scene(scene)
+    like = scene.meshes[0].verts
+    given = {}
+    for name, value in (("origins", origins), ("directions", directions)):
+        tensor = as_tensor(name, value, like=like, floating=True)
+        check_float(name, tensor)
+        check_shape(name, tensor, ("N", 3), (3,))
+        check_finite(name, tensor, largest=1e30)
+        given[name] = tensor.to(like.device, torch.float64)
+    count = max(len(t) if t.dim() == 2 else 1 for t in given.values())
+    for name, tensor in given.items():
+        if tensor.dim() == 2 and len(tensor) not in (1, count):
+            raise ValueError(f"{name}: expected as many rows as the other, {count}, got {len(tensor)}")
+        given[name] = tensor.expand(count, 3)
+    d = given["directions"]
+    zero = (d.detach() == 0).all(1)
+    if bool(zero.any()):
+        raise ValueError(f"directions: expected lengths above zero, got zeros in row {int(zero.nonzero()[0])}")
+    found = trace_records(scene, given["origins"], d)
+    index = (found.face >= 0).nonzero()[:, 0]
+    face, index = found.face[index].to(like.device), index.to(like.device)
+    rays = Rays(index, given["origins"][index], d[index])
+    surfaces = Surfaces(scene)
+    b = barycentrics(found.b.to(like.device)[index])
+    corners = surfaces.verts[surfaces.faces[face]]
+    if moves(corners, rays.origin, rays.direction):
+        b = rays.barycentrics(corners.double(), b)
+    return Hits(surfaces, rays, face, b)
+
+
+def primary_hits(
+    scene: Scene | Mesh,
+    camera: Camera,
+    spp: int = 16,
+    seed: int = 0,
+    *,
+    filter: str = "box",
+    grad_seed: int | None = None,
+) -> PrimaryHits:
+    """What the rays of an image hit: render()'s samples, for a pipeline of your own. The arguments are render()'s, with one
+    camera. Raises what render() raises."""
+    request = make_request(scene, camera, spp, seed, filter=filter, grad_seed=grad_seed)
+    if camera.batch is not None:
+        raise ValueError(f"camera: expected one camera, got a batch of {camera.batch}; take camera[i] one by one")
+    return PrimaryHits(as_scene(scene), request)
+
+
+def surface_samples(primary: PrimaryHits, count: int | None = None) -> SurfaceSamples:
+    """Samples for the gradient inside faces, fewer than those of the image: by default half a sample a pixel of surface.
+
+    primary   of primary_hits()
+    count     of samples; see surface_samples of render()
+
+    Raises TypeError or ValueError that names the argument.
+    """
+    request = _request_of(primary, "surface_samples", count)
+    surface, _ = primary.frame.sampler.samples(request, interior=True, boundary=False)
+    return SurfaceSamples(primary.frame, surface)
+
+
+def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool | Tensor = True) -> EdgeSamples:
+    """Samples for the gradient of what moves at edges.
+
+    primary   of primary_hits()
+    count     of samples; see edge_samples of render()
+    creases   at which edges between two visible faces radiance may jump: True, at all; False, at none; or numbers at the corners
+              of faces (F, 3, K), at those where these differ on both sides
+
+    Raises TypeError or ValueError that names the argument.
+    """
+    request = _request_of(primary, "edge_samples", count)
+    F = len(primary.frame.surfaces.faces)
+    attributes = None
+    if isinstance(creases, Tensor):
+        check_float("creases", creases)
+        check_shape("creases", creases, (F, 3, "K"))
+        check_finite("creases", creases)
+        attributes = creases.detach().cpu()
+    elif creases is True:
+        attributes = every_face(F)
+    elif creases is not False:
+        raise TypeError(f"creases: expected True, False or a tensor (F, 3, K), got {type(creases).__name__}")
+    request = request._replace(scene=without_colors(request.scene, attributes))
+    _, curves = primary.frame.sampler.samples(request, interior=False, boundary=True)
+    return EdgeSamples(primary.frame, curves)
+
+
+def attach_boundary(image: Tensor, samples: EdgeSamples, jump: Tensor, background: Tensor | None = None) -> Tensor:
+    """The image, with the gradient of what moves at edges: its value is the same.
+
+    image       (H, W, C)
+    samples     of edge_samples()
+    jump        (S, C) samples.jump(…), without derivatives
+    background  (C,) or (H, W, C) behind all surfaces; black when None
+
+    In reverse and in forward mode, once. Raises TypeError or ValueError that names the argument.
+    """
+    frame = samples.frame
+    jump = _rows("jump", jump, len(samples)).detach()
+    check_float("image", image)
+    check_shape("image", image, (frame.height, frame.width, jump.shape[1]))
+    background = _background(background, jump, frame)
+    zero = boundary(frame, samples.x, samples.velocity, jump, samples.to_background, background)
+    return image + once(zero.reshape(image.shape).to(image))
+
+
+# -- shared with shader.py ------------------------------------------------------------------------------------------------
+
+
+def boundary(
+    frame: Frame, x: Tensor, velocity: Tensor, jump: Tensor, to_background: Tensor | None, background: Tensor | None
+) -> Tensor:
+    """(H · W, C): Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
+    feet = Footprints.of(x.detach().cpu(), frame.request)
+    point, pixel = frame.here(feet.point), frame.here(feet.pixel)
+    jumps = jump[point]
+    if background is not None and to_background is not None:
+        background = background.detach()
+        behind = background.reshape(frame.pixels, -1)[pixel] if background.dim() == 3 else background
+        jumps = jumps + to_background.to(jump.dtype)[point, None] * behind.to(jump)
+    weight = frame.here(feet.weight).to(jump.dtype)
+    values = (weight * velocity.to(jump.dtype)[point])[:, None] * jumps
+    return torch.zeros_like(jump[:1]).expand(frame.pixels, -1).index_add(0, pixel, values)
+
+
+def transformed() -> bool:
+    """Whether a transform of torch.func is under way."""
+    functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
+    return functorch.peek_interpreter_stack() is not None
+
+
+def differentiates() -> bool:
+    return torch.is_grad_enabled() or transformed() or torch.autograd.forward_ad._current_level >= 0
+
+
+def moves(*tensors: Tensor) -> bool:
+    """Whether a derivative by one of them may be asked for."""
+    if transformed():
+        return True
+    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
+        return True
+    dual = torch.autograd.forward_ad
+    return dual._current_level >= 0 and any(dual.unpack_dual(t).tangent is not None for t in tensors)
+
+
+def once(value: Tensor) -> Tensor:
+    """The same, of which only first derivatives can be taken."""
+    return _FirstOrder.apply(value)
+
+
+class _FirstOrder(torch.autograd.Function):
+    """The identity, whose derivative has none: that of the samples' places and of their visibility is not known."""
+
+    @staticmethod
+    def forward(value: Tensor) -> Tensor:
+        return value.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        # With the value, so that a derivative of the gradient by what the image depends on comes by here.
+        return _Last.apply(*grad_outputs, *ctx.saved_tensors)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, Any]:
+        return _FirstOrder.apply(*args), in_dims[0]
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        return tangents[0].clone()
+
+
+class _Last(torch.autograd.Function):
+    """The first of its arguments, which has no derivative."""
+
+    @staticmethod
+    def forward(grad: Tensor, value: Tensor) -> Tensor:
+        return grad.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        raise RuntimeError(FIRST_ORDER)
+
+
+def _request_of(primary: PrimaryHits, name: str, count: int | None) -> Request:
+    if not isinstance(primary, PrimaryHits):
+        raise TypeError(f"primary: expected what primary_hits() returned, got {type(primary).__name__}")
+    request = primary.frame.request
+    if count is None:
+        return request
+    number = check_positive_int("count", count, most=1 << 40)
+    return request._replace(gradient=request.gradient._replace(**{name: number}))
+
+
+def _rows(name: str, value: Tensor, count: int) -> Tensor:
+    value = as_tensor(name, value, floating=True)
+    check_float(name, value)
+    check_shape(name, value, (count, "C"))
+    return value
+
+
+def _background(background: Tensor | None, like: Tensor, frame: Frame) -> Tensor | None:
+    if background is None:
+        return None
+    background = as_tensor("background", background, like=like, floating=True)
+    check_float("background", background)
+    check_shape("background", background, (like.shape[1],), (frame.height, frame.width, like.shape[1]))
+    return background
