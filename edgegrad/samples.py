@@ -220,7 +220,7 @@ def trace(scene: Scene | Mesh, origins: Tensor, directions: Tensor) -> Hits:
     for name, value in (("origins", origins), ("directions", directions)):
         tensor = as_tensor(name, value, like=like, floating=True)
         check_float(name, tensor)
-        check_shape(name, tensor, ("N", 3), (3,))
+        check_shape(name, tensor, (len(tensor) if tensor.dim() == 2 and len(tensor) == 0 else "N", 3), (3,))
         check_finite(name, tensor, largest=1e30)
         given[name] = tensor.to(like.device, torch.float64)
     count = max(len(t) if t.dim() == 2 else 1 for t in given.values())
@@ -336,7 +336,7 @@ def boundary(
         jumps = jumps + to_background.to(jump.dtype)[point, None] * behind.to(jump)
     weight = frame.here(feet.weight).to(jump.dtype)
     values = (weight * velocity.to(jump.dtype)[point])[:, None] * jumps
-    return torch.zeros_like(jump[:1]).expand(frame.pixels, -1).index_add(0, pixel, values)
+    return frame.image(pixel, values)
 
 
 def transformed() -> bool:

@@ -191,7 +191,7 @@ class _Image:
             return torch.func.grad(sum_of_steps)(zero).detach()
         with torch.enable_grad():
             zero.requires_grad_()
-            return torch.autograd.grad(sum_of_steps(zero), zero)[0].detach()
+            return torch.autograd.grad(sum_of_steps(zero), zero, materialize_grads=True)[0].detach()
 
     def _step_values(self, hits: Hits) -> Tensor:
         """(N, K) the functions of all steps."""
