@@ -269,7 +269,7 @@ KEPT = ("ray structure", "topology")  # what may be there already, from an earli
 def image_room(request: Request) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the image does not fit."""
     needs = core.image_bytes(pass_size(request), request.cameras)
-    return memory.room("render", needs, lambda: _lower(request))
+    return memory.room("render", needs, lambda: lower(request))
 
 
 def gradient_room(adjoint: Tensor, request: Request, wanted: Collection[str]) -> AbstractContextManager[None]:
@@ -289,7 +289,7 @@ def gradient_room(adjoint: Tensor, request: Request, wanted: Collection[str]) ->
         surface_samples=options.surface_samples,
         edge_samples=options.edge_samples,
     )
-    return memory.room("backward pass", needs, lambda: _lower(request) + ", or let fewer tensors require a gradient")
+    return memory.room("backward pass", needs, lambda: lower(request) + ", or let fewer tensors require a gradient")
 
 
 def derivatives_room(request: Request, wanted: Collection[str], directions: int) -> AbstractContextManager[None]:
@@ -303,10 +303,10 @@ def derivatives_room(request: Request, wanted: Collection[str], directions: int)
     samples = max(options.surface_samples, options.edge_samples)
     needs["samples in pixels"] = core.pixel_row_bytes(size, samples=samples, width=width)
     needs["tangents"] = sum(8 * directions * request.slot(name).numel() for name in wanted)
-    return memory.room("jvp", needs, lambda: _lower(request) + ", or ask for fewer directions at a time")
+    return memory.room("jvp", needs, lambda: lower(request) + ", or ask for fewer directions at a time")
 
 
-def _lower(request: Request) -> str:
+def lower(request: Request) -> str:
     camera = request.camera
     return (
         f"the camera's size ({camera.width} × {camera.height} pixels), its batch ({request.cameras}), "

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from . import _memory as memory
 from ._kernel import core
 from ._ops import Hits as ImageHits
-from ._ops import camera_seed, kernel_camera, kernel_hits, kernel_scene, warn_of_ends
+from ._ops import camera_seed, kernel_camera, kernel_hits, kernel_scene, lower, pass_size, warn_of_ends
 from ._request import Request
 from .scene import Flat, Scene, flatten
 
@@ -70,6 +72,24 @@ class TraceRecords(NamedTuple):
 
     face: Tensor  # (N,) int64, −1: none
     b: Tensor  # (N, 2) float64
+
+
+# Bytes of a record, and of the rows of curves: four vertices each.
+SURFACE_BYTES, CURVE_BYTES = 8 * (1 + 2 + 3 + 3 * 14 + 1), 8 * (2 + 3 + 6 + 3 + 14 + 4 * (1 + 1 + 3))
+
+
+def shaded_room(request: Request) -> AbstractContextManager[None]:
+    """Raises MemoryError before its block if the image of a shader does not fit, and if an allocation in it fails; what the
+    shader itself takes is not known before."""
+    size, options = pass_size(request), request.gradient
+    pixels = request.camera.height * request.camera.width
+    needs = core.image_bytes(size, request.cameras)
+    if torch.is_grad_enabled():
+        # By default about half a sample a pixel of surface, and some at edges.
+        surface = options.surface_samples if options.surface_samples >= 0 else pixels // 2
+        edge = options.edge_samples if options.edge_samples >= 0 else pixels // 8
+        needs["samples"] = request.cameras * (SURFACE_BYTES * surface + CURVE_BYTES * edge)
+    return memory.room("render with a shader", needs, lambda: lower(request) + ", or what the shader keeps of a point")
 
 
 def barycentrics(b: Tensor) -> Tensor:

@@ -18,10 +18,13 @@ from ._check import as_tensor, check_finite, check_float, check_positive_int, ch
 from ._kernel import core
 from ._ops import Hits, backward_kernel, forward_kernel, image_room, pass_size
 from ._request import MOVING, SLOTS, Request, Work, as_scene, label, make_request, required
+from ._samples import CURVE_BYTES, SURFACE_BYTES, without_colors
+from ._surfaces import every_face
 from .camera import Camera
 from .mesh import Mesh
-from .render import render
+from .render import SHADING, render
 from .scene import Flat, Scene
+from .shader import AT_ONCE
 
 # -- the plan ---------------------------------------------------------------------------------------------------------
 
@@ -87,9 +90,36 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
     """
     _check_options("plan", options)
     scene = as_scene(scene)
+    shading = {name: options.pop(name) for name in SHADING if name in options}
     request = make_request(scene, camera, spp, seed, **options)
+    if shading.get("shader") is not None:
+        return Plan(_shaded_terms(scene, request, shading.get("creases", "auto")))
     wanted = required(request)
     return Plan({**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted)})
+
+
+def _shaded_terms(scene: Scene, request: Request, creases: object) -> dict[str, Term]:
+    """With a shader, of which nothing is asked before it runs: neither what it needs nor at which edges it may jump."""
+    attributes = every_face(len(request.scene.faces)) if creases is True else None
+    request = request._replace(scene=without_colors(request.scene, attributes))
+    moving = [name for name in required(request) if name in MOVING]
+    # Whether a tensor of the shader's own requires a gradient is not known either.
+    wanted = [*moving, "colors"] if torch.is_grad_enabled() else []
+    terms = {**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted)}
+    rows = CURVE_BYTES * terms["boundary"].samples + SURFACE_BYTES * terms["interior"].samples
+    terms["textures"] = Term(False, "the shader looks up its own")
+    terms["shader"] = Term(
+        True, f"asked for at most {AT_ONCE:,} points at a time; what it keeps of them is not counted here"
+    )
+    terms["samples"] = Term(rows > 0, "handed to the shader" if rows else "no gradients", bytes=rows)
+    terms["interior"] = replace(
+        terms["interior"], why="of what the shader uses" + (" and what moves" if moving else "")
+    )
+    if creases == "auto" and terms["boundary"].on:
+        terms["creases"] = Term(False, "where what the shader asks for jumps; not counted here")
+    for name in ("colors", "uvs", "texels", "vertex_attributes", "face_attributes"):
+        terms.pop(f"{label(name)} gradient", None)
+    return terms
 
 
 def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str, Term]:
@@ -302,6 +332,9 @@ def profile(
     cameras counts as one step. Autograd itself is not run, so what it costs is not here. Raises what render() raises.
     """
     _check_options("profile", options)
+    if options.get("shader") is not None:
+        raise ValueError("shader: expected None, for profile() measures the kernel alone; torch.profiler sees a shader")
+    options = {name: value for name, value in options.items() if name not in SHADING}
     scene, repeats = as_scene(scene), check_positive_int("repeats", repeats)
     # What is kept between calls must not help: before each step the vertices are elsewhere, each time somewhere else.
     request = make_request(scene, camera, spp, seed, **options)

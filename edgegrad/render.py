@@ -23,6 +23,8 @@ from .mesh import Mesh
 from .scene import Scene
 from .shader import Shader, render_shaded
 
+SHADING = ("shader", "creases", "check_shader")  # the options of shaders
+
 
 def render(
     scene: Scene | Mesh,
@@ -117,7 +119,7 @@ def jvp(
     forward mode. The same as torch.func.jvp of render(), under torch.vmap; what it returns is not in
     the graph. Raises what render() raises.
     """
-    own = {n: v for n, v in options.items() if n not in ("shader", "creases", "check_shader")}
+    own = {n: v for n, v in options.items() if n not in SHADING}
     make_request(scene, camera, spp, seed, **own)  # checks them
     scene = as_scene(scene)
     for name in check_aovs(aovs) if aovs is not None else ():

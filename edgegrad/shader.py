@@ -17,7 +17,7 @@ from torch.utils.checkpoint import checkpoint
 
 from ._check import values_visible
 from ._request import Request
-from ._samples import RayRecords, without_colors
+from ._samples import RayRecords, shaded_room, without_colors
 from ._steps import UNEQUAL, Crossings, Points, Steps, find_crossings
 from ._surfaces import every_face
 from .camera import Camera
@@ -40,7 +40,8 @@ def render_shaded(
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
-    images = [_Image(Frame(scene, request, k), shader, creases, check).render() for k in range(request.cameras)]
+    with shaded_room(request):
+        images = [_Image(Frame(scene, request, k), shader, creases, check).render() for k in range(request.cameras)]
     return images[0] if camera.batch is None else torch.stack(images)
 
 

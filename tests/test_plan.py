@@ -469,3 +469,26 @@ def test_profile_rebuilds_for_every_repeat(monkeypatch):
     monkeypatch.setattr(importlib.import_module("edgegrad.plan"), "forward_kernel", forward_kernel)
     eg.profile(icosphere(3), CAMERA, spp=1, repeats=3)
     assert built == [True] * 6
+
+
+def test_with_a_shader():
+    scene, camera = requiring(creased(), CAMERA, ("verts",))
+    planned = eg.plan(scene, camera, 4, shader=lambda hits: hits.normal)
+    assert planned["shader"].on and planned["interior"].on and planned["boundary"].on and planned["samples"].bytes > 0
+    assert not planned["creases"].on and "colors gradient" not in planned
+    assert eg.plan(scene, camera, 4, shader=lambda hits: hits.normal, creases=True)["creases"].on
+    assert not eg.plan(creased(), CAMERA, shader=lambda hits: hits.normal)["boundary"].on
+    with torch.no_grad():
+        assert not eg.plan(creased(), CAMERA, shader=lambda hits: hits.normal)["samples"].on
+    with pytest.raises(ValueError, match=r"shader: expected None, for profile\(\)"):
+        eg.profile(scene, camera, shader=lambda hits: hits.normal)
+
+
+def test_a_shader_that_does_not_fit_is_refused_before_it_runs(monkeypatch: pytest.MonkeyPatch):
+    from edgegrad import _memory
+
+    monkeypatch.setattr(_memory, "available", lambda: 100 << 20)
+    asked = []
+    with pytest.raises(MemoryError, match=r"render with a shader: expected to need at most the 105 MB .* lower"):
+        eg.render(creased(), CAMERA, shader=lambda hits: asked.append(hits) or hits.normal, surface_samples=10**7)
+    assert not asked
