@@ -69,7 +69,31 @@ class Surfaces:
         """(F, 3, K) of all that was asked for and may jump, each scaled to its largest number."""
         parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
         parts = [p / p.abs().max().clamp(min=1e-30) for p in parts]
-        return torch.cat(parts, -1) if parts else self.verts.new_zeros((len(self.faces), 3, 0))
+        return _Beside.apply(torch.cat(parts, -1)) if parts else self.verts.new_zeros((len(self.faces), 3, 0))
+
+
+class _Beside(torch.autograd.Function):
+    """Attributes (F, 3, K); under torch.vmap those of all elements side by side, for all share the samples of one image."""
+
+    @staticmethod
+    def forward(attributes: Tensor) -> Tensor:
+        return attributes.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.mark_non_differentiable(output)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> None:
+        return None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> None:
+        return None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int, ...], *args: Any) -> tuple[Tensor, None]:
+        return _Beside.apply(args[0].movedim(in_dims[0], -1).flatten(2)), None
 
 
 def every_face(count: int) -> Tensor:

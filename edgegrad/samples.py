@@ -397,6 +397,10 @@ class _Last(torch.autograd.Function):
         return grad.clone()
 
     @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, Any]:
+        return _Last.apply(*args), in_dims[0]
+
+    @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
         pass
 

@@ -461,3 +461,52 @@ def test_creases_are_found_where_the_shader_jumps():
 
     assert abs(found(True) - full.mean) < 0.03 * abs(full.mean)
     assert abs(found("auto") - full.mean) > 0.05 * abs(full.mean)
+
+
+# -- each face in a pixel shaded once -----------------------------------------------------------------------------------
+
+
+def images(shaded: bool, seeds: int, spp: int) -> Tensor:
+    """(seeds, H, W, C) of a texture of noise on a ball."""
+    scene, camera = textured(), front_camera(SIZE)
+    texture = torch.rand((32, 32, 1), generator=torch.Generator().manual_seed(1), dtype=F64)
+    scene = eg.Scene([scene.meshes[0].replace(texture=texture)])
+    more = {"shader": by_hand(scene)} if shaded else {}
+    with torch.no_grad():
+        return torch.stack([eg.render(scene, camera, spp=spp, seed=seed, **more) for seed in range(seeds)])
+
+
+@pytest.mark.slow
+def test_shading_once_is_unbiased():
+    once, every = images(True, 256, 16), images(False, 256, 16)
+    error = ((once.var(0) + every.var(0)) / 256).sqrt()
+    some = error > 1e-4
+    z = ((once.mean(0) - every.mean(0)) / error)[some]
+    assert int(some.sum()) > 200
+    assert abs(float(z.mean())) < 4 / len(z) ** 0.5
+    assert 0.8 < float(z.square().mean()) < 1.25
+    # It is noisier, as one sample of a face is than the mean of sixteen that share a lattice.
+    assert float(once.var(0).mean()) > 2 * float(every.var(0).mean())
+
+
+def test_a_batch_of_attributes_of_faces_under_vmap():
+    mesh, camera = icosphere(1), front_camera(SIZE)
+    colors = torch.rand((3, len(mesh.faces), 2), generator=torch.Generator().manual_seed(0), dtype=F64)
+
+    def image(colors: Tensor, verts: Tensor) -> Tensor:
+        return eg.render(
+            mesh.replace(verts=verts),
+            camera,
+            shader=lambda hits: hits.interpolate(colors),
+            edge_samples=20000,
+            surface_samples=20000,
+        )
+
+    def gradient(colors: Tensor) -> tuple[Tensor, ...]:
+        adjoint = smooth_adjoint(SIZE, SIZE, 2)
+        return torch.func.grad(lambda c, v: (image(c, v) * adjoint).sum(), argnums=(0, 1))(colors, mesh.verts)
+
+    together = torch.func.vmap(gradient)(colors)
+    for k in range(3):
+        for one, all in zip(gradient(colors[k]), together, strict=True):
+            assert (one - all[k]).norm() < 0.03 * one.norm()
