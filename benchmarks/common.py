@@ -58,7 +58,9 @@ class Kernel:
         """Seconds; writes `image`."""
         threads = threads or torch.get_num_threads()
         begin = time.perf_counter()
-        self.profile = self.scene.forward(self.camera, self.channels, self.options, threads, self.image.numpy(), self.hits)
+        self.profile = self.scene.forward(
+            self.camera, self.channels, self.options, threads, self.image.numpy(), self.hits
+        )
         return time.perf_counter() - begin
 
     def backward(

@@ -40,5 +40,13 @@ def test_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:
     assert abs(forward / reverse - 1) < 0.02
 
 
+def test_shaders(monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = outputs(FOLDER / "shaders.ipynb", monkeypatch)
+    fd, gradient = last_numbers(next(text for text in texts if text.startswith("finite difference")))
+    assert abs(gradient / fd - 1) < 0.03
+    start, end = last_numbers(next(text for text in texts if text.startswith("error at the start")))
+    assert end < 0.2 * start
+
+
 def test_there_is_no_other() -> None:
-    assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == ["derivatives", "first_steps"]
+    assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == ["derivatives", "first_steps", "shaders"]

@@ -1,0 +1,200 @@
+"""What shaders written in PyTorch cost, in time, memory and noise: one table.
+
+Run:  python benchmarks/shaders.py [--only time memory noise steps]
+
+Times are medians of steps, image and backward pass, on a sphere of 81,920 faces at 256² and 16 samples a pixel; ratios are of
+steps that alternate in one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import torch
+from common import sphere
+from torch import Tensor
+from tqdm import tqdm
+
+import edgegrad as eg
+from edgegrad.report.scenes import front_camera, smooth_adjoint
+from edgegrad.report.scenes import sphere as icosphere
+
+F64 = torch.float64
+
+
+def network() -> torch.nn.Module:
+    """Three layers, 64 wide."""
+    torch.manual_seed(0)
+    layers = [torch.nn.Linear(6, 64), torch.nn.ReLU(), torch.nn.Linear(64, 64), torch.nn.ReLU(), torch.nn.Linear(64, 3)]
+    return torch.nn.Sequential(*layers)
+
+
+def harmonics(n: Tensor) -> Tensor:
+    x, y, z = n.unbind(1)
+    return torch.stack([torch.ones_like(x), x, y, z, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y], 1)
+
+
+def steps_of_time() -> dict[str, Callable[[int], None]]:
+    """One step each: the kernel's own colours and texture, and shaders."""
+    mesh, camera, _ = sphere(256)
+    adjoint = smooth_adjoint(256, 256, 3).float()
+    texture = torch.rand((256, 256, 3), generator=torch.Generator().manual_seed(0)).requires_grad_()
+    light = torch.rand((9, 3)).requires_grad_()
+    assert mesh.colors is not None
+    verts, colors = mesh.verts.clone().requires_grad_(), mesh.colors.clone().requires_grad_()
+    uvs = torch.stack([torch.atan2(mesh.verts[:, 0], mesh.verts[:, 2]) / (2 * math.pi), mesh.verts[:, 1]], 1)
+    textured = eg.Mesh(mesh.verts, mesh.faces, texture=texture, uvs=uvs, uv_faces=mesh.faces)
+    net = network()
+
+    def lit(hits: eg.Hits) -> Tensor:
+        return hits.sample(texture) * (harmonics(hits.shading_normal) @ light)
+
+    def learned(hits: eg.Hits) -> Tensor:
+        return net(torch.cat([hits.position, hits.view], 1))
+
+    def disc(hits: eg.Hits) -> Tensor:
+        return hits.where(0.5 - (hits.position[:, :2] - 0.1).norm(dim=1), 0.9, 0.2 + 0.2 * hits.position)
+
+    def smooth(hits: eg.Hits) -> Tensor:
+        inside = (0.5 - (hits.position[:, :2] - 0.1).norm(dim=1)).sigmoid()[:, None]
+        return 0.9 * inside + (1 - inside) * (0.2 + 0.2 * hits.position)
+
+    def run(mesh: eg.Mesh, seed: int, shader: Callable[[eg.Hits], Tensor] | None = None) -> None:
+        image = eg.render(mesh, camera, seed=seed, shader=shader)
+        (image * adjoint).sum().backward()
+
+    return {
+        "fused, colours of vertices": lambda seed: run(mesh.replace(verts=verts, colors=colors), seed),
+        "fused, texture": lambda seed: run(textured.replace(verts=verts), seed),
+        "shader: texture in nine harmonics": lambda seed: run(textured.replace(verts=verts), seed, lit),
+        "shader: network 3 × 64": lambda seed: run(mesh.replace(verts=verts), seed, learned),
+        "shader: a smooth disc": lambda seed: run(mesh.replace(verts=verts), seed, smooth),
+        "shader: a disc by where()": lambda seed: run(mesh.replace(verts=verts), seed, disc),
+    }
+
+
+def times(repeats: int = 9) -> None:
+    steps = steps_of_time()
+    for step in steps.values():
+        step(0)
+    taken: dict[str, list[float]] = {name: [] for name in steps}
+    for seed in tqdm(range(repeats), desc="time", leave=False):
+        for name, step in steps.items():
+            begin = time.perf_counter()
+            step(seed)
+            taken[name].append(time.perf_counter() - begin)
+    fused = taken["fused, colours of vertices"]
+    print("| step, image and gradient | ms | ratio |\n|---|---|---|")
+    for name, own in taken.items():
+        ratio = statistics.median(a / b for a, b in zip(own, fused, strict=True))
+        print(f"| {name} | {1e3 * statistics.median(own):.0f} | {ratio:.2f} |")
+
+
+def peak(gradient: bool) -> None:
+    """Prints what this process needs above its start, MB."""
+    mesh, camera, _ = sphere((1080, 1920))
+    net, verts = network(), mesh.verts.clone().requires_grad_(gradient)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with torch.set_grad_enabled(gradient):
+        image = eg.render(
+            mesh.replace(verts=verts), camera, shader=lambda hits: net(torch.cat([hits.position, hits.view], 1))
+        )
+        if gradient:
+            image.square().mean().backward()
+    print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+
+
+def memory() -> None:
+    print("| 1920 × 1080, 16 samples a pixel, network 3 × 64 | MB |\n|---|---|")
+    for gradient in (False, True):
+        found = subprocess.run(
+            [sys.executable, __file__, "--peak", str(int(gradient))], capture_output=True, check=True
+        )
+        print(f"| {'image and gradient' if gradient else 'image'} | {float(found.stdout):.0f} |")
+
+
+def noise(seeds: int = 64) -> None:
+    """Of an image whose faces are shaded once in a pixel, beside one whose samples all are: the pixels of one 4 × 4 as fine."""
+    camera, fine = front_camera(64), 4
+    finer = camera.replace(K=torch.cat([fine * camera.K[:2], camera.K[2:]]), size=(64 * fine, 64 * fine))
+    texture = torch.rand((64, 64, 3), generator=torch.Generator().manual_seed(0), dtype=F64)
+
+    def textured(hits: eg.Hits) -> Tensor:
+        return hits.sample(texture, uv=0.5 + 0.4 * hits.position[:, :2])
+
+    cases = {
+        "a smooth shader, 20,480 faces": (5, lambda hits: 0.5 + 0.4 * torch.sin(4 * hits.position)),
+        "a smooth shader, 320 faces": (2, lambda hits: 0.5 + 0.4 * torch.sin(4 * hits.position)),
+        "white noise of 2/3 px, 320 faces": (2, textured),
+    }
+    print("| root mean square noise of a pixel inside | once | every sample |\n|---|---|---|")
+    for name, (level, shader) in cases.items():
+        mesh = icosphere(level)
+        mesh = mesh.replace(verts=0.9 * mesh.verts)
+        with torch.no_grad():
+            once = torch.stack([eg.render(mesh, camera, seed=seed, shader=shader) for seed in range(seeds)])
+            every = torch.stack([eg.render(mesh, finer, 1, seed, shader=shader) for seed in range(seeds)])
+        every = torch.nn.functional.avg_pool2d(every.movedim(-1, 1), fine).movedim(1, -1)
+        inside = slice(24, 40), slice(24, 40)
+        rms = [float(x.var(0)[inside].mean().sqrt()) for x in (once, every)]
+        print(f"| {name} | {rms[0]:.4f} | {rms[1]:.4f} |")
+
+
+def spacing(seeds: int = 48) -> None:
+    """The error of the derivative of a painted disc's area by its radius, 2 π r, and of stripes by their width."""
+    size = 64
+    K = torch.tensor([[0.4 * size, 0, size / 2], [0, 0.4 * size, size / 2], [0, 0, 1]], dtype=F64)
+    camera = eg.Camera(torch.eye(4, dtype=F64), K, (size, size), "orthographic")
+    corner = torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=F64)
+    mesh = eg.Mesh(corner, torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    wide = 3.2 / (0.4 * size)  # a stripe of 3.2 px, and a gap as wide
+
+    def disc(r: Tensor) -> Callable[[eg.Hits], Tensor]:
+        return lambda hits: hits.where(0.6 + r - (hits.position[:, :2] - 0.05).norm(dim=1), 1.0, 0.0)
+
+    def stripes(r: Tensor) -> Callable[[eg.Hits], Tensor]:
+        def shader(hits: eg.Hits) -> Tensor:
+            x = hits.position[:, 0] + 0.3 * hits.position[:, 1]
+            return hits.where(torch.cos(math.pi * x / wide) + r, 1.0, 0.0)
+
+        return shader
+
+    # Both borders of each stripe move by δx = δr wide / π; there are 4 / (2 wide) square units of them and as many again.
+    cases = {"disc of 31 px": (disc, 2 * math.pi * 0.6), "stripes of 3.2 px": (stripes, 4 / wide * wide / math.pi)}
+    print("| spacing of lines, px | " + " | ".join(f"{name}: bias, one image" for name in cases) + " | ms |")
+    print("|---|" + "---|" * (len(cases) + 1))
+    for apart in (8.0, 4.0, 2.0, 1.0, 0.5, 0.25):
+        cells, begin = [], time.perf_counter()
+        for shader, area in cases.values():
+            found = []
+            for seed in range(seeds):
+                r = torch.zeros((), dtype=F64, requires_grad=True)
+                image = eg.render(mesh, camera, seed=seed, shader=shader(r), step_spacing=apart)
+                found.append(torch.autograd.grad(image.sum(), r)[0])
+            ratio = torch.stack(found) / (area * (0.4 * size) ** 2)
+            bias, error = float(ratio.mean()) - 1, float(ratio.std())
+            cells.append(f"{100 * bias:+.1f} ± {100 * error / seeds**0.5:.1f} %, {100 * error:.1f} %")
+        milliseconds = 1e3 * (time.perf_counter() - begin) / (seeds * len(cases))
+        print(f"| {apart:g} | " + " | ".join(cells) + f" | {milliseconds:.0f} |")
+
+
+PARTS = {"time": times, "memory": memory, "noise": noise, "steps": spacing}
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--peak", type=int, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.peak is not None:
+        peak(bool(arguments.peak))
+        sys.exit()
+    for part in arguments.only:
+        PARTS[part]()
+        print()
