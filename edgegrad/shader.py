@@ -100,8 +100,9 @@ class _Image:
         for first in range(0, len(samples), AT_ONCE):
             some = samples.part(first, first + AT_ONCE)
 
-            def radiance(some: SurfaceSamples = some) -> Tensor:
-                return self._shade(some.hits)
+            def radiance(first: int = first) -> Tensor:
+                # Hits of its own each time, for these keep what was computed from them.
+                return self._shade(samples.part(first, first + AT_ONCE).hits)
 
             # So that memory is that of some points, not of all.
             many = len(samples) > AT_ONCE and not transformed()

@@ -510,3 +510,27 @@ def test_a_batch_of_attributes_of_faces_under_vmap():
     for k in range(3):
         for one, all in zip(gradient(colors[k]), together, strict=True):
             assert (one - all[k]).norm() < 0.03 * one.norm()
+
+
+def test_in_parts_of_bounded_size(monkeypatch: pytest.MonkeyPatch):
+    """What is given to the shader at once changes nothing."""
+    mesh, camera = bumpy(), front_camera(SIZE)
+    net = network(6)
+    sizes = []
+
+    def shader(hits: eg.Hits) -> Tensor:
+        sizes.append(len(hits))
+        return hits.where(hits.position[:, 0] - 0.1, net(torch.cat([hits.position, hits.normal], 1)), 0.3)
+
+    def gradients() -> list[Tensor]:
+        verts = mesh.verts.clone().requires_grad_()
+        image = eg.render(mesh.replace(verts=verts), camera, seed=2, shader=shader)
+        loss = (image * smooth_adjoint(SIZE, SIZE, 3)).sum()
+        return [image.detach(), *torch.autograd.grad(loss, [verts, *net.parameters()])]
+
+    whole, most = gradients(), max(sizes)
+    sizes.clear()
+    monkeypatch.setattr("edgegrad.shader.AT_ONCE", 128)
+    for a, b in zip(gradients(), whole, strict=True):
+        assert torch.allclose(a, b, rtol=1e-6, atol=1e-9 * float(b.abs().max()))
+    assert max(sizes) <= 1024 < most  # rows of an image are whole
