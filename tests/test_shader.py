@@ -183,14 +183,14 @@ def by_mesh(hits: eg.Hits, theta: Tensor) -> Tensor:
 
 def checkerboard(hits: eg.Hits, theta: Tensor) -> Tensor:
     """In world space."""
-    cells = hits.floor(2.3 * hits.position[:, :2] + 0.8 * hits.position[:, 2:] + 0.21).sum(1, keepdim=True)
+    cells = hits.floor(1.7 * hits.position[:, :2] + 0.6 * hits.position[:, 2:] + 0.4).sum(1, keepdim=True)
     return 0.2 + 0.6 * (cells % 2) * torch.tensor([1.0, 0.7, 0.4], dtype=F64) + 0.1 * hits.position
 
 
 def disc(hits: eg.Hits, theta: Tensor) -> Tensor:
     """Painted on, along the view, and a ring of the same border that must not count twice."""
     s = 0.4 - (hits.position[:, :2] - 0.1).norm(dim=1)
-    inside = hits.where(s, torch.tensor([0.9, 0.3, 0.1], dtype=F64), 0.3 + 0.2 * hits.position)
+    inside = hits.where(s, torch.tensor([0.9, 0.8, 0.7], dtype=F64), 0.3 + 0.2 * hits.position)
     return inside + hits.where(-3 * s, 0.0, 0.2)
 
 
