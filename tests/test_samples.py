@@ -139,6 +139,45 @@ def test_points_to_see_are_checked():
         hits.visible(torch.zeros(2, 3))
 
 
+# -- places in the image ------------------------------------------------------------------------------------------------
+
+
+def views() -> dict[str, eg.Camera]:
+    straight = front_camera(SIZE)
+    flat = straight.K.clone()
+    flat[:2, :2] /= 3.0
+    return {
+        "perspective": straight,
+        "orthographic": eg.Camera(straight.world_to_camera, flat, (SIZE, SIZE), "orthographic"),
+        "distorted": straight.replace(distortion=torch.tensor([-0.4, 0.3, 0.02, -0.01], dtype=F64)),
+        "panorama": eg.Camera.panorama(straight.world_to_camera, (SIZE, 2 * SIZE)),
+    }
+
+
+@pytest.mark.parametrize("view", views())
+def test_places_show_what_pixels_do(view: str):
+    """What is seen at a place, and the ray that goes there and its derivative by the place, beside the hits of an image."""
+    primary = eg.primary_hits(ball(1), views()[view], spp=4)
+    hits, frame = primary.hits, primary.frame
+    x = hits.pixel
+    places = frame.sampler.hits_at(x)
+    assert float((places.face == hits.face).double().mean()) > 0.999
+    same = places.face == hits.face
+    assert torch.allclose(places.b[same], hits.barycentrics[same][:, 1:], atol=1e-6)
+    rays = frame.sampler.rays_at(x)
+    b = frame.view.barycentrics(frame.surfaces, hits.face, rays.along)
+    assert torch.allclose(b, hits.barycentrics, atol=1e-5)
+    step = 1e-4
+    for axis in range(2):
+        moved = torch.zeros_like(x).index_fill(1, torch.tensor(axis), step)
+        ends = [frame.sampler.rays_at(x + sign * moved).along for sign in (1, -1)]
+        slope = (ends[0] - ends[1]) / (2 * step)
+        # Beyond the side of a cube the scale of a ray is another.
+        near = (ends[0] - ends[1]).norm(dim=1) < 100 * step
+        assert float(near.double().mean()) > 0.99
+        assert torch.allclose(slope[near], rays.along_by_x[near, :, axis], atol=1e-5, rtol=1e-4)
+
+
 # -- the parts of an image --------------------------------------------------------------------------------------------
 
 

@@ -295,11 +295,12 @@ def derivative(case: Case, seeds: int) -> Estimate:
 
 
 def check(name: str, of: str, seeds: int) -> None:
-    at, stepped = case(name, of), name in ("checkerboard", "disc", "nearest texture", "its own step")
-    # Over larger steps the image is no straight function of the shape.
-    fine = of == "shape" and not name.startswith("its own")
-    step = STEPS["pose"] if name.startswith("its own") else STEPS[of] / (2 if fine else 1)
-    right_ratio(differences(at, step, 8 * seeds if fine else seeds), derivative(at, 24 if stepped else 6))
+    own, stepped = name.startswith("its own"), name in ("checkerboard", "disc", "nearest texture", "its own step")
+    step = STEPS["pose" if own else of]
+    if stepped and of == "shape":  # borders move much: the second-order error is larger still
+        step, seeds = step / 1.5, 4 * seeds
+    at = case(name, of)
+    right_ratio(differences(at, step, seeds), derivative(at, 24 if stepped else 6))
 
 
 @pytest.mark.parametrize("name", ["network", "flat normals", "disc"])
