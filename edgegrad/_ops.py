@@ -212,13 +212,15 @@ def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Ten
 
 
 def _gradient_options(request: Request, wanted: Collection[str], camera: int, dry: bool = False) -> Any:
-    options, work = request.gradient, Work.of(request.gradient, wanted)
+    options, work = request.gradient, Work.of(request, wanted)
     return core.GradientOptions(
         seed=camera_seed(options.grad_seed, camera),
         surface_samples=options.surface_samples,
         edge_samples=options.edge_samples,
         interior_geometry=work.motion,
         boundary=work.boundary,
+        steps=work.steps,
+        step_spacing=options.step_spacing,
         dry=dry,
     )
 
@@ -253,6 +255,7 @@ def pass_size(request: Request) -> Any:
         colors=len(flat.colors),
         uvs=len(flat.uvs),
         texels=len(flat.texels),
+        alphas=len(flat.alphas),
         pixels=camera.height * camera.width,
         radiance=flat.colors.shape[1],
         vertex_attributes=beside.vertex_attributes.shape[-1],
@@ -277,7 +280,7 @@ def image_room(request: Request) -> AbstractContextManager[None]:
 
 def gradient_room(adjoint: Tensor, request: Request, wanted: Collection[str]) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the gradients do not fit."""
-    work, options = Work.of(request.gradient, wanted), request.gradient
+    work, options = Work.of(request, wanted), request.gradient
     needs = {}
     for name in SLOTS:
         if name in wanted:
@@ -288,6 +291,7 @@ def gradient_room(adjoint: Tensor, request: Request, wanted: Collection[str]) ->
         pass_size(request),
         motion=work.motion,
         boundary=work.boundary,
+        steps=work.steps,
         wanted=list(wanted),
         surface_samples=options.surface_samples,
         edge_samples=options.edge_samples,
@@ -297,10 +301,10 @@ def gradient_room(adjoint: Tensor, request: Request, wanted: Collection[str]) ->
 
 def derivatives_room(request: Request, wanted: Collection[str], directions: int) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if derivatives in so many directions do not fit."""
-    work, options, size = Work.of(request.gradient, wanted), request.gradient, pass_size(request)
+    work, options, size = Work.of(request, wanted), request.gradient, pass_size(request)
     width = directions * request.channels
     needs = core.gradient_bytes(
-        size, motion=work.motion, boundary=work.boundary, wanted=[], surface_samples=0, edge_samples=0
+        size, motion=work.motion, boundary=work.boundary, steps=work.steps, wanted=[], surface_samples=0, edge_samples=0
     )
     needs["derivatives"] = 2 * 8 * request.cameras * request.camera.height * request.camera.width * width
     samples = max(options.surface_samples, options.edge_samples)

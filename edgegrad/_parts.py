@@ -23,6 +23,9 @@ MOST_ZEROS = 1 << 24  # rows that a glTF may ask for without holding them
 MOST_INSTANCES = 100_000  # of the parts of a 3MF: nested components multiply
 # What Pillow is let loose on. Not EPS, above all, for which it runs another program.
 TEXTURES = ("PNG", "JPEG", "MPO", "JPEG2000", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "DDS")
+# What a glTF calls its samplers' settings.
+WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
+FILTERS = {9728: "nearest", 9729: "linear"}
 MESHES = (".obj", ".gltf", ".glb", ".ply", ".stl", ".off", ".3mf")
 
 
@@ -44,6 +47,10 @@ class Part(NamedTuple):
     texture: Tensor | None = None  # (h, w, 3) float32
     colors: Tensor | None = None  # (N, 3) float32
     face_colors: Tensor | None = None  # (F, 3) float32
+    alpha: Tensor | None = None  # (h, w) float32, of what is cut out
+    cutoff: float = 0.5
+    wrap: tuple[str, str] = ("repeat", "repeat")  # of u and v
+    filter: str = "linear"
 
 
 class _Folder:
@@ -103,6 +110,16 @@ class _Textures:
                 raise Fault(f"expected a whole image in the texture {name!r}, got a damaged one ({error})") from error
             linear = srgb_to_linear(torch.from_numpy(texels)).float()
             self.known[key] = (linear[..., None] if linear.dim() == 2 else linear) * linear.new_tensor(factor)
+        return self.known[key]
+
+    def alpha(self, image: Any, factor: float) -> Tensor | None:
+        """(h, w) float32, of an image that get() took, times a factor; None where it has none."""
+        if "A" not in image.getbands() and "transparency" not in image.info:
+            return None
+        key = (id(image), factor, "alpha")
+        if key not in self.known:
+            texels = np.asarray(image.convert("RGBA"))[..., 3] / 255.0
+            self.known[key] = factor * torch.from_numpy(texels).float()
         return self.known[key]
 
 
@@ -442,9 +459,15 @@ def _gltf_look(
     if not materials or "material" not in primitive:
         return look
     material = tree["materials"][primitive["material"]]
+    base = material.get("pbrMetallicRoughness", {})
+    masked = material.get("alphaMode") == "MASK"
+    opacity = float((*base.get("baseColorFactor", ()), 1.0, 1.0, 1.0, 1.0)[3])
+    cutoff = look["cutoff"] = float(material.get("alphaCutoff", 0.5))
+    if masked and opacity < cutoff:  # all of it is cut out, whatever a texture says
+        look["alpha"] = torch.full((1, 1), opacity)
+        look["uvs"] = np.zeros((len(raw["vertices"]), 2), np.float32) if look["uvs"] is None else look["uvs"]
     if "KHR_materials_pbrSpecularGlossiness" in material.get("extensions", {}):
         raise Fault("expected a metallic-roughness material, got specular-glossiness; convert it")
-    base = material.get("pbrMetallicRoughness", {})
     factor = tuple(float(f) for f in base.get("baseColorFactor", (1.0, 1.0, 1.0))[:3])  # trimesh has it in 8 bit only
     reference = base.get("baseColorTexture")
     if reference is None:
@@ -462,4 +485,20 @@ def _gltf_look(
         raise Fault(f"expected plain TEXCOORD_0 for the texture {name!r}, got others; bake them into one set")
     if colors is not None and not bool((colors == 1.0).all()):
         raise Fault(f"expected the texture {name!r} or vertex colours, got both; bake one into the other")
-    return {"uvs": look["uvs"], "texture": textures.get(name, image, factor)}
+    look.pop("colors", None)
+    look["texture"] = textures.get(name, image, factor)
+    if masked and "alpha" not in look:
+        look["alpha"] = textures.alpha(image, opacity)
+    return {**look, **_gltf_sampler(tree, tree["textures"][reference["index"]], name)}
+
+
+def _gltf_sampler(tree: dict[str, Any], texture: dict[str, Any], name: str) -> dict[str, object]:
+    """How a texture is looked up. The filter for magnification is taken: pixels are means of points as it is."""
+    sampler = tree["samplers"][texture["sampler"]] if "sampler" in texture else {}
+    wraps, nearest = [sampler.get(key, 10497) for key in ("wrapS", "wrapT")], sampler.get("magFilter", 9729)
+    if any(wrap not in WRAPS for wrap in wraps) or nearest not in FILTERS:
+        raise Fault(
+            f"expected a sampler of glTF 2.0 for the texture {name!r}, got wraps {wraps} and magFilter {nearest}; "
+            "export it again"
+        )
+    return {"wrap": (WRAPS[wraps[0]], WRAPS[wraps[1]]), "filter": FILTERS[nearest]}

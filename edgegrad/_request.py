@@ -40,7 +40,7 @@ class Channels(NamedTuple):
     unit: int  # the first of three of these that are a direction, given the length 1 once interpolated; −1: none
     face_attributes: Tensor  # (F, m) float64, of whole faces
     barycentrics: bool  # 3 channels
-    uv: bool  # 2 channels; all faces are textured
+    uv: bool  # 2 channels; all faces have texture coordinates
 
 
 class ImageOptions(NamedTuple):
@@ -103,10 +103,11 @@ SCHEMA = ", ".join(f"{_NAMES[kind]} {field}" for field, kind in zip(FIELDS, _TYP
 # What a gradient can be asked for, from the kernel's table (csrc/scene/gradients.h), and where it is among the packed values.
 SLOTS: tuple[str, ...] = core.GRADIENT_SLOTS
 POSITIONS = tuple(FIELDS.index(name) for name in SLOTS)
-_LABELS = {"texels": "texture"}
+_LABELS = {"texels": "texture", "alphas": "alpha"}
 PER_CAMERA = (*PackedCamera._fields, "vertex_attributes")  # slots with a row for each camera
 MOVING = ("verts", *(name for name in SLOTS if name in PackedCamera._fields))  # slots that move the image
 APPEARANCE = ("colors", "uvs", "texels", "vertex_attributes", "face_attributes")
+STEPPING = (*MOVING, "uvs", "alphas")  # slots that move what is cut out, and the borders of nearest texels
 
 
 def label(slot: str) -> str:
@@ -142,12 +143,17 @@ class Work(NamedTuple):
     motion: bool  # inside faces, of what moves them: vertices and camera
     appearance: bool  # inside faces, of colours, textures and texture coordinates
     boundary: bool  # at edges, of what moves them
+    steps: bool  # where faces are cut out, and at the borders of nearest texels
 
     @classmethod
-    def of(cls, options: GradientOptions, wanted: Collection[str]) -> Work:
+    def of(cls, request: Request, wanted: Collection[str]) -> Work:
+        options = request.gradient
         moves = any(name in wanted for name in MOVING)
         appearance = any(name in wanted for name in APPEARANCE)
-        return cls(moves and options.channels_vary, appearance, moves and options.visibility)
+        steps = request.scene.has_steps and any(name in wanted for name in STEPPING)
+        return cls(
+            moves and options.channels_vary, appearance, moves and options.visibility, steps and options.visibility
+        )
 
 
 # -- from what the user gives -------------------------------------------------------------------------------------------
@@ -165,8 +171,10 @@ def make_request(
     filter: str = "box",
     grad_seed: int | None = None,
     step_spacing: float = 1.0,
+    all_uvs: bool = False,
 ) -> Request:
-    """The arguments of render(), checked. Raises TypeError or ValueError."""
+    """The arguments of render(), checked; and whether texture coordinates that nothing needs are taken along. Raises TypeError
+    or ValueError."""
     scene = as_scene(scene)
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
@@ -186,7 +194,7 @@ def make_request(
         check_shape("background", scene.background, (*camera.size, "C"), fix="give it the camera's size")
     _check_devices(scene, camera)
 
-    flat = flatten(scene)
+    flat = flatten(scene, all_uvs)
     if torch.compiler.is_compiling():
         # Dynamo does not trace a function that is given one tensor twice; corners of vertex colours are the faces.
         flat = flat._replace(corners=flat.corners.clone())
@@ -235,7 +243,10 @@ def _check_devices(scene: Scene, camera: Camera) -> None:
 
 
 def _radiance_varies(scene: Scene) -> bool:
-    return any(m.colors is not None or m.corner_colors is not None or m.texture is not None for m in scene.meshes)
+    return any(
+        m.colors is not None or m.corner_colors is not None or (m.texture is not None and m.filter != "nearest")
+        for m in scene.meshes
+    )
 
 
 def _check_seed(name: str, seed: object) -> int:

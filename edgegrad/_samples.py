@@ -49,6 +49,12 @@ class CurveRecords(NamedTuple):
     row_of: Tensor  # (R,) int64, the sample of a row
     vertex: Tensor  # (R,) int64
     by_q: Tensor  # (R, 3) float64, the curve's velocity by a vertex in camera coordinates
+    uv_row_of: Tensor  # (P,) int64, the sample of a row by texture coordinates, of cut-outs
+    uv: Tensor  # (P,) int64
+    by_uv: Tensor  # (P, 2) float64
+    alpha_row_of: Tensor  # (Q,) int64, the sample of a row by texels of alpha
+    alpha: Tensor  # (Q,) int64
+    by_alpha: Tensor  # (Q,) float64
 
 
 class PlaceRecords(NamedTuple):
@@ -166,9 +172,9 @@ def without_colors(flat: Flat, attributes: Tensor | None = None) -> Flat:
     return flat._replace(
         corners=corners,
         colors=colors,
-        uvs=flat.uvs.new_zeros((0, 2)),
+        uvs=flat.uvs if len(flat.cut_outs) else flat.uvs.new_zeros((0, 2)),
         texels=colors.new_zeros((0, colors.shape[1])),
-        textures=flat.textures.new_zeros((0, 3)),
+        textures=flat.textures.new_zeros((0, 6)),
         face_texture=flat.face_texture.new_zeros(0),
         background=colors.new_zeros(colors.shape[1]),
     )
@@ -264,7 +270,9 @@ class Sampler:
 
             yield PixelRecords(*self._compute(self._request, compute))
 
-    def samples(self, request: Request, interior: bool, boundary: bool) -> tuple[SurfaceRecords, CurveRecords]:
+    def samples(
+        self, request: Request, interior: bool, boundary: bool, steps: bool = False
+    ) -> tuple[SurfaceRecords, CurveRecords]:
         """Of the gradient, after all pixel hits were taken; the scene of `request` has colours that jump where creases are."""
 
         def compute(request: Request, camera: Any) -> Sequence[Tensor]:
@@ -278,6 +286,8 @@ class Sampler:
                     edge_samples=options.edge_samples,
                     interior_geometry=interior,
                     boundary=boundary,
+                    steps=steps,
+                    step_spacing=options.step_spacing,
                 ),
                 threads=torch.get_num_threads(),
                 adjoint=np.ones((*self.coverage.shape, flat.background.shape[-1]), self.coverage.numpy().dtype),

@@ -47,7 +47,7 @@ class Surfaces:
         for i, mesh in enumerate(self.scene.meshes):
             if mesh.uvs is None or mesh.uv_faces is None:
                 raise ValueError(
-                    f"hits.uv: meshes[{i}] has no texture coordinates; give it a texture with uvs and uv_faces, or choose "
+                    f"hits.uv: meshes[{i}] has no texture coordinates; give it uvs and uv_faces, or choose "
                     "another mesh by hits.mesh"
                 )
             parts.append(mesh.uvs.to(self.verts.dtype)[mesh.uv_faces.long()])

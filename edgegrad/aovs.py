@@ -35,6 +35,7 @@ def render_aovs(
     visibility: bool = True,
     filter: str = "box",
     grad_seed: int | None = None,
+    step_spacing: float = 1.0,
 ) -> dict[str, Tensor]:
     """Channels of a scene by name, (H, W, c) each, or (B, H, W, c) for a batch of cameras, all from the same samples.
 
@@ -66,9 +67,9 @@ def render_aovs(
     if "uv" in names:
         _check_uvs(scene)
     request = make_request(
-        scene if "image" in names else _without_radiance(scene, "uv" in names), camera, spp, seed,
+        scene if "image" in names else _without_radiance(scene), camera, spp, seed,
         surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility, filter=filter,
-        grad_seed=grad_seed,
+        grad_seed=grad_seed, step_spacing=step_spacing, all_uvs="uv" in names,
     )  # fmt: skip
     batched, device = camera.batch is not None, scene.meshes[0].verts.device
     found: dict[str, Tensor] = {}
@@ -104,18 +105,17 @@ def _check_uvs(scene: Scene) -> None:
         if mesh.uvs is None:
             raise ValueError(
                 f"aovs: expected uvs of all meshes for 'uv', got none of meshes[{i}]; "
-                "give it a texture with uvs and uv_faces, or leave 'uv' out"
+                "give it uvs and uv_faces, or leave 'uv' out"
             )
 
 
-def _without_radiance(scene: Scene, keep_uvs: bool) -> Scene:
+def _without_radiance(scene: Scene) -> Scene:
     """The same surfaces with one channel of radiance that nobody sees, in the image's dtype."""
     dtype = image_dtype(scene)
 
     def bare(mesh: Mesh) -> Mesh:
-        if keep_uvs and mesh.texture is not None:
-            return mesh.replace(texture=mesh.texture.detach()[..., :1].to(dtype))
-        return mesh.replace(colors=mesh.verts.detach().new_zeros((len(mesh.verts), 1), dtype=dtype))
+        colors = mesh.verts.detach().new_zeros((len(mesh.verts), 1), dtype=dtype)
+        return mesh.replace(colors=colors, uvs=mesh.uvs, uv_faces=mesh.uv_faces)
 
     return Scene([bare(mesh) for mesh in scene.meshes])
 

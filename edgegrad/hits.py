@@ -14,9 +14,7 @@ from ._check import as_tensor, check_finite, check_float, check_shape
 from ._samples import RayRecords, visible
 from ._steps import Steps
 from ._surfaces import Rays, Surfaces, View, every_face
-
-WRAPS = ("repeat", "clamp", "mirror")
-FILTERS = ("linear", "nearest")
+from .mesh import FILTERS, WRAPS
 
 
 class Hits:

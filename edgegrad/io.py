@@ -2,9 +2,12 @@
 
 What colours mean: vertex and face colours of OBJ and PLY files and the texels of every texture are sRGB on disk and
 become linear radiance; factors of materials (glTF baseColorFactor, OBJ Kd) and vertex colours of glTF are linear
-already. All become three float32 channels; alpha is dropped, as are lights, normals and everything of a material but
-its base colour. A glTF multiplies the texture, the factor and the vertex colours. Elsewhere, where a file gives
-several looks, the first of these is taken: texture, vertex colours, face colours, the material's colour.
+already. All become three float32 channels; lights are dropped, as are normals and everything of a material but its
+base colour. A glTF multiplies the texture, the factor and the vertex colours. Elsewhere, where a file gives several
+looks, the first of these is taken: texture, vertex colours, face colours, the material's colour.
+
+Alpha is dropped, but where a material of a glTF has the alphaMode MASK: the alpha of its texture times that of its
+factor is then the mesh's, with its alphaCutoff. Wrap and filter are those of a glTF's sampler.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
@@ -132,11 +136,17 @@ def _naming(path: PathLike) -> Iterator[None]:
         raise ValueError(f"{path}: {error}") from error
 
 
+def _look_of(part: Part) -> tuple[object, ...]:
+    """What parts that become one mesh have in common."""
+    kinds = part.colors is None, part.face_colors is None, id(part.texture), id(part.alpha)
+    return *kinds, part.cutoff if part.alpha is not None else None, part.wrap, part.filter
+
+
 def _merge(parts: list[Part]) -> Part:
     """One part from parts that look alike. Raises Fault when they do not."""
     if len(parts) == 1:
         return parts[0]
-    if len({(part.colors is None, part.face_colors is None, id(part.texture)) for part in parts}) > 1:
+    if len({_look_of(part) for part in parts}) > 1:
         names = ", ".join(repr(part.name) for part in parts[:5]) + (", …" if len(parts) > 5 else "")
         raise Fault(
             f"expected one mesh, got {len(parts)} parts ({names}) with different textures or kinds of colour; "
@@ -156,24 +166,32 @@ def _merge(parts: list[Part]) -> Part:
         texture=parts[0].texture,
         colors=torch.cat(joined("colors")) if joined("colors") else None,
         face_colors=torch.cat(joined("face_colors")) if joined("face_colors") else None,
+        alpha=parts[0].alpha,
+        cutoff=parts[0].cutoff,
+        wrap=parts[0].wrap,
+        filter=parts[0].filter,
     )
 
 
 def _to_mesh(part: Part) -> Mesh:
     verts, faces = _weld(part.verts, part.faces)
-    if part.texture is not None:
+    images: dict[str, Any] = {}
+    if part.texture is not None or part.alpha is not None:
         if part.uvs is None:
             raise Fault(f"part {part.name!r}: expected texture coordinates for its texture, got none; unwrap the mesh")
         uvs, uv_faces = _weld(part.uvs, part.faces)
-        return Mesh(verts, faces, texture=part.texture, uvs=uvs, uv_faces=uv_faces)
-    if part.colors is None:
-        return Mesh(verts, faces, face_colors=part.face_colors)
+        wrap = part.wrap[0] if part.wrap[0] == part.wrap[1] else part.wrap
+        images = {"uvs": uvs, "uv_faces": uv_faces, "texture": part.texture, "wrap": wrap, "filter": part.filter}
+    if part.alpha is not None:
+        images |= {"alpha": part.alpha, "alpha_cutoff": part.cutoff}
+    if part.colors is None or part.texture is not None:
+        return Mesh(verts, faces, face_colors=part.face_colors if part.texture is None else None, **images)
     corners = part.colors[torch.from_numpy(part.faces)]
     colors = corners.new_zeros(len(verts), 3)
     colors[faces] = corners
     if torch.equal(colors[faces], corners):
-        return Mesh(verts, faces, colors=colors)
-    return Mesh(verts, faces, corner_colors=corners)
+        return Mesh(verts, faces, colors=colors, **images)
+    return Mesh(verts, faces, corner_colors=corners, **images)
 
 
 def _weld(rows: np.ndarray, index: np.ndarray) -> tuple[Tensor, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +20,12 @@ from ._check import (
     check_integer,
     check_shape,
 )
+from ._kernel import core
 
 PLAIN = 0.7  # radiance of a mesh without colours, in every channel
+WRAPS: tuple[str, ...] = core.WRAPS  # repeat, clamp, mirror
+FILTERS: tuple[str, ...] = core.TEXTURE_FILTERS  # linear, nearest
+_SETTINGS = ("alpha_cutoff", "wrap", "filter")  # fields that are no tensors
 SMALLEST_MESH, LARGEST_UV = 1e-38, 1e9
 
 
@@ -34,9 +39,14 @@ class Mesh:
     colors         (V, C) float   one a vertex, interpolated over the faces
     face_colors    (F, C) float   one a face, constant over it
     corner_colors  (F, 3, C) float  one a corner of a face; jumps across edges where they differ
-    texture        (h, w, C) float  image on the faces: row 0 on top, texel centres at +0.5, bilinear, repeated; needs
-    uvs            (T, 2) float   texture coordinates, v running up (as in OBJ), and
+    texture        (h, w, C) float  image on the faces: row 0 on top, texel centres at +0.5; needs uvs
+    uvs            (T, 2) float   texture coordinates, v running up (as in OBJ), with
     uv_faces       (F, 3) int     indices into uvs, apart from `faces`, so that vertices stay welded at seams
+    alpha          (h, w) float   another image on the faces, of any size, whatever gives the radiance: where it is below
+    alpha_cutoff   number         this, faces are cut out, and rays pass through; needs uvs
+    wrap           what lies beyond the rim of both images: "repeat", "clamp" (the texels at the rim go on) or "mirror"; or
+                   a pair of these, for u and v
+    filter         "linear" between the centres of texels, or "nearest", the texel that the point lies in
 
     Faces of zero area render nothing. Numbers reach up to 3.4e38, the range of float32, also in float64; uvs up to 1e9, for
     beyond that a double does not tell the texels of a large texture apart; the largest of the verts lies above 1e-38, unless
@@ -52,10 +62,17 @@ class Mesh:
     texture: Tensor | None = None
     uvs: Tensor | None = None
     uv_faces: Tensor | None = None
+    alpha: Tensor | None = None
+    alpha_cutoff: float = 0.5
+    wrap: str | tuple[str, str] = "repeat"
+    filter: str = "linear"
 
     def __post_init__(self) -> None:
+        self._check_settings()
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
+            if field.name in _SETTINGS:
+                continue
             if value is not None or field.name in ("verts", "faces"):
                 like = self.verts if field.name not in ("verts", "faces", "uv_faces") else None
                 object.__setattr__(
@@ -77,17 +94,19 @@ class Mesh:
         for kind in kinds:
             check_float(kind, getattr(self, kind))
             check_shape(kind, getattr(self, kind), shapes[kind])
-        if self.texture is not None:
+        if self.alpha is not None:
+            check_float("alpha", self.alpha)
+            check_shape("alpha", self.alpha, ("h", "w"))
+        user = "a texture" if self.texture is not None else "alpha" if self.alpha is not None else None
+        user = user or ("uv_faces" if self.uv_faces is not None else "uvs" if self.uvs is not None else None)
+        if user is not None:
             if self.uvs is None or self.uv_faces is None:
                 missing = "uvs" if self.uvs is None else "uv_faces"
-                raise ValueError(f"{missing}: expected with a texture, got None; pass uvs (T, 2) and uv_faces (F, 3)")
+                raise ValueError(f"{missing}: expected with {user}, got None; pass uvs (T, 2) and uv_faces (F, 3)")
             check_float("uvs", self.uvs)
             check_shape("uvs", self.uvs, ("T", 2))
             check_integer("uv_faces", self.uv_faces)
             check_shape("uv_faces", self.uv_faces, (F, 3))
-        elif self.uvs is not None or self.uv_faces is not None:
-            extra = "uvs" if self.uvs is not None else "uv_faces"
-            raise ValueError(f"{extra}: expected None without a texture, got a tensor; pass texture=… or leave it out")
 
         # First of all, for more rows than can be counted take as long to look at.
         check_countable("faces", self.faces, V, "verts")
@@ -95,11 +114,33 @@ class Mesh:
             check_countable("uv_faces", self.uv_faces, self.uvs.shape[0], "uvs")
         check_finite("verts", self.verts, smallest=SMALLEST_MESH if self.verts.dtype == torch.float64 else 0.0)
         check_indices("faces", self.faces, V, "verts")
-        for kind in kinds:
+        for kind in kinds + ["alpha"] * (self.alpha is not None):
             check_finite(kind, getattr(self, kind))
         if self.uvs is not None and self.uv_faces is not None:
             check_finite("uvs", self.uvs, largest=LARGEST_UV)
             check_indices("uv_faces", self.uv_faces, self.uvs.shape[0], "uvs")
+
+    def _check_settings(self) -> None:
+        if isinstance(self.alpha_cutoff, bool) or not isinstance(self.alpha_cutoff, (int, float)):
+            raise TypeError(f"alpha_cutoff: expected a number, got {type(self.alpha_cutoff).__name__}")
+        if not math.isfinite(self.alpha_cutoff):
+            raise ValueError(f"alpha_cutoff: expected a finite number, got {self.alpha_cutoff}")
+        object.__setattr__(self, "alpha_cutoff", float(self.alpha_cutoff))
+        if isinstance(self.wrap, list):
+            object.__setattr__(self, "wrap", tuple(self.wrap))
+        if self.wrap not in WRAPS and not (
+            isinstance(self.wrap, tuple) and len(self.wrap) == 2 and all(w in WRAPS for w in self.wrap)
+        ):
+            raise ValueError(
+                f"wrap: expected one of {', '.join(WRAPS)}, or a pair of them for u and v, got {self.wrap!r}"
+            )
+        if self.filter not in FILTERS:
+            raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {self.filter!r}")
+
+    @property
+    def wraps(self) -> tuple[str, str]:
+        """`wrap` of u and of v."""
+        return (self.wrap, self.wrap) if isinstance(self.wrap, str) else self.wrap
 
     @property
     def channels(self) -> int | None:
@@ -112,12 +153,14 @@ class Mesh:
     def replace(self, **fields: Any) -> Mesh:
         """This mesh with some tensors replaced: `mesh.replace(verts=v)` keeps faces and colours.
 
-        Giving another kind of colour removes the one there was.
+        Giving another kind of colour removes the one there was, with texture coordinates that nothing else needs.
         """
         check_fields(self, fields)
         appearance = {"colors", "face_colors", "corner_colors", "texture"}
         if any(name in appearance and fields[name] is not None for name in fields):
-            gone = appearance | (set() if fields.get("texture") is not None else {"uvs", "uv_faces"})
+            needs_uvs = fields.get("texture") is not None or fields.get("alpha", self.alpha) is not None
+            needs_uvs = needs_uvs or fields.get("uvs") is not None
+            gone = appearance | (set() if needs_uvs else {"uvs", "uv_faces"})
             fields = {**dict.fromkeys(gone - set(fields)), **fields}
         return dataclasses.replace(self, **fields)
 
@@ -155,7 +198,7 @@ class Mesh:
         moved = {}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if value is None:
+            if not isinstance(value, Tensor):
                 continue
             if value.is_floating_point():
                 moved[field.name] = value.to(*args, **kwargs)
@@ -166,9 +209,10 @@ class Mesh:
     def detach(self) -> Mesh:
         """The same mesh, cut from the autograd graph."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return dataclasses.replace(self, **{name: v.detach() for name, v in values.items() if v is not None})
+        return dataclasses.replace(self, **{n: v.detach() for n, v in values.items() if isinstance(v, Tensor)})
 
     def __repr__(self) -> str:
         kinds = [k for k in ("colors", "face_colors", "corner_colors", "texture") if getattr(self, k) is not None]
         look = f"{kinds[0]} {tuple(getattr(self, kinds[0]).shape)}" if kinds else "plain"
+        look += f", alpha {tuple(self.alpha.shape)}" if self.alpha is not None else ""
         return f"Mesh({self.verts.shape[0]} vertices, {self.faces.shape[0]} faces, {look}, {self.verts.dtype})"

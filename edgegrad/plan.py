@@ -127,7 +127,7 @@ def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str
     needs = core.image_bytes(pass_size(request), B)
     copied = _bytes_of_copies(scene, request.scene)
     cameras = "" if B == 1 else f", {B} cameras"
-    textures = len(request.scene.textures)
+    textures, cut_outs = len(request.scene.textures), len(request.scene.cut_outs)
     return {
         "scene": Term(
             copied > 0,
@@ -140,8 +140,11 @@ def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str
             bytes=needs["ray structure"],
         ),
         "image": Term(True, f"{spp} samples a pixel{cameras}", B * camera.height * camera.width * spp, needs["image"]),
-        # Its memory is the user's own, or counted with the scene.
+        # Their memory is the user's own, or counted with the scene.
         "textures": Term(textures > 0, f"{textures} to look up" if textures else "no mesh has one"),
+        "cut-outs": Term(
+            cut_outs > 0, "rays pass through where alpha is below its cutoff" if cut_outs else "no mesh has alpha"
+        ),
         "kept for backward": Term(
             any_gradient,
             "coverage, depth, and which faces were hit" if any_gradient else "nothing requires a gradient",
@@ -152,7 +155,7 @@ def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str
 
 def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term]:
     flat, camera, B = request.scene, request.camera, request.cameras
-    work = Work.of(request.gradient, wanted)
+    work = Work.of(request, wanted)
     moves = any(name in wanted for name in MOVING)
 
     # The kernel counts them itself. It is asked whatever is wanted, for it also checks what render() leaves to it.
@@ -170,9 +173,9 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
         counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections")
     )
     needs = core.gradient_bytes(
-        pass_size(request), motion=work.motion, boundary=work.boundary, wanted=list(wanted),
+        pass_size(request), motion=work.motion, boundary=work.boundary, steps=work.steps, wanted=list(wanted),
         surface_samples=surface, edge_samples=edge, curves=silhouettes + creases,
-        intersections=intersections,
+        intersections=intersections, step_lines=counts["step_lines"],
     )  # fmt: skip
 
     def bytes_of(*parts: str) -> int:
@@ -230,6 +233,14 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
             bytes=bytes_of("intersections"),
         ),
     }
+    lines = counts["step_lines"]
+    no_steps = "no face is cut out, and no nearest texels" if not flat.has_steps else "nothing that moves them"
+    no_steps = no_steps if request.gradient.visibility or not flat.has_steps else "visibility=False"
+    terms["steps"] = Term(
+        lines > 0,
+        (f"on {lines:,} lines over faces" if lines else "none in view") if work.steps else no_steps,
+        bytes=bytes_of("steps"),
+    )
     for name in SLOTS:
         why = "required; summed in double" if name in wanted else "not required"
         terms[f"{label(name)} gradient"] = Term(name in wanted, why, bytes=8 * request.slot(name).numel())
@@ -239,7 +250,7 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
 # What the kernel counts.
 _CURVES = ("silhouettes", "creases", "intersections")
 _COUNTS = (
-    "surface_samples", "edge_samples", "surface_wanted", "edge_wanted", *_CURVES,
+    "surface_samples", "edge_samples", "surface_wanted", "edge_wanted", "step_lines", *_CURVES,
 )  # fmt: skip
 
 
@@ -250,7 +261,7 @@ def _bound(samples: int, wanted: int) -> str:
 
 def _bytes_of_copies(scene: Scene, flat: Flat) -> int:
     """Of the flat arrays that are not the user's own tensors."""
-    tensors = [value for mesh in scene.meshes for value in vars(mesh).values() if value is not None]
+    tensors = [value for mesh in scene.meshes for value in vars(mesh).values() if isinstance(value, Tensor)]
     tensors += [] if scene.background is None else [scene.background]
     own = {tensor.untyped_storage().data_ptr() for tensor in tensors}
     copies = {
@@ -264,7 +275,7 @@ def _bytes_of_copies(scene: Scene, flat: Flat) -> int:
 # What the kernel measures, in the order of a step.
 _PARTS = (
     "update", "forward", "view", "surface measure", "surface rays", "surface scatter", "curves", "edge rays",
-    "edge scatter", "world",
+    "edge scatter", "step rays", "step scatter", "world",
 )  # fmt: skip
 _BAR = 24  # characters of a bar of 100 %
 
@@ -277,6 +288,7 @@ class Profile(Mapping[str, float]):
     view             vertices in the image, where the loss looks, and the background's gradient
     surface …        triangles laid end to end; samples and their rays; adding what they found
     curves, edge …   the same at edges
+    step …           the same at steps within faces
     world            from camera coordinates to the user's arrays
     python           all the rest: checks and copies of tensors
     """
@@ -356,7 +368,7 @@ def profile(
     seconds = {part: statistics.median(run[part] for run in runs) for part in (*_PARTS, "python")}
     samples = {
         "image_samples": adjoint.shape[:-1].numel() * request.image.spp,
-        **{name: int(runs[-1][name]) for name in ("surface_samples", "edge_samples", *_CURVES)},
+        **{name: int(runs[-1][name]) for name in ("surface_samples", "edge_samples", "step_lines", *_CURVES)},
     }
     return Profile(seconds, samples)
 

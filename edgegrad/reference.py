@@ -100,11 +100,28 @@ def closest_faces(scene: Scene, camera: Camera, points: Tensor) -> Tensor:
             area = w.sum(-1)
             depth = (w * Z[near]).sum(-1) / area
             inside &= area != 0  # a face seen end-on, or of no area, covers nothing
+            inside &= _shows(scene, near, w / area[..., None])
             if camera.projection == "perspective":
                 inside &= depth > 0
             closest = near[torch.where(inside, depth, math.inf).argmin(-1)]
             found.append(torch.where(inside.any(-1), closest, -1))
     return torch.cat(found) if found else torch.empty(0, dtype=torch.int64)
+
+
+def _shows(scene: Scene, faces: Tensor, barycentrics: Tensor) -> Tensor:
+    """Whether the faces (n,) are there at these points of them (m, n, 3), or cut out: (m, n)."""
+    shows = torch.ones(barycentrics.shape[:-1], dtype=torch.bool)
+    first = 0
+    for mesh in scene.meshes:
+        last = first + len(mesh.faces)
+        if mesh.alpha is not None:
+            own = torch.nonzero((faces >= first) & (faces < last))[:, 0]
+            uv = (barycentrics[:, own, :, None] * _corner_uvs(mesh, faces[own] - first)).sum(-2)
+            uv = torch.where(uv.isfinite(), uv, 0.0)  # of faces without area, which cover nothing
+            alpha = _lookup(mesh, mesh.alpha.double()[..., None], uv.reshape(-1, 2)).reshape(uv.shape[:-1])
+            shows[:, own] = alpha >= mesh.alpha_cutoff
+        first = last
+    return shows
 
 
 def _bounds(P: Tensor) -> tuple[Tensor, Tensor]:
@@ -146,15 +163,15 @@ def _surface_radiance(scene: Scene, camera: Camera, points: Tensor, faces: Tenso
         w = _edge_functions(P[faces[rows]], points[rows])
         b = w / w.sum(-1, keepdim=True)
         value = (b[..., None] * _corner_values(mesh, scene.channels, faces[rows] - first)).sum(1)
-        out = out.index_put((rows,), value if mesh.texture is None else _bilinear(mesh.texture.double(), value))
+        out = out.index_put((rows,), value if mesh.texture is None else _lookup(mesh, mesh.texture.double(), value))
         first = last
     return out
 
 
 def _corner_values(mesh: Mesh, channels: int, faces: Tensor) -> Tensor:
     """What the mesh interpolates over its faces (N,), at their corners: colours (N, 3, C), or uvs (N, 3, 2)."""
-    if mesh.uvs is not None and mesh.uv_faces is not None:
-        return mesh.uvs.double()[mesh.uv_faces.long()[faces]]
+    if mesh.texture is not None:
+        return _corner_uvs(mesh, faces)
     if mesh.colors is not None:
         return mesh.colors.double()[mesh.faces.long()[faces]]
     if mesh.corner_colors is not None:
@@ -164,16 +181,37 @@ def _corner_values(mesh: Mesh, channels: int, faces: Tensor) -> Tensor:
     return torch.full((len(faces), 3, channels), PLAIN, dtype=torch.float64)
 
 
-def _bilinear(texture: Tensor, uv: Tensor) -> Tensor:
-    """Texture (h, w, C) at coordinates (N, 2): texel centres at +0.5, row 0 on top while v runs up, repeated."""
+def _corner_uvs(mesh: Mesh, faces: Tensor) -> Tensor:
+    """(N, 3, 2) of faces (N,)."""
+    assert mesh.uvs is not None and mesh.uv_faces is not None
+    return mesh.uvs.double()[mesh.uv_faces.long()[faces]]
+
+
+def _lookup(mesh: Mesh, texture: Tensor, uv: Tensor) -> Tensor:
+    """Texture (h, w, C) of a mesh at coordinates (N, 2): texel centres at +0.5, row 0 on top while v runs up."""
     h, w = texture.shape[:2]
-    column, row = uv[:, 0] * w - 0.5, (1.0 - uv[:, 1]) * h - 0.5
+    column, row = uv[:, 0] * w, (1.0 - uv[:, 1]) * h
+
+    def texel(i: Tensor, j: Tensor) -> Tensor:
+        return texture[_wrapped(i, h, mesh.wraps[1]), _wrapped(j, w, mesh.wraps[0])]
+
+    if mesh.filter == "nearest":
+        return texel(row.detach().floor().long(), column.detach().floor().long())
+    column, row = column - 0.5, row - 0.5
     left, top = column.detach().floor(), row.detach().floor()
     s, t = (column - left)[:, None], (row - top)[:, None]
     i, j = top.long(), left.long()
-    upper = (1.0 - s) * texture[i % h, j % w] + s * texture[i % h, (j + 1) % w]
-    lower = (1.0 - s) * texture[(i + 1) % h, j % w] + s * texture[(i + 1) % h, (j + 1) % w]
+    upper = (1.0 - s) * texel(i, j) + s * texel(i, j + 1)
+    lower = (1.0 - s) * texel(i + 1, j) + s * texel(i + 1, j + 1)
     return (1.0 - t) * upper + t * lower
+
+
+def _wrapped(index: Tensor, count: int, wrap: str) -> Tensor:
+    if wrap == "clamp":
+        return index.clamp(0, count - 1)
+    if wrap == "repeat":
+        return index % count
+    return count - 1 - ((index % (2 * count)) - count + 0.5).abs().sub(0.5).long()
 
 
 def _background(scene: Scene) -> Tensor:

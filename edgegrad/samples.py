@@ -179,7 +179,12 @@ class EdgeSamples:
         q = frame.view.in_camera(frame.surfaces.verts)
         rows = (frame.here(records.by_q) * (q - q.detach())[frame.here(records.vertex)]).sum(1)
         by_k = records.by_k @ (frame.intrinsics - frame.intrinsics.detach())
-        self.velocity = frame.here(by_k).index_add(0, frame.here(records.row_of), rows)
+        velocity = frame.here(by_k).index_add(0, frame.here(records.row_of), rows)
+        flat = frame.request.scene
+        by_uv = (records.by_uv * (flat.uvs - flat.uvs.detach())[records.uv]).sum(1)
+        by_alpha = records.by_alpha * (flat.alphas - flat.alphas.detach())[records.alpha, 0].double()
+        velocity = velocity.index_add(0, frame.here(records.uv_row_of), frame.here(by_uv))
+        self.velocity = velocity.index_add(0, frame.here(records.alpha_row_of), frame.here(by_alpha))
 
     def __len__(self) -> int:
         return len(self.x)
@@ -297,7 +302,7 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
     elif creases is not False:
         raise TypeError(f"creases: expected True, False or a tensor (F, 3, K), got {type(creases).__name__}")
     request = request._replace(scene=without_colors(request.scene, attributes))
-    _, curves = primary.frame.sampler.samples(request, interior=False, boundary=True)
+    _, curves = primary.frame.sampler.samples(request, interior=False, boundary=True, steps=request.scene.has_steps)
     return EdgeSamples(primary.frame, curves)
 
 

@@ -20,7 +20,7 @@ from ._check import (
     check_shape,
     values_visible,
 )
-from .mesh import PLAIN, Mesh
+from .mesh import FILTERS, PLAIN, WRAPS, Mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +119,22 @@ class Flat(NamedTuple):
     colors: Tensor  # (A, C) float32 or float64
     uvs: Tensor  # (T, 2) float64
     texels: Tensor  # (X, C), the textures end to end, row by row
-    textures: Tensor  # (N, 3) int64: first texel, height, width
+    textures: Tensor  # (N, 6) int64: first texel, height, width, wrap of u and v, filter
     face_texture: Tensor  # (F,) int32: texture of the face, −1 for none; (0,) when the scene has no texture
+    uv_corners: Tensor  # (F, 3) int32, rows of uvs, −1 for none; (0, 3) when corners say as much
+    alphas: Tensor  # (Y, 1), alpha textures end to end, row by row
+    cut_outs: Tensor  # (M, 6) int64: first of its alphas, height, width, wrap of u and v, filter
+    face_cut_out: Tensor  # (F,) int32: cut-out of the face, −1 for none; (0,) when the scene has none
     background: Tensor  # (C,) or (H, W, C)
+    cutoffs: list[float]  # of the cut-outs
     spacing: list[
         float
     ]  # of the numbers in which the vertices were given: pairs of a vertex and the spacing from there on
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether something jumps within a face: it is cut out, or its texels are."""
+        return len(self.cut_outs) > 0 or bool((self.textures[:, 5] == FILTERS.index("nearest")).any())
 
 
 def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
@@ -162,8 +172,17 @@ def image_dtype(scene: Scene) -> torch.dtype:
     return torch.float64 if any(t.dtype == torch.float64 for t in floats) else torch.float32
 
 
-def flatten(scene: Scene) -> Flat:
-    """The arrays of a scene; every step is a differentiable torch operation, so gradients find their way back."""
+def _sampler(mesh: Mesh) -> list[int]:
+    """How the images of a mesh are looked up: the wrap of u and of v, and the filter, as the kernel counts them."""
+    u, v = mesh.wraps
+    return [WRAPS.index(u), WRAPS.index(v), FILTERS.index(mesh.filter)]
+
+
+def flatten(scene: Scene, all_uvs: bool = False) -> Flat:
+    """The arrays of a scene; every step is a differentiable torch operation, so gradients find their way back.
+
+    all_uvs   also texture coordinates that neither a texture nor a cut-out needs
+    """
     C = scene.channels
     cpu = torch.device("cpu")  # said everywhere, for a user may have set another default device
     dtype = image_dtype(scene)
@@ -172,8 +191,15 @@ def flatten(scene: Scene) -> Flat:
     def empty(width: int, kind: torch.dtype) -> Tensor:
         return torch.empty((0, width), dtype=kind, device=cpu)
 
+    any_cut_out = any(mesh.alpha is not None for mesh in scene.meshes)
+
+    def has_uvs(mesh: Mesh) -> bool:
+        return mesh.texture is not None or mesh.alpha is not None or (all_uvs and mesh.uvs is not None)
+
+    own_uvs = any_cut_out or any(has_uvs(mesh) and mesh.texture is None for mesh in scene.meshes)
     verts, faces, corners, colors, uvs, texels, textures, face_texture = ([] for _ in range(8))
-    n_verts = n_colors = n_uvs = n_texels = 0
+    uv_corners, alphas, cut_outs, face_cut_out, cutoffs = ([] for _ in range(5))
+    n_verts = n_colors = n_uvs = n_texels = n_alphas = 0
     alone = len(scene.meshes) == 1
     # Colours of vertices are indexed by the faces. That it is one tensor tells the kernel that neighbours agree at their edge.
     by_vertex = all(mesh.texture is None and mesh.colors is not None for mesh in scene.meshes)
@@ -182,15 +208,32 @@ def flatten(scene: Scene) -> Flat:
         mesh_faces = _rows(mesh.faces, V, n_verts, alone)
         verts.append(mesh.verts.cpu().double())
         faces.append(mesh_faces)
-        if mesh.texture is not None:
+        uv_rows = torch.full((F, 3), -1, dtype=torch.int32, device=cpu) if own_uvs else None
+        if has_uvs(mesh):
             assert mesh.uvs is not None and mesh.uv_faces is not None
+            uvs.append(mesh.uvs.cpu().double())
+            uv_rows = _rows(mesh.uv_faces, mesh.uvs.shape[0], n_uvs, alone)
+            n_uvs += mesh.uvs.shape[0]
+        if own_uvs:
+            uv_corners.append(uv_rows)
+        if any_cut_out:
+            face_cut_out.append(
+                torch.full((F,), -1 if mesh.alpha is None else len(cut_outs), dtype=torch.int32, device=cpu)
+            )
+        if mesh.alpha is not None:
+            h, w = mesh.alpha.shape
+            cut_outs.append([n_alphas, h, w, *_sampler(mesh)])
+            cutoffs.append(mesh.alpha_cutoff)
+            alphas.append(mesh.alpha.cpu().to(dtype).reshape(h * w, 1))
+            n_alphas += h * w
+        if mesh.texture is not None:
+            assert uv_rows is not None
             h, w = mesh.texture.shape[:2]
             face_texture.append(torch.full((F,), len(textures), dtype=torch.int32, device=cpu))
-            textures.append([n_texels, h, w])
+            textures.append([n_texels, h, w, *_sampler(mesh)])
             texels.append(mesh.texture.cpu().to(dtype).reshape(h * w, C))
-            uvs.append(mesh.uvs.cpu().double())
-            corners.append(_rows(mesh.uv_faces, mesh.uvs.shape[0], n_uvs, alone))
-            n_uvs, n_texels = n_uvs + mesh.uvs.shape[0], n_texels + h * w
+            corners.append(uv_rows)
+            n_texels += h * w
         else:
             if mesh.colors is not None:
                 rows, index = mesh.colors, mesh_faces if by_vertex or not n_verts else mesh_faces - n_verts
@@ -226,8 +269,13 @@ def flatten(scene: Scene) -> Flat:
         join(colors, empty(C, dtype)),
         join(uvs, empty(2, torch.float64)),
         join(texels, empty(C, dtype)),
-        torch.tensor(textures, dtype=torch.int64, device=cpu).reshape(-1, 3),
+        torch.tensor(textures, dtype=torch.int64, device=cpu).reshape(-1, 6),
         join(face_texture, torch.empty(0, dtype=torch.int32, device=cpu)),
+        join(uv_corners, empty(3, torch.int32)),
+        join(alphas, empty(1, dtype)),
+        torch.tensor(cut_outs, dtype=torch.int64, device=cpu).reshape(-1, 6),
+        join(face_cut_out, torch.empty(0, dtype=torch.int32, device=cpu)),
         background,
+        cutoffs,
         _vertex_spacing(scene),
     )

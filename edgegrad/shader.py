@@ -60,9 +60,11 @@ class _Image:
         frame = self._frame
         visibility = frame.request.gradient.visibility
         moving = visibility and moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
-        surface, curves = frame.sampler.samples(self._with_creases(), interior=True, boundary=moving)
+        flat = frame.request.scene
+        cut = visibility and flat.has_steps and (moving or moves(flat.uvs, flat.alphas))
+        surface, curves = frame.sampler.samples(self._with_creases(), interior=True, boundary=moving, steps=cut)
         zero = self._interior(SurfaceSamples(frame, surface))
-        if moving:
+        if moving or cut:
             zero = zero + self._boundary(EdgeSamples(frame, curves))
         if visibility and self._kinds:
             zero = zero + self._steps()

@@ -45,9 +45,7 @@ class Look(torch.nn.Module):
     def __init__(self, width: int = 64) -> None:
         super().__init__()
         sizes = [9, width, width, 3]
-        layers = [
-            m for a, b in itertools.pairwise(sizes) for m in (torch.nn.Linear(a, b), torch.nn.SiLU())
-        ]
+        layers = [m for a, b in itertools.pairwise(sizes) for m in (torch.nn.Linear(a, b), torch.nn.SiLU())]
         self.layers = torch.nn.Sequential(*layers[:-1], torch.nn.Softplus())
 
     def forward(self, hits: eg.Hits) -> Tensor:

@@ -397,7 +397,7 @@ def test_a_texture_gets_the_images_gradient() -> None:
         (["alpha", "depth", "alpha"], ValueError, "aovs: expected each name once, got 'alpha' twice"),
         ([None], ValueError, "aovs: expected names among .*, got None"),
         ([["alpha"]], ValueError, "aovs: expected names among .*, got .*alpha"),
-        (["uv"], ValueError, r"aovs: expected uvs of all meshes for 'uv', got none of meshes\[1\]; give it a texture"),
+        (["uv"], ValueError, r"aovs: expected uvs of all meshes for 'uv', got none of meshes\[1\]; give it uvs"),
     ],
 )
 def test_messages(aovs: object, error: type[Exception], message: str) -> None:

@@ -64,7 +64,7 @@ def inputs(scene: eg.Scene, camera: eg.Camera) -> dict[str, list[tuple[Tensor, T
     found: dict[str, list[tuple[Tensor, Tensor]]] = {}
     for mesh in scene.meshes:
         for name, value in vars(mesh).items():
-            if value is not None and value.is_floating_point():
+            if isinstance(value, Tensor) and value.is_floating_point():
                 kind = "verts" if name == "verts" else "uvs" if name == "uvs" else "colours"
                 direction = (
                     value + torch.tensor([0.5, 0.2, 0.1], dtype=F64) if name == "verts" else smooth_direction(value)

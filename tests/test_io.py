@@ -13,6 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
+import edgegrad as eg
 from edgegrad.camera import Camera
 from edgegrad.io import (
     linear_to_srgb,
@@ -263,6 +264,63 @@ def test_glb_vertex_colours_are_linear(tmp_path, dtype):
     material = {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.5, 1.0, 1.0]}}
     (tmp_path / "m.glb").write_bytes(square_glb(material, colors=colors))
     np.testing.assert_allclose(load_mesh(tmp_path / "m.glb").colors.numpy(), shares[:, :3] * [0.5, 0.5, 1], atol=step)
+
+
+def png_with_alpha(alpha):
+    stream = io.BytesIO()
+    Image.fromarray(np.concatenate([TEXELS, np.asarray(alpha, np.uint8)[..., None]], -1)).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def cut_out_glb(alpha, sampler=None, **material):
+    """The textured square with an alpha in its texture."""
+    base = {"baseColorTexture": {"index": 0}, **material.pop("base", {})}
+    more = {} if sampler is None else {"samplers": [sampler]}
+    return square_glb(
+        material={"pbrMetallicRoughness": base, **material}, uv=True, extra=(png_with_alpha(alpha),),
+        images=[{"bufferView": 3, "mimeType": "image/png"}],
+        textures=[{"source": 0, **({} if sampler is None else {"sampler": 0})}], **more,
+    )  # fmt: skip
+
+
+def test_gltf_masks_and_samplers(tmp_path):
+    alpha = np.array([[0, 255], [102, 153]])
+    file = tmp_path / "s.glb"
+    file.write_bytes(cut_out_glb(alpha))
+    assert load_mesh(file).alpha is None  # opaque
+    file.write_bytes(cut_out_glb(alpha, alphaMode="MASK"))
+    mesh = load_mesh(file)
+    assert (mesh.alpha_cutoff, mesh.wrap, mesh.filter) == (0.5, "repeat", "linear")
+    np.testing.assert_allclose(mesh.alpha, alpha / 255.0, atol=1e-6)
+    np.testing.assert_allclose(texel_at(mesh, 0, 0), linear(TEXELS[1, 0]), atol=1e-6)
+    assert load_mesh(file, materials=False).alpha is None
+    sampler = {"wrapS": 33071, "wrapT": 33648, "magFilter": 9728, "minFilter": 9987}
+    base = {"baseColorFactor": [1.0, 0.5, 1.0, 0.75]}
+    file.write_bytes(cut_out_glb(alpha, sampler, base=base, alphaMode="MASK", alphaCutoff=0.3))
+    mesh = load_mesh(file)
+    assert (mesh.alpha_cutoff, mesh.wrap, mesh.filter) == (0.3, ("clamp", "mirror"), "nearest")
+    np.testing.assert_allclose(mesh.alpha, 0.75 * alpha / 255.0, atol=1e-6)
+    # One texel of four is there, and a ray through another meets nothing.
+    camera = eg.Camera.look_at([0.5, 0.5, 2.0], [0.5, 0.5, 0.0], size=(8, 8), fov_y=20.0)
+    seen = eg.render_aovs(mesh, camera, ["alpha"], 16)["alpha"]
+    assert 0.0 < seen.mean() < 1.0
+    del sampler["wrapS"], sampler["magFilter"]
+    file.write_bytes(cut_out_glb(alpha, sampler, alphaMode="MASK"))
+    assert (load_mesh(file).wrap, load_mesh(file).filter) == (("repeat", "mirror"), "linear")
+    file.write_bytes(cut_out_glb(alpha, {"wrapS": 1}))
+    with pytest.raises(ValueError, match=r"expected a sampler of glTF 2\.0 for the texture .* got wraps \[1, 10497\]"):
+        load_mesh(file)
+
+
+def test_gltf_masks_without_alpha_in_a_texture(tmp_path):
+    file = tmp_path / "s.glb"
+    for opacity, shows in ((0.7, True), (0.2, False)):
+        for uv in (True, False):
+            base = {"baseColorFactor": [1.0, 1.0, 1.0, opacity]}
+            file.write_bytes(square_glb(material={"pbrMetallicRoughness": base, "alphaMode": "MASK"}, uv=uv))
+            camera = eg.Camera.look_at([0.5, 0.5, 2.0], [0.5, 0.5, 0.0], size=(8, 8), fov_y=20.0)
+            seen = eg.render_aovs(load_mesh(file), camera, ["alpha"], 4)["alpha"].mean()
+            assert seen == (1.0 if shows else 0.0)
 
 
 def test_glb_base_colour_is_linear_and_not_rounded(tmp_path):

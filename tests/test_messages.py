@@ -142,8 +142,29 @@ MESH = {
     ),
     "texture without uvs": (lambda: textured(uvs=None), V, "uvs: expected with a texture, got None"),
     "texture without uv_faces": (lambda: textured(uv_faces=None), V, "uv_faces: expected with a texture, got None"),
-    "uvs without a texture": (lambda: textured(texture=None), V, "uvs: expected None without a texture, got a tensor"),
-    "uv_faces without a texture": (lambda: mesh(uv_faces=FACES), V, "uv_faces: expected None without a texture"),
+    "uvs alone": (lambda: textured(texture=None, uv_faces=None), V, "uv_faces: expected with uvs, got None"),
+    "uv_faces alone": (lambda: mesh(uv_faces=FACES), V, "uvs: expected with uv_faces, got None"),
+    "alpha without uvs": (lambda: mesh(alpha=torch.ones(2, 2)), V, "uvs: expected with alpha, got None"),
+    "alpha of colours": (lambda: textured(alpha=torch.ones(2, 2, 1)), V, "alpha: expected shape (h, w), got (2, 2, 1)"),
+    "alpha of bytes": (lambda: textured(alpha=torch.ones(2, 2).byte()), T, "alpha: expected float32 or float64"),
+    "alpha not finite": (
+        lambda: textured(alpha=torch.tensor([[1.0, NAN]])),
+        V,
+        "alpha: expected finite numbers, got nan at [0, 1]",
+    ),
+    "alpha_cutoff as text": (lambda: textured(alpha_cutoff="half"), T, "alpha_cutoff: expected a number, got str"),
+    "alpha_cutoff not finite": (
+        lambda: textured(alpha_cutoff=NAN),
+        V,
+        "alpha_cutoff: expected a finite number, got nan",
+    ),
+    "wrap unknown": (lambda: textured(wrap="border"), V, "wrap: expected one of repeat, clamp, mirror, or a pair"),
+    "wrap of three axes": (lambda: textured(wrap=("clamp",) * 3), V, "wrap: expected one of repeat, clamp, mirror"),
+    "filter of a texture": (
+        lambda: textured(filter="cubic"),
+        V,
+        "filter: expected one of linear, nearest, got 'cubic'",
+    ),
     "uvs in 3-D": (lambda: textured(uvs=VERTS), V, "uvs: expected shape (T, 2), got (8, 3)"),
     "uvs of integers": (lambda: textured(uvs=FACES[:, :2]), T, "uvs: expected float32 or float64, got torch.int64"),
     "uvs not finite": (
@@ -368,7 +389,7 @@ def spoilt(name: str, index: tuple[int, ...], value: float) -> Callable[[], obje
 
     def call() -> torch.Tensor:
         look = textured() if name in ("texture", "uvs", "uv_faces") else mesh(colors=VERTS)
-        fields = {n: v.clone() for n, v in vars(look).items() if v is not None}
+        fields = {n: v.clone() for n, v in vars(look).items() if isinstance(v, torch.Tensor)}
         background, pose, intrinsics = torch.zeros(8, 8, 3), POSE.clone(), K.clone()
         scene = eg.Scene(eg.Mesh(**fields), background)
         view = camera(world_to_camera=pose, K=intrinsics)
@@ -433,7 +454,7 @@ FLAT = flatten(eg.Scene([textured(), mesh(colors=VERTS)]))
         ({"colors": FLAT.colors[:, :2]}, ["texels: expected 2 columns, got 3"]),
         ({"uvs": torch.zeros(8, 3, dtype=F64)}, ["uvs: expected 2 columns, got 3"]),
         ({"texels": FLAT.texels[:, :1]}, ["texels: expected 3 columns, got 1"]),
-        ({"textures": FLAT.textures[:, :2]}, ["textures: expected 3 columns, got 2"]),
+        ({"textures": FLAT.textures[:, :2]}, ["textures: expected 6 columns, got 2"]),
         ({"corners": FLAT.corners[:3]}, ["corners: expected one row a face"]),
         ({"faces": FLAT.faces[:0], "corners": FLAT.corners[:0]}, ["faces: expected at least one face, got none"]),
         ({"face_texture": FLAT.face_texture[:3]}, ["face_texture: expected one number a face"]),
@@ -492,7 +513,7 @@ def kernel_backward(**gradients: np.ndarray) -> None:
         (lambda: kernel_forward(vertex=1), ["background: expected one number for each channel"]),
         (lambda: kernel_forward(vertex=1, missing=1), ["vertex_attributes: expected one row a vertex"]),
         (lambda: kernel_forward(face=1, missing=1), ["face_attributes: expected one row a face"]),
-        (lambda: kernel_forward(uv=True), ["uv: expected a texture on all faces"]),
+        (lambda: kernel_forward(uv=True), ["uv: expected texture coordinates of all faces"]),
         (lambda: kernel_channels(face=5), ["face_attributes: expected at most 4 columns"]),
         (lambda: kernel_channels(vertex=3, unit=1), ["unit: expected -1, or the first of three columns"]),
         (lambda: kernel_backward(verts=np.zeros((3, 3))), ["gradient of verts: expected the size of verts"]),

@@ -83,12 +83,20 @@ LOOKS = {
     "face_colors": {"face_colors": values(2, CHANNELS)},
     "corner_colors": {"corner_colors": values(2, 3, CHANNELS)},
     "texture": {"texture": values(3, 4, CHANNELS), "uvs": UVS},
+    "clamp": {"texture": values(3, 4, CHANNELS), "uvs": UVS, "wrap": "clamp"},
+    "mirror": {"texture": values(3, 4, CHANNELS), "uvs": 3.0 * UVS - 1.0, "wrap": ("mirror", "repeat")},
+    "nearest": {
+        "texture": values(3, 4, CHANNELS),
+        "uvs": 3.0 * UVS - 1.0,
+        "wrap": ("clamp", "mirror"),
+        "filter": "nearest",
+    },
 }
 VIEWS = ["perspective", "orthographic"]
 
 
 def mesh(look: str, verts: Tensor = VERTS) -> eg.Mesh:
-    return eg.Mesh(verts, FACES, uv_faces=UV_FACES if look == "texture" else None, **LOOKS[look])
+    return eg.Mesh(verts, FACES, uv_faces=UV_FACES if "uvs" in LOOKS[look] else None, **LOOKS[look])
 
 
 def skewed_camera(view: str) -> eg.Camera:
@@ -139,7 +147,8 @@ def check_gradient(scene: eg.Scene, camera: eg.Camera, inputs: dict[str, Tensor]
 def test_gradcheck(look, view):
     """Every input at once: vertices, what the mesh looks like, the pose's entries and those of K."""
     camera = skewed_camera(view)
-    inputs = {"verts": VERTS, **LOOKS[look], "world_to_camera": camera.world_to_camera[:3], "K": camera.K[:2]}
+    tensors = {name: value for name, value in LOOKS[look].items() if isinstance(value, Tensor)}
+    inputs = {"verts": VERTS, **tensors, "world_to_camera": camera.world_to_camera[:3], "K": camera.K[:2]}
     check_gradient(eg.Scene(mesh(look)), camera, inputs)
 
 
@@ -200,7 +209,7 @@ def leaves_of(scene: eg.Scene, camera: eg.Camera) -> tuple[eg.Scene, eg.Camera, 
 
     meshes = []
     for i, m in enumerate(scene.meshes):
-        fields = {n: v for n, v in vars(m).items() if v is not None and v.is_floating_point()}
+        fields = {n: v for n, v in vars(m).items() if isinstance(v, Tensor) and v.is_floating_point()}
         meshes.append(m.replace(**{n: leaf(f"{n} of mesh {i}", v) for n, v in fields.items()}))
     camera = camera.replace(world_to_camera=leaf("world_to_camera", camera.world_to_camera), K=leaf("K", camera.K))
     return eg.Scene(meshes), camera, leaves

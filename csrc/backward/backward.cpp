@@ -10,6 +10,7 @@
 #include "boundary/boundary.h"
 #include "boundary/curve.h"
 #include "boundary/curve_measure.h"
+#include "boundary/steps.h"
 #include "camera/windows.h"
 #include "core/channels.h"
 #include "interior/interior.h"
@@ -45,15 +46,16 @@ struct Terms {
     bool motion;      // inside faces, of what moves them
     bool appearance;  // inside faces, of colours and textures
     bool boundary;
+    bool steps;  // within faces
 
     bool interior() const { return motion || appearance; }
-    bool any() const { return interior() || boundary; }
+    bool any() const { return interior() || boundary || steps; }
 };
 
 template <class Number>
 Terms terms_of(const Slots<Number>& slots, const GradientOptions& o) {
     const bool moves = slots.geometry();
-    return {moves && o.interior_geometry, slots.appearance(), moves && o.boundary};
+    return {moves && o.interior_geometry, slots.appearance(), moves && o.boundary, slots.steps() && o.steps};
 }
 
 // What the image and its adjoint say, through whichever window of the camera one looks.
@@ -81,7 +83,10 @@ void with_view(const BackwardInput<T>& input, const Camera& camera, const InImag
     const auto& [filtered, importance, occlusion] = in_image;
     const ViewVolume volume(camera, InImage<T>::margin_of(image));
     const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, team);
-    const CameraFrame frame(geometry.caster(), camera);
+    std::optional<CutOuts<T>> cut_outs;
+    if (scene.cut_outs.face) cut_outs.emplace(scene, camera, vertices.q.data());
+    const SeenThrough* through = cut_outs ? &*cut_outs : nullptr;
+    const CameraFrame frame(geometry.caster(), camera, through);
     Scatter scatter(team, {scene.radiance, scene.attributes.vertex_width, scene.attributes.face_width});
     // What the controls need, of faces and of creases.
     const bool creases = terms.boundary && may_jump(scene, geometry.topology());
@@ -103,6 +108,7 @@ void with_view(const BackwardInput<T>& input, const Camera& camera, const InImag
                          .team = team,
                          .scatter = scatter,
                          .frame = frame,
+                         .cut_outs = through,
                          .occlusion = occlusion,
                          .hits = hits ? &*hits : nullptr,
                          .seen = hit_buffers.seen,
@@ -171,6 +177,7 @@ void add_terms(const BackwardInput<T>& input, const BackwardView<T>& view, const
         add_boundary<N>(view, *curves, n.edge, contraction, to, profile);
         if (!curves->x_bar.empty()) add_places(view, curves->x_bar, to);
     }
+    if (terms.steps) add_steps<N>(view, contraction, to, profile);
 }
 
 // The options for each of several windows: samples in proportion to what each wants, as many as one image would get.
@@ -239,7 +246,8 @@ BackwardProfile& BackwardProfile::operator+=(const BackwardProfile& o) {
     surface_wanted += o.surface_wanted, edge_wanted += o.edge_wanted;
     silhouettes += o.silhouettes, creases += o.creases, intersections += o.intersections;
     measure += o.measure, curves += o.curves, view += o.view, world += o.world;
-    for (int i = 0; i < 2; ++i) surface[i] += o.surface[i], edge[i] += o.edge[i];
+    step_lines += o.step_lines;
+    for (int i = 0; i < 2; ++i) surface[i] += o.surface[i], edge[i] += o.edge[i], step[i] += o.step[i];
     return *this;
 }
 
@@ -288,7 +296,7 @@ BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOpt
         Destination to;
         to.want_k = grad.K || grad.distortion;
         to.q = grad.geometry() ? q_bar.data() : nullptr;
-        to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels;
+        to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels, to.alphas = grad.alphas;
         to.vertex_attributes = grad.vertex_attributes, to.face_attributes = grad.face_attributes;
         dispatch_channels(scene.channels, scene.channels > scene.radiance,
                           [&]<int N>() { add_terms<N>(input, view, terms, Reverse{terms.motion}, to, own); });
@@ -308,7 +316,8 @@ void render_tangents(const BackwardInput<T>& input, GradientOptions o, Team& tea
     Terms terms{};
     for (const Tangents& t : tangents) {
         const Terms own = terms_of(t, o);
-        terms = {terms.motion || own.motion, terms.appearance || own.appearance, terms.boundary || own.boundary};
+        terms = {terms.motion || own.motion, terms.appearance || own.appearance, terms.boundary || own.boundary,
+                 terms.steps || own.steps};
     }
     add_background_tangent(input, tangents, team, image_dot);
     if (!terms.any()) return;
@@ -326,7 +335,7 @@ void render_tangents(const BackwardInput<T>& input, GradientOptions o, Team& tea
 
 template <class T>
 void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, Team& team, double* gradient) {
-    const Terms terms{.motion = o.interior_geometry, .appearance = false, .boundary = o.boundary};
+    const Terms terms{.motion = o.interior_geometry, .appearance = false, .boundary = o.boundary, .steps = o.steps};
     if (!terms.any()) return;
     o.controls = false;
     Destination to;
@@ -339,7 +348,7 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, Te
 template <class T>
 Records record_samples(const BackwardInput<T>& input, GradientOptions o, Team& team) {
     Records records;
-    const Terms terms{.motion = o.interior_geometry, .appearance = false, .boundary = o.boundary};
+    const Terms terms{.motion = o.interior_geometry, .appearance = false, .boundary = o.boundary, .steps = o.steps};
     if (!terms.any()) return records;
     o.controls = false;
     Destination to;

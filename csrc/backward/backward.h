@@ -17,7 +17,9 @@ struct GradientOptions {
     uint64_t seed = 0;
     bool interior_geometry = true;  // whether the colours vary over faces, so that moving them shows inside
     bool boundary = true;
-    bool dry = false;      // only count the samples
+    bool steps = true;        // whether what moves steps within faces counts
+    double step_spacing = 1;  // px between the lines that find them
+    bool dry = false;         // only count the samples
     bool controls = true;  // whether integrals that are known serve as control variates; they are of one given adjoint
     int pixel_spp = 0;     // if not zero, all of the interior term from so many samples a pixel, for the benchmarks
 };
@@ -27,10 +29,11 @@ struct BackwardProfile {
     int64_t surface_samples = 0, edge_samples = 0;
     int64_t surface_wanted = 0, edge_wanted = 0;              // default samples before the budget (budget.h)
     int64_t silhouettes = 0, creases = 0, intersections = 0;  // curves in view
+    int64_t step_lines = 0;                                   // that look for steps within faces
     double view = 0;                                          // vertices in camera coordinates, where the loss looks
     double measure = 0, curves = 0;                           // triangles and curves laid end to end
-    double surface[2] = {0, 0}, edge[2] = {0, 0};             // samples with their rays; adding what they found
-    double world = 0;                                         // from camera coordinates to the user's arrays
+    double surface[2] = {0, 0}, edge[2] = {0, 0}, step[2] = {0, 0};  // samples with their rays; adding what they found
+    double world = 0;                                                // from camera coordinates to the user's arrays
 
     // Of another window of the camera.
     BackwardProfile& operator+=(const BackwardProfile& o);

@@ -29,6 +29,7 @@ struct BackwardView {
     Team& team;
     Scatter& scatter;
     const CameraFrame& frame;
+    const SeenThrough* cut_outs;  // null: there are none
     const OcclusionHint& occlusion;
     const ImageHits* hits;           // null where neither term asks
     const uint8_t* seen;             // (F,): 0, or the side from which the forward pass hit the face
@@ -55,11 +56,18 @@ uint8_t side_of(const BackwardView<T>& view, int64_t face) {
     return view.camera.side(q[0], q[1], q[2]);
 }
 
+// Whether a face that the ray at n meets is there, not cut out.
+template <class T>
+bool is_there(const BackwardView<T>& view, int64_t face, Vec2 n) {
+    return !view.cut_outs || view.cut_outs->shows(int32_t(face), n);
+}
+
 // Whether the ray at n meets a face, decided in double.
 template <class T>
 bool meets(const BackwardView<T>& view, int64_t face, Vec2 n) {
     const auto corner = corners_of(view, face);
-    return covers(face_map(view.camera, corner.data()), n) && !view.camera.passes_through_eye(corner.data());
+    return covers(face_map(view.camera, corner.data()), n) && !view.camera.passes_through_eye(corner.data()) &&
+           is_there(view, face, n);
 }
 
 // The depth at which the ray at n meets a face.

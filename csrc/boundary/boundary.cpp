@@ -3,13 +3,12 @@
 #include "boundary/boundary.h"
 
 #include <algorithm>
-#include <span>
 #include <vector>
 
-#include "boundary/contractions.h"
 #include "boundary/crease_control.h"
 #include "boundary/crossings.h"
 #include "boundary/curve_measure.h"
+#include "boundary/curve_samples.h"
 #include "boundary/edge_source.h"
 #include "boundary/intersection_source.h"
 #include "core/sampler.h"
@@ -18,75 +17,6 @@
 namespace edgegrad {
 
 namespace {
-
-template <int N, class T>
-ReverseBoundary<N, T> contract(const BackwardView<T>& view, const Reverse&, ChunkGrad& grad) {
-    return {view, grad};
-}
-template <int N, class T>
-ForwardBoundary<T> contract(const BackwardView<T>& view, const Forward& c, ChunkGrad& grad) {
-    return {view, c.directions, grad};
-}
-template <int N, class T>
-ScreenBoundary<T> contract(const BackwardView<T>& view, const Screen&, ChunkGrad& grad) {
-    return {view, grad};
-}
-
-template <int N, class T>
-RecordBoundary contract(const BackwardView<T>& view, const Record&, ChunkGrad& grad) {
-    return {view.camera, grad.records.curves};
-}
-
-// Samples of one source, in batches of rays.
-template <class Contraction, class T, CurveSource Source>
-class CurveSamples {
-   public:
-    CurveSamples(const BackwardView<T>& view, Source& source, Contraction contraction)
-        : view_(view), visibility_(view), source_(source), contraction_(std::move(contraction)), rays_(view.frame) {}
-
-    // The point at the fraction s of the curve.
-    void add(const typename Source::Curve& curve, double s, double weight) {
-        const int i = rays_.count;
-        const Vec2 u = source_.position(curve, s);
-        const auto [x, area_scale] = bend(view_.camera, u);
-        if (area_scale == 0 || !contraction_.wants(i, x)) return;
-        typename Source::Sample& sample = sample_[i];
-        sample.u = u, sample.n = normalised(view_.camera, u), sample.weight = weight;
-        sample.x = x, sample.area_scale = area_scale;
-        if (!source_.place(curve, s, sample)) return;
-        rays_.n_x[i] = sample.n.x, rays_.n_y[i] = sample.n.y;
-        ignored_[i] = sample.ignored;
-        if (++rays_.count == RayBatch::size) cast();
-    }
-
-    void finish(ChunkGrad& grad) {
-        cast();
-        source_.finish(grad);
-    }
-
-   private:
-    void cast() {
-        rays_.prepare();
-        view_.geometry.caster().cast(rays_, ignored_);
-        for (int i = 0; i < rays_.count; ++i) {
-            typename Source::Sample& sample = sample_[i];
-            const int32_t hit = visibility_.beyond_float(sample, rays_.face[i]);
-            if (hit >= 0 && !visibility_.lies_behind(hit, source_.faces_of(sample), sample)) continue;
-            contraction_.add(i, source_, sample);
-        }
-        rays_.count = 0;
-        source_.cast();
-    }
-
-    const BackwardView<T>& view_;
-    const Visibility<T> visibility_;
-    Source& source_;
-    Contraction contraction_;
-
-    CameraRays rays_;
-    typename Source::Sample sample_[RayBatch::size];
-    std::span<const int32_t> ignored_[RayBatch::size];
-};
 
 // Some of the samples.
 struct Drawn {
@@ -122,7 +52,7 @@ template <int N, class Contraction, class T>
 void add_edges(const BackwardView<T>& view, const Curves<T>& curves, const CoincidentCurves& coincident,
                const Drawn& drawn, const Contraction& contraction, ChunkGrad& grad) {
     EdgeSource<T> source(view, curves.finder, coincident);
-    CurveSamples samples(view, source, contract<N>(view, contraction, grad));
+    CurveSamples samples(view, source, on_curves<N>(view, contraction, grad));
     CreaseControl<N, T> control(view);
     Curve curve;
     bool controlled = false;
@@ -146,7 +76,7 @@ void add_intersections(const BackwardView<T>& view, const Curves<T>& curves, con
                        const Contraction& contraction, ChunkGrad& grad) {
     const Intersections& intersections = view.geometry.intersections();
     IntersectionSource<T> source(view);
-    CurveSamples samples(view, source, contract<N>(view, contraction, grad));
+    CurveSamples samples(view, source, on_curves<N>(view, contraction, grad));
     IntersectionCurve curve;
     drawn.each([&](int64_t k, double s, double weight) {
         const Intersection& i = intersections.all()[curves.intersection[k - int64_t(curves.curve.size())].index];

@@ -85,8 +85,7 @@ class ForwardBoundary {
             if (const SurfacePoint& p = surfaces.at[k]; p.face >= 0)
                 shade<0>(view_.scene, p.face, p.b, radiance_.data() + k * C_);
         velocity_.resize(directions_.size());
-        for (size_t d = 0; d < directions_.size(); ++d)
-            velocity_[d] = directions_[d].moves() ? source.velocities(sample, directions_[d]) : CurveJumps{};
+        for (size_t d = 0; d < directions_.size(); ++d) velocity_[d] = source.velocities(sample, directions_[d]);
         pixels_.around(sample.x, [&](int64_t pixel, double weight) {
             // Each pixel has a background of its own.
             const T* background = view_.scene.background_at(pixel);
@@ -136,7 +135,7 @@ class ScreenBoundary {
 class RecordBoundary {
    public:
     RecordBoundary(const Camera& camera, CurveRecords& records) : camera_(camera), records_(records) {
-        form_.q.prepare(3, 1);
+        form_.q.prepare(3, 1), form_.uvs.prepare(2, 1), form_.alphas.prepare(1, 1);
     }
 
     bool wants(int, Vec2) const { return true; }
@@ -162,7 +161,7 @@ class RecordBoundary {
     void add(Source& source, const typename Source::Sample& sample, const SampleSurfaces& surfaces, CurveJumps curve,
              const double* factor) {
         if (std::all_of(factor, factor + CurveRecords::surfaces, [](double f) { return f == 0; })) return;
-        form_.q.clear(), form_.k = {};
+        form_.q.clear(), form_.uvs.clear(), form_.alphas.clear(), form_.k = {};
         source.add_motion(sample, curve, form_);
         source.finish(form_);
         const int64_t sample_index = records_.size();
@@ -181,6 +180,14 @@ class RecordBoundary {
             // From the frame of the window to that of the camera.
             const Vec3 q = transposed_times(camera_.turn, {by_q[0], by_q[1], by_q[2]});
             append(records_.by_q, {q.x, q.y, q.z});
+        });
+        form_.uvs.each([&](int64_t row, const double* by_uv) {
+            records_.uv_row_of.push_back(sample_index), records_.uv.push_back(int32_t(row));
+            append(records_.by_uv, {by_uv[0], by_uv[1]});
+        });
+        form_.alphas.each([&](int64_t texel, const double* by_alpha) {
+            records_.alpha_row_of.push_back(sample_index), records_.alpha.push_back(texel);
+            records_.by_alpha.push_back(*by_alpha);
         });
     }
 

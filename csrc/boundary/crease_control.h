@@ -23,7 +23,8 @@
 
 namespace edgegrad {
 
-// What differs between the sides of a crease of faces without texture: all channels, at its ends.
+// What differs between the sides of a crease of faces without texture: all channels, at its ends. Where one face may be
+// there without the other, it is no such crease.
 template <int N, class T>
 class CreaseJumps {
    public:
@@ -59,7 +60,8 @@ class CreaseJumps {
 
 template <class T>
 bool joins_colors(const SceneView<T>& scene, const Curve& c) {
-    return c.is_crease() && !is_textured(scene, c.minus.face) && !is_textured(scene, c.plus.face);
+    return c.is_crease() && !is_textured(scene, c.minus.face) && !is_textured(scene, c.plus.face) &&
+           !cut_outs_jump(scene, c.minus, c.plus);
 }
 
 template <int N, class T>

@@ -68,7 +68,7 @@ class CreaseVisibility {
     template <class Body>
     void answer(Body body) {
         rays_.prepare();
-        view_.geometry.caster().cast(rays_);
+        view_.frame.cast(rays_);
         for (int k = 0, ray = 0; k < size_; ++k) {
             const auto& [c, fewest, missed] = asked_[k];
             int visible = 0, hidden = 0;
@@ -89,13 +89,14 @@ class CreaseVisibility {
    private:
     // Least fractions of the samples: where nothing may divide a crease; and where it may, but rays find it undivided.
     static constexpr double few = 1.0 / 512, beside_silhouettes = 1.0 / 128, beside_parts = 1.0 / 32,
-                            beside_missed =
-                                1.0 / 8;  // faces near which others were not hit: something may pass through
+                            beside_missed = 1.0 / 8;  // faces near which others were not hit: something may pass
+                                                      // through, or be cut out
 
     // Fewer than 16 rays a pixel miss more of where parts meet, and of which faces are divided.
     double by_evidence(double least) const { return OcclusionHint::factor(least, view_.image.spp); }
 
     double fewest(const Curve& c, Relation relation) const {
+        if (view_.cut_outs) return beside_missed;
         if (relation != Relation::apart) return beside_parts;
         Vec2 low{INFINITY, INFINITY}, high{-INFINITY, -INFINITY};  // of both faces
         double farthest = -INFINITY;

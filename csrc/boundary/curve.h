@@ -47,6 +47,15 @@ inline Barycentrics at_edge(const HalfEdge& h, double t) {
     return {b[1], b[2]};
 }
 
+// The same a little within the face, where it matters: on the rim itself the nearest texel may be that of a neighbour.
+template <class T>
+Barycentrics beside_edge(const SceneView<T>& scene, const HalfEdge& h, double t) {
+    const Barycentrics b = at_edge(h, t);
+    constexpr double inward = 0x1p-24;
+    if (!takes_nearest(scene, h.face)) return b;
+    return {(1 - inward) * b.u + inward / 3, (1 - inward) * b.v + inward / 3};
+}
+
 template <class T>
 int32_t vertex(const SceneView<T>& scene, const HalfEdge& h, int corner) {
     return scene.faces[3 * int64_t(h.face) + corner];
@@ -62,17 +71,50 @@ bool in_front(const BackwardView<T>& view, const HalfEdge& first, const HalfEdge
     return other == 0 || (viewer > 0) != (other > 0);
 }
 
-// Whether two faces may differ in attributes along the edge they share: barycentrics are of each face alone; texture
-// coordinates are compared below.
+// Whether two faces differ in texture coordinates along the edge they share.
+template <class T>
+bool uvs_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
+    const auto uv = [&](const HalfEdge& h, int corner) {
+        return scene.uvs + 2 * int64_t(scene.uv_corners[3 * int64_t(h.face) + corner]);
+    };
+    const auto differ = [](const double* a, const double* b) { return a[0] != b[0] || a[1] != b[1]; };
+    return differ(uv(m, m.first()), uv(p, p.first())) || differ(uv(m, m.second()), uv(p, p.second()));
+}
+
+// Whether two faces may differ in attributes along the edge they share: barycentrics are of each face alone.
 template <class T>
 bool attributes_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
     const Attributes& a = scene.attributes;
     const auto differ = [](const double* values, int width, int64_t i, int64_t j) {
         return i != j && !std::equal(values + width * i, values + width * (i + 1), values + width * j);
     };
-    return a.barycentrics || differ(a.face, a.face_width, m.face, p.face) ||
+    return a.barycentrics || (a.uv && uvs_jump(scene, m, p)) || differ(a.face, a.face_width, m.face, p.face) ||
            differ(a.vertex, a.vertex_width, vertex(scene, m, m.first()), vertex(scene, p, p.first())) ||
            differ(a.vertex, a.vertex_width, vertex(scene, m, m.second()), vertex(scene, p, p.second()));
+}
+
+// Whether an edge runs exactly along a border of nearest texels. Another border is a step within a face.
+template <class T>
+bool lies_between_texels(const SceneView<T>& scene, const HalfEdge& h) {
+    if (!takes_nearest(scene, h.face)) return false;
+    const auto along = [&](const auto& texture) {
+        const auto place = [&](int corner) {
+            const double* uv = scene.uvs + 2 * int64_t(scene.uv_corners[3 * int64_t(h.face) + corner]);
+            return texture.place({uv[0], uv[1]});
+        };
+        const Vec2 a = place(h.first()), b = place(h.second());
+        return (a.x == b.x && a.x == std::floor(a.x)) || (a.y == b.y && a.y == std::floor(a.y));
+    };
+    return (is_textured(scene, h.face) && along(texture_of(scene, h.face))) ||
+           (scene.cut_outs.on(h.face) && along(alpha_of(scene, h.face)));
+}
+
+// Whether one of two faces may be there and the other cut out along the edge they share.
+template <class T>
+bool cut_outs_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
+    const CutOutArrays<T>& c = scene.cut_outs;
+    if (!c.on(m.face) && !c.on(p.face)) return false;
+    return c.face[m.face] != c.face[p.face] || lies_between_texels(scene, m) || uvs_jump(scene, m, p);
 }
 
 // Whether two faces may differ along the edge they share: their values at its ends are compared.
@@ -81,6 +123,7 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
     const bool textured = is_textured(scene, m.face);
     if (textured != is_textured(scene, p.face)) return true;
     if (textured && scene.face_texture[m.face] != scene.face_texture[p.face]) return true;
+    if (textured && lies_between_texels(scene, m)) return true;
     const auto row = [&](const HalfEdge& h, int corner) {
         return int64_t(scene.corners[3 * int64_t(h.face) + corner]);
     };
@@ -92,7 +135,7 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
         if (!textured && !std::equal(scene.colors + C * i, scene.colors + C * (i + 1), scene.colors + C * j))
             return true;
     }
-    return scene.channels > scene.radiance && attributes_jump(scene, m, p);
+    return (scene.channels > scene.radiance && attributes_jump(scene, m, p)) || cut_outs_jump(scene, m, p);
 }
 
 // Whether neighbouring faces may differ at their common edge. Attributes that are indexed like the vertices
@@ -100,7 +143,8 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
 template <class T>
 bool may_jump(const SceneView<T>& scene, const Topology& topology) {
     const Attributes& a = scene.attributes;
-    return scene.corners != scene.faces || topology.welds() || a.face_width > 0 || a.barycentrics;
+    return scene.corners != scene.faces || topology.welds() || a.face_width > 0 || a.barycentrics || a.uv ||
+           scene.cut_outs.face;
 }
 
 // A face that turns clockwise in the image (x right, y down) lies to the right of its sides, where the normal

@@ -54,6 +54,7 @@ class EdgeSource {
         sample.t = t;
         sample.behind = {};
         sample.share = {.side = {curve.minus, curve.plus}, .side_t = {t, t}};
+        if (view_.cut_outs && !show(curve, t, sample.share)) return false;
         const std::span<const int32_t> own = place.faces.faces;
         sample.gathered.clear();
         if ((place.segment || place.edge_on) && !share(place, sample)) return false;
@@ -76,7 +77,7 @@ class EdgeSource {
         SampleSurfaces surfaces;
         for (int k = 0; k < 2; ++k) {
             const HalfEdge& h = share.side[k];
-            surfaces.at[k] = h.face >= 0 ? SurfacePoint{h.face, at_edge(h, share.side_t[k])} : behind;
+            surfaces.at[k] = h.face >= 0 ? SurfacePoint{h.face, beside_edge(view_.scene, h, share.side_t[k])} : behind;
         }
         if (uncovers(sample))
             surfaces.at[surfaces.count++] =
@@ -102,6 +103,7 @@ class EdgeSource {
 
     // δx ∧ τ of the point, with the vertices of the faces on either side in equal parts, as flush() has it.
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
+        if (!direction.moves()) return {};
         const Curve& curve = place_[sample.place].own.curve;
         const Vec2 tangent = bent_tangent(sample);
         const auto velocity = [&](Vec3 point, Vec3 point_dot) {
@@ -176,6 +178,18 @@ class EdgeSource {
         other_edges_.clear();
     }
 
+    // Sets what is there on either side at the point t, where faces may be cut out; false if nothing is.
+    bool show(const Curve& curve, double t, CoincidentShare& share) const {
+        share.side[0].face = share.side[1].face = -1;
+        for (const HalfEdge& h : view_.geometry.topology().half_edges(curve.edge)) {
+            const int turn = finder_.turn_of(h);
+            if (turn == 0 || !shows(view_.scene, h.face, beside_edge(view_.scene, h, t))) continue;
+            HalfEdge& side = share.side[turn > 0 ? 0 : 1];
+            if (side.face < 0 || !in_front(view_, side, h, curve.a, curve.b)) side = h;
+        }
+        return share.side[0].face >= 0 || share.side[1].face >= 0;
+    }
+
     // Another curve on the line of the latest.
     const CoincidentCurve& other(int64_t edge, const Curve& line) {
         const size_t k = std::find(other_edges_.begin(), other_edges_.end(), edge) - other_edges_.begin();
@@ -213,6 +227,8 @@ class EdgeSource {
                 ignored.insert(ignored.end(), faces.begin(), faces.end());
                 if (s < 0 || s > 1) return true;
                 const CoincidentCurve& c = other(o.edge, curve);
+                CoincidentShare there;
+                if (view_.cut_outs && !show(c.curve, c.curve.parameter(s), there)) return true;
                 return visible = coincidence_.add(c, c.curve.parameter(s));
             }
             for (const int32_t f : faces) {

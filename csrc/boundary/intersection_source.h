@@ -21,6 +21,7 @@
 #include "backward/view.h"
 #include "boundary/curve_source.h"
 #include "scene/intersections.h"
+#include "shading/cut_outs.h"
 
 namespace edgegrad {
 
@@ -86,6 +87,7 @@ class IntersectionSource {
         // A face seen edge-on has no image.
         bool visible = std::isfinite(place.scale);
         for (const Plane& plane : place.plane) visible &= view_.camera.along_ray(plane.normal, sample.n) != 0;
+        for (const SurfacePoint& p : sample.side) visible &= shows(view_.scene, p.face, p.b);
         if (!visible) places_ -= another;
         return visible;
     }
@@ -105,6 +107,7 @@ class IntersectionSource {
     }
 
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
+        if (!direction.moves()) return {};
         const Place& place = place_[sample.place];
         const double z = sample.point.z;
         const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);

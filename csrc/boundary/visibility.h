@@ -37,7 +37,9 @@ class Visibility {
     // moved off that face by as much as floats may err.
     int32_t beyond_float(const CurveSample& sample, int32_t face) const {
         const Vec2 n = sample.n;
-        const auto decide = [&](int32_t f) { return lies_far_before(view_, f, sample.point.z) || meets(view_, f, n); };
+        const auto decide = [&](int32_t f) {
+            return lies_far_before(view_, f, sample.point.z) ? is_there(view_, f, n) : meets(view_, f, n);
+        };
         if (face < 0 || decide(face)) return face;
         std::vector<int32_t> ignored(sample.ignored.begin(), sample.ignored.end());
         CameraRays rays(view_.frame);
@@ -54,7 +56,7 @@ class Visibility {
             ignored.insert(std::upper_bound(ignored.begin(), ignored.end(), face), face);
             const std::span<const int32_t> all[2] = {ignored, ignored};
             rays.prepare();
-            view_.geometry.caster().cast(rays, all);
+            view_.frame.cast(rays, all);
             face = rays.face[0];
             if (const int32_t other = rays.face[1]; other >= 0 && decide(other))
                 if (const double z = depth_of(view_, other, n); z < depth) nearest = other, depth = z;

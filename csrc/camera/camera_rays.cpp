@@ -5,8 +5,9 @@
 
 namespace edgegrad {
 
-CameraFrame::CameraFrame(const RayCaster& caster, const Camera& camera)
+CameraFrame::CameraFrame(const RayCaster& caster, const Camera& camera, const SeenThrough* through)
     : caster_(caster),
+      through_(through),
       frame_(caster.frame()),
       axis_x_(camera.R_inverse * Vec3{1, 0, 0}),
       axis_y_(camera.R_inverse * Vec3{0, 1, 0}),
@@ -15,6 +16,11 @@ CameraFrame::CameraFrame(const RayCaster& caster, const Camera& camera)
       perspective_(camera.perspective),
       far_(!camera.perspective || frame_.is_far(eye_)),
       straight_(camera.is_straight()) {}
+
+void CameraFrame::cast(CameraRays& rays, const RayCaster::Ignored* ignored) const {
+    if (through_) cast_through(rays, ignored, [](int32_t) { return true; });
+    else caster_.cast(rays, ignored);
+}
 
 double CameraFrame::error(Vec3 p) const {
     // Positions are rounded as far from the centre as they are; rays where they start: see prepare().

@@ -9,10 +9,29 @@
 
 namespace edgegrad {
 
+// What rays pass through: faces that are not there where the ray at n meets them (shading/cut_outs.h).
+class SeenThrough {
+   public:
+    virtual bool shows(int32_t face, Vec2 n) const = 0;
+
+   protected:
+    ~SeenThrough() = default;
+};
+
+class CameraRays;
+
 // A camera in the frame of a ray structure.
 class CameraFrame {
    public:
-    CameraFrame(const RayCaster& caster, const Camera& camera);
+    // `through`: null if all faces are there everywhere.
+    CameraFrame(const RayCaster& caster, const Camera& camera, const SeenThrough* through);
+
+    // The nearest face along each ray that is there, of those that the ray does not ignore.
+    void cast(CameraRays& rays, const RayCaster::Ignored* ignored = nullptr) const;
+
+    // The same through what `meets(face)` refuses.
+    template <class Meets>
+    void cast_through(CameraRays& rays, const RayCaster::Ignored* ignored, Meets meets) const;
 
     // World units by which a ray may miss a point p that it was aimed at: a few roundings of what Embree is given.
     double error(Vec3 p) const;
@@ -26,6 +45,7 @@ class CameraFrame {
    private:
     friend class CameraRays;
     const RayCaster& caster_;
+    const SeenThrough* through_;
     RayFrame frame_;
     Vec3 axis_x_, axis_y_, axis_z_;  // of the camera, in world coordinates times whatever scale they have
     Vec3 eye_;
@@ -56,12 +76,23 @@ class CameraRays : public RayBatch {
 };
 
 template <class Meets>
+void CameraFrame::cast_through(CameraRays& rays, const RayCaster::Ignored* ignored, Meets meets) const {
+    // The rays of a packet mostly ask for the same face together.
+    int32_t latest = -1;
+    bool met = false;
+    caster_.cast_through(rays, ignored, [&](int ray, int32_t face) {
+        if (face != latest) latest = face, met = meets(face);
+        return met && (!through_ || through_->shows(face, rays.n(ray)));
+    });
+}
+
+template <class Meets>
 int32_t CameraFrame::beyond_float(Vec2 n, int32_t face, RayCaster::Ignored ignored, Meets meets) const {
     if (face < 0 || meets(face)) return face;
     CameraRays ray(*this);
     ray.n_x[0] = n.x, ray.n_y[0] = n.y, ray.count = 1;
     ray.prepare();
-    caster_.cast_through(ray, &ignored, meets);
+    cast_through(ray, &ignored, meets);
     return ray.face[0];
 }
 

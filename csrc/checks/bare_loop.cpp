@@ -12,7 +12,7 @@ namespace edgegrad {
 double bare_loop(const Camera& camera, const RayCaster& caster, const ImageOptions& o, int packet_width, Team& team) {
     constexpr int tile = 16;
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + tile - 1) / tile;
-    const CameraFrame frame(caster, camera);
+    const CameraFrame frame(caster, camera, nullptr);
     const PixelRays pixel_rays(camera, o);
     std::vector<double> seconds(int64_t(tiles_x) * tiles_y);
     team.each_with(

@@ -33,7 +33,7 @@ struct Scene {
     std::vector<int32_t> faces, corners, face_texture;
     std::vector<T> colors, texels, background;
     std::vector<double> uvs{0.1, 0.0, 1.2, 0.1, 1.1, 0.9, -0.1, 1.0};
-    std::vector<int64_t> textures{0, 16, 8};
+    std::vector<int64_t> textures{0, 16, 8, 0, 0, 0};
 
     Scene() : texels(16 * 8 * channels), background(width * height * channels) {
         for (size_t i = 0; i < texels.size(); ++i) texels[i] = T(hash(i, 1, 1) % 256) / 255;

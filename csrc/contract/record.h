@@ -49,6 +49,13 @@ struct CurveRecords {
     std::vector<int64_t> row_of;        // (R,): the sample of each row
     std::vector<int32_t> vertex;        // (R,)
     std::vector<double> by_q;           // (R, 3) velocity by the vertex in camera coordinates
+    // Of steps within faces: rows by texture coordinates and by alpha texels.
+    std::vector<int64_t> uv_row_of;     // (P,): the sample of each row
+    std::vector<int32_t> uv;            // (P,)
+    std::vector<double> by_uv;          // (P, 2)
+    std::vector<int64_t> alpha_row_of;  // (Q,): the sample of each row
+    std::vector<int64_t> alpha;         // (Q,)
+    std::vector<double> by_alpha;       // (Q,)
 
     int64_t size() const { return int64_t(x.size()) / 2; }
     void add(const CurveRecords& o);
@@ -96,8 +103,12 @@ inline void SurfaceRecords::add(const SurfaceRecords& o) {
 inline void CurveRecords::add(const CurveRecords& o) {
     const int64_t before = size();
     append(x, o.x), append(face, o.face), append(b, o.b), append(factor, o.factor), append(by_k, o.by_k);
-    for (const int64_t i : o.row_of) row_of.push_back(before + i);
-    append(vertex, o.vertex), append(by_q, o.by_q);
+    const auto append_rows = [&](std::vector<int64_t>& to, const std::vector<int64_t>& from) {
+        for (const int64_t i : from) to.push_back(before + i);
+    };
+    append_rows(row_of, o.row_of), append(vertex, o.vertex), append(by_q, o.by_q);
+    append_rows(uv_row_of, o.uv_row_of), append(uv, o.uv), append(by_uv, o.by_uv);
+    append_rows(alpha_row_of, o.alpha_row_of), append(alpha, o.alpha), append(by_alpha, o.by_alpha);
 }
 
 }  // namespace edgegrad

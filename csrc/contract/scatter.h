@@ -32,6 +32,7 @@ class RowBuffer {
     void prepare(int width, int owners) {
         if (recent_.empty()) width_ = width, rows_.resize(owners), recent_.resize(n_recent);
     }
+    bool is_wanted() const { return !recent_.empty(); }
     void clear() {
         bool any = false;
         for (Rows& r : rows_) any |= r.count > 0, r.count = 0;
@@ -99,7 +100,7 @@ class RowBuffer {
 
 // What the samples of one chunk give.
 struct ChunkGrad {
-    RowBuffer q, x, colors, uvs, texels;  // vertices: q in camera coordinates, x in the image
+    RowBuffer q, x, colors, uvs, texels, alphas;  // vertices: q in camera coordinates, x in the image
     RowBuffer vertex_attributes, face_attributes;
     RowBuffer pixels;  // of what has the size of the image
     IntrinsicsGrad k;
@@ -108,7 +109,7 @@ struct ChunkGrad {
 
 // Where it goes; null where none is wanted.
 struct Destination {
-    double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr;
+    double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr, *alphas = nullptr;
     double *vertex_attributes = nullptr, *face_attributes = nullptr, *pixels = nullptr;
     int pixel_width = 0;  // numbers a pixel
     IntrinsicsGrad k = {};
@@ -128,6 +129,7 @@ constexpr RowSlot row_slots[] = {{&ChunkGrad::q, &Destination::q, 3},
                                  {&ChunkGrad::colors, &Destination::colors, as_radiance},
                                  {&ChunkGrad::uvs, &Destination::uvs, 2},
                                  {&ChunkGrad::texels, &Destination::texels, as_radiance},
+                                 {&ChunkGrad::alphas, &Destination::alphas, 1},
                                  {&ChunkGrad::vertex_attributes, &Destination::vertex_attributes, as_vertex_attributes},
                                  {&ChunkGrad::face_attributes, &Destination::face_attributes, as_face_attributes},
                                  {&ChunkGrad::pixels, &Destination::pixels, as_pixels}};

@@ -78,12 +78,11 @@ constexpr int tile = 16;
 template <int N, class T>
 class PixelRow {
    public:
-    PixelRow(const SceneView<T>& scene, const std::deque<Side>& sides, const RayCaster& caster,
-             const ImageOptions& options, Team& team, T* image, const HitBuffers<T>& out)
+    PixelRow(const SceneView<T>& scene, const std::deque<Side>& sides, const ImageOptions& options, Team& team,
+             T* image, const HitBuffers<T>& out)
         : scene_(scene),
           sides_(sides),
           side_(&sides.front()),
-          caster_(caster),
           spp_(options.spp),
           radius_(options.filter.radius()),
           team_(team),
@@ -164,7 +163,7 @@ class PixelRow {
     void trace() {
         if (++traced_ % 16 == 0) team_.check();
         rays_.prepare();
-        caster_.cast(rays_);
+        side_->frame.cast(rays_);
         if (scene_.n_faces > in_cache) prefetch_faces();
         int i = 0;
         for (int p = 0; p < parts_; ++p) {
@@ -263,7 +262,7 @@ class PixelRow {
     // Casts the rays again, through the faces whose plane holds the eye. What the others hit stays the same.
     void cast_beyond() {
         rays_.prepare();
-        caster_.cast_through(rays_, nullptr, [&](int32_t face) { return !is_unseen(face); });
+        side_->frame.cast_through(rays_, nullptr, [&](int32_t face) { return !is_unseen(face); });
     }
 
     bool is_unseen(int32_t face) const {
@@ -294,7 +293,6 @@ class PixelRow {
     const SceneView<T>& scene_;
     const std::deque<Side>& sides_;
     const Side* side_;  // of the rays
-    const RayCaster& caster_;
     const int spp_;
     const double radius_;  // of the filter
     Team& team_;
@@ -391,8 +389,7 @@ void render_pixels(const SceneView<T>& scene, const std::deque<Side>& sides, con
     const int unit = std::min(tile, RayBatch::size / std::gcd(RayBatch::size, o.spp));
     const ReachablePixels reachable(camera, caster, sides.front().q, o.filter.radius() - 0.5, team);
     team.each_with(
-        int64_t(tiles_x) * tiles_y,
-        [&] { return std::make_unique<PixelRow<N, T>>(scene, sides, caster, o, team, image, out); },
+        int64_t(tiles_x) * tiles_y, [&] { return std::make_unique<PixelRow<N, T>>(scene, sides, o, team, image, out); },
         [&](PixelRow<N, T>& row, int64_t t) {
             const int x0 = int(t % tiles_x) * tile, x1 = std::min(x0 + tile, camera.width);
             const int y0 = int(t / tiles_x) * rows, y1 = std::min(y0 + rows, camera.height);
@@ -410,7 +407,7 @@ void render_pixels(const SceneView<T>& scene, const std::deque<Side>& sides, con
 template <class T>
 void render_forward(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o,
                     Team& team, T* image, const HitBuffers<T>& out) {
-    const std::deque<Side> sides = make_sides(camera, scene.verts, scene.n_verts, caster, o, team);
+    const std::deque<Side> sides = make_sides(scene, camera, caster, o, team);
     std::fill(out.seen, out.seen + scene.n_faces, uint8_t(0));
     dispatch_channels(scene.channels, scene.channels > scene.radiance,
                       [&]<int N>() { render_pixels<N>(scene, sides, caster, o, team, image, out); });

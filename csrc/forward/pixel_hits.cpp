@@ -18,12 +18,11 @@ namespace {
 template <class T>
 class HitRow {
    public:
-    HitRow(const SceneView<T>& scene, const std::deque<Side>& sides, const RayCaster& caster,
-           const ImageOptions& options, const HitBuffers<T>& out, Team& team)
+    HitRow(const SceneView<T>& scene, const std::deque<Side>& sides, const ImageOptions& options,
+           const HitBuffers<T>& out, Team& team)
         : scene_(scene),
           sides_(sides),
           side_(&sides.front()),
-          caster_(caster),
           options_(options),
           out_(out),
           team_(team),
@@ -74,11 +73,11 @@ class HitRow {
     void cast(PixelHits& to) {
         team_.check();
         rays_.prepare();
-        caster_.cast(rays_);
+        side_->frame.cast(rays_);
         // A face whose plane holds the eye shows nothing.
         if (std::any_of(rays_.face, rays_.face + rays_.count, [&](int32_t f) { return f >= 0 && !is_known(f); })) {
             rays_.prepare();
-            caster_.cast_through(rays_, nullptr, [&](int32_t face) { return !is_unseen(face); });
+            side_->frame.cast_through(rays_, nullptr, [&](int32_t face) { return !is_unseen(face); });
         }
         int i = 0;
         for (int p = 0; p < parts_; ++p) {
@@ -143,7 +142,6 @@ class HitRow {
     const SceneView<T>& scene_;
     const std::deque<Side>& sides_;
     const Side* side_;  // the one that is looked through
-    const RayCaster& caster_;
     const ImageOptions& options_;
     const HitBuffers<T>& out_;
     Team& team_;
@@ -171,10 +169,10 @@ class HitRow {
 template <class T>
 PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                           const ImageOptions& options, int first, int end, Team& team, const HitBuffers<T>& out) {
-    const std::deque<Side> sides = make_sides(camera, scene.verts, scene.n_verts, caster, options, team);
+    const std::deque<Side> sides = make_sides(scene, camera, caster, options, team);
     std::vector<PixelHits> rows(end - first);
     team.each_with(
-        end - first, [&] { return std::make_unique<HitRow<T>>(scene, sides, caster, options, out, team); },
+        end - first, [&] { return std::make_unique<HitRow<T>>(scene, sides, options, out, team); },
         [&](HitRow<T>& row, int64_t k) { row.find(first + int(k), rows[k]); });
     PixelHits all;
     size_t n = 0;

@@ -7,6 +7,7 @@
 #include "camera/camera_rays.h"
 #include "camera/vertices.h"
 #include "camera/windows.h"
+#include "shading/cut_outs.h"
 #include "shading/surface.h"
 
 namespace edgegrad {
@@ -27,10 +28,10 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
                   Team& team) {
     PlaceHits out;
     out.face.assign(places.size, -1), out.part.assign(places.size, -1), out.b.assign(2 * places.size, 0.0);
-    const RayCaster& caster = geometry.caster();
     for (const Camera& side : sides_of(camera)) {
         const Array<Vec3> q = camera_vertices(side, scene.verts, scene.n_verts, team);
-        const CameraFrame frame(caster, side);
+        const CutOuts<T> cut_outs(scene, side, q.data());
+        const CameraFrame frame(geometry.caster(), side, scene.cut_outs.face ? &cut_outs : nullptr);
         const auto corners = [&](int32_t face) {
             const int32_t* v = scene.faces + 3 * int64_t(face);
             return std::array<Vec3, 3>{q[v[0]], q[v[1]], q[v[2]]};
@@ -43,7 +44,7 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
             int64_t place[RayBatch::size];
             const auto cast = [&] {
                 rays.prepare();
-                caster.cast(rays);
+                frame.cast(rays);
                 for (int i = 0; i < rays.count; ++i) {
                     const int32_t face = frame.beyond_float(rays.n(i), rays.face[i], {}, is_seen);
                     if (face < 0) continue;
@@ -76,7 +77,8 @@ RayRecords rays_at(const Camera& camera, const Places& places, Team& team) {
             const Camera* window = &sides.front();
             Vec2 n = nowhere;
             for (const Camera& side : sides)
-                if (const Vec2 here = through(side, places[k]); std::isfinite(here.x + here.y)) window = &side, n = here;
+                if (const Vec2 here = through(side, places[k]); std::isfinite(here.x + here.y))
+                    window = &side, n = here;
             append_ray(*window, n, to.along, to.along_by_k, &to.along_by_x);
         }
     });

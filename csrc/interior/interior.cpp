@@ -66,7 +66,7 @@ class InteriorChunk {
    private:
     void cast() {
         rays_.prepare();
-        view_.geometry.caster().cast(rays_);
+        view_.frame.cast(rays_);
         for (int i = 0; i < rays_.count; ++i) contraction_.add(i, sample_[i], rays_.n(i), is_visible(i));
         rays_.count = 0;
     }
@@ -77,6 +77,7 @@ class InteriorChunk {
         const int32_t own = sample_[i].face;
         if (rays_.face[i] == own) return true;
         const Vec2 n = rays_.n(i);
+        if (!is_there(view_, own, n)) return false;
         const double depth = depth_of(view_, own, n);
         const auto far_before = [&](int32_t face) { return lies_far_before(view_, face, depth); };
         const auto decide = [&](int32_t face) { return face == own || far_before(face) || meets(view_, face, n); };
@@ -166,7 +167,7 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
                 sobol.fill(place + done, rays.count, rays.n_x, rays.n_y);
                 place_in_pixel(view.camera, view.image.filter, x, y, rays.count, rays.n_x, rays.n_y);
                 rays.prepare();
-                view.geometry.caster().cast(rays);
+                view.frame.cast(rays);
                 for (int i = 0; i < rays.count; ++i) {
                     const int32_t face = rays.face[i];
                     if (face < 0 || (faces && !faces[face])) continue;

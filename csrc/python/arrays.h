@@ -14,6 +14,7 @@
 #include "python/checks.h"
 #include "python/unlocked.h"
 #include "scene/geometry.h"
+#include "shading/texture.h"
 
 namespace edgegrad {
 
@@ -53,13 +54,20 @@ struct SceneArrays {
     In<T, 2> texels;
     In<int64_t, 2> textures;
     In<int32_t, 1> face_texture;
+    In<int32_t, 2> uv_corners;  // (F, 3) or (0, 3)
+    In<T, 2> alphas;
+    In<int64_t, 2> cut_outs;
+    In<int32_t, 1> face_cut_out;
     In<T, 3> background;  // (1, 1, C) or (H, W, C)
+    std::vector<double> cutoffs;
     Spacing spacing;
     bool by_vertex = false;
 
     SceneArrays(In<double, 2> verts_, In<int32_t, 2> faces_, In<int32_t, 2> corners_, In<T, 2> colors_,
                 In<double, 2> uvs_, In<T, 2> texels_, In<int64_t, 2> textures_, In<int32_t, 1> face_texture_,
-                In<T, 3> background_, const std::vector<double>& spacing_, int threads)
+                In<int32_t, 2> uv_corners_, In<T, 2> alphas_, In<int64_t, 2> cut_outs_, In<int32_t, 1> face_cut_out_,
+                In<T, 3> background_, const std::vector<double>& cutoffs_, const std::vector<double>& spacing_,
+                int threads)
         : verts(verts_),
           faces(faces_),
           corners(corners_),
@@ -68,7 +76,12 @@ struct SceneArrays {
           texels(texels_),
           textures(textures_),
           face_texture(face_texture_),
+          uv_corners(uv_corners_),
+          alphas(alphas_),
+          cut_outs(cut_outs_),
+          face_cut_out(face_cut_out_),
           background(background_),
+          cutoffs(cutoffs_),
           spacing(make_spacing(spacing_)) {
         const auto width = [](const char* name, size_t got, size_t expected) {
             if (got != expected)
@@ -78,15 +91,19 @@ struct SceneArrays {
         const size_t R = colors.shape(1);
         width("verts", verts.shape(1), 3), width("faces", faces.shape(1), 3), width("corners", corners.shape(1), 3);
         width("uvs", uvs.shape(1), 2), width("texels", texels.shape(1), R);
-        width("textures", textures.shape(1), 3);
+        width("textures", textures.shape(1), texture_columns);
+        width("uv_corners", uv_corners.shape(1), 3), width("alpha", alphas.shape(1), 1);
+        width("cut_outs", cut_outs.shape(1), texture_columns);
         if (corners.shape(0) != faces.shape(0)) refuse("corners: expected one row a face");
         if (faces.shape(0) == 0 || verts.shape(0) == 0) refuse("faces: expected at least one face, got none");
         check_finite("verts", verts.data(), verts.size(), 3, threads);
         check_finite("colors", colors.data(), colors.size(), R, threads);
         check_finite("uvs", uvs.data(), uvs.size(), 2, threads);
         check_finite("texture", texels.data(), texels.size(), R, threads);
+        check_finite("alpha", alphas.data(), alphas.size(), 1, threads);
         check_finite("background", background.data(), background.size(), background.shape(2), threads);
         check_indices("faces", faces.data(), faces.size(), verts.shape(0), "verts", threads);
+        check_cut_outs(threads);
         const bool textured = textures.shape(0) > 0;
         if (!textured) {
             // Colours of vertices are indexed by the faces, or by a copy of them.
@@ -98,11 +115,7 @@ struct SceneArrays {
             return;
         }
         if (face_texture.shape(0) != faces.shape(0)) refuse("face_texture: expected one number a face");
-        for (size_t i = 0; i < textures.shape(0); ++i) {
-            const int64_t first = textures(i, 0), h = textures(i, 1), w = textures(i, 2);
-            if (h < 1 || w < 1 || first < 0 || first + h * w > int64_t(texels.shape(0)))
-                refuse("textures: row " + std::to_string(i) + " lies outside the texels");
-        }
+        check_textures("textures", textures, int64_t(texels.shape(0)));
         for (size_t f = 0; f < faces.shape(0); ++f) {
             if (face_texture(f) >= int64_t(textures.shape(0)))
                 refuse("face_texture: expected a texture's number, got " + std::to_string(face_texture(f)));
@@ -121,11 +134,7 @@ struct SceneArrays {
             refuse("face_attributes: expected one row a face");
         check_finite("vertex_attributes", a.vertex, channels.vertex.size(), a.vertex_width, threads);
         check_finite("face_attributes", a.face, channels.face.size(), a.face_width, threads);
-        bool all_textured = textures.shape(0) > 0;
-        if (a.uv && all_textured)
-            all_textured = std::all_of(face_texture.data(), face_texture.data() + face_texture.size(),
-                                       [](int32_t texture) { return texture >= 0; });
-        if (a.uv && !all_textured) refuse("uv: expected a texture on all faces");
+        if (a.uv && !all_have_uvs()) refuse("uv: expected texture coordinates of all faces");
         return view_of(a);
     }
 
@@ -135,14 +144,58 @@ struct SceneArrays {
     }
 
    private:
+    void check_textures(const char* name, const In<int64_t, 2>& table, int64_t texels) const {
+        for (size_t i = 0; i < table.shape(0); ++i) {
+            const int64_t first = table(i, 0), h = table(i, 1), w = table(i, 2);
+            if (h < 1 || w < 1 || first < 0 || first + h * w > texels)
+                refuse(std::string(name) + ": row " + std::to_string(i) + " lies outside the texels");
+            if (Sampler s = texture_at<T>(nullptr, table.data(), int64_t(i)).sampler;
+                s.u < Wrap::repeat || s.u > Wrap::mirror || s.v < Wrap::repeat || s.v > Wrap::mirror ||
+                s.filter < TextureFilter::linear || s.filter > TextureFilter::nearest)
+                refuse(std::string(name) + ": row " + std::to_string(i) + " has an unknown wrap or filter");
+        }
+    }
+
+    void check_cut_outs(int threads) const {
+        const size_t F = faces.shape(0), own = uv_corners.shape(0);
+        if (own != 0 && own != F) refuse("uv_corners: expected one row a face");
+        if (own != 0 && !all_pass(uv_corners.data(), uv_corners.size(), threads, [&](const int32_t* v, int64_t n) {
+                return std::all_of(v, v + n, [&](int32_t i) { return i >= -1 && i < int64_t(uvs.shape(0)); });
+            }))
+            refuse("uv_faces: expected indices from 0 to " + std::to_string(int64_t(uvs.shape(0)) - 1) +
+                   " (rows of uvs)");
+        if (cutoffs.size() != cut_outs.shape(0)) refuse("cutoffs: expected one number a cut-out");
+        check_textures("cut_outs", cut_outs, int64_t(alphas.shape(0)));
+        if (cut_outs.shape(0) == 0) return;
+        if (face_cut_out.shape(0) != F || own == 0) refuse("face_cut_out: expected one number a face, and uv_corners");
+        for (size_t f = 0; f < F; ++f) {
+            if (face_cut_out(f) >= int64_t(cut_outs.shape(0)))
+                refuse("face_cut_out: expected a cut-out's number, got " + std::to_string(face_cut_out(f)));
+            for (int i = 0; i < 3; ++i)
+                if (face_cut_out(f) >= 0 && uv_corners(f, i) < 0)
+                    refuse("uv_faces: expected indices from 0 to " + std::to_string(int64_t(uvs.shape(0)) - 1) +
+                           " (rows of uvs), got another at " + at(3 * int64_t(f) + i, 3));
+        }
+    }
+
+    bool all_have_uvs() const {
+        if (uv_corners.shape(0) > 0)
+            return std::all_of(uv_corners.data(), uv_corners.data() + uv_corners.size(),
+                               [](int32_t row) { return row >= 0; });
+        return textures.shape(0) > 0 && std::all_of(face_texture.data(), face_texture.data() + face_texture.size(),
+                                                    [](int32_t texture) { return texture >= 0; });
+    }
+
     SceneView<T> view_of(const Attributes& attributes) const {
         if (background.shape(2) != colors.shape(1) + attributes.channels())
             refuse("background: expected one number for each channel");
+        const int32_t* of_corners =
+            by_vertex ? faces.data() : corners.data();  // one array: neighbours agree (may_jump)
         return {verts.data(),
                 int64_t(verts.shape(0)),
                 faces.data(),
                 int64_t(faces.shape(0)),
-                by_vertex ? faces.data() : corners.data(),  // one array: neighbours agree at their edge (may_jump)
+                of_corners,
                 colors.data(),
                 int64_t(colors.shape(0)),
                 uvs.data(),
@@ -156,7 +209,10 @@ struct SceneArrays {
                 int(background.shape(2)),
                 &spacing,
                 attributes,
-                int(colors.shape(1))};
+                int(colors.shape(1)),
+                uv_corners.shape(0) ? uv_corners.data() : of_corners,
+                {alphas.data(), int64_t(alphas.shape(0)), cut_outs.data(), cutoffs.data(),
+                 cut_outs.shape(0) ? face_cut_out.data() : nullptr}};
     }
 };
 

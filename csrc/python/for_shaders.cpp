@@ -66,6 +66,10 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
     curves["by_k"] = rows(std::move(c.by_k), {intrinsics_width});
     curves["row_of"] = rows(std::move(c.row_of)), curves["vertex"] = rows(std::move(c.vertex));
     curves["by_q"] = rows(std::move(c.by_q), {3});
+    curves["uv_row_of"] = rows(std::move(c.uv_row_of)), curves["uv"] = rows(std::move(c.uv));
+    curves["by_uv"] = rows(std::move(c.by_uv), {2});
+    curves["alpha_row_of"] = rows(std::move(c.alpha_row_of)), curves["alpha"] = rows(std::move(c.alpha));
+    curves["by_alpha"] = rows(std::move(c.by_alpha));
     return nb::make_tuple(surface, curves);
 }
 

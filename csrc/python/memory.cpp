@@ -13,6 +13,7 @@
 #include "backward/image_hits.h"
 #include "boundary/curve_measure.h"
 #include "boundary/meeting_parts.h"
+#include "boundary/steps.h"
 #include "camera/vertices.h"
 #include "camera/windows.h"
 #include "contract/scatter.h"
@@ -29,7 +30,7 @@ using Bytes = std::map<std::string, int64_t>;
 
 // Rows of the arrays of a scene, the image of one camera, and who works.
 struct PassSize {
-    int64_t verts, faces, colors, uvs, texels, pixels;
+    int64_t verts, faces, colors, uvs, texels, alphas, pixels;
     int radiance, vertex_attributes, face_attributes;  // widths
     int channels, number;                              // of the image; bytes of one number
     bool textured;
@@ -54,8 +55,8 @@ Bytes image_bytes(const PassSize& s, int64_t cameras) {
 
 // What of the gradient is wanted: that of what moves inside faces and at edges, and of the arrays of colours.
 struct GradientWork {
-    bool motion, boundary, colors, uvs, texels, vertex_attributes, face_attributes;
-    int64_t surface_samples, edge_samples, curves, intersections;  // −1: not known
+    bool motion, boundary, steps, colors, uvs, texels, alphas, vertex_attributes, face_attributes;
+    int64_t surface_samples, edge_samples, curves, intersections, step_lines;  // −1: not known
 };
 
 Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
@@ -66,7 +67,7 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         return RowBuffer::bytes({samples, primitives, each, destinations, width}, s.threads);
     };
     Bytes bytes;
-    if (interior || w.boundary) {
+    if (interior || w.boundary || w.steps) {
         bytes["view"] = word * s.pixels + s.verts * (VertexView::bytes_per_vertex + 3 * word * moves);
         bytes["ray structure"] = RayCaster::bytes(s.faces, s.verts);
     }
@@ -85,6 +86,16 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         if (w.vertex_attributes) samples += rows(n, s.faces, 3, s.vertex_attributes, s.verts);
         if (w.face_attributes) samples += rows(n, s.faces, 1, s.face_attributes, s.faces);
     }
+    if (w.steps) {
+        // A line meets a step in a few points; each moves three vertices, three texture coordinates and four alphas.
+        constexpr int64_t points = 4;
+        const int64_t lines = w.step_lines < 0 ? many / points : w.step_lines;
+        int64_t& steps = bytes["steps"];
+        steps = s.faces * lined_face_bytes;
+        if (moves) steps += points * rows(lines, s.faces, 3, 3, s.verts);
+        if (w.uvs) steps += points * rows(lines, s.faces, 3, 2, s.uvs);
+        if (w.alphas) steps += points * rows(lines, -1, 4, 1, s.alphas);
+    }
     if (w.boundary) {
         // Where all attributes are indexed like the vertices, curves are silhouettes: a quarter of a tangled mesh.
         const int64_t curves = w.curves < 0 ? s.edges() / (s.jumps ? 1 : 4) : w.curves;
@@ -102,30 +113,30 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
 
 void bind_memory(nb::module_& m) {
     nb::class_<PassSize>(m, "PassSize")
-        .def(nb::new_([](int64_t verts, int64_t faces, int64_t colors, int64_t uvs, int64_t texels, int64_t pixels,
-                         int radiance, int vertex_attributes, int face_attributes, int channels, int number,
-                         bool textured, bool jumps, int threads, int sides) {
+        .def(nb::new_([](int64_t verts, int64_t faces, int64_t colors, int64_t uvs, int64_t texels, int64_t alphas,
+                         int64_t pixels, int radiance, int vertex_attributes, int face_attributes, int channels,
+                         int number, bool textured, bool jumps, int threads, int sides) {
                  return PassSize{
-                     verts,           faces,    colors, uvs,      texels, pixels,  radiance, vertex_attributes,
+                     verts,           faces,    colors, uvs,      texels, alphas,  pixels, radiance, vertex_attributes,
                      face_attributes, channels, number, textured, jumps,  threads, sides};
              }),
-             nb::kw_only(), "verts"_a, "faces"_a, "colors"_a, "uvs"_a, "texels"_a, "pixels"_a, "radiance"_a,
+             nb::kw_only(), "verts"_a, "faces"_a, "colors"_a, "uvs"_a, "texels"_a, "alphas"_a, "pixels"_a, "radiance"_a,
              "vertex_attributes"_a, "face_attributes"_a, "channels"_a, "number"_a, "textured"_a, "jumps"_a, "threads"_a,
              "sides"_a);
     m.def("image_bytes", &image_bytes, "size"_a, "cameras"_a);
     m.def(
         "gradient_bytes",
-        [](const PassSize& size, bool motion, bool boundary, const std::vector<std::string>& wanted,
-           int64_t surface_samples, int64_t edge_samples, int64_t curves, int64_t intersections) {
+        [](const PassSize& size, bool motion, bool boundary, bool steps, const std::vector<std::string>& wanted,
+           int64_t surface_samples, int64_t edge_samples, int64_t curves, int64_t intersections, int64_t step_lines) {
             const auto is = [&](const char* name) {
                 return std::find(wanted.begin(), wanted.end(), name) != wanted.end();
             };
-            return gradient_bytes(size,
-                                  {motion, boundary, is("colors"), is("uvs"), is("texels"), is("vertex_attributes"),
-                                   is("face_attributes"), surface_samples, edge_samples, curves, intersections});
+            return gradient_bytes(size, {motion, boundary, steps, is("colors"), is("uvs"), is("texels"), is("alphas"),
+                                         is("vertex_attributes"), is("face_attributes"), surface_samples, edge_samples,
+                                         curves, intersections, step_lines});
         },
-        "size"_a, nb::kw_only(), "motion"_a, "boundary"_a, "wanted"_a, "surface_samples"_a = -1, "edge_samples"_a = -1,
-        "curves"_a = -1, "intersections"_a = -1);
+        "size"_a, nb::kw_only(), "motion"_a, "boundary"_a, "steps"_a, "wanted"_a, "surface_samples"_a = -1,
+        "edge_samples"_a = -1, "curves"_a = -1, "intersections"_a = -1, "step_lines"_a = -1);
     // What samples leave in the pixels around them: at most nine, of a Gaussian.
     m.def(
         "pixel_row_bytes",

@@ -126,6 +126,9 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Chann
             {"curves", p.curves},
             {"edge rays", p.edge[0]},
             {"edge scatter", p.edge[1]},
+            {"step_lines", double(p.step_lines)},
+            {"step rays", p.step[0]},
+            {"step scatter", p.step[1]},
             {"world", p.world}};
 }
 
@@ -179,10 +182,12 @@ void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
     nb::class_<Scene> scene(m, scene_name);
     scene
         .def(nb::init<In<double, 2>, In<int32_t, 2>, In<int32_t, 2>, In<T, 2>, In<double, 2>, In<T, 2>, In<int64_t, 2>,
-                      In<int32_t, 1>, In<T, 3>, const std::vector<double>&, int>(),
+                      In<int32_t, 1>, In<int32_t, 2>, In<T, 2>, In<int64_t, 2>, In<int32_t, 1>, In<T, 3>,
+                      const std::vector<double>&, const std::vector<double>&, int>(),
              "verts"_a.noconvert(), "faces"_a.noconvert(), "corners"_a.noconvert(), "colors"_a.noconvert(),
              "uvs"_a.noconvert(), "texels"_a.noconvert(), "textures"_a.noconvert(), "face_texture"_a.noconvert(),
-             "background"_a.noconvert(), "spacing"_a, "threads"_a)
+             "uv_corners"_a.noconvert(), "alphas"_a.noconvert(), "cut_outs"_a.noconvert(), "face_cut_out"_a.noconvert(),
+             "background"_a.noconvert(), "cutoffs"_a, "spacing"_a, "threads"_a)
         .def("forward", &forward<T>, "camera"_a, "channels"_a, "options"_a, "threads"_a, "image"_a.noconvert(),
              "hits"_a)
         .def("faces_at_centers", &find_faces<T>, "camera"_a, "channels"_a, "threads"_a, "face"_a.noconvert())
@@ -231,11 +236,14 @@ NB_MODULE(_core, m) {
     nb::class_<ImageOptions>(m, "ImageOptions").def(nb::new_(&make_image_options), "spp"_a, "filter"_a, "seed"_a);
     nb::class_<GradientOptions>(m, "GradientOptions")
         .def(nb::new_([](uint64_t seed, int64_t surface_samples, int64_t edge_samples, bool interior_geometry,
-                         bool boundary, bool dry) {
-                 return GradientOptions{surface_samples, edge_samples, seed, interior_geometry, boundary, dry, !dry};
+                         bool boundary, bool steps, double step_spacing, bool dry) {
+                 return GradientOptions{surface_samples, edge_samples, seed, interior_geometry, boundary, steps,
+                                        step_spacing,    dry,          !dry};
              }),
              "seed"_a, nb::kw_only(), "surface_samples"_a = -1, "edge_samples"_a = -1, "interior_geometry"_a = true,
-             "boundary"_a = true, "dry"_a = false);
+             "boundary"_a = true, "steps"_a = true, "step_spacing"_a = 1.0, "dry"_a = false);
+    m.attr("WRAPS") = nb::make_tuple(wrap_names[0], wrap_names[1], wrap_names[2]);
+    m.attr("TEXTURE_FILTERS") = nb::make_tuple(texture_filter_names[0], texture_filter_names[1]);
     std::vector<std::string> slots;
     for (const auto& slot : gradient_slots<double>) slots.push_back(slot.name);
     m.attr("GRADIENT_SLOTS") = nb::tuple(nb::cast(slots));

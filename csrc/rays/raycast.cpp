@@ -360,12 +360,11 @@ struct ValidLanes {
 } constexpr valid_lanes;
 
 struct RejectContext {
-    RayQueryContext query;                          // first, so that a pointer to it is a pointer to this
-    const RayCaster::Ignored* ignored;              // by ray, or null
-    bool (*meets)(const void* data, int32_t face);  // or null
+    RayQueryContext query;                                   // first, so that a pointer to it is a pointer to this
+    const RayCaster::Ignored* ignored;                       // by ray, or null
+    bool (*meets)(const void* data, int ray, int32_t face);  // or null
     const void* data;
-    int32_t face = -1;  // that was asked for last, and the answer: the rays of a packet mostly ask together
-    bool is_met = false;
+    int first = 0;  // of the packet's rays in the batch
 };
 
 void reject(const FilterArguments* a) {
@@ -382,10 +381,7 @@ void reject(const FilterArguments* a) {
             found = ignored.size() > 16 ? std::binary_search(ignored.begin(), ignored.end(), f)
                                         : std::find(ignored.begin(), ignored.end(), f) != ignored.end();
         }
-        if (!found && context->meets) {
-            if (context->face != f) context->face = f, context->is_met = context->meets(context->data, f);
-            found = !context->is_met;
-        }
+        if (!found && context->meets) found = !context->meets(context->data, context->first + int(id[i]), f);
         if (found) a->valid[i] = 0;
     }
 }
@@ -401,6 +397,7 @@ void RayCaster::trace(RayBatch& batch, Query query, const Ignored* ignored, cons
     const auto each = [&](auto& packets, int width, auto ask) {
         for (int k = 0; k < batch.count; k += width) {
             if (ignored) context.ignored = ignored + k;
+            context.first = k;
             ask(valid_lanes.first[std::min(width, batch.count - k)], static_cast<Scene>(scene_), &packets[k / width],
                 &arguments);
         }

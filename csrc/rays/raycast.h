@@ -98,9 +98,9 @@ class RayCaster {
     // The nearest face along each ray.
     void cast(RayBatch& batch, const Ignored* ignored = nullptr) const;
 
-    // The same through what `meets(face)` refuses.
+    // The same through what `meets(ray, face)` refuses; `ray` counts those of the batch.
     template <class Meets>
-    void cast_through(RayBatch& batch, const Ignored* ignored, Meets meets) const;
+    void cast_through(RayBatch& batch, const Ignored* ignored, const Meets& meets) const;
 
     // Whether a ray meets any face.
     void cast_occluded(RayBatch& batch, const Ignored* ignored = nullptr) const;
@@ -110,9 +110,9 @@ class RayCaster {
 
    private:
     enum class Query { closest, any };
-    // What `call(data, face)` says of each face that a ray might hit.
+    // What `call(data, ray, face)` says of each face that a ray might hit.
     struct Decision {
-        bool (*call)(const void* data, int32_t face);
+        bool (*call)(const void* data, int ray, int32_t face);
         const void* data;
     };
     void trace(RayBatch& batch, Query query, const Ignored* ignored, const Decision* meets) const;
@@ -160,9 +160,10 @@ class RayBatch {
 };
 
 template <class Meets>
-void RayCaster::cast_through(RayBatch& batch, const Ignored* ignored, Meets meets) const {
+void RayCaster::cast_through(RayBatch& batch, const Ignored* ignored, const Meets& meets) const {
     cast(batch, ignored,
-         {[](const void* data, int32_t face) -> bool { return (*static_cast<const Meets*>(data))(face); }, &meets});
+         {[](const void* data, int ray, int32_t face) -> bool { return (*static_cast<const Meets*>(data))(ray, face); },
+          &meets});
 }
 
 }  // namespace edgegrad

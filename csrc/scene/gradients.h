@@ -15,6 +15,7 @@ struct Slots {
     Number* colors = nullptr;
     Number* uvs = nullptr;
     Number* texels = nullptr;
+    Number* alphas = nullptr;
     Number* vertex_attributes = nullptr;
     Number* face_attributes = nullptr;
     Number* background = nullptr;
@@ -23,6 +24,8 @@ struct Slots {
     Number* distortion = nullptr;       // (8,), see lens.h
 
     bool geometry() const { return verts || world_to_camera || K || distortion; }
+    // What moves steps within faces.
+    bool steps() const { return geometry() || uvs || alphas; }
     bool appearance() const { return colors || uvs || texels || vertex_attributes || face_attributes; }
 };
 
@@ -48,6 +51,8 @@ inline constexpr GradientSlot<T> gradient_slots[] = {
     {"uvs", &Gradients::uvs, &Tangents::uvs, [](const SceneView<T>& s, int64_t) { return 2 * s.n_uvs; }},
     {"texels", &Gradients::texels, &Tangents::texels,
      [](const SceneView<T>& s, int64_t) { return s.radiance * s.n_texels; }},
+    {"alphas", &Gradients::alphas, &Tangents::alphas,
+     [](const SceneView<T>& s, int64_t) { return s.cut_outs.n_alphas; }},
     {"vertex_attributes", &Gradients::vertex_attributes, &Tangents::vertex_attributes,
      [](const SceneView<T>& s, int64_t) { return s.attributes.vertex_width * s.n_verts; }},
     {"face_attributes", &Gradients::face_attributes, &Tangents::face_attributes,

@@ -32,11 +32,38 @@ struct Attributes {
     const double* face = nullptr;  // (F, face_width) values of whole faces
     int face_width = 0;            // at most most_of_face
     bool barycentrics = false;     // 3
-    bool uv = false;               // 2, of textured faces
+    bool uv = false;               // 2, if all faces have texture coordinates
 
     static constexpr int most_of_face = 4;
 
     int channels() const { return alpha + vertex_width + face_width + 3 * barycentrics + 2 * uv; }
+};
+
+// How an image is looked up. Beyond its rim it is repeated, its outermost texels go on, or it is mirrored.
+enum class Wrap { repeat, clamp, mirror };
+enum class TextureFilter { linear, nearest };
+constexpr const char* wrap_names[] = {"repeat", "clamp", "mirror"};
+constexpr const char* texture_filter_names[] = {"linear", "nearest"};
+struct Sampler {
+    Wrap u = Wrap::repeat, v = Wrap::repeat;
+    TextureFilter filter = TextureFilter::linear;
+
+    bool operator==(const Sampler&) const = default;
+};
+
+// A row of a table of textures: first texel, height, width, and the sampler's three numbers.
+constexpr int texture_columns = 6;
+
+// Faces that are cut out where an alpha texture is below a cutoff (shading/cut_outs.h).
+template <class T>
+struct CutOutArrays {
+    const T* alphas = nullptr;  // (Y,) all alpha textures, row by row
+    int64_t n_alphas = 0;
+    const int64_t* textures = nullptr;  // (M, 6)
+    const double* cutoffs = nullptr;    // (M,)
+    const int32_t* face = nullptr;      // (F,) row of both, −1 for whole faces; null when there are no others
+
+    bool on(int64_t f) const { return face && face[f] >= 0; }
 };
 
 // A corner of a face refers to a row of `colors`, or, where the face carries a texture, to a row of `uvs`.
@@ -54,14 +81,16 @@ struct SceneView {
     int64_t n_uvs;
     const T* texels;  // (X, R) all textures, row by row
     int64_t n_texels;
-    const int64_t* textures;      // (N, 3) first texel, height, width
+    const int64_t* textures;      // (N, 6)
     const int32_t* face_texture;  // (F,) row of textures, −1 for none; null when the scene has no texture
     const T* background;          // (C,) or (H, W, C)
     bool background_is_image;
     int channels;  // C of the image: R of radiance, then the attributes
     const Spacing* spacing;
     Attributes attributes = {};
-    int radiance = channels;  // R
+    int radiance = channels;              // R
+    const int32_t* uv_corners = corners;  // (F, 3) rows of uvs, for faces that have any
+    CutOutArrays<T> cut_outs = {};
 
     const T* background_at(int64_t pixel) const {
         return background_is_image ? background + pixel * channels : background;

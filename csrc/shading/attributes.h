@@ -44,7 +44,7 @@ void each_attribute(const SceneView<T>& scene, const AttributeArrays& from, int6
     if (a.barycentrics)
         for (int i = 0; i < 3; ++i) visit(k++, i == 0 ? from.one : 0, i == 1 ? from.one : 0, i == 2 ? from.one : 0);
     if (a.uv) {
-        const int32_t* row = scene.corners + 3 * face;
+        const int32_t* row = scene.uv_corners + 3 * face;
         for (int i = 0; i < 2; ++i) {
             const auto at = [&](int corner) { return from.uvs ? from.uvs[2 * int64_t(row[corner]) + i] : 0; };
             visit(k++, at(0), at(1), at(2));
@@ -138,7 +138,7 @@ void add_attribute_rows(const SceneView<T>& scene, int64_t face, const double* r
         grad.face_attributes.add(face, sum);
     }
     if (to.uvs && a.uv)
-        for (int i = 0; i < 3; ++i) grad.uvs.template add<2>(scene.corners[3 * face + i], rows + (i + 1) * n - 2);
+        for (int i = 0; i < 3; ++i) grad.uvs.template add<2>(scene.uv_corners[3 * face + i], rows + (i + 1) * n - 2);
 }
 
 }  // namespace edgegrad

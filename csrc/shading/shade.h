@@ -12,6 +12,7 @@
 #include "scene/gradients.h"
 #include "scene/scene.h"
 #include "shading/attributes.h"
+#include "shading/cut_outs.h"
 #include "shading/surface.h"
 #include "shading/texture.h"
 
@@ -24,16 +25,14 @@ bool is_textured(const SceneView<T>& scene, int64_t face) {
 
 template <class T>
 Texture<T> texture_of(const SceneView<T>& scene, int64_t face) {
-    const int64_t* row = scene.textures + 3 * int64_t(scene.face_texture[face]);
-    return {scene.texels, row[0], row[1], row[2]};
+    return texture_at(scene.texels, scene.textures, scene.face_texture[face]);
 }
 
+// Whether the nearest texel is taken on a face, of its texture or of its alpha.
 template <class T>
-Vec2 interpolated_uv(const SceneView<T>& scene, int64_t face, Barycentrics b) {
-    const int32_t* row = scene.corners + 3 * face;
-    const auto uv = [&](int i) { return Vec2{scene.uvs[2 * int64_t(row[i])], scene.uvs[2 * int64_t(row[i]) + 1]}; };
-    const Vec2 uv0 = uv(0);
-    return uv0 + b.u * (uv(1) - uv0) + b.v * (uv(2) - uv0);
+bool takes_nearest(const SceneView<T>& scene, int64_t face) {
+    return (is_textured(scene, face) && texture_of(scene, face).sampler.filter == TextureFilter::nearest) ||
+           (scene.cut_outs.on(face) && alpha_of(scene, face).sampler.filter == TextureFilter::nearest);
 }
 
 // How many channels there are, and how many of radiance. N: see core/channels.h.

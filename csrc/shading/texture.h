@@ -1,10 +1,12 @@
-// Bilinear lookup in a repeated texture, texel centres at +0.5, row 0 on top while v runs up.
+// Lookup in a texture, texel centres at +0.5, row 0 on top while v runs up: bilinear, or of the nearest texel.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 
 #include "core/math.h"
+#include "scene/scene.h"
 
 namespace edgegrad {
 
@@ -13,7 +15,28 @@ struct Texture {
     const T* texels;
     int64_t first;  // row of the first texel among all texels
     int64_t height, width;
+    Sampler sampler = {};
+
+    // In texels, right and down.
+    Vec2 place(Vec2 uv) const { return {uv.x * width, (1 - uv.y) * height}; }
 };
+
+// Row `index` of a table of textures.
+template <class T>
+Texture<T> texture_at(const T* texels, const int64_t* table, int64_t index) {
+    const int64_t* row = table + texture_columns * index;
+    return {texels, row[0], row[1], row[2], {Wrap(row[3]), Wrap(row[4]), TextureFilter(row[5])}};
+}
+
+// The texel from 0 to n − 1 that stands at i, an integer. Reduced in floating point: it may lie so far out that an
+// integer would overflow.
+inline int64_t wrapped(double i, int64_t n, Wrap wrap) {
+    if (wrap == Wrap::clamp) return int64_t(std::clamp(i, 0.0, double(n - 1)));
+    const double period = double(wrap == Wrap::mirror ? 2 * n : n);
+    const double r = i - period * std::floor(i / period);
+    const int64_t j = r >= 0 && r < period ? int64_t(r) : 0;  // as in footprint()
+    return j < n ? j : 2 * n - 1 - j;
+}
 
 // The four texels around uv, with what is needed of their weights.
 struct Footprint {
@@ -23,8 +46,37 @@ struct Footprint {
     double weight(int i) const { return (i & 1 ? a : 1 - a) * (i & 2 ? b : 1 - b); }
 };
 
+// The four texels around the corner (i, j) of texels, integers, with the fractions that are given.
+template <class T>
+Footprint footprint_at(const Texture<T>& t, double i, double j, double a, double b) {
+    const auto [u, v, filter] = t.sampler;
+    const int64_t i0 = wrapped(i, t.width, u), i1 = wrapped(i + 1, t.width, u);
+    const int64_t top = t.first + wrapped(j, t.height, v) * t.width,
+                  bottom = t.first + wrapped(j + 1, t.height, v) * t.width;
+    return {{top + i0, top + i1, bottom + i0, bottom + i1}, a, b};
+}
+
+// The texel (i, j), integers, as four of which it has all the weight: what is computed of its weights' derivatives is
+// zero.
+template <class T>
+Footprint texel_at(const Texture<T>& t, double i, double j) {
+    const int64_t texel = t.first + wrapped(j, t.height, t.sampler.v) * t.width + wrapped(i, t.width, t.sampler.u);
+    return {{texel, texel, texel, texel}, 0, 0};
+}
+
+// Where the sampler is not that of most textures.
+template <class T>
+[[gnu::noinline]] Footprint footprint_of_sampler(const Texture<T>& t, Vec2 uv) {
+    const Vec2 p = t.place(uv);
+    if (t.sampler.filter == TextureFilter::nearest) return texel_at(t, std::floor(p.x), std::floor(p.y));
+    const double i = std::floor(p.x - 0.5), j = std::floor(p.y - 0.5);
+    return footprint_at(t, i, j, p.x - 0.5 - i, p.y - 0.5 - j);
+}
+
 template <class T>
 Footprint footprint(const Texture<T>& t, Vec2 uv) {
+    if (t.sampler != Sampler()) [[unlikely]]
+        return footprint_of_sampler(t, uv);
     const double x = uv.x * t.width - 0.5, y = (1 - uv.y) * t.height - 0.5;
     const double fx = std::floor(x), fy = std::floor(y);
     // Reduced in floating point: uv may lie so far out that an integer would overflow.

@@ -58,7 +58,8 @@ class ReportScene:
         digest = hashlib.sha256(repr((self.camera.size, self.camera.projection)).encode())
         tensors = [self.camera.world_to_camera, self.camera.K, self.adjoint, self.scene.background]
         for mesh in self.scene.meshes:
-            tensors += [getattr(mesh, field.name) for field in dataclasses.fields(mesh)]
+            tensors += [getattr(mesh, field.name) for field in dataclasses.fields(mesh)[:8]]
+            tensors += [] if mesh.alpha is None else [mesh.alpha]
         for tensor in tensors:
             digest.update(b"-" if tensor is None else tensor.detach().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()[:16]

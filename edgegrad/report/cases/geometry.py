@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ group = Group("geometry")
 CAMERA = front_camera(48)
 
 
-def on_screen(pixels: list[list[float]], depth: list[float], faces: list[list[int]], **fields: Tensor) -> Mesh:
+def on_screen(pixels: list[list[float]], depth: list[float], faces: list[list[int]], **fields: Any) -> Mesh:
     """A mesh by the pixels and depths of its vertices before CAMERA."""
     verts = unproject(CAMERA, torch.tensor(pixels, dtype=F64), torch.tensor(depth, dtype=F64))
     return Mesh(verts, torch.tensor(faces), **fields)
@@ -43,7 +43,7 @@ def sliver(length: float, width: float, smooth: bool) -> Problem:
     middle = vector(23.3, 25.1)
     pixels = torch.stack([middle - along - across, middle - along + across, middle + along])
     verts = unproject(CAMERA, pixels, vector(3.9, 3.9, 4.2))
-    look = {"colors": smooth_colors(verts)} if smooth else {"face_colors": of_faces((0.9, 0.3, 0.1))}
+    look: dict[str, Any] = {"colors": smooth_colors(verts)} if smooth else {"face_colors": of_faces((0.9, 0.3, 0.1))}
     mesh = Mesh(verts, torch.tensor([[0, 1, 2]]), **look)
     return everything(Scene([mesh], background()), CAMERA, camera_too=False, faint=True)
 
