@@ -69,9 +69,9 @@ def render(
                      jumps that it asked for (normals; texture coordinates at seams; attributes of interpolate(); all
                      edges if it asked for `face` or `barycentrics`); True, at all; False, at none
     check_shader     asks the shader twice, the second time with half of the points in another order, and compares
-    step_spacing     px between the lines along which steps within faces are looked for: those that a shader declares, of which two
-                     borders that lie closer may be missed; rims of what alpha cuts out, and borders of nearest texels. Closer lines
-                     cost more and err less
+    step_spacing     px between the lines along which steps within faces are looked for: those that a shader declares, of which
+                     two borders that lie closer may be missed; rims of what alpha cuts out, and borders of nearest texels.
+                     Closer lines cost more and err less
 
     Differentiable once, in reverse and in forward mode, in every floating-point tensor of the scene and the camera; torch.vmap
     and torch.func's transforms work, one element of the batch at a time, all with the same seed; tangents of one image
