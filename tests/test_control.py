@@ -215,7 +215,7 @@ def through_itself() -> eg.Mesh:
 # Creases all of which are visible or hidden; such that another mesh passes through them, where no silhouette tells; and the
 # creases of a sheet seen flat, which its own bumps hide.
 CREASES = {
-    "a sphere": ([coloured_sphere(4)], (0.3, -0.2, 3.5), 0.003),
+    "a sphere": ([coloured_sphere(4)], (0.3, -0.2, 3.5), 0.008),
     "a sphere in a sheet": ([coloured_sphere(3), coloured_grid(10, lambda x, y: 0 * x, 1)], (0.3, -0.2, 3.5), 0.005),
     "two sheets": (
         [coloured_grid(20, lambda x, y: 0 * x, 2), coloured_grid(23, lambda x, y: 0.3 * x + 0.013 * y + 0.006, 3)],

@@ -104,6 +104,10 @@ class ImageHits {
         return std::clamp(share_[2 * part + side - 1] / some * missed, turned_away, missed);
     }
 
+    // Whether that is as little as it ever is.
+    bool is_turned_away(int32_t vertex, int side) const { return where_missed(vertex, side) <= turned_away; }
+    static constexpr double turned_away = 1.0 / 64;
+
     // With those of Parts, of which there may be as many as vertices.
     static constexpr int64_t bytes_per_vertex = sizeof(uint8_t) + 4 * sizeof(float);
 
@@ -112,7 +116,7 @@ class ImageHits {
    private:
     // Of a vertex: of a face that was hit; of a face that has such vertices and others; behind all around it.
     static constexpr uint8_t hit = 1, rim = 2, behind = 4;
-    static constexpr double turned_away = 1.0 / 64, some = 1.0 / 16;
+    static constexpr double some = 1.0 / 16;
     static constexpr int enough = 64;  // faces that tell which sides of a part are visible
     const Parts& parts_;
     Array<uint8_t> at_;

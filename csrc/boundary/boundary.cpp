@@ -18,6 +18,16 @@ namespace edgegrad {
 
 namespace {
 
+// Of a sample it only matters whether it is visible.
+struct Witness {
+    bool& visible;
+    bool wants(int, Vec2) const { return true; }
+    template <CurveSource Source>
+    void add(int, Source&, typename Source::Sample&) {
+        visible = true;
+    }
+};
+
 // Some of the samples.
 struct Drawn {
     const Systematic& systematic;
@@ -48,8 +58,46 @@ struct Drawn {
     }
 };
 
+// Samples keep so far from the ends of a crease that what floats leave of a silhouette there does not matter.
+double kept_off_ends(const Curve& curve, double s) {
+    const double end = curve.is_crease() ? std::min(Crossings::float_reach / curve.length, 0.1) : 0;
+    return std::clamp(s, end, 1 - end);
+}
+
+// Unless it is the same as before; false if it has no extent.
+template <class T>
+bool find(const Curves<T>& curves, const MeasuredCurve& measured, Curve& curve) {
+    if (curve.edge == measured.edge || curves.finder.find(measured.edge, curve)) return true;
+    curve.edge = -1;
+    return false;
+}
+
+// Whether any sample of a crease between hidden faces is visible, for once. No silhouette passes before these faces, so
+// that other curves on a crease (coincident.h) have no part in whether something hides it.
+template <class T>
+bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const Systematic& systematic, int64_t n) {
+    if (!curves.any_hidden) return false;
+    const CoincidentCurves alone({}, systematic, view.team);
+    std::vector<uint8_t> found((n + scatter_chunk - 1) / scatter_chunk, 0);
+    view.team.each(int64_t(found.size()), [&](int64_t chunk) {
+        bool visible = false;
+        EdgeSource<T> source(view, curves.finder, alone);
+        CurveSamples samples(view, source, Witness{visible});
+        Curve curve;
+        const Drawn drawn{systematic, chunk * scatter_chunk, std::min(n, (chunk + 1) * scatter_chunk)};
+        drawn.each([&](int64_t k, double s, double weight) {
+            if (k >= int64_t(curves.curve.size()) || !curves.curve[k].hidden) return;
+            if (!find(curves, curves.curve[k], curve)) return;
+            samples.add(curve, kept_off_ends(curve, s), weight);
+        });
+        samples.cast();
+        found[chunk] = visible;
+    });
+    return std::find(found.begin(), found.end(), 1) != found.end();
+}
+
 template <int N, class Contraction, class T>
-void add_edges(const BackwardView<T>& view, const Curves<T>& curves, const CoincidentCurves& coincident,
+void add_edges(const BackwardView<T>& view, const Curves<T>& curves, const CoincidentCurves& coincident, bool hidden,
                const Drawn& drawn, const Contraction& contraction, ChunkGrad& grad) {
     EdgeSource<T> source(view, curves.finder, coincident);
     CurveSamples samples(view, source, on_curves<N>(view, contraction, grad));
@@ -57,13 +105,15 @@ void add_edges(const BackwardView<T>& view, const Curves<T>& curves, const Coinc
     Curve curve;
     bool controlled = false;
     drawn.each([&](int64_t k, double s, double weight) {
-        if (const MeasuredCurve& measured = curves.curve[k]; curve.edge != measured.edge) {
+        const MeasuredCurve& measured = curves.curve[k];
+        if (measured.hidden && !hidden) return;
+        if (curve.edge != measured.edge) {
             if (controlled) control.flush(grad.x);
-            curves.finder.find(measured.edge, curve);
+            controlled = false;
+            if (!find(curves, measured, curve)) return;
             controlled = measured.controlled && control.set(curve);
         }
-        const double end = curve.is_crease() ? std::min(Crossings::float_reach / curve.length, 0.1) : 0;
-        s = std::clamp(s, end, 1 - end);
+        s = kept_off_ends(curve, s);
         if (controlled) control.subtract(s, weight);
         samples.add(curve, s, weight);
     });
@@ -97,13 +147,16 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
     Systematic systematic(curves.measure, view.team);
     if (!(systematic.total() > 0)) return;
     systematic.draw(n, to_unit(hash(view.options.seed, 3, gradient_stream)));
+    const bool hidden = any_visible(view, curves, systematic, n);  // whether these count after all
+    curves.add_segments(view, hidden);
     const CoincidentCurves coincident(std::move(curves.segments), systematic, view.team);
     profile.curves += watch.lap();
     if (!curves.x_bar.empty()) to.x = curves.x_bar.data();
     view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         const Drawn drawn{systematic, first, last};
         const int64_t middle = drawn.before(int64_t(curves.curve.size()));
-        if (first < middle) add_edges<N>(view, curves, coincident, {systematic, first, middle}, contraction, grad);
+        if (first < middle)
+            add_edges<N>(view, curves, coincident, hidden, {systematic, first, middle}, contraction, grad);
         if (middle < last) add_intersections<N>(view, curves, {systematic, middle, last}, contraction, grad);
     });
     to.x = nullptr;

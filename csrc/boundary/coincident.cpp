@@ -203,6 +203,8 @@ void CoincidentCurves::find_companions(const Systematic& samples, Team& team) {
         }
     });
     for (const auto& part : parts) companions_.insert(companions_.end(), part.begin(), part.end());
+    std::sort(companions_.begin(), companions_.end(),
+              [](const Companion& a, const Companion& b) { return a.edge < b.edge; });
 }
 
 const ImageSegment* CoincidentCurves::find(int64_t edge) const {

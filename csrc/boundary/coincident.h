@@ -113,7 +113,7 @@ class LineBuckets {
 
 class CoincidentCurves {
    public:
-    // Of the segments in all parts, by ascending edges. Only what lies near those that have samples is kept.
+    // Of the segments in all parts. Only what lies near those that have samples is kept.
     CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, const Systematic& samples, Team& team);
 
     // Of each curve, at most: its segment in a list that doubles as it grows, and again where others lie on its line;
@@ -166,7 +166,7 @@ class CoincidentCurves {
         uint32_t segment;
     };
 
-    Array<ImageSegment> segments_{0};    // by ascending edges
+    Array<ImageSegment> segments_{0};
     std::vector<Companion> companions_;  // by ascending edges
     uint64_t mask_ = 0;
     std::vector<uint32_t> begin_;  // of each bucket, in entries_

@@ -32,9 +32,9 @@ class CreaseJumps {
         if constexpr (N == 0) value_.resize(2 * C_);
     }
 
-    void set(const Curve& curve) {
+    void set(const HalfEdge& minus, const HalfEdge& plus) {
         std::fill(value_.begin(), value_.end(), 0.0);
-        add(curve.minus, 1), add(curve.plus, -1);
+        add(minus, 1), add(plus, -1);
     }
     double at(int end, int channel) const { return value_[end * C_ + channel]; }
     // Σ_c weight_c |jump_c|.
@@ -78,11 +78,12 @@ class CreaseControl {
         bend_ = std::fabs(curve.w1 - curve.w0) / (curve.w0 + curve.w1);
         if (!(bend_ < 1.0 / 3)) return false;
         curve_ = &curve, tangent_ = curve.tangent();
-        jumps_.set(curve);
+        jumps_.set(curve.minus, curve.plus);
         for (int k = 0; k < 2; ++k) {
             vertex_[0][k] = vertex(scene, curve.minus, k ? curve.minus.second() : curve.minus.first());
             vertex_[1][k] = vertex(scene, curve.plus, k ? curve.plus.second() : curve.plus.first());
         }
+        for (int k = 0; k < 2; ++k) per_[k] = 1 / (k ? tangent_.y : tangent_.x);
         at_a_ = at_b_ = 0;
         return true;
     }
@@ -91,17 +92,12 @@ class CreaseControl {
     double density(double least) const { return std::clamp(std::max(curve_->length / wide, bend_), least, 1.0); }
 
     void add_integral() {
-        // Gauss-Legendre with three points, exact up to degree 5.
-        constexpr double node[3] = {-0.7745966692414834, 0, 0.7745966692414834},
-                         weight[3] = {5. / 18, 8. / 18, 5. / 18};
+        const bool box = view_.image.filter.is_box();
         for (double begin = 0; begin < 1;) {
             const double end = end_of_piece(begin);
             const Piece piece(*this, begin, end);
-            for (int j = 0; j < 3; ++j) {
-                const double s = 0.5 * ((begin + end) + node[j] * (end - begin));
-                const double value = weight[j] * (end - begin) * piece.at(s);
-                at_a_ += (1 - s) * value, at_b_ += s * value;
-            }
+            if (box) add_constant(piece, begin, end);
+            else add_quadratic(piece, begin, end);
             begin = end;
         }
     }
@@ -139,6 +135,11 @@ class CreaseControl {
             }
             if (box) a_[0] = a_[2] = a_[1], b_[0] = b_[2] = b_[1];
         }
+        // Ã times the jump at either end of the curve, in the middle.
+        struct Ends {
+            double a, b;
+        };
+        Ends ends() const { return {a_[1], b_[1]}; }
         double at(double s) const {
             const double r = half_ > 0 ? (s - middle_) / half_ : 0, low = 0.5 * r * (r - 1), high = 0.5 * r * (r + 1);
             const double a = low * a_[0] + (1 - r * r) * a_[1] + high * a_[2];
@@ -150,19 +151,41 @@ class CreaseControl {
         double middle_, half_, a_[3] = {}, b_[3] = {};  // Ã times the jump at either end of the curve
     };
 
+    // ∫ φ_k (φ_a a + φ_b b) ds for constants a and b.
+    void add_constant(const Piece& piece, double begin, double end) {
+        const auto power = [&](double (&p)[3], double s) { p[0] = s, p[1] = s * s / 2, p[2] = s * s * s / 3; };
+        double low[3], high[3];
+        power(low, begin), power(high, end);
+        const double one = high[0] - low[0], s = high[1] - low[1], s2 = high[2] - low[2];
+        const auto [a, b] = piece.ends();
+        at_a_ += (one - 2 * s + s2) * a + (s - s2) * b;
+        at_b_ += (s - s2) * a + s2 * b;
+    }
+
+    // The same where Ã is a quadratic: by Gauss's rule with three points, exact up to degree 5.
+    void add_quadratic(const Piece& piece, double begin, double end) {
+        constexpr double node[3] = {-0.7745966692414834, 0, 0.7745966692414834},
+                         weight[3] = {5. / 18, 8. / 18, 5. / 18};
+        for (int j = 0; j < 3; ++j) {
+            const double s = 0.5 * ((begin + end) + node[j] * (end - begin));
+            const double value = weight[j] * (end - begin) * piece.at(s);
+            at_a_ += (1 - s) * value, at_b_ += s * value;
+        }
+    }
+
     // Where the piece that begins at s ends: at the next line of the filter, the border of a pixel for a box, the
     // middle of one else; or at 1.
     double end_of_piece(double s) const {
         const double shift = view_.image.filter.is_box() ? 0 : 0.5;
         double end = 1;
-        const auto meet = [&](double origin, double along) {
+        const auto meet = [&](double origin, double along, double per) {
             if (along == 0) return;
             // The next line lies at least a millionth of the curve ahead, for s may be rounded to before the last one.
             const double here = origin + (s + 1e-6) * along - shift;
             const double line = along > 0 ? std::floor(here) + 1 : std::ceil(here) - 1;
-            end = std::min(end, (line + shift - origin) / along);
+            end = std::min(end, (line + shift - origin) * per);
         };
-        meet(curve_->x0.x, tangent_.x), meet(curve_->x0.y, tangent_.y);
+        meet(curve_->x0.x, tangent_.x, per_[0]), meet(curve_->x0.y, tangent_.y, per_[1]);
         return std::max(end, s + 1e-6);
     }
 
@@ -172,6 +195,7 @@ class CreaseControl {
     const int C_;
     const Curve* curve_ = nullptr;
     Vec2 tangent_;
+    double per_[2];  // 1 / tangent_
     double bend_ = 0;
     int32_t vertex_[2][2];  // of minus and plus; a and b
     double at_a_ = 0, at_b_ = 0;

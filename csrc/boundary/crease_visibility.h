@@ -25,6 +25,14 @@ struct Expected {
     double samples;
 };
 
+// Such fractions: of creases behind what the image hit that nothing divides, or that a silhouette meets; on the side of
+// a closed mesh that is turned away; and of visible ones that nothing divides, with at least 16 rays a pixel.
+struct CreaseSamples {
+    static constexpr OcclusionHint::Few hidden{.rays = 0.5, .share = 1.0 / 64, .least = 1.0 / 256},
+        hidden_in_part{.rays = 2, .share = 1.0 / 128, .least = 1.0 / 256};
+    static constexpr double turned_away = 1.0 / 16 * ImageHits::turned_away, visible = 1.0 / 512;
+};
+
 template <class T>
 class CreaseVisibility {
    public:
@@ -38,9 +46,9 @@ class CreaseVisibility {
     // Of a crease behind what the image hit in so many pixels (occlusion.h). If all of it is visible or none, a part
     // that shows through a gap cannot be what rays missed.
     Expected hidden(Relation relation, int64_t pixels) const {
-        constexpr OcclusionHint::Few whole{.rays = 0.5, .share = 1.0 / 64, .least = 1.0 / 256},
-            in_part{.rays = 2, .share = 1.0 / 128, .least = 1.0 / 256};
-        return {false, view_.occlusion.factor(relation == Relation::apart ? whole : in_part, pixels, view_.image.spp)};
+        const bool whole = relation == Relation::apart;
+        return {false, view_.occlusion.factor(whole ? CreaseSamples::hidden : CreaseSamples::hidden_in_part, pixels,
+                                              view_.image.spp)};
     }
 
     // Of any other; nothing where rays must tell.
@@ -88,7 +96,7 @@ class CreaseVisibility {
 
    private:
     // Least fractions of the samples: where nothing may divide a crease; and where it may, but rays find it undivided.
-    static constexpr double few = 1.0 / 512, beside_silhouettes = 1.0 / 128, beside_parts = 1.0 / 32,
+    static constexpr double few = CreaseSamples::visible, beside_silhouettes = 1.0 / 128, beside_parts = 1.0 / 32,
                             beside_missed = 1.0 / 8;  // faces near which others were not hit: something may pass
                                                       // through, or be cut out
 

@@ -71,26 +71,31 @@ bool in_front(const BackwardView<T>& view, const HalfEdge& first, const HalfEdge
     return other == 0 || (viewer > 0) != (other > 0);
 }
 
+// Whether two rows of an array differ.
+template <class Number>
+bool rows_differ(const Number* values, int width, int64_t i, int64_t j) {
+    if (i == j) return false;
+    for (int c = 0; c < width; ++c)
+        if (values[width * i + c] != values[width * j + c]) return true;
+    return false;
+}
+
 // Whether two faces differ in texture coordinates along the edge they share.
 template <class T>
 bool uvs_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
-    const auto uv = [&](const HalfEdge& h, int corner) {
-        return scene.uvs + 2 * int64_t(scene.uv_corners[3 * int64_t(h.face) + corner]);
-    };
-    const auto differ = [](const double* a, const double* b) { return a[0] != b[0] || a[1] != b[1]; };
-    return differ(uv(m, m.first()), uv(p, p.first())) || differ(uv(m, m.second()), uv(p, p.second()));
+    const auto row = [&](const HalfEdge& h, int corner) { return scene.uv_corners[3 * int64_t(h.face) + corner]; };
+    return rows_differ(scene.uvs, 2, row(m, m.first()), row(p, p.first())) ||
+           rows_differ(scene.uvs, 2, row(m, m.second()), row(p, p.second()));
 }
 
 // Whether two faces may differ in attributes along the edge they share: barycentrics are of each face alone.
 template <class T>
 bool attributes_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
     const Attributes& a = scene.attributes;
-    const auto differ = [](const double* values, int width, int64_t i, int64_t j) {
-        return i != j && !std::equal(values + width * i, values + width * (i + 1), values + width * j);
-    };
-    return a.barycentrics || (a.uv && uvs_jump(scene, m, p)) || differ(a.face, a.face_width, m.face, p.face) ||
-           differ(a.vertex, a.vertex_width, vertex(scene, m, m.first()), vertex(scene, p, p.first())) ||
-           differ(a.vertex, a.vertex_width, vertex(scene, m, m.second()), vertex(scene, p, p.second()));
+    return a.barycentrics || (a.uv && uvs_jump(scene, m, p)) ||
+           rows_differ(a.face, a.face_width, m.face, p.face) ||
+           rows_differ(a.vertex, a.vertex_width, vertex(scene, m, m.first()), vertex(scene, p, p.first())) ||
+           rows_differ(a.vertex, a.vertex_width, vertex(scene, m, m.second()), vertex(scene, p, p.second()));
 }
 
 // Whether an edge runs exactly along a border of nearest texels. Another border is a step within a face.
@@ -124,18 +129,12 @@ bool carries_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& 
     if (textured != is_textured(scene, p.face)) return true;
     if (textured && scene.face_texture[m.face] != scene.face_texture[p.face]) return true;
     if (textured && lies_between_texels(scene, m)) return true;
-    const auto row = [&](const HalfEdge& h, int corner) {
-        return int64_t(scene.corners[3 * int64_t(h.face) + corner]);
+    const auto differ = [&](int of_m, int of_p) {
+        const int64_t i = scene.corners[3 * int64_t(m.face) + of_m], j = scene.corners[3 * int64_t(p.face) + of_p];
+        return textured ? rows_differ(scene.uvs, 2, i, j) : rows_differ(scene.colors, scene.radiance, i, j);
     };
-    const int64_t ends[2][2] = {{row(m, m.first()), row(p, p.first())}, {row(m, m.second()), row(p, p.second())}};
-    for (const auto& [i, j] : ends) {
-        if (i == j) continue;
-        if (textured && !std::equal(scene.uvs + 2 * i, scene.uvs + 2 * i + 2, scene.uvs + 2 * j)) return true;
-        const int C = scene.radiance;
-        if (!textured && !std::equal(scene.colors + C * i, scene.colors + C * (i + 1), scene.colors + C * j))
-            return true;
-    }
-    return (scene.channels > scene.radiance && attributes_jump(scene, m, p)) || cut_outs_jump(scene, m, p);
+    return differ(m.first(), p.first()) || differ(m.second(), p.second()) ||
+           (scene.channels > scene.radiance && attributes_jump(scene, m, p)) || cut_outs_jump(scene, m, p);
 }
 
 // Whether neighbouring faces may differ at their common edge. Attributes that are indexed like the vertices
@@ -153,12 +152,28 @@ inline int side_of(const HalfEdge& h, const Array<int8_t>& facing) {
     return h.backwards ? -facing[h.face] : facing[h.face];
 }
 
-// The orientation of each face in the image, Camera::facing (F,).
+// The orientation of each face in the image, Camera::facing (F,): that of its corners in the image, where they lie
+// inside the view, unless its rounding decides.
 template <class T>
 Array<int8_t> facing_of_faces(const BackwardView<T>& view) {
     Array<int8_t> facing(view.scene.n_faces);
+    const double rounding = 16 * view.camera.rounding_of_positions();
     view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+        constexpr int64_t ahead = 16;
         for (int64_t f = first; f < last; ++f) {
+            const int32_t* v = view.scene.faces + 3 * f;
+            if (f + ahead < last)
+                for (int i = 0; i < 3; ++i) prefetch(&view.vertices.x[v[3 * ahead + i]]);
+            const Array<uint8_t>& outcode = view.vertices.outcode;
+            if (!(outcode[v[0]] | outcode[v[1]] | outcode[v[2]])) [[likely]] {
+                const Vec2 x0 = view.vertices.x[v[0]], e1 = view.vertices.x[v[1]] - x0, e2 = view.vertices.x[v[2]] - x0;
+                const double twice = wedge(e1, e2);
+                const double side = std::fabs(e1.x) + std::fabs(e1.y) + std::fabs(e2.x) + std::fabs(e2.y);
+                if (std::fabs(twice) > rounding * side) [[likely]] {
+                    facing[f] = twice > 0 ? 1 : -1;
+                    continue;
+                }
+            }
             const auto q = corners_of(view, f);
             facing[f] = int8_t(view.camera.facing(q[0], q[1], q[2]));
         }
@@ -180,36 +195,64 @@ class CurveFinder {
     // On which side of its edge a face lies in the image; see side_of.
     int turn_of(const HalfEdge& h) const { return side_of(h, facing_); }
 
-    // Calls body(edge) for those of the edges first … last − 1 that may have a curve, or one that is no crease. Most
-    // have one face on each side; with no jump there is then nothing more to look at, and little of memory is read for
-    // them.
-    template <class Body>
-    void each(int64_t first, int64_t last, bool creases, Body body) const {
+    // What is known of an edge at which a surface goes on: that there is no curve, or nothing more to do; that the
+    // faces differ along it; nothing.
+    enum class Glance { done, differs, unknown };
+
+    // Calls body(edge) for those of the edges first … last − 1 that may have a curve. Most have one face on each side:
+    // there glance(edge, face, face) tells whether to look any further, so that little of memory is read for them.
+    template <class See, class Body>
+    void each(int64_t first, int64_t last, See glance, Body body) const {
         const Topology& topology = view_.geometry.topology();
         const int8_t* const facing = facing_.data();
-        const bool jumps = creases && jumps_;
         const int32_t* face = topology.faces(first).data();
-        std::vector<int64_t> edges;
+        std::vector<int64_t> edges, joins;  // those with a curve, as far as is known; those that need a jump
+        const int32_t* const end =
+            last < topology.n_edges() ? topology.faces(last).data() : topology.faces(last - 1).data();
         for (int64_t e = first; e < last; ++e) {
+            if (face + 2 * far < end) glance.prefetch(face[2 * far]), glance.prefetch(face[2 * far + 1]);
             if (topology.joins_two(e)) [[likely]] {
-                const bool through = facing[face[0]] * facing[face[1]] > 0;
+                const int32_t one = face[0], other = face[1];
                 face += 2;
-                if (through && !(jumps && carries_jump(e))) [[likely]]
-                    continue;
+                if (facing[one] * facing[other] > 0) {
+                    const Glance seen = jumps_ ? glance(e, one, other) : Glance::done;
+                    if (seen == Glance::unknown) joins.push_back(e);
+                    if (seen != Glance::differs) continue;
+                }
             } else {
                 face += topology.faces(e).size();
             }
             edges.push_back(e);
             topology.prefetch(e);
         }
-        // What is asked of memory some edges ahead is there when it is wanted.
-        constexpr size_t ahead = 4;
+        if (!joins.empty()) {
+            const size_t others = edges.size();
+            for (size_t i = 0; i < joins.size(); ++i) {
+                if (i + 2 * far < joins.size()) prefetch_corners(joins[i + 2 * far]);
+                if (i + far < joins.size()) prefetch_values(joins[i + far]);
+                if (carries_jump(joins[i])) edges.push_back(joins[i]);
+            }
+            std::inplace_merge(edges.begin(), edges.begin() + others, edges.end());
+        }
         for (size_t i = 0; i < edges.size(); ++i) {
-            if (i + 2 * ahead < edges.size()) prefetch_face(edges[i + 2 * ahead]);
-            if (i + ahead < edges.size()) prefetch_vertices(edges[i + ahead]);
+            if (i + 2 * near < edges.size()) {
+                prefetch_faces(edges[i + 2 * near]);
+                if (jumps_) prefetch_corners(edges[i + 2 * near]);
+            }
+            if (i + near < edges.size()) {
+                prefetch_vertices(edges[i + near]);
+                if (jumps_) prefetch_values(edges[i + near]);
+            }
+            if (i + near / 2 < edges.size()) prefetch_place(edges[i + near / 2]);
             body(edges[i]);
         }
     }
+
+    // Where edges between two faces are seen only if they are silhouettes.
+    struct NoCreases {
+        Glance operator()(int64_t, int32_t, int32_t) const { return Glance::done; }
+        void prefetch(int32_t) const {}
+    };
 
     // The curve of an edge; false when there is none.
     bool find(int64_t edge, Curve& c) const {
@@ -254,17 +297,80 @@ class CurveFinder {
         return c.length > 0 && c.rounding < most_rounding;
     }
 
+    // The crease of an edge of which is known that it joins two faces, one on either side of it in the image, that both
+    // lie in the view, and that its rounding does not matter.
+    bool find_between(int64_t edge, Curve& c) const {
+        const auto halves = view_.geometry.topology().half_edges(edge);
+        const int minus = side_of(halves[0], facing_) > 0 ? 0 : 1;
+        const int32_t va = vertex(view_.scene, halves[0], halves[0].first()),
+                      vb = vertex(view_.scene, halves[0], halves[0].second());
+        const VertexView& p = view_.vertices;
+        c.edge = edge, c.minus = halves[minus], c.plus = halves[1 - minus];
+        c.a = p.q[va], c.b = p.q[vb], c.x0 = p.x[va], c.x1 = p.x[vb];
+        c.t0 = 0, c.t1 = 1, c.rounding = 0;
+        c.w0 = view_.camera.depth_weight(c.a), c.w1 = view_.camera.depth_weight(c.b);
+        c.length = length(c.tangent());
+        return c.length > 0;
+    }
+
+    // Of pixel positions, px: of points whose coordinates are at most p in size, axis by axis, and whose denominators
+    // are at least w; the positions add up to `pixels`. A sum q = R p + t is rounded as its terms are large: an
+    // orthographic camera far away loses depth, not place. In perspective, X / Z is rounded with X, and with Z as large
+    // as it is itself.
+    double rounding(const double (&p)[3], double w, double pixels) const {
+        const Camera& camera = view_.camera;
+        const auto terms = [&](int row, double t) {
+            const Vec3 r = camera.R.row[row];
+            return std::fabs(r.x) * p[0] + std::fabs(r.y) * p[1] + std::fabs(r.z) * p[2] + std::fabs(t);
+        };
+        const double across = std::max(terms(0, camera.t.x), terms(1, camera.t.y)),
+                     depth = camera.roundings_of_weight(terms(2, camera.t.z), w);
+        return 32 * std::numeric_limits<double>::epsilon() *
+               (camera.pixels_per_unit / w * across +
+                std::max(1.0, depth) * (std::fabs(camera.k[2]) + std::fabs(camera.k[5]) + pixels));
+    }
+
    private:
-    void prefetch_face(int64_t edge) const {
-        prefetch(view_.scene.faces + 3 * int64_t(view_.geometry.topology().half_edges(edge)[0].face));
+    // What is asked of memory so many edges ahead is there when it is wanted: where little is done for each edge, and
+    // where more is.
+    static constexpr size_t far = 24, near = 4;
+
+    void prefetch_corners(int64_t edge) const {
+        for (const int32_t f : view_.geometry.topology().faces(edge)) {
+            prefetch_all(view_.scene.corners + 3 * int64_t(f), 3);
+            if (view_.scene.face_texture) prefetch(view_.scene.face_texture + f);
+        }
+    }
+    void prefetch_values(int64_t edge) const {
+        for (const int32_t f : view_.geometry.topology().faces(edge)) {
+            const int64_t row = view_.scene.corners[3 * int64_t(f)];
+            if (is_textured(view_.scene, f)) prefetch(view_.scene.uvs + 2 * row);
+            else prefetch_all(view_.scene.colors + view_.scene.radiance * row, view_.scene.radiance);
+            if (const int width = view_.scene.attributes.face_width)
+                prefetch_all(view_.scene.attributes.face + width * int64_t(f), width);
+        }
+    }
+    void prefetch_faces(int64_t edge) const {
+        for (const int32_t f : view_.geometry.topology().faces(edge))
+            prefetch_all(view_.scene.faces + 3 * int64_t(f), 3);
     }
     void prefetch_vertices(int64_t edge) const {
         const HalfEdge& h = view_.geometry.topology().half_edges(edge)[0];
         const VertexView& p = view_.vertices;
         for (const int corner : {h.first(), h.second()}) {
             const int32_t v = vertex(view_.scene, h, corner);
-            prefetch(&p.q[v]), prefetch(&p.x[v]), prefetch(&p.outcode[v]), prefetch(view_.scene.verts + 3 * int64_t(v));
+            prefetch_all(&p.q[v], 1), prefetch(&p.x[v]), prefetch(&p.outcode[v]);
+            prefetch_all(view_.scene.verts + 3 * int64_t(v), 3);
         }
+    }
+
+    void prefetch_place(int64_t edge) const {
+        const HalfEdge& h = view_.geometry.topology().half_edges(edge)[0];
+        const int32_t v = vertex(view_.scene, h, h.first());
+        if (view_.vertices.outcode[v]) return;
+        const Vec2 x = view_.vertices.x[v];
+        view_.importance.prefetch(x);
+        if (jumps_) prefetch(view_.adjoint.of(view_.pixel(x)));
     }
 
     bool carries_jump(int64_t edge) const {
@@ -276,24 +382,13 @@ class CurveFinder {
     // image has no curve there. The bound is a generous one.
     static constexpr double most_rounding = 16;
 
-    // Of the pixel positions of a curve that ends at these vertices, px. A sum q = R p + t is rounded as its terms are
-    // large, axis by axis: an orthographic camera far away loses depth, not place. In perspective, X / Z is rounded
-    // with X, and with Z as large as it is itself.
+    // Of a curve that ends at these vertices.
     double rounding(const Curve& c, int32_t va, int32_t vb) const {
-        const Camera& camera = view_.camera;
         double p[3] = {};
         for (const int32_t v : {va, vb})
             for (int i = 0; i < 3; ++i) p[i] = std::max(p[i], std::fabs(view_.scene.verts[3 * int64_t(v) + i]));
-        const auto terms = [&](int row, double t) {
-            const Vec3 r = camera.R.row[row];
-            return std::fabs(r.x) * p[0] + std::fabs(r.y) * p[1] + std::fabs(r.z) * p[2] + std::fabs(t);
-        };
-        const double w = std::min(c.w0, c.w1), across = std::max(terms(0, camera.t.x), terms(1, camera.t.y)),
-                     depth = camera.roundings_of_weight(terms(2, camera.t.z), w);
-        const double pixels = std::fabs(camera.k[2]) + std::fabs(camera.k[5]) + std::fabs(c.x0.x) + std::fabs(c.x0.y) +
-                              std::fabs(c.x1.x) + std::fabs(c.x1.y);
-        return 32 * std::numeric_limits<double>::epsilon() *
-               (camera.pixels_per_unit / w * across + std::max(1.0, depth) * pixels);
+        const double pixels = std::fabs(c.x0.x) + std::fabs(c.x0.y) + std::fabs(c.x1.x) + std::fabs(c.x1.y);
+        return rounding(p, std::min(c.w0, c.w1), pixels);
     }
 
     const BackwardView<T>& view_;

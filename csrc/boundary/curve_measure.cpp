@@ -5,6 +5,7 @@
 #include <optional>
 
 #include "boundary/crease_control.h"
+#include "boundary/crease_faces.h"
 #include "boundary/crease_visibility.h"
 #include "boundary/intersection_source.h"
 #include "core/channels.h"
@@ -15,6 +16,12 @@ namespace {
 
 // Default samples a pixel of curve; see surface_measure.cpp.
 constexpr double samples_per_pixel = 24;
+
+// The error of a gradient is seen relative to all of it. What controls know has none, so the more of it that is, the
+// fewer samples do for the rest: their error falls as one over their number, and the rest of the gradient, a vector by
+// vertices, is about √(Σ measure² of the rest / Σ measure² of all) of the whole. No less than a quarter, for a motion
+// that all vertices share feels silhouettes more than creases, nor than takes a few milliseconds.
+constexpr double least_rest = 1.0 / 4, least_samples = 1 << 12;
 
 // How few samples a silhouette gets if it lies behind what the image hit (occlusion.h). Never none, for it may be
 // visible all the same; a gap may run along it, so that fewer rays than elsewhere find it. What was merely not hit
@@ -108,9 +115,17 @@ inline int64_t hiding_pixels(const OcclusionHint& occlusion, Vec2 low, Vec2 high
 }
 
 // What tells of creases without a sample.
+template <class T>
 struct CreaseHints {
-    Crossings crossings;
-    MeetingParts meeting;
+    const Crossings crossings;
+    const MeetingParts meeting;
+    const CreaseFaces<T> faces;
+
+    CreaseHints(const BackwardView<T>& view, const CurveFinder<T>& finder,
+                const std::vector<std::vector<ImageSegment>>& silhouettes)
+        : crossings(silhouettes, view.camera.width, view.camera.height, view.team),
+          meeting(view.hit, view.scene.faces, view.geometry.parts(), view.camera.width, view.camera.height, view.team),
+          faces(view, finder, crossings, meeting) {}
 };
 
 // The curves of one chunk of edges.
@@ -121,8 +136,14 @@ class MeasuredEdges {
    public:
     // `hints`, and `x`, where controls go: null if there are no controls.
     MeasuredEdges(const BackwardView<T>& view, const CurveFinder<T>& finder, const JumpScale& scale,
-                  const CreaseHints* hints, RowBuffer* x)
-        : view_(view), finder_(finder), scale_(scale), x_(x), jumps_(view.scene), control_(view) {
+                  const CreaseHints<T>* hints, RowBuffer* x)
+        : view_(view),
+          finder_(finder),
+          scale_(scale),
+          faces_(hints ? &hints->faces : nullptr),
+          x_(x),
+          jumps_(view.scene),
+          control_(view) {
         if (hints) visibility_.emplace(view, hints->crossings, hints->meeting);
     }
 
@@ -130,22 +151,12 @@ class MeasuredEdges {
     std::vector<MeasuredCurve> curves;
     std::vector<ImageSegment> segments;
 
+    std::vector<ClearCrease> clear;
+    bool any_hidden = false;
+
     void add(int64_t first, int64_t last) {
-        finder_.each(first, last, finder_.finds_creases(), [&](int64_t e) {
-            Curve c;
-            if (!finder_.find(e, c)) return;
-            ++(c.is_crease() ? found.creases : found.silhouettes);
-            const auto [low, high] = view_.camera.image_box(c.low(), c.high());
-            const Jump jump{int64_t(curves.size()), size_of_jump(c), view_.importance.mean(low, high)};
-            if (!(jump.importance > 0) || !std::isfinite(c.length)) return;
-            curves.push_back({.edge = int32_t(e)});
-            const int64_t hiding = hiding_pixels(view_.occlusion, low, high, c.nearest_depth());
-            if (c.is_crease() && visibility_) {
-                add_crease(c, jump, hiding);
-            } else {
-                segments.push_back(image_segment(view_, c, jump.curve));
-                measure(c, jump, hiding ? view_.occlusion.factor(occluded, hiding, view_.image.spp) : 1);
-            }
+        finder_.each(first, last, FaceGlance{*this}, [&](int64_t e) {
+            if (!add_clear(e)) add_any(e);
         });
         answer();
     }
@@ -157,10 +168,82 @@ class MeasuredEdges {
         double size, importance;
     };
 
-    void measure(const Curve& c, const Jump& jump, double samples) {
-        const double pixels = c.length * view_.camera.stretch(c.low(), c.high()) * jump.size * samples;
-        curves[jump.curve].measure = pixels * jump.importance;
+    // What is known of the faces on both sides of an edge.
+    struct FaceGlance {
+        MeasuredEdges& edges;
+        using Glance = typename CurveFinder<T>::Glance;
+
+        Glance operator()(int64_t e, int32_t f, int32_t g) const {
+            if (!edges.faces_) return Glance::unknown;
+            const CreaseFace &one = (*edges.faces_)[f], &other = (*edges.faces_)[g];
+            if (one.value == other.value || std::isnan(one.value + other.value)) return Glance::unknown;
+            if (one.state != CreaseFace::hidden || other.state != CreaseFace::hidden) return Glance::differs;
+            edges.add_hidden(e, one, other);
+            return Glance::done;
+        }
+        void prefetch(int32_t face) const {
+            if (edges.faces_) edgegrad::prefetch(&(*edges.faces_)[face]);
+        }
+    };
+
+    // A crease between hidden faces gets so few samples that how large its jump is does not matter.
+    void add_hidden(int64_t e, const CreaseFace& one, const CreaseFace& other) {
+        ++found.creases;
+        if (!(one.importance > 0 && other.importance > 0)) return;
+        const double pixels = std::min(one.pixels, other.pixels);
         found.pixels += pixels;
+        curves.push_back(
+            {.measure = pixels * std::max(one.importance, other.importance), .edge = int32_t(e), .hidden = true});
+        any_hidden = true;
+    }
+
+    // A crease between faces that are visible as a whole, of which one was hit; or hidden, as it turns out. False for
+    // any other.
+    bool add_clear(int64_t e) {
+        const Topology& topology = view_.geometry.topology();
+        if (!faces_ || !topology.joins_two(e)) return false;
+        const auto sides = topology.faces(e);
+        if (finder_.facing()[sides[0]] * finder_.facing()[sides[1]] <= 0) return false;
+        const CreaseFace &one = (*faces_)[sides[0]], &other = (*faces_)[sides[1]];
+        if (one.state == CreaseFace::hidden && other.state == CreaseFace::hidden)
+            return add_hidden(e, one, other), true;
+        if (std::min(one.state, other.state) < CreaseFace::clear || std::max(one.state, other.state) < CreaseFace::seen)
+            return false;
+        Curve c;
+        if (!finder_.find_between(e, c) || !control_.set(c)) return false;
+        ++found.creases;
+        const Jump jump{int64_t(curves.size()), size_of_jump(c), view_.importance.mean(c.low(), c.high())};
+        if (!(jump.importance > 0)) return true;
+        clear.push_back({int32_t(curves.size()), CellMarks::around(c.low(), c.high())});
+        curves.push_back({.edge = int32_t(e)});
+        expect(c, jump, {true, OcclusionHint::factor(CreaseSamples::visible, view_.image.spp)});
+        return true;
+    }
+
+    void add_any(int64_t e) {
+        Curve c;
+        if (!finder_.find(e, c)) return;
+        ++(c.is_crease() ? found.creases : found.silhouettes);
+        const auto [low, high] = view_.camera.image_box(c.low(), c.high());
+        const Jump jump{int64_t(curves.size()), size_of_jump(c), view_.importance.mean(low, high)};
+        if (!(jump.importance > 0) || !std::isfinite(c.length)) return;
+        curves.push_back({.edge = int32_t(e)});
+        const int64_t hiding = hiding_pixels(view_.occlusion, low, high, c.nearest_depth());
+        if (c.is_crease() && visibility_) {
+            add_crease(c, jump, hiding);
+        } else {
+            segments.push_back(image_segment(view_, c, jump.curve));
+            measure(c, jump, hiding ? view_.occlusion.factor(occluded, hiding, view_.image.spp) : 1);
+        }
+    }
+
+    void measure(const Curve& c, const Jump& jump, double samples) {
+        MeasuredCurve& curve = curves[jump.curve];
+        const double pixels = c.length * view_.camera.stretch(c.low(), c.high()) * jump.size;
+        curve.measure = pixels * samples * jump.importance;
+        found.pixels += pixels * samples;
+        const double square = std::pow(pixels * jump.importance, 2);
+        found.unknown += square * samples, found.squares += square * (curve.controlled ? 1 : samples);
     }
 
     void add_crease(const Curve& c, const Jump& jump, int64_t hiding) {
@@ -197,7 +280,7 @@ class MeasuredEdges {
     // Relative to a jump of the size of the mean, which is taken where nothing is known.
     double size_of_jump(const Curve& c) {
         if (!joins_colors(view_.scene, c)) return 1;
-        jumps_.set(c);
+        jumps_.set(c.minus, c.plus);
         const double size = 0.5 * (jumps_.size(0, scale_.weights) + jumps_.size(1, scale_.weights));
         return std::min(size / scale_.unknown, largest);
     }
@@ -206,6 +289,7 @@ class MeasuredEdges {
     const BackwardView<T>& view_;
     const CurveFinder<T>& finder_;
     const JumpScale& scale_;
+    const CreaseFaces<T>* faces_;
     RowBuffer* x_;
     CreaseJumps<N, T> jumps_;
     CreaseControl<N, T> control_;
@@ -233,11 +317,13 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
             const double pixels = c.length * view.camera.stretch(c.low(), c.high()) *
                                   (hiding ? view.occlusion.factor(occluded, hiding, view.image.spp) : 1);
             found[k].pixels += pixels;
+            found[k].unknown += std::pow(pixels * importance, 2);
             parts[k].push_back({pixels * importance, int32_t(i)});
         }
     });
     for (size_t k = 0; k < parts.size(); ++k) {
         out.pixels += found[k].pixels, out.intersections += found[k].intersections;
+        out.squares += found[k].unknown, out.unknown += found[k].unknown;
         out.intersection.insert(out.intersection.end(), parts[k].begin(), parts[k].end());
     }
 }
@@ -248,7 +334,7 @@ std::vector<std::vector<ImageSegment>> silhouettes(const BackwardView<T>& view, 
     const int64_t E = view.geometry.topology().n_edges();
     std::vector<std::vector<ImageSegment>> parts(Team::blocks(E));
     view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) {
-        finder.each(first, last, false, [&](int64_t e) {
+        finder.each(first, last, typename CurveFinder<T>::NoCreases(), [&](int64_t e) {
             Curve c;
             if (finder.find(e, c) && !c.is_crease() && std::isfinite(c.length))
                 parts[k].push_back(image_segment(view, c, 0));
@@ -270,7 +356,37 @@ Curves<T>::Curves(const BackwardView<T>& view, Array<int8_t> facing)
 template <class T>
 int64_t Curves<T>::wanted(int64_t given) const {
     if (!(pixels > 0)) return 0;
-    return given >= 0 ? given : int64_t(std::ceil(samples_per_pixel * pixels));
+    if (given >= 0) return given;
+    const double rest = squares > 0 ? std::clamp(std::sqrt(unknown / squares), least_rest, 1.0) : 1;
+    const double all = samples_per_pixel * pixels;
+    return int64_t(std::ceil(std::max(rest * all, std::min(all, least_samples))));
+}
+
+template <class T>
+void Curves<T>::add_segments(const BackwardView<T>& view, bool all) {
+    const int64_t n = int64_t(segments.size());
+    const auto segment = [&](int64_t k) {
+        Curve c;
+        finder.find(curve[k].edge, c);
+        return image_segment(view, c, k);
+    };
+    if (all) {
+        std::vector<std::vector<ImageSegment>> hidden(Team::blocks(int64_t(curve.size())));
+        view.team.each_block(int64_t(curve.size()), [&](int64_t part, int64_t first, int64_t last) {
+            for (int64_t k = first; k < last; ++k)
+                if (curve[k].hidden) hidden[part].push_back(segment(k));
+        });
+        segments.insert(segments.end(), std::make_move_iterator(hidden.begin()), std::make_move_iterator(hidden.end()));
+    }
+    CellMarks marks(view.camera.width, view.camera.height);
+    if (!all)
+        view.team.each(n, [&](int64_t part) {
+            for (const ImageSegment& s : segments[part]) marks.mark(s.a, s.b, s.reach);
+        });
+    view.team.each(int64_t(clear.size()), [&](int64_t part) {
+        for (const ClearCrease& c : clear[part])
+            if (all || marks.any(c.cells)) segments[part].push_back(segment(c.curve));
+    });
 }
 
 template <int N, class T>
@@ -278,19 +394,21 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing) {
     Curves<T> out(view, std::move(facing));
     const int64_t E = view.geometry.topology().n_edges();
     const JumpScale scale = out.finder.finds_creases() ? jump_scale(view) : JumpScale{};
-    const int width = view.camera.width, height = view.camera.height;
-    std::optional<CreaseHints> hints;
-    if (!out.x_bar.empty())
-        hints.emplace(Crossings(silhouettes(view, out.finder), width, height, view.team),
-                      MeetingParts(view.hit, view.scene.faces, view.geometry.parts(), width, height, view.team));
+    std::optional<CreaseHints<T>> hints;
+    if (!out.x_bar.empty()) hints.emplace(view, out.finder, silhouettes(view, out.finder));
     std::vector<CurvesFound> found;
     std::vector<std::vector<MeasuredCurve>> curves;
+    std::vector<uint8_t> any_hidden;
     const auto measure = [&](int64_t k, int64_t first, int64_t last, RowBuffer* x) {
         MeasuredEdges<N, T> part(view, out.finder, scale, hints ? &*hints : nullptr, x);
         part.add(first, last);
         found[k] = part.found, curves[k] = std::move(part.curves), out.segments[k] = std::move(part.segments);
+        out.clear[k] = std::move(part.clear);
+        any_hidden[k] = part.any_hidden;
     };
-    const auto resize = [&](int64_t n) { found.resize(n), curves.resize(n), out.segments.resize(n); };
+    const auto resize = [&](int64_t n) {
+        found.resize(n), curves.resize(n), out.segments.resize(n), out.clear.resize(n), any_hidden.resize(n);
+    };
     if (out.x_bar.empty()) {
         resize(Team::blocks(E));
         view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) { measure(k, first, last, nullptr); });
@@ -304,7 +422,8 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing) {
         });
     }
     for (const CurvesFound& f : found)
-        out.pixels += f.pixels, out.silhouettes += f.silhouettes, out.creases += f.creases;
+        out.pixels += f.pixels, out.silhouettes += f.silhouettes, out.creases += f.creases, out.squares += f.squares,
+            out.unknown += f.unknown;
     int64_t n = 0;
     for (const auto& part : curves) n += int64_t(part.size());
     measure_intersections(view, out);
@@ -312,6 +431,8 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing) {
     for (size_t i = 0; i < out.intersection.size(); ++i) out.measure[n + int64_t(i)] = out.intersection[i].measure;
     for (size_t k = 0; k < curves.size(); ++k) {
         for (ImageSegment& s : out.segments[k]) s.curve += int32_t(out.curve.size());
+        for (ClearCrease& c : out.clear[k]) c.curve += int32_t(out.curve.size());
+        out.any_hidden |= any_hidden[k];
         for (const MeasuredCurve& c : curves[k])
             out.measure[int64_t(out.curve.size())] = c.measure, out.curve.push_back(c);
     }

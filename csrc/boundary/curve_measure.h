@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "backward/view.h"
+#include "boundary/cell_marks.h"
 #include "boundary/coincident.h"
 #include "boundary/curve.h"
 
@@ -13,13 +14,20 @@ namespace edgegrad {
 // Curves are laid end to end by length · (mean |Ã| near them) · (how large the jump is, as far as it is known), less
 // where they are most likely occluded or where a control (crease_control.h) says nearly all.
 struct CurvesFound {
-    double pixels = 0;  // the measure without the adjoint, which default samples go by
+    double pixels = 0;                // the measure without the adjoint, which default samples go by
+    double squares = 0, unknown = 0;  // Σ measure² of what is expected to be visible, and of what controls do not say
     int64_t silhouettes = 0, creases = 0, intersections = 0;  // in view
 };
 struct MeasuredCurve {
     double measure = 0;
     int32_t edge;
     bool controlled = false;  // whether x_bar has the integral of a crease's control
+    bool hidden = false;      // a crease between hidden faces (crease_faces.h)
+};
+// A crease between faces that are seen whole.
+struct ClearCrease {
+    int32_t curve;
+    CellMarks::Cells cells;
 };
 struct MeasuredIntersection {
     double measure = 0;
@@ -27,7 +35,7 @@ struct MeasuredIntersection {
 };
 // Bytes of a curve in view, at most; the list of curves doubles as it grows.
 constexpr int64_t bytes_per_curve() {
-    return 3 * sizeof(MeasuredCurve) + sizeof(double) + CoincidentCurves::bytes_per_curve();
+    return 3 * (sizeof(MeasuredCurve) + sizeof(ClearCrease)) + sizeof(double) + CoincidentCurves::bytes_per_curve();
 }
 
 template <class T>
@@ -36,13 +44,18 @@ struct Curves : CurvesFound {
     std::vector<MeasuredCurve> curve;                 // those where the loss looks, by ascending edges
     std::vector<MeasuredIntersection> intersection;   // after them, those of faces that pass through each other
     Array<double> measure{0};                         // of both
-    std::vector<std::vector<ImageSegment>> segments;  // of those that others may lie on, by ascending edges
+    std::vector<std::vector<ImageSegment>> segments;  // of those that others may lie on
+    std::vector<std::vector<ClearCrease>> clear;      // of which no segment was made
+    bool any_hidden = false;                          // or of creases between hidden faces, if there are any
     Array<double> x_bar;  // (V, 2) what controls add to the cotangents of places in the image; empty: there are none
 
     Curves(const BackwardView<T>& view, Array<int8_t> facing);
 
     // Samples: so many as are given, if not −1, or the defaults.
     int64_t wanted(int64_t given) const;
+
+    // Adds the segments of those clear creases in whose pixels any other curve lies; or of all creases.
+    void add_segments(const BackwardView<T>& view, bool all);
 };
 
 // Finds and measures all curves, and begins x_bar with the integrals of the controls. `facing` (F,): Camera::facing.

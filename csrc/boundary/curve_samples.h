@@ -56,7 +56,6 @@ class CurveSamples {
         source_.finish(grad);
     }
 
-   private:
     void cast() {
         rays_.prepare();
         view_.frame.cast(rays_, ignored_);
@@ -70,6 +69,7 @@ class CurveSamples {
         source_.cast();
     }
 
+   private:
     const BackwardView<T>& view_;
     const Visibility<T> visibility_;
     Source& source_;

@@ -17,6 +17,12 @@ inline void prefetch(const void* p) {
 #endif
 }
 
+// The same of n elements from p on, which may lie in two lines of the cache.
+template <class T>
+void prefetch_all(const T* p, int64_t n) {
+    prefetch(p), prefetch(reinterpret_cast<const char*>(p + n) - 1);
+}
+
 // An array of which every element will be written before it is read, by several threads. Unlike std::vector it sets
 // nothing to zero: one thread would do that, and fetch the pages from the system, while the others wait. Memory comes
 // from the one that writes it first.

@@ -79,6 +79,12 @@ class Importance {
             for (const int i : {i0, i1}) edgegrad::prefetch(&table_[index(i, j)]);
     }
 
+    // The same for a place of the image.
+    void prefetch(Vec2 x) const {
+        const int i = clamp(x.x, width_), j = clamp(x.y, height_);
+        prefetch(i, i, j, std::min(j + 1, height_));
+    }
+
     // Mean over the pixels that the filter reaches from a box.
     double mean(Vec2 low, Vec2 high) const {
         return mean(clamp(std::floor(low.x - radius_), width_), clamp(std::floor(high.x + radius_) + 1, width_),

@@ -1,0 +1,134 @@
+// What the image says of whole faces. Of a mesh with a colour for each face every edge is a crease, and nearly all of
+// them lie between two faces that are hidden, or visible, as a whole: of these nothing more is asked.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <vector>
+
+#include "backward/view.h"
+#include "boundary/crease_visibility.h"
+#include "boundary/crossings.h"
+#include "boundary/curve.h"
+#include "boundary/meeting_parts.h"
+#include "scene/contact.h"
+
+namespace edgegrad {
+
+struct CreaseFace {
+    // `hidden`: behind all that was hit around it, or on the side of a closed mesh that is turned away; `clear`: in the
+    // middle of what was hit, `seen`: and hit itself. Of none of these does a silhouette pass before the face.
+    // `unknown` for all others.
+    enum State : uint8_t { unknown, hidden, clear, seen };
+    float value;   // of two that differ the faces differ along their edge; not a number: of this one it does not say
+    float pixels;  // of a hidden one: the measure of a crease beside it, without the adjoint
+    float importance;  // and of the adjoint
+    State state;
+};
+
+template <class T>
+class CreaseFaces {
+   public:
+    CreaseFaces(const BackwardView<T>& view, const CurveFinder<T>& finder, const Crossings& crossings,
+                const MeetingParts& meeting)
+        : view_(view), finder_(finder), crossings_(crossings), meeting_(meeting), faces_(view.scene.n_faces) {
+        set_largest();
+        view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+            constexpr int64_t ahead = 16;
+            for (int64_t f = first; f < last; ++f) {
+                if (f + ahead < last)
+                    for (int i = 0; i < 3; ++i) {
+                        const int32_t v = view.scene.faces[3 * (f + ahead) + i];
+                        prefetch(&view.vertices.x[v]), prefetch(&view.vertices.q[v].z);
+                    }
+                faces_[f] = look_at(f);
+            }
+        });
+    }
+
+    const CreaseFace& operator[](int64_t face) const { return faces_[face]; }
+
+    static constexpr int64_t bytes_per_face = sizeof(CreaseFace);
+
+   private:
+    CreaseFace look_at(int64_t f) const {
+        CreaseFace out{value_of(f), 0, 0, CreaseFace::unknown};
+        const int32_t* v = view_.scene.faces + 3 * f;
+        const VertexView& p = view_.vertices;
+        if ((p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]]) || is_textured(view_.scene, f)) return out;
+        const ImageHits& hits = *view_.hits;
+        const bool behind = hits.are_behind(v);
+        const ImageHits::Face hit = hits.of(v);
+        if (!behind && hit.partly && !hit.clear) return out;
+
+        const Vec2 a = p.x[v[0]], b = p.x[v[1]], c = p.x[v[2]];
+        const Vec2 low{std::min({a.x, b.x, c.x}), std::min({a.y, b.y, c.y})},
+            high{std::max({a.x, b.x, c.x}), std::max({a.y, b.y, c.y})};
+        const auto [nearest, farthest] = std::minmax({p.q[v[0]].z, p.q[v[1]].z, p.q[v[2]].z});
+        const double touching = contact(spacing_, largest_, std::max(std::fabs(nearest), std::fabs(farthest)));
+        const double w = view_.camera.perspective ? nearest : 1;
+        if (!(finder_.rounding(by_axis_, w, pixels_) < Crossings::float_reach) ||
+            crossings_.in(low, high, farthest + touching))
+            return out;
+        if (hit.partly) {
+            if (!meeting_.in(low, high)) out.state = view_.seen[f] ? CreaseFace::seen : CreaseFace::clear;
+            return out;
+        }
+        // Each point of a side is as near to one of its ends as the hint reaches.
+        const double longest = std::max({length(b - a), length(c - b), length(a - c)});
+        double samples = 0;
+        if (behind && longest <= 2 * OcclusionHint::reach)
+            samples = view_.occlusion.factor(CreaseSamples::hidden, OcclusionHint::pixels_around, view_.image.spp);
+        else if (hits.is_turned_away(v[0], side_of(view_, f))) samples = CreaseSamples::turned_away;
+        if (samples == 0) return out;
+        out.state = CreaseFace::hidden;
+        out.pixels = float(longest * samples), out.importance = float(view_.importance.mean(low, high));
+        return out;
+    }
+
+    // Of values at the corners only those of faces of one colour are compared.
+    float value_of(int64_t f) const {
+        const SceneView<T>& scene = view_.scene;
+        const auto sum = [](const auto* values, int n) {
+            double all = 0;
+            for (int i = 0; i < n; ++i) all += (i + 1) * double(values[i]);
+            return float(all);
+        };
+        if (const Attributes& a = scene.attributes; a.face_width) return sum(a.face + a.face_width * f, a.face_width);
+        const int32_t* row = scene.corners + 3 * f;
+        if (row[0] != row[1] || row[1] != row[2] || is_textured(scene, f))
+            return std::numeric_limits<float>::quiet_NaN();
+        return sum(scene.colors + scene.radiance * int64_t(row[0]), scene.radiance);
+    }
+
+    // Bounds for all faces, of what else would be asked of each edge: how large coordinates and how coarse they are.
+    void set_largest() {
+        const int64_t V = view_.scene.n_verts;
+        std::vector<Vec3> parts(Team::blocks(V));
+        view_.team.each_block(V, [&](int64_t k, int64_t first, int64_t last) {
+            double most[3] = {};
+            for (int64_t v = first; v < last; ++v)
+                for (int i = 0; i < 3; ++i) most[i] = std::max(most[i], std::fabs(view_.scene.verts[3 * v + i]));
+            parts[k] = {most[0], most[1], most[2]};
+        });
+        for (const Vec3& m : parts) {
+            const double of_part[3] = {m.x, m.y, m.z};
+            for (int i = 0; i < 3; ++i) by_axis_[i] = std::max(by_axis_[i], of_part[i]);
+        }
+        largest_ = std::max({by_axis_[0], by_axis_[1], by_axis_[2]});
+        spacing_ = *std::max_element(view_.scene.spacing->value.begin(), view_.scene.spacing->value.end());
+        const double margin = 2 * (view_.importance.radius() + 1);
+        pixels_ = 2 * (view_.camera.width + view_.camera.height + 2 * margin);
+    }
+
+    const BackwardView<T>& view_;
+    const CurveFinder<T>& finder_;
+    const Crossings& crossings_;
+    const MeetingParts& meeting_;
+    Array<CreaseFace> faces_;
+    double by_axis_[3] = {}, largest_ = 0, spacing_ = 0, pixels_ = 0;
+};
+
+}  // namespace edgegrad
