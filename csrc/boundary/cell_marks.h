@@ -23,6 +23,8 @@ class CellMarks {
 
     static Cells around(Vec2 low, Vec2 high) { return {index(low.x), index(low.y), index(high.x), index(high.y)}; }
 
+    static constexpr int64_t bytes_per_pixel = sizeof(uint8_t);  // at most
+
     // Those that a segment comes nearer to than `margin`; by any thread.
     void mark(Vec2 a, Vec2 b, double margin) {
         const int parts = 1 + int(std::min(length(b - a) / cell, 0x1p16));

@@ -50,8 +50,6 @@ class CreaseFaces {
 
     const CreaseFace& operator[](int64_t face) const { return faces_[face]; }
 
-    static constexpr int64_t bytes_per_face = sizeof(CreaseFace);
-
    private:
     CreaseFace look_at(int64_t f) const {
         CreaseFace out{value_of(f), 0, 0, CreaseFace::unknown};

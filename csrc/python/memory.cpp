@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "backward/image_hits.h"
+#include "boundary/crease_faces.h"
 #include "boundary/curve_measure.h"
 #include "boundary/meeting_parts.h"
 #include "boundary/steps.h"
@@ -100,7 +101,9 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         // Where all attributes are indexed like the vertices, curves are silhouettes: a quarter of a tangled mesh.
         const int64_t curves = w.curves < 0 ? s.edges() / (s.jumps ? 1 : 4) : w.curves;
         bytes["edges in view"] = s.faces + curves * bytes_per_curve();
-        bytes["creases"] = s.jumps ? 2 * word * s.verts + MeetingParts::bytes_per_pixel * s.pixels : 0;
+        bytes["creases"] = s.jumps ? 2 * word * s.verts + int64_t(sizeof(CreaseFace)) * s.faces +
+                                         (MeetingParts::bytes_per_pixel + CellMarks::bytes_per_pixel) * s.pixels
+                                   : 0;
         bytes["edge samples"] = rows(w.edge_samples < 0 ? many : w.edge_samples,
                                      w.curves < 0 ? s.edges() : w.curves + w.intersections, 6, 3, s.verts);
         bytes["topology"] = Topology::bytes(s.faces, s.edges()) + FaceTree::bytes(s.faces);
