@@ -251,7 +251,8 @@ def test_default_samples_at_creases(name: str) -> None:
 
 
 def test_hidden_creases_seen_through_a_gap() -> None:
-    """A hole of half a pixel, which one ray a pixel misses every other time: then all creases behind it count as hidden."""
+    """A hole of half a pixel, which one ray a pixel misses every other time: then what lies behind it was not hit, and only its
+    rim tells that it may be seen."""
     ball = coloured_sphere(3)
     corner = torch.tensor([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]], dtype=F64)
     verts = torch.cat([torch.cat([size * corner, torch.full((4, 1), 1.3, dtype=F64)], 1) for size in (2.0, 0.03)])
