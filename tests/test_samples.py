@@ -133,6 +133,26 @@ def test_what_joins_at_an_edge_hides_what_lies_beyond_and_no_more(dtype: torch.d
     assert bool(hits.visible(on_wall)[floor].all())
 
 
+def test_rays_pass_through_what_is_cut_out():
+    """A square screen of which the left half is cut out, before a floor."""
+    uvs = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64)
+    corner = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=F64)
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    alpha = torch.tensor([[0.0, 1.0]], dtype=F64)
+    screen = eg.Mesh(corner, faces, uvs=uvs, uv_faces=faces, alpha=alpha, wrap="clamp")
+    floor = eg.Mesh(3 * corner + torch.tensor([0.0, 0, 1], dtype=F64), faces)
+    scene = eg.Scene([screen, floor])
+    x = torch.linspace(-0.95, 0.95, 20, dtype=F64)
+    origins = torch.stack([x, torch.full_like(x, 0.3), torch.full_like(x, -2.0)], 1)
+    hits = eg.trace(scene, origins, torch.tensor([0.0, 0.0, 1.0], dtype=F64))
+    assert torch.equal(hits.mesh, (x < 0).long())
+    below = hits.select(hits.mesh == 1)
+    # From the floor straight back: through the hole; and a light far to the right is behind what is left of the screen.
+    assert bool(below.visible(below.position - torch.tensor([0.0, 0, 5], dtype=F64)).all())
+    near = below.select(below.position[:, 0] > -0.5)
+    assert not bool(near.visible(torch.tensor([2.0, 0.3, -2.0], dtype=F64)).any())
+
+
 def test_points_to_see_are_checked():
     hits = eg.primary_hits(ball(), front_camera(SIZE)).hits
     with pytest.raises(ValueError, match=r"points: expected shape"):

@@ -92,8 +92,7 @@ bool uvs_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
 template <class T>
 bool attributes_jump(const SceneView<T>& scene, const HalfEdge& m, const HalfEdge& p) {
     const Attributes& a = scene.attributes;
-    return a.barycentrics || (a.uv && uvs_jump(scene, m, p)) ||
-           rows_differ(a.face, a.face_width, m.face, p.face) ||
+    return a.barycentrics || (a.uv && uvs_jump(scene, m, p)) || rows_differ(a.face, a.face_width, m.face, p.face) ||
            rows_differ(a.vertex, a.vertex_width, vertex(scene, m, m.first()), vertex(scene, p, p.first())) ||
            rows_differ(a.vertex, a.vertex_width, vertex(scene, m, m.second()), vertex(scene, p, p.second()));
 }

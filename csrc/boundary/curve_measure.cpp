@@ -119,13 +119,14 @@ template <class T>
 struct CreaseHints {
     const Crossings crossings;
     const MeetingParts meeting;
-    const CreaseFaces<T> faces;
+    std::optional<CreaseFaces<T>> faces;  // none where some are cut out: their rims are no silhouettes that they know
 
     CreaseHints(const BackwardView<T>& view, const CurveFinder<T>& finder,
                 const std::vector<std::vector<ImageSegment>>& silhouettes)
         : crossings(silhouettes, view.camera.width, view.camera.height, view.team),
-          meeting(view.hit, view.scene.faces, view.geometry.parts(), view.camera.width, view.camera.height, view.team),
-          faces(view, finder, crossings, meeting) {}
+          meeting(view.hit, view.scene.faces, view.geometry.parts(), view.camera.width, view.camera.height, view.team) {
+        if (!view.scene.cut_outs.face) faces.emplace(view, finder, crossings, meeting);
+    }
 };
 
 // The curves of one chunk of edges.
@@ -140,7 +141,7 @@ class MeasuredEdges {
         : view_(view),
           finder_(finder),
           scale_(scale),
-          faces_(hints ? &hints->faces : nullptr),
+          faces_(hints && hints->faces ? &*hints->faces : nullptr),
           x_(x),
           jumps_(view.scene),
           control_(view) {

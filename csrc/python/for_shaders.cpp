@@ -3,9 +3,9 @@
 #include "backward/backward.h"
 #include "forward/pixel_hits.h"
 #include "forward/places.h"
+#include "forward/trace.h"
 #include "python/arrays.h"
 #include "python/unlocked.h"
-#include "rays/trace.h"
 
 using namespace nanobind::literals;
 
@@ -129,8 +129,7 @@ nb::dict trace_rays(const SceneArrays<T>& arrays, In<double, 2> origins, In<doub
     unlocked(threads, [&](Team& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
-        found = trace({arrays.verts.data(), arrays.faces.data()}, geometry->caster(),
-                      {origins.data(), directions.data(), int64_t(n)}, team);
+        found = trace(arrays.view(), geometry->caster(), {origins.data(), directions.data(), int64_t(n)}, team);
     });
     nb::dict out;
     out["face"] = rows(std::move(found.face)), out["b"] = rows(std::move(found.b), {2});
@@ -148,7 +147,7 @@ nb::object visible_points(const SceneArrays<T>& arrays, In<int32_t, 1> face, In<
     unlocked(threads, [&](Team& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
-        found = visible({arrays.verts.data(), arrays.faces.data()}, geometry->caster(),
+        found = visible(arrays.view(), geometry->caster(),
                         {face.data(), b.data(), to.data(), contact.data(), int64_t(n)}, team);
     });
     return rows(std::move(found));

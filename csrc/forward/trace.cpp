@@ -1,13 +1,20 @@
-#include "rays/trace.h"
+#include "forward/trace.h"
 
 #include <algorithm>
 #include <cmath>
+
+#include "shading/cut_outs.h"
 
 namespace edgegrad {
 
 namespace {
 
 Vec3 vec(const double* v) { return {v[0], v[1], v[2]}; }
+
+template <class T>
+Vec3 corner(const SceneView<T>& scene, int64_t face, int i) {
+    return vec(scene.verts + 3 * int64_t(scene.faces[3 * face + i]));
+}
 
 // Where a ray meets the plane of a face: barycentrics, and the distance in lengths of its direction (Möller and
 // Trumbore 1997). Not numbers where it runs along the plane.
@@ -21,8 +28,9 @@ struct Meeting {
         return u >= -rounding && v >= -rounding && u + v <= 1 + rounding;
     }
 };
-Meeting meet(const Triangles& triangles, int64_t face, const Ray& ray) {
-    const Vec3 q0 = triangles.corner(face, 0), e1 = triangles.corner(face, 1) - q0, e2 = triangles.corner(face, 2) - q0,
+template <class T>
+Meeting meet(const SceneView<T>& scene, int64_t face, const Ray& ray) {
+    const Vec3 q0 = corner(scene, face, 0), e1 = corner(scene, face, 1) - q0, e2 = corner(scene, face, 2) - q0,
                s = ray.origin - q0;
     const Vec3 p = cross(ray.direction, e2), q = cross(s, e1);
     const double scale = 1 / dot(e1, p);
@@ -73,7 +81,8 @@ void each_batch(int64_t size, Team& team, Body body) {
 
 }  // namespace
 
-RayHits trace(const Triangles& triangles, const RayCaster& caster, const TracedRays& rays, Team& team) {
+template <class T>
+RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRays& rays, Team& team) {
     RayHits out;
     out.face.resize(rays.size), out.b.resize(2 * rays.size);
     each_batch(rays.size, team, [&](int64_t first, int n) {
@@ -85,10 +94,11 @@ RayHits trace(const Triangles& triangles, const RayCaster& caster, const TracedR
         cast_each(
             caster, n, out.face.data() + first, ray, [](int) { return -1; },
             [&](int i, int32_t face) {
-                const Meeting m = meet(triangles, face, ray(i));
+                const Meeting m = meet(scene, face, ray(i));
                 if (!m.exists() || m.t < 0) return false;
                 double u = std::max(m.u, 0.0), v = std::max(m.v, 0.0);
                 if (u + v > 1) u /= u + v, v = 1 - u;
+                if (!shows(scene, face, {u, v})) return false;
                 out.b[2 * (first + i)] = u, out.b[2 * (first + i) + 1] = v;
                 return true;
             });
@@ -96,7 +106,8 @@ RayHits trace(const Triangles& triangles, const RayCaster& caster, const TracedR
     return out;
 }
 
-std::vector<uint8_t> visible(const Triangles& triangles, const RayCaster& caster, const Sightlines& lines, Team& team) {
+template <class T>
+std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, Team& team) {
     std::vector<uint8_t> out(lines.size);
     each_batch(lines.size, team, [&](int64_t first, int n) {
         Ray ray[RayBatch::size];
@@ -105,7 +116,7 @@ std::vector<uint8_t> visible(const Triangles& triangles, const RayCaster& caster
             const int64_t k = first + i, face = lines.face[k];
             const double u = lines.b[2 * k], v = lines.b[2 * k + 1];
             const Vec3 from =
-                (1 - u - v) * triangles.corner(face, 0) + u * triangles.corner(face, 1) + v * triangles.corner(face, 2);
+                (1 - u - v) * corner(scene, face, 0) + u * corner(scene, face, 1) + v * corner(scene, face, 2);
             ray[i] = {from, vec(lines.to + 3 * k) - from, 1};
             contact[i] = lines.contact[k] / length(ray[i].direction);
         }
@@ -113,12 +124,18 @@ std::vector<uint8_t> visible(const Triangles& triangles, const RayCaster& caster
         cast_each(
             caster, n, hidden_by, [&](int i) { return ray[i]; }, [&](int i) { return lines.face[first + i]; },
             [&](int i, int32_t face) {
-                const Meeting m = meet(triangles, face, ray[i]);
-                return m.exists() && m.inside() && m.t > contact[i] && m.t < 1 - contact[i];
+                const Meeting m = meet(scene, face, ray[i]);
+                return m.exists() && m.inside() && m.t > contact[i] && m.t < 1 - contact[i] &&
+                       shows(scene, face, inside({m.u, m.v}));
             });
         for (int i = 0; i < n; ++i) out[first + i] = hidden_by[i] < 0;
     });
     return out;
 }
+
+template RayHits trace(const SceneView<float>&, const RayCaster&, const TracedRays&, Team&);
+template RayHits trace(const SceneView<double>&, const RayCaster&, const TracedRays&, Team&);
+template std::vector<uint8_t> visible(const SceneView<float>&, const RayCaster&, const Sightlines&, Team&);
+template std::vector<uint8_t> visible(const SceneView<double>&, const RayCaster&, const Sightlines&, Team&);
 
 }  // namespace edgegrad

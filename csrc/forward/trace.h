@@ -1,5 +1,5 @@
 // Any rays through a scene, from where a user says: what they hit, and whether a point sees another. Embree says in
-// float which face a ray may meet, double decides whether it does.
+// float which face a ray may meet, double decides whether it does, and whether the face is there or cut out.
 #pragma once
 
 #include <cstdint>
@@ -7,19 +7,9 @@
 
 #include "core/parallel.h"
 #include "rays/raycast.h"
+#include "scene/scene.h"
 
 namespace edgegrad {
-
-// Vertices (V, 3) and faces (F, 3).
-struct Triangles {
-    const double* verts;
-    const int32_t* faces;
-
-    Vec3 corner(int64_t face, int i) const {
-        const double* p = verts + 3 * int64_t(faces[3 * face + i]);
-        return {p[0], p[1], p[2]};
-    }
-};
 
 // Origins and directions (N, 3).
 struct TracedRays {
@@ -31,7 +21,8 @@ struct RayHits {
     std::vector<int32_t> face;  // (N,) the nearest, −1: none
     std::vector<double> b;      // (N, 2) where on it
 };
-RayHits trace(const Triangles& triangles, const RayCaster& caster, const TracedRays& rays, Team& team);
+template <class T>
+RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRays& rays, Team& team);
 
 // N points on faces, and the points (N, 3) that they may see.
 struct Sightlines {
@@ -41,6 +32,7 @@ struct Sightlines {
     int64_t size;
 };
 // (N,): 1 where nothing lies between the two. The face of the point itself hides nothing.
-std::vector<uint8_t> visible(const Triangles& triangles, const RayCaster& caster, const Sightlines& lines, Team& team);
+template <class T>
+std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, Team& team);
 
 }  // namespace edgegrad
