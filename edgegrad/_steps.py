@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -31,8 +32,12 @@ class Steps:
 
     def __init__(self, states: Tensor | None = None) -> None:
         self.kinds: list[str] = []
-        self.values: list[Tensor] = []  # (N,) each
+        self.values: list[Tensor] = []  # (N,) each; not numbers where it was not asked for
         self._states = states
+
+    @property
+    def forced(self) -> bool:
+        return self._states is not None
 
     def above_zero(self, s: Tensor) -> Tensor:
         forced = self._note(SIGN, s)
@@ -50,6 +55,19 @@ class Steps:
         if len(self.kinds) > self._states.shape[1]:
             raise ValueError(UNEQUAL)
         return self._states[:, len(self.kinds) - 1].to(values.device)
+
+
+class StepsOfSome(Steps):
+    """Those of some of the points, which are steps of all of them."""
+
+    def __init__(self, whole: Steps, index: Tensor, count: int) -> None:
+        super().__init__()
+        self._whole, self._index, self._count = whole, index, count
+
+    def _note(self, kind: str, values: Tensor) -> Tensor | None:
+        nothing = values.new_full((self._count,), torch.nan)
+        forced = self._whole._note(kind, nothing.index_copy(0, self._index, values))
+        return None if forced is None else forced[self._index]
 
 
 UNEQUAL = (
@@ -118,7 +136,7 @@ def find_crossings(
     at: At, kinds: list[str], size: tuple[int, int], margin: float, spacing: float, seed: int
 ) -> Crossings:
     """Of an image of `size` (height, width), widened by `margin`. `at` tells what is at places (N, 2) of it."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = np.random.default_rng(seed)  # torch's own draws nothing under torch.vmap
     lines = _at_jumps(at, _grid(at, size, margin, spacing, generator))
     found = []
     # A piece that turns out to have a jump within (one surface ends before another) is divided there and looked at again.
@@ -139,9 +157,9 @@ def find_crossings(
     return Crossings(*map(torch.cat, zip(*found, strict=True)))
 
 
-def _grid(at: At, size: tuple[int, int], margin: float, spacing: float, generator: torch.Generator) -> _Lines:
+def _grid(at: At, size: tuple[int, int], margin: float, spacing: float, generator: np.random.Generator) -> _Lines:
     """All pieces, to the border of the image: lines run through the points of a grid, and end in points on the border."""
-    shift = torch.rand(2, generator=generator, dtype=torch.float64)
+    shift = torch.from_numpy(generator.random(2))
 
     def inner(length: int, shift: Tensor) -> Tensor:
         low, high = -margin, length + margin
@@ -193,7 +211,7 @@ def _bisect(at: At, low: Points, high: Points, like_low: Callable[[Points, Point
     return low, high
 
 
-def _candidates(lines: _Lines, kinds: list[str], generator: torch.Generator) -> _Candidates:
+def _candidates(lines: _Lines, kinds: list[str], generator: np.random.Generator) -> _Candidates:
     found: list[_Candidates] = []
     for k, kind in enumerate(kinds):
         a, b = lines.low.values[:, k], lines.high.values[:, k]
@@ -207,7 +225,7 @@ def _candidates(lines: _Lines, kinds: list[str], generator: torch.Generator) -> 
         line = (count > 0).nonzero()[:, 0]
         n, first = count[line], below[line] + 1
         for i in range(MOST_LEVELS):
-            drawn = (torch.rand(len(line), generator=generator, dtype=torch.float64) * n).floor()
+            drawn = (torch.from_numpy(generator.random(len(line))) * n).floor()
             level = first + torch.where(n > MOST_LEVELS, drawn, float(i))
             weight = (n / MOST_LEVELS).clamp(min=1)
             some = n > i
@@ -231,8 +249,9 @@ def _refine(at: At, lines: _Lines, kinds: list[str], candidates: _Candidates) ->
     whole = function(high) - function(low)
     low, high = _bisect(at, low, high, lambda mid, low: (above(mid) == above(low)) & (mid.face >= 0))
     rest = (function(high) - function(low)).abs()
-    # Of a smooth function 1/4096 is left, of one that jumps the jump.
-    good = (low.face == high.face) & (low.face >= 0) & (rest <= 0.05 * whole.abs())
+    # Of a smooth function 1/4096 is left, of one that jumps the jump. Both ends may lie on faces of their own: a border may run
+    # along an edge.
+    good = (low.part == high.part) & (low.face >= 0) & (rest <= 0.05 * whole.abs())
     return low, high, good
 
 
@@ -243,11 +262,13 @@ def _crossings(
     f = torch.stack([p.values.gather(1, c.step[:, None])[:, 0] - c.level for p in (low, high)])
     t = (f[0] / (f[0] - f[1]))[:, None].clamp(0, 1)
     signs = torch.tensor([kind == SIGN for kind in kinds])
-    before, after = (torch.where(signs, (p.values > 0).double(), p.values.floor()) for p in (low, high))
+    before, after = (torch.where(signs, (p.values > 0).double(), p.values.floor().nan_to_num()) for p in (low, high))
+    same = (low.face == high.face)[:, None]  # a place on two faces is taken on the first
     # Of steps that lie on one another, the first stands for all.
     first = (before != after).double().argmax(1) == c.step
     found = Crossings(
-        torch.lerp(low.x, high.x, t), low.face, torch.lerp(low.b, high.b, t), c.step, axis[c.line], spacing * c.weight,
+        torch.lerp(low.x, high.x, t), low.face, torch.where(same, torch.lerp(low.b, high.b, t), low.b), c.step,
+        axis[c.line], spacing * c.weight,
         before, after, f[1] > f[0],
     )  # fmt: skip
     return Crossings(*(part[first] for part in found))

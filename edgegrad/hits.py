@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ._check import as_tensor, check_finite, check_float, check_shape
+from ._check import as_tensor, check_finite, check_float, check_shape, values_visible
 from ._samples import RayRecords, visible
-from ._steps import Steps
+from ._steps import Steps, StepsOfSome
 from ._surfaces import Rays, Surfaces, View, every_face
 from .mesh import FILTERS, WRAPS
 
@@ -23,7 +23,8 @@ class Hits:
     Where the renderer differentiates a shader, they are differentiable functions of the vertices and the camera at fixed
     places in the image; elsewhere they have no derivatives. A shader must be a function of each point by itself.
 
-    render() makes them for its shader, trace() for any rays, primary_hits() for those of an image.
+    render() makes them for its shader, trace() for any rays, primary_hits() for those of an image. A property is kept once it
+    was asked for; under torch.utils.checkpoint of one's own, ask for those that are needed before.
     """
 
     def __init__(
@@ -48,12 +49,26 @@ class Hits:
         return f"Hits({len(self)} points)"
 
     def select(self, index: Tensor) -> Hits:
-        """Some of the points, or all in another order: `index` (M,) int64, or a mask (N,)."""
+        """Some of the points, or all in another order: `index` (M,) of integers, each once, or a mask (N,). What is declared of
+        them by where() and floor() is declared of the whole. Raises TypeError or ValueError that names the argument."""
+        index = as_tensor("index", index).to(self._face.device)
+        count = len(self)
         if index.dtype == torch.bool:
+            check_shape("index", index, (count,), fix="a mask has a value for each point")
             index = index.nonzero()[:, 0]
+        if index.is_floating_point() or index.is_complex():
+            raise TypeError(f"index: expected integers or a mask, got {index.dtype}")
+        check_shape("index", index, (len(index) if index.dim() == 1 else "M",))
+        index = index.long()
+        if values_visible(index) and not bool(((index >= -count) & (index < count)).all()):
+            raise ValueError(f"index: expected numbers below {count}, got {int(index.max())}")
+        return self.apart(index, StepsOfSome(self._steps, index % max(count, 1), count))
+
+    def apart(self, index: Tensor, steps: Steps | None = None) -> Hits:
+        """Some of the points, as hits that know nothing of the whole."""
         view = self._view.select(index) if isinstance(self._view, Rays) else self._view
         pixel = None if self._pixel is None else self._pixel[index]
-        return Hits(self._surfaces, view, self._face[index], self._exact[index], pixel, self._rays_at)
+        return Hits(self._surfaces, view, self._face[index], self._exact[index], pixel, self._rays_at, steps)
 
     @property
     def pixel(self) -> Tensor:
@@ -192,7 +207,7 @@ class Hits:
         texture = as_tensor("texture", texture, floating=True)
         check_float("texture", texture)
         check_shape("texture", texture, ("h", "w", "K"))
-        wraps = (wrap, wrap) if isinstance(wrap, str) else tuple(wrap)
+        wraps = (wrap, wrap) if isinstance(wrap, str) or not isinstance(wrap, Sequence) else tuple(wrap)
         if len(wraps) != 2 or any(w not in WRAPS for w in wraps):
             raise ValueError(f'wrap: expected "repeat", "clamp" or "mirror", or two of these, got {wrap!r}')
         if filter not in FILTERS:
@@ -266,11 +281,11 @@ class Hits:
 
         torch.where() gives the same image, but no gradient for the border. Borders are found along lines through the image,
         a pixel apart unless render() is given another step_spacing; two that lie closer may be missed. A shader must call
-        where(), floor() and nearest lookups equally often, in the same order, whatever its points. Raises TypeError or
+        where(), floor() and nearest lookups equally often, in the same order, whatever its points. Outside of a shader that
+        render() was given there is no image, and it is torch.where(). Raises TypeError or
         ValueError that names the argument.
         """
-        s = as_tensor("s", s, floating=True)
-        check_float("s", s)
+        s = _function("s", s)
         check_shape("s", s, (len(self),), (len(self), 1))
         up = self._steps.above_zero(s.reshape(-1))[:, None]
         sides = []
@@ -278,19 +293,21 @@ class Hits:
             value = as_tensor(name, side, like=s, floating=True)
             if value.dim() > 2 or (value.dim() == 2 and value.shape[0] not in (1, len(self))):
                 raise ValueError(f"{name}: expected rows (N, C), a colour (C,) or a number, got {tuple(value.shape)}")
-            if value.dim() == 1 and value.shape[0] > 1024:
+            if value.dim() == 1 and (value.shape[0] > 1024 or 64 < value.shape[0] == len(self)):
                 raise ValueError(
                     f"{name}: expected rows (N, C), a colour (C,) or a number, got shape {tuple(value.shape)}; a number a point "
                     "is value[:, None]"
                 )
             sides.append(value)
+        channels = [value.shape[-1] if value.dim() else 1 for value in sides]
+        if channels[0] != channels[1] and 1 not in channels:
+            raise ValueError(f"b: expected as many channels as a has, {channels[0]}, got {channels[1]}")
         return torch.where(up, *sides)
 
     def floor(self, t: Tensor) -> Tensor:
         """The largest integers not above t (N,) or (N, K), whose jumps are declared steps: see where(). For checkerboards,
         stripes, tables. Raises TypeError or ValueError that names the argument."""
-        t = as_tensor("t", t, floating=True)
-        check_float("t", t)
+        t = _function("t", t)
         check_shape("t", t, (len(self),), (len(self), "K"))
         if t.dim() == 1:
             return self._steps.floor(t)
@@ -314,6 +331,19 @@ class Hits:
         size = torch.maximum(points.abs().amax(1), self.position.detach().abs().amax(1)).double()
         spacing = max(torch.finfo(t.dtype).eps for t in (points, s.verts))
         return visible(s.scene, self._face, self._exact[:, 1:], points.double(), 16 * spacing * size)
+
+
+def _function(name: str, value: Tensor) -> Tensor:
+    """Of a step: finite, and not of the half precision that autocast gives. Raises TypeError or ValueError."""
+    value = as_tensor(name, value, floating=True)
+    if value.dtype in (torch.float16, torch.bfloat16):
+        value = value.float()
+    check_float(name, value)
+    if values_visible(value) and not bool(torch.isfinite(value.detach()).all()):
+        raise ValueError(
+            f"{name}: expected finite numbers, got {value.detach()[~torch.isfinite(value.detach())][0].item()}"
+        )
+    return value
 
 
 def _wrapped(cell: Tensor, count: int, wrap: str) -> Tensor:

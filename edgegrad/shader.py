@@ -120,7 +120,7 @@ class _Image:
         with torch.no_grad():
             for first in range(0, len(samples.hits), AT_ONCE):
                 end = min(first + AT_ONCE, len(samples.hits))
-                points = samples.hits.select(torch.arange(first, end, device=self._frame.device))
+                points = samples.hits.apart(torch.arange(first, end, device=self._frame.device))
                 jump = jump + samples.jump_of(first, end, self._shade(points).detach())
         return boundary(self._frame, samples.x, samples.velocity, jump, samples.to_background, self._background())
 
@@ -221,11 +221,11 @@ class _Image:
         if self._kinds not in (None, kinds):
             raise ValueError(UNEQUAL)
         self._kinds = kinds
-        if self._check and len(hits) > 1:
+        if self._check and len(hits) > 1 and not hits._steps.forced:
             order = torch.randperm(len(hits), generator=torch.Generator().manual_seed(0)).to(radiance.device)
             order = order[: (len(hits) + 1) // 2]
             with torch.no_grad():
-                again = self._shader(hits.select(order)).to(radiance.dtype)
+                again = self._shader(hits.apart(order)).to(radiance.dtype)
             if not torch.allclose(
                 again, radiance.detach()[order], rtol=1e-4, atol=1e-5 * float(radiance.detach().abs().max())
             ):

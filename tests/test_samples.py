@@ -550,8 +550,90 @@ def test_what_steps_are_given_is_checked():
     refused(lambda hits: hits.where(hits.position, 1.0, 0.0), r"s: expected shape")
     refused(lambda hits: hits.where(hits.depth, hits.position[:5], 0.0), r"a: expected rows \(N, C\)")
     refused(lambda hits: hits.where(hits.face, 1.0, 0.0), r"s: ", TypeError)
+    refused(
+        lambda hits: hits.where(hits.depth, torch.ones(3), torch.ones(2)), r"b: expected as many channels as a has, 3"
+    )
+    refused(lambda hits: hits.where(hits.depth, hits.depth, 0.0), r"a: expected rows .* a number a point is value")
+    refused(lambda hits: hits.where(hits.depth / 0, 1.0, 0.0), r"s: expected finite numbers, got inf")
+    refused(lambda hits: hits.sample(torch.ones(2, 2, 1), uv=hits.position[:, :2], wrap=5), r"wrap: expected")  # type: ignore[arg-type]
+    refused(lambda hits: hits.select(torch.ones(3, dtype=torch.bool)).normal, r"index: expected shape")
+    refused(lambda hits: hits.select(hits.face + len(hits)).normal, r"index: expected numbers below")
+    refused(lambda hits: hits.select(hits.depth).normal, r"index: expected integers", TypeError)
     refused(lambda hits: hits.floor(hits.face), r"t: ", TypeError)
     with pytest.raises(ValueError, match=r"step_spacing: expected a number from 0\.015625 to 64, got 0"):
         eg.render(ball(), front_camera(SIZE), step_spacing=0)
     with pytest.raises(TypeError, match=r"step_spacing: expected a number, got str"):
         eg.render(ball(), front_camera(SIZE), step_spacing="1")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["where", "floor", "nearest"])
+def test_borders_along_edges(kind: str):
+    """A border that runs exactly along edges of the mesh, of a grid of 4 × 4 squares: x = θ, with an edge at 0."""
+    grid = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, 5, dtype=F64)] * 2, indexing="ij"), -1).reshape(-1, 2)
+    corner = torch.tensor(
+        [[5 * i + j for i, j in ((a, b), (a + 1, b), (a + 1, b + 1), (a, b + 1))] for a in range(4) for b in range(4)]
+    )
+    faces = torch.cat([corner[:, :3], corner[:, [0, 2, 3]]])
+    mesh = eg.Mesh(torch.nn.functional.pad(grid, (0, 1)), faces)
+    texture = torch.tensor([[[0.0], [1.0]]], dtype=F64)
+
+    def gradient(seed: int) -> Tensor:
+        theta = torch.zeros((), dtype=F64, requires_grad=True)
+
+        def shader(hits: eg.Hits) -> Tensor:
+            s = hits.position[:, 0] - theta
+            if kind == "where":
+                return hits.where(s, 1.0, 0.0)
+            if kind == "floor":
+                return 1 + hits.floor(0.5 * s)[:, None]
+            return hits.sample(texture, uv=torch.stack([0.5 + s / 4, 0.5 + 0 * s], 1), filter="nearest")
+
+        return torch.autograd.grad(eg.render(mesh, flat_camera(32), seed=seed, shader=shader).sum(), theta)[0]
+
+    found = torch.stack([gradient(seed) for seed in range(8)]).mean()
+    assert float(found) == pytest.approx(-2 * (0.4 * 32) ** 2, rel=0.03)
+
+
+def test_steps_of_some_points_are_steps_of_all():
+    """Two materials, each asked for its own points."""
+
+    def gradient(selected: bool) -> Tensor:
+        theta = torch.zeros((), dtype=F64, requires_grad=True)
+        back, front = square(), square(0.4)
+        front = front.replace(verts=0.4 * front.verts - torch.tensor([0.0, 0.0, 1.0], dtype=F64))
+
+        def of_back(hits: eg.Hits) -> Tensor:
+            return hits.where(hits.position[:, 0] - 0.7 - theta, 1.0, 0.3)
+
+        def of_front(hits: eg.Hits) -> Tensor:
+            return 0.1 * hits.floor(7 * hits.position[:, 1] + theta)[:, None]
+
+        def shader(hits: eg.Hits) -> Tensor:
+            front = hits.mesh == 1
+            if not selected:
+                return torch.where(front[:, None], of_front(hits), of_back(hits))
+            color = torch.zeros((len(hits), 1), dtype=F64)
+            color = color.index_put(((~front).nonzero()[:, 0],), of_back(hits.select(~front)))
+            return color.index_put((front.nonzero()[:, 0],), of_front(hits.select(front)))
+
+        image = eg.render(eg.Scene([back, front]), flat_camera(32), shader=shader, check_shader=True)
+        return torch.autograd.grad((image * smooth_adjoint(32, 32, 1)).sum(), theta)[0]
+
+    one, all = gradient(True), gradient(False)
+    assert abs(float(all)) > 1
+    assert float(one) == pytest.approx(float(all), rel=1e-6)
+
+
+def test_many_directions_of_steps_in_one_pass():
+    mesh, camera = ball(), front_camera(SIZE)
+
+    def shader(hits: eg.Hits) -> Tensor:
+        return hits.where(hits.position[:, 0] - 0.1, 1.0, 0.2) + hits.floor(3 * hits.position[:, 1:2])
+
+    directions = torch.stack([0.1 * torch.sin(k * mesh.verts) for k in (1, 2, 3)])
+    _, dots = eg.jvp(mesh, camera, {mesh.verts: directions}, seed=3, shader=shader)
+    for direction, dot in zip(directions, dots, strict=True):
+        _, one = torch.func.jvp(
+            lambda v: eg.render(mesh.replace(verts=v), camera, seed=3, shader=shader), (mesh.verts,), (direction,)
+        )[:2]
+        assert torch.allclose(dot, one, atol=1e-9)
