@@ -174,7 +174,10 @@ class EdgeSamples:
         self.x = frame.here(records.x)
         sample, which = (records.face >= 0).nonzero(as_tuple=True)
         self.sample, self._factor = frame.here(sample), frame.here(records.factor[sample, which])
-        self.hits = frame.fixed_hits(records.face[sample, which], records.b[sample, which], records.x[sample])
+        # A little inside the faces, so that rounding does not take a step along their edge for passed: at u = 1 a texture that
+        # repeats begins anew.
+        b = torch.lerp(records.b[sample, which], torch.tensor(1 / 3).double(), torch.finfo(frame.dtype).eps ** (2 / 3))
+        self.hits = frame.fixed_hits(records.face[sample, which], b, records.x[sample])
         self.to_background = frame.here(torch.where(records.face == -1, records.factor, 0).sum(1))
         q = frame.view.in_camera(frame.surfaces.verts)
         rows = (frame.here(records.by_q) * (q - q.detach())[frame.here(records.vertex)]).sum(1)
