@@ -93,7 +93,8 @@ class _Beside(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int, ...], *args: Any) -> tuple[Tensor, None]:
-        return _Beside.apply(args[0].movedim(in_dims[0], -1).flatten(2)), None
+        (attributes,), (batch,) = args, in_dims
+        return _Beside.apply(attributes.movedim(batch, -1).flatten(2)), None
 
 
 def every_face(count: int) -> Tensor:

@@ -17,13 +17,11 @@ Or with less: the image of primary_hits with a graph has the gradient inside fac
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from ._autograd import FIRST_ORDER
 from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
+from ._derivatives import moves, once
 from ._request import Request, as_scene, make_request
 from ._samples import CurveRecords, Footprints, RayRecords, Sampler, SurfaceRecords, barycentrics, without_colors
 from ._samples import trace as trace_records
@@ -345,76 +343,6 @@ def boundary(
     weight = frame.here(feet.weight).to(jump.dtype)
     values = (weight * velocity.to(jump.dtype)[point])[:, None] * jumps
     return frame.image(pixel, values)
-
-
-def transformed() -> bool:
-    """Whether a transform of torch.func is under way."""
-    functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
-    return functorch.peek_interpreter_stack() is not None
-
-
-def differentiates() -> bool:
-    return torch.is_grad_enabled() or transformed() or torch.autograd.forward_ad._current_level >= 0
-
-
-def moves(*tensors: Tensor) -> bool:
-    """Whether a derivative by one of them may be asked for."""
-    if transformed():
-        return True
-    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
-        return True
-    dual = torch.autograd.forward_ad
-    return dual._current_level >= 0 and any(dual.unpack_dual(t).tangent is not None for t in tensors)
-
-
-def once(value: Tensor) -> Tensor:
-    """The same, of which only first derivatives can be taken."""
-    return _FirstOrder.apply(value)
-
-
-class _FirstOrder(torch.autograd.Function):
-    """The identity, whose derivative has none: that of the samples' places and of their visibility is not known."""
-
-    @staticmethod
-    def forward(value: Tensor) -> Tensor:
-        return value.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        # With the value, so that a derivative of the gradient by what the image depends on comes by here.
-        return _Last.apply(*grad_outputs, *ctx.saved_tensors)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, Any]:
-        return _FirstOrder.apply(*args), in_dims[0]
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        return tangents[0].clone()
-
-
-class _Last(torch.autograd.Function):
-    """The first of its arguments, which has no derivative."""
-
-    @staticmethod
-    def forward(grad: Tensor, value: Tensor) -> Tensor:
-        return grad.clone()
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, Any]:
-        return _Last.apply(*args), in_dims[0]
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)
 
 
 def _request_of(primary: PrimaryHits, name: str, count: int | None) -> Request:

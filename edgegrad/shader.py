@@ -16,13 +16,14 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ._check import values_visible
+from ._derivatives import differentiates, moves, once, transformed
 from ._request import Request
 from ._samples import RayRecords, shaded_room, without_colors
 from ._steps import UNEQUAL, Crossings, Points, Steps, find_crossings
 from ._surfaces import every_face
 from .camera import Camera
 from .hits import Hits
-from .samples import EdgeSamples, Frame, SurfaceSamples, boundary, differentiates, moves, once, transformed
+from .samples import EdgeSamples, Frame, SurfaceSamples, boundary
 from .scene import Scene
 
 Shader = Callable[[Hits], Tensor]
