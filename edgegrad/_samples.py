@@ -271,7 +271,7 @@ class Sampler:
             yield PixelRecords(*self._compute(self._request, compute))
 
     def samples(
-        self, request: Request, interior: bool, boundary: bool, steps: bool = False
+        self, request: Request, interior: bool, boundary: bool, rim: bool = False, steps: bool = False
     ) -> tuple[SurfaceRecords, CurveRecords]:
         """Of the gradient, after all pixel hits were taken; the scene of `request` has colours that jump where creases are."""
 
@@ -286,6 +286,7 @@ class Sampler:
                     edge_samples=options.edge_samples,
                     interior_geometry=interior,
                     boundary=boundary,
+                    rim=rim,
                     steps=steps,
                     step_spacing=options.step_spacing,
                 ),

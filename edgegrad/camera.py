@@ -50,8 +50,8 @@ class Camera:
                      has them (12 or 14 if zeros follow); of a fisheye (4,): k1, k2, k3, k4; None: a pinhole, or a fisheye without
 
     A fisheye shows up to all around, 180° from its axis, a perspective lens what lies less than 88° from it. Where the distortion
-    folds the image over, it ends: beyond there is background, and a render warns with the radius. Where that lies within the
-    image, how it moves with the distortion and with K has no gradient.
+    folds the image over, it ends: beyond there is background, and a render warns with the radius. How that rim moves with the
+    distortion and with K has its gradient.
 
     All tensors are differentiable. Numbers reach up to 3.4e38, the range of float32, also in float64, and so do those of
     the inverse of K. Raises TypeError for a wrong type, ValueError for a wrong shape or value.

@@ -169,8 +169,8 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
     )
     _, profiles = backward_kernel(ones, hits, request, wanted, dry=True)
     counts = {name: int(sum(profile[name] for profile in profiles)) for name in _COUNTS}
-    surface, edge, silhouettes, creases, intersections = (
-        counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections")
+    surface, edge, silhouettes, creases, intersections, rim = (
+        counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections", "rim")
     )
     needs = core.gradient_bytes(
         pass_size(request), motion=work.motion, boundary=work.boundary, steps=work.steps, wanted=list(wanted),
@@ -184,6 +184,7 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
     # Why the terms are off, "" where nothing keeps them from running.
     still = "" if moves else "neither verts nor the camera require a gradient"
     no_boundary = still or ("" if request.gradient.visibility else "visibility=False")
+    no_rim = "" if {"K", "distortion"} & set(wanted) else "neither K nor distortion requires a gradient"
     no_interior = ""
     if not (work.motion or work.appearance):
         no_interior = "each face has one radiance, wherever it moves" if moves else "nothing asks for it"
@@ -232,6 +233,12 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
             no_boundary or (f"{intersections:,} in view" if intersections else "none in view"),
             bytes=bytes_of("intersections"),
         ),
+        "rim": Term(
+            rim > 0,
+            no_boundary
+            or no_rim
+            or (f"where the lens folds or ends, {rim:,} px in view" if rim else "no lens ends in view"),
+        ),
     }
     lines = counts["step_lines"]
     no_steps = "no face is cut out, and no nearest texels" if not flat.has_steps else "nothing that moves them"
@@ -248,7 +255,7 @@ def _gradient_terms(request: Request, wanted: Collection[str]) -> dict[str, Term
 
 
 # What the kernel counts.
-_CURVES = ("silhouettes", "creases", "intersections")
+_CURVES = ("silhouettes", "creases", "intersections", "rim")
 _COUNTS = (
     "surface_samples", "edge_samples", "surface_wanted", "edge_wanted", "step_lines", *_CURVES,
 )  # fmt: skip

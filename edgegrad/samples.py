@@ -158,7 +158,8 @@ class SurfaceSamples:
 
 
 class EdgeSamples:
-    """Samples on the curves where the image jumps: silhouettes, borders, intersections and creases.
+    """Samples on the curves where the image jumps: silhouettes, borders, intersections and creases, and
+    the rim where a lens folds or ends.
 
     hits      Hits, the N points on their surfaces, at most three a sample; without derivatives
     sample    (N,) int64, whose each is
@@ -303,8 +304,11 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
     elif creases is not False:
         raise TypeError(f"creases: expected True, False or a tensor (F, 3, K), got {type(creases).__name__}")
     request = request._replace(scene=without_colors(request.scene, attributes))
-    _, curves = primary.frame.sampler.samples(request, interior=False, boundary=True, steps=request.scene.has_steps)
-    return EdgeSamples(primary.frame, curves)
+    frame = primary.frame
+    _, curves = frame.sampler.samples(
+        request, interior=False, boundary=True, rim=moves(frame.intrinsics), steps=request.scene.has_steps
+    )
+    return EdgeSamples(frame, curves)
 
 
 def attach_boundary(image: Tensor, samples: EdgeSamples, jump: Tensor, background: Tensor | None = None) -> Tensor:

@@ -63,7 +63,9 @@ class _Image:
         moving = visibility and moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
         flat = frame.request.scene
         cut = visibility and flat.has_steps and (moving or moves(flat.uvs, flat.alphas))
-        surface, curves = frame.sampler.samples(self._with_creases(), interior=True, boundary=moving, steps=cut)
+        surface, curves = frame.sampler.samples(
+            self._with_creases(), interior=True, boundary=moving, rim=moves(frame.intrinsics), steps=cut
+        )
         zero = self._interior(SurfaceSamples(frame, surface))
         if moving or cut:
             zero = zero + self._boundary(EdgeSamples(frame, curves))

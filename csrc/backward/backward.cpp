@@ -46,6 +46,7 @@ struct Terms {
     bool motion;      // inside faces, of what moves them
     bool appearance;  // inside faces, of colours and textures
     bool boundary;
+    bool rim;    // of what a lens shows, beside the boundary
     bool steps;  // within faces
 
     bool interior() const { return motion || appearance; }
@@ -55,7 +56,20 @@ struct Terms {
 template <class Number>
 Terms terms_of(const Slots<Number>& slots, const GradientOptions& o) {
     const bool moves = slots.geometry();
-    return {moves && o.interior_geometry, slots.appearance(), moves && o.boundary, slots.steps() && o.steps};
+    return {.motion = moves && o.interior_geometry,
+            .appearance = slots.appearance(),
+            .boundary = moves && o.boundary,
+            .rim = (slots.K || slots.distortion) && o.boundary && o.rim,
+            .steps = slots.steps() && o.steps};
+}
+
+// Of what anything may move.
+Terms all_motion(const GradientOptions& o) {
+    return {.motion = o.interior_geometry,
+            .appearance = false,
+            .boundary = o.boundary,
+            .rim = o.boundary && o.rim,
+            .steps = o.steps};
 }
 
 // What the image and its adjoint say, through whichever window of the camera one looks.
@@ -138,10 +152,10 @@ Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Desti
     }
     if (terms.boundary) {
         if (!terms.interior()) facing = facing_of_faces(view);
-        const Curves<T>& curves = out.curves.emplace(measure_curves<N>(view, std::move(facing)));
+        const Curves<T>& curves = out.curves.emplace(measure_curves<N>(view, std::move(facing), terms.rim));
         out.wanted.edge = profile.edge_wanted = curves.wanted(o.edge_samples);
         profile.silhouettes = curves.silhouettes, profile.creases = curves.creases;
-        profile.intersections = curves.intersections;
+        profile.intersections = curves.intersections, profile.rim = curves.rim;
         profile.curves = watch.lap();
     }
     return out;
@@ -244,7 +258,7 @@ void add_background_tangent(const BackwardInput<T>& input, const std::vector<Tan
 BackwardProfile& BackwardProfile::operator+=(const BackwardProfile& o) {
     surface_samples += o.surface_samples, edge_samples += o.edge_samples;
     surface_wanted += o.surface_wanted, edge_wanted += o.edge_wanted;
-    silhouettes += o.silhouettes, creases += o.creases, intersections += o.intersections;
+    silhouettes += o.silhouettes, creases += o.creases, intersections += o.intersections, rim += o.rim;
     measure += o.measure, curves += o.curves, view += o.view, world += o.world;
     step_lines += o.step_lines;
     for (int i = 0; i < 2; ++i) surface[i] += o.surface[i], edge[i] += o.edge[i], step[i] += o.step[i];
@@ -316,8 +330,8 @@ void render_tangents(const BackwardInput<T>& input, GradientOptions o, Team& tea
     Terms terms{};
     for (const Tangents& t : tangents) {
         const Terms own = terms_of(t, o);
-        terms = {terms.motion || own.motion, terms.appearance || own.appearance, terms.boundary || own.boundary,
-                 terms.steps || own.steps};
+        terms.motion |= own.motion, terms.appearance |= own.appearance;
+        terms.boundary |= own.boundary, terms.rim |= own.rim, terms.steps |= own.steps;
     }
     add_background_tangent(input, tangents, team, image_dot);
     if (!terms.any()) return;
@@ -335,7 +349,7 @@ void render_tangents(const BackwardInput<T>& input, GradientOptions o, Team& tea
 
 template <class T>
 void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, Team& team, double* gradient) {
-    const Terms terms{.motion = o.interior_geometry, .appearance = false, .boundary = o.boundary, .steps = o.steps};
+    const Terms terms = all_motion(o);
     if (!terms.any()) return;
     o.controls = false;
     Destination to;
@@ -348,7 +362,7 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, Te
 template <class T>
 Records record_samples(const BackwardInput<T>& input, GradientOptions o, Team& team) {
     Records records;
-    const Terms terms{.motion = o.interior_geometry, .appearance = false, .boundary = o.boundary, .steps = o.steps};
+    const Terms terms = all_motion(o);
     if (!terms.any()) return records;
     o.controls = false;
     Destination to;

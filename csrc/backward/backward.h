@@ -17,6 +17,7 @@ struct GradientOptions {
     uint64_t seed = 0;
     bool interior_geometry = true;  // whether the colours vary over faces, so that moving them shows inside
     bool boundary = true;
+    bool rim = true;          // whether that of what a lens shows counts, where boundary does
     bool steps = true;        // whether what moves steps within faces counts
     double step_spacing = 1;  // px between the lines that find them
     bool dry = false;         // only count the samples
@@ -29,6 +30,7 @@ struct BackwardProfile {
     int64_t surface_samples = 0, edge_samples = 0;
     int64_t surface_wanted = 0, edge_wanted = 0;              // default samples before the budget (budget.h)
     int64_t silhouettes = 0, creases = 0, intersections = 0;  // curves in view
+    double rim = 0;                                           // px in view of that of a lens
     int64_t step_lines = 0;                                   // that look for steps within faces
     double view = 0;                                          // vertices in camera coordinates, where the loss looks
     double measure = 0, curves = 0;                           // triangles and curves laid end to end

@@ -11,6 +11,7 @@
 #include "boundary/curve_samples.h"
 #include "boundary/edge_source.h"
 #include "boundary/intersection_source.h"
+#include "boundary/rim_source.h"
 #include "core/sampler.h"
 #include "core/systematic.h"
 
@@ -136,6 +137,17 @@ void add_intersections(const BackwardView<T>& view, const Curves<T>& curves, con
     samples.finish(grad);
 }
 
+template <int N, class Contraction, class T>
+void add_rim(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& drawn, const Contraction& contraction,
+             ChunkGrad& grad) {
+    RimSamples samples(view, curves.rim_curve->rim, on_curves<N>(view, contraction, grad));
+    const auto before = int64_t(curves.curve.size() + curves.intersection.size());
+    drawn.each([&](int64_t k, double s, double weight) {
+        samples.add(curves.rim_curve->arcs[k - before].arc, std::clamp(s, 0.0, 1.0), weight);
+    });
+    samples.finish(grad);
+}
+
 }  // namespace
 
 template <int N, class Contraction, class T>
@@ -154,10 +166,12 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
     if (!curves.x_bar.empty()) to.x = curves.x_bar.data();
     view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         const Drawn drawn{systematic, first, last};
-        const int64_t middle = drawn.before(int64_t(curves.curve.size()));
-        if (first < middle)
-            add_edges<N>(view, curves, coincident, hidden, {systematic, first, middle}, contraction, grad);
-        if (middle < last) add_intersections<N>(view, curves, {systematic, middle, last}, contraction, grad);
+        const int64_t edges = drawn.before(int64_t(curves.curve.size()));
+        const int64_t lines = drawn.before(int64_t(curves.curve.size() + curves.intersection.size()));
+        if (first < edges)
+            add_edges<N>(view, curves, coincident, hidden, {systematic, first, edges}, contraction, grad);
+        if (edges < lines) add_intersections<N>(view, curves, {systematic, edges, lines}, contraction, grad);
+        if (lines < last) add_rim<N>(view, curves, {systematic, lines, last}, contraction, grad);
     });
     to.x = nullptr;
 }

@@ -34,7 +34,7 @@ class AdjointRadiance {
     }
 
     // The jumps of the loss at a sample.
-    template <CurveSource Source>
+    template <MovingCurve Source>
     CurveJumps jumps(int i, Source& source, typename Source::Sample& sample) {
         const SampleSurfaces surfaces = source.surfaces(sample);
         double radiance[SampleSurfaces::most];
@@ -54,7 +54,7 @@ class ReverseBoundary {
     ReverseBoundary(const BackwardView<T>& view, ChunkGrad& grad) : radiance_(view), grad_(grad) {}
 
     bool wants(int i, Vec2 x) { return radiance_.wants(i, x); }
-    template <CurveSource Source>
+    template <MovingCurve Source>
     void add(int i, Source& source, typename Source::Sample& sample) {
         source.add_motion(sample, radiance_.jumps(i, source, sample), grad_);
     }
@@ -78,7 +78,7 @@ class ForwardBoundary {
 
     bool wants(int, Vec2) const { return true; }
 
-    template <CurveSource Source>
+    template <MovingCurve Source>
     void add(int, Source& source, typename Source::Sample& sample) {
         const SampleSurfaces surfaces = source.surfaces(sample);
         for (int k = 0; k < surfaces.count; ++k)
@@ -119,7 +119,7 @@ class ScreenBoundary {
     ScreenBoundary(const BackwardView<T>& view, ChunkGrad& grad) : view_(view), radiance_(view), grad_(grad) {}
 
     bool wants(int i, Vec2 x) { return radiance_.wants(i, x); }
-    template <CurveSource Source>
+    template <MovingCurve Source>
     void add(int i, Source& source, typename Source::Sample& sample) {
         const CurveJumps jumps = radiance_.jumps(i, source, sample);
         const Vec2 moved = (jumps.first + jumps.second) * source.normal(sample);
@@ -140,7 +140,7 @@ class RecordBoundary {
 
     bool wants(int, Vec2) const { return true; }
 
-    template <CurveSource Source>
+    template <MovingCurve Source>
     void add(int, Source& source, typename Source::Sample& sample) {
         const SampleSurfaces surfaces = source.surfaces(sample);
         double first[CurveRecords::surfaces] = {}, second[CurveRecords::surfaces] = {};
@@ -157,7 +157,7 @@ class RecordBoundary {
     static_assert(CurveRecords::surfaces == SampleSurfaces::most);
 
     // One of the curves. Its velocity is what its motion is the adjoint of.
-    template <CurveSource Source>
+    template <MovingCurve Source>
     void add(Source& source, const typename Source::Sample& sample, const SampleSurfaces& surfaces, CurveJumps curve,
              const double* factor) {
         if (std::all_of(factor, factor + CurveRecords::surfaces, [](double f) { return f == 0; })) return;

@@ -329,6 +329,16 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
     }
 }
 
+// The rim of what the lens shows, where the loss looks. Nothing is known of the jump.
+template <class T>
+void measure_rim(const BackwardView<T>& view, Curves<T>& out) {
+    if (!view.camera.lens_view.end) return;
+    for (const RimArc& arc : out.rim_curve.emplace(view.camera, view.importance).arcs) {
+        out.rim += arc.length, out.pixels += arc.length;
+        out.squares += arc.measure * arc.measure, out.unknown += arc.measure * arc.measure;
+    }
+}
+
 // Silhouettes and borders.
 template <class T>
 std::vector<std::vector<ImageSegment>> silhouettes(const BackwardView<T>& view, const CurveFinder<T>& finder) {
@@ -391,7 +401,7 @@ void Curves<T>::add_segments(const BackwardView<T>& view, bool all) {
 }
 
 template <int N, class T>
-Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing) {
+Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool rim) {
     Curves<T> out(view, std::move(facing));
     const int64_t E = view.geometry.topology().n_edges();
     const JumpScale scale = out.finder.finds_creases() ? jump_scale(view) : JumpScale{};
@@ -428,8 +438,12 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing) {
     int64_t n = 0;
     for (const auto& part : curves) n += int64_t(part.size());
     measure_intersections(view, out);
-    out.curve.reserve(n), out.measure = Array<double>(n + int64_t(out.intersection.size()));
-    for (size_t i = 0; i < out.intersection.size(); ++i) out.measure[n + int64_t(i)] = out.intersection[i].measure;
+    if (rim) measure_rim(view, out);
+    out.curve.reserve(n), out.measure = Array<double>(n + int64_t(out.intersection.size()) + out.arcs());
+    int64_t next = n;
+    for (const MeasuredIntersection& i : out.intersection) out.measure[next++] = i.measure;
+    if (out.rim_curve)
+        for (const RimArc& arc : out.rim_curve->arcs) out.measure[next++] = arc.measure;
     for (size_t k = 0; k < curves.size(); ++k) {
         for (ImageSegment& s : out.segments[k]) s.curve += int32_t(out.curve.size());
         for (ClearCrease& c : out.clear[k]) c.curve += int32_t(out.curve.size());
@@ -442,8 +456,8 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing) {
 
 // clang-format off
 #define EDGEGRAD_INSTANTIATE(N) \
-    template Curves<float> measure_curves<N>(const BackwardView<float>&, Array<int8_t>); \
-    template Curves<double> measure_curves<N>(const BackwardView<double>&, Array<int8_t>);
+    template Curves<float> measure_curves<N>(const BackwardView<float>&, Array<int8_t>, bool); \
+    template Curves<double> measure_curves<N>(const BackwardView<double>&, Array<int8_t>, bool);
 EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
 #undef EDGEGRAD_INSTANTIATE
 template struct Curves<float>;

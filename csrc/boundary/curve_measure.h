@@ -2,12 +2,14 @@
 #pragma once
 
 #include <cstdint>
+#include <optional>
 #include <vector>
 
 #include "backward/view.h"
 #include "boundary/cell_marks.h"
 #include "boundary/coincident.h"
 #include "boundary/curve.h"
+#include "boundary/rim_source.h"
 
 namespace edgegrad {
 
@@ -17,6 +19,7 @@ struct CurvesFound {
     double pixels = 0;                // the measure without the adjoint, which default samples go by
     double squares = 0, unknown = 0;  // Σ measure² of what is expected to be visible, and of what controls do not say
     int64_t silhouettes = 0, creases = 0, intersections = 0;  // in view
+    double rim = 0;                                           // px of the rim of what a lens shows, in view
 };
 struct MeasuredCurve {
     double measure = 0;
@@ -41,15 +44,18 @@ constexpr int64_t bytes_per_curve() {
 template <class T>
 struct Curves : CurvesFound {
     CurveFinder<T> finder;
-    std::vector<MeasuredCurve> curve;                 // those where the loss looks, by ascending edges
-    std::vector<MeasuredIntersection> intersection;   // after them, those of faces that pass through each other
-    Array<double> measure{0};                         // of both
+    std::vector<MeasuredCurve> curve;                // those where the loss looks, by ascending edges
+    std::vector<MeasuredIntersection> intersection;  // after them, those of faces that pass through each other
+    std::optional<RimCurve> rim_curve;               // and after these the rim of what a lens shows, if it is asked for
+    Array<double> measure{0};                        // of all
     std::vector<std::vector<ImageSegment>> segments;  // of those that others may lie on
     std::vector<std::vector<ClearCrease>> clear;      // of which no segment was made
     bool any_hidden = false;                          // or of creases between hidden faces, if there are any
     Array<double> x_bar;  // (V, 2) what controls add to the cotangents of places in the image; empty: there are none
 
     Curves(const BackwardView<T>& view, Array<int8_t> facing);
+
+    int64_t arcs() const { return rim_curve ? int64_t(rim_curve->arcs.size()) : 0; }
 
     // Samples: so many as are given, if not −1, or the defaults.
     int64_t wanted(int64_t given) const;
@@ -59,7 +65,8 @@ struct Curves : CurvesFound {
 };
 
 // Finds and measures all curves, and begins x_bar with the integrals of the controls. `facing` (F,): Camera::facing.
+// `rim`: whether that of a lens counts, which moves with its parameters alone.
 template <int N, class T>
-Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing);
+Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool rim);
 
 }  // namespace edgegrad

@@ -58,26 +58,33 @@ struct CurveJumps {
     double first = 0, second = 0;
 };
 
+// What a contraction asks of a curve on which a sample lies, at the pixel position `sample.x`. `jumps` takes one
+// number, linear in the radiance, of each of the surfaces. `add_motion` takes the jumps of the loss; `velocities` is
+// what it is the adjoint of, in one direction, and `normal` that of places x in the image. `finish` adds what was
+// summed for the latest curve.
+template <class S>
+concept MovingCurve = requires(S& source, const S& known, typename S::Sample& sample, const double* radiance,
+                               CurveJumps jumps, const Direction& direction, ChunkGrad& grad) {
+    { sample.x } -> std::same_as<Vec2&>;
+    { source.surfaces(sample) } -> std::same_as<SampleSurfaces>;
+    { known.jumps(sample, radiance) } -> std::same_as<CurveJumps>;
+    { known.velocities(sample, direction) } -> std::same_as<CurveJumps>;
+    { known.normal(sample) } -> std::same_as<Vec2>;
+    source.add_motion(sample, jumps, grad);
+    source.finish(grad);
+};
+
 // `place` sets where the fraction s of a curve lies, of a sample that has its x, n and weight; false if no ray is
 // needed to know that nothing shows there. `faces_of` serves the test whether what the ray meets hides the point.
-// `jumps` takes one number, linear in the radiance, of each of the surfaces. `add_motion` takes the jumps of the loss;
-// `velocities` is what it is the adjoint of, in one direction, and `normal` that of places x in the image. `finish`
-// adds what was summed for the latest curve. `cast` tells that no sample waits any more.
+// `cast` tells that no sample waits any more.
 template <class S>
 concept CurveSource =
-    std::derived_from<typename S::Sample, CurveSample> &&
-    requires(S& source, const S& known, typename S::Sample& sample, const typename S::Curve& curve, double s,
-             const double* radiance, CurveJumps jumps, const Direction& direction, ChunkGrad& grad) {
+    MovingCurve<S> && std::derived_from<typename S::Sample, CurveSample> &&
+    requires(S& source, const S& known, typename S::Sample& sample, const typename S::Curve& curve, double s) {
         { known.position(curve, s) } -> std::same_as<Vec2>;
         { source.place(curve, s, sample) } -> std::same_as<bool>;
         { known.faces_of(sample) } -> std::same_as<const CurveFaces&>;
-        { source.surfaces(sample) } -> std::same_as<SampleSurfaces>;
-        { known.jumps(sample, radiance) } -> std::same_as<CurveJumps>;
-        { known.velocities(sample, direction) } -> std::same_as<CurveJumps>;
-        { known.normal(sample) } -> std::same_as<Vec2>;
-        source.add_motion(sample, jumps, grad);
         source.cast();
-        source.finish(grad);
     };
 
 }  // namespace edgegrad

@@ -7,13 +7,19 @@ namespace edgegrad {
 
 namespace {
 
-// Least det ∂m/∂n on the circle |n| = r; what is not a number counts as a fold.
+// Places on the circle |n| = r.
+constexpr int angles = 16;
+Vec2 on_circle(double r, int i) {
+    const double a = 2 * M_PI * i / angles;
+    return {r * std::cos(a), r * std::sin(a)};
+}
+
+// Least det ∂m/∂n there; what is not a number counts as a fold.
 template <RadialLens L>
 double least_area_scale(const L& lens, double r) {
-    constexpr int angles = 16;
     double least = std::numeric_limits<double>::infinity();
     for (int i = 0; i < angles; ++i) {
-        const double a = 2 * M_PI * i / angles, det = determinant(lens.jacobian({r * std::cos(a), r * std::sin(a)}));
+        const double det = determinant(lens.jacobian(on_circle(r, i)));
         if (!(det > 0)) return 0;
         least = std::min(least, det);
     }
@@ -121,6 +127,14 @@ LensDisc disc_of(const AnyLens& lens) {
             std::max(disc.reach, 1.01 * length(with_radial_lens(lens, [&](const auto& l) { return l.bend(n); })));
     }
     return disc;
+}
+
+Vec2 folding_place(const BrownConrady& lens, const LensDisc& disc) {
+    const auto area_scale = [&](int i) { return determinant(lens.jacobian(on_circle(disc.fold, i))); };
+    int least = 0;
+    for (int i = 1; i < angles; ++i)
+        if (area_scale(i) < area_scale(least)) least = i;
+    return on_circle(disc.fold, least);
 }
 
 std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m) {

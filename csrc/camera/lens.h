@@ -91,6 +91,8 @@ struct LensDisc {
     double reach = fold;                                    // no |m| from within is greater
 };
 LensDisc disc_of(const AnyLens& lens);
+// The n with |n| = fold at which det ∂m/∂n is least, of those by which the fold was found.
+Vec2 folding_place(const BrownConrady& lens, const LensDisc& disc);
 constexpr double greatest_radius = 30;  // 88° from the axis; what shows more sees through sides
 
 // The n in the disc that is bent to m; none if there is none.

@@ -191,6 +191,9 @@ double WideFisheye::stretch(Box2 n) const {
     return std::max(1.0, fisheye_.at_angle(std::min(p.angle, rim_)) / std::max(p.sine, least));
 }
 
+Vec2 WideFisheye::rim_place(Vec2 e) const { return scaled(reach_ * e) + Vec2{k_[2] / scale_.x, k_[5] / scale_.y}; }
+Vec2 WideFisheye::rim_tangent(Vec2 e) const { return scaled(reach_ * Vec2{-e.y, e.x}); }
+
 bool WideFisheye::ends_in(Box2 x) const {
     double farthest = 0;
     for (const Vec2 corner : {x.low, {x.high.x, x.low.y}, x.high, {x.low.x, x.high.y}})

@@ -46,6 +46,11 @@ class WideFisheye {
     std::optional<Box2> side_box(Box2 x) const;
     double stretch(Box2 n) const;
 
+    // The m of a point of the rim, its derivative by the angle of e in the image, and its direction.
+    Vec2 rim_place(Vec2 e) const;
+    Vec2 rim_tangent(Vec2 e) const;
+    Vec3 rim_direction(Vec2 e) const { return direction_of(rim_, e); }
+
     // Whether some of a box of pixel positions lies beyond the rim.
     bool ends_in(Box2 x) const;
 

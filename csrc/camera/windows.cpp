@@ -25,6 +25,7 @@ Camera window(const Camera& camera, const L& lens, Box2 n) {
     out.set_scale(scale);
     const double y[2] = {scale.y * n.low.y, scale.y * n.high.y};
     out.lens_view = {};
+    out.lens_view.end = camera.lens_view.end;
     out.lens_view.low = {scale.x * n.low.x, std::min(y[0], y[1])};
     out.lens_view.high = {scale.x * n.high.x, std::max(y[0], y[1])};
     if (!lens.side().closed)
