@@ -203,12 +203,9 @@ def case(lens: str, what: str) -> Case:
     if what[0] != "d":
         return moved(balls, view, what)
     change = torch.zeros_like(view.coefficients)
-    change[int(what[1])] = 4.0
-    rho, further = (
-        float((area(outline(lens, view.K, d)) / math.pi).sqrt())
-        for d in (view.coefficients, view.coefficients + 1e-4 * change)
-    )
-    change *= 8.0 / abs((further - rho) / 1e-4)
+    change[int(what[1])] = 1e-4
+    before, after = (outline(lens, view.K, d) for d in (view.coefficients, view.coefficients + change))
+    change *= 8.0 / float((after - before).norm(dim=1).max())
 
     def distortion(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
         return balls(), view.replace(distortion=view.coefficients + theta * change)

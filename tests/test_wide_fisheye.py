@@ -273,6 +273,7 @@ SOME = [
     and (place, view := VIEWS[(i + j + k) // 2 % 3]) != ("beside", "crop")  # not in view
     # High powers of the angle move what is far from the axis alone.
     and (place == "behind" or what not in ("d2", "d3"))
+    and (place, what) != ("ahead", "d1")
 ]
 
 
