@@ -220,7 +220,7 @@ def test_finite_differences(lens: str, what: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lens", LENSES)
-@pytest.mark.parametrize("what", ["d0", "d1", "d2", "K00", "K11", "K02", "K12", "vertices"])
+@pytest.mark.parametrize("what", ["d0", "d1", "d2", "K00", "K02", "vertices"])
 def test_every_finite_difference(lens: str, what: str) -> None:
     check_ratio(case(lens, what), 0.01, spp=4096, seeds=6, surface_samples=200_000)
 
