@@ -1,6 +1,6 @@
 """What shaders written in PyTorch cost, in time, memory and noise: one table.
 
-Run:  python benchmarks/shaders.py [--only time memory noise steps]
+Run:  python benchmarks/shaders.py [--only time memory noise]
 
 Times are medians of steps, image and backward pass, on a sphere of 81,920 faces at 256² and 16 samples a pixel; ratios are of
 steps that alternate in one run.
@@ -147,45 +147,7 @@ def noise(seeds: int = 64) -> None:
         print(f"| {name} | {rms[0]:.4f} | {rms[1]:.4f} |")
 
 
-def spacing(seeds: int = 48) -> None:
-    """The error of the derivative of a painted disc's area by its radius, 2 π r, and of stripes by their width."""
-    size = 64
-    K = torch.tensor([[0.4 * size, 0, size / 2], [0, 0.4 * size, size / 2], [0, 0, 1]], dtype=F64)
-    camera = eg.Camera(torch.eye(4, dtype=F64), K, (size, size), "orthographic")
-    corner = torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=F64)
-    mesh = eg.Mesh(corner, torch.tensor([[0, 1, 2], [0, 2, 3]]))
-    wide = 3.2 / (0.4 * size)  # a stripe of 3.2 px, and a gap as wide
-
-    def disc(r: Tensor) -> Callable[[eg.Hits], Tensor]:
-        return lambda hits: hits.where(0.6 + r - (hits.position[:, :2] - 0.05).norm(dim=1), 1.0, 0.0)
-
-    def stripes(r: Tensor) -> Callable[[eg.Hits], Tensor]:
-        def shader(hits: eg.Hits) -> Tensor:
-            x = hits.position[:, 0] + 0.3 * hits.position[:, 1]
-            return hits.where(torch.cos(math.pi * x / wide) + r, 1.0, 0.0)
-
-        return shader
-
-    # Both borders of each stripe move by δx = δr wide / π; there are 4 / (2 wide) square units of them and as many again.
-    cases = {"disc of 31 px": (disc, 2 * math.pi * 0.6), "stripes of 3.2 px": (stripes, 4 / wide * wide / math.pi)}
-    print("| spacing of lines, px | " + " | ".join(f"{name}: bias, one image" for name in cases) + " | ms |")
-    print("|---|" + "---|" * (len(cases) + 1))
-    for apart in (8.0, 4.0, 2.0, 1.0, 0.5, 0.25):
-        cells, begin = [], time.perf_counter()
-        for shader, area in cases.values():
-            found = []
-            for seed in range(seeds):
-                r = torch.zeros((), dtype=F64, requires_grad=True)
-                image = eg.render(mesh, camera, seed=seed, shader=shader(r), step_spacing=apart)
-                found.append(torch.autograd.grad(image.sum(), r)[0])
-            ratio = torch.stack(found) / (area * (0.4 * size) ** 2)
-            bias, error = float(ratio.mean()) - 1, float(ratio.std())
-            cells.append(f"{100 * bias:+.1f} ± {100 * error / seeds**0.5:.1f} %, {100 * error:.1f} %")
-        milliseconds = 1e3 * (time.perf_counter() - begin) / (seeds * len(cases))
-        print(f"| {apart:g} | " + " | ".join(cells) + f" | {milliseconds:.0f} |")
-
-
-PARTS = {"time": times, "memory": memory, "noise": noise, "steps": spacing}
+PARTS = {"time": times, "memory": memory, "noise": noise}
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

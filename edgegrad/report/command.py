@@ -44,12 +44,12 @@ def add_report(commands: Any) -> None:
         "--case",
         nargs="+",
         metavar="NAME",
-        help="cases or groups of them, statistics, fits (all); a wrong name lists all",
+        help="cases or groups of them, statistics, steps, fits (all); a wrong name lists all",
     )
     extreme.add_argument("--quick", action="store_true", help="fewer seeds, to try it out")
     extreme.add_argument(
         "--out", type=Path, default=Path("out/stability"), metavar="DIR",
-        help="for stability.json, .md, .png and stability-fits.png (%(default)s)",
+        help="for stability.json, .md, .png, stability-steps.png and stability-fits.png (%(default)s)",
     )  # fmt: skip
     extreme.set_defaults(run=_stability)
 
@@ -74,8 +74,8 @@ def _error_time(args: argparse.Namespace) -> int:
 
 def _stability(args: argparse.Namespace) -> int:
     """Error of image and gradient in extreme cases against independent references: scale, cameras, geometry, what coincides,
-    stiff scenes; whether the gradient is unbiased, and ill-conditioned fits. Ctrl-C keeps what is measured. The exit code is 1
-    if a case is wrong."""
+    stiff scenes; whether the gradient is unbiased, steps within faces, and ill-conditioned fits. Ctrl-C keeps what is measured.
+    The exit code is 1 if a case is wrong."""
     from .stability import failures, stability
 
     make_folder(args.out)

@@ -16,13 +16,13 @@ from typing import Any
 from tqdm import tqdm
 
 from .._files import replacing
-from . import fits, statistics
+from . import fits, statistics, steps
 from .cases import CASES
 from .cases.measure import NOISY, QUICK, WRONG, Effort, measure
 from .error_time import percent, settings
 
 NAME = "stability"
-SECTIONS = {"statistics": statistics.measure, "fits": fits.measure}
+SECTIONS = {"statistics": statistics.measure, "steps": steps.measure, "fits": fits.measure}
 NEEDS = {"statistics": ["scipy"], "fits": ["cholespy"]}
 
 Document = dict[str, Any]
@@ -31,7 +31,7 @@ Document = dict[str, Any]
 def stability(out: Path, cases: Sequence[str] | None = None, *, quick: bool = False) -> tuple[Document, bool]:
     """Measures and writes stability.json, .md and .png in the folder `out`; (what is in the JSON, whether Ctrl-C ended it).
 
-    cases  names of cases, groups of them, "statistics" or "fits"; all when None
+    cases  names of cases, groups of them, "statistics", "steps" or "fits"; all when None
     quick  fewer seeds, to try it out
 
     Raises ValueError for an unknown name, ImportError where SciPy or cholespy is missing that a chosen section needs.

@@ -19,16 +19,21 @@ from .stability import NAME, Document, gradient
 COLORS = {RIGHT: "#0072B2", LIMIT: "#E69F00", WRONG: "#D55E00", NOISY: "#CC79A7", RAISED: "#6e6e6e"}
 FLOOR = 1e-5  # smaller errors are drawn there
 FITS = ("#6e6e6e", "#D55E00", "#0072B2")
+STEPS = {"disc": "#0072B2", "stripes": "#D55E00", "texels": "#009E73"}  # what is painted; the second of each is dashed
 
 
 def publish(out: Path, document: Document) -> None:
-    """Writes stability.md, stability.png and, if fits were made, stability-fits.png. Raises OSError."""
+    """Writes stability.md, and stability.png, stability-steps.png and stability-fits.png if there is what they show. Raises
+    OSError."""
     with replacing(out / f"{NAME}.md") as temporary:
         temporary.write_text(table(document), encoding="utf-8")
     rows = [row for row in document["cases"] if "parts" in row]
     if rows:
         with replacing(out / f"{NAME}.png") as temporary:
             errors(rows).savefig(temporary, bbox_inches="tight", pad_inches=0.15)
+    if document["sections"].get("steps"):
+        with replacing(out / f"{NAME}-steps.png") as temporary:
+            spacings(document["sections"]["steps"]).savefig(temporary)
     if document["sections"].get("fits"):
         with replacing(out / f"{NAME}-fits.png") as temporary:
             losses(document["sections"]["fits"]).savefig(temporary)
@@ -101,6 +106,37 @@ def _column(axes: Axes, groups: dict[str, list[dict[str, Any]]], length: int) ->
     axes.set_yticks(ticks, labels)
 
 
+def spacings(found: dict[str, Any]) -> Figure:
+    """The error of one image's derivative against the spacing of lines, each case named at the end of its curve."""
+    figure = Figure(figsize=(8.4, 4.2), dpi=150)
+    figure.subplots_adjust(left=0.1, right=0.76, top=0.83, bottom=0.13)
+    axes = figure.subplots()
+    x = [row["spacing"] for row in found["rows"]]
+    for name in found["rows"][0]["cases"]:
+        y = [max(row["cases"][name]["error"], FLOOR) for row in found["rows"]]
+        painted, means = name.split(", ")
+        line = "-" if means.startswith("hits") else "--"
+        axes.plot(x, y, line, color=STEPS[painted], linewidth=1.4, marker="o", markersize=3.5, label=name)
+    axes.set_xscale("log", base=2)
+    axes.set_yscale("log")
+    axes.grid(True, which="major", color=GRID, linewidth=0.8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(FAINT)
+    axes.tick_params(which="both", labelsize=8, color=FAINT, labelcolor=INK)
+    axes.tick_params(which="minor", length=0)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda spacing, _: f"{spacing:g}"))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda error, _: percent(error)))
+    axes.set_xlabel("spacing of lines, px (1 is the default)", color=INK, fontsize=8.5)
+    axes.set_ylabel("relative error of one image's derivative", color=INK, fontsize=8.5)
+    figure.legend(loc="center left", bbox_to_anchor=(0.775, 0.48), frameon=False, fontsize=8.5)
+    figure.text(0.012, 0.94, "Steps within faces", fontsize=13, color=INK)
+    figure.text(
+        0.012, 0.885, f"Derivative of a painted area by its size, root mean square of {found['seeds']} seeds. Solid: declared "
+        "by a shader. Dashed: the kernel's own.", fontsize=8.5, color=FAINT,
+    )  # fmt: skip
+    return figure
+
+
 def losses(fits: list[dict[str, Any]]) -> Figure:
     """The loss at each step, each fit named at the end of its curve."""
     figure = Figure(figsize=(8.4, 3.6), dpi=150)
@@ -158,7 +194,7 @@ torch {now["torch"]}, embreex {now["embreex"]}, Python {now["python"]}, {now["sy
     if limits:
         lines += ["## Limits\n", "Measured above, and not hidden by a clamp:\n"]
         lines += [_limit(row) for row in limits] + [""]
-    for name, write in (("statistics", _statistics), ("fits", _fits)):
+    for name, write in (("statistics", _statistics), ("steps", _steps), ("fits", _fits)):
         if name in document["sections"]:
             lines += write(document["sections"][name])
     return "\n".join(lines).rstrip() + "\n"
@@ -241,6 +277,30 @@ def _tail(part: dict[str, float] | None) -> str:
     if part is None:
         return "– | –"
     return f"{percent(part['share'])}, {part['times']:.1f} × ({percent(part['squares'])}) | {part['deviation']:.1f}"
+
+
+def _steps(found: dict[str, Any]) -> list[str]:
+    names = list(found["rows"][0]["cases"])
+    lines = [f"""## Steps within faces
+
+![Error against the spacing of lines]({NAME}-steps.png)
+
+The derivative of a painted area by its size against what it should be: a disc 31 px wide, stripes of 3.2 px with gaps as
+wide, a checkerboard of texels of 3.2 px that lies askew, which grows as a whole. Declared by a shader, as alpha that cuts out
+and as nearest texels. Mean over {found["seeds"]} seeds ± its standard error, and the root mean square error of one image, with
+the default of everything but the spacing of the lines that find steps (`step_spacing`).
+
+| spacing, px | {" | ".join(names)} | an image and its gradient, ms |
+|---{"|---" * (len(names) + 1)}|"""]  # fmt: skip
+    for row in found["rows"]:
+        cells = [_spaced(row["cases"][name]) for name in names]
+        times = [1e3 * row["cases"][name]["seconds"] for name in names]
+        lines.append(f"| {row['spacing']:g} | {' | '.join(cells)} | {min(times):.0f} … {max(times):.0f} |")
+    return [*lines, ""]
+
+
+def _spaced(entry: dict[str, float]) -> str:
+    return f"{100 * entry['bias']:+.2f} ± {100 * entry['noise']:.2f} %, {percent(entry['error'])}"
 
 
 def _fits(fits: list[dict[str, Any]]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from .cases import CASES
 from .cases.case import Problem, everything, rotation
 from .cases.measure import Running, exact, sample
 from .exact import exact_image
+from .painted import PAINTED
 from .scenes import (
     background,
     cube,
@@ -57,6 +59,7 @@ def scenes() -> dict[str, Callable[[], Problem]]:
         "40 slivers": lambda: everything(Scene([random_slivers(40, 1, camera)], background()), camera),
         "sphere": lambda: everything(Scene([sphere(2)], background()), camera),
         **{name: CASES[name].build for name in chosen},
+        **{name: partial(build, camera) for name, build in PAINTED.items()},
     }
 
 
