@@ -19,7 +19,7 @@ from .scene import Flat, Scene, flatten
 
 
 class PixelRecords(NamedTuple):
-    """Some of an image's hits: all samples of a pixel on one face, at one of them."""
+    """Some of an image's hits: all samples of a pixel on one face, at one of them, or at several."""
 
     pixel: Tensor  # (N,) int64, row by row
     face: Tensor  # (N,) int64
@@ -246,17 +246,23 @@ class Sampler:
 
         return _of_values(request.pack(), with_request, *more)
 
-    def pixel_hits(self, at_once: int) -> Iterator[PixelRecords]:
-        """Those of the image, some `at_once` rows of pixels after another."""
+    def pixel_hits(self, at_once: int, most: int = 1, only: Tensor | None = None) -> Iterator[PixelRecords]:
+        """Those of the image, some `at_once` rows of pixels after another; at `most` samples of a pixel on one face each.
+
+        only   (H, W) bool: of these pixels, after those of all; their samples are drawn independently of those
+        """
         height, width = self._request.camera.height, self._request.camera.width
-        rows = max(1, at_once // (width * min(self._request.image.spp, 4)))
+        rows = max(1, at_once // (width * min(self._request.image.spp, 4 * most)))
+        places = () if only is None else (only.to(torch.uint8),)
         for first in range(0, height, rows):
             end = min(height, first + rows)
 
-            def compute(request: Request, camera: Any, first: int = first, end: int = end) -> PixelRecords:
+            def compute(
+                request: Request, camera: Any, *only: Tensor, first: int = first, end: int = end
+            ) -> PixelRecords:
                 options = request.image._replace(seed=camera_seed(request.image.seed, self._camera))
                 camera = kernel_camera(request.camera, self._camera)
-                if first == 0:
+                if first == 0 and not only:
                     warn_of_ends([camera])
                 found = kernel_scene(request.scene).pixel_hits(
                     camera=camera,
@@ -264,11 +270,13 @@ class Sampler:
                     threads=torch.get_num_threads(),
                     first=first,
                     end=end,
+                    most=most,
+                    only=only[0].numpy() if only else None,
                     hits=kernel_hits(self._hits),
                 )
                 return _record(PixelRecords, found)
 
-            yield PixelRecords(*self._compute(self._request, compute))
+            yield PixelRecords(*self._compute(self._request, compute, *places))
 
     def samples(
         self, request: Request, interior: bool, boundary: bool, rim: bool = False, steps: bool = False

@@ -1,6 +1,7 @@
 """Images of shaders written in PyTorch, with gradients of what moves at silhouettes and at declared steps.
 
-The value of the image and its gradient come from different samples. Those of the image are shaded without a graph. To it
+The value of the image and its gradient come from different samples. Those of the image are shaded without a graph, several of a
+face where borders of steps run through a pixel. To it
 terms are added whose value is exactly zero: samples inside faces, shaded with a graph at points that move with the scene while
 their pixel stays; samples on curves, shaded without one on both sides, whose jump multiplies the curve's velocity; and, where
 the shader declares steps, samples on these. All of it is PyTorch, so whatever the shader uses gets its gradient by itself.
@@ -15,10 +16,11 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from ._borders import Borders
 from ._check import values_visible
 from ._derivatives import differentiates, moves, once, transformed
 from ._request import Request
-from ._samples import RayRecords, shaded_room, without_colors
+from ._samples import PixelRecords, RayRecords, shaded_room, without_colors
 from ._steps import UNEQUAL, Crossings, Points, Steps, find_crossings
 from ._surfaces import every_face
 from .camera import Camera
@@ -78,14 +80,27 @@ class _Image:
     def _values(self) -> Tensor:
         """The image, without a graph."""
         frame = self._frame
+        borders = Borders((frame.height, frame.width))
         with torch.no_grad():
             image: Any = 0
             for found in frame.sampler.pixel_hits(AT_ONCE):
-                hits = frame.fixed_hits(found.face, found.b, found.x)
-                radiance = self._shade(hits).detach()
-                weighted = radiance * frame.here(found.weight).to(radiance.dtype)[:, None]
-                image = image + frame.image(found.pixel, weighted)
+                sums, steps = self._shaded(found)
+                image = image + sums
+                borders.add(found.pixel, steps)
+            again, most = borders.found() if frame.request.image.spp > 1 else (None, 1)
+            if again is not None and bool(again.any()):
+                image = image.masked_fill(frame.here(again).reshape(-1, 1), 0.0)
+                for found in frame.sampler.pixel_hits(AT_ONCE, most, again):
+                    image = image + self._shaded(found)[0]
         return frame.composed(image, self._background())
+
+    def _shaded(self, found: PixelRecords) -> tuple[Tensor, Steps]:
+        """(H · W, C) what hits add to the image, and the steps that were asked for there."""
+        frame = self._frame
+        hits = frame.fixed_hits(found.face, found.b, found.x)
+        radiance = self._shade(hits).detach()
+        weighted = radiance * frame.here(found.weight).to(radiance.dtype)[:, None]
+        return frame.image(found.pixel, weighted), hits._steps
 
     def _background(self) -> Tensor | None:
         """(C,) or (H, W, C)."""

@@ -19,11 +19,12 @@ template <class T>
 class HitRow {
    public:
     HitRow(const SceneView<T>& scene, const std::deque<Side>& sides, const ImageOptions& options,
-           const HitBuffers<T>& out, Team& team)
+           const PixelChoice& choice, const HitBuffers<T>& out, Team& team)
         : scene_(scene),
           sides_(sides),
           side_(&sides.front()),
           options_(options),
+          choice_(choice),
           out_(out),
           team_(team),
           rays_(side_->frame) {}
@@ -35,6 +36,7 @@ class HitRow {
         for (const Side& side : sides_) {
             if (&side != side_) side_ = &side, rays_.look_through(side.frame), known_ = filled();
             for (int x = 0; x < width; ++x) {
+                if (choice_.only && !choice_.only[int64_t(y) * width + x]) continue;
                 if (!side.camera.may_show({x + 0.5, y + 0.5}, options_.filter.radius())) continue;
                 for (int done = 0; done < options_.spp;) {
                     const int n = std::min(options_.spp - done, RayBatch::size - rays_.count);
@@ -46,6 +48,7 @@ class HitRow {
             }
             cast(to);
         }
+        if (choice_.only) return;
         for (int x = 0; x < width; ++x) {
             const int64_t pixel = int64_t(y) * width + x;
             const Pixel& p = row_[x];
@@ -57,13 +60,17 @@ class HitRow {
     }
 
    private:
-    // Samples of a pixel on one face, at one of them.
-    struct Group {
-        int32_t face;
-        int count;
+    struct Drawn {
         uint64_t key;
         Vec2 n;
     };
+    // Samples of a pixel on one face, at some of them: those with the least keys, a heap.
+    struct Group {
+        int32_t face;
+        int count;
+        std::vector<Drawn> drawn;
+    };
+    static bool is_less(const Drawn& a, const Drawn& b) { return a.key < b.key; }
     struct Pixel {
         int hits = 0;
         double farthest = -std::numeric_limits<double>::infinity();
@@ -81,7 +88,7 @@ class HitRow {
         }
         int i = 0;
         for (int p = 0; p < parts_; ++p) {
-            if (part_[p].x != x_) groups_.clear(), x_ = part_[p].x, samples_ = 0;
+            if (part_[p].x != x_) count_ = 0, x_ = part_[p].x, samples_ = 0;
             for (const int end = i + part_[p].n; i < end; ++i, ++samples_)
                 if (rays_.face[i] >= 0) add(rays_.face[i], rays_.n(i));
             if (samples_ == options_.spp) finish(to);
@@ -89,17 +96,27 @@ class HitRow {
         rays_.count = parts_ = 0;
     }
 
-    // The sample with the least random number stands for all. So where one more or one less hits the face, it mostly
-    // stays the same, and images of scenes that differ a little do.
+    // The samples with the least random numbers stand for all. So where one more or one less hits the face, they mostly
+    // stay the same, and images of scenes that differ a little do.
     void add(int32_t face, Vec2 n) {
-        const uint64_t key = hash(options_.seed, hash(5, uint64_t(y_) * side_->camera.width + x_), samples_);
-        auto group = std::find_if(groups_.begin(), groups_.end(), [&](const Group& g) { return g.face == face; });
-        if (group == groups_.end()) {
-            groups_.push_back({face, 1, key, n});
-            return;
+        const int stream = choice_.only ? 6 : 5;
+        const uint64_t key = hash(options_.seed, hash(stream, uint64_t(y_) * side_->camera.width + x_), samples_);
+        const auto end = groups_.begin() + count_;
+        auto group = std::find_if(groups_.begin(), end, [&](const Group& g) { return g.face == face; });
+        if (group == end) {
+            if (end == groups_.end()) groups_.emplace_back();
+            group = groups_.begin() + count_++;
+            group->face = face, group->count = 0, group->drawn.clear();
         }
         ++group->count;
-        if (key < group->key) group->key = key, group->n = n;
+        std::vector<Drawn>& drawn = group->drawn;
+        if (int(drawn.size()) == choice_.most) {
+            if (drawn.front().key <= key) return;
+            std::pop_heap(drawn.begin(), drawn.end(), is_less);
+            drawn.pop_back();
+        }
+        drawn.push_back({key, n});
+        std::push_heap(drawn.begin(), drawn.end(), is_less);
     }
 
     // Hands over what a pixel shows through this side.
@@ -107,14 +124,17 @@ class HitRow {
         const Camera& camera = side_->camera;
         const Vec2 middle = normalised(camera, {x_ + 0.5, y_ + 0.5});
         Pixel& pixel = row_[x_];
-        for (const Group& g : groups_) {
+        for (int i = 0; i < count_; ++i) {
+            const Group& g = groups_[i];
             const auto corner = corners(g.face);
             const FaceMap map = face_map(camera, corner.data());
-            const Barycentrics b = barycentrics_of_hit(map, g.n);
-            const Vec2 x = bend(camera, to_pixels(camera, g.n)).x;
-            to.pixel.push_back(int32_t(int64_t(y_) * camera.width + x_)), to.face.push_back(g.face);
-            append(to.b, {b.u, b.v}), append(to.x, {x.x, x.y});
-            to.weight.push_back(double(g.count) / options_.spp);
+            for (const Drawn& drawn : g.drawn) {
+                const Barycentrics b = barycentrics_of_hit(map, drawn.n);
+                const Vec2 x = bend(camera, to_pixels(camera, drawn.n)).x;
+                to.pixel.push_back(int32_t(int64_t(y_) * camera.width + x_)), to.face.push_back(g.face);
+                append(to.b, {b.u, b.v}), append(to.x, {x.x, x.y});
+                to.weight.push_back(double(g.count) / (double(options_.spp) * g.drawn.size()));
+            }
             DepthBound depth;
             depth.set(camera, corner.data(), map);
             pixel.hits += g.count;
@@ -124,7 +144,7 @@ class HitRow {
             if (!seen.load(std::memory_order_relaxed))
                 seen.store(camera.side(corner[0], corner[1], corner[2]), std::memory_order_relaxed);
         }
-        groups_.clear(), x_ = -1;
+        count_ = 0, x_ = -1;
     }
 
     std::array<Vec3, 3> corners(int32_t face) const {
@@ -143,6 +163,7 @@ class HitRow {
     const std::deque<Side>& sides_;
     const Side* side_;  // the one that is looked through
     const ImageOptions& options_;
+    const PixelChoice& choice_;
     const HitBuffers<T>& out_;
     Team& team_;
 
@@ -161,6 +182,7 @@ class HitRow {
     int y_ = 0;
     std::array<int32_t, 256> known_ = filled();
     std::vector<Group> groups_;
+    int count_ = 0;             // of them, in use
     int x_ = -1, samples_ = 0;  // the pixel that they are of, and how many of its samples came
 };
 
@@ -168,12 +190,14 @@ class HitRow {
 
 template <class T>
 PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                          const ImageOptions& options, int first, int end, Team& team, const HitBuffers<T>& out) {
+                          const ImageOptions& options, const PixelChoice& choice, Team& team,
+                          const HitBuffers<T>& out) {
     const std::deque<Side> sides = make_sides(scene, camera, caster, options, team);
-    std::vector<PixelHits> rows(end - first);
+    std::vector<PixelHits> rows(choice.end - choice.first);
     team.each_with(
-        end - first, [&] { return std::make_unique<HitRow<T>>(scene, sides, options, out, team); },
-        [&](HitRow<T>& row, int64_t k) { row.find(first + int(k), rows[k]); });
+        choice.end - choice.first,
+        [&] { return std::make_unique<HitRow<T>>(scene, sides, options, choice, out, team); },
+        [&](HitRow<T>& row, int64_t k) { row.find(choice.first + int(k), rows[k]); });
     PixelHits all;
     size_t n = 0;
     for (const PixelHits& row : rows) n += row.pixel.size();
@@ -185,9 +209,9 @@ PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const
     return all;
 }
 
-template PixelHits find_pixel_hits(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&, int,
-                                   int, Team&, const HitBuffers<float>&);
-template PixelHits find_pixel_hits(const SceneView<double>&, const Camera&, const RayCaster&, const ImageOptions&, int,
-                                   int, Team&, const HitBuffers<double>&);
+template PixelHits find_pixel_hits(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&,
+                                   const PixelChoice&, Team&, const HitBuffers<float>&);
+template PixelHits find_pixel_hits(const SceneView<double>&, const Camera&, const RayCaster&, const ImageOptions&,
+                                   const PixelChoice&, Team&, const HitBuffers<double>&);
 
 }  // namespace edgegrad

@@ -1,7 +1,8 @@
 // What the samples of an image hit, for shaders written in PyTorch.
 //
 // All samples of a pixel that hit the same face are one hit: it stands for them all, at one of them drawn at random, so
-// that a shader is asked once for each face in a pixel and the mean over samples keeps its expected value.
+// that a shader is asked once for each face in a pixel and the mean over samples keeps its expected value. Where more
+// are wanted, several of them stand for all.
 #pragma once
 
 #include <cstdint>
@@ -19,9 +20,17 @@ struct PixelHits {
     std::vector<double> weight;  // the share of the pixel's samples
 };
 
-// Of the rows first … end − 1 of the image. Writes those rows of `out`, and marks the faces in it.
+// Which hits, of the rows first … end − 1 of an image.
+struct PixelChoice {
+    int first, end;
+    int most = 1;                   // of the samples of a pixel on one face that stand for all of them
+    const uint8_t* only = nullptr;  // (H, W): the pixels; null: all
+};
+
+// Of all pixels; writes their rows of `out`, and marks the faces in it. Of some pixels it writes nothing, and their
+// samples are drawn again, independently of those for all.
 template <class T>
 PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                          const ImageOptions& options, int first, int end, Team& team, const HitBuffers<T>& out);
+                          const ImageOptions& options, const PixelChoice& choice, Team& team, const HitBuffers<T>& out);
 
 }  // namespace edgegrad

@@ -1,5 +1,9 @@
 // What shaders written in PyTorch are made of: samples as records of arrays, what is seen at places and along rays.
 
+#include <nanobind/stl/optional.h>
+
+#include <optional>
+
 #include "backward/backward.h"
 #include "forward/pixel_hits.h"
 #include "forward/places.h"
@@ -26,14 +30,18 @@ nb::object rows(std::vector<X>&& values, std::vector<size_t> row = {}) {
 
 template <class T>
 nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& options, int threads,
-                    int first, int end, const HitArrays<T>& hits) {
+                    int first, int end, int most, std::optional<In<uint8_t, 2>> only, const HitArrays<T>& hits) {
     hits.check(arrays, camera);
     if (first < 0 || first > end || end > camera.height) refuse("rows: expected rows of the image");
+    if (most < 1) refuse("most: expected at least 1");
+    if (only && (int(only->shape(0)) != camera.height || int(only->shape(1)) != camera.width))
+        refuse("only: expected a number a pixel");
+    const PixelChoice choice{first, end, most, only ? only->data() : nullptr};
     PixelHits found;
     unlocked(threads, [&](Team& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
-        found = find_pixel_hits(arrays.view(), camera, geometry->caster(), options, first, end, team, hits.view());
+        found = find_pixel_hits(arrays.view(), camera, geometry->caster(), options, choice, team, hits.view());
     });
     nb::dict out;
     out["pixel"] = rows(std::move(found.pixel)), out["face"] = rows(std::move(found.face));
@@ -157,7 +165,9 @@ nb::object visible_points(const SceneArrays<T>& arrays, In<int32_t, 1> face, In<
 
 template <class T>
 void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
-    scene.def("pixel_hits", &pixel_hits<T>, "camera"_a, "options"_a, "threads"_a, "first"_a, "end"_a, "hits"_a)
+    scene
+        .def("pixel_hits", &pixel_hits<T>, "camera"_a, "options"_a, "threads"_a, "first"_a, "end"_a, "most"_a,
+             "only"_a.none(), "hits"_a)
         .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)
         .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(), "threads"_a)
