@@ -37,6 +37,9 @@ class Fault(Exception):
     """What is wrong with a file, said without its name."""
 
 
+RAMP = torch.tensor([[0.0, 1.0]])  # alpha that is looked up where it is known
+
+
 class Part(NamedTuple):
     """A part of a file as it stands there, before equal vertices are welded; colours are linear."""
 
@@ -452,7 +455,7 @@ def _gltf_look(
     """The fields of a part that say what it looks like; texture, factor and vertex colours are multiplied."""
     visual = raw.get("visual")
     look: dict[str, object] = {"uvs": _uvs(visual)}
-    colors = None
+    colors = values = None
     if "COLOR_0" in primitive["attributes"]:
         values = raw["vertex_colors"] if visual is None else visual.vertex_attributes["color"]
         colors = look["colors"] = _colors("vertex", values, srgb=False)
@@ -463,6 +466,9 @@ def _gltf_look(
     masked = material.get("alphaMode") == "MASK"
     opacity = float((*base.get("baseColorFactor", ()), 1.0, 1.0, 1.0, 1.0)[3])
     cutoff = look["cutoff"] = float(material.get("alphaCutoff", 0.5))
+    of_vertices = _vertex_alpha(values) if masked and colors is not None else None
+    if of_vertices is not None and float(of_vertices.min()) == float(of_vertices.max()):
+        opacity, of_vertices = opacity * float(of_vertices[0]), None
     if masked and opacity < cutoff:  # all of it is cut out, whatever a texture says
         look["alpha"] = torch.full((1, 1), opacity)
         look["uvs"] = np.zeros((len(raw["vertices"]), 2), np.float32) if look["uvs"] is None else look["uvs"]
@@ -475,6 +481,14 @@ def _gltf_look(
             look["face_colors"] = torch.tensor(factor, dtype=torch.float32).repeat(len(raw["faces"]), 1)
         else:
             look["colors"] = colors * colors.new_tensor(factor)
+        if of_vertices is not None and "alpha" not in look:
+            # Linear over a face, as the texture coordinates by which a ramp of two texels is looked up.
+            u = 0.25 + 0.5 * opacity * of_vertices
+            look |= {
+                "alpha": RAMP,
+                "uvs": torch.stack([u, torch.full_like(u, 0.5)], 1).numpy(),
+                "wrap": ("clamp", "clamp"),
+            }
         return look
     source = tree["images"][tree["textures"][reference["index"]].get("source", 0)]
     name = str(source.get("name") or source.get("uri") or material.get("name") or "in the file")[:60]
@@ -485,11 +499,28 @@ def _gltf_look(
         raise Fault(f"expected plain TEXCOORD_0 for the texture {name!r}, got others; bake them into one set")
     if colors is not None and not bool((colors == 1.0).all()):
         raise Fault(f"expected the texture {name!r} or vertex colours, got both; bake one into the other")
+    if of_vertices is not None and "alpha" not in look:
+        raise Fault(
+            f"expected the texture {name!r} or the alpha of COLOR_0 to cut out, got both; bake the alpha into the texture"
+        )
     look.pop("colors", None)
     look["texture"] = textures.get(name, image, factor)
     if masked and "alpha" not in look:
         look["alpha"] = textures.alpha(image, opacity)
     return {**look, **_gltf_sampler(tree, tree["textures"][reference["index"]], name)}
+
+
+def _vertex_alpha(values: Any) -> Tensor | None:
+    """(N,) float32 the fourth number of colours, if there is one."""
+    values = np.asarray(values)
+    if values.shape[1] < 4:
+        return None
+    whole = np.iinfo(values.dtype).max if values.dtype.kind in "iu" else 1.0
+    alpha = values[:, 3].astype(np.float64) / whole
+    if not ((alpha >= 0.0) & (alpha <= 1.0)).all():
+        bad = int(np.argwhere(~((alpha >= 0.0) & (alpha <= 1.0)))[0, 0])
+        raise Fault(f"expected alpha of COLOR_0 from 0 to 1, got {alpha[bad]} at vertex {bad}; repair it")
+    return torch.from_numpy(alpha).float()
 
 
 def _gltf_sampler(tree: dict[str, Any], texture: dict[str, Any], name: str) -> dict[str, object]:

@@ -323,6 +323,53 @@ def test_gltf_masks_without_alpha_in_a_texture(tmp_path):
             assert seen == (1.0 if shows else 0.0)
 
 
+@pytest.mark.parametrize("type_", ["<f4", "<u1", "<u2"])
+def test_gltf_masks_by_alpha_of_vertices(tmp_path, type_):
+    """Alpha rises from 0 to 1 from left to right; times 0.8 it is above a half right of 5/8."""
+    scale = 1 if type_ == "<f4" else np.iinfo(type_).max
+    colors = (np.array([[1, 1, 1, x] for x, _, _ in SQUARE]) * scale).astype(type_)
+    K = torch.tensor([[32.0, 0, 0], [0, 32, 0], [0, 0, 1]])
+    camera = eg.Camera(torch.eye(4), K, (32, 32), "orthographic")
+    base = {"baseColorFactor": [1.0, 1.0, 1.0, 0.8]}
+    file = tmp_path / "s.glb"
+    for uv in (False, True):
+        file.write_bytes(square_glb({"pbrMetallicRoughness": base, "alphaMode": "MASK"}, colors=colors, uv=uv))
+        mesh = load_mesh(file)
+        uvs = mesh.uvs.double().requires_grad_()
+        seen = eg.render_aovs(mesh.replace(uvs=uvs).to(torch.float64), camera, ["alpha"], 64)["alpha"]
+        assert seen.mean().item() == pytest.approx(0.375, abs=2e-3)
+        assert seen[:, 0].mean() == 0 and seen[:, -1].mean() == 1
+        # A larger alpha everywhere: the border at x = cutoff / 0.8 − δ / 0.8 moves left.
+        (by_uv,) = torch.autograd.grad(seen.mean(), uvs)
+        assert by_uv[:, 0].sum().item() == pytest.approx(1 / (0.5 * 0.8), rel=1e-3)
+    file.write_bytes(square_glb({"pbrMetallicRoughness": base}, colors=colors))
+    assert load_mesh(file).alpha is None  # opaque
+    same = colors.copy()
+    for share, shown in ((0.5, 0.0), (0.75, 1.0)):  # 0.4 and 0.6 in all
+        same[:, 3] = np.array(share * scale).astype(type_)
+        file.write_bytes(square_glb({"pbrMetallicRoughness": base, "alphaMode": "MASK"}, colors=same))
+        assert eg.render_aovs(load_mesh(file), camera, ["alpha"], 4)["alpha"].mean() == shown
+
+
+def test_gltf_masks_by_a_texture_and_by_vertices(tmp_path):
+    base = {"baseColorTexture": {"index": 0}}
+    colors = np.array([[1, 1, 1, x] for x, _, _ in SQUARE], "<f4")
+    file = tmp_path / "s.glb"
+    parts = dict(
+        material={"pbrMetallicRoughness": base, "alphaMode": "MASK"}, uv=True, colors=colors,
+        extra=(png_with_alpha([[0, 255], [102, 153]]),), images=[{"bufferView": 4, "mimeType": "image/png"}],
+        textures=[{"source": 0}],
+    )  # fmt: skip
+    file.write_bytes(square_glb(**parts))
+    with pytest.raises(ValueError, match=r"or the alpha of COLOR_0 to cut out, got both; bake"):
+        load_mesh(file)
+    file.write_bytes(square_glb(**{**parts, "colors": np.array([[1, 1, 1, 0.9]] * 4, "<f4")}))
+    np.testing.assert_allclose(load_mesh(file).alpha, 0.9 * np.array([[0, 255], [102, 153]]) / 255.0, atol=1e-6)
+    file.write_bytes(square_glb(**{**parts, "colors": np.array([[1, 1, 1, 1.5]] * 4, "<f4")}))
+    with pytest.raises(ValueError, match=r"expected alpha of COLOR_0 from 0 to 1, got 1\.5 at vertex 0"):
+        load_mesh(file)
+
+
 def test_glb_base_colour_is_linear_and_not_rounded(tmp_path):
     material = {"pbrMetallicRoughness": {"baseColorFactor": [0.001, 0.3, 0.7, 1.0]}}
     (tmp_path / "f.glb").write_bytes(square_glb(material))
