@@ -13,6 +13,21 @@ from torch.nn.functional import normalize
 from .scene import Scene
 
 
+def rows_of(table: Tensor, index: Tensor) -> Tensor:
+    """table[index], row by row: (*index, *row). Three times as fast as that, and its derivative twice."""
+    return table.index_select(0, index.reshape(-1)).reshape(*index.shape, *table.shape[1:])
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """(N,) of vectors (N, 3). Sums of three numbers are faster one by one."""
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+
+
+def interpolated(b: Tensor, corners: Tensor) -> Tensor:
+    """(N, K) from barycentrics (N, 3) and values at corners (N, 3, K). No matrix product, which autocast would make less exact."""
+    return b[:, :1] * corners[:, 0] + b[:, 1:2] * corners[:, 1] + b[:, 2:] * corners[:, 2]
+
+
 class Surfaces:
     """Meshes laid end to end.
 
@@ -50,19 +65,23 @@ class Surfaces:
                     f"hits.uv: meshes[{i}] has no texture coordinates; give it uvs and uv_faces, or choose "
                     "another mesh by hits.mesh"
                 )
-            parts.append(mesh.uvs.to(self.verts.dtype)[mesh.uv_faces.long()])
+            parts.append(rows_of(mesh.uvs.to(self.verts.dtype), mesh.uv_faces.long()))
         return torch.cat(parts)
 
     @cached_property
     def vertex_normals(self) -> Tensor:
         """(V, 3) unit normals: the mean of the incident faces' by area, of vertices as they are indexed."""
-        corner = self.verts[self.faces]
+        corner = rows_of(self.verts, self.faces)
         area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         index = self.faces.reshape(-1)
         return normalize(torch.zeros_like(self.verts).index_add(0, index, area.repeat_interleave(3, 0)), dim=-1)
 
+    def corners(self, face: Tensor) -> Tensor:
+        """(N, 3, 3) world coordinates of those of faces (N,)."""
+        return rows_of(self.verts, rows_of(self.faces, face))
+
     def face_normals(self, face: Tensor) -> Tensor:
-        corner = self.verts[self.faces[face]]
+        corner = self.corners(face)
         return normalize(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=-1)
 
     def crease_attributes(self) -> Tensor:
@@ -106,8 +125,8 @@ def meet(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
     """(N, 3) barycentrics of where rays meet the planes of faces with corners (N, 3, 3) (Möller and Trumbore 1997)."""
     e1, e2, s = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
     p, q = torch.linalg.cross(direction, e2), torch.linalg.cross(s, e1)
-    scale = 1 / (e1 * p).sum(-1)
-    u, v = (s * p).sum(-1) * scale, (direction * q).sum(-1) * scale
+    scale = 1 / dot(e1, p)
+    u, v = dot(s, p) * scale, dot(direction, q) * scale
     return torch.stack([1 - u - v, u, v], 1)
 
 
@@ -127,7 +146,7 @@ class View:
     def barycentrics(self, surfaces: Surfaces, face: Tensor, along: Tensor) -> Tensor:
         """(N, 3) where rays meet the planes of faces. `along` (N, 3): the directions of rays from the eye in camera coordinates,
         or, in an orthographic view, points that rays along the axis go through."""
-        corners = self.in_camera(surfaces.verts[surfaces.faces[face]])
+        corners = self.in_camera(surfaces.corners(face))
         if self.perspective:
             return meet(corners, torch.zeros_like(along), along)
         return meet(corners, along, along.new_tensor([0.0, 0.0, 1.0]).expand_as(along))
@@ -163,7 +182,7 @@ class Rays(NamedTuple):
     def depth(self, points: Tensor) -> Tensor:
         """(N,) in lengths of the direction."""
         d = self.direction
-        return ((points.double() - self.origin) * d).sum(-1) / (d * d).sum(-1)
+        return dot(points.double() - self.origin, d) / dot(d, d)
 
     def to_viewer(self, points: Tensor) -> Tensor:
         return -normalize(self.direction, dim=-1)

@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from ._check import as_tensor, check_finite, check_float, check_shape, values_visible
 from ._samples import RayRecords, visible
 from ._steps import Steps, StepsOfSome
-from ._surfaces import Rays, Surfaces, View, every_face
+from ._surfaces import Rays, Surfaces, View, every_face, interpolated, rows_of
 from .mesh import FILTERS, WRAPS
 
 
@@ -114,7 +114,7 @@ class Hits:
     def position(self) -> Tensor:
         """(N, 3) in world coordinates."""
         s = self._surfaces
-        return (self._barycentrics[:, :, None] * s.verts[s.faces[self._face]]).sum(1)
+        return interpolated(self._barycentrics, s.corners(self._face))
 
     @cached_property
     def depth(self) -> Tensor:
@@ -134,15 +134,15 @@ class Hits:
         """(N, 3) unit normal, interpolated between those of the vertices: means of their faces' by area."""
         s = self._surfaces
         self._note("shading_normal", lambda: s.vertex_normals[s.faces])
-        normals = s.vertex_normals[s.faces[self._face]]
-        return normalize((self._barycentrics[:, :, None] * normals).sum(1), dim=-1)
+        normals = rows_of(s.vertex_normals, rows_of(s.faces, self._face))
+        return normalize(interpolated(self._barycentrics, normals), dim=-1)
 
     @cached_property
     def uv(self) -> Tensor:
         """(N, 2) texture coordinates, v running up."""
         s = self._surfaces
         self._note("uv", lambda: s.corner_uvs)
-        return (self._barycentrics[:, :, None] * s.corner_uvs[self._face]).sum(1)
+        return interpolated(self._barycentrics, rows_of(s.corner_uvs, self._face))
 
     @cached_property
     def view(self) -> Tensor:
@@ -182,9 +182,9 @@ class Hits:
 
         self._note(("attribute", id(attribute)), corners)
         if per == "face":
-            return attribute[self._face]
-        values = attribute[s.faces[self._face]] if per == "vertex" else attribute[self._face]
-        return (self._barycentrics.to(values.dtype)[:, :, None] * values).sum(1)
+            return rows_of(attribute, self._face)
+        values = rows_of(attribute, rows_of(s.faces, self._face) if per == "vertex" else self._face)
+        return interpolated(self._barycentrics.to(values.dtype), values)
 
     def sample(
         self,
@@ -222,7 +222,8 @@ class Hits:
         if filter == "nearest":
             h, w = texture.shape[:2]
             cell = self.floor(torch.stack([uv[:, 0].double() * w, (1 - uv[:, 1].double()) * h], 1))
-            return texture[_wrapped(cell[:, 1], h, wraps[1]), _wrapped(cell[:, 0], w, wraps[0])]
+            place = _wrapped(cell[:, 1], h, wraps[1]) * w + _wrapped(cell[:, 0], w, wraps[0])
+            return rows_of(texture.reshape(h * w, -1), place)
         if not mipmap:
             return _bilinear(texture, uv, wraps)
         levels = self._pyramid(texture)
@@ -266,7 +267,7 @@ class Hits:
             def apart(axis: int) -> Tensor:
                 moved = step * rays.along_by_x[:, :, axis]
                 b = [view.barycentrics(surfaces, self._face, rays.along + sign * moved) for sign in (1, -1)]
-                return (((b[0] - b[1])[:, :, None] * corners).sum(1) * size).norm(dim=1) / (2 * step)
+                return (interpolated(b[0] - b[1], corners) * size).norm(dim=1) / (2 * step)
 
             most = torch.maximum(apart(0), apart(1))
             return torch.nan_to_num(most, nan=1.0, posinf=1e9).clamp(1, 1e9).log2()
@@ -365,7 +366,7 @@ def _bilinear(texture: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
     flat = texture.reshape(h * w, -1)
 
     def texels(dy: int, dx: int) -> Tensor:
-        return flat[_wrapped(y0 + dy, h, wraps[1]) * w + _wrapped(x0 + dx, w, wraps[0])]
+        return rows_of(flat, _wrapped(y0 + dy, h, wraps[1]) * w + _wrapped(x0 + dx, w, wraps[0]))
 
     top = (1 - fx) * texels(0, 0) + fx * texels(0, 1)
     bottom = (1 - fx) * texels(1, 0) + fx * texels(1, 1)

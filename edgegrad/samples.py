@@ -245,7 +245,7 @@ def trace(scene: Scene | Mesh, origins: Tensor, directions: Tensor) -> Hits:
     rays = Rays(index, given["origins"][index], d[index])
     surfaces = Surfaces(scene)
     b = barycentrics(found.b.to(like.device)[index])
-    corners = surfaces.verts[surfaces.faces[face]]
+    corners = surfaces.corners(face)
     if moves(corners, rays.origin, rays.direction):
         b = rays.barycentrics(corners.double(), b)
     return Hits(surfaces, rays, face, b)
