@@ -84,13 +84,13 @@ class TraceRecords(NamedTuple):
 SURFACE_BYTES, CURVE_BYTES = 8 * (1 + 2 + 3 + 3 * 14 + 1), 8 * (2 + 3 + 6 + 3 + 14 + 4 * (1 + 1 + 3))
 
 
-def shaded_room(request: Request) -> AbstractContextManager[None]:
+def shaded_room(request: Request, gradient: bool | None = None) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the image of a shader does not fit, and if an allocation in it fails; what the
-    shader itself takes is not known before."""
+    shader itself takes is not known before. With the samples of the `gradient`, by default where gradients are enabled."""
     size, options = pass_size(request), request.gradient
     pixels = request.camera.height * request.camera.width
     needs = core.image_bytes(size, request.cameras)
-    if torch.is_grad_enabled():
+    if torch.is_grad_enabled() if gradient is None else gradient:
         # By default about half a sample a pixel of surface, and some at edges.
         surface = options.surface_samples if options.surface_samples >= 0 else pixels // 2
         edge = options.edge_samples if options.edge_samples >= 0 else pixels // 8

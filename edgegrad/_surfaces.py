@@ -24,7 +24,7 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def interpolated(b: Tensor, corners: Tensor) -> Tensor:
-    """(N, K) from barycentrics (N, 3) and values at corners (N, 3, K). No matrix product, which autocast would make less exact."""
+    """(N, K) from barycentrics (N, 3) and values at corners (N, 3, K). A matrix product would lose digits under autocast."""
     return b[:, :1] * corners[:, 0] + b[:, 1:2] * corners[:, 1] + b[:, 2:] * corners[:, 2]
 
 

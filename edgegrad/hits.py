@@ -60,8 +60,9 @@ class Hits:
             raise TypeError(f"index: expected integers or a mask, got {index.dtype}")
         check_shape("index", index, (len(index) if index.dim() == 1 else "M",))
         index = index.long()
-        if values_visible(index) and not bool(((index >= -count) & (index < count)).all()):
-            raise ValueError(f"index: expected numbers below {count}, got {int(index.max())}")
+        wrong = (index < -count) | (index >= count)
+        if values_visible(index) and bool(wrong.any()):
+            raise ValueError(f"index: expected numbers from {-count} to {count - 1}, got {int(index[wrong][0])}")
         return self.apart(index, StepsOfSome(self._steps, index % max(count, 1), count))
 
     def apart(self, index: Tensor, steps: Steps | None = None) -> Hits:

@@ -6,8 +6,8 @@ already. All become three float32 channels; lights are dropped, as are normals a
 base colour. A glTF multiplies the texture, the factor and the vertex colours. Elsewhere, where a file gives several
 looks, the first of these is taken: texture, vertex colours, face colours, the material's colour.
 
-Alpha is dropped, but where a material of a glTF has the alphaMode MASK: the alpha of its texture times that of its
-factor is then the mesh's, with its alphaCutoff. Wrap and filter are those of a glTF's sampler.
+Alpha is dropped, but where a material of a glTF has the alphaMode MASK: the alpha of its texture, or of its vertices
+(COLOR_0), times that of its factor is then the mesh's, with its alphaCutoff. Wrap and filter are those of a glTF's sampler.
 """
 
 from __future__ import annotations

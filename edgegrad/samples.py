@@ -23,7 +23,16 @@ from torch import Tensor
 from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
 from ._derivatives import moves, once
 from ._request import Request, as_scene, make_request
-from ._samples import CurveRecords, Footprints, RayRecords, Sampler, SurfaceRecords, barycentrics, without_colors
+from ._samples import (
+    CurveRecords,
+    Footprints,
+    RayRecords,
+    Sampler,
+    SurfaceRecords,
+    barycentrics,
+    shaded_room,
+    without_colors,
+)
 from ._samples import trace as trace_records
 from ._steps import Steps
 from ._surfaces import Rays, Surfaces, View, every_face
@@ -274,10 +283,11 @@ def surface_samples(primary: PrimaryHits, count: int | None = None) -> SurfaceSa
     primary   of primary_hits()
     count     of samples; see surface_samples of render()
 
-    Raises TypeError or ValueError that names the argument.
+    Raises TypeError or ValueError that names the argument, MemoryError if so many do not fit.
     """
     request = _request_of(primary, "surface_samples", count)
-    surface, _ = primary.frame.sampler.samples(request, interior=True, boundary=False)
+    with shaded_room(request._replace(gradient=request.gradient._replace(edge_samples=0)), gradient=True):
+        surface, _ = primary.frame.sampler.samples(request, interior=True, boundary=False)
     return SurfaceSamples(primary.frame, surface)
 
 
@@ -289,7 +299,7 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
     creases   at which edges between two visible faces radiance may jump: True, at all; False, at none; or numbers at the corners
               of faces (F, 3, K), at those where these differ on both sides
 
-    Raises TypeError or ValueError that names the argument.
+    Raises TypeError or ValueError that names the argument, MemoryError if so many do not fit.
     """
     request = _request_of(primary, "edge_samples", count)
     F = len(primary.frame.surfaces.faces)
@@ -305,9 +315,10 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
         raise TypeError(f"creases: expected True, False or a tensor (F, 3, K), got {type(creases).__name__}")
     request = request._replace(scene=without_colors(request.scene, attributes))
     frame = primary.frame
-    _, curves = frame.sampler.samples(
-        request, interior=False, boundary=True, rim=moves(frame.intrinsics), steps=request.scene.has_steps
-    )
+    with shaded_room(request._replace(gradient=request.gradient._replace(surface_samples=0)), gradient=True):
+        _, curves = frame.sampler.samples(
+            request, interior=False, boundary=True, rim=moves(frame.intrinsics), steps=request.scene.has_steps
+        )
     return EdgeSamples(frame, curves)
 
 
@@ -321,8 +332,11 @@ def attach_boundary(image: Tensor, samples: EdgeSamples, jump: Tensor, backgroun
 
     In reverse and in forward mode, once. Raises TypeError or ValueError that names the argument.
     """
+    if not isinstance(samples, EdgeSamples):
+        raise TypeError(f"samples: expected what edge_samples() returned, got {type(samples).__name__}")
     frame = samples.frame
     jump = _rows("jump", jump, len(samples)).detach()
+    image = as_tensor("image", image, like=jump, floating=True)
     check_float("image", image)
     check_shape("image", image, (frame.height, frame.width, jump.shape[1]))
     background = _background(background, jump, frame)

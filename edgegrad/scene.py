@@ -73,7 +73,12 @@ class Scene:
             object.__setattr__(self, "background", background)
             C = next(iter(known)) if known else "C"
             check_float("background", background)
-            check_shape("background", background, (C,), ("H", "W", C))
+            fix = (
+                "as many channels as the colours of the meshes; for a shader of others leave these away"
+                if known
+                else ""
+            )
+            check_shape("background", background, (C,), ("H", "W", C), fix=fix)
             check_finite("background", background)
 
     @property

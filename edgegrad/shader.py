@@ -188,8 +188,13 @@ class _Image:
             values = torch.full((len(x), len(kinds)), torch.nan, dtype=torch.float64)
             there = (face >= 0).nonzero()[:, 0]
             for some in there.split(AT_ONCE):
-                hits = frame.fixed_hits(face[some], b[some], x[some])
-                values[some] = self._step_values(hits).detach().cpu()
+                found = self._step_values(frame.fixed_hits(face[some], b[some], x[some])).detach()
+                if not values_visible(found):
+                    raise RuntimeError(
+                        "torch.vmap: expected declared steps that are the same for all of a batch, for where they lie is "
+                        "looked for once; render one by one where s of hits.where() or t of hits.floor() differs"
+                    )
+                values[some] = found.cpu()
             return Points(x, face, part, b, values)
 
         with torch.no_grad():

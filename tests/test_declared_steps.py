@@ -165,6 +165,42 @@ def test_steps_in_forward_mode_and_under_transforms():
         assert torch.allclose(x, y, rtol=1e-6, atol=1e-9)
 
 
+def test_steps_that_differ_within_a_batch_are_refused():
+    def image(a: Tensor, color: Tensor) -> Tensor:
+        return eg.render(
+            ball(), front_camera(SIZE), shader=lambda hits: hits.where(hits.position[:, 0] - a, color, 0.0)
+        )
+
+    ones, zeros = torch.ones((2, 3), dtype=F64), torch.zeros(2, dtype=F64)
+    assert torch.equal(*torch.vmap(image, (None, 0))(zeros[0], ones))
+    with pytest.raises(
+        RuntimeError, match=r"torch\.vmap: expected declared steps that are the same for all of a batch"
+    ):
+        torch.vmap(image, (0, None))(zeros, ones[0])
+
+
+@pytest.mark.parametrize(("wide", "least", "most"), [(30.0, 0.97, 1.02), (1.0, 0.97, 1.02), (0.5, 0.5, 0.7)])
+def test_a_step_along_a_strip_of_surface(wide: float, least: float, most: float):
+    """0.1 px beside the silhouette of what is wide, and along the middle of what is narrow, as the documents tell."""
+    turn = torch.linalg.matrix_exp(0.4 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]], dtype=F64))
+    corner = torch.tensor([[0.0, -20, 0], [wide, -20, 0], [wide, 20, 0], [0, 20, 0]], dtype=F64)
+    mesh = eg.Mesh(corner @ turn.T, torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    K = torch.tensor([[1.0, 0, 32], [0, 1, 32], [0, 0, 1]], dtype=F64)
+    camera = eg.Camera(torch.eye(4, dtype=F64), K, (64, 64), "orthographic")
+    where = 0.1 if wide > 1 else wide / 2
+
+    def derivative(seed: int) -> Tensor:
+        t = torch.zeros((), dtype=F64, requires_grad=True)
+        image = eg.render(
+            mesh, camera, spp=1, seed=seed,
+            shader=lambda hits: hits.where((hits.position @ turn)[:, 0] - where - t, 1.0, 0.0),
+        )  # fmt: skip
+        return torch.autograd.grad(image.sum(), t)[0] / -40.0
+
+    found = torch.stack([derivative(seed) for seed in range(12)])
+    assert least < float(found.mean()) < most
+
+
 def test_steps_that_are_not_always_asked_for():
     def shader(hits: eg.Hits) -> Tensor:
         return hits.where(hits.depth - 3, 1.0, 0.0) if len(hits) > 50 else torch.ones(len(hits), 1)
@@ -191,7 +227,9 @@ def test_what_steps_are_given_is_checked():
     refused(lambda hits: hits.where(hits.depth / 0, 1.0, 0.0), r"s: expected finite numbers, got inf")
     refused(lambda hits: hits.sample(torch.ones(2, 2, 1), uv=hits.position[:, :2], wrap=5), r"wrap: expected")  # type: ignore[arg-type]
     refused(lambda hits: hits.select(torch.ones(3, dtype=torch.bool)).normal, r"index: expected shape")
-    refused(lambda hits: hits.select(hits.face + len(hits)).normal, r"index: expected numbers below")
+    refused(
+        lambda hits: hits.select(hits.face + len(hits)).normal, r"index: expected numbers from -\d+ to \d+, got \d+"
+    )
     refused(lambda hits: hits.select(hits.depth).normal, r"index: expected integers", TypeError)
     refused(lambda hits: hits.floor(hits.face), r"t: ", TypeError)
     with pytest.raises(ValueError, match=r"step_spacing: expected a number from 0\.015625 to 64, got 0"):

@@ -298,6 +298,13 @@ def test_what_parts_are_given_is_checked():
         eg.edge_samples(primary, creases="auto")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"image: expected shape"):
         eg.attach_boundary(torch.zeros(3, 3, 3), edges, torch.zeros(len(edges), 3))
+    for call in (eg.surface_samples, eg.edge_samples):
+        with pytest.raises(MemoryError, match=r"got about .* TB \(samples"), torch.no_grad():
+            call(primary, 10**12)
+    with pytest.raises(TypeError, match=r"samples: expected what edge_samples\(\) returned, got PrimaryHits"):
+        eg.attach_boundary(torch.zeros(SIZE, SIZE, 3), primary, torch.zeros(len(edges), 3))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"image: expected a tensor, array or nested sequence of numbers, got NoneType"):
+        eg.attach_boundary(None, edges, torch.zeros(len(edges), 3))  # type: ignore[arg-type]
     w = torch.eye(4).expand(2, 4, 4)
     with pytest.raises(ValueError, match=r"camera: expected one camera, got a batch of 2"):
         eg.primary_hits(ball(), front_camera(SIZE).replace(world_to_camera=w))
