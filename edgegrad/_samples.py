@@ -249,7 +249,7 @@ class Sampler:
     def pixel_hits(self, at_once: int, most: int = 1, only: Tensor | None = None) -> Iterator[PixelRecords]:
         """Those of the image, some `at_once` rows of pixels after another; at `most` samples of a pixel on one face each.
 
-        only   (H, W) bool: of these pixels, after those of all; their samples are drawn independently of those
+        only   (H, W) bool: of these pixels, after those of all; which of their samples these are is drawn independently
         """
         height, width = self._request.camera.height, self._request.camera.width
         rows = max(1, at_once // (width * min(self._request.image.spp, 4 * most)))

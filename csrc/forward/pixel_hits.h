@@ -27,8 +27,8 @@ struct PixelChoice {
     const uint8_t* only = nullptr;  // (H, W): the pixels; null: all
 };
 
-// Of all pixels; writes their rows of `out`, and marks the faces in it. Of some pixels it writes nothing, and their
-// samples are drawn again, independently of those for all.
+// Of all pixels; writes their rows of `out`, and marks the faces in it. Of some pixels it writes nothing, and which of
+// their samples stand for all is drawn independently of the draw for all pixels.
 template <class T>
 PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                           const ImageOptions& options, const PixelChoice& choice, Team& team, const HitBuffers<T>& out);
