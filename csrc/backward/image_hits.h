@@ -78,14 +78,15 @@ class ImageHits {
     // Whether a face with this vertex was hit.
     bool at(int64_t vertex) const { return at_[vertex] & hit; }
 
-    // What the corners of a face say together: `partly`: it has a corner of a face that was hit; `whole`: all its
-    // corners are; `clear`: and no face beside it has others.
+    // What the corners of a face say together: `missed`: none is of a face that was hit; `partly`: one is, or of a
+    // neighbour of such a face; `whole`: all are of faces that were hit; `clear`: and no face beside it has others.
     struct Face {
-        bool partly, whole, clear;
+        bool missed, partly, whole, clear;
     };
     Face of(const int32_t* v) const {
         const uint8_t a = at_[v[0]], b = at_[v[1]], c = at_[v[2]];
-        return {((a | b | c) & (hit | rim)) != 0, (a & b & c & hit) != 0, !((a | b | c) & rim)};
+        return {((a | b | c) & hit) == 0, ((a | b | c) & (hit | rim)) != 0, (a & b & c & hit) != 0,
+                !((a | b | c) & rim)};
     }
 
     // Whether the corners of a face lie inside the view, behind all that was hit around them (OcclusionHint), and it is

@@ -28,7 +28,10 @@ namespace edgegrad {
 template <int N, class T>
 class CreaseJumps {
    public:
-    explicit CreaseJumps(const SceneView<T>& scene) : scene_(scene), C_(channels_of<N>(scene)) {
+    explicit CreaseJumps(const BackwardView<T>& view)
+        : scene_(N == 0 ? without_continuous(view.scene, view.geometry.topology()) : view.scene),
+          first_(view.scene.channels - scene_.channels),
+          C_(channels_of<N>(scene_)) {
         if constexpr (N == 0) value_.resize(2 * C_);
     }
 
@@ -36,11 +39,22 @@ class CreaseJumps {
         std::fill(value_.begin(), value_.end(), 0.0);
         add(minus, 1), add(plus, -1);
     }
-    double at(int end, int channel) const { return value_[end * C_ + channel]; }
-    // Σ_c weight_c |jump_c|.
-    double size(int end, const std::vector<double>& weights) const {
+    // Σ_c weight_c |jump_c|, the mean of both ends.
+    double size(const std::vector<double>& weights) const {
         double sum = 0;
-        for (int c = 0; c < C_; ++c) sum += weights[c] * std::fabs(at(end, c));
+        for (int c = 0; c < C_; ++c) sum += weights[first_ + c] * (std::fabs(value_[c]) + std::fabs(value_[C_ + c]));
+        return 0.5 * sum;
+    }
+    // Σ_c A_c jump_c at both ends, given A of all channels.
+    struct Ends {
+        double a = 0, b = 0;
+    };
+    Ends times(const T* A) const {
+        Ends sum;
+        for (int c = 0; c < C_; ++c) {
+            const double own = A[first_ + c];
+            sum.a += own * value_[c], sum.b += own * value_[C_ + c];
+        }
         return sum;
     }
 
@@ -53,8 +67,8 @@ class CreaseJumps {
         });
     }
 
-    const SceneView<T>& scene_;
-    const int C_;
+    const SceneView<T> scene_;  // of the channels that may jump
+    const int first_, C_;       // of them
     std::conditional_t<N == 0, std::vector<double>, std::array<double, 2 * all_channels<N>>> value_{};
 };
 
@@ -67,8 +81,7 @@ bool joins_colors(const SceneView<T>& scene, const Curve& c) {
 template <int N, class T>
 class CreaseControl {
    public:
-    explicit CreaseControl(const BackwardView<T>& view)
-        : view_(view), C_(channels_of<N>(view.scene)), jumps_(view.scene), A_(C_) {}
+    explicit CreaseControl(const BackwardView<T>& view) : view_(view), jumps_(view) {}
 
     // Begins with a curve; false where there is no control.
     bool set(const Curve& curve) {
@@ -87,6 +100,7 @@ class CreaseControl {
         at_a_ = at_b_ = 0;
         return true;
     }
+    const CreaseJumps<N, T>& jumps() const { return jumps_; }  // of that curve
 
     // What its density is multiplied by, if a short crease gets `least`.
     double density(double least) const { return std::clamp(std::max(curve_->length / wide, bend_), least, 1.0); }
@@ -127,19 +141,16 @@ class CreaseControl {
         Piece(CreaseControl& control, double begin, double end)
             : middle_(0.5 * (begin + end)), half_(0.5 * (end - begin)) {
             const bool box = control.view_.image.filter.is_box();
-            for (int k = box ? 1 : 0; k < (box ? 2 : 3); ++k) {
-                control.view_.adjoint.template at<N>(control.curve_->position(middle_ + (k - 1) * half_),
-                                                     control.A_.data());
-                for (int c = 0; c < control.C_; ++c)
-                    a_[k] += control.A_[c] * control.jumps_.at(0, c), b_[k] += control.A_[c] * control.jumps_.at(1, c);
-            }
+            for (int k = box ? 1 : 0; k < (box ? 2 : 3); ++k)
+                control.view_.adjoint.around(control.curve_->position(middle_ + (k - 1) * half_),
+                                             [&](const T* A, double weight) {
+                                                 const auto [a, b] = control.jumps_.times(A);
+                                                 a_[k] += weight * a, b_[k] += weight * b;
+                                             });
             if (box) a_[0] = a_[2] = a_[1], b_[0] = b_[2] = b_[1];
         }
         // Ã times the jump at either end of the curve, in the middle.
-        struct Ends {
-            double a, b;
-        };
-        Ends ends() const { return {a_[1], b_[1]}; }
+        typename CreaseJumps<N, T>::Ends ends() const { return {a_[1], b_[1]}; }
         double at(double s) const {
             const double r = half_ > 0 ? (s - middle_) / half_ : 0, low = 0.5 * r * (r - 1), high = 0.5 * r * (r + 1);
             const double a = low * a_[0] + (1 - r * r) * a_[1] + high * a_[2];
@@ -192,7 +203,6 @@ class CreaseControl {
     static constexpr double wide = 1024;  // px, from which length on a crease gets all samples
 
     const BackwardView<T>& view_;
-    const int C_;
     const Curve* curve_ = nullptr;
     Vec2 tangent_;
     double per_[2];  // 1 / tangent_
@@ -200,7 +210,6 @@ class CreaseControl {
     int32_t vertex_[2][2];  // of minus and plus; a and b
     double at_a_ = 0, at_b_ = 0;
     CreaseJumps<N, T> jumps_;
-    std::vector<double> A_;
 };
 
 }  // namespace edgegrad

@@ -18,14 +18,16 @@
 namespace edgegrad {
 
 struct CreaseFace {
-    // `hidden`: behind all that was hit around it, or on the side of a closed mesh that is turned away; `clear`: in the
-    // middle of what was hit, `seen`: and hit itself. Of none of these does a silhouette pass before the face.
-    // `unknown` for all others.
-    enum State : uint8_t { unknown, hidden, clear, seen };
+    // `turned`: on the side of a closed mesh that is turned away, `hidden`: and no silhouette passes before it, or
+    // behind all that was hit around it; `clear`: in the middle of what was hit, and no silhouette passes before it,
+    // `seen`: and hit itself. `unknown` for all others.
+    enum State : uint8_t { unknown, turned, hidden, clear, seen };
     float value;   // of two that differ the faces differ along their edge; not a number: of this one it does not say
-    float pixels;  // of a hidden one: the measure of a crease beside it, without the adjoint
+    float pixels;  // of one that is hidden or turned: the measure of a crease beside it, without the adjoint
     float importance;  // and of the adjoint
     State state;
+
+    bool is_hidden() const { return state == turned || state == hidden; }
 };
 
 template <class T>
@@ -59,7 +61,7 @@ class CreaseFaces {
         const ImageHits& hits = *view_.hits;
         const bool behind = hits.are_behind(v);
         const ImageHits::Face hit = hits.of(v);
-        if (!behind && hit.partly && !hit.clear) return out;
+        if (!behind && hit.partly && !hit.clear && !hit.missed) return out;
 
         const Vec2 a = p.x[v[0]], b = p.x[v[1]], c = p.x[v[2]];
         const Vec2 low{std::min({a.x, b.x, c.x}), std::min({a.y, b.y, c.y})},
@@ -67,21 +69,25 @@ class CreaseFaces {
         const auto [nearest, farthest] = std::minmax({p.q[v[0]].z, p.q[v[1]].z, p.q[v[2]].z});
         const double touching = contact(spacing_, largest_, std::max(std::fabs(nearest), std::fabs(farthest)));
         const double w = view_.camera.perspective ? nearest : 1;
-        if (!(finder_.rounding(by_axis_, w, pixels_) < Crossings::float_reach) ||
-            crossings_.in(low, high, farthest + touching))
-            return out;
-        if (hit.partly) {
+        if (!(finder_.rounding(by_axis_, w, pixels_) < Crossings::float_reach)) return out;
+        const bool crossed = crossings_.in(low, high, farthest + touching);
+        if (!crossed && hit.clear && !hit.missed) {
             if (!meeting_.in(low, high)) out.state = view_.seen[f] ? CreaseFace::seen : CreaseFace::clear;
             return out;
         }
+        if (!hit.missed) return out;
         // Each point of a side is as near to one of its ends as the hint reaches.
         const double longest = std::max({length(b - a), length(c - b), length(a - c)});
         double samples = 0;
-        if (behind && longest <= 2 * OcclusionHint::reach)
+        if (behind && !crossed && longest <= 2 * OcclusionHint::reach) {
             samples = view_.occlusion.factor(CreaseSamples::hidden, OcclusionHint::pixels_around, view_.image.spp);
-        else if (hits.is_turned_away(v[0], side_of(view_, f))) samples = CreaseSamples::turned_away;
-        if (samples == 0) return out;
-        out.state = CreaseFace::hidden;
+            out.state = CreaseFace::hidden;
+        } else if (hits.is_turned_away(v[0], side_of(view_, f))) {
+            samples = CreaseSamples::turned_away;
+            out.state = crossed || hit.partly ? CreaseFace::turned : CreaseFace::hidden;
+        } else {
+            return out;
+        }
         out.pixels = float(longest * samples), out.importance = float(view_.importance.mean(low, high));
         return out;
     }

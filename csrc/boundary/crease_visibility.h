@@ -63,14 +63,15 @@ class CreaseVisibility {
 
     // Adds rays to some points of a crease to the batch; returns its place there.
     int ask(const Curve& c, Relation relation) {
-        asked_[size_] = {c, by_evidence(std::max(fewest(c, relation), beside_silhouettes)), where_missed(c)};
-        for (const double s : asked_at) {
-            const Vec2 n = normalised(view_.camera, c.position(s));
-            rays_.n_x[rays_.count] = n.x, rays_.n_y[rays_.count++] = n.y;
+        const int n = points(c);
+        asked_[size_] = {c, n, by_evidence(std::max(fewest(c, relation), beside_silhouettes)), where_missed(c)};
+        for (int i = 0; i < n; ++i) {
+            const Vec2 at = normalised(view_.camera, c.position(asked_at[i]));
+            rays_.n_x[rays_.count] = at.x, rays_.n_y[rays_.count++] = at.y;
         }
         return size_++;
     }
-    bool full() const { return size_ == most; }
+    bool full() const { return size_ == most || rays_.count > RayBatch::size - most_points; }
 
     // Casts them; body(k, curve, expected) gets the answers, k = 0, 1, … as they were asked.
     template <class Body>
@@ -78,10 +79,10 @@ class CreaseVisibility {
         rays_.prepare();
         view_.frame.cast(rays_);
         for (int k = 0, ray = 0; k < size_; ++k) {
-            const auto& [c, fewest, missed] = asked_[k];
+            const auto& [c, points, fewest, missed] = asked_[k];
             int visible = 0, hidden = 0;
-            for (const double s : asked_at) {
-                const Answer a = at(c, s, ray++);
+            for (int i = 0; i < points; ++i) {
+                const Answer a = at(c, asked_at[i], ray++);
                 visible += a == Answer::visible, hidden += a == Answer::hidden;
             }
             // Beside what the image hit, one that rays find hidden may be visible between them, as at a limb.
@@ -91,10 +92,15 @@ class CreaseVisibility {
         rays_.count = size_ = 0;
     }
 
-    static constexpr double asked_at[] = {0.05, 0.35, 0.65, 0.95};
-    static constexpr int points = int(std::size(asked_at)), most = RayBatch::size / points;  // creases in a batch
+    static constexpr int few_points = 2, most = RayBatch::size / few_points;  // creases in a batch
 
    private:
+    // Where rays go: the ends of a crease that is no longer than some pixels, which has few samples itself; two points
+    // more of others.
+    static constexpr double asked_at[] = {0.05, 0.95, 0.35, 0.65};
+    static constexpr int most_points = int(std::size(asked_at));
+    static int points(const Curve& c) { return c.length < 4 ? few_points : most_points; }
+
     // Least fractions of the samples: where nothing may divide a crease; and where it may, but rays find it undivided.
     static constexpr double few = CreaseSamples::visible, beside_silhouettes = 1.0 / 128, beside_parts = 1.0 / 32,
                             beside_missed = 1.0 / 8;  // faces near which others were not hit: something may pass
@@ -151,6 +157,7 @@ class CreaseVisibility {
 
     struct Asked {
         Curve curve;
+        int points;
         double fewest, missed;
     };
 

@@ -145,6 +145,17 @@ bool may_jump(const SceneView<T>& scene, const Topology& topology) {
            scene.cut_outs.face;
 }
 
+// The scene without the first of its channels if these are the same on both sides of an edge: what is interpolated from
+// vertices, unless copies are joined, and alpha where nothing is cut out.
+template <class T>
+SceneView<T> without_continuous(SceneView<T> scene, const Topology& topology) {
+    if (scene.corners != scene.faces || topology.welds() || scene.face_texture || scene.cut_outs.face) return scene;
+    Attributes& a = scene.attributes;
+    a.alpha = false, a.vertex_width = 0, a.unit = -1;
+    scene.radiance = 0, scene.channels = a.channels();
+    return scene;
+}
+
 // A face that turns clockwise in the image (x right, y down) lies to the right of its sides, where the normal
 // (τ_y, −τ_x) does not point. One seen exactly edge-on covers nothing. > 0: the side of minus, < 0: of plus.
 inline int side_of(const HalfEdge& h, const Array<int8_t>& facing) {
@@ -310,6 +321,12 @@ class CurveFinder {
         c.w0 = view_.camera.depth_weight(c.a), c.w1 = view_.camera.depth_weight(c.b);
         c.length = length(c.tangent());
         return c.length > 0;
+    }
+
+    // Of the curve of an edge that lies in the view.
+    double rounding(const Curve& c) const {
+        const HalfEdge& h = c.minus.face >= 0 ? c.minus : c.plus;
+        return rounding(c, vertex(view_.scene, h, h.first()), vertex(view_.scene, h, h.second()));
     }
 
     // Of pixel positions, px: of points whose coordinates are at most p in size, axis by axis, and whose denominators

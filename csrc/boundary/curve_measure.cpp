@@ -21,7 +21,7 @@ constexpr double samples_per_pixel = 24;
 // fewer samples do for the rest: their error falls as one over their number, and the rest of the gradient, a vector by
 // vertices, is about √(Σ measure² of the rest / Σ measure² of all) of the whole. No less than a third, for a motion
 // that all vertices share feels silhouettes more than creases, nor than takes a few milliseconds.
-constexpr double least_rest = 1.0 / 3, least_samples = 1 << 12;
+constexpr double least_rest = 1.0 / 5, least_samples = 1 << 12;
 
 // How few samples a silhouette gets if it lies behind what the image hit (occlusion.h). Never none, for it may be
 // visible all the same; a gap may run along it, so that fewer rays than elsewhere find it. What was merely not hit
@@ -143,7 +143,7 @@ class MeasuredEdges {
           scale_(scale),
           faces_(hints && hints->faces ? &*hints->faces : nullptr),
           x_(x),
-          jumps_(view.scene),
+          jumps_(view),
           control_(view) {
         if (hints) visibility_.emplace(view, hints->crossings, hints->meeting);
     }
@@ -178,7 +178,7 @@ class MeasuredEdges {
             if (!edges.faces_) return Glance::unknown;
             const CreaseFace &one = (*edges.faces_)[f], &other = (*edges.faces_)[g];
             if (one.value == other.value || std::isnan(one.value + other.value)) return Glance::unknown;
-            if (one.state != CreaseFace::hidden || other.state != CreaseFace::hidden) return Glance::differs;
+            if (!one.is_hidden() || !other.is_hidden()) return Glance::differs;
             edges.add_hidden(e, one, other);
             return Glance::done;
         }
@@ -189,13 +189,26 @@ class MeasuredEdges {
 
     // A crease between hidden faces gets so few samples that how large its jump is does not matter.
     void add_hidden(int64_t e, const CreaseFace& one, const CreaseFace& other) {
+        const bool alone = one.state == CreaseFace::hidden && other.state == CreaseFace::hidden;
         ++found.creases;
         if (!(one.importance > 0 && other.importance > 0)) return;
-        const double pixels = std::min(one.pixels, other.pixels);
+        const double pixels = alone ? std::min(one.pixels, other.pixels) : add_turned(e);
+        if (!(pixels > 0)) return;
         found.pixels += pixels;
+        any_hidden |= alone;
         curves.push_back(
-            {.measure = pixels * std::max(one.importance, other.importance), .edge = int32_t(e), .hidden = true});
-        any_hidden = true;
+            {.measure = pixels * std::max(one.importance, other.importance), .edge = int32_t(e), .hidden = alone});
+    }
+
+    // Adds the segment of the next curve, a crease that is turned away, before which a silhouette may pass; returns its
+    // measure without the adjoint.
+    double add_turned(int64_t e) {
+        Curve c;
+        if (!finder_.find_between(e, c)) return 0;
+        c.rounding = finder_.rounding(c);
+        segments.push_back(image_segment(view_, c, int64_t(curves.size())));
+        const bool apart = visibility_->relation(c) == Relation::apart;
+        return c.length * (apart ? CreaseSamples::turned_away : ImageHits::turned_away);
     }
 
     // A crease between faces that are visible as a whole, of which one was hit; or hidden, as it turns out. False for
@@ -206,14 +219,13 @@ class MeasuredEdges {
         const auto sides = topology.faces(e);
         if (finder_.facing()[sides[0]] * finder_.facing()[sides[1]] <= 0) return false;
         const CreaseFace &one = (*faces_)[sides[0]], &other = (*faces_)[sides[1]];
-        if (one.state == CreaseFace::hidden && other.state == CreaseFace::hidden)
-            return add_hidden(e, one, other), true;
+        if (one.is_hidden() && other.is_hidden()) return add_hidden(e, one, other), true;
         if (std::min(one.state, other.state) < CreaseFace::clear || std::max(one.state, other.state) < CreaseFace::seen)
             return false;
         Curve c;
         if (!finder_.find_between(e, c) || !control_.set(c)) return false;
         ++found.creases;
-        const Jump jump{int64_t(curves.size()), size_of_jump(c), view_.importance.mean(c.low(), c.high())};
+        const Jump jump{int64_t(curves.size()), relative(control_.jumps()), view_.importance.mean(c.low(), c.high())};
         if (!(jump.importance > 0)) return true;
         clear.push_back({int32_t(curves.size()), CellMarks::around(c.low(), c.high())});
         curves.push_back({.edge = int32_t(e)});
@@ -282,8 +294,10 @@ class MeasuredEdges {
     double size_of_jump(const Curve& c) {
         if (!joins_colors(view_.scene, c)) return 1;
         jumps_.set(c.minus, c.plus);
-        const double size = 0.5 * (jumps_.size(0, scale_.weights) + jumps_.size(1, scale_.weights));
-        return std::min(size / scale_.unknown, largest);
+        return relative(jumps_);
+    }
+    double relative(const CreaseJumps<N, T>& jumps) const {
+        return std::min(jumps.size(scale_.weights) / scale_.unknown, largest);
     }
 
     static constexpr double largest = 2;  // so that a bright face among dark ones does not take all samples

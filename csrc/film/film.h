@@ -97,6 +97,12 @@ class FilteredAdjoint {
     // A of a pixel, C numbers.
     const T* of(int64_t pixel) const { return A_ + pixel * scene_.channels; }
 
+    // Ã(x) = Σ k A: calls visit(A, k) for the pixels that it is made of, A being C numbers.
+    template <class Visit>
+    void around(Vec2 x, Visit visit) const {
+        pixels_.around(x, [&](int64_t pixel, double weight) { visit(of(pixel), weight); });
+    }
+
     // Ã(x), C numbers; false where it is zero in all channels.
     template <int N>
     bool at(Vec2 x, double* out) const {
