@@ -29,7 +29,7 @@ constexpr double colored = 0.5, textured = 4;
 
 // Where the adjoint is as rough as noise it changes from pixel to pixel within a face: up to so many times more samples
 // are taken, on faces that are several pixels long.
-constexpr double most = 5;
+constexpr double most = 4;
 double more_if_rough(double rough, double longest) {
     return std::clamp(rough, 1.0, std::clamp(longest / 2, 1.0, most));
 }
