@@ -19,7 +19,7 @@ constexpr double samples_per_pixel = 24;
 
 // The error of a gradient is seen relative to all of it. What controls know has none, so the more of it that is, the
 // fewer samples do for the rest: their error falls as one over their number, and the rest of the gradient, a vector by
-// vertices, is about √(Σ measure² of the rest / Σ measure² of all) of the whole. No less than a third, for a motion
+// vertices, is about √(Σ measure² of the rest / Σ measure² of all) of the whole. No less than a fifth, for a motion
 // that all vertices share feels silhouettes more than creases, nor than takes a few milliseconds.
 constexpr double least_rest = 1.0 / 5, least_samples = 1 << 12;
 
