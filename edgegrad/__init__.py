@@ -2,8 +2,18 @@
 
 from .aovs import render_aovs
 from .camera import Camera
+from .environment import Environment
 from .hits import Hits
 from .io import load_camera, load_mesh, load_scene, read_image, save_camera, write_image
+from .lights import (
+    AreaLight,
+    DirectionalLight,
+    LightPoints,
+    PointLight,
+    SphericalHarmonics,
+    SpotLight,
+)
+from .material import Material, Texture, vertex_normals
 from .mesh import Mesh
 from .plan import Plan, plan, profile
 from .render import jvp, render, screen_gradient
@@ -22,14 +32,23 @@ from .scene import Scene
 __version__ = "0.1.0"
 
 __all__ = [
+    "AreaLight",
     "Camera",
+    "DirectionalLight",
     "EdgeSamples",
+    "Environment",
     "Hits",
+    "LightPoints",
+    "Material",
     "Mesh",
     "Plan",
+    "PointLight",
     "PrimaryHits",
     "Scene",
+    "SphericalHarmonics",
+    "SpotLight",
     "SurfaceSamples",
+    "Texture",
     "attach_boundary",
     "edge_samples",
     "jvp",
@@ -46,5 +65,6 @@ __all__ = [
     "screen_gradient",
     "surface_samples",
     "trace",
+    "vertex_normals",
     "write_image",
 ]

@@ -10,22 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ._rows import dot, rows_of
 from .scene import Scene
-
-
-def rows_of(table: Tensor, index: Tensor) -> Tensor:
-    """table[index], row by row: (*index, *row). Three times as fast as that, and its derivative twice."""
-    return table.index_select(0, index.reshape(-1)).reshape(*index.shape, *table.shape[1:])
-
-
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """(N,) of vectors (N, 3). Sums of three numbers are faster one by one."""
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
-
-
-def interpolated(b: Tensor, corners: Tensor) -> Tensor:
-    """(N, K) from barycentrics (N, 3) and values at corners (N, 3, K). A matrix product would lose digits under autocast."""
-    return b[:, :1] * corners[:, 0] + b[:, 1:2] * corners[:, 1] + b[:, 2:] * corners[:, 2]
 
 
 class Surfaces:
@@ -54,6 +40,18 @@ class Surfaces:
             other.__dict__.pop(name, None)
         other.verts, other.scene, other.pyramids = self.verts.detach(), self.scene.detach(), {}
         return other
+
+    @cached_property
+    def first_faces(self) -> list[int]:
+        """The first face of each mesh."""
+        return [sum(len(m.faces) for m in self.scene.meshes[:k]) for k in range(len(self.scene.meshes))]
+
+    @cached_property
+    def ball(self) -> tuple[Tensor, float]:
+        """A centre (3,) and a radius of a ball around all vertices, float64."""
+        verts = self.verts.detach().double()
+        low, high = verts.amin(0), verts.amax(0)
+        return (low + high) / 2, float((high - low).norm()) / 2
 
     @cached_property
     def corner_uvs(self) -> Tensor:
@@ -87,7 +85,7 @@ class Surfaces:
     def crease_attributes(self) -> Tensor:
         """(F, 3, K) of all that was asked for and may jump, each scaled to its largest number."""
         parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
-        parts = [p / p.abs().max().clamp(min=1e-30) for p in parts]
+        parts = [p / p.abs().max().clamp(min=1e-30) for p in parts if p.shape[-1]]
         return _Beside.apply(torch.cat(parts, -1)) if parts else self.verts.new_zeros((len(self.faces), 3, 0))
 
 

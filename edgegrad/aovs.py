@@ -7,15 +7,18 @@ radiance. What follows from vertices and camera is made here, by torch operation
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ._autograd import faces_at_centers, render_image
+from ._lit import Lighting
 from ._request import Channels, Request, as_scene, make_request
 from .camera import Camera
 from .mesh import Mesh
 from .scene import Scene, image_dtype
+from .shader import render_shaded
 
 IDS = ("mesh_id", "face_id")
 # In the order in which the kernel has them (csrc/scene/scene.h).
@@ -36,6 +39,8 @@ def render_aovs(
     filter: str = "box",
     grad_seed: int | None = None,
     step_spacing: float = 1.0,
+    shadows: bool = True,
+    light_samples: int = 1,
 ) -> dict[str, Tensor]:
     """Channels of a scene by name, (H, W, c) each, or (B, H, W, c) for a batch of cameras, all from the same samples.
 
@@ -64,18 +69,28 @@ def render_aovs(
     """
     names = check_aovs(aovs)
     scene = as_scene(scene)
+    lighting = Lighting.of(shadows, light_samples)
     if "uv" in names:
         _check_uvs(scene)
-    request = make_request(
-        scene if "image" in names else _without_radiance(scene), camera, spp, seed,
-        surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility, filter=filter,
-        grad_seed=grad_seed, step_spacing=step_spacing, all_uvs="uv" in names,
-    )  # fmt: skip
+    options: dict[str, Any] = {
+        "surface_samples": surface_samples, "edge_samples": edge_samples, "visibility": visibility, "filter": filter,
+        "grad_seed": grad_seed, "step_spacing": step_spacing,
+    }  # fmt: skip
     batched, device = camera.batch is not None, scene.meshes[0].verts.device
     found: dict[str, Tensor] = {}
+    shaded = scene.is_lit and "image" in names
+    if shaded:
+        request = make_request(scene, camera, spp, seed, **options)
+        found["image"] = render_shaded(scene, camera, lighting, request, "auto", False)
+        if names == ["image"]:
+            return found
+    radiance = "image" in names and not shaded
+    request = make_request(
+        scene if radiance else _without_radiance(scene), camera, spp, seed, **options, all_uvs="uv" in names
+    )
     if any(name in IDS for name in names):
-        found = {name: ids.to(device) for name, ids in _ids(scene, faces_at_centers(request, batched)).items()}
-    rendered = [name for name in AOVS if name in names and name not in IDS]
+        found |= {name: ids.to(device) for name, ids in _ids(scene, faces_at_centers(request, batched)).items()}
+    rendered = [name for name in AOVS if name in names and name not in (*IDS, *found)]
     if rendered:
         if rendered != ["image"]:
             request = _with_channels(request, rendered)
@@ -115,7 +130,7 @@ def _without_radiance(scene: Scene) -> Scene:
 
     def bare(mesh: Mesh) -> Mesh:
         colors = mesh.verts.detach().new_zeros((len(mesh.verts), 1), dtype=dtype)
-        return mesh.replace(colors=colors, uvs=mesh.uvs, uv_faces=mesh.uv_faces)
+        return mesh.replace(colors=colors, uvs=mesh.uvs, uv_faces=mesh.uv_faces, material=None)
 
     return Scene([bare(mesh) for mesh in scene.meshes])
 

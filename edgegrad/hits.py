@@ -4,17 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from ._check import as_tensor, check_finite, check_float, check_shape, values_visible
+from ._rows import interpolated, rows_of
 from ._samples import RayRecords, visible
+from ._seeds import STEPS, mixed_bits, signed
 from ._steps import Steps, StepsOfSome
-from ._surfaces import Rays, Surfaces, View, every_face, interpolated, rows_of
-from .mesh import FILTERS, WRAPS
+from ._surfaces import Rays, Surfaces, View, every_face
+from ._textures import bilinear, in_texels, nearest, pyramid
+from .lights import Light, LightPoints
+from .material import WRAPS
+from .mesh import FILTERS
+
+
+class Forced(NamedTuple):
+    """What is known of the shadow of one light at some points, instead of being drawn and traced."""
+
+    light: int  # place in scene.casting
+    points: LightPoints  # N of them
+    lit: Tensor  # (N,) 0 or 1
+    some: Tensor  # (N,) bool: at which points; elsewhere light points are drawn, and shadow rays cast
+
+    def select(self, index: Tensor) -> Forced:
+        return Forced(self.light, self.points.select(index), self.lit[index], self.some[index])
 
 
 class Hits:
@@ -36,8 +53,12 @@ class Hits:
         pixel: Tensor | None = None,  # (N, 2)
         rays_at: Callable[[Tensor], RayRecords] | None = None,  # those of the camera
         steps: Steps | None = None,
+        seed: Tensor | None = None,  # (N,) int64, of random()
+        forced: Forced | None = None,
     ) -> None:
         self._surfaces, self._view, self._rays_at = surfaces, view, rays_at
+        self._seed = torch.arange(len(face), device=face.device) if seed is None else seed
+        self._forced = forced
         self._face, self._exact = face, barycentrics
         self._barycentrics = barycentrics.to(surfaces.verts.dtype)
         self._pixel, self._steps = pixel, steps or Steps()
@@ -69,7 +90,9 @@ class Hits:
         """Some of the points, as hits that know nothing of the whole."""
         view = self._view.select(index) if isinstance(self._view, Rays) else self._view
         pixel = None if self._pixel is None else self._pixel[index]
-        return Hits(self._surfaces, view, self._face[index], self._exact[index], pixel, self._rays_at, steps)
+        forced = None if self._forced is None else self._forced.select(index)
+        place = self._face[index], self._exact[index], pixel
+        return Hits(self._surfaces, view, *place, self._rays_at, steps, self._seed[index], forced)
 
     @property
     def pixel(self) -> Tensor:
@@ -215,52 +238,53 @@ class Hits:
             raise ValueError(f'filter: expected "linear" or "nearest", got {filter!r}')
         if mipmap and filter == "nearest":
             raise ValueError('mipmap: expected filter="linear" with it, got "nearest"')
+        kind = "mipmap" if mipmap else filter
         if uv is None:
-            uv, of_uv = self.uv, None
-        else:
-            of_uv = uv = as_tensor("uv", uv, floating=True)
+            corners = self._surfaces.corner_uvs[self._face] if mipmap else None
+            return self._look_up(texture, self.uv, wraps, kind, corners)
+        uv = as_tensor("uv", uv, floating=True)
         check_shape("uv", uv, (len(self), 2))
-        if filter == "nearest":
-            h, w = texture.shape[:2]
-            cell = self.floor(torch.stack([uv[:, 0].double() * w, (1 - uv[:, 1].double()) * h], 1))
-            place = _wrapped(cell[:, 1], h, wraps[1]) * w + _wrapped(cell[:, 0], w, wraps[0])
-            return rows_of(texture.reshape(h * w, -1), place)
-        if not mipmap:
-            return _bilinear(texture, uv, wraps)
-        levels = self._pyramid(texture)
-        level = self._level(texture, of_uv).clamp(0, len(levels) - 1)
-        below = level.floor()
-        value: Any = 0
-        for k, image in enumerate(levels):
-            weight = torch.where(below == k, 1 - (level - below), torch.where(below == k - 1, level - below, 0.0))
-            value = value + weight.to(texture.dtype)[:, None] * _bilinear(image, uv, wraps)
-        return value
-
-    def _pyramid(self, texture: Tensor) -> list[Tensor]:
-        """The texture, and its means over squares of 2, 4, 8 … texels."""
-        kept = self._surfaces.pyramids
-        if not torch.is_grad_enabled() and id(texture) in kept:
-            return kept[id(texture)][1]
-        levels = [texture]
-        while max(levels[-1].shape[:2]) > 1:
-            image = levels[-1].movedim(-1, 0)[None]
-            size = max(1, image.shape[2] // 2), max(1, image.shape[3] // 2)
-            levels.append(torch.nn.functional.adaptive_avg_pool2d(image, size)[0].movedim(0, -1))
-        if not torch.is_grad_enabled():
-            kept[id(texture)] = texture, levels
-        return levels
-
-    def _level(self, texture: Tensor, of_uv: Tensor | None) -> Tensor:
-        """(N,) the logarithm of how many texels neighbouring pixels are apart, at most; without derivatives."""
-        if self._rays_at is None or self._pixel is None or isinstance(self._view, Rays):
-            raise ValueError("mipmap: expected hits of a camera, for rays of trace() have no neighbours; leave it out")
-        if of_uv is not None:
+        if mipmap:
             raise ValueError(
                 "mipmap: expected the surface's own texture coordinates, for how others change from pixel to pixel is not "
                 "known; leave uv out, or mipmap"
             )
+        return self._look_up(texture, uv, wraps, kind, None)
+
+    def _look_up(
+        self, texture: Tensor, uv: Tensor, wraps: tuple[str, ...], filter: str, corners: Tensor | None
+    ) -> Tensor:
+        """(N, K), with "linear", "nearest" or "mipmap", for which `corners` (N, 3, 2) are the texture coordinates of the faces'
+        corners."""
+        if filter == "nearest":
+            return nearest(texture, self.floor(in_texels(texture, uv)), wraps)
+        if filter == "linear":
+            return bilinear(texture, uv, wraps)
+        assert corners is not None
+        levels = self._pyramid(texture)
+        level = self._level(texture, corners).clamp(0, len(levels) - 1)
+        below = level.floor()
+        value: Any = 0
+        for k, image in enumerate(levels):
+            weight = torch.where(below == k, 1 - (level - below), torch.where(below == k - 1, level - below, 0.0))
+            value = value + weight.to(texture.dtype)[:, None] * bilinear(image, uv, wraps)
+        return value
+
+    def _pyramid(self, texture: Tensor) -> list[Tensor]:
+        """The levels of a texture, kept where they have no graph."""
+        kept = self._surfaces.pyramids
+        if torch.is_grad_enabled():
+            return pyramid(texture)
+        if id(texture) not in kept:
+            kept[id(texture)] = texture, pyramid(texture)
+        return kept[id(texture)][1]
+
+    def _level(self, texture: Tensor, corner_uvs: Tensor) -> Tensor:
+        """(N,) the logarithm of how many texels neighbouring pixels are apart, at most; without derivatives."""
+        if self._rays_at is None or self._pixel is None or isinstance(self._view, Rays):
+            raise ValueError("mipmap: expected hits of a camera, for rays of trace() have no neighbours; leave it out")
         with torch.no_grad():
-            corners = self._surfaces.corner_uvs.detach()[self._face].double()
+            corners = corner_uvs.detach().double()
             size = torch.tensor([texture.shape[1], texture.shape[0]], dtype=torch.float64, device=corners.device)
             rays, surfaces, view = self._rays_at(self._pixel), self._surfaces.detach(), self._view.detach()
             step = 1 / 64  # px, within which the face's plane is as good as straight
@@ -334,6 +358,63 @@ class Hits:
         spacing = max(torch.finfo(t.dtype).eps for t in (points, s.verts))
         return visible(s.scene, self._face, self._exact[:, 1:], points.double(), 16 * spacing * size)
 
+    # -- lights --------------------------------------------------------------------------------------------------------
+
+    @property
+    def lights(self) -> tuple[Light, ...]:
+        """The scene's lights that cast shadows, in a fixed order: those of scene.lights, then the meshes that emit."""
+        return self._surfaces.scene.casting
+
+    def random(self, n: int, stream: int = 0, part: int = 0, parts: int = 1) -> Tensor:
+        """(N, n) float64, uniform in [0, 1): the same for what belongs to the same sample, without derivatives. Points that
+        follow one another, and the `parts` of one point, have numbers that fill the unit cube evenly (a Kronecker sequence
+        with the powers of the generalised golden ratio of three dimensions); `stream` gives others."""
+        seed = self._seed * parts + part
+        columns = []
+        for k in range(n):
+            mixed = seed * STEPS[k % 3] + signed(mixed_bits(stream * 0x10001 + k))
+            columns.append(((mixed >> 11) & ((1 << 53) - 1)).double() * 2.0**-53)
+        return torch.stack(columns, 1)
+
+    def light_points(self, light: Light, sample: int = 0, samples: int = 1) -> LightPoints:
+        """A point of a light of `lights` for each of the N points, drawn by what the light emits, or one after another of so many
+        `samples`: light.place() and light.arriving() take them."""
+        index = self._index(light)
+        points = light.draw(self.random(3, index, sample, samples))
+        forced = self._forced
+        if forced is None or forced.light != index:
+            return points
+        some = forced.some
+        return LightPoints(
+            torch.where(some, forced.points.index, points.index),
+            torch.where(some[:, None], forced.points.uv, points.uv),
+            torch.where(some, forced.points.density, points.density),
+        )
+
+    def visible_from(self, light: Light, points: LightPoints) -> Tensor:
+        """(N,) 1 where nothing lies between the points and those of a light, else 0: see visible(). Without derivatives."""
+        index, s = self._index(light), self._surfaces
+        place = light.place(points).detach().to(s.verts.device, torch.float64)
+        here = self.position.detach().double()
+        spacing = torch.finfo(s.verts.dtype).eps
+        size = here.abs().amax(1)
+        if light.infinite:
+            center, radius = s.ball
+            place = here + place * ((here - center).norm(dim=1, keepdim=True) + 1.01 * radius)
+        else:
+            size = torch.maximum(size, place.abs().amax(1))
+        lit = visible(s.scene, self._face, self._exact[:, 1:], place, 16 * spacing * size).to(self.position.dtype)
+        forced = self._forced
+        if forced is None or forced.light != index:
+            return lit
+        return torch.where(forced.some, forced.lit.to(lit), lit)
+
+    def _index(self, light: Light) -> int:
+        for i, known in enumerate(self.lights):
+            if known is light:
+                return i
+        raise ValueError(f"light: expected one of hits.lights, got {light!r}; lights are told apart by what they are")
+
 
 def _function(name: str, value: Tensor) -> Tensor:
     """Of a step: finite, and not of the half precision that autocast gives. Raises TypeError or ValueError."""
@@ -346,29 +427,3 @@ def _function(name: str, value: Tensor) -> Tensor:
             f"{name}: expected finite numbers, got {value.detach()[~torch.isfinite(value.detach())][0].item()}"
         )
     return value
-
-
-def _wrapped(cell: Tensor, count: int, wrap: str) -> Tensor:
-    """Texels as they are counted in the texture, int64."""
-    i = cell.detach().long()
-    if wrap == "repeat":
-        return i % count
-    if wrap == "clamp":
-        return i.clamp(0, count - 1)
-    i = i % (2 * count)
-    return torch.minimum(i, 2 * count - 1 - i)
-
-
-def _bilinear(texture: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
-    h, w = texture.shape[:2]
-    x, y = uv[:, 0].double() * w - 0.5, (1 - uv[:, 1].double()) * h - 0.5
-    x0, y0 = x.detach().floor(), y.detach().floor()
-    fx, fy = (x - x0).to(texture.dtype)[:, None], (y - y0).to(texture.dtype)[:, None]
-    flat = texture.reshape(h * w, -1)
-
-    def texels(dy: int, dx: int) -> Tensor:
-        return rows_of(flat, _wrapped(y0 + dy, h, wraps[1]) * w + _wrapped(x0 + dx, w, wraps[0]))
-
-    top = (1 - fx) * texels(0, 0) + fx * texels(0, 1)
-    bottom = (1 - fx) * texels(1, 0) + fx * texels(1, 1)
-    return (1 - fy) * top + fy * bottom

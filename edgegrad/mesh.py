@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ._affine import Affine
 from ._check import (
     as_tensor,
     check_countable,
@@ -21,12 +22,14 @@ from ._check import (
     check_shape,
 )
 from ._kernel import core
+from ._tree import map_tensors, moved
+from .material import LARGEST_UV, WRAPS, Material
 
-PLAIN = 0.7  # radiance of a mesh without colours, in every channel
-WRAPS: tuple[str, ...] = core.WRAPS  # repeat, clamp, mirror
+PLAIN = 0.7  # radiance, or base colour, of a mesh without colours, in every channel
 FILTERS: tuple[str, ...] = core.TEXTURE_FILTERS  # linear, nearest
-_SETTINGS = ("alpha_cutoff", "wrap", "filter")  # fields that are no tensors
-SMALLEST_MESH, LARGEST_UV = 1e-38, 1e9
+_SETTINGS = ("alpha_cutoff", "wrap", "filter", "material")  # fields that are no tensors
+_INDEXING = ("verts", "faces", "uv_faces", "normal_faces")  # what takes no type from the vertices
+SMALLEST_MESH = 1e-38
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,11 @@ class Mesh:
     wrap           what lies beyond the rim of both images: "repeat", "clamp" (the texels at the rim go on) or "mirror"; or
                    a pair of these, for u and v
     filter         "linear" between the centres of texels, or "nearest", the texel that the point lies in
+    material       how it scatters light, and what it emits: then the colours above are base colours. None: it is not lit, and
+                   colours are radiance
+    normals        (N, 3) float   normals, of any length, interpolated over the faces where a material is lit; without, faces
+                   are flat. They are turned to the side of the face that is seen
+    normal_faces   (F, 3) int     indices into normals; those of `faces` when None
 
     Faces of zero area render nothing. Numbers reach up to 3.4e38, the range of float32, also in float64; uvs up to 1e9, for
     beyond that a double does not tell the texels of a large texture apart; the largest of the verts lies above 1e-38, unless
@@ -66,6 +74,9 @@ class Mesh:
     alpha_cutoff: float = 0.5
     wrap: str | tuple[str, str] = "repeat"
     filter: str = "linear"
+    material: Material | None = None
+    normals: Tensor | None = None
+    normal_faces: Tensor | None = None
 
     def __post_init__(self) -> None:
         self._check_settings()
@@ -74,7 +85,7 @@ class Mesh:
             if field.name in _SETTINGS:
                 continue
             if value is not None or field.name in ("verts", "faces"):
-                like = self.verts if field.name not in ("verts", "faces", "uv_faces") else None
+                like = self.verts if field.name not in _INDEXING else None
                 object.__setattr__(
                     self, field.name, as_tensor(field.name, value, like=like, floating=field.name == "verts")
                 )
@@ -108,6 +119,7 @@ class Mesh:
             check_integer("uv_faces", self.uv_faces)
             check_shape("uv_faces", self.uv_faces, (F, 3))
 
+        self._check_lit(V, F)
         # First of all, for more rows than can be counted take as long to look at.
         check_countable("faces", self.faces, V, "verts")
         if self.uvs is not None and self.uv_faces is not None:
@@ -119,6 +131,42 @@ class Mesh:
         if self.uvs is not None and self.uv_faces is not None:
             check_finite("uvs", self.uvs, largest=LARGEST_UV)
             check_indices("uv_faces", self.uv_faces, self.uvs.shape[0], "uvs")
+        if self.normals is not None:
+            check_finite("normals", self.normals)
+            if self.normal_faces is not None:
+                check_indices("normal_faces", self.normal_faces, self.normals.shape[0], "normals")
+
+    def _check_lit(self, V: int, F: int) -> None:
+        """The material and the normals, but for their numbers."""
+        if self.normals is not None:
+            check_float("normals", self.normals)
+            check_shape("normals", self.normals, ("N", 3))
+            if self.normal_faces is None:
+                if len(self.normals) != V:
+                    raise ValueError(
+                        f"normal_faces: expected with {len(self.normals)} normals of {V} vertices, got None; pass normal_faces "
+                        "(F, 3), or a normal for each vertex"
+                    )
+            else:
+                check_integer("normal_faces", self.normal_faces)
+                check_shape("normal_faces", self.normal_faces, (F, 3))
+                check_countable("normal_faces", self.normal_faces, len(self.normals), "normals")
+        elif self.normal_faces is not None:
+            raise ValueError("normals: expected with normal_faces, got None; pass normals (N, 3)")
+        if self.material is None:
+            return
+        if not isinstance(self.material, Material):
+            raise TypeError(
+                f"material: expected a Material, got {type(self.material).__name__}; eg.Material(…) makes one"
+            )
+        self.material.check_fits(V, F, self.uvs is not None)
+        own, C = self._color_channels, self.material.channels
+        if own not in (None, 1) and C not in (None, own):
+            raise ValueError(f"material: expected {own} channels like the mesh's colours, got {C}")
+        if self.material.alpha_mode == "OPAQUE" and self.alpha is not None:
+            raise ValueError(
+                'alpha: expected None with alpha_mode="OPAQUE", got an image; take "MASK", or leave it out'
+            )
 
     def _check_settings(self) -> None:
         if isinstance(self.alpha_cutoff, bool) or not isinstance(self.alpha_cutoff, (int, float)):
@@ -145,6 +193,11 @@ class Mesh:
     @property
     def channels(self) -> int | None:
         """C, or None for a plain mesh, which takes the channels of its scene."""
+        own, of_material = self._color_channels, None if self.material is None else self.material.channels
+        return own if of_material is None else of_material if own is None else max(own, of_material)
+
+    @property
+    def _color_channels(self) -> int | None:
         for value in (self.colors, self.face_colors, self.corner_colors, self.texture):
             if value is not None:
                 return value.shape[-1]
@@ -167,52 +220,24 @@ class Mesh:
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Mesh:
         """The mesh with vertices `scale · R v + t`, differentiable in all four.
 
-        R (3, 3) any matrix, identity when None; t (3,) world units, zero when None; scale a number or 0-d tensor.
-        Raises TypeError or ValueError.
+        R (3, 3) any matrix, identity when None; t (3,) world units, zero when None; scale a number or 0-d tensor. Normals go
+        along. Raises TypeError or ValueError.
         """
-        v = self.verts
-        scale = as_tensor("scale", scale, like=v)
-        check_float("scale", scale)
-        if scale.numel() != 1:
-            raise ValueError(f"scale: expected one number, got shape {tuple(scale.shape)}; scale the verts yourself")
-        check_finite("scale", scale)
-        if R is not None:
-            R = as_tensor("R", R, like=v)
-            check_float("R", R)
-            check_shape("R", R, (3, 3))
-            check_finite("R", R)
-            # Column by column rather than by a matrix product: each row is then rounded alike, so that copies of
-            # one vertex stay equal and its edges stay welded.
-            v = v[:, 0:1] * R[:, 0] + v[:, 1:2] * R[:, 1] + v[:, 2:3] * R[:, 2]
-        v = v * scale.reshape(())
-        if t is not None:
-            t = as_tensor("t", t, like=v)
-            check_float("t", t)
-            check_shape("t", t, (3,))
-            check_finite("t", t)
-            v = v + t
-        return self.replace(verts=v)
+        affine = Affine.of(R, t, scale, self.verts)
+        fields = {} if self.normals is None else {"normals": affine.normals(self.normals)}
+        return self.replace(verts=affine.points(self.verts), **fields)
 
     def to(self, *args: Any, **kwargs: Any) -> Mesh:
         """All tensors moved to a device; floating-point tensors also to a dtype, as `torch.Tensor.to`."""
-        moved = {}
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if not isinstance(value, Tensor):
-                continue
-            if value.is_floating_point():
-                moved[field.name] = value.to(*args, **kwargs)
-            else:
-                moved[field.name] = value.to(torch.empty(0).to(*args, **kwargs).device)
-        return dataclasses.replace(self, **moved)
+        return moved(self, *args, **kwargs)
 
     def detach(self) -> Mesh:
         """The same mesh, cut from the autograd graph."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return dataclasses.replace(self, **{n: v.detach() for n, v in values.items() if isinstance(v, Tensor)})
+        return map_tensors(self, Tensor.detach)
 
     def __repr__(self) -> str:
         kinds = [k for k in ("colors", "face_colors", "corner_colors", "texture") if getattr(self, k) is not None]
         look = f"{kinds[0]} {tuple(getattr(self, kinds[0]).shape)}" if kinds else "plain"
         look += f", alpha {tuple(self.alpha.shape)}" if self.alpha is not None else ""
+        look += ", lit" if self.material is not None else ""
         return f"Mesh({self.verts.shape[0]} vertices, {self.faces.shape[0]} faces, {look}, {self.verts.dtype})"

@@ -16,6 +16,7 @@ from torch import Tensor
 from . import _memory as memory
 from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
 from ._kernel import core
+from ._lit import Lighting, check_unlit
 from ._ops import Hits, backward_kernel, forward_kernel, image_room, pass_size
 from ._request import MOVING, SLOTS, Request, Work, as_scene, label, make_request, required
 from ._samples import CURVE_BYTES, SURFACE_BYTES, without_colors
@@ -94,6 +95,9 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
     request = make_request(scene, camera, spp, seed, **options)
     if shading.get("shader") is not None:
         return Plan(_shaded_terms(scene, request, shading.get("creases", "auto")))
+    lighting = Lighting.of(shading.get("shadows", True), shading.get("light_samples", 1))
+    if scene.is_lit:
+        return Plan(_lit_terms(scene, request, shading.get("creases", "auto"), lighting))
     wanted = required(request)
     return Plan({**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted)})
 
@@ -119,6 +123,26 @@ def _shaded_terms(scene: Scene, request: Request, creases: object) -> dict[str, 
         terms["creases"] = Term(False, "where what the shader asks for jumps; not counted here")
     for name in ("colors", "uvs", "texels", "vertex_attributes", "face_attributes"):
         terms.pop(f"{label(name)} gradient", None)
+    return terms
+
+
+def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighting) -> dict[str, Term]:
+    """Materials and lights are shaded in PyTorch, as by a shader."""
+    terms = _shaded_terms(scene, request, creases)
+    lights = sum(1 if light.punctual else lighting.samples for light in scene.casting)
+    shaded = terms["interior"].samples + terms["boundary"].samples
+    terms["textures"] = Term(False, "looked up where they are lit")
+    del terms["shader"]
+    terms["lights"] = Term(
+        lights > 0, f"{lights} points of lights for each point; at most {AT_ONCE:,} points at a time"
+    )
+    why = (
+        f"{lights} rays for each point of the gradient, and for each face in a pixel"
+        if lighting.shadows
+        else "shadows=False"
+    )
+    terms["shadows"] = Term(lights > 0 and lighting.shadows, why if lights else "no lights", samples=lights * shaded)
+    terms["shadow edges"] = Term(False, "what moves at a shadow's border has no gradient yet")
     return terms
 
 
@@ -353,6 +377,7 @@ def profile(
     _check_options("profile", options)
     if options.get("shader") is not None:
         raise ValueError("shader: expected None, for profile() measures the kernel alone; torch.profiler sees a shader")
+    check_unlit("profile", as_scene(scene), "it measures the kernel alone; torch.profiler sees what shades")
     options = {name: value for name, value in options.items() if name not in SHADING}
     scene, repeats = as_scene(scene), check_positive_int("repeats", repeats)
     # What is kept between calls must not help: before each step the vertices are elsewhere, each time somewhere else.

@@ -15,15 +15,17 @@ from torch.utils._pytree import tree_map
 
 from ._autograd import render_image
 from ._check import as_tensor, check_finite, check_float, check_not_meta, check_shape
+from ._lit import Lighting, check_unlit
 from ._ops import forward_kernel, screen_gradient_kernel
 from ._request import as_scene, make_request
+from ._tree import map_tensors, tensors_in
 from .aovs import IDS, check_aovs, render_aovs
 from .camera import Camera
 from .mesh import Mesh
 from .scene import Scene
 from .shader import Shader, render_shaded
 
-SHADING = ("shader", "creases", "check_shader")  # the options of shaders
+SHADING = ("shader", "creases", "check_shader", "shadows", "light_samples")  # the options of shaders and of lit scenes
 
 
 def render(
@@ -41,6 +43,8 @@ def render(
     creases: bool | str = "auto",
     check_shader: bool = False,
     step_spacing: float = 1.0,
+    shadows: bool = True,
+    light_samples: int = 1,
 ) -> Tensor:
     """The image (H, W, C) of a scene, or (B, H, W, C) for a batch of cameras: linear radiance, row 0 on top.
 
@@ -72,6 +76,11 @@ def render(
     step_spacing     px between the lines along which steps within faces are looked for: those that a shader declares, of which
                      two borders that lie closer may be missed; rims of what alpha cuts out, and borders of nearest texels.
                      Closer lines cost more and err less
+    shadows          of lit scenes: False lets light pass through everything. The motion of a shadow's border has no gradient yet
+    light_samples    of lit scenes: points drawn of each light that has an extent, for each point that is shaded
+
+    A scene with a light, or with a mesh that has a material, is lit: see Scene and Material. It is shaded in PyTorch, as by a
+    `shader`, and its image has the dtype of the vertices.
 
     Differentiable once, in reverse and in forward mode, in every floating-point tensor of the scene and the camera; torch.vmap
     and torch.func's transforms work, one element of the batch at a time, all with the same seed; tangents of one image
@@ -84,6 +93,9 @@ def render(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
         filter=filter, grad_seed=grad_seed, step_spacing=step_spacing,
     )  # fmt: skip
+    lighting = Lighting.of(shadows, light_samples)
+    if shader is None and as_scene(scene).is_lit:
+        shader = lighting
     if shader is not None:
         return render_shaded(as_scene(scene), camera, shader, request, creases, check_shader)
     image = render_image(request, batched=camera.batch is not None)
@@ -129,7 +141,7 @@ def jvp(
             raise ValueError(f"aovs: expected channels with derivatives, got {name!r}; ask render_aovs() for ids")
     if not isinstance(tangents, Mapping) or not tangents:
         raise TypeError("tangents: expected a mapping of tensors of the scene and the camera to their tangents")
-    owned = {id(v) for thing in (*scene.meshes, scene, camera) for v in vars(thing).values() if isinstance(v, Tensor)}
+    owned = {id(tensor) for thing in (scene, camera) for tensor in tensors_in(thing)}
     leaves, values = [], []
     for leaf, tangent in tangents.items():
         if not isinstance(leaf, Tensor) or id(leaf) not in owned or not leaf.is_floating_point():
@@ -152,12 +164,10 @@ def jvp(
     def image(*values: Tensor) -> Any:
         moved = dict(zip(map(id, leaves), values, strict=True))
 
-        def replaced(thing: Any, **fields: Any) -> Any:
-            own = {n: moved[id(v)] for n, v in vars(thing).items() if isinstance(v, Tensor) and id(v) in moved}
-            return thing.replace(**fields, **own) if own or fields else thing
+        def replaced(tensor: Tensor) -> Tensor:
+            return moved.get(id(tensor), tensor)
 
-        meshes = [replaced(mesh) for mesh in scene.meshes]
-        there = replaced(scene, meshes=meshes), replaced(camera)
+        there = map_tensors(scene, replaced), map_tensors(camera, replaced)
         if aovs is not None:
             return render_aovs(*there, aovs, spp, seed, **options)
         return render(*there, spp, seed, **options)
@@ -181,6 +191,7 @@ def screen_gradient(
     It shows where content should go: against it. Its sum is the derivative for moving everything together; what the background
     does is not in it. The other arguments are those of render(). Raises what render() raises.
     """
+    check_unlit("screen_gradient", as_scene(scene), "detach the materials, or take the gradient of render()")
     request = make_request(scene, camera, spp, seed, **options)
     adjoint = as_tensor("adjoint", adjoint, floating=True).detach()
     check_float("adjoint", adjoint)

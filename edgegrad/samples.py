@@ -22,6 +22,7 @@ from torch import Tensor
 
 from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
 from ._derivatives import moves, once
+from ._ops import camera_seed
 from ._request import Request, as_scene, make_request
 from ._samples import (
     CurveRecords,
@@ -34,6 +35,7 @@ from ._samples import (
     without_colors,
 )
 from ._samples import trace as trace_records
+from ._seeds import sample_seeds
 from ._steps import Steps
 from ._surfaces import Rays, Surfaces, View, every_face
 from .camera import Camera
@@ -42,6 +44,7 @@ from .mesh import Mesh
 from .scene import Scene
 
 ALL_AT_ONCE = 1 << 40
+SAMPLES = ("image", "inside", "edges", "steps")  # kinds that draw numbers of their own
 
 
 class Frame:
@@ -49,7 +52,7 @@ class Frame:
 
     def __init__(self, scene: Scene, request: Request, index: int = 0) -> None:
         packed = request.camera
-        self.request = request._replace(scene=without_colors(request.scene))
+        self.request, self._index = request._replace(scene=without_colors(request.scene)), index
         self.sampler = Sampler(self.request, index)
         self.surfaces = Surfaces(scene)
         self.device, self.dtype = self.surfaces.verts.device, self.surfaces.verts.dtype
@@ -66,18 +69,28 @@ class Frame:
         """On the device of the scene."""
         return tensor.to(self.device)
 
-    def fixed_hits(self, face: Tensor, b: Tensor, x: Tensor, steps: Steps | None = None) -> Hits:
+    def seeds(self, kind: str, count: int, first: int = 0) -> Tensor:
+        """(count,) int64: of the samples of a kind from `first` on."""
+        request = self.request
+        seed = camera_seed(request.image.seed, self._index) if kind == "image" else self.sampler.grad_seed
+        return self.here(sample_seeds(seed, SAMPLES.index(kind), first, count))
+
+    def fixed_hits(
+        self, face: Tensor, b: Tensor, x: Tensor, seed: Tensor | None = None, steps: Steps | None = None
+    ) -> Hits:
         """Without derivatives; b (N, 2)."""
         place = self.here(face), self.here(barycentrics(b)), self.here(x)
-        return Hits(self.fixed, self.fixed_view, *place, rays_at=self.sampler.rays_at, steps=steps)
+        return Hits(self.fixed, self.fixed_view, *place, self.sampler.rays_at, steps, seed)
 
-    def moving_hits(self, face: Tensor, rays: RayRecords | SurfaceRecords, x: Tensor) -> Hits:
+    def moving_hits(
+        self, face: Tensor, rays: RayRecords | SurfaceRecords, x: Tensor, seed: Tensor | None = None
+    ) -> Hits:
         """Functions of vertices and camera, at fixed places in the image."""
         face, along = self.here(face), rays.along
         if moves(self.intrinsics):
             along = along + rays.along_by_k @ (self.intrinsics - self.intrinsics.detach())
         b = self.view.barycentrics(self.surfaces, face, self.here(along))
-        return Hits(self.surfaces, self.view, face, b, self.here(x), self.sampler.rays_at)
+        return Hits(self.surfaces, self.view, face, b, self.here(x), self.sampler.rays_at, seed=seed)
 
     def image(self, pixel: Tensor, values: Tensor) -> Tensor:
         """(H · W, C): the sums of rows of values (N, C) by pixel."""
@@ -110,7 +123,8 @@ class PrimaryHits:
     def __init__(self, scene: Scene, request: Request) -> None:
         self.frame = frame = Frame(scene, request)
         (found,) = frame.sampler.pixel_hits(ALL_AT_ONCE)
-        self.hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x)
+        seed = frame.seeds("image", len(found.face))
+        self.hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, seed)
         self.index, self.weight = frame.here(found.pixel), frame.here(found.weight).to(frame.dtype)
         self.coverage = frame.here(frame.sampler.coverage)
 
@@ -136,8 +150,8 @@ class SurfaceSamples:
     weight  (S,) px² that each stands for
     """
 
-    def __init__(self, frame: Frame, records: SurfaceRecords) -> None:
-        self.frame, self._records = frame, records
+    def __init__(self, frame: Frame, records: SurfaceRecords, first: int = 0) -> None:
+        self.frame, self._records, self._first = frame, records, first
         self.weight = frame.here(records.weight)
         self._hits: Hits | None = None
 
@@ -149,12 +163,13 @@ class SurfaceSamples:
 
     def part(self, first: int, end: int) -> SurfaceSamples:
         """Some of them."""
-        return SurfaceSamples(self.frame, SurfaceRecords(*(part[first:end] for part in self._records)))
+        return SurfaceSamples(self.frame, SurfaceRecords(*(part[first:end] for part in self._records)), first)
 
     @property
     def hits(self) -> Hits:
         if self._hits is None:
-            self._hits = self.frame.moving_hits(self._records.face, self._records, self._records.x)
+            seed = self.frame.seeds("inside", len(self), self._first)
+            self._hits = self.frame.moving_hits(self._records.face, self._records, self._records.x, seed)
         return self._hits
 
     def image(self, radiance: Tensor) -> Tensor:
@@ -185,7 +200,9 @@ class EdgeSamples:
         # A little inside the faces, so that rounding does not take a step along their edge for passed: at u = 1 a texture that
         # repeats begins anew.
         b = torch.lerp(records.b[sample, which], torch.tensor(1 / 3).double(), torch.finfo(frame.dtype).eps ** (2 / 3))
-        self.hits = frame.fixed_hits(records.face[sample, which], b, records.x[sample])
+        # All sides of a sample see the same points of lights.
+        seed = frame.seeds("edges", len(self))[self.sample]
+        self.hits = frame.fixed_hits(records.face[sample, which], b, records.x[sample], seed)
         self.to_background = frame.here(torch.where(records.face == -1, records.factor, 0).sum(1))
         q = frame.view.in_camera(frame.surfaces.verts)
         rows = (frame.here(records.by_q) * (q - q.detach())[frame.here(records.vertex)]).sum(1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -20,7 +21,11 @@ from ._check import (
     check_shape,
     values_visible,
 )
-from .mesh import FILTERS, PLAIN, WRAPS, Mesh
+from ._mesh_light import MeshLight
+from ._tree import map_tensors, moved
+from .lights import Light
+from .material import WRAPS
+from .mesh import FILTERS, PLAIN, Mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,17 +35,22 @@ class Scene:
     meshes      a sequence of Mesh (or one), all with the same number of channels C
     background  (C,) or (H, W, C) float, linear radiance where nothing is hit; black when None. An image is laid behind
                 the pixels: I = Σ samples that hit + (1 − coverage) · background
+    lights      a sequence of lights; meshes whose materials have emission are lights too, and those among `lights` join the
+                meshes. All with one channel or C
 
-    Raises TypeError or ValueError.
+    With a light, or a mesh with a material, the scene is lit: meshes with a material are shaded, those without keep their
+    colours for radiance. Raises TypeError or ValueError.
     """
 
     meshes: Sequence[Mesh]
     background: Tensor | None = None
+    lights: Sequence[Light | Mesh] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.meshes, (Mesh, Sequence)):
             raise TypeError(f"meshes: expected a Mesh or a sequence of them, got {type(self.meshes).__name__}")
         meshes = (self.meshes,) if isinstance(self.meshes, Mesh) else tuple(self.meshes)
+        meshes = self._check_lights(meshes)
         object.__setattr__(self, "meshes", meshes)
         if not meshes:
             raise ValueError("meshes: expected at least one Mesh, got none")
@@ -56,6 +66,13 @@ class Scene:
                 f"meshes[{i}]: expected {C} channels like meshes[{first}], got {meshes[i].channels}; "
                 "give all colours and textures the same number of channels"
             )
+        for i, light in enumerate(self._lights):
+            if light.channels is not None and known and light.channels not in known:
+                raise ValueError(
+                    f"lights[{i}]: expected {next(iter(known))} channels, or one, like the meshes and lights before it, got "
+                    f"{light.channels}; give it a colour for each channel"
+                )
+            known |= set() if light.channels is None else {light.channels}
         corners = 3 * sum(mesh.faces.shape[0] for mesh in meshes)
         rows = max(
             corners, *(sum(len(t) for m in meshes if (t := getattr(m, n)) is not None) for n in ("verts", "uvs"))
@@ -81,12 +98,49 @@ class Scene:
             check_shape("background", background, (C,), ("H", "W", C), fix=fix)
             check_finite("background", background)
 
+    def _check_lights(self, meshes: tuple[Mesh, ...]) -> tuple[Mesh, ...]:
+        """The meshes, with those among the lights. Raises TypeError or ValueError."""
+        given = (self.lights,) if isinstance(self.lights, (Light, Mesh)) else self.lights
+        if not isinstance(given, Sequence):
+            raise TypeError(f"lights: expected a sequence of lights, got {type(given).__name__}")
+        own = []
+        for i, light in enumerate(given):
+            if isinstance(light, Mesh):
+                if light.material is None or light.material.emission is None:
+                    raise ValueError(
+                        f"lights[{i}]: expected a light, got a Mesh without emission; give it material=eg.Material(emission=…)"
+                    )
+                meshes = (*meshes, light)
+            elif isinstance(light, Light) and not isinstance(light, MeshLight):
+                own.append(light)
+            else:
+                raise TypeError(
+                    f"lights[{i}]: expected a light such as eg.PointLight, or a Mesh that emits, got {type(light).__name__}"
+                )
+        object.__setattr__(self, "lights", tuple(own))
+        return meshes
+
+    @property
+    def _lights(self) -> tuple[Light, ...]:
+        return self.lights  # pyright: ignore[reportReturnType]: those that are meshes joined the meshes
+
+    @property
+    def is_lit(self) -> bool:
+        """Whether meshes are shaded: one has a material, or there is a light."""
+        return bool(self.lights) or any(mesh.material is not None for mesh in self.meshes)
+
+    @cached_property
+    def casting(self) -> tuple[Light, ...]:
+        """The lights that cast shadows, in a fixed order: those of `lights`, then the meshes that emit."""
+        emitting = [m for m in self.meshes if m.material is not None and m.material.emission is not None]
+        return (*(light for light in self._lights if light.casts), *map(MeshLight, emitting))
+
     @property
     def channels(self) -> int:
         """Number of channels C; 3 for a plain scene on black."""
-        for mesh in self.meshes:
-            if mesh.channels is not None:
-                return mesh.channels
+        for part in (*self.meshes, *self._lights):
+            if part.channels is not None:
+                return part.channels
         return 3 if self.background is None else self.background.shape[-1]
 
     def replace(self, **fields: Any) -> Scene:
@@ -95,22 +149,25 @@ class Scene:
         return dataclasses.replace(self, **fields)
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Scene:
-        """All meshes moved together; see Mesh.transformed."""
-        return self.replace(meshes=[mesh.transformed(R, t, scale) for mesh in self.meshes])
+        """All meshes and lights moved together; see Mesh.transformed. Surfaces stay as bright: the intensities of points
+        and spots, which fall off with distance, are multiplied by scale². Of lights from all around R must be a rotation."""
+        return self.replace(
+            meshes=[mesh.transformed(R, t, scale) for mesh in self.meshes],
+            lights=[light.transformed(R, t, scale) for light in self._lights],
+        )
 
     def to(self, *args: Any, **kwargs: Any) -> Scene:
         """All tensors moved to a device or dtype, as `torch.Tensor.to`."""
-        background = None if self.background is None else self.background.to(*args, **kwargs)
-        return Scene([mesh.to(*args, **kwargs) for mesh in self.meshes], background)
+        return moved(self, *args, **kwargs)
 
     def detach(self) -> Scene:
         """The same scene, cut from the autograd graph."""
-        background = None if self.background is None else self.background.detach()
-        return Scene([mesh.detach() for mesh in self.meshes], background)
+        return map_tensors(self, Tensor.detach)
 
     def __repr__(self) -> str:
         back = "black" if self.background is None else f"background {tuple(self.background.shape)}"
-        return f"Scene({', '.join(map(repr, self.meshes))}; {back})"
+        lights = "".join(f", {type(light).__name__}" for light in self.lights)
+        return f"Scene({', '.join(map(repr, self.meshes))}; {back}{lights})"
 
 
 class Flat(NamedTuple):

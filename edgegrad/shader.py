@@ -10,12 +10,14 @@ the shader declares steps, samples on these. All of it is PyTorch, so whatever t
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from ._background import environments
 from ._borders import Borders
 from ._check import values_visible
 from ._derivatives import differentiates, moves, once, transformed
@@ -83,28 +85,35 @@ class _Image:
         borders = Borders((frame.height, frame.width))
         with torch.no_grad():
             image: Any = 0
+            count = 0
             for found in frame.sampler.pixel_hits(AT_ONCE):
-                sums, steps = self._shaded(found)
+                sums, steps = self._shaded(found, count)
+                count += len(found.face)
                 image = image + sums
                 borders.add(found.pixel, steps)
             again, most = borders.found() if frame.request.image.spp > 1 else (None, 1)
             if again is not None and bool(again.any()):
                 image = image.masked_fill(frame.here(again).reshape(-1, 1), 0.0)
                 for found in frame.sampler.pixel_hits(AT_ONCE, most, again):
-                    image = image + self._shaded(found)[0]
-        return frame.composed(image, self._background())
+                    image = image + self._shaded(found, count)[0]
+                    count += len(found.face)
+        return frame.composed(image, self._background)
 
-    def _shaded(self, found: PixelRecords) -> tuple[Tensor, Steps]:
-        """(H · W, C) what hits add to the image, and the steps that were asked for there."""
+    def _shaded(self, found: PixelRecords, first: int) -> tuple[Tensor, Steps]:
+        """(H · W, C) what hits add to the image, the number `first` of all that were shaded and those after it, and the steps that
+        were asked for there."""
         frame = self._frame
-        hits = frame.fixed_hits(found.face, found.b, found.x)
+        hits = frame.fixed_hits(found.face, found.b, found.x, frame.seeds("image", len(found.face), first))
         radiance = self._shade(hits).detach()
         weighted = radiance * frame.here(found.weight).to(radiance.dtype)[:, None]
         return frame.image(found.pixel, weighted), hits._steps
 
+    @cached_property
     def _background(self) -> Tensor | None:
-        """(C,) or (H, W, C)."""
+        """(C,) or (H, W, C): the scene's, or the environments that it shows."""
         background = self._frame.surfaces.scene.background
+        if background is None:
+            background = environments(self._frame)
         if background is not None and background.shape[-1] != self._channels:
             raise ValueError(
                 f"shader: expected as many channels as the background has, {background.shape[-1]}, got {self._channels}"
@@ -140,20 +149,25 @@ class _Image:
                 end = min(first + AT_ONCE, len(samples.hits))
                 points = samples.hits.apart(torch.arange(first, end, device=self._frame.device))
                 jump = jump + samples.jump_of(first, end, self._shade(points).detach())
-        return boundary(self._frame, samples.x, samples.velocity, jump, samples.to_background, self._background())
+        return boundary(self._frame, samples.x, samples.velocity, jump, samples.to_background, self._background)
 
     def _steps(self) -> Tensor:
         """(H · W, C): Σ k(x − c) [L₊ − L₋] δs / |∇ₓs| · weight over where lines cross steps s = 0 of the shader."""
         frame = self._frame
         found = self._crossings()
         rays = frame.sampler.rays_at(found.x)
+        seed = frame.seeds("steps", len(found.x))
         step = frame.here(found.step)[:, None]
         gradient = torch.cat([self._by_place(found, rays, part) for part in _parts(found)])
         with torch.no_grad():
             jumps = []
             for part in _parts(found):
                 sides = [
-                    self._shade(frame.fixed_hits(found.face[part], found.b[part], found.x[part], Steps(states[part])))
+                    self._shade(
+                        frame.fixed_hits(
+                            found.face[part], found.b[part], found.x[part], seed[part], Steps(states[part])
+                        )
+                    )
                     for states in (found.before, found.after)
                 ]
                 jumps.append((sides[1] - sides[0]).detach())

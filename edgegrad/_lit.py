@@ -1,0 +1,198 @@
+"""Radiance of surfaces with materials in the light of a scene, as a shader of Hits:
+
+    L(y, v) = emission + Σ f(y, v, l) max(0, n·l) V(y, l) E(y) + irradiance without shadows · base / π
+
+with one point, or a few, of each light that has an extent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from ._appearance import OnMesh, jumps
+from ._bsdf import Scattering, dot, terminator
+from ._check import check_positive_int
+from ._surfaces import Surfaces
+from .hits import Hits
+from .lights import Light, LightPoints, SphericalHarmonics
+from .scene import Scene
+
+
+class Lighting(NamedTuple):
+    """The options of render() for lit scenes."""
+
+    shadows: bool
+    samples: int  # points of each light with an extent, for each point that is shaded
+
+    @classmethod
+    def of(cls, shadows: object, light_samples: object) -> Lighting:
+        """Raises TypeError or ValueError."""
+        if not isinstance(shadows, bool):
+            raise TypeError(f"shadows: expected True or False, got {type(shadows).__name__} ({shadows!r})")
+        return cls(shadows, check_positive_int("light_samples", light_samples, most=1 << 16))
+
+    def __call__(self, hits: Hits) -> Tensor:
+        return radiance(hits, *self)
+
+
+class _Surface(NamedTuple):
+    """Points that light falls on."""
+
+    position: Tensor  # (N, 3)
+    v: Tensor  # (N, 3) unit directions to the viewer
+    g: Tensor  # (N, 3) unit normals of the faces, on the viewer's side
+    n: Tensor  # (N, 3) those that shade
+    scattering: Scattering
+    flat: bool  # whether they are the same
+
+    def select(self, rows: Tensor) -> _Surface:
+        position, v, g, n = (part[rows] for part in (self.position, self.v, self.g, self.n))
+        return _Surface(position, v, g, n, self.scattering.select(rows), self.flat)
+
+
+def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tensor:
+    """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours."""
+    surfaces = hits._surfaces
+    meshes, C = surfaces.scene.meshes, surfaces.scene.channels
+    _note_jumps(hits)
+    total = hits._barycentrics.new_zeros((len(hits), C))
+    for index in range(len(meshes)):
+        if len(meshes) == 1:
+            return _of_mesh(hits, index, Lighting(shadows, light_samples)).expand(len(hits), C)
+        rows = (surfaces.mesh_of_face[hits._face] == index).nonzero()[:, 0]
+        of_mesh = _of_mesh(hits.select(rows), index, Lighting(shadows, light_samples))
+        total = total.index_copy(0, rows, of_mesh.expand(len(rows), C))
+    return total
+
+
+def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
+    """(N, C) or (N, 1)."""
+    surfaces = hits._surfaces
+    scene, mesh = surfaces.scene, surfaces.scene.meshes[index]
+    at = OnMesh(mesh, hits._face - surfaces.first_faces[index], hits._barycentrics, hits)
+    base, material = at.base_color(), mesh.material
+    if material is None:
+        return base
+    g, v = surfaces.face_normals(hits._face), hits.view
+    front = dot(g.detach(), v.detach()) >= 0
+    side = torch.where(front, 1.0, -1.0).to(g)
+    n = at.shading_normal(g)
+    lambertian = material.metallic is None and material.roughness is None
+    metallic, roughness = (
+        None if lambertian else g.new_full((1, 1), default) if given is None else at.value(given)
+        for given, default in ((material.metallic, 0.0), (material.roughness, 1.0))
+    )
+    flat = mesh.normals is None and material.normal_map is None
+    surface = _Surface(hits.position, v, side * g, side * n, Scattering(base, metallic, roughness), flat)
+    total = g.new_zeros((len(hits), 1))
+    if material.emission is not None:
+        total = total + at.value(material.emission)
+    for light in scene.lights:
+        if isinstance(light, SphericalHarmonics):
+            total = total + surface.scattering.diffuse / math.pi * light.irradiance(surface.n)
+    for light in scene.casting:
+        count = 1 if light.punctual else lighting.samples
+        for sample in range(count):
+            total = total + _from_light(hits, light, (sample, count), surface, lighting.shadows) / count
+    return total if material.two_sided else torch.where(front, total, 0.0)
+
+
+def _from_light(hits: Hits, light: Light, which: tuple[int, int], surface: _Surface, shadows: bool) -> Tensor:
+    """(N, C): f max(0, n·l) V E of one point of a light, `which` of so many."""
+    points = hits.light_points(light, *which)
+    with torch.no_grad():
+        l = _towards(light, points, surface.position)
+        lit = ((dot(surface.n, l) > 0) & (dot(surface.g, l) > 0))[:, 0]
+    rows = lit.nonzero()[:, 0]
+    C = hits._surfaces.scene.channels
+    total = surface.position.new_zeros((len(hits), C))
+    if len(rows) == 0:
+        return total
+    surface, points = surface.select(rows), points.select(rows)
+    l = _towards(light, points, surface.position)
+    arriving = light.arriving(points, surface.position) * dot(surface.n, l)
+    if not surface.flat:
+        arriving = arriving * terminator(surface.g, surface.n, l)
+    if shadows:
+        arriving = arriving * hits.apart(rows).visible_from(light, points)[:, None]
+    scattered = surface.scattering.evaluate(surface.v, surface.n, l) * arriving
+    return total.index_copy(0, rows, scattered.expand(len(rows), C))
+
+
+def _towards(light: Light, points: LightPoints, position: Tensor) -> Tensor:
+    """(N, 3) unit directions."""
+    place = light.place(points).to(position)
+    return place if light.infinite else normalize(place - position, dim=-1)
+
+
+# -- at which edges it may jump -------------------------------------------------------------------------------------------
+
+
+def _note_jumps(hits: Hits) -> None:
+    surfaces = hits._surfaces
+    scene = surfaces.scene
+    if len(scene.meshes) > 1:
+        hits._note("mesh", lambda: surfaces.mesh_of_face[:, None, None].expand(-1, 3, 1))
+    for index, mesh in enumerate(scene.meshes):
+        hits._note(("looks", index), _of_scene(surfaces, index, lambda mesh=mesh: jumps(mesh)))
+        if mesh.material is None or not (scene.lights or scene.casting):
+            continue
+        if mesh.normals is None:
+            hits._note(("g", index), _of_scene(surfaces, index, lambda index=index: _face_normals(surfaces, index)))
+            continue
+        if mesh.normal_faces is not None:
+            normals, rows = mesh.normals, mesh.normal_faces
+            hits._note(("n", index), _of_scene(surfaces, index, lambda n=normals, r=rows: n[r.long()]))
+        for k, light in enumerate(scene.casting):
+            hits._note(("lit", index, k), _of_scene(surfaces, index, lambda i=index, o=light: _sunken(surfaces, i, o)))
+
+
+def _of_scene(surfaces: Surfaces, index: int, of_mesh: Callable[[], Tensor]) -> Callable[[], Tensor]:
+    """(F, 3, K) of all faces from that of one mesh's; zero elsewhere."""
+
+    def corners() -> Tensor:
+        own = of_mesh().detach()
+        first = surfaces.first_faces[index]
+        after = len(surfaces.faces) - first - len(own)
+        return torch.nn.functional.pad(own, (0, 0, 0, 0, first, after))
+
+    return corners
+
+
+def _faces_of(surfaces: Surfaces, index: int) -> Tensor:
+    first = surfaces.first_faces[index]
+    return torch.arange(first, first + len(surfaces.scene.meshes[index].faces), device=surfaces.verts.device)
+
+
+def _face_normals(surfaces: Surfaces, index: int) -> Tensor:
+    return surfaces.face_normals(_faces_of(surfaces, index))[:, None].expand(-1, 3, -1)
+
+
+def _sunken(surfaces: Surfaces, index: int, light: Light) -> Tensor:
+    """(F, 3, 1): n·l at corners with interpolated normals times what terminator() leaves of it. The face's own normal g comes in
+    by that alone, and changes nothing where g·l ≥ (g·n)(n·l): so of a fine mesh only edges near the border of its shaded side are
+    creases. A light with an extent has such a border for each of its points: then the normals of all faces (F, 3, 3)."""
+    if not light.punctual:
+        return _face_normals(surfaces, index)
+    mesh = surfaces.scene.meshes[index]
+    assert mesh.normals is not None
+    rows = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
+    g = _face_normals(surfaces, index).reshape(-1, 3)
+    n = normalize(mesh.normals.detach().to(g)[rows.long()].reshape(-1, 3), dim=-1)
+    n = torch.where(dot(n, g) < 0, -n, n)
+    position = mesh.verts.detach().to(g)[mesh.faces.long()].reshape(-1, 3)
+    l = _towards(light, light.draw(position), position).detach()
+    side = torch.where(dot(n, l) < 0, -1.0, 1.0).to(g)
+    return (dot(n, l) * terminator(side * g, side * n, l)).reshape(-1, 3, 1)
+
+
+def check_unlit(function: str, scene: Scene, instead: str) -> None:
+    """Raises ValueError."""
+    if scene.is_lit:
+        raise ValueError(f"{function}: expected a scene without materials and lights, got one that has them; {instead}")
