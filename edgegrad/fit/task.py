@@ -101,7 +101,7 @@ class PoseTask:
             raise ValueError("fit_focal: expected False with fit_scale and an orthographic camera, where both are one")
         free = [0, 1, 2, 3, 4] + [5] * depth + [GROW] * fit_scale + [ZOOM] * fit_focal
         return PoseTask(
-            Scene(double),
+            scene.replace(meshes=double, background=None),
             aovs,
             picture,
             behind,

@@ -1,0 +1,480 @@
+"""Lights: what arrives against closed forms and quadrature, images, shadows, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from finite_differences import Case, check, gradient, rotation
+from lit_scenes import (
+    F64,
+    ball,
+    by_quadrature,
+    directions,
+    from_above,
+    grid,
+    hits_of,
+    plane,
+    polygon_irradiance,
+    vector,
+)
+from torch import Tensor
+from torch.autograd import gradcheck
+
+import edgegrad as eg
+from edgegrad.hits import Forced
+from edgegrad.lights import harmonics
+
+WHITE = eg.Material(base_color=1.0)
+
+
+def uniform(count: int, seed: int = 0) -> Tensor:
+    return torch.rand((count, 3), dtype=F64, generator=torch.Generator().manual_seed(seed))
+
+
+def picture(h: int = 4, w: int = 6, seed: int = 1) -> Tensor:
+    return 0.2 + torch.rand((h, w, 3), dtype=F64, generator=torch.Generator().manual_seed(seed))
+
+
+def lamp(verts: Tensor, emission: Tensor, two_sided: bool = True) -> Any:
+    """The light of an emissive mesh, as the scene has it."""
+    mesh = eg.Mesh(
+        verts, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=eg.Material(0.0, emission=emission, two_sided=two_sided)
+    )
+    return eg.Scene([mesh]).casting[0]
+
+
+QUAD = torch.tensor([[-0.5, -0.4, 1.0], [0.6, -0.5, 1.2], [0.7, 0.5, 1.3], [-0.3, 0.6, 0.9]], dtype=F64)
+HERE = torch.tensor([[0.1, 0.2, 0.0], [0.4, -0.3, 0.1], [-0.6, 0.1, 0.2]], dtype=F64)
+LIGHTS: dict[str, tuple[Callable[..., Any], list[Tensor]]] = {
+    "directional": (eg.DirectionalLight, [vector(0.3, -0.2, -1), vector(2).sum(), vector(1, 0.5, 0.2)]),
+    "point": (eg.PointLight, [vector(0.3, 0.2, 1), vector(2).sum(), vector(1, 0.5, 0.2)]),
+    "spot": (
+        eg.SpotLight,
+        [
+            vector(0.3, 0.2, 1),
+            vector(-0.2, 0.1, -1),
+            vector(2).sum(),
+            vector(1, 0.5, 0.2),
+            vector(0.1).sum(),
+            vector(0.9).sum(),
+        ],
+    ),
+    "area": (lamp, [QUAD, picture(1, 4)[0]]),
+    "environment": (eg.Environment, [picture(), rotation((0.0, 1.0, 0.0), vector(0.5).sum())]),
+}
+
+
+@pytest.mark.parametrize("kind", LIGHTS)
+def test_what_arrives_has_right_derivatives(kind: str):
+    make, values = LIGHTS[kind]
+    points = make(*values).draw(uniform(3))
+    leaves = [value.clone().requires_grad_() for value in values]
+
+    def of(*values: Tensor) -> tuple[Tensor, ...]:
+        *own, position = values
+        if kind == "environment":
+            # Only rotations are taken: by the angle about an axis.
+            own[1] = rotation((0.0, 1.0, 0.0), own[1][0, 2])
+        light = make(*own)
+        arriving = light.arriving(points, position)
+        if kind == "area":
+            # The density is that of where the faces are, by their areas now: so this is what is integrated over barycentrics.
+            arriving = arriving * light._area(points.index).detach().norm(dim=1, keepdim=True)
+        return light.place(points), arriving
+
+    assert gradcheck(of, (*leaves, HERE.clone().requires_grad_()))
+
+
+def test_points_of_an_environment_have_their_density():
+    light = eg.Environment(picture(5, 7), rotation((1.0, 0.0, 0.0), vector(0.7).sum()))
+    points = light.draw(uniform(200_000))
+    assert math.isclose(float((1 / points.density).mean()), 4 * math.pi, rel_tol=0.005)
+    d = light.place(points)
+    torch.testing.assert_close(d.norm(dim=1), torch.ones(len(d), dtype=F64))
+    # What arrives is what is seen there, over the density.
+    arriving = light.arriving(points, d)
+    torch.testing.assert_close(arriving * points.density[:, None], light.towards(d))
+    up, angle = directions(400)
+    whole = torch.cat([light.towards(up), light.towards(-up)]).sum(0) * angle
+    torch.testing.assert_close(arriving.mean(0), whole, rtol=0.004, atol=0)
+    # A texel is where its row and column say: +Y on top, −Z in the middle, +X to the right.
+    image = torch.zeros(8, 16, 1, dtype=F64)
+    image[0], image[3:5, 7:9], image[3:5, 11:13] = 1, 2, 3
+    seen = eg.Environment(image).towards(torch.tensor([[0, 1, 0], [0, 0, -1], [1, 0, 0], [-1, 0, 0]], dtype=F64))
+    torch.testing.assert_close(seen[:, 0], vector(1, 2, 3, 0))
+
+
+def test_dark_texels_and_dark_faces_are_drawn_too():
+    image = torch.zeros(2, 4, 1, dtype=F64)
+    image[0, 0] = 1e6
+    assert eg.Environment(image).draw(uniform(2000)).index.bincount(minlength=8).min() > 0
+    assert eg.Environment(0 * image).draw(uniform(2000)).index.bincount(minlength=8).min() > 50
+    assert lamp(QUAD, vector(0.0)).draw(uniform(2000)).index.bincount(minlength=2).min() > 500
+
+
+def test_area_light_is_the_closed_form_and_so_is_its_gradient():
+    """Also by the vertices: points stay at their barycentrics, while areas change."""
+    flat = QUAD.clone()
+    flat[:, 2] = 1.0 + 0.2 * flat[:, 0]
+    verts = flat.clone().requires_grad_()
+    place, normal = vector(0.1, 0.2, 0.0), torch.nn.functional.normalize(vector(0.1, -0.2, 1), dim=0)
+    light = lamp(verts, vector(1.0))
+    points = light.draw(uniform(200_000))
+    there = light.place(points)
+    assert light.mesh.verts is verts
+    l = torch.nn.functional.normalize(there - place, dim=1)
+    found = (light.arriving(points, place.expand(len(l), 3))[:, 0] * (l @ normal)).mean()
+    # Faces of a bent quad are apart: the sum of two triangles. Seen from below they run clockwise.
+    exact = sum(-polygon_irradiance(verts[rows].flip(0), place, -normal) for rows in ([0, 1, 2], [0, 2, 3]))
+    assert isinstance(exact, Tensor)
+    torch.testing.assert_close(found, exact.abs(), rtol=0.005, atol=0)
+    by_found, by_exact = (torch.autograd.grad(value, verts, retain_graph=True)[0] for value in (found, exact.abs()))
+    torch.testing.assert_close(by_found, by_exact, rtol=0.01, atol=0.005 * float(by_exact.abs().max()))
+
+
+def test_area_light_of_one_side():
+    behind = lamp(QUAD, vector(1.0), two_sided=False)
+    points = behind.draw(uniform(10))
+    assert (behind.arriving(points, HERE[:1].expand(10, 3)) == 0).all()
+    assert (behind.arriving(points, vector(0, 0, 5).expand(10, 3)) > 0).all()
+
+
+def image_of(light: Any, material: eg.Material = WHITE, **options: Any) -> Tensor:
+    lights = light if isinstance(light, list) else [light]
+    return eg.render(eg.Scene([plane(material=material)], lights=lights), from_above(), **options)
+
+
+def test_directional_light_on_a_plane():
+    image = image_of(eg.DirectionalLight([3.0, 0.0, -4.0], 2.0, [1.0, 0.5, 0.25]), eg.Material(base_color=0.5))
+    torch.testing.assert_close(image, (vector(1, 0.5, 0.25) * 0.5 * 2 * 0.8 / math.pi).expand(16, 16, 3))
+
+
+def test_point_light_on_a_plane_in_closed_form():
+    position = vector(0.3, -0.2, 1.0)
+    image = torch.stack([image_of(eg.PointLight(position, 3.0), seed=seed) for seed in range(8)]).mean(0)
+    r = (position - grid()).norm(dim=-1)
+    exact = (3.0 * position[2] / r**3 / math.pi).mean(-1)
+    torch.testing.assert_close(image[..., 0], exact, rtol=0.1, atol=0)  # a pixel's point is drawn at random within it
+    torch.testing.assert_close(image[..., 0].mean(), exact.mean(), rtol=0.005, atol=0)
+
+
+def test_spot_light_has_the_cone_of_gltf():
+    spot = eg.SpotLight([0.0, 0, 1], [0.0, 0, -2], 3.0, inner_angle=0.3, outer_angle=0.7)
+    point = eg.PointLight([0.0, 0, 1], 3.0)
+    angle = vector(0.0, 0.29, 0.5, 0.71)
+    there = torch.stack([angle.tan(), 0 * angle, 0 * angle], 1)
+    points = spot.draw(uniform(4))
+    share = spot.arriving(points, there) / point.arriving(points, there)
+    ramp = (math.cos(0.5) - math.cos(0.7)) / (math.cos(0.3) - math.cos(0.7))
+    torch.testing.assert_close(share[:, 0], vector(1, 1, ramp**2, 0))
+
+
+def test_spherical_harmonics_are_orthonormal_and_give_irradiance():
+    up, angle = directions(200)
+    Y = torch.cat([harmonics(up), harmonics(-up)])
+    torch.testing.assert_close(Y.T @ Y * angle, torch.eye(9, dtype=F64), atol=1e-4, rtol=0)
+    coefficients = torch.zeros(9, 3, dtype=F64)
+    coefficients[0], coefficients[2] = 2.0, 1.0
+    turn = rotation((1.0, 0.0, 0.0), vector(math.pi / 2).sum())
+    n = torch.eye(3, dtype=F64)
+    own = eg.SphericalHarmonics(coefficients)
+    assert own.irradiance(n)[2, 0] > own.irradiance(n)[0, 0]
+    torch.testing.assert_close(eg.SphericalHarmonics(coefficients, turn).irradiance(n @ turn.T), own.irradiance(n))
+    image = image_of(own, eg.Material(base_color=0.5))
+    torch.testing.assert_close(image, (own.irradiance(n)[2] * 0.5 / math.pi).expand(16, 16, 3))
+
+
+# -- shadows ----------------------------------------------------------------------------------------------------------------
+
+
+def shadowed(light: Any, **options: Any) -> Tensor:
+    blocker = eg.Mesh(plane(0.25).verts + vector(0, 0, 0.5), plane().faces, material=eg.Material(0.0))
+    side = eg.Camera.look_at([0.0, -4.0, 2.0], [0.0, 0.0, 0.1], (0.0, 0.0, 1.0), 40.0, (16, 16))
+    return eg.render(eg.Scene([plane(1.0, material=WHITE), blocker], lights=[light]), side, 64, **options)
+
+
+@pytest.mark.parametrize("kind", ["directional", "point"])
+def test_a_rectangle_casts_its_shadow(kind: str):
+    """The share of points of the plane that is dark."""
+    scene = eg.Scene(
+        [plane(1.0, material=WHITE), eg.Mesh(plane(0.25).verts + vector(0, 0, 0.5), plane().faces)],
+        lights=[eg.DirectionalLight([0.0, 0.2, -1.0]) if kind == "directional" else eg.PointLight([0.1, 0, 1.0])],
+    )
+    g = torch.Generator().manual_seed(0)
+    xy = 2 * torch.rand((20_000, 2), dtype=F64, generator=g) - 1
+    hits = eg.trace(scene, torch.cat([xy, torch.full((len(xy), 1), -1.0, dtype=F64)], 1), vector(0, 0, 1))
+    (light,) = hits.lights
+    lit = hits.visible_from(light, hits.light_points(light)) > 0
+    low, high = (-0.25, 0.25) if kind == "directional" else (-0.6, 0.4)
+    move = (0.0, 0.1) if kind == "directional" else (0.0, 0.0)
+    size = 0.25 if kind == "directional" else 0.5
+    inside = (xy[:, 0] > low) & (xy[:, 0] < high) & ((xy[:, 1] - move[1]).abs() < size)
+    assert bool((lit == ~inside).all())
+
+
+def test_options_of_shadows():
+    light = eg.DirectionalLight([0.0, 0.2, -1.0])
+    with_, without = shadowed(light), shadowed(light, shadows=False)
+    assert float(with_.sum()) < 0.99 * float(without.sum())
+    for kwargs, error in (
+        ({"shadows": 1}, TypeError),
+        ({"light_samples": 0}, ValueError),
+        ({"light_samples": 1.5}, TypeError),
+    ):
+        with pytest.raises(error, match=next(iter(kwargs))):
+            shadowed(light, **kwargs)
+    light = eg.Environment([1.0])
+    noise = [
+        torch.stack([shadowed(light, light_samples=n, seed=seed) for seed in range(6)]).var(0).mean().sqrt()
+        for n in (1, 16)
+    ]
+    assert noise[1] < 0.4 * noise[0]
+
+
+def test_random_numbers_of_points():
+    scene = eg.Scene([plane(material=WHITE)])
+    hits = hits_of(scene, 4096)
+    u = hits.random(3)
+    assert u.shape == (4096, 3) and bool(((u >= 0) & (u < 1)).all())
+    cells = ((u * 4).long() * torch.tensor([16, 4, 1])).sum(1).bincount(minlength=64)
+    assert cells.min() > 44 and cells.max() < 84  # 64 each: more even than chance, where they reach from 40 to 90
+    assert torch.equal(hits.select(torch.tensor([7, 3])).random(3), u[[7, 3]])
+    assert not torch.equal(hits.random(3, 1), u)
+
+
+def test_forced_shadows():
+    scene = eg.Scene([plane(material=WHITE)], lights=[eg.PointLight([0.0, 0, 1]), eg.Environment([1.0])])
+    hits = hits_of(scene, 4)
+    light = hits.lights[1]
+    drawn = hits.light_points(light)
+    some = torch.tensor([True, False, True, False])
+    hits._forced = Forced(1, drawn._replace(density=drawn.density * 7), vector(0, 0, 1, 1), some)
+    order = torch.tensor([2, 1, 0])
+    part = hits.apart(order)
+    torch.testing.assert_close(part.light_points(light).density / drawn.density[order], vector(7, 1, 7))
+    lit = part.visible_from(light, drawn.select(order))
+    assert torch.equal(lit, vector(1, 1, 0))
+    assert bool((part.visible_from(hits.lights[0], hits.lights[0].draw(uniform(3))) == 1).all())
+    with pytest.raises(ValueError, match=r"light: expected one of hits\.lights"):
+        hits.light_points(eg.PointLight([0.0, 0, 1]))
+
+
+# -- scenes ----------------------------------------------------------------------------------------------------------------
+
+
+def all_lights() -> list[Any]:
+    return [
+        eg.DirectionalLight([0.3, 0.2, -1.0]), eg.PointLight([0.5, 0.5, 1.5], 2.0),
+        eg.SpotLight([-0.5, 0.5, 1.5], [0.2, -0.2, -1.0], 2.0), eg.Environment(picture()),
+        eg.SphericalHarmonics(0.1 * picture(3, 3).reshape(9, 3)),
+        eg.AreaLight.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], [3.0, 2.0, 1.0]),
+    ]  # fmt: skip
+
+
+def everything() -> tuple[eg.Scene, eg.Camera]:
+    floor = plane(1.0, material=eg.Material(0.6, metallic=0.3, roughness=0.5)).transformed(t=vector(0, 0, -0.5))
+    thing = ball(1, material=WHITE).transformed(scale=0.4)
+    camera = eg.Camera.look_at([0.5, -3.0, 2.0], [0.0, 0.0, 0.0], (0.0, 0.0, 1.0), 45.0, (16, 16)).to(F64)
+    return eg.Scene([floor, thing], lights=all_lights()), camera
+
+
+def test_moved_scenes_look_the_same():
+    scene, camera = everything()
+    R, t, scale = rotation((0.6, 0.0, 0.8), vector(0.8).sum()), vector(1, 2, 3), 2.5
+    back = torch.eye(4, dtype=F64)
+    back[:3, :3], back[:3, 3] = R.T / scale, -R.T @ t / scale
+    w = camera.world_to_camera.to(F64) @ back
+    there = camera.replace(world_to_camera=torch.cat([w[:3] * scale, w[3:]]))
+    images = [eg.render(scene, camera, seed=3), eg.render(scene.transformed(R, t, scale), there, seed=3)]
+    # A ray may meet another face than before: compared in the mean of 4 × 4 pixels.
+    small = [torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), 4) for image in images]
+    torch.testing.assert_close(*small, rtol=0.03, atol=0.01)
+    for light in (eg.Environment([1.0]), eg.SphericalHarmonics(torch.ones(9, 1))):
+        with pytest.raises(ValueError, match="R: expected a rotation"):
+            light.transformed(2 * torch.eye(3))
+
+
+def test_to_and_detach_take_everything_along():
+    scene, _ = everything()
+    leaf = vector(1.0).sum().requires_grad_()
+    scene = scene.replace(lights=[eg.PointLight([0.0, 0, 1], leaf), *scene.lights])
+    assert not any(
+        t.requires_grad for light in scene.detach().lights for t in vars(light).values() if isinstance(t, Tensor)
+    )
+    small = scene.to(torch.float32)
+    assert all(
+        t.dtype == torch.float32 for light in small.lights for t in vars(light).values() if isinstance(t, Tensor)
+    )
+    material = small.meshes[0].material
+    assert material is not None and isinstance(material.roughness, Tensor) and material.roughness.dtype == torch.float32
+    assert "PointLight" in repr(scene)
+
+
+def test_renders_in_every_way():
+    scene, camera = everything()
+    image = eg.render(scene, camera, 4)
+    assert image.dtype == F64 and torch.equal(image, eg.render(scene, camera, 4))
+    single = eg.render(scene.to(torch.float32), camera.to(torch.float32), 4)
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double().mean(), image.mean(), rtol=0.02, atol=0)
+    batch = camera.replace(world_to_camera=camera.world_to_camera.expand(2, 4, 4))
+    assert eg.render(scene, batch, 4).shape == (2, 16, 16, 3)
+    aovs = eg.render_aovs(scene, camera, ["alpha", "image", "mesh_id"], 4)
+    assert list(aovs) == ["alpha", "image", "mesh_id"] and torch.equal(aovs["image"], image)
+    plan = eg.plan(scene, camera, 4, light_samples=3)
+    assert plan["lights"].on and plan["shadows"].on and "9 points of lights" in plan["lights"].why
+    assert not eg.plan(scene, camera, shadows=False)["shadows"].on
+    with pytest.raises(ValueError, match="screen_gradient: expected a scene without materials"):
+        eg.screen_gradient(scene, camera, image)
+    with pytest.raises(ValueError, match="profile: expected a scene without materials"):
+        eg.profile(scene, camera)
+
+
+def test_forward_mode_is_reverse_mode():
+    scene, camera = everything()
+    values = {"position": vector(0.5, 0.5, 1.5), "roughness": vector(0.5).sum(), "verts": scene.meshes[1].verts}
+
+    def of(position: Tensor, roughness: Tensor, verts: Tensor) -> eg.Scene:
+        floor, thing, *rest = scene.meshes
+        floor = floor.replace(material=eg.Material(0.6, metallic=0.3, roughness=roughness))
+        return eg.Scene(
+            [floor, thing.replace(verts=verts), *rest], lights=[eg.PointLight(position, 2.0), *scene.lights]
+        )
+
+    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
+    image = eg.render(of(**leaves), camera, 4)
+    g = torch.Generator().manual_seed(2)
+    dots = {name: torch.randn((2, *v.shape), dtype=F64, generator=g) for name, v in values.items()}
+    moved = of(**values)
+    material = moved.meshes[0].material
+    assert material is not None
+    own = {"position": moved.lights[0].position, "roughness": material.roughness, "verts": moved.meshes[1].verts}
+    _, image_dot = eg.jvp(moved, camera, {own[name]: dots[name] for name in own}, 4)
+    weight = torch.randn(image.shape, dtype=F64, generator=g)
+    by = dict(zip(leaves, torch.autograd.grad((image * weight).sum(), list(leaves.values())), strict=True))
+    reverse = sum((dots[name] * by[name]).reshape(2, -1).sum(1) for name in by)
+    assert isinstance(reverse, Tensor)
+    torch.testing.assert_close((image_dot * weight).reshape(2, -1).sum(1), reverse)
+
+
+# -- environments that are shown -------------------------------------------------------------------------------------------
+
+
+def test_a_visible_environment_is_the_background():
+    radiance = picture(4, 8).requires_grad_()
+    far = plane(0.3, material=eg.Material(0.0)).transformed(t=vector(0, 0, -3))
+    turned = vector(0.0).sum().requires_grad_()
+
+    def image(radiance: Tensor, turned: Tensor) -> Tensor:
+        w2c = torch.eye(4, dtype=F64)
+        w2c = torch.cat(
+            [
+                torch.cat(
+                    [torch.diag(vector(1, -1, -1)) @ rotation((0.0, 1.0, 0.0), turned), vector(0, 0, 0)[:, None]], 1
+                ),
+                w2c[3:],
+            ]
+        )
+        camera = eg.Camera(w2c, torch.tensor([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]], dtype=F64), (16, 16))
+        return eg.render(eg.Scene([far], lights=[eg.Environment(radiance)]), camera)
+
+    found = image(radiance, turned)
+    pixels = torch.arange(16, dtype=F64)
+    y, x = torch.meshgrid(pixels, pixels, indexing="ij")
+    exact: Any = 0
+    for dx in (0.25, 0.75):
+        for dy in (0.25, 0.75):
+            d = torch.stack([(x + dx - 8) / 8, -(y + dy - 8) / 8, -torch.ones_like(x)], -1).reshape(-1, 3)
+            exact = exact + eg.Environment(radiance).towards(d).reshape(16, 16, 3) / 4
+    torch.testing.assert_close(found[:, :3], exact[:, :3])
+    weight = picture(16, 16, 9)
+    weight[4:12] = 0  # away from the thing, whose silhouette moves too
+    by = torch.autograd.grad((found * weight).sum(), [radiance, turned], retain_graph=True)
+    torch.testing.assert_close(by[0], torch.autograd.grad((exact * weight).sum(), radiance)[0])
+    h = 1e-5
+    with torch.no_grad():
+        high, low = ((image(radiance, vector(k * h).sum()) * weight).sum() for k in (1, -1))
+    torch.testing.assert_close(by[1], (high - low) / (2 * h), rtol=1e-4, atol=0)
+    hidden = eg.Environment(radiance, visible=False)
+    assert float(eg.render(eg.Scene([far], lights=[hidden]), from_above()).detach().abs().sum()) == 0
+    shown = eg.render(eg.Scene([far], vector(1, 2, 3), lights=[eg.Environment(radiance)]), from_above())
+    torch.testing.assert_close(shown[0, 0], vector(1, 2, 3))
+
+
+# -- gradients inside faces --------------------------------------------------------------------------------------------------
+
+
+def by_light(name: str) -> Case:
+    def case(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
+        move = theta * vector(0.3, 0.5, 0.8)
+        light = {
+            "position": lambda: eg.PointLight(vector(0.8, 0.7, 1.5) + move, 2.0),
+            "intensity": lambda: eg.PointLight(vector(0.8, 0.7, 1.5), 2.0 + theta),
+            "direction": lambda: eg.DirectionalLight(vector(0.5, -0.6, -1) + move, 2.0),
+            "cone": lambda: eg.SpotLight(vector(0.4, 0.3, 2.0), vector(-0.1, 0, -1), 4.0, None, 0.1, 0.5 + 0.3 * theta),
+            "lamp": lambda: eg.AreaLight.rectangle(vector(1.6, 0.7, 1.5) + move, [0.3, 0, 0], [0, 0.3, 0], 4.0),
+            "radiance": lambda: eg.Environment(picture() * (1 + theta), visible=False),
+        }[name]()
+        floor = plane(1.0, material=eg.Material([0.5, 0.6, 0.7], metallic=0.2, roughness=0.5))
+        return eg.Scene([floor], lights=[light]), from_above(16, 1.9)
+
+    return case
+
+
+@pytest.mark.parametrize("name", ["position", "intensity", "direction", "cone", "lamp", "radiance"])
+def test_gradients_by_lights_are_finite_differences(name: str):
+    wide = name in ("lamp", "radiance")
+    options = {"shadows": False, "light_samples": 8 if wide else 1}
+    exact = by_quadrature(by_light(name), 1e-3, **options)
+    check(
+        name,
+        exact,
+        gradient(by_light(name), 12 if name == "radiance" else 6, surface_samples=20_000, edge_samples=500, **options),
+    )
+
+
+# -- what is refused ---------------------------------------------------------------------------------------------------------
+
+MESH = plane(material=WHITE)
+REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
+    (lambda: eg.DirectionalLight([0.0, 0, 0]), ValueError, "direction: expected a direction, got zeros"),
+    (lambda: eg.DirectionalLight([0.0, 1]), ValueError, r"direction: expected shape \(3,\)"),
+    (lambda: eg.PointLight("here"), TypeError, "position: expected"),
+    (lambda: eg.PointLight([0.0, 0, float("nan")]), ValueError, "position: expected finite"),
+    (lambda: eg.PointLight([0.0, 0, 1], [1.0, 2.0]), ValueError, "intensity: expected one number"),
+    (lambda: eg.PointLight([0.0, 0, 1], 1.0, 3.0), ValueError, "color: expected shape"),
+    (lambda: eg.SpotLight([0.0, 0, 1], [0, 0, -1.0], inner_angle=1.0), ValueError, "inner_angle: expected 0 ≤"),
+    (lambda: eg.SpotLight([0.0, 0, 1], [0, 0, -1.0], outer_angle=2.0), ValueError, "outer_angle"),
+    (lambda: eg.Environment(torch.ones(4, 3)), ValueError, "radiance: expected shape"),
+    (lambda: eg.Environment([1.0], 2 * torch.eye(3)), ValueError, "rotation: expected a rotation"),
+    (lambda: eg.Environment([1.0], visible=1), TypeError, "visible: expected True or False"),
+    (lambda: eg.SphericalHarmonics(torch.ones(4, 3)), ValueError, r"coefficients: expected shape \(9, C\)"),
+    (
+        lambda: eg.AreaLight.disc([0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], 1.0, 2),
+        ValueError,
+        "segments: expected at least 3",
+    ),
+    (lambda: eg.AreaLight.of(3, 1.0), TypeError, "mesh: expected a Mesh"),
+    (lambda: eg.Scene([MESH], lights=3), TypeError, "lights: expected a sequence"),
+    (lambda: eg.Scene([MESH], lights=[3]), TypeError, r"lights\[0\]: expected a light"),
+    (
+        lambda: eg.Scene([MESH], lights=[MESH]),
+        ValueError,
+        r"lights\[0\]: expected a light, got a Mesh without emission",
+    ),
+    (
+        lambda: eg.Scene([MESH], lights=[eg.PointLight([0.0, 0, 1], 1.0, [1.0, 2]), eg.Environment([1.0, 2, 3])]),
+        ValueError,
+        r"lights\[1\]: expected 2 channels",
+    ),
+]
+
+
+@pytest.mark.parametrize(("make", "error", "text"), REFUSED)
+def test_what_is_refused(make: Callable[[], Any], error: type[Exception], text: str):
+    with pytest.raises(error, match=text):
+        make()
