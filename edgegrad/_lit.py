@@ -17,11 +17,15 @@ from torch.nn.functional import normalize
 
 from ._appearance import OnMesh, jumps
 from ._bsdf import Scattering, dot, terminator
-from ._check import check_positive_int
+from ._check import check_positive_int, values_visible
+from ._request import Request
 from ._surfaces import Surfaces
+from ._tree import tensors_in
+from .camera import Camera
 from .hits import Hits
 from .lights import Light, LightPoints, SphericalHarmonics
 from .scene import Scene
+from .shader import render_shaded
 
 
 class Lighting(NamedTuple):
@@ -36,6 +40,14 @@ class Lighting(NamedTuple):
         if not isinstance(shadows, bool):
             raise TypeError(f"shadows: expected True or False, got {type(shadows).__name__} ({shadows!r})")
         return cls(shadows, check_positive_int("light_samples", light_samples, most=1 << 16))
+
+    def image(self, scene: Scene, camera: Camera, request: Request, creases: bool | str = "auto") -> Tensor:
+        """(H, W, C), or (B, H, W, C) for a batch of cameras. Raises RuntimeError for a batch of torch.vmap."""
+        if not torch.compiler.is_compiling() and not values_visible(*tensors_in(scene)):
+            raise RuntimeError(
+                "torch.vmap: expected one scene for all of a batch where it is lit; render them one by one"
+            )
+        return render_shaded(scene, camera, self, request, creases, False)
 
     def __call__(self, hits: Hits) -> Tensor:
         return radiance(hits, *self)

@@ -236,10 +236,12 @@ def as_scene(scene: Scene | Mesh) -> Scene:
 
 def _check_devices(scene: Scene, camera: Camera) -> None:
     """Tensors may lie on any device that holds numbers. Raises ValueError."""
-    fields = [*(field for mesh in scene.meshes for field in vars(mesh).items()), ("background", scene.background)]
-    for name, value in [*fields, *vars(camera).items()]:
-        if isinstance(value, Tensor):
-            check_not_meta(name, value)
+    materials = [mesh.material for mesh in scene.meshes if mesh.material is not None]
+    textures = [texture for material in materials for texture in material.textures.values()]
+    for thing in (*scene.meshes, *materials, *textures, scene, *scene.lights, camera):
+        for name, value in vars(thing).items():
+            if isinstance(value, Tensor):
+                check_not_meta(name, value)
 
 
 def _radiance_varies(scene: Scene) -> bool:

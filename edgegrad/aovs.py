@@ -18,7 +18,6 @@ from ._request import Channels, Request, as_scene, make_request
 from .camera import Camera
 from .mesh import Mesh
 from .scene import Scene, image_dtype
-from .shader import render_shaded
 
 IDS = ("mesh_id", "face_id")
 # In the order in which the kernel has them (csrc/scene/scene.h).
@@ -81,7 +80,7 @@ def render_aovs(
     shaded = scene.is_lit and "image" in names
     if shaded:
         request = make_request(scene, camera, spp, seed, **options)
-        found["image"] = render_shaded(scene, camera, lighting, request, "auto", False)
+        found["image"] = lighting.image(scene, camera, request)
         if names == ["image"]:
             return found
     radiance = "image" in names and not shaded

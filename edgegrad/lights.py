@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ._affine import Affine, check_rotation
-from ._check import check_fields, check_positive_int, check_shape
+from ._check import check_fields, check_positive_int, check_shape, values_visible
 from .material import Material, numbers
 from .mesh import Mesh
 
@@ -84,7 +84,7 @@ class Light:
             value = value.reshape(())
         else:
             check_shape(name, value, shape)
-        if unit and not bool((value.detach() != 0).any()):
+        if unit and values_visible(value) and not bool((value.detach() != 0).any()):
             raise ValueError(f"{name}: expected a direction, got zeros")
         object.__setattr__(self, name, value)
 
@@ -189,7 +189,9 @@ class SpotLight(Light):
         self._set_power()
         self._set("inner_angle")
         self._set("outer_angle")
-        inner, outer = (float(getattr(self, name).detach()) for name in ("inner_angle", "outer_angle"))
+        if not values_visible(*(torch.as_tensor(angle) for angle in (self.inner_angle, self.outer_angle))):
+            return
+        inner, outer = (float(torch.as_tensor(angle).detach()) for angle in (self.inner_angle, self.outer_angle))
         if not 0 <= inner < outer <= math.pi / 2 + 1e-6:
             raise ValueError(
                 f"inner_angle: expected 0 ≤ inner_angle < outer_angle ≤ π/2, got {inner:.6g} and {outer:.6g}; angles are radians "

@@ -110,8 +110,10 @@ class Material:
     B): a Lambertian base under microfacets with the GGX distribution, α = roughness² (Walter et al. 2007), Smith's masking with
     correlated heights (Heitz 2014; glTF's own text has it uncorrelated), and Schlick's Fresnel term from
     F0 = 0.04 + (base − 0.04) · metallic. One of the two left out is metallic = 0, or roughness = 1. α counts as 1e-4 where it is
-    less, for a mirror has no density. As in glTF, what the layer reflects is taken from the base by another half vector, so a
-    white dielectric returns more than came at grazing angles (1.14 at 75°, roughness 0.3). Numbers outside of 0 … 1 are not refused, for an optimisation may pass there.
+    less, for a mirror has no density. As in glTF, what the layer reflects and what it takes from the base go by different half
+    vectors, so a white dielectric returns more than came at grazing angles (1.14 at 75°, roughness 0.3). Numbers outside of
+    0 … 1 are not refused, for an optimisation may pass there.
+
     Raises TypeError or ValueError that names the argument.
     """
 

@@ -23,6 +23,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from ._lit import check_unlit
 from .camera import Camera
 from .mesh import PLAIN, Mesh
 from .scene import Scene
@@ -154,6 +155,7 @@ def _edge_functions(P: Tensor, x: Tensor) -> Tensor:
 
 def _surface_radiance(scene: Scene, camera: Camera, points: Tensor, faces: Tensor) -> Tensor:
     """Radiance (N, C) of the given faces at the image points (N, 2); zero where the face is -1."""
+    check_unlit("reference", scene, "it knows colours alone")
     P, _ = _project(scene, camera)
     out = torch.zeros((len(points), scene.channels), dtype=torch.float64)
     first = 0

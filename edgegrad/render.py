@@ -95,7 +95,7 @@ def render(
     )  # fmt: skip
     lighting = Lighting.of(shadows, light_samples)
     if shader is None and as_scene(scene).is_lit:
-        shader = lighting
+        return lighting.image(as_scene(scene), camera, request, creases)
     if shader is not None:
         return render_shaded(as_scene(scene), camera, shader, request, creases, check_shader)
     image = render_image(request, batched=camera.batch is not None)

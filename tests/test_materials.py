@@ -298,17 +298,45 @@ def by_material(name: str) -> Case:
     return case
 
 
-@pytest.mark.parametrize("name", ["base_color", "metallic", "roughness", "emission", "normals", "verts", "flat"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "base_color",
+        "metallic",
+        "roughness",
+        "emission",
+        "normals",
+        pytest.param("verts", marks=pytest.mark.slow),
+        "flat",
+    ],
+)
 def test_gradients_by_materials_are_finite_differences(name: str):
     moves = name in ("verts", "flat")
     options = {"shadows": False}
-    exact = by_quadrature(by_material(name), 0.02 if moves else 1e-3, 48 if moves else 16, **options)
+    exact = by_quadrature(by_material(name), 0.02 if moves else 1e-3, 32 if moves else 16, **options)
     samples = {"surface_samples": 40_000, "edge_samples": 40_000 if moves else 1000}
     check(
         name,
         exact,
         gradient(by_material(name), 6 if name in ("base_color", "metallic", "emission") else 12, **samples, **options),
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("filter", ["linear", "nearest"])
+def test_gradients_by_texture_coordinates(filter: str):
+    """Borders of nearest texels are steps."""
+
+    def case(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
+        mesh, turn = plane(1.0), torch.tensor([[0.85, 0.27], [-0.27, 0.85]], dtype=F64)
+        assert mesh.uvs is not None
+        image = torch.rand((5, 5, 3), dtype=F64, generator=torch.Generator().manual_seed(1))
+        uvs = mesh.uvs @ turn + theta * vector(0.05, 0.03)
+        mesh = mesh.replace(uvs=uvs, material=eg.Material(eg.Texture(image, filter=filter)))
+        return eg.Scene([mesh], lights=[eg.PointLight([1.0, 1.0, 3.0], 50.0)]), from_above(16, 1.9)
+
+    exact = by_quadrature(case, 0.05, 160)
+    check(filter, exact, gradient(case, 12, surface_samples=40_000, edge_samples=500, step_spacing=0.25))
 
 
 # -- what is refused ---------------------------------------------------------------------------------------------------------
