@@ -100,8 +100,8 @@ class _Image:
         return frame.composed(image, self._background)
 
     def _shaded(self, found: PixelRecords, first: int) -> tuple[Tensor, Steps]:
-        """(H · W, C) what hits add to the image, the number `first` of all that were shaded and those after it, and the steps that
-        were asked for there."""
+        """(H · W, C) what hits add to the image, the `first` of those shaded so far and those after it, and the steps asked for
+        there."""
         frame = self._frame
         hits = frame.fixed_hits(found.face, found.b, found.x, frame.seeds("image", len(found.face), first))
         radiance = self._shade(hits).detach()

@@ -335,8 +335,8 @@ def test_gradients_by_texture_coordinates(filter: str):
         mesh = mesh.replace(uvs=uvs, material=eg.Material(eg.Texture(image, filter=filter)))
         return eg.Scene([mesh], lights=[eg.PointLight([1.0, 1.0, 3.0], 50.0)]), from_above(16, 1.9)
 
-    exact = by_quadrature(case, 0.05, 160)
-    check(filter, exact, gradient(case, 12, surface_samples=40_000, edge_samples=500, step_spacing=0.25))
+    exact = by_quadrature(case, 0.1, 56)
+    check(filter, exact, gradient(case, 20, surface_samples=20_000, edge_samples=500, step_spacing=0.125))
 
 
 # -- what is refused ---------------------------------------------------------------------------------------------------------
