@@ -403,6 +403,9 @@ class Hits:
             place = here + place * ((here - center).norm(dim=1, keepdim=True) + 1.01 * radius)
         else:
             size = torch.maximum(size, place.abs().amax(1))
+            if not light.punctual:
+                # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
+                spacing = max(spacing, 2.0**-40)
         lit = visible(s.scene, self._face, self._exact[:, 1:], place, 16 * spacing * size).to(self.position.dtype)
         forced = self._forced
         if forced is None or forced.light != index:

@@ -217,6 +217,16 @@ def test_a_rectangle_casts_its_shadow(kind: str):
     assert bool((lit == ~inside).all())
 
 
+def test_a_lamp_does_not_hide_itself():
+    """Its faces are thin triangles in one plane, seen at an angle."""
+    lamp = eg.AreaLight.disc([1.6, 0.0, 1.0], [0.3, 0.0, 0.0], [0.0, 0.3, 0.1], 5.0)
+    scene = eg.Scene([plane(1.0, material=WHITE), lamp])
+    xy = 2 * uniform(20_000)[:, :2] - 1
+    hits = eg.trace(scene, torch.cat([xy, torch.full((len(xy), 1), -1.0, dtype=F64)], 1), vector(0, 0, 1))
+    (light,) = hits.lights
+    assert bool((hits.visible_from(light, hits.light_points(light)) == 1).all())
+
+
 def test_options_of_shadows():
     light = eg.DirectionalLight([0.0, 0.2, -1.0])
     with_, without = shadowed(light), shadowed(light, shadows=False)
