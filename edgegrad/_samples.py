@@ -55,6 +55,20 @@ class CurveRecords(NamedTuple):
     alpha_row_of: Tensor  # (Q,) int64, the sample of a row by texels of alpha
     alpha: Tensor  # (Q,) int64
     by_alpha: Tensor  # (Q,) float64
+    light_row_of: Tensor  # (L,) int64, the sample of a row by points of lights, of borders of shadows: the first surface is that
+    # in the light, the second that in the shadow
+    light: Tensor  # (L,) int64
+    by_light: Tensor  # (L, 3) float64, by the place in camera coordinates, or by the direction towards a light at infinity
+
+
+class LightRows(NamedTuple):
+    """Points of lights that cast shadows; those of one light follow one another, and count as their mean."""
+
+    place: Tensor  # (L, 3) float64: world coordinates, or, at infinity, the unit direction towards the light
+    infinite: Tensor  # (L,) uint8
+    power: Tensor  # (L,) float64: what a point gives at the distance one, or from infinity; relative
+    face: Tensor  # (L,) int32 that the point lies on, −1: none
+    first: Tensor  # (lights + 1,) int64
 
 
 class PlaceRecords(NamedTuple):
@@ -307,6 +321,25 @@ class Sampler:
         parts = self._compute(request, compute)
         count = len(SurfaceRecords._fields)
         return SurfaceRecords(*parts[:count]), CurveRecords(*parts[count:])
+
+    def shadow_samples(self, lights: LightRows, samples: int = -1) -> CurveRecords:
+        """On the borders of shadows, after all pixel hits were taken; so many, or by default."""
+
+        def compute(request: Request, camera: Any, *lights: Tensor) -> CurveRecords:
+            rows = LightRows(*lights)
+            found = kernel_scene(request.scene).shadow_samples(
+                camera=camera,
+                image=core.ImageOptions(**request.image._asdict()),
+                options=core.GradientOptions(seed=self.grad_seed),
+                lights=core.LightPoints(**{n: v.cpu().contiguous().numpy() for n, v in rows._asdict().items()}),
+                samples=samples,
+                threads=torch.get_num_threads(),
+                adjoint=np.ones((*self.coverage.shape, request.scene.background.shape[-1]), self.coverage.numpy().dtype),
+                hits=kernel_hits(self._hits),
+            )
+            return _record(CurveRecords, found)
+
+        return CurveRecords(*self._compute(self._request, compute, *lights))
 
     def hits_at(self, x: Tensor) -> PlaceRecords:
         """What is seen at places (N, 2) in the image."""

@@ -10,6 +10,7 @@
 #include "boundary/boundary.h"
 #include "boundary/curve.h"
 #include "boundary/curve_measure.h"
+#include "boundary/shadows.h"
 #include "boundary/steps.h"
 #include "camera/windows.h"
 #include "core/channels.h"
@@ -260,7 +261,8 @@ BackwardProfile& BackwardProfile::operator+=(const BackwardProfile& o) {
     surface_wanted += o.surface_wanted, edge_wanted += o.edge_wanted;
     silhouettes += o.silhouettes, creases += o.creases, intersections += o.intersections, rim += o.rim;
     measure += o.measure, curves += o.curves, view += o.view, world += o.world;
-    step_lines += o.step_lines;
+    step_lines += o.step_lines, shadow_samples += o.shadow_samples;
+    for (int i = 0; i < 3; ++i) shadow[i] += o.shadow[i];
     for (int i = 0; i < 2; ++i) surface[i] += o.surface[i], edge[i] += o.edge[i], step[i] += o.step[i];
     return *this;
 }
@@ -373,13 +375,27 @@ Records record_samples(const BackwardInput<T>& input, GradientOptions o, Team& t
     return records;
 }
 
-#define EDGEGRAD_INSTANTIATE(T)                                                                                  \
-    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,             \
-                                             const Gradients&);                                                  \
-    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&, \
-                                  double*);                                                                      \
-    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);              \
-    template Records record_samples(const BackwardInput<T>&, GradientOptions, Team&);
+template <class T>
+CurveRecords record_shadows(const BackwardInput<T>& input, const GradientOptions& o, const LightPoints& lights,
+                            int64_t samples, Team& team) {
+    Records records;
+    Destination to;
+    to.records = &records;
+    BackwardProfile profile;
+    each_view(input, o, Terms{}, team,
+              [&](const BackwardView<T>& view) { add_shadows<0>(view, lights, samples, Record{}, to, profile); });
+    return std::move(records.curves);
+}
+
+#define EDGEGRAD_INSTANTIATE(T)                                                                                        \
+    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,                   \
+                                             const Gradients&);                                                        \
+    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&,       \
+                                  double*);                                                                            \
+    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);                    \
+    template Records record_samples(const BackwardInput<T>&, GradientOptions, Team&);                                  \
+    template CurveRecords record_shadows(const BackwardInput<T>&, const GradientOptions&, const LightPoints&, int64_t, \
+                                         Team&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)
 #undef EDGEGRAD_INSTANTIATE

@@ -8,6 +8,7 @@
 #include "forward/forward.h"
 #include "scene/geometry.h"
 #include "scene/gradients.h"
+#include "scene/light_points.h"
 
 namespace edgegrad {
 
@@ -32,9 +33,11 @@ struct BackwardProfile {
     int64_t silhouettes = 0, creases = 0, intersections = 0;  // curves in view
     double rim = 0;                                           // px in view of that of a lens
     int64_t step_lines = 0;                                   // that look for steps within faces
-    double view = 0;                                          // vertices in camera coordinates, where the loss looks
-    double measure = 0, curves = 0;                           // triangles and curves laid end to end
+    int64_t shadow_samples = 0;
+    double view = 0;                 // vertices in camera coordinates, where the loss looks
+    double measure = 0, curves = 0;  // triangles and curves laid end to end
     double surface[2] = {0, 0}, edge[2] = {0, 0}, step[2] = {0, 0};  // samples with their rays; adding what they found
+    double shadow[3] = {0, 0, 0};                                    // edges before lights; pilots; samples
     double world = 0;                                                // from camera coordinates to the user's arrays
 
     // Of another window of the camera.
@@ -76,6 +79,11 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions optio
 // The samples of both terms, for shaders written in PyTorch. Creases are the edges at which the scene's colours jump.
 template <class T>
 Records record_samples(const BackwardInput<T>& input, GradientOptions options, Team& team);
+
+// The samples on the borders of shadows, so many or, if −1, by default.
+template <class T>
+CurveRecords record_shadows(const BackwardInput<T>& input, const GradientOptions& options, const LightPoints& lights,
+                            int64_t samples, Team& team);
 
 // q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a window.
 void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,

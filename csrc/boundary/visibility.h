@@ -86,11 +86,7 @@ class Visibility {
     }
 
     bool shares_vertex(int64_t face, std::span<const int32_t> others) const {
-        const int32_t* v = view_.scene.faces + 3 * face;
-        for (const int32_t f : others)
-            for (int i = 0; i < 3; ++i)
-                if (std::find(v, v + 3, view_.scene.faces[3 * int64_t(f) + i]) != v + 3) return true;
-        return false;
+        return std::any_of(others.begin(), others.end(), [&](int32_t f) { return share_vertex(view_.scene, face, f); });
     }
 
     // n, moved away from a face that does not cover it, across the side that it lies beyond.

@@ -101,6 +101,7 @@ class RowBuffer {
 // What the samples of one chunk give.
 struct ChunkGrad {
     RowBuffer q, x, colors, uvs, texels, alphas;  // vertices: q in camera coordinates, x in the image
+    RowBuffer lights;                             // points of lights, in camera coordinates
     RowBuffer vertex_attributes, face_attributes;
     RowBuffer pixels;  // of what has the size of the image
     IntrinsicsGrad k;
@@ -110,6 +111,7 @@ struct ChunkGrad {
 // Where it goes; null where none is wanted.
 struct Destination {
     double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr, *alphas = nullptr;
+    double* lights = nullptr;
     double *vertex_attributes = nullptr, *face_attributes = nullptr, *pixels = nullptr;
     int pixel_width = 0;  // numbers a pixel
     IntrinsicsGrad k = {};
@@ -130,6 +132,7 @@ constexpr RowSlot row_slots[] = {{&ChunkGrad::q, &Destination::q, 3},
                                  {&ChunkGrad::uvs, &Destination::uvs, 2},
                                  {&ChunkGrad::texels, &Destination::texels, as_radiance},
                                  {&ChunkGrad::alphas, &Destination::alphas, 1},
+                                 {&ChunkGrad::lights, &Destination::lights, 3},
                                  {&ChunkGrad::vertex_attributes, &Destination::vertex_attributes, as_vertex_attributes},
                                  {&ChunkGrad::face_attributes, &Destination::face_attributes, as_face_attributes},
                                  {&ChunkGrad::pixels, &Destination::pixels, as_pixels}};

@@ -50,6 +50,23 @@ nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const Im
     return out;
 }
 
+nb::dict arrays_of(CurveRecords&& c) {
+    nb::dict curves;
+    curves["x"] = rows(std::move(c.x), {2}), curves["face"] = rows(std::move(c.face), {CurveRecords::surfaces});
+    curves["b"] = rows(std::move(c.b), {CurveRecords::surfaces, 2});
+    curves["factor"] = rows(std::move(c.factor), {CurveRecords::surfaces});
+    curves["by_k"] = rows(std::move(c.by_k), {intrinsics_width});
+    curves["row_of"] = rows(std::move(c.row_of)), curves["vertex"] = rows(std::move(c.vertex));
+    curves["by_q"] = rows(std::move(c.by_q), {3});
+    curves["uv_row_of"] = rows(std::move(c.uv_row_of)), curves["uv"] = rows(std::move(c.uv));
+    curves["by_uv"] = rows(std::move(c.by_uv), {2});
+    curves["alpha_row_of"] = rows(std::move(c.alpha_row_of)), curves["alpha"] = rows(std::move(c.alpha));
+    curves["by_alpha"] = rows(std::move(c.by_alpha));
+    curves["light_row_of"] = rows(std::move(c.light_row_of)), curves["light"] = rows(std::move(c.light));
+    curves["by_light"] = rows(std::move(c.by_light), {3});
+    return curves;
+}
+
 // The samples of the terms inside faces and on curves, as records of arrays.
 template <class T>
 nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
@@ -63,22 +80,53 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
                                team);
     });
     SurfaceRecords& s = found.surface;
-    CurveRecords& c = found.curves;
-    nb::dict surface, curves;
+    nb::dict surface;
     surface["face"] = rows(std::move(s.face)), surface["x"] = rows(std::move(s.x), {2});
     surface["along"] = rows(std::move(s.along), {3}), surface["weight"] = rows(std::move(s.weight));
     surface["along_by_k"] = rows(std::move(s.along_by_k), {3, intrinsics_width});
-    curves["x"] = rows(std::move(c.x), {2}), curves["face"] = rows(std::move(c.face), {CurveRecords::surfaces});
-    curves["b"] = rows(std::move(c.b), {CurveRecords::surfaces, 2});
-    curves["factor"] = rows(std::move(c.factor), {CurveRecords::surfaces});
-    curves["by_k"] = rows(std::move(c.by_k), {intrinsics_width});
-    curves["row_of"] = rows(std::move(c.row_of)), curves["vertex"] = rows(std::move(c.vertex));
-    curves["by_q"] = rows(std::move(c.by_q), {3});
-    curves["uv_row_of"] = rows(std::move(c.uv_row_of)), curves["uv"] = rows(std::move(c.uv));
-    curves["by_uv"] = rows(std::move(c.by_uv), {2});
-    curves["alpha_row_of"] = rows(std::move(c.alpha_row_of)), curves["alpha"] = rows(std::move(c.alpha));
-    curves["by_alpha"] = rows(std::move(c.by_alpha));
-    return nb::make_tuple(surface, curves);
+    return nb::make_tuple(surface, arrays_of(std::move(found.curves)));
+}
+
+// Points of lights as edges cast shadows of them.
+struct LightArrays {
+    In<double, 2> place;
+    In<uint8_t, 1> infinite;
+    In<double, 1> power;
+    In<int32_t, 1> face;
+    In<int64_t, 1> first;
+
+    void check(int64_t faces) const {
+        const size_t n = place.shape(0);
+        if (place.shape(1) != 3 || infinite.size() != n || power.size() != n || face.size() != n)
+            refuse("lights: expected a row a point");
+        check_finite("lights", place.data(), place.size(), 3, 1), check_finite("power", power.data(), n, 1, 1);
+        if (first.size() < 1 || first(0) != 0 || first(first.size() - 1) != int64_t(n) ||
+            !std::is_sorted(first.data(), first.data() + first.size()))
+            refuse("first: expected where each light's points begin, and their number");
+        for (size_t i = 0; i < n; ++i)
+            if (face(i) >= faces) refuse("face: expected a face of the scene, or -1");
+    }
+    LightPoints view() const {
+        return {place.data(), infinite.data(), power.data(), face.data(), first.data(), int64_t(first.size()) - 1};
+    }
+};
+
+// The samples on the borders of shadows.
+template <class T>
+nb::dict shadow_samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
+                        const GradientOptions& options, const LightArrays& lights, int64_t samples, int threads,
+                        Out<T, 3> adjoint, const HitArrays<T>& hits) {
+    check_image("adjoint", adjoint, camera, arrays.background.shape(2));
+    hits.check(arrays, camera), lights.check(int64_t(arrays.faces.shape(0)));
+    const SceneView<T> scene = arrays.view();
+    CurveRecords found;
+    unlocked(threads, [&](Team& team) {
+        GeometryWork done;
+        const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
+        found = record_shadows(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view()}, options,
+                               lights.view(), samples, team);
+    });
+    return arrays_of(std::move(found));
 }
 
 // The pixels whose filter reaches points of the image: for each pair the point, the pixel, and the filter's weight
@@ -169,6 +217,8 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
         .def("pixel_hits", &pixel_hits<T>, "camera"_a, "options"_a, "threads"_a, "first"_a, "end"_a, "most"_a,
              "only"_a.none(), "hits"_a)
         .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
+        .def("shadow_samples", &shadow_samples<T>, "camera"_a, "image"_a, "options"_a, "lights"_a, "samples"_a,
+             "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)
         .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(), "threads"_a)
         .def("visible", &visible_points<T>, "face"_a.noconvert(), "b"_a.noconvert(), "to"_a.noconvert(),
@@ -179,6 +229,11 @@ template void bind_scene_for_shaders(nb::class_<SceneArrays<float>>&);
 template void bind_scene_for_shaders(nb::class_<SceneArrays<double>>&);
 
 void bind_for_shaders(nb::module_& m) {
+    nb::class_<LightArrays>(m, "LightPoints")
+        .def(nb::new_([](In<double, 2> place, In<uint8_t, 1> infinite, In<double, 1> power, In<int32_t, 1> face,
+                         In<int64_t, 1> first) { return LightArrays{place, infinite, power, face, first}; }),
+             "place"_a.noconvert(), "infinite"_a.noconvert(), "power"_a.noconvert(), "face"_a.noconvert(),
+             "first"_a.noconvert());
     m.def("footprints", &footprints, "x"_a.noconvert(), "filter"_a, "width"_a, "height"_a);
     m.def("rays_at", &rays_of, "camera"_a, "x"_a.noconvert(), "threads"_a);
 }

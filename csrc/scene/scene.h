@@ -97,4 +97,11 @@ struct SceneView {
     }
 };
 
+// Whether two faces have a vertex in common, by index.
+template <class T>
+bool share_vertex(const SceneView<T>& scene, int64_t face, int64_t other) {
+    const int32_t *v = scene.faces + 3 * face, *w = scene.faces + 3 * other;
+    return std::any_of(v, v + 3, [&](int32_t i) { return std::find(w, w + 3, i) != w + 3; });
+}
+
 }  // namespace edgegrad

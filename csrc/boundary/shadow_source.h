@@ -1,0 +1,161 @@
+// Borders of shadows as a source of curves.
+//
+// A point l of a light and an edge (a, b) span the shadow plane, with the normal N = (b − a) × d, where d = p − l runs
+// from the light to the point p of the edge (or, from a light at infinity, along its rays). Its border on a face, the
+// receiver, with the normal m through v_i, is where the two planes meet. With y(x) what is seen of the receiver at x,
+//
+//     F(x) = N · (y(x) − p)
+//
+// is zero there, and the border's share of ∂loss/∂Φ is ∫ Ã [L(F > 0) − L(F < 0)] δF / |∇F| dℓ. Along the ray r = dq/dz
+// of the camera, with c = N·r / m·r, barycentrics β of y, and y = w_a a + w_b b + w_l l on the shadow plane,
+//
+//     δF = c m · Σ β_i δv_i − N · (w_a δa + w_b δb + w_l δl) + (N − c m) · δq(x),
+//
+// δq(x) at a fixed depth. The last factor is also ∇F, by the place in the image. Per unit of t on the edge the border
+// has the length |y′| with y′ = S / (m·d) · m × N, S = |y − l| / |p − l|, or 1 if the light is at infinity: so all that
+// is asked of the place on the edge is that rays go there. A light at infinity moves by its direction towards it.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "backward/view.h"
+#include "boundary/curve_source.h"
+#include "scene/light_points.h"
+
+namespace edgegrad {
+
+// Where the ray of a light past an edge meets a face.
+struct ShadowPoint {
+    int32_t a, b;         // vertices of the edge
+    int32_t light;        // of the points of lights
+    int32_t caster;       // corner of a face beside the edge that casts the shadow, but not on the edge
+    int32_t face;         // the receiver
+    int64_t segment = 0;  // of the sampler (shadows.cpp)
+    double t;             // on the edge, (1 − t) a + t b
+    Barycentrics on;      // the receiver
+    double along;         // y = l + along · d, or p + along · d from a light at infinity
+};
+
+template <class T>
+class ShadowSource {
+   public:
+    using Curve = ShadowPoint;
+
+    struct Sample : CurveSample {
+        ShadowPoint shadow;
+        int32_t receiver;  // which the ray ignores
+        CurveFaces faces;
+        Vec3 N, m;          // the latter times c
+        double by_a, by_b;  // w_a, w_b, w_l
+        double by_light;
+        Vec2 by_n;       // ∂F/∂n
+        double speed;    // |du/dt|, px of the straight image
+        double scale;    // that over |∇F|
+        bool lit_ahead;  // whether the lit side is where F > 0
+    };
+
+    ShadowSource(const BackwardView<T>& view, const LightPoints& lights) : view_(view), lights_(lights) {}
+
+    Vec2 position(const Curve& curve, double) const { return project(view_.camera, place_of(curve)); }
+
+    // In camera coordinates.
+    Vec3 place_of(const Curve& curve) const {
+        const auto v = corners_of(view_, curve.face);
+        return curve.on[0] * v[0] + curve.on[1] * v[1] + curve.on[2] * v[2];
+    }
+
+    bool place(const Curve& curve, double, Sample& sample) const {
+        const Camera& camera = view_.camera;
+        const auto v = corners_of(view_, curve.face);
+        const Array<Vec3>& q = view_.vertices.q;
+        const bool infinite = lights_.infinite[curve.light];
+        const Vec3 a = q[curve.a], b = q[curve.b], p = (1 - curve.t) * a + curve.t * b;
+        const Vec3 light = infinite ? camera.R * lights_.at(curve.light) : camera.to_camera(lights_.at(curve.light));
+        const Vec3 d = infinite ? -light : p - light, m = cross(v[1] - v[0], v[2] - v[0]);
+        const Vec3 N = cross(b - a, d), y = place_of(curve);
+        // What is lit from behind is dark on both sides of the border.
+        if (!(dot(m, d) * dot(m, camera.view_direction(y)) > 0)) return false;
+
+        sample.shadow = curve, sample.receiver = curve.face;
+        sample.point = y, sample.behind = {};
+        const double S = infinite ? 1 : curve.along;
+        sample.by_a = S * (1 - curve.t), sample.by_b = S * curve.t;
+        sample.by_light = infinite ? -curve.along : 1 - curve.along;
+        sample.N = N, sample.m = (camera.along_ray(N, sample.n) / camera.along_ray(m, sample.n)) * m;
+        const Vec3 slope = camera.unit_at_depth(y.z) * (N - sample.m);
+        sample.by_n = {slope.x, slope.y};
+        const Vec3 moved = (S / dot(m, d)) * cross(m, N);
+        const double w = 1 / camera.depth_weight(y),
+                     w_dot = camera.projection([&](auto c) { return c.weight_jvp(moved); });
+        sample.speed =
+            length(scaled_to_pixels(camera, {(moved.x - w_dot * sample.n.x) * w, (moved.y - w_dot * sample.n.y) * w}));
+        sample.scale = sample.speed / length(place_vjp(camera, sample.by_n));
+        sample.lit_ahead = dot(N, q[curve.caster] - a) < 0;
+        if (!std::isfinite(sample.scale)) return false;
+
+        sample.ignored = {&sample.receiver, 1};
+        const int32_t* vertex = view_.scene.faces + 3 * int64_t(curve.face);
+        sample.faces = {sample.ignored, 0, view_.scene.spacing->of(vertex[0])};
+        for (int i = 0; i < 3; ++i)
+            for (int axis = 0; axis < 3; ++axis)
+                sample.faces.coordinate =
+                    std::max(sample.faces.coordinate, std::fabs(view_.scene.verts[3 * int64_t(vertex[i]) + axis]));
+        return true;
+    }
+
+    const CurveFaces& faces_of(const Sample& sample) const { return sample.faces; }
+
+    // The receiver in the light, and in the shadow.
+    SampleSurfaces surfaces(const Sample& sample) const {
+        const SurfacePoint there{sample.receiver, sample.shadow.on, sample.point.z};
+        return {{there, there}};
+    }
+
+    CurveJumps jumps(const Sample& sample, const double* radiance) const {
+        return {(sample.lit_ahead ? 1 : -1) * sample.weight * (radiance[0] - radiance[1]), 0};
+    }
+
+    // The curve moves with δx as F does with −δx.
+    Vec2 normal(const Sample& sample) const {
+        return (-sample.scale * sample.area_scale) * pixel_vjp(view_.camera, sample.n, sample.by_n);
+    }
+
+    CurveJumps velocities(const Sample& sample, const Direction& direction) const {
+        if (!direction.moves()) return {};
+        const int32_t* vertex = view_.scene.faces + 3 * int64_t(sample.receiver);
+        Vec3 receiver;
+        for (int i = 0; i < 3; ++i) receiver += sample.shadow.on[i] * direction.q[vertex[i]];
+        const Vec3 caster = sample.by_a * direction.q[sample.shadow.a] + sample.by_b * direction.q[sample.shadow.b];
+        const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
+        const double F_dot =
+            dot(sample.m, receiver) - dot(sample.N, caster) + sample.by_n.x * n_dot.x + sample.by_n.y * n_dot.y;
+        return {sample.scale * sample.area_scale * F_dot, 0};
+    }
+
+    void add_motion(const Sample& sample, CurveJumps jumps, ChunkGrad& grad) const {
+        const double F_bar = sample.scale * sample.area_scale * jumps.first;
+        const int32_t* vertex = view_.scene.faces + 3 * int64_t(sample.receiver);
+        for (int i = 0; i < 3; ++i) {
+            const Vec3 bar = (F_bar * sample.shadow.on[i]) * sample.m;
+            grad.q.add<3>(vertex[i], &bar.x);
+        }
+        const Vec3 a_bar = (-F_bar * sample.by_a) * sample.N, b_bar = (-F_bar * sample.by_b) * sample.N;
+        grad.q.add<3>(sample.shadow.a, &a_bar.x), grad.q.add<3>(sample.shadow.b, &b_bar.x);
+        if (grad.lights.is_wanted()) {
+            const Vec3 bar = (-F_bar * sample.by_light) * sample.N;
+            grad.lights.add<3>(sample.shadow.light, &bar.x);
+        }
+        normalised_vjp(view_.camera, sample.n, F_bar * sample.by_n, grad.k);
+    }
+
+    void cast() {}
+    void finish(ChunkGrad&) {}
+
+   private:
+    const BackwardView<T>& view_;
+    const LightPoints& lights_;
+};
+
+}  // namespace edgegrad
