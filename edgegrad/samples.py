@@ -197,9 +197,9 @@ class EdgeSamples:
         self.x = frame.here(records.x)
         sample, which = (records.face >= 0).nonzero(as_tuple=True)
         self.sample, self._factor = frame.here(sample), frame.here(records.factor[sample, which])
-        # A little inside the faces, so that rounding does not take a step along their edge for passed: at u = 1 a texture that
-        # repeats begins anew.
-        b = torch.lerp(records.b[sample, which], torch.tensor(1 / 3).double(), torch.finfo(frame.dtype).eps ** (2 / 3))
+        # On the border of a face a little inside, so that rounding does not take a step along it for passed: at u = 1 a texture
+        # that repeats begins anew.
+        b = _within(records.b[sample, which], torch.finfo(frame.dtype).eps ** (2 / 3))
         # All sides of a sample see the same points of lights.
         seed = frame.seeds("edges", len(self))[self.sample]
         self.hits = frame.fixed_hits(records.face[sample, which], b, records.x[sample], seed)
@@ -378,6 +378,12 @@ def boundary(
     weight = frame.here(feet.weight).to(jump.dtype)
     values = (weight * velocity.to(jump.dtype)[point])[:, None] * jumps
     return frame.image(pixel, values)
+
+
+def _within(b: Tensor, least: float) -> Tensor:
+    """Barycentrics (N, 2), those of corners no less than that."""
+    b = barycentrics(b).clamp(min=least)
+    return (b / b.sum(1, keepdim=True))[:, 1:]
 
 
 def _request_of(primary: PrimaryHits, name: str, count: int | None) -> Request:

@@ -132,9 +132,11 @@ class ScreenBoundary {
     ChunkGrad& grad_;
 };
 
+template <class T>
 class RecordBoundary {
    public:
-    RecordBoundary(const Camera& camera, CurveRecords& records) : camera_(camera), records_(records) {
+    RecordBoundary(const BackwardView<T>& view, CurveRecords& records)
+        : view_(view), camera_(view.camera), records_(records) {
         form_.q.prepare(3, 1), form_.uvs.prepare(2, 1), form_.alphas.prepare(1, 1);
         form_.lights.prepare(3, 1);
     }
@@ -168,10 +170,12 @@ class RecordBoundary {
         source.finish(form_);
         const int64_t sample_index = records_.size();
         append(records_.x, {sample.x.x, sample.x.y});
+        const Vec2 normal = in_straight_image(source.normal(sample), sample.n);
         for (int k = 0; k < CurveRecords::surfaces; ++k) {
             const SurfacePoint p = k < surfaces.count ? surfaces.at[k] : SurfacePoint();
             records_.face.push_back(k < surfaces.count ? int32_t(p.face) : -2);
-            append(records_.b, {p.b.u, p.b.v});
+            const Barycentrics b = factor[k] != 0 && p.face >= 0 ? aside(p, sample, normal, factor[k] > 0 ? -1 : 1) : p.b;
+            append(records_.b, {b.u, b.v});
             records_.factor.push_back(factor[k]);
         }
         append_intrinsics(records_.by_k, camera_, form_.k);
@@ -198,6 +202,32 @@ class RecordBoundary {
         });
     }
 
+    // (∂x/∂u)ᵀ x̄.
+    Vec2 in_straight_image(Vec2 x_bar, Vec2 n) const {
+        const auto along = [&](Vec2 u) {
+            const Vec2 x = bend_jvp(camera_, n, u);
+            return x.x * x_bar.x + x.y * x_bar.y;
+        };
+        return {along({1, 0}), along({0, 1})};
+    }
+
+    // A point of a surface moved a little off the curve to the side where it is visible: there alone is it known what
+    // lies between it and a light, where the curve is one of contact, and which of two steps along it was taken.
+    Barycentrics aside(const SurfacePoint& p, const CurveSample& sample, Vec2 normal, double side) const {
+        constexpr double little = 1e-3, most = 1e-2;  // px; of the face
+        const double size = length(normal);
+        if (!(size > 0 && std::isfinite(size))) return p.b;
+        const auto corner = corners_of(view_, p.face);
+        Barycentrics b;
+        if (!barycentrics(face_map(camera_, corner.data()),
+                          normalised(camera_, sample.u + (side * little / size) * normal), b))
+            return p.b;
+        const double u = b.u - p.b.u, v = b.v - p.b.v, moved = std::max(std::fabs(u), std::fabs(v));
+        const double part = moved > most ? most / moved : 1;
+        return inside({p.b.u + part * u, p.b.v + part * v});
+    }
+
+    const BackwardView<T>& view_;
     const Camera& camera_;
     CurveRecords& records_;
     ChunkGrad form_;
