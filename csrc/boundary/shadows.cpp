@@ -23,9 +23,9 @@ namespace edgegrad {
 
 namespace {
 
-constexpr int64_t pair_tests = 1 << 21;       // of edges before points of lights
+constexpr int64_t pair_tests = 1 << 23;       // of edges before points of lights
 constexpr int64_t fewest_segments = 1 << 10;  // that edges are cut into
-constexpr int64_t most_segments = 1 << 15;
+constexpr int64_t most_segments = 1 << 16;
 constexpr int most_of_edge = 64;
 constexpr int pilots = 4;                                              // a segment
 constexpr double floor_share = 0.2;                                    // of the density that pilots do not decide
@@ -35,6 +35,10 @@ constexpr int64_t fewest_samples = 256;
 struct Segment {
     ShadowEdge edge;
     double t0, t1;
+
+    int64_t points() const { return edge.end - edge.first; }
+    // What it stands for: of the mean over the points of its light, and of the edge.
+    double share() const { return edge.weight * double(points()) * (t1 - t0); }
 };
 
 // Edges cut in proportion to their measure; drawn from, where there are too many.
@@ -43,7 +47,7 @@ std::vector<Segment> segments_of(const BackwardView<T>& view, const std::vector<
     std::vector<Segment> out;
     if (edges.empty()) return out;
     Array<double> measure(int64_t(edges.size()));
-    for (size_t i = 0; i < edges.size(); ++i) measure[i] = edges[i].weight * edges[i].measure;
+    for (size_t i = 0; i < edges.size(); ++i) measure[i] = edges[i].measure;
     Systematic systematic(measure, view.team);
     if (!(systematic.total() > 0)) return out;
     if (int64_t(edges.size()) > most_segments) {
@@ -53,7 +57,7 @@ std::vector<Segment> segments_of(const BackwardView<T>& view, const std::vector<
             const double position = systematic.position(i);
             k = i ? systematic.primitive(position, k) : systematic.primitive(position);
             ShadowEdge edge = edges[k];
-            edge.weight *= systematic.weight(k);
+            edge.weight *= systematic.weight(k), edge.measure *= systematic.weight(k);
             out.push_back({edge, 0, 1});
         }
         return out;
@@ -73,26 +77,26 @@ class LightRays {
     LightRays(const BackwardView<T>& view, const LightPoints& lights) : view_(view), lights_(lights) {}
 
     // The point at t of an edge, for whoever knows the segment by this number.
-    void add(const ShadowEdge& edge, int64_t segment, double t, double weight) {
-        const HalfEdge& h = view_.geometry.topology().half_edges(edge.edge)[0];
+    void add(int64_t edge, ShadowEdges::Point from, int64_t segment, double t, double weight) {
+        const HalfEdge& h = view_.geometry.topology().half_edges(edge)[0];
         const SceneView<T>& scene = view_.scene;
         const auto vertex_of = [&](int c) { return scene.faces[3 * int64_t(h.face) + c]; };
         const Vec3 a = corner(scene, h.face, h.first()), b = corner(scene, h.face, h.second());
         Waiting& w = waiting_[count_];
         w.point = {.a = vertex_of(h.first()),
                    .b = vertex_of(h.second()),
-                   .light = edge.light,
-                   .caster = edge.caster,
+                   .light = from.light,
+                   .caster = from.caster,
                    .face = -1,
                    .segment = segment,
                    .t = t,
                    .on = {},
                    .along = 0};
         w.weight = weight;
-        w.edge = edge.edge;
-        w.infinite = lights_.infinite[edge.light];
+        w.edge = edge;
+        w.infinite = lights_.infinite[from.light];
         w.p = (1 - t) * a + t * b;
-        const Vec3 light = lights_.at(edge.light);
+        const Vec3 light = lights_.at(from.light);
         if (w.infinite) {
             // From outside of the scene.
             const RayFrame& frame = view_.geometry.caster().frame();
@@ -103,9 +107,9 @@ class LightRays {
             w.ray = {light, w.p - light};
         }
         auto& without = without_[count_];
-        const auto beside = view_.geometry.topology().faces(edge.edge);
+        const auto beside = view_.geometry.topology().faces(edge);
         without.assign(beside.begin(), beside.end());
-        if (const int32_t own = lights_.face[edge.light]; own >= 0) without.push_back(own);
+        if (const int32_t own = lights_.face[from.light]; own >= 0) without.push_back(own);
         std::sort(without.begin(), without.end());
         ++count_;
     }
@@ -229,14 +233,25 @@ class Pilots {
 template <class T, class Contraction>
 class ShadowChunk {
    public:
-    ShadowChunk(const BackwardView<T>& view, const LightPoints& lights, Contraction contraction)
+    ShadowChunk(const BackwardView<T>& view, const LightPoints& lights, const std::vector<ShadowEdges::Point>& points,
+                Contraction contraction)
         : view_(view),
+          points_(points),
           source_(view, lights),
           light_rays_(view, lights),
           samples_(view, source_, std::move(contraction)) {}
 
-    void add(const Segment& segment, int64_t index, double fraction, double weight) {
-        light_rays_.add(segment.edge, index, segment.t0 + fraction * (segment.t1 - segment.t0), weight);
+    // The i-th sample, at a fraction of a segment: the points of the light one after another, each with all of the
+    // segment. Where these are many, samples fall on different ones, and would all meet the same place of the segment
+    // if it were not moved on by the golden ratio from one to the next.
+    void add(const Segment& segment, int64_t index, double fraction, int64_t i, double weight) {
+        const int64_t count = segment.points();
+        const double at = fraction * double(count);
+        const int64_t point = std::min(int64_t(at), count - 1);
+        double t = at - double(point);
+        if (count > 1) t += double(i) * 0.6180339887498949, t -= std::floor(t);
+        light_rays_.add(segment.edge.edge, points_[segment.edge.first + point], index,
+                        segment.t0 + t * (segment.t1 - segment.t0), weight);
         if (light_rays_.is_full()) cast();
     }
     void finish(ChunkGrad& grad) {
@@ -252,13 +267,11 @@ class ShadowChunk {
     }
 
     const BackwardView<T>& view_;
+    const std::vector<ShadowEdges::Point>& points_;
     ShadowSource<T> source_;
     LightRays<T> light_rays_;
     CurveSamples<Contraction, T, ShadowSource<T>> samples_;
 };
-
-// The share of its light's points that a segment stands for, times its length in t.
-double share_of(const Segment& s) { return s.edge.weight * (s.t1 - s.t0); }
 
 }  // namespace
 
@@ -266,7 +279,8 @@ template <int N, class Contraction, class T>
 void add_shadows(const BackwardView<T>& view, const LightPoints& lights, int64_t samples,
                  const Contraction& contraction, Destination& to, BackwardProfile& profile) {
     Stopwatch watch;
-    const std::vector<Segment> segments = segments_of(view, find_shadow_edges(view, lights, pair_tests));
+    const ShadowEdges edges = ShadowEdgeFinder<T>(view, lights).find(pair_tests);
+    const std::vector<Segment> segments = segments_of(view, edges.edges);
     profile.shadow[0] += watch.lap();
     const int64_t count = int64_t(segments.size());
     if (count == 0) return;
@@ -275,10 +289,10 @@ void add_shadows(const BackwardView<T>& view, const LightPoints& lights, int64_t
     const uint64_t pilot_seed = hash(view.options.seed, 10, gradient_stream);
     view.team.each_block(count, [&](int64_t, int64_t first, int64_t last) {
         ChunkGrad unused;
-        ShadowChunk chunk(view, lights, Pilots(view, lights, found));
+        ShadowChunk chunk(view, lights, edges.points, Pilots(view, lights, found));
         for (int64_t i = first; i < last; ++i) {
             const double shift = to_unit(hash(pilot_seed, i));
-            for (int k = 0; k < pilots; ++k) chunk.add(segments[i], i, (k + shift) / pilots, 1);
+            for (int k = 0; k < pilots; ++k) chunk.add(segments[i], i, (k + shift) / pilots, k, 1);
         }
         chunk.finish(unused);
     });
@@ -288,18 +302,17 @@ void add_shadows(const BackwardView<T>& view, const LightPoints& lights, int64_t
     double known = 0, prior = 0;
     for (int64_t i = 0; i < count; ++i) {
         const Segment& s = segments[i];
-        measure[i] = share_of(s) * std::sqrt(found[i].squares / pilots), known += measure[i];
-        prior += share_of(s) * s.edge.measure;
-        const int64_t light =
-            std::upper_bound(lights.first, lights.first + lights.lights + 1, s.edge.light) - lights.first - 1;
-        length[light] += share_of(s) * found[i].length / pilots;
+        measure[i] = s.share() * std::sqrt(found[i].squares / pilots), known += measure[i];
+        prior += (s.t1 - s.t0) * s.edge.measure;
+        length[s.edge.light] += s.share() * found[i].length / pilots;
     }
     profile.shadow[1] += watch.lap();
     double wanted = 0;
     for (int64_t k = 0; k < lights.lights; ++k)
         wanted += length[k] * (lights.first[k + 1] - lights.first[k] > 1 ? samples_a_pixel_of_many : samples_a_pixel);
     for (int64_t i = 0; i < count; ++i)
-        measure[i] += floor_share * (known > 0 ? known : 1) * share_of(segments[i]) * segments[i].edge.measure / prior;
+        measure[i] += floor_share * (known > 0 ? known : 1) * segments[i].edge.measure *
+                      (segments[i].t1 - segments[i].t0) / prior;
     // No more rays than an eighth of the image's, for each is one of a light and one of the camera, alone.
     const int64_t most = std::max(fewest_samples, int64_t(view.camera.width) * view.camera.height * view.image.spp / 8);
     const int64_t n = samples >= 0 ? samples : std::clamp(int64_t(std::min(wanted, 1e15)), fewest_samples, most);
@@ -309,14 +322,14 @@ void add_shadows(const BackwardView<T>& view, const LightPoints& lights, int64_t
     systematic.draw(n, to_unit(hash(view.options.seed, 11, gradient_stream)));
     double seconds[2] = {0, 0};
     view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        ShadowChunk chunk(view, lights, on_curves<N>(view, contraction, grad));
+        ShadowChunk chunk(view, lights, edges.points, on_curves<N>(view, contraction, grad));
         int64_t k = -1;
         for (int64_t i = first; i < last; ++i) {
             const double position = systematic.position(i);
             k = k < 0 ? systematic.primitive(position) : systematic.primitive(position, k);
             const double fraction =
                 std::clamp((position - systematic.begin_of(k)) / systematic.measure_of(k), 0.0, 1.0);
-            chunk.add(segments[k], k, fraction, systematic.weight(k) * share_of(segments[k]));
+            chunk.add(segments[k], k, fraction, i, systematic.weight(k) * segments[k].share());
         }
         chunk.finish(grad);
     });
