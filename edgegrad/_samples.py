@@ -322,7 +322,7 @@ class Sampler:
         count = len(SurfaceRecords._fields)
         return SurfaceRecords(*parts[:count]), CurveRecords(*parts[count:])
 
-    def shadow_samples(self, lights: LightRows, samples: int = -1) -> CurveRecords:
+    def shadow_samples(self, lights: LightRows, seed: int, samples: int = -1) -> CurveRecords:
         """On the borders of shadows, after all pixel hits were taken; so many, or by default."""
 
         def compute(request: Request, camera: Any, *lights: Tensor) -> CurveRecords:
@@ -330,7 +330,7 @@ class Sampler:
             found = kernel_scene(request.scene).shadow_samples(
                 camera=camera,
                 image=core.ImageOptions(**request.image._asdict()),
-                options=core.GradientOptions(seed=self.grad_seed),
+                options=core.GradientOptions(seed=seed),
                 lights=core.LightPoints(**{n: v.cpu().contiguous().numpy() for n, v in rows._asdict().items()}),
                 samples=samples,
                 threads=torch.get_num_threads(),

@@ -17,7 +17,7 @@ from .scene import Scene
 class Surfaces:
     """Meshes laid end to end.
 
-    It also notes which properties that may jump at an edge a shader asks for: there the shader may jump too.
+    It also notes which properties that may jump at an edge a shader asks for, and which shadows: there it may jump too.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -30,6 +30,7 @@ class Surfaces:
         self.mesh_of_face = torch.repeat_interleave(torch.arange(len(meshes)), counts).to(self.verts.device)
         self.scene = scene
         self.jumping: dict[Any, Callable[[], Tensor]] = {}  # (F, 3, K) at corners, of what may jump
+        self.shadowing: set[int] = set()  # lights, in scene.casting, of which a shader asks for shadows
         self.pyramids: dict[int, tuple[Tensor, list[Tensor]]] = {}  # of textures, by their ids
 
     def detach(self) -> Surfaces:
@@ -140,6 +141,10 @@ class View:
     def in_camera(self, points: Tensor) -> Tensor:
         """World points (..., 3) in camera coordinates, float64."""
         return points.double() @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+
+    def turned(self, directions: Tensor) -> Tensor:
+        """World directions (..., 3) in camera coordinates, float64."""
+        return directions.double() @ self.world_to_camera[:3, :3].T
 
     def barycentrics(self, surfaces: Surfaces, face: Tensor, along: Tensor) -> Tensor:
         """(N, 3) where rays meet the planes of faces. `along` (N, 3): the directions of rays from the eye in camera coordinates,

@@ -392,8 +392,12 @@ class Hits:
         )
 
     def visible_from(self, light: Light, points: LightPoints) -> Tensor:
-        """(N,) 1 where nothing lies between the points and those of a light, else 0: see visible(). Without derivatives."""
-        index, s = self._index(light), self._surfaces
+        """(N,) 1 where nothing lies between the points and those of a light, else 0: see visible(). A border of its shadow is
+        a step: what moves there has a gradient, though this has none."""
+        index, s, forced = self._index(light), self._surfaces, self._forced
+        s.shadowing.add(index)
+        if forced is not None and forced.light == index and values_visible(forced.some) and bool(forced.some.all()):
+            return forced.lit.to(self.position.dtype)
         place = light.place(points).detach().to(s.verts.device, torch.float64)
         here = self.position.detach().double()
         spacing = torch.finfo(s.verts.dtype).eps
@@ -407,7 +411,6 @@ class Hits:
                 # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
                 spacing = max(spacing, 2.0**-40)
         lit = visible(s.scene, self._face, self._exact[:, 1:], place, 16 * spacing * size).to(self.position.dtype)
-        forced = self._forced
         if forced is None or forced.light != index:
             return lit
         return torch.where(forced.some, forced.lit.to(lit), lit)

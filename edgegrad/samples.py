@@ -36,15 +36,16 @@ from ._samples import (
 )
 from ._samples import trace as trace_records
 from ._seeds import sample_seeds
+from ._shadows import ShadowLight
 from ._steps import Steps
 from ._surfaces import Rays, Surfaces, View, every_face
 from .camera import Camera
-from .hits import Hits
+from .hits import Forced, Hits
 from .mesh import Mesh
 from .scene import Scene
 
 ALL_AT_ONCE = 1 << 40
-SAMPLES = ("image", "inside", "edges", "steps")  # kinds that draw numbers of their own
+SAMPLES = ("image", "inside", "edges", "steps", "shadows")  # kinds that draw numbers of their own
 
 
 class Frame:
@@ -76,11 +77,17 @@ class Frame:
         return self.here(sample_seeds(seed, SAMPLES.index(kind), first, count))
 
     def fixed_hits(
-        self, face: Tensor, b: Tensor, x: Tensor, seed: Tensor | None = None, steps: Steps | None = None
+        self,
+        face: Tensor,
+        b: Tensor,
+        x: Tensor,
+        seed: Tensor | None = None,
+        steps: Steps | None = None,
+        forced: Forced | None = None,
     ) -> Hits:
         """Without derivatives; b (N, 2)."""
         place = self.here(face), self.here(barycentrics(b)), self.here(x)
-        return Hits(self.fixed, self.fixed_view, *place, self.sampler.rays_at, steps, seed)
+        return Hits(self.fixed, self.fixed_view, *place, self.sampler.rays_at, steps, seed, forced)
 
     def moving_hits(
         self, face: Tensor, rays: RayRecords | SurfaceRecords, x: Tensor, seed: Tensor | None = None
@@ -192,7 +199,7 @@ class EdgeSamples:
               that of the place by vertices and camera
     """
 
-    def __init__(self, frame: Frame, records: CurveRecords) -> None:
+    def __init__(self, frame: Frame, records: CurveRecords, light: ShadowLight | None = None) -> None:
         self.frame, self._records = frame, records
         self.x = frame.here(records.x)
         sample, which = (records.face >= 0).nonzero(as_tuple=True)
@@ -201,8 +208,13 @@ class EdgeSamples:
         # that repeats begins anew.
         b = _within(records.b[sample, which], torch.finfo(frame.dtype).eps ** (2 / 3))
         # All sides of a sample see the same points of lights.
-        seed = frame.seeds("edges", len(self))[self.sample]
-        self.hits = frame.fixed_hits(records.face[sample, which], b, records.x[sample], seed)
+        seed = frame.seeds("edges" if light is None else "shadows", len(self))[self.sample]
+        forced = None
+        if light is not None:
+            points = light.points.select(frame.here(records.light)[self.sample])
+            lit = frame.here(which == 0).to(frame.dtype)
+            forced = Forced(light.index, points, lit, torch.ones_like(lit, dtype=torch.bool))
+        self.hits = frame.fixed_hits(records.face[sample, which], b, records.x[sample], seed, forced=forced)
         self.to_background = frame.here(torch.where(records.face == -1, records.factor, 0).sum(1))
         q = frame.view.in_camera(frame.surfaces.verts)
         rows = (frame.here(records.by_q) * (q - q.detach())[frame.here(records.vertex)]).sum(1)
@@ -212,7 +224,13 @@ class EdgeSamples:
         by_uv = (records.by_uv * (flat.uvs - flat.uvs.detach())[records.uv]).sum(1)
         by_alpha = records.by_alpha * (flat.alphas - flat.alphas.detach())[records.alpha, 0].double()
         velocity = velocity.index_add(0, frame.here(records.uv_row_of), frame.here(by_uv))
-        self.velocity = velocity.index_add(0, frame.here(records.alpha_row_of), frame.here(by_alpha))
+        velocity = velocity.index_add(0, frame.here(records.alpha_row_of), frame.here(by_alpha))
+        if light is not None:
+            place = light.place
+            place = frame.view.turned(place) if light.light.infinite else frame.view.in_camera(place)
+            rows = (frame.here(records.by_light) * (place - place.detach())[frame.here(records.light)]).sum(1)
+            velocity = velocity.index_add(0, frame.here(records.light_row_of), rows)
+        self.velocity = velocity
 
     def __len__(self) -> int:
         return len(self.x)

@@ -21,8 +21,9 @@ from ._background import environments
 from ._borders import Borders
 from ._check import values_visible
 from ._derivatives import differentiates, moves, once, transformed
-from ._request import Request
+from ._request import Request, derived_seed
 from ._samples import PixelRecords, RayRecords, shaded_room, without_colors
+from ._shadows import ShadowLight
 from ._steps import UNEQUAL, Crossings, Points, Steps, find_crossings
 from ._surfaces import every_face
 from .camera import Camera
@@ -75,6 +76,8 @@ class _Image:
             zero = zero + self._boundary(EdgeSamples(frame, curves))
         if visibility and self._kinds:
             zero = zero + self._steps()
+        if visibility:
+            zero = zero + self._shadows()
         return image + once(zero.reshape(image.shape))
 
     # -- the image -----------------------------------------------------------------------------------------------------
@@ -140,6 +143,19 @@ class _Image:
             total = total + some.image(L)
         total = total.reshape(frame.pixels, -1)
         return total - total.detach()
+
+    def _shadows(self) -> Any:
+        """(H · W, C), or 0: the same over samples on the borders of the shadows that the shader asked for."""
+        frame = self._frame
+        found: Any = 0
+        for index in sorted(frame.surfaces.shadowing):
+            seed = derived_seed(frame.sampler.grad_seed, index + 2)
+            light = ShadowLight.of(frame.surfaces, index, seed)
+            moving = frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics, light.place
+            if moves(*moving):
+                records = frame.sampler.shadow_samples(light.rows(frame.surfaces), seed)
+                found = found + self._boundary(EdgeSamples(frame, records, light))
+        return found
 
     def _boundary(self, samples: EdgeSamples) -> Tensor:
         """(H · W, C): Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
