@@ -26,7 +26,10 @@ class ShadowLight(NamedTuple):
     @classmethod
     def of(cls, surfaces: Surfaces, index: int, seed: int) -> ShadowLight:
         light = surfaces.scene.casting[index]
-        return cls(index, light, light.draw(_even(1 if light.punctual else MANY, seed).to(surfaces.verts.device)))
+        points = light.draw(_even(1 if light.punctual else MANY, seed).to(surfaces.verts.device))
+        # Neighbours follow one another, for edges are asked before parts of a light.
+        with torch.no_grad():
+            return cls(index, light, points.select(z_order(light.place(points))))
 
     @property
     def place(self) -> Tensor:
@@ -64,6 +67,18 @@ class ShadowLight(NamedTuple):
             return torch.full((len(self.points.index),), -1, dtype=torch.int32)
         mesh = next(i for i, mesh in enumerate(surfaces.scene.meshes) if mesh is self.light.mesh)
         return (self.points.index + surfaces.first_faces[mesh]).int().cpu()
+
+
+def z_order(place: Tensor) -> Tensor:
+    """(K,) int64: places (K, 3) in the order of a Z-curve through the cube around them (Morton 1966)."""
+    low, high = place.amin(0), place.amax(0)
+    size = (high - low).amax()
+    cell = ((place - low) / torch.where(size > 0, size, 1.0) * 1023.99).long()
+    code = torch.zeros(len(place), dtype=torch.int64, device=place.device)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return code.argsort()
 
 
 def _even(count: int, seed: int) -> Tensor:

@@ -23,13 +23,15 @@ namespace edgegrad {
 
 namespace {
 
-constexpr int64_t pair_tests = 1 << 23;       // of edges before points of lights
-constexpr int64_t fewest_segments = 1 << 10;  // that edges are cut into
+constexpr int64_t pair_tests = 1 << 23;  // of edges before points of lights
+// Into how many segments edges are cut, along themselves before a light that is a point, else by parts of the light.
+constexpr int64_t cuts = 1 << 10, cuts_of_light = 1 << 14;
 constexpr int64_t most_segments = 1 << 16;
 constexpr int most_of_edge = 64;
-constexpr int pilots = 4;                                              // a segment
-constexpr double floor_share = 0.2;                                    // of the density that pilots do not decide
-constexpr double samples_a_pixel = 24, samples_a_pixel_of_many = 192;  // of a border; of the mean one of many points
+constexpr int64_t points_of_segment = 8;  // at least, of a part of a light
+constexpr int pilots = 4;                 // a segment
+constexpr double floor_share = 0.2;       // of the density that pilots do not decide
+constexpr double samples_a_pixel = 24;    // of the border of a point's shadow
 constexpr int64_t fewest_samples = 256;
 
 struct Segment {
@@ -62,10 +64,22 @@ std::vector<Segment> segments_of(const BackwardView<T>& view, const std::vector<
         }
         return out;
     }
-    const double each = systematic.total() / double(fewest_segments);
     for (size_t i = 0; i < edges.size(); ++i) {
-        const int n = int(std::clamp(std::round(systematic.measure_of(int64_t(i)) / each), 1.0, double(most_of_edge)));
-        for (int k = 0; k < n; ++k) out.push_back({edges[i], double(k) / n, double(k + 1) / n});
+        const ShadowEdge& edge = edges[i];
+        const int64_t points = edge.end - edge.first;
+        const bool by_light = points > 1;
+        const double share = systematic.measure_of(int64_t(i)) / systematic.total();
+        const double most = by_light ? std::max<double>(1, double(points / points_of_segment)) : most_of_edge;
+        const int64_t n = int64_t(std::clamp(std::round(share * double(by_light ? cuts_of_light : cuts)), 1.0, most));
+        for (int64_t k = 0; k < n; ++k) {
+            Segment segment{edge, double(k) / double(n), double(k + 1) / double(n)};
+            if (by_light) {
+                segment.t0 = 0, segment.t1 = 1;
+                segment.edge.first = edge.first + points * k / n, segment.edge.end = edge.first + points * (k + 1) / n;
+                segment.edge.measure *= double(segment.points()) / double(points);
+            }
+            out.push_back(segment);
+        }
     }
     return out;
 }
@@ -307,14 +321,15 @@ void add_shadows(const BackwardView<T>& view, const LightPoints& lights, int64_t
         length[s.edge.light] += s.share() * found[i].length / pilots;
     }
     profile.shadow[1] += watch.lap();
+    // No more rays than an eighth of the image's, for each is one of a light and one of the camera, alone; and so many
+    // where lights have an extent, for each of their points casts a shadow of its own.
+    const int64_t most = std::max(fewest_samples, int64_t(view.camera.width) * view.camera.height * view.image.spp / 8);
     double wanted = 0;
     for (int64_t k = 0; k < lights.lights; ++k)
-        wanted += length[k] * (lights.first[k + 1] - lights.first[k] > 1 ? samples_a_pixel_of_many : samples_a_pixel);
+        wanted += lights.first[k + 1] - lights.first[k] > 1 ? double(most) : samples_a_pixel * length[k];
     for (int64_t i = 0; i < count; ++i)
         measure[i] += floor_share * (known > 0 ? known : 1) * segments[i].edge.measure *
                       (segments[i].t1 - segments[i].t0) / prior;
-    // No more rays than an eighth of the image's, for each is one of a light and one of the camera, alone.
-    const int64_t most = std::max(fewest_samples, int64_t(view.camera.width) * view.camera.height * view.image.spp / 8);
     const int64_t n = samples >= 0 ? samples : std::clamp(int64_t(std::min(wanted, 1e15)), fewest_samples, most);
     profile.shadow_samples += n;
     if (view.options.dry || n == 0) return;
