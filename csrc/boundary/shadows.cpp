@@ -255,15 +255,15 @@ class ShadowChunk {
           light_rays_(view, lights),
           samples_(view, source_, std::move(contraction)) {}
 
-    // The i-th sample, at a fraction of a segment: the points of the light one after another, each with all of the
-    // segment. Where these are many, samples fall on different ones, and would all meet the same place of the segment
-    // if it were not moved on by the golden ratio from one to the next.
-    void add(const Segment& segment, int64_t index, double fraction, int64_t i, double weight) {
+    // At a fraction of a segment: the points of the light one after another, each with all of the segment. Where these
+    // are more than samples, samples would all meet the same place of the segment if it were not moved on by the golden
+    // ratio from one point to the next.
+    void add(const Segment& segment, int64_t index, double fraction, double weight) {
         const int64_t count = segment.points();
         const double at = fraction * double(count);
         const int64_t point = std::min(int64_t(at), count - 1);
         double t = at - double(point);
-        if (count > 1) t += double(i) * 0.6180339887498949, t -= std::floor(t);
+        if (count > 1) t += double(segment.edge.first + point) * 0.6180339887498949, t -= std::floor(t);
         light_rays_.add(segment.edge.edge, points_[segment.edge.first + point], index,
                         segment.t0 + t * (segment.t1 - segment.t0), weight);
         if (light_rays_.is_full()) cast();
@@ -306,7 +306,7 @@ void add_shadows(const BackwardView<T>& view, const LightPoints& lights, int64_t
         ShadowChunk chunk(view, lights, edges.points, Pilots(view, lights, found));
         for (int64_t i = first; i < last; ++i) {
             const double shift = to_unit(hash(pilot_seed, i));
-            for (int k = 0; k < pilots; ++k) chunk.add(segments[i], i, (k + shift) / pilots, k, 1);
+            for (int k = 0; k < pilots; ++k) chunk.add(segments[i], i, (k + shift) / pilots, 1);
         }
         chunk.finish(unused);
     });
@@ -344,7 +344,7 @@ void add_shadows(const BackwardView<T>& view, const LightPoints& lights, int64_t
             k = k < 0 ? systematic.primitive(position) : systematic.primitive(position, k);
             const double fraction =
                 std::clamp((position - systematic.begin_of(k)) / systematic.measure_of(k), 0.0, 1.0);
-            chunk.add(segments[k], k, fraction, i, systematic.weight(k) * segments[k].share());
+            chunk.add(segments[k], k, fraction, systematic.weight(k) * segments[k].share());
         }
         chunk.finish(grad);
     });

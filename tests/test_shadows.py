@@ -1,0 +1,148 @@
+"""Borders of shadows, against exact areas: a rectangle casts its shadow on a plane, and a camera below it sees nothing else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from finite_differences import check, estimate
+from torch import Tensor
+
+import edgegrad as eg
+
+FOCAL, HEIGHT, SIZE = 45.0, 0.9, 96  # of the camera: px, world units above the plane, px
+CORNERS = ((-0.3, -0.2), (0.35, -0.2), (0.35, 0.25), (-0.3, 0.25))
+DOUBLE = torch.float64
+
+
+def vector(*numbers: float) -> Tensor:
+    return torch.tensor(numbers, dtype=DOUBLE)
+
+
+class Setting:
+    """All that may move: the caster's corners (4, 2) and height, the light, the plane's height, the camera."""
+
+    def __init__(self) -> None:
+        self.corners = torch.tensor(CORNERS, dtype=DOUBLE)
+        self.height = torch.tensor(1.4, dtype=DOUBLE)
+        self.light = vector(0.2, 0.1, 4.0)  # its place, or the direction towards it
+        self.ground = torch.tensor(0.0, dtype=DOUBLE)
+        self.camera = vector(0.05, -0.04, HEIGHT)
+        self.focal = torch.tensor(FOCAL, dtype=DOUBLE)
+
+    def scene(self, lights: Callable[[Setting], eg.Mesh | object]) -> eg.Scene:
+        caster = torch.cat([self.corners, self.height.expand(4, 1)], 1)
+        square = torch.tensor([[-9.0, -9], [9, -9], [9, 9], [-9, 9]], dtype=DOUBLE)
+        ground = torch.cat([square, self.ground.expand(4, 1)], 1)
+        faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+        return eg.Scene([eg.Mesh(ground, faces), eg.Mesh(caster, faces)], lights=[lights(self)])
+
+    def view(self) -> eg.Camera:
+        """Straight down, x to the right and y down in the image."""
+        rotation = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], dtype=DOUBLE)
+        pose = torch.cat([rotation, (-rotation @ self.camera)[:, None]], 1)
+        pose = torch.cat([pose, vector(0, 0, 0, 1)[None]])
+        zero, one, middle = (torch.tensor(n, dtype=DOUBLE) for n in (0.0, 1.0, SIZE / 2))
+        K = torch.stack([self.focal, zero, middle, zero, self.focal, middle, zero, zero, one]).reshape(3, 3)
+        return eg.Camera(world_to_camera=pose, K=K, size=(SIZE, SIZE))
+
+    def shadow(self, light: Tensor, infinite: bool) -> Tensor:
+        """Its corners in the image (4, 2)."""
+        p = torch.cat([self.corners, self.height.expand(4, 1)], 1)
+        d = -light.expand(4, 3) if infinite else p - light
+        y = p + ((self.ground - self.height) / d[:, 2])[:, None] * d
+        x = (y - self.camera)[:, :2] * torch.tensor([1.0, -1.0]) * self.focal / (self.camera[2] - self.ground)
+        return x + SIZE / 2
+
+
+def moment(polygon: Tensor) -> Tensor:
+    """∫ (1 + x / 40) dx over a polygon (N, 2), by Green's theorem."""
+    x, y = polygon.unbind(1)
+    x1, y1 = x.roll(-1), y.roll(-1)
+    wedge = x * y1 - x1 * y
+    return (wedge.sum() / 2 + ((x + x1) * wedge).sum() / 6 / 40) * torch.sign(wedge.sum().detach())
+
+
+def adjoint() -> Tensor:
+    """Whose image through a tent filter is 1 + x / 40, away from the border."""
+    x = torch.arange(SIZE, dtype=DOUBLE) + 0.5
+    return (1 + x / 40).expand(SIZE, SIZE)[:, :, None]
+
+
+def visibility(hits: eg.Hits) -> Tensor:
+    (light,) = hits.lights
+    return hits.visible_from(light, hits.light_points(light))[:, None]
+
+
+def point(s: Setting) -> object:
+    return eg.PointLight(s.light)
+
+
+def sun(s: Setting) -> object:
+    return eg.DirectionalLight(-s.light)
+
+
+def spot(s: Setting) -> object:
+    return eg.SpotLight(s.light, vector(0, 0, -1), outer_angle=1.0)
+
+
+LIGHTS = {"point": point, "sun": sun, "spot": spot}
+MOTIONS: dict[str, Callable[[Setting, Tensor], None]] = {
+    "caster moves": lambda s, t: setattr(s, "corners", s.corners + t * vector(1.0, 0.3)),
+    "caster grows": lambda s, t: setattr(s, "corners", s.corners * (1 + t)),
+    "one corner": lambda s, t: setattr(s, "corners", s.corners + t * torch.eye(4, dtype=DOUBLE)[:, :1] * vector(1, 0.5)),
+    "caster rises": lambda s, t: setattr(s, "height", s.height + t),
+    "light moves": lambda s, t: setattr(s, "light", s.light + t * vector(1.0, -0.4, 0.3)),
+    "ground rises": lambda s, t: setattr(s, "ground", s.ground + t),
+    "camera moves": lambda s, t: setattr(s, "camera", s.camera + t * vector(0.7, 0.2, 0.5)),
+    "focal length": lambda s, t: setattr(s, "focal", s.focal * (1 + t)),
+}
+
+
+def gradient(motion: str, lights: Callable[[Setting], object], seed: int, **options: object) -> float:
+    setting, theta = Setting(), torch.zeros((), dtype=DOUBLE, requires_grad=True)
+    MOTIONS[motion](setting, theta)
+    image = eg.render(
+        setting.scene(lights), setting.view(), spp=4, seed=seed, filter="tent", shader=visibility, creases=False, **options
+    )
+    return torch.autograd.grad((image * adjoint()).sum(), theta)[0].item()
+
+
+def exact(motion: str, points: Tensor | None = None, infinite: bool = False) -> float:
+    """Of what is lit, minus the shadow; the mean over points of a light as offsets (K, 3) if given."""
+    setting, theta = Setting(), torch.zeros((), dtype=DOUBLE, requires_grad=True)
+    MOTIONS[motion](setting, theta)
+    offsets = torch.zeros((1, 3), dtype=DOUBLE) if points is None else points
+    shadows = [moment(setting.shadow(setting.light + offset, infinite)) for offset in offsets]
+    return -torch.autograd.grad(torch.stack(shadows).mean(), theta)[0].item()
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_shadow_of_a_rectangle(motion: str, light: str) -> None:
+    found = estimate([gradient(motion, LIGHTS[light], seed) for seed in range(6)])
+    check(f"{light}, {motion}", exact(motion, infinite=light == "sun"), found)
+
+
+U, V = vector(0.5, 0.0, 0.1), vector(0.0, 0.4, 0.0)  # half the sides of an emissive rectangle
+
+
+def panel(s: Setting) -> object:
+    return eg.AreaLight.rectangle(s.light, U, V, 1.0)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_penumbra_of_a_rectangle(motion: str) -> None:
+    """The mean over all points of the panel: Gauss and Legendre's rule with five points a side."""
+    nodes = torch.tensor([-math.sqrt(5 + 2 * math.sqrt(10 / 7)), -math.sqrt(5 - 2 * math.sqrt(10 / 7)), 0.0])
+    nodes = torch.cat([nodes, -nodes[:2].flip(0)]).double() / 3
+    heavy, light = (322 + 13 * math.sqrt(70)) / 900, (322 - 13 * math.sqrt(70)) / 900
+    weight = vector(light, heavy, 128 / 225, heavy, light) / 2
+    truth = 0.0
+    for a, wa in zip(nodes, weight, strict=True):
+        for b, wb in zip(nodes, weight, strict=True):
+            truth += float(wa * wb) * exact(motion, (a * U + b * V)[None])
+    found = estimate([gradient(motion, panel, seed) for seed in range(8)])
+    check(f"panel, {motion}", truth, found)
