@@ -32,7 +32,7 @@ constexpr int64_t points_of_segment = 8;  // at least, of a part of a light
 constexpr int pilots = 4;                 // a segment
 constexpr double floor_share = 0.2;       // of the density that pilots do not decide
 constexpr double samples_a_pixel = 24;    // of the border of a point's shadow
-constexpr int64_t fewest_samples = 256;
+constexpr int64_t fewest_samples = 256, most_samples = 1 << 18;
 
 struct Segment {
     ShadowEdge edge;
@@ -323,7 +323,8 @@ void add_shadows(const BackwardView<T>& view, const LightPoints& lights, int64_t
     profile.shadow[1] += watch.lap();
     // No more rays than an eighth of the image's, for each is one of a light and one of the camera, alone; and so many
     // where lights have an extent, for each of their points casts a shadow of its own.
-    const int64_t most = std::max(fewest_samples, int64_t(view.camera.width) * view.camera.height * view.image.spp / 8);
+    const int64_t most = std::clamp(int64_t(view.camera.width) * view.camera.height * view.image.spp / 8, fewest_samples,
+                                    most_samples);
     double wanted = 0;
     for (int64_t k = 0; k < lights.lights; ++k)
         wanted += lights.first[k + 1] - lights.first[k] > 1 ? double(most) : samples_a_pixel * length[k];
