@@ -55,10 +55,14 @@ class CurveRecords(NamedTuple):
     alpha_row_of: Tensor  # (Q,) int64, the sample of a row by texels of alpha
     alpha: Tensor  # (Q,) int64
     by_alpha: Tensor  # (Q,) float64
-    light_row_of: Tensor  # (L,) int64, the sample of a row by points of lights, of borders of shadows: the first surface is that
+    light_row_of: (
+        Tensor  # (L,) int64, the sample of a row by points of lights, of borders of shadows: the first surface is that
+    )
     # in the light, the second that in the shadow
     light: Tensor  # (L,) int64
-    by_light: Tensor  # (L, 3) float64, by the place in camera coordinates, or by the direction towards a light at infinity
+    by_light: (
+        Tensor  # (L, 3) float64, by the place in camera coordinates, or by the direction towards a light at infinity
+    )
 
 
 class LightRows(NamedTuple):
@@ -334,7 +338,9 @@ class Sampler:
                 lights=core.LightPoints(**{n: v.cpu().contiguous().numpy() for n, v in rows._asdict().items()}),
                 samples=samples,
                 threads=torch.get_num_threads(),
-                adjoint=np.ones((*self.coverage.shape, request.scene.background.shape[-1]), self.coverage.numpy().dtype),
+                adjoint=np.ones(
+                    (*self.coverage.shape, request.scene.background.shape[-1]), self.coverage.numpy().dtype
+                ),
                 hits=kernel_hits(self._hits),
             )
             return _record(CurveRecords, found)

@@ -19,7 +19,7 @@ MANY = 1024  # points that stand for a light with an extent, other ones with eac
 class ShadowLight(NamedTuple):
     """A light as edges see it."""
 
-    index: int  # in scene.casting
+    number: int  # in scene.casting
     light: Light
     points: LightPoints
 

@@ -213,7 +213,7 @@ class EdgeSamples:
         if light is not None:
             points = light.points.select(frame.here(records.light)[self.sample])
             lit = frame.here(which == 0).to(frame.dtype)
-            forced = Forced(light.index, points, lit, torch.ones_like(lit, dtype=torch.bool))
+            forced = Forced(light.number, points, lit, torch.ones_like(lit, dtype=torch.bool))
         self.hits = frame.fixed_hits(records.face[sample, which], b, records.x[sample], seed, forced=forced)
         self.to_background = frame.here(torch.where(records.face == -1, records.factor, 0).sum(1))
         q = frame.view.in_camera(frame.surfaces.verts)

@@ -35,7 +35,9 @@ Parts = Callable[[Moved], list[eg.Mesh]]
 
 def lit(mesh: eg.Mesh, smooth: bool = False) -> eg.Mesh:
     normals = eg.vertex_normals(mesh.verts, mesh.faces) if smooth else None
-    return mesh.replace(material=eg.Material(base_color=0.7), normals=normals, colors=torch.ones((len(mesh.verts), 1), dtype=F64))
+    return mesh.replace(
+        material=eg.Material(base_color=0.7), normals=normals, colors=torch.ones((len(mesh.verts), 1), dtype=F64)
+    )
 
 
 def of(mesh: trimesh.Trimesh) -> eg.Mesh:
@@ -67,7 +69,9 @@ def terrain(n: int = 24) -> eg.Mesh:
 
 
 def triangle() -> eg.Mesh:
-    return eg.Mesh(torch.tensor([[0.6, 0, 0], [-0.3, 0.5, 0.1], [-0.3, -0.5, -0.1]], dtype=F64), torch.tensor([[0, 1, 2]]))
+    return eg.Mesh(
+        torch.tensor([[0.6, 0, 0], [-0.3, 0.5, 0.1], [-0.3, -0.5, -0.1]], dtype=F64), torch.tensor([[0, 1, 2]])
+    )
 
 
 def lamp_shade() -> eg.Mesh:
@@ -83,16 +87,19 @@ def lamp_shade() -> eg.Mesh:
 # -- lights -------------------------------------------------------------------------------------------------------------
 
 
-def point(m: Moved, at: Tensor = vector(1.1, -0.7, 2.4)) -> object:
+LAMP = vector(1.1, -0.7, 2.4)
+
+
+def point(m: Moved, at: Tensor = LAMP) -> object:
     return eg.PointLight(at + m.by(LIGHT), 10.0)
 
 
-def sun(m: Moved, at: Tensor = vector(1.1, -0.7, 2.4)) -> object:
+def sun(m: Moved, at: Tensor = LAMP) -> object:
     return eg.DirectionalLight(-(at + m.by(LIGHT)), 1.5)
 
 
 def spot(m: Moved) -> object:
-    at = vector(1.1, -0.7, 2.4) + m.by(LIGHT)
+    at = LAMP + m.by(LIGHT)
     return eg.SpotLight(at, vector(-1.1, 0.7, -2.0), 10.0, inner_angle=0.2, outer_angle=0.6)
 
 
@@ -126,12 +133,19 @@ def above(mesh: eg.Mesh, smooth: bool = False, shift: Tensor = SHIFT) -> Parts:
 
 def sphere_on_sphere(m: Moved) -> list[eg.Mesh]:
     big, small = sphere(3, 0.45, vector(0, 0, 0.5)), sphere(2, 0.25, vector(0.25, -0.1, 1.2))
-    return [ground(Moved(CASTER, m.theta)), lit(big).transformed(t=m.by(RECEIVER)), lit(small).transformed(t=m.by(CASTER))]
+    return [
+        ground(Moved(CASTER, m.theta)),
+        lit(big).transformed(t=m.by(RECEIVER)),
+        lit(small).transformed(t=m.by(CASTER)),
+    ]
 
 
 def across_a_border(m: Moved) -> list[eg.Mesh]:
     """Part of the shadow falls beside the receiver."""
-    return [lit(plane(0.5)).transformed(t=m.by(RECEIVER)), lit(triangle()).transformed(t=vector(0.3, 0.1, 1) + m.by(CASTER))]
+    return [
+        lit(plane(0.5)).transformed(t=m.by(RECEIVER)),
+        lit(triangle()).transformed(t=vector(0.3, 0.1, 1) + m.by(CASTER)),
+    ]
 
 
 def alone(mesh: eg.Mesh, smooth: bool) -> Parts:
@@ -151,7 +165,10 @@ def grazing(m: Moved) -> list[eg.Mesh]:
         torch.tensor([[-2, -0.02, -1.2], [2, -0.02, -1.2], [2, 0.02, 1.2], [-2, 0.02, 1.2]], dtype=F64),
         torch.tensor([[0, 1, 2], [0, 2, 3]]),
     )
-    return [lit(strip).transformed(t=m.by(RECEIVER)), lit(triangle()).transformed(t=vector(0.2, -0.5, 0.3) + m.by(CASTER))]
+    return [
+        lit(strip).transformed(t=m.by(RECEIVER)),
+        lit(triangle()).transformed(t=vector(0.2, -0.5, 0.3) + m.by(CASTER)),
+    ]
 
 
 class Case(NamedTuple):
@@ -166,15 +183,17 @@ class Case(NamedTuple):
         return eg.Scene(self.parts(m), lights=[self.light(m)]), self.camera(m)
 
     def camera(self, m: Moved) -> eg.Camera:
-        camera = eg.Camera.look_at(
-            eye=(1.2, -3.5, 2.6), target=(0, 0, 0.3), up=(0, 0, 1), fov_y=42, size=(64, 64)
-        ).to(F64)
+        camera = eg.Camera.look_at(eye=(1.2, -3.5, 2.6), target=(0, 0, 0.3), up=(0, 0, 1), fov_y=42, size=(64, 64)).to(
+            F64
+        )
         shift = torch.cat([m.by(CAMERA), torch.zeros(1, dtype=F64)])
         move = torch.cat([torch.zeros((4, 3), dtype=F64), shift[:, None]], 1)
         camera = camera.replace(world_to_camera=camera.world_to_camera + move)
         if not self.crop:
             return camera
-        K = camera.K * torch.tensor([[6.0], [6.0], [1.0]], dtype=F64) - torch.tensor([[0, 0, 130.0], [0, 0, 200], [0, 0, 0]])
+        K = camera.K * torch.tensor([[6.0], [6.0], [1.0]], dtype=F64) - torch.tensor(
+            [[0, 0, 130.0], [0, 0, 200], [0, 0, 0]]
+        )
         return camera.replace(K=K)
 
 
@@ -191,7 +210,9 @@ CASES = {
         for moves in (CASTER, RECEIVER, LIGHT, CAMERA)
     },
     **{
-        f"sphere of 1,280, {light.__name__}, {moves} moves": Case(above(sphere(3, 0.4, vector(0, 0, 1.0))), light, moves)
+        f"sphere of 1,280, {light.__name__}, {moves} moves": Case(
+            above(sphere(3, 0.4, vector(0, 0, 1.0))), light, moves
+        )
         for light in (spot, panel, bulb)
         for moves in (CASTER, LIGHT)
     },

@@ -92,7 +92,9 @@ LIGHTS = {"point": point, "sun": sun, "spot": spot}
 MOTIONS: dict[str, Callable[[Setting, Tensor], None]] = {
     "caster moves": lambda s, t: setattr(s, "corners", s.corners + t * vector(1.0, 0.3)),
     "caster grows": lambda s, t: setattr(s, "corners", s.corners * (1 + t)),
-    "one corner": lambda s, t: setattr(s, "corners", s.corners + t * torch.eye(4, dtype=DOUBLE)[:, :1] * vector(1, 0.5)),
+    "one corner": lambda s, t: setattr(
+        s, "corners", s.corners + t * torch.eye(4, dtype=DOUBLE)[:, :1] * vector(1, 0.5)
+    ),
     "caster rises": lambda s, t: setattr(s, "height", s.height + t),
     "light moves": lambda s, t: setattr(s, "light", s.light + t * vector(1.0, -0.4, 0.3)),
     "ground rises": lambda s, t: setattr(s, "ground", s.ground + t),
@@ -105,7 +107,14 @@ def gradient(motion: str, lights: Callable[[Setting], object], seed: int, **opti
     setting, theta = Setting(), torch.zeros((), dtype=DOUBLE, requires_grad=True)
     MOTIONS[motion](setting, theta)
     image = eg.render(
-        setting.scene(lights), setting.view(), spp=4, seed=seed, filter="tent", shader=visibility, creases=False, **options
+        setting.scene(lights),
+        setting.view(),
+        spp=4,
+        seed=seed,
+        filter="tent",
+        shader=visibility,
+        creases=False,
+        **options,
     )
     return torch.autograd.grad((image * adjoint()).sum(), theta)[0].item()
 

@@ -170,11 +170,16 @@ class RecordBoundary {
         source.finish(form_);
         const int64_t sample_index = records_.size();
         append(records_.x, {sample.x.x, sample.x.y});
-        const Vec2 normal = in_straight_image(source.normal(sample), sample.n);
+        // Along the rim of a lens there is one side.
+        constexpr bool has_sides = std::derived_from<typename Source::Sample, CurveSample>;
+        Vec2 normal;
+        if constexpr (has_sides) normal = in_straight_image(source.normal(sample), sample.n);
         for (int k = 0; k < CurveRecords::surfaces; ++k) {
             const SurfacePoint p = k < surfaces.count ? surfaces.at[k] : SurfacePoint();
             records_.face.push_back(k < surfaces.count ? int32_t(p.face) : -2);
-            const Barycentrics b = factor[k] != 0 && p.face >= 0 ? aside(p, sample, normal, factor[k] > 0 ? -1 : 1) : p.b;
+            Barycentrics b = p.b;
+            if constexpr (has_sides)
+                if (factor[k] != 0 && p.face >= 0) b = aside(p, sample, normal, factor[k] > 0 ? -1 : 1);
             append(records_.b, {b.u, b.v});
             records_.factor.push_back(factor[k]);
         }
