@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ._derivatives import moves
 from ._mesh_light import MeshLight
 from ._samples import LightRows
 from ._seeds import STEPS, mixed_bits, signed
@@ -30,6 +31,11 @@ class ShadowLight(NamedTuple):
         # Neighbours follow one another, for edges are asked before parts of a light.
         with torch.no_grad():
             return cls(index, light, points.select(z_order(light.place(points))))
+
+    @staticmethod
+    def moves(light: Light) -> bool:
+        """Whether the place of one of its points may be differentiated."""
+        return moves(light.place(light.draw(torch.zeros((1, 3), dtype=torch.float64))))
 
     @property
     def place(self) -> Tensor:

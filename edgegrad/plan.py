@@ -20,6 +20,7 @@ from ._lit import Lighting, check_unlit
 from ._ops import Hits, backward_kernel, forward_kernel, image_room, pass_size
 from ._request import MOVING, SLOTS, Request, Work, as_scene, label, make_request, required
 from ._samples import CURVE_BYTES, SURFACE_BYTES, without_colors
+from ._shadows import ShadowLight
 from ._surfaces import every_face
 from .camera import Camera
 from .mesh import Mesh
@@ -142,8 +143,28 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
         else "shadows=False"
     )
     terms["shadows"] = Term(lights > 0 and lighting.shadows, why if lights else "no lights", samples=lights * shaded)
-    terms["shadow edges"] = Term(False, "what moves at a shadow's border has no gradient yet")
+    terms["shadow edges"] = _shadow_edges(scene, request, lighting)
     return terms
+
+
+def _shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
+    if not scene.casting or not lighting.shadows:
+        return Term(False, "shadows=False" if scene.casting else "no lights")
+    if not request.gradient.visibility:
+        return Term(False, "visibility=False")
+    moving = [name for name in required(request) if name in MOVING]
+    lights = [light for light in scene.casting if moving or ShadowLight.moves(light)]
+    if not lights:
+        return Term(False, "nothing that casts, receives or gives light moves, nor the camera")
+    many = sum(not light.punctual for light in lights)
+    samples = (
+        request.cameras
+        * many
+        * core.most_shadow_samples(request.camera.width, request.camera.height, request.image.spp)
+    )
+    why = f"of {len(lights)} light{'s' * (len(lights) > 1)}: 24 samples a pixel of border"
+    why += ", not counted here" + "; of those with an extent by the rays of the image" * (many > 0)
+    return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
 
 
 def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str, Term]:

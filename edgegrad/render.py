@@ -76,7 +76,7 @@ def render(
     step_spacing     px between the lines along which steps within faces are looked for: those that a shader declares, of which
                      two borders that lie closer may be missed; rims of what alpha cuts out, and borders of nearest texels.
                      Closer lines cost more and err less
-    shadows          of lit scenes: False lets light pass through everything. The motion of a shadow's border has no gradient yet
+    shadows          of lit scenes: False lets light pass through everything
     light_samples    of lit scenes: points drawn of each light that has an extent, for each point that is shaded
 
     A scene with a light, or with a mesh that has a material, is lit: see Scene and Material. It is shaded in PyTorch, as by a

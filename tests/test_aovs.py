@@ -230,7 +230,7 @@ def finite_difference_ratio(lens: str, k: int, names: list[str], step: float = 5
     for seed in range(4):
         with torch.no_grad():
             high, low = (
-                products(eg.render_aovs(*moved(scene, camera, h * direction), names, 4096, seed)) for h in (step, -step)
+                products(eg.render_aovs(*moved(scene, camera, h * direction), names, 8192, seed)) for h in (step, -step)
             )
         for name in names:
             differences[name].append(((high[name] - low[name]) / (2 * step)).item())

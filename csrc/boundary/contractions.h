@@ -219,7 +219,7 @@ class RecordBoundary {
     // A point of a surface moved a little off the curve to the side where it is visible: there alone is it known what
     // lies between it and a light, where the curve is one of contact, and which of two steps along it was taken.
     Barycentrics aside(const SurfacePoint& p, const CurveSample& sample, Vec2 normal, double side) const {
-        constexpr double little = 1e-3, most = 1e-2;  // px; of the face
+        constexpr double little = 1e-5, most = 1e-2;  // px; of the face
         const double size = length(normal);
         if (!(size > 0 && std::isfinite(size))) return p.b;
         const auto corner = corners_of(view_, p.face);

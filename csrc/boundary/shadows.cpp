@@ -289,6 +289,10 @@ class ShadowChunk {
 
 }  // namespace
 
+int64_t most_shadow_samples(int64_t width, int64_t height, int spp) {
+    return std::clamp(width * height * spp / 8, fewest_samples, most_samples);
+}
+
 template <int N, class Contraction, class T>
 void add_shadows(const BackwardView<T>& view, const LightPoints& lights, int64_t samples,
                  const Contraction& contraction, Destination& to, BackwardProfile& profile) {
@@ -323,8 +327,7 @@ void add_shadows(const BackwardView<T>& view, const LightPoints& lights, int64_t
     profile.shadow[1] += watch.lap();
     // No more rays than an eighth of the image's, for each is one of a light and one of the camera, alone; and so many
     // where lights have an extent, for each of their points casts a shadow of its own.
-    const int64_t most =
-        std::clamp(int64_t(view.camera.width) * view.camera.height * view.image.spp / 8, fewest_samples, most_samples);
+    const int64_t most = most_shadow_samples(view.camera.width, view.camera.height, view.image.spp);
     double wanted = 0;
     for (int64_t k = 0; k < lights.lights; ++k)
         wanted += lights.first[k + 1] - lights.first[k] > 1 ? double(most) : samples_a_pixel * length[k];

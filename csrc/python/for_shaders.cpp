@@ -5,6 +5,7 @@
 #include <optional>
 
 #include "backward/backward.h"
+#include "boundary/shadows.h"
 #include "forward/pixel_hits.h"
 #include "forward/places.h"
 #include "forward/trace.h"
@@ -235,6 +236,7 @@ void bind_for_shaders(nb::module_& m) {
              "place"_a.noconvert(), "infinite"_a.noconvert(), "power"_a.noconvert(), "face"_a.noconvert(),
              "first"_a.noconvert());
     m.def("footprints", &footprints, "x"_a.noconvert(), "filter"_a, "width"_a, "height"_a);
+    m.def("most_shadow_samples", &most_shadow_samples, "width"_a, "height"_a, "spp"_a);
     m.def("rays_at", &rays_of, "camera"_a, "x"_a.noconvert(), "threads"_a);
 }
 
