@@ -1,4 +1,5 @@
-"""Pixels that borders of a shader's steps run through: there one point of a face is a poor guess at the whole pixel.
+"""Pixels that borders of a shader's steps, or of shadows, run through: there one point of a face is a poor guess at the whole
+pixel.
 
 A pixel is one of them where a step is on different sides in the pixels around it. What was found in the pixel itself is not
 asked: whether it is shaded again, with other points, must not depend on the points that it then does without, or the mean
@@ -11,7 +12,8 @@ import torch
 from torch import Tensor
 
 from ._check import values_visible
-from ._steps import FLOOR, Steps
+from ._steps import FLOOR, SIGN
+from .hits import Hits
 
 MOST = 8  # points of a face in a pixel
 SHARE = 4  # so many times the points of the first look, in all
@@ -28,16 +30,23 @@ class Borders:
         self._greatest: list[Tensor] = []
         self._known = True
 
-    def add(self, pixel: Tensor, steps: Steps) -> None:
-        """Points of the pixels (N,)."""
-        self._known = self._known and values_visible(*steps.values)
-        if not self._known or not steps.kinds:
+    def add(self, pixel: Tensor, hits: Hits) -> None:
+        """Points of the pixels (N,), after they were shaded."""
+        sides = list(zip(hits._steps.kinds, hits._steps.values, strict=True))
+        # Where a light has an extent each point sees another part of it, and what neighbours see says nothing of borders. Points
+        # that see neither side of a shadow are not asked.
+        lights = [k for k, light in enumerate(hits.lights) if light.punctual]
+        sides += [(SIGN, hits.lit[k] - 0.5 if k in hits.lit else None) for k in lights]
+        self._known = self._known and values_visible(*(values for _, values in sides if values is not None))
+        if not self._known or not sides:
             return
         self._points += torch.bincount(pixel, minlength=len(self._points)).int()
-        for k, (kind, values) in enumerate(zip(steps.kinds, steps.values, strict=True)):
+        for k, (kind, values) in enumerate(sides):
             if k == len(self._least):
                 self._least.append(torch.full_like(self._points, LEVELS, dtype=torch.int16))
                 self._greatest.append(torch.full_like(self._points, -1, dtype=torch.int16))
+            if values is None:
+                continue
             values = values.detach().cpu().double()
             asked = torch.isfinite(values)
             side = (values.floor() % LEVELS if kind == FLOOR else values > 0)[asked].to(torch.int16)

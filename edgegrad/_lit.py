@@ -27,6 +27,8 @@ from .lights import Light, LightPoints, SphericalHarmonics
 from .scene import Scene
 from .shader import render_shaded
 
+POINTS_IN_PENUMBRA = 4  # of a face in a pixel that are shaded
+
 
 class Lighting(NamedTuple):
     """The options of render() for lit scenes."""
@@ -47,7 +49,9 @@ class Lighting(NamedTuple):
             raise RuntimeError(
                 "torch.vmap: expected one scene for all of a batch where it is lit; render them one by one"
             )
-        return render_shaded(scene, camera, self, request, creases, False)
+        # Each point sees another one of a light with an extent.
+        points = POINTS_IN_PENUMBRA if any(not light.punctual for light in scene.casting) else 1
+        return render_shaded(scene, camera, self, request, creases, False, points)
 
     def __call__(self, hits: Hits) -> Tensor:
         return radiance(hits, *self)

@@ -62,6 +62,10 @@ class Hits:
         self._face, self._exact = face, barycentrics
         self._barycentrics = barycentrics.to(surfaces.verts.dtype)
         self._pixel, self._steps = pixel, steps or Steps()
+        self._whole: tuple[Hits, Tensor] | None = None  # of which these are some points, the rows of these
+        self.lit: dict[
+            int, Tensor
+        ] = {}  # (N,) by lights of scene.casting: visible_from(), not numbers where it was not asked
 
     def __len__(self) -> int:
         return len(self._face)
@@ -92,7 +96,12 @@ class Hits:
         pixel = None if self._pixel is None else self._pixel[index]
         forced = None if self._forced is None else self._forced.select(index)
         place = self._face[index], self._exact[index], pixel
-        return Hits(self._surfaces, view, *place, self._rays_at, steps, self._seed[index], forced)
+        some = Hits(self._surfaces, view, *place, self._rays_at, steps, self._seed[index], forced)
+        if self._whole is None:
+            some._whole = self, index
+        else:
+            some._whole = self._whole[0], self._whole[1][index]
+        return some
 
     @property
     def pixel(self) -> Tensor:
@@ -410,10 +419,19 @@ class Hits:
             if not light.punctual:
                 # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
                 spacing = max(spacing, 2.0**-40)
-        lit = visible(s.scene, self._face, self._exact[:, 1:], place, 16 * spacing * size).to(self.position.dtype)
+        lit = visible(s.scene, self._face, self._exact[:, 1:], place, 16 * spacing * size)
+        lit = self._noted(index, lit.to(self.position.dtype))
         if forced is None or forced.light != index:
             return lit
         return torch.where(forced.some, forced.lit.to(lit), lit)
+
+    def _noted(self, light: int, lit: Tensor) -> Tensor:
+        """Known to the whole of which these are some points."""
+        whole, rows = self._whole or (self, torch.arange(len(self), device=lit.device))
+        if values_visible(lit):
+            known = whole.lit.setdefault(light, lit.new_full((len(whole),), torch.nan))
+            known.index_copy_(0, rows, lit.detach())
+        return lit
 
     def _index(self, light: Light) -> int:
         for i, known in enumerate(self.lights):

@@ -39,23 +39,31 @@ CREASES = ("auto", True, False)
 
 
 def render_shaded(
-    scene: Scene, camera: Camera, shader: Shader, request: Request, creases: bool | str, check: bool
+    scene: Scene,
+    camera: Camera,
+    shader: Shader,
+    request: Request,
+    creases: bool | str,
+    check: bool,
+    points: int = 1,
 ) -> Tensor:
-    """The image (H, W, C), or (B, H, W, C) for a batch of cameras."""
+    """The image (H, W, C), or (B, H, W, C) for a batch of cameras; so many points of a face in a pixel are shaded."""
     if not callable(shader):
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
     with shaded_room(request):
-        images = [_Image(Frame(scene, request, k), shader, creases, check).render() for k in range(request.cameras)]
+        images = [
+            _Image(Frame(scene, request, k), shader, creases, check, points).render() for k in range(request.cameras)
+        ]
     return images[0] if camera.batch is None else torch.stack(images)
 
 
 class _Image:
     """The image of one camera of a batch."""
 
-    def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool) -> None:
-        self._frame, self._shader, self._creases, self._check = frame, shader, creases, check
+    def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool, points: int) -> None:
+        self._frame, self._shader, self._creases, self._check, self._points = frame, shader, creases, check, points
         self._channels: int | None = None
         self._kinds: list[str] | None = None  # of the steps that the shader declares
 
@@ -89,11 +97,11 @@ class _Image:
         with torch.no_grad():
             image: Any = 0
             count = 0
-            for found in frame.sampler.pixel_hits(AT_ONCE):
-                sums, steps = self._shaded(found, count)
+            for found in frame.sampler.pixel_hits(AT_ONCE, self._points):
+                sums, hits = self._shaded(found, count)
                 count += len(found.face)
                 image = image + sums
-                borders.add(found.pixel, steps)
+                borders.add(found.pixel, hits)
             again, most = borders.found() if frame.request.image.spp > 1 else (None, 1)
             if again is not None and bool(again.any()):
                 image = image.masked_fill(frame.here(again).reshape(-1, 1), 0.0)
@@ -102,14 +110,13 @@ class _Image:
                     count += len(found.face)
         return frame.composed(image, self._background)
 
-    def _shaded(self, found: PixelRecords, first: int) -> tuple[Tensor, Steps]:
-        """(H · W, C) what hits add to the image, the `first` of those shaded so far and those after it, and the steps asked for
-        there."""
+    def _shaded(self, found: PixelRecords, first: int) -> tuple[Tensor, Hits]:
+        """(H · W, C) what hits add to the image, the `first` of those shaded so far and those after it, and the hits."""
         frame = self._frame
         hits = frame.fixed_hits(found.face, found.b, found.x, frame.seeds("image", len(found.face), first))
         radiance = self._shade(hits).detach()
         weighted = radiance * frame.here(found.weight).to(radiance.dtype)[:, None]
-        return frame.image(found.pixel, weighted), hits._steps
+        return frame.image(found.pixel, weighted), hits
 
     @cached_property
     def _background(self) -> Tensor | None:
