@@ -22,6 +22,7 @@ from ._request import Request
 from ._surfaces import Surfaces
 from ._tree import tensors_in
 from .camera import Camera
+from .environment import Environment
 from .hits import Hits
 from .lights import Light, LightPoints, SphericalHarmonics
 from .scene import Scene
@@ -122,6 +123,8 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
 def _from_light(hits: Hits, light: Light, which: tuple[int, int], surface: _Surface, shadows: bool) -> Tensor:
     """(N, C): f max(0, n·l) V E of one point of a light, `which` of so many."""
     points = hits.light_points(light, *which)
+    if isinstance(light, Environment) and not hits.knows_light(light):
+        points = light.above(points, surface.g)
     with torch.no_grad():
         l = _towards(light, points, surface.position)
         lit = ((dot(surface.n, l) > 0) & (dot(surface.g, l) > 0))[:, 0]

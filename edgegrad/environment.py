@@ -95,6 +95,33 @@ class Environment(Light):
         across = (1 - y * y).clamp(min=0).sqrt()
         return torch.stack([across * phi.sin(), y, -across * phi.cos()], 1)
 
+    def points_at(self, direction: Tensor) -> LightPoints:
+        """Those at unit directions (N, 3) in the world; without derivatives."""
+        with torch.no_grad():
+            d = direction.double()
+            x, y, z = (d if self.rotation is None else normalize(d @ self.rotation.to(d), dim=-1)).unbind(-1)
+            h, w = self._size
+            row = (torch.acos(y.clamp(-1, 1)) * (h / math.pi)).long().clamp(0, h - 1)
+            border = torch.stack([row, row + 1]).double().mul(math.pi / h).cos()
+            turn = (torch.atan2(x, -z) / (2 * math.pi) + 0.5) * w
+            column = turn.long().clamp(0, w - 1)
+            index = row * w + column
+            uv = torch.stack([turn - column, (y - border[0]) / (border[1] - border[0])], 1).clamp(0, 1)
+            return LightPoints(index, uv, self._table[1][index])
+
+    def above(self, points: LightPoints, normal: Tensor) -> LightPoints:
+        """The same directions, those below surfaces with unit normals (N, 3) mirrored to above them: each stands for both."""
+        with torch.no_grad():
+            d, n = self.place(points), normal.detach().double()
+            cosine = (d * n).sum(1, keepdim=True)
+            mirrored = self.points_at(d - 2 * cosine * n)
+            below = cosine[:, 0] < 0
+            return LightPoints(
+                torch.where(below, mirrored.index, points.index),
+                torch.where(below[:, None], mirrored.uv, points.uv),
+                points.density + mirrored.density,
+            )
+
     def place(self, points: LightPoints) -> Tensor:
         d = self._own_directions(points)
         return d if self.rotation is None else normalize(d @ self.rotation.to(d).mT, dim=-1)

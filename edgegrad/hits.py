@@ -433,6 +433,10 @@ class Hits:
             known.index_copy_(0, rows, lit.detach())
         return lit
 
+    def knows_light(self, light: Light) -> bool:
+        """Whether the points of a light are given here, for all the border of one shadow."""
+        return self._forced is not None and self._forced.light == self._index(light)
+
     def _index(self, light: Light) -> int:
         for i, known in enumerate(self.lights):
             if known is light:

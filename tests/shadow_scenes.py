@@ -33,11 +33,18 @@ Lights = Callable[[Moved], object]
 Parts = Callable[[Moved], list[eg.Mesh]]
 
 
-def lit(mesh: eg.Mesh, smooth: bool = False) -> eg.Mesh:
+def lit(mesh: eg.Mesh, smooth: bool = False, base: float = 0.25) -> eg.Mesh:
     normals = eg.vertex_normals(mesh.verts, mesh.faces) if smooth else None
     return mesh.replace(
-        material=eg.Material(base_color=0.7), normals=normals, colors=torch.ones((len(mesh.verts), 1), dtype=F64)
+        material=eg.Material(base_color=base), normals=normals, colors=torch.ones((len(mesh.verts), 1), dtype=F64)
     )
+
+
+def grown(mesh: eg.Mesh, m: Moved, shift: Tensor = SHIFT) -> eg.Mesh:
+    """It grows from the middle of its foot, and moves: both darken a bright ground, so that little cancels."""
+    v = mesh.verts
+    foot = torch.cat([v[:, :2].mean(0), v[:, 2:].amin(0)])
+    return mesh.replace(verts=v + m.by(CASTER, 0.6 * (v - foot) + 0.3 * shift))
 
 
 def of(mesh: trimesh.Trimesh) -> eg.Mesh:
@@ -124,32 +131,32 @@ def image_sky(m: Moved) -> object:
 
 
 def ground(m: Moved) -> eg.Mesh:
-    return lit(plane()).transformed(t=m.by(RECEIVER, vector(0.1, 0.2, 1.0)))
+    return lit(plane(), base=0.8).transformed(t=m.by(RECEIVER, vector(0.1, 0.2, 1.0)))
 
 
 def above(mesh: eg.Mesh, smooth: bool = False, shift: Tensor = SHIFT) -> Parts:
-    return lambda m: [ground(m), lit(mesh, smooth).transformed(t=m.by(CASTER, shift))]
+    return lambda m: [ground(m), lit(grown(mesh, m, shift), smooth)]
 
 
 def sphere_on_sphere(m: Moved) -> list[eg.Mesh]:
     big, small = sphere(3, 0.45, vector(0, 0, 0.5)), sphere(2, 0.25, vector(0.25, -0.1, 1.2))
     return [
         ground(Moved(CASTER, m.theta)),
-        lit(big).transformed(t=m.by(RECEIVER)),
-        lit(small).transformed(t=m.by(CASTER)),
+        lit(big, base=0.8).transformed(t=m.by(RECEIVER)),
+        lit(grown(small, m)),
     ]
 
 
 def across_a_border(m: Moved) -> list[eg.Mesh]:
     """Part of the shadow falls beside the receiver."""
     return [
-        lit(plane(0.5)).transformed(t=m.by(RECEIVER)),
-        lit(triangle()).transformed(t=vector(0.3, 0.1, 1) + m.by(CASTER)),
+        lit(plane(0.5), base=0.8).transformed(t=m.by(RECEIVER)),
+        lit(grown(triangle().transformed(t=vector(0.3, 0.1, 1)), m)),
     ]
 
 
 def alone(mesh: eg.Mesh, smooth: bool) -> Parts:
-    return lambda m: [lit(mesh, smooth).transformed(t=m.by(CASTER))]
+    return lambda m: [lit(grown(mesh, m), smooth)]
 
 
 def warped(mesh: eg.Mesh, smooth: bool) -> Parts:
@@ -166,8 +173,8 @@ def grazing(m: Moved) -> list[eg.Mesh]:
         torch.tensor([[0, 1, 2], [0, 2, 3]]),
     )
     return [
-        lit(strip).transformed(t=m.by(RECEIVER)),
-        lit(triangle()).transformed(t=vector(0.2, -0.5, 0.3) + m.by(CASTER)),
+        lit(strip, base=0.8).transformed(t=m.by(RECEIVER)),
+        lit(grown(triangle().transformed(t=vector(0.2, -0.5, 0.3)), m)),
     ]
 
 

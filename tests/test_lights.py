@@ -497,3 +497,25 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
 def test_what_is_refused(make: Callable[[], Any], error: type[Exception], text: str):
     with pytest.raises(error, match=text):
         make()
+
+
+@pytest.mark.parametrize("image", [False, True])
+def test_directions_above_a_surface_give_the_same_irradiance(image: bool) -> None:
+    """With less noise, from all of them."""
+    seeded = torch.Generator().manual_seed(3)
+    radiance = torch.rand((9, 16, 1), dtype=F64, generator=seeded) ** 3 if image else vector(1.0)
+    turn = torch.linalg.matrix_exp(torch.tensor([[0, -0.3, 0.5], [0.3, 0, -0.2], [-0.5, 0.2, 0]], dtype=F64))
+    sky = eg.Environment(radiance, rotation=turn)
+    points = sky.draw(torch.rand((200_000, 3), dtype=F64, generator=seeded))
+    direction = sky.place(points)
+    again = sky.points_at(direction)
+    assert torch.allclose(sky.place(again), direction, atol=1e-12)
+    assert torch.equal(again.density, points.density)
+    normal = torch.nn.functional.normalize(vector(0.3, 0.5, -0.4), dim=0)
+    above = sky.above(points, normal.expand(len(direction), 3))
+    cosine = sky.place(above) @ normal
+    assert float(cosine.min()) >= 0
+    half = sky.arriving(points, direction)[:, 0] * (direction @ normal).clamp(min=0)
+    whole = sky.arriving(above, direction)[:, 0] * cosine
+    assert float(whole.std()) < 0.7 * float(half.std())
+    assert abs(float(whole.mean() - half.mean())) < 4 * float(half.std()) / len(direction) ** 0.5

@@ -17,7 +17,7 @@ FINE = 24  # rays a pixel, each way: all are shaded
 def adjoint() -> Tensor:
     """Smooth, and of one sign."""
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
-    return (1 + 0.8 * torch.sin(0.08 * x + 0.03 * y - 2.2) + 0.3 * torch.cos(0.11 * y)).double()[:, :, None] / 100
+    return (1.3 + 0.9 * torch.sin(0.05 * x - 1.6) + 0.3 * torch.cos(0.11 * y)).double()[:, :, None] / 100
 
 
 def loss(case: Case, theta: float, seed: int) -> float:
