@@ -1,13 +1,29 @@
 """Meshes, scenes and cameras from files; images come from edgegrad.image.
 
-What colours mean: vertex and face colours of OBJ and PLY files and the texels of every texture are sRGB on disk and
-become linear radiance; factors of materials (glTF baseColorFactor, OBJ Kd) and vertex colours of glTF are linear
-already. All become three float32 channels; lights are dropped, as are normals and everything of a material but its
-base colour. A glTF multiplies the texture, the factor and the vertex colours. Elsewhere, where a file gives several
-looks, the first of these is taken: texture, vertex colours, face colours, the material's colour.
+What colours mean: vertex and face colours of OBJ and PLY files and the texels of textures of colour are sRGB on disk and
+become linear; factors of materials (glTF baseColorFactor, emissiveFactor, OBJ Kd, Ke), vertex colours of glTF and textures of
+data (normals, metallic, roughness) are linear already. All become float32. A glTF multiplies the texture, the factor and the
+vertex colours. Elsewhere, where a file gives several looks, the first of these is taken: texture, vertex colours, face
+colours, the material's colour.
 
-Alpha is dropped, but where a material of a glTF has the alphaMode MASK: the alpha of its texture, or of its vertices
-(COLOR_0), times that of its factor is then the mesh's, with its alphaCutoff. Wrap and filter are those of a glTF's sampler.
+lit=False, the default, takes these colours for radiance. Lights are dropped, as are normals and everything of a material but its
+base colour. Alpha is dropped, but where a material of a glTF has the alphaMode MASK: the alpha of its texture, or of its
+vertices (COLOR_0), times that of its factor is then the mesh's, with its alphaCutoff. Wrap and filter are those of a glTF's
+sampler.
+
+lit=True takes them for base colours:
+
+- glTF: metallic-roughness materials with all five textures, each on its own set of texture coordinates with its own
+  KHR_texture_transform, wraps and filter (mipmaps, but where the sampler says otherwise); KHR_materials_emissive_strength;
+  doubleSided, without which the back of faces is black; alphaMode MASK. BLEND is shown where alpha is 0.5 or more, and cut out
+  elsewhere. A material with KHR_materials_unlit is none, and its colours are radiance. Normals, in the world, where the file
+  has them; else faces are flat. Point, spot and directional lights of KHR_lights_punctual, whose range is without end. Units are
+  glTF's: candela, lux and candela a square metre.
+- OBJ: Lambertian, with Ke for emission, and d and map_d cut out below 0.5. With highlights (Ks, unless illum is 0 or 1) a
+  dielectric, rough by Ns; with Pr or Pm metallic-roughness. vn are its normals.
+- other formats: Lambertian, with the normals of a PLY.
+
+What else a file asks for is said once, in one UserWarning that names it.
 """
 
 from __future__ import annotations
@@ -15,14 +31,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from ._check import check_positive_int
 from ._files import PathLike, check_readable, check_suffix, replacing
-from ._parts import Fault, Part, read_parts
+from ._formats.part import Fault, Wanted
+from ._parts import GLTFS, read_cameras, read_model
+from ._welding import merge, to_mesh
 from .camera import Camera
 from .image import linear_to_srgb, read_image, srgb_to_linear, write_image
 from .mesh import Mesh
@@ -40,39 +57,54 @@ __all__ = [
 ]
 
 
-def load_mesh(path: PathLike, texture: PathLike | Tensor | None = None, materials: bool = True) -> Mesh:
+def load_mesh(
+    path: PathLike, texture: PathLike | Tensor | None = None, materials: bool = True, lit: bool = False
+) -> Mesh:
     """One Mesh from an OBJ, glTF, GLB, PLY, STL, OFF or 3MF file, in the file's units and axes.
 
     Vertices that the file repeats (at texture seams, for normals, in triangle soups) are welded where their float32
     positions are equal; unused ones are left out; polygons become fans of triangles. Texture coordinates are indexed
     apart, v running up. Where welded vertices had different colours, they become `corner_colors`. OFF and 3MF give
     the shape only. What colours mean stands at the top of this module. Parts that look alike (all plain, all with
-    vertex colours, all with face colours, all on one texture) become one Mesh. Files that the file names are read
-    from its folder and below, and from nowhere else.
+    vertex colours, all with face colours, all on one texture; lit, all with one material) become one Mesh. Files that the
+    file names are read from its folder and below, and from nowhere else.
 
     texture    an image file, or (h, w, C) linear radiance, to lay on the file's texture coordinates instead of its look
-    materials  False leaves out the file's textures and material colours, and does not miss their files
+    materials  False leaves out the file's textures and materials, and does not miss their files
+    lit        True: a mesh for lit scenes, with a material and normals; Lambertian where the file's own is left out. Lights of
+               the file come by load_scene
 
     Raises FileNotFoundError (the file, or one that it names), ValueError (another kind of file, damaged, without
     triangles, bad indices or positions, or parts that do not look alike: use load_scene), TypeError, or ImportError
     without trimesh.
     """
+    wanted = Wanted(materials and texture is None, _checked_lit(lit), unwrap=texture is not None)
     with _naming(path):
-        parts = read_parts(path, materials and texture is None, unwrap=texture is not None)
+        parts = read_model(path, wanted).parts
         if texture is not None:
             image = texture if isinstance(texture, Tensor) else read_image(texture, channels=3)
             parts = [part._replace(colors=None, face_colors=None, texture=image) for part in parts]
-        return _to_mesh(_merge(parts))
+        return to_mesh(merge(parts))
 
 
-def load_scene(path: PathLike, materials: bool = True) -> Scene:
+def load_scene(path: PathLike, materials: bool = True, lit: bool = False) -> Scene:
     """A Scene with one Mesh for each part of a file: a primitive at a node of a glTF, a material in an object of an
     OBJ, a solid of an STL, an item of a 3MF. Transformations are applied to the vertices.
 
+    lit   True: with materials, normals and the lights of the file; without lights, one that has none is black
+
     See load_mesh for everything else, and for the errors.
     """
+    wanted = Wanted(materials, _checked_lit(lit), split=True)
     with _naming(path):
-        return Scene([_to_mesh(part) for part in read_parts(path, materials, split=True)])
+        model = read_model(path, wanted)
+        return Scene([to_mesh(part) for part in model.parts], lights=model.lights)
+
+
+def _checked_lit(lit: object) -> bool:
+    if not isinstance(lit, bool):
+        raise TypeError(f"lit: expected True or False, got {type(lit).__name__} ({lit!r})")
+    return lit
 
 
 def save_camera(path: PathLike, camera: Camera) -> None:
@@ -96,12 +128,24 @@ def save_camera(path: PathLike, camera: Camera) -> None:
         temporary.write_text(json.dumps(fields, indent=1) + "\n", encoding="utf-8")
 
 
-def load_camera(path: PathLike, dtype: torch.dtype = torch.float32) -> Camera:
-    """A camera as save_camera writes it; "projection" may be left out (perspective), and "distortion" (none).
+def load_camera(
+    path: PathLike, dtype: torch.dtype = torch.float32, size: tuple[int, int] | None = None, index: int = 0
+) -> Camera:
+    """A camera as save_camera writes it; "projection" may be left out (perspective), and "distortion" (none). Or one of a glTF or
+    GLB file, where it stands in the scene.
 
-    Raises FileNotFoundError, or ValueError that names the file and the key.
+    size   (H, W) of a glTF's camera, which has none; pixels are square, and its height of view counts, not its aspectRatio
+    index  which of a glTF's, in the order of their nodes
+
+    Raises FileNotFoundError, TypeError, or ValueError that names the file and the key.
     """
-    file = check_readable(path, (".json",))
+    file = check_readable(path, (".json", *GLTFS))
+    if file.suffix.lower() in GLTFS:
+        return _gltf_camera(path, dtype, size, index)
+    if size is not None or index != 0:
+        raise ValueError(
+            f"{path}: expected neither size nor index for a JSON file, which says its size; leave them out"
+        )
     known = {"world_to_camera", "K", "size", "projection", "distortion"}
     try:
         fields = json.loads(file.read_text(encoding="utf-8"))
@@ -123,6 +167,19 @@ def load_camera(path: PathLike, dtype: torch.dtype = torch.float32) -> Camera:
         raise ValueError(f"{path}: {error}") from error
 
 
+def _gltf_camera(path: PathLike, dtype: torch.dtype, size: tuple[int, int] | None, index: int) -> Camera:
+    if size is None:
+        raise ValueError(
+            f"{path}: size: expected (height, width) in pixels for the camera of a glTF, got None; pass size="
+        )
+    height, width = (check_positive_int("size", side, most=1 << 24) for side in size)
+    with _naming(path):
+        found = read_cameras(path, (height, width), dtype)
+        if not isinstance(index, int) or not 0 <= index < len(found):
+            raise ValueError(f"index: expected that of one of {len(found)} cameras in the file, from 0, got {index!r}")
+        return found[index]
+
+
 @contextmanager
 def _naming(path: PathLike) -> Iterator[None]:
     """Makes every fault of a file an error that names the file."""
@@ -134,74 +191,3 @@ def _naming(path: PathLike) -> Iterator[None]:
         if str(error).startswith(str(path)):
             raise
         raise ValueError(f"{path}: {error}") from error
-
-
-def _look_of(part: Part) -> tuple[object, ...]:
-    """What parts that become one mesh have in common."""
-    kinds = part.colors is None, part.face_colors is None, id(part.texture), id(part.alpha)
-    return *kinds, part.cutoff if part.alpha is not None else None, part.wrap, part.filter
-
-
-def _merge(parts: list[Part]) -> Part:
-    """One part from parts that look alike. Raises Fault when they do not."""
-    if len(parts) == 1:
-        return parts[0]
-    if len({_look_of(part) for part in parts}) > 1:
-        names = ", ".join(repr(part.name) for part in parts[:5]) + (", …" if len(parts) > 5 else "")
-        raise Fault(
-            f"expected one mesh, got {len(parts)} parts ({names}) with different textures or kinds of colour; "
-            "use load_scene, which keeps them apart, or materials=False"
-        )
-
-    def joined(name: str) -> list:
-        found = [getattr(part, name) for part in parts]
-        return [] if any(value is None for value in found) else found
-
-    start = np.cumsum([0] + [len(part.verts) for part in parts])
-    return Part(
-        name=parts[0].name,
-        verts=np.concatenate(joined("verts")),
-        faces=np.concatenate([part.faces + n for part, n in zip(parts, start, strict=False)]),
-        uvs=np.concatenate(joined("uvs")) if joined("uvs") else None,
-        texture=parts[0].texture,
-        colors=torch.cat(joined("colors")) if joined("colors") else None,
-        face_colors=torch.cat(joined("face_colors")) if joined("face_colors") else None,
-        alpha=parts[0].alpha,
-        cutoff=parts[0].cutoff,
-        wrap=parts[0].wrap,
-        filter=parts[0].filter,
-    )
-
-
-def _to_mesh(part: Part) -> Mesh:
-    verts, faces = _weld(part.verts, part.faces)
-    images: dict[str, Any] = {}
-    if part.texture is not None or part.alpha is not None:
-        if part.uvs is None:
-            raise Fault(f"part {part.name!r}: expected texture coordinates for its texture, got none; unwrap the mesh")
-        uvs, uv_faces = _weld(part.uvs, part.faces)
-        wrap = part.wrap[0] if part.wrap[0] == part.wrap[1] else part.wrap
-        images = {"uvs": uvs, "uv_faces": uv_faces, "texture": part.texture, "wrap": wrap, "filter": part.filter}
-    if part.alpha is not None:
-        images |= {"alpha": part.alpha, "alpha_cutoff": part.cutoff}
-    if part.colors is None or part.texture is not None:
-        return Mesh(verts, faces, face_colors=part.face_colors if part.texture is None else None, **images)
-    corners = part.colors[torch.from_numpy(part.faces)]
-    colors = corners.new_zeros(len(verts), 3)
-    colors[faces] = corners
-    if torch.equal(colors[faces], corners):
-        return Mesh(verts, faces, colors=colors, **images)
-    return Mesh(verts, faces, corner_colors=corners, **images)
-
-
-def _weld(rows: np.ndarray, index: np.ndarray) -> tuple[Tensor, Tensor]:
-    """The rows that `index` (F, 3) uses, equal ones once, in the order of the file; and the index into them."""
-    used, flat = np.unique(index, return_inverse=True)
-    rows = rows[used]
-    order = np.lexsort(rows.T)
-    starts = np.concatenate([[True], (rows[order[1:]] != rows[order[:-1]]).any(1)])
-    first = np.empty(len(rows), np.int64)
-    first[order] = order[starts][np.cumsum(starts) - 1]  # the sort is stable: a group starts with its first row
-    kept, renumbered = np.unique(first, return_inverse=True)
-    faces = renumbered.reshape(-1)[flat.reshape(-1)].reshape(-1, 3).astype(np.int64)
-    return torch.from_numpy(rows[kept]), torch.from_numpy(faces)
