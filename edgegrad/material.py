@@ -84,6 +84,11 @@ class Texture:
         check_fields(self, fields)
         return dataclasses.replace(self, **fields)
 
+    def __repr__(self) -> str:
+        factor = "" if self.factor is None else f", factor {_short(self.factor)}"
+        own = "" if self.uvs is None else f", {len(self.uvs)} uvs"
+        return f"Texture({tuple(self.image.shape)}, {self.filter}, {' '.join(self.wraps)}{factor}{own})"
+
 
 Parameter = Tensor | Texture
 
@@ -194,6 +199,17 @@ class Material:
         """This material with some fields replaced."""
         check_fields(self, fields)
         return dataclasses.replace(self, **fields)
+
+    def __repr__(self) -> str:
+        given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return f"Material({', '.join(f'{name}={_short(v)}' for name, v in given.items() if v is not None)})"
+
+
+def _short(value: Any) -> str:
+    """Few numbers as they are, many by their shape."""
+    if not isinstance(value, Tensor):
+        return repr(value)
+    return str(value.detach().tolist()) if value.numel() <= 4 else f"tensor {tuple(value.shape)}"
 
 
 def _channels(value: Any) -> int | None:

@@ -405,3 +405,11 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
 def test_what_is_refused(make: Callable[[], Any], error: type[Exception], text: str):
     with pytest.raises(error, match=text):
         make()
+
+
+def test_repr_is_one_line():
+    texture = eg.Texture(torch.rand(4, 5, 3), filter="mipmap", factor=0.5)
+    assert repr(eg.Material(roughness=0.5, base_color=texture, emission=torch.rand(8, 3))) == (
+        "Material(base_color=Texture((4, 5, 3), mipmap, repeat repeat, factor 0.5), roughness=0.5, emission=tensor (8, 3), "
+        "normal_scale=1.0, two_sided=True, alpha_mode='MASK')"
+    )
