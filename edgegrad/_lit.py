@@ -28,7 +28,7 @@ from .lights import Light, LightPoints, SphericalHarmonics
 from .scene import Scene
 from .shader import render_shaded
 
-POINTS_IN_PENUMBRA = 4  # of a face in a pixel that are shaded
+FEWEST_IN_PENUMBRA = 4  # points of a face in a pixel that are shaded, at least; else a quarter of its samples
 
 
 class Lighting(NamedTuple):
@@ -51,7 +51,8 @@ class Lighting(NamedTuple):
                 "torch.vmap: expected one scene for all of a batch where it is lit; render them one by one"
             )
         # Each point sees another one of a light with an extent.
-        points = POINTS_IN_PENUMBRA if any(not light.punctual for light in scene.casting) else 1
+        extended = any(not light.punctual for light in scene.casting)
+        points = max(FEWEST_IN_PENUMBRA, request.image.spp // 4) if extended else 1
         return render_shaded(scene, camera, self, request, creases, False, points)
 
     def __call__(self, hits: Hits) -> Tensor:
