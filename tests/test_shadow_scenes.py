@@ -39,7 +39,8 @@ def gradient(case: Case, seeds: int) -> Estimate:
     for seed in range(seeds):
         theta = torch.zeros((), dtype=torch.float64, requires_grad=True)
         scene, camera = case.at(theta)
-        image = eg.render(scene, camera, spp=64, seed=1000 + seed, light_samples=4)
+        many = {"surface_samples": 30_000, "edge_samples": 30_000}
+        image = eg.render(scene, camera, spp=64, seed=1000 + seed, light_samples=4, **many)
         found.append(torch.autograd.grad((image * adjoint()).sum(), theta)[0].item())
     return estimate(found)
 
