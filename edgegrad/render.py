@@ -58,9 +58,9 @@ def render(
                      little over them, ⅛ to 1/64 where they are most likely occluded. Large textured triangles, and large
                      ones under a rough loss, take whole samples a pixel, at least one
     edge_samples     samples of the gradient at edges and where faces pass through each other, for each camera: an int in all,
-                     or None for 24 a pixel of curve, 1/16 where it is most likely occluded; creases by the size of their
-                     jump, and few where all of one is visible. Default samples of both kinds together take about as long
-                     as the image at most: plan() says where that bound
+                     and as many on the borders of the shadows of each light; or None for 24 a pixel of curve, 1/16 where it is
+                     most likely occluded; creases by the size of their jump, and few where all of one is visible. Default
+                     samples of both kinds together take about as long as the image at most: plan() says where that bound
     visibility       False leaves out what moves at silhouettes and other jumps; the gradient is then that of the shading alone
     filter           "box" (1 px wide), "tent" (2 px) or "gaussian" (σ ½ px, 3 px)
     grad_seed        seed of the gradient's samples; derived from `seed` when None. They also depend on the image by which

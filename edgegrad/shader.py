@@ -155,12 +155,13 @@ class _Image:
         """(H · W, C), or 0: the same over samples on the borders of the shadows that the shader asked for."""
         frame = self._frame
         found: Any = 0
+        count = frame.request.gradient.edge_samples
         for index in sorted(frame.surfaces.shadowing):
             seed = derived_seed(frame.sampler.grad_seed, index + 2)
             light = ShadowLight.of(frame.surfaces, index, seed)
             moving = frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics, light.place
             if moves(*moving):
-                records = frame.sampler.shadow_samples(light.rows(frame.surfaces), seed)
+                records = frame.sampler.shadow_samples(light.rows(frame.surfaces), seed, count)
                 found = found + self._boundary(EdgeSamples(frame, records, light))
         return found
 

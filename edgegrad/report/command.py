@@ -20,7 +20,8 @@ def add_report(commands: Any) -> None:
         "--scene",
         nargs="+",
         metavar="NAME",
-        help="triangle, sphere, tangled, flat-colors, noise, slivers, globe, quad, scan, million (all)",
+        help="triangle, sphere, tangled, flat-colors, noise, slivers, globe, quad, scan, million, lit-point, lit-area, lit-sky "
+        "(all)",
     )
     curve.add_argument(
         "--methods", nargs="+", metavar="NAME",

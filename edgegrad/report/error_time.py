@@ -27,7 +27,7 @@ from .._files import replacing
 from .._kernel import core
 from ..plan import profile
 from .methods import METHODS, Method, missing
-from .references import QUICK, Effort, Reference, disagrees, reference
+from .references import LIT, QUICK, Effort, Reference, disagrees, reference
 from .scenes import SCENES, ReportScene, build
 
 NAME = "error-time"
@@ -165,7 +165,8 @@ class _Run:
             self.bar.update(len(methods))
             return
         self.bar.set_description(f"{name}: reference")
-        correct = reference(scene, self.out, QUICK if self.quick else Effort(), self.say)
+        effort = QUICK if self.quick else LIT if scene.scene.is_lit else Effort()
+        correct = reference(scene, self.out, effort, self.say)
         self._describe(scene, correct)
         for method_name in methods:
             try:
@@ -254,8 +255,8 @@ def settings(size: int, seeds: int, quick: bool) -> dict[str, Any]:
 
 
 def cost_of_terms(scene: ReportScene) -> dict[str, float]:
-    """Median seconds of each part of a step, as edgegrad.profile measures them."""
-    return dict(profile(scene.scene, scene.camera, scene.adjoint))
+    """Median seconds of each part of a step, as edgegrad.profile measures them: of the kernel, so none of lit scenes."""
+    return {} if scene.scene.is_lit else dict(profile(scene.scene, scene.camera, scene.adjoint))
 
 
 def _processor() -> str:

@@ -21,6 +21,7 @@ from ..mesh import Mesh
 from ..render import render
 from ..scene import Scene
 from . import mitsuba
+from .finer import finer_image
 from .scenes import ReportScene
 
 FORWARD_SPP = 16  # of the image in a whole step; the gradient does not depend on it, as the loss is linear
@@ -72,9 +73,10 @@ def rigid(scene: ReportScene, vertex: Tensor) -> dict[str, Tensor]:
 
 def differentiate(scene: ReportScene, **options: object) -> tuple[Tensor, float, float]:
     """(V, 3) float64 by edgegrad, and the seconds of update and image, and of the backward pass."""
-    leaves = [mesh.verts.detach().clone().requires_grad_() for mesh in scene.scene.meshes]
+    leaves = [mesh.verts.detach().clone().requires_grad_() for mesh in scene.moving]
     begin = time.perf_counter()
-    meshes = [mesh.replace(verts=verts) for mesh, verts in zip(scene.scene.meshes, leaves, strict=True)]
+    meshes = [mesh.replace(verts=verts) for mesh, verts in zip(scene.moving, leaves, strict=True)]
+    meshes += scene.scene.meshes[len(meshes) :]
     image = render(scene.scene.replace(meshes=meshes), scene.camera, **options)  # type: ignore[arg-type]
     middle = time.perf_counter()
     image.backward(scene.adjoint)
@@ -178,8 +180,10 @@ class FiniteDifferences:
 
     def _loss(self, verts: Tensor, spp: int, seed: int) -> float:
         with torch.no_grad():
-            image = render(self._scene.moved(verts), self._scene.camera, spp=spp, seed=seed)
-        return float((image.double() * self._scene.adjoint.double()).sum())
+            scene = self._scene.moved(verts)
+            times = round(spp**0.5) if scene.is_lit else 1
+            image = finer_image(scene, self._scene.camera, times, spp=round(spp / times**2), seed=seed)
+        return float((image * self._scene.adjoint.double()).sum())
 
     def _turned(self, vector: Tensor) -> Tensor:
         """The vertices turned about the centroid by |vector| radians; copies of one vertex stay equal to the last bit."""
@@ -194,10 +198,17 @@ class Peer:
     part = "whole"
     budgets: tuple[float, ...] = SPP
 
-    def __init__(self, scene: ReportScene, name: str) -> None:
-        self.name, self._scene = name, scene
+    def __init__(self, scene: ReportScene, name: str, guiding: bool = False) -> None:
+        self.name, self._scene = name + (GUIDED if guiding else ""), scene
         self.version = f"mitsuba {mitsuba.available()}"
-        self._peer = mitsuba.Mitsuba(scene.scene, scene.camera, scene.adjoint, name)
+        self._peer = mitsuba.Mitsuba(
+            scene.scene, scene.camera, scene.adjoint, name, guiding=guiding, objects=scene.objects
+        )
+
+    @classmethod
+    def all(cls, scene: ReportScene, name: str) -> list[Peer]:
+        """In lit scenes also with guided samples of the borders of shadows."""
+        return [cls(scene, name, guiding) for guiding in ((False, True) if scene.scene.is_lit else (False,))]
 
     @property
     def compile_seconds(self) -> float:
@@ -221,6 +232,7 @@ def pixels_per_unit(scene: ReportScene) -> float:
 
 
 PEERS = ("direct_projective", "prb_projective")
+GUIDED = "-guided"
 METHODS: dict[str, Callable[[ReportScene], Sequence[Method]]] = {
     "edgegrad": lambda scene: [Edgegrad(scene)],
     "interior": lambda scene: [Edgegrad(scene, "interior")],
@@ -229,8 +241,8 @@ METHODS: dict[str, Callable[[ReportScene], Sequence[Method]]] = {
     "finite-differences": lambda scene: [
         FiniteDifferences(scene, of_vertices) for of_vertices in ((False, True) if len(scene.verts) <= 3 else (False,))
     ],
-    "direct_projective": lambda scene: [Peer(scene, "direct_projective")],
-    "prb_projective": lambda scene: [Peer(scene, "prb_projective")],
+    "direct_projective": lambda scene: Peer.all(scene, "direct_projective"),
+    "prb_projective": lambda scene: Peer.all(scene, "prb_projective"),
 }
 
 

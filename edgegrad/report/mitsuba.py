@@ -16,6 +16,9 @@ import torch
 from torch import Tensor
 
 from ..camera import Camera
+from ..environment import Environment
+from ..lights import PointLight
+from ..material import Material, Texture
 from ..mesh import PLAIN, Mesh
 from ..scene import Scene
 
@@ -60,9 +63,13 @@ class Mitsuba:
     adjoint   (H, W, 3)   ∂loss/∂image, the constant that the image is multiplied with
     boundary  False leaves out what moves at silhouettes (sppp = 0)
     interior  False leaves out the inside of faces (sppc = 0); so it is anyway where no radiance varies over a face
+    guiding   of lit scenes: samples of the borders of shadows are guided, by its octree
+    objects   of the gradient: so many meshes, the first ones; all when None
 
     Its best settings: stops at the first hit, no indirect boundary samples (and so no guiding, which serves only those), the
-    stratified sampler "multijitter", SPLIT interior samples for each boundary sample.
+    stratified sampler "multijitter", SPLIT interior samples for each boundary sample. In lit scenes it stops at the first light,
+    and there are as many indirect boundary samples as interior ones; the shadows of point lights have no gradient there, as
+    Mitsuba finds their borders from points on emitters.
     Biased where radiance jumps across an edge that two faces share: Mitsuba samples no such crease, and at a silhouette may
     take the colour of the face behind it (colours of faces: a cube was 85 % off).
 
@@ -78,6 +85,8 @@ class Mitsuba:
         integrator: str,
         boundary: bool = True,
         interior: bool = True,
+        guiding: bool = False,
+        objects: int | None = None,
     ) -> None:
         if integrator not in INTEGRATORS:
             raise ValueError(f"integrator: expected one of {', '.join(INTEGRATORS)}, got {integrator!r}")
@@ -90,23 +99,25 @@ class Mitsuba:
         dr.set_thread_count(torch.get_num_threads())
         self.compile_seconds = 0.0
         self._boundary = boundary
+        self._lit = scene.is_lit
         self._interior = interior and any(
-            m.colors is not None or m.corner_colors is not None or m.texture is not None for m in scene.meshes
+            m.material is not None or m.colors is not None or m.corner_colors is not None or m.texture is not None
+            for m in scene.meshes
         )
         scene, camera, self._scale = _resized(scene, camera)
         self._warm: set[tuple[int, int, int]] = set()
-        self._integrator = mi.load_dict({"type": integrator, "sppi": 0, "guiding": "none"})
-        self._integrator.max_depth = 1  # an attribute, as direct_projective overrides the setting
+        self._integrator = mi.load_dict({"type": integrator, "sppi": 0, "guiding": "octree" if guiding else "none"})
+        self._integrator.max_depth = 2 if self._lit else 1  # an attribute, as direct_projective overrides the setting
         self._integrator.sample_border_warning = False  # only for filters wider than a pixel
         description = {
             "type": "scene",
             "camera": _sensor(mi, scene, camera),
-            "background": {"type": "constant", "radiance": _rgb(background)},
-            **{f"mesh{i}": _shape(mi, dr, mesh, f"mesh{i}") for i, mesh in enumerate(scene.meshes)},
+            **_lights(mi, scene, background, self._scale),
+            **{f"mesh{i}": _shape(mi, dr, mesh, f"mesh{i}", self._lit) for i, mesh in enumerate(scene.meshes)},
         }
         self._scene = mi.load_dict(description)
         self._params = mi.traverse(self._scene)
-        self._keys = [f"mesh{i}.vertex_positions" for i in range(len(scene.meshes))]
+        self._keys = [f"mesh{i}.vertex_positions" for i in range(len(scene.meshes[:objects]))]
         self._verts = [dr.detach(mi.Float(self._params[key])) for key in self._keys]
         self._adjoint = mi.TensorXf(_array(adjoint))
         dr.eval(self._verts, self._adjoint)
@@ -128,6 +139,7 @@ class Mitsuba:
         sppp = max(1, round(samples / SPLIT)) if self._boundary else 0
         # As attributes: numbers given to mi.render would hold for both kinds of samples.
         self._integrator.sppc, self._integrator.sppp = sppc, sppp
+        self._integrator.sppi = max(1, round(samples)) if self._lit and self._boundary else 0
         self._scene.sensors()[0].sampler().set_sample_count(primal_spp)
         first = None
         if (sppc, sppp, primal_spp) not in self._warm:  # Dr.Jit's kernels hold these numbers
@@ -165,7 +177,8 @@ def _resized(scene: Scene, camera: Camera) -> tuple[Scene, Camera, float]:
     M = camera.world_to_camera.detach().cpu().double().clone()
     M[..., :3, 3] = scale * (M[..., :3, :3] @ center + M[..., :3, 3])
     moved = [mesh.replace(verts=scale * (mesh.verts - center)) for mesh in meshes]
-    return scene.replace(meshes=moved), camera.replace(world_to_camera=M), scale
+    lights = [light.transformed(t=-center).transformed(scale=scale) for light in scene.lights]
+    return scene.replace(meshes=moved, lights=lights), camera.replace(world_to_camera=M), scale
 
 
 def _sensor(mi: Any, scene: Scene, camera: Camera) -> dict[str, Any]:
@@ -201,6 +214,28 @@ def _rgb(color: Tensor) -> dict[str, Any]:
     return {"type": "rgb", "value": color.detach().cpu().double().tolist()}
 
 
+def _lights(mi: Any, scene: Scene, background: Tensor, scale: float) -> dict[str, Any]:
+    """Beside meshes that emit. A black background is none, so that no samples of lights go there."""
+    found: dict[str, Any] = {}
+    for i, light in enumerate(scene.lights):
+        if isinstance(light, PointLight):
+            color = torch.ones(3) if light.color is None else light.color.expand(3)
+            power = torch.as_tensor(light.intensity).detach() * color
+            position = light.position.detach().cpu().double().tolist()
+            found[f"light{i}"] = {"type": "point", "position": position, "intensity": _rgb(power)}
+        elif (
+            isinstance(light, Environment) and light.radiance.dim() == 1 and scene.background is None and light.visible
+        ):
+            found[f"light{i}"] = {"type": "constant", "radiance": _rgb(light.radiance.expand(3))}
+        else:
+            raise ValueError(
+                f"lights[{i}]: expected points, or a constant environment that is seen, got {light!r}; not supported by this peer"
+            )
+    if not scene.is_lit or bool((background != 0).any()):
+        found["background"] = {"type": "constant", "radiance": _rgb(background)}
+    return found
+
+
 def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().cpu().float().contiguous().numpy()
 
@@ -212,7 +247,7 @@ def _by_vertex(verts: int, faces: Tensor, corners: Tensor) -> Tensor | None:
     return values if torch.equal(values[faces], corners) else None
 
 
-def _shape(mi: Any, dr: Any, mesh: Mesh, name: str) -> Any:
+def _shape(mi: Any, dr: Any, mesh: Mesh, name: str, lit: bool) -> Any:
     """A mesh as an emitter of its colours. Vertices are never split, nor faces turned: Mitsuba would take a seam, or an edge
     that both its faces run along in one direction, for two open borders."""
     verts, faces = mesh.verts.detach().cpu().double(), mesh.faces.cpu().long()
@@ -243,16 +278,45 @@ def _shape(mi: Any, dr: Any, mesh: Mesh, name: str) -> Any:
 
     props = mi.Properties()
     props["face_normals"] = True
+    if mesh.material is not None or (lit and mesh.colors is not None and not bool((mesh.colors != 0).any())):
+        _material(mi, props, mesh)
+        return _filled(mi, props, name, verts, faces)
     props["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}})
     props["emitter"] = _two_sided(mi, dr, mi.load_dict(radiance) if isinstance(radiance, dict) else radiance)
+    shape = _filled(mi, props, name, verts, faces, uvs)
+    for key, values in attributes.items():
+        shape.add_attribute(key, 3, _array(values).ravel())
+    return shape
+
+
+def _material(mi: Any, props: Any, mesh: Mesh) -> None:
+    """A Lambertian constant that both sides show, light from the front of a surface that scatters nothing, or black."""
+    material = Material(base_color=0.0) if mesh.material is None else mesh.material
+    given = [
+        1.0 if material.base_color is None else material.base_color,
+        0.0 if material.emission is None else material.emission,
+    ]
+    plain = material.metallic is None and material.roughness is None and mesh.normals is None
+    plain &= mesh.material is None or (mesh.colors is None and mesh.texture is None)
+    plain &= not any(isinstance(value, Texture) or torch.as_tensor(value).dim() > 1 for value in given)
+    if not plain or (material.emission is None) != material.two_sided:
+        raise ValueError(
+            "material: expected a Lambertian constant of both sides, or emission from the front; not supported by this peer"
+        )
+    base, emission = (torch.as_tensor(value).detach().cpu().expand(3) for value in given)
+    diffuse = {"type": "diffuse", "reflectance": _rgb(base)}
+    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": diffuse} if material.two_sided else diffuse)
+    if material.emission is not None:
+        props["emitter"] = mi.load_dict({"type": "area", "radiance": _rgb(emission)})
+
+
+def _filled(mi: Any, props: Any, name: str, verts: Tensor, faces: Tensor, uvs: Tensor | None = None) -> Any:
     shape = mi.Mesh(name, len(verts), len(faces), props, has_vertex_texcoords=uvs is not None)
     params = mi.traverse(shape)
     params["vertex_positions"] = mi.Float(_array(verts).ravel())
     params["faces"] = mi.UInt32(faces.numpy().astype(np.uint32).ravel())
     if uvs is not None:
         params["vertex_texcoords"] = mi.Float(_array(uvs).ravel())
-    for key, values in attributes.items():
-        shape.add_attribute(key, 3, _array(values).ravel())
     params.update()
     return shape
 

@@ -25,7 +25,9 @@ STYLES = {
     "finite-differences": ("finite differences", "#6e6e6e", 1.3, "s"),
     "finite-differences-vertices": ("finite differences", "#6e6e6e", 1.3, "s"),
     "direct_projective": ("direct_projective", "#D55E00", 1.5, "D"),
+    "direct_projective-guided": ("direct_projective, guided", "#D55E00", 1.0, "P"),
     "prb_projective": ("prb_projective", "#CC79A7", 1.5, "D"),
+    "prb_projective-guided": ("prb_projective, guided", "#CC79A7", 1.0, "P"),
 }
 TITLES = {"vertex": "vertices", "translation": "translation", "rotation": "rotation"}
 GAP = 0.062  # of a panel's height, between labels

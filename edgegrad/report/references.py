@@ -39,6 +39,8 @@ class Effort:
     check_seeds: int = 4
 
 
+# Lit scenes are shaded in PyTorch, point by point.
+LIT = Effort(1 << 18, 1 << 21, most=1 << 21)
 QUICK = Effort(1 << 16, 1 << 14, 4.0, 1 << 21, runs=2, check_spp=16, check_seeds=2)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._tree import tensors_in
 from ..camera import Camera
+from ..environment import Environment
 from ..io import load_scene
+from ..lights import AreaLight, Light, PointLight
+from ..material import Material
 from ..mesh import Mesh
 from ..scene import Scene
 
@@ -30,11 +34,17 @@ class ReportScene:
     scene: Scene
     camera: Camera
     adjoint: Tensor  # (H, W, C) ∂loss/∂image
+    objects: int | None = None  # of the gradient: so many meshes, the first ones; all when None
+
+    @property
+    def moving(self) -> Sequence[Mesh]:
+        """The meshes that the gradient is of."""
+        return self.scene.meshes[: self.objects]
 
     @property
     def verts(self) -> Tensor:
-        """(V, 3) float64, of all meshes end to end."""
-        return torch.cat([mesh.verts.double() for mesh in self.scene.meshes])
+        """(V, 3) float64, of these end to end."""
+        return torch.cat([mesh.verts.double() for mesh in self.moving])
 
     @property
     def faces(self) -> int:
@@ -47,10 +57,9 @@ class ReportScene:
 
     def moved(self, verts: Tensor) -> Scene:
         """The scene with other vertices (V, 3)."""
-        parts = verts.split([len(mesh.verts) for mesh in self.scene.meshes])
-        return self.scene.replace(
-            meshes=[mesh.replace(verts=part) for mesh, part in zip(self.scene.meshes, parts, strict=True)]
-        )
+        parts = verts.split([len(mesh.verts) for mesh in self.moving])
+        moved = [mesh.replace(verts=part) for mesh, part in zip(self.moving, parts, strict=True)]
+        return self.scene.replace(meshes=[*moved, *self.scene.meshes[len(moved) :]])
 
     @property
     def fingerprint(self) -> str:
@@ -60,6 +69,9 @@ class ReportScene:
         for mesh in self.scene.meshes:
             tensors += [getattr(mesh, field.name) for field in dataclasses.fields(mesh)[:8]]
             tensors += [] if mesh.alpha is None else [mesh.alpha]
+        if self.scene.is_lit:
+            digest.update(repr((self.objects, [type(light).__name__ for light in self.scene.lights])).encode())
+            tensors += tensors_in(self.scene)
         for tensor in tensors:
             digest.update(b"-" if tensor is None else tensor.detach().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()[:16]
@@ -80,7 +92,8 @@ def build(name: str, size: int = 256, mesh: Path | None = None, **variant: float
     # As users have them: meshes in float32.
     scene, camera = scene.to(torch.float32), camera.to(torch.float64)
     adjoint = noise_adjoint if name == "noise" else smooth_adjoint
-    return ReportScene(name, title, scene, camera, adjoint(size, size, scene.channels).float())
+    objects = 1 if name in LIT else None
+    return ReportScene(name, title, scene, camera, adjoint(size, size, scene.channels).float(), objects)
 
 
 # -- pieces that the tests use as well -------------------------------------------------------------------------------
@@ -293,6 +306,39 @@ def _million(size: int) -> Built:
     return _sphere(size, subdivisions=8)
 
 
+def _lit(size: int, light: Light | Mesh, title: str, subdivisions: int = 6) -> Built:
+    """A black ellipsoid and its shadow on a plane. The gradient is that of the ellipsoid: that of the plane's corners, which all
+    of the image moves, would hide it. Were it lit, each edge of it would be a crease, which Mitsuba does not sample."""
+    ball = sphere(subdivisions)
+    look = Material(base_color=torch.tensor([0.8, 0.6, 0.4], dtype=torch.float64))
+    size_of, at = torch.tensor(
+        [[0.5, 0.3, 0.4], [0.0, 0.0, 1.0]], dtype=torch.float64
+    )  # a turn of a ball would change nothing
+    raised = ball.verts * size_of + at
+    square = 4.0 * torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=torch.float64)
+    plane = Mesh(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=look)
+    meshes = [Mesh(raised, ball.faces, colors=torch.zeros_like(raised)), plane]
+    camera = Camera.look_at((1.2, -3.5, 2.6), (0.0, 0.0, 0.3), (0.0, 0.0, 1.0), 42.0, (size, size))
+    return f"shadow of a black ellipsoid of {len(ball.faces):,} faces, {title}", Scene(meshes, lights=[light]), camera
+
+
+LAMP = (0.9, -0.6, 2.4)
+
+
+def _lit_point(size: int, subdivisions: int = 6) -> Built:
+    return _lit(size, PointLight(torch.tensor(LAMP, dtype=torch.float64), 10.0), "point light", subdivisions)
+
+
+def _lit_area(size: int, subdivisions: int = 6) -> Built:
+    at, u, v = (torch.tensor(x, dtype=torch.float64) for x in (LAMP, (0.0, 0.3, 0.0), (0.4, 0.0, 0.1)))
+    panel = AreaLight.rectangle(at, u, v, 8.0, two_sided=False)  # u × v points down
+    return _lit(size, panel, "area light", subdivisions)
+
+
+def _lit_sky(size: int, subdivisions: int = 6) -> Built:
+    return _lit(size, Environment(torch.ones(3, dtype=torch.float64)), "constant environment", subdivisions)
+
+
 def _scan(size: int, path: Path | None) -> Built:
     from ..cli import framing  # here, since the command line imports the reports
 
@@ -328,4 +374,8 @@ SCENES: dict[str, Callable[..., Built]] = {
     "quad": _quad,
     "scan": _scan,
     "million": _million,
+    "lit-point": _lit_point,
+    "lit-area": _lit_area,
+    "lit-sky": _lit_sky,
 }
+LIT = ("lit-point", "lit-area", "lit-sky")

@@ -231,15 +231,16 @@ def _statistics(found: dict[str, Any]) -> list[str]:
     lines = [f"""## Unbiased
 
 Mean of {fair["seeds"]} seeds against exact integrals, few samples each: z = (mean − exact) / standard error for
-every component of every part and 16 random sums of all pixels. {fair["components"]} components in all, tested
+every component of every part and 16 random sums of all pixels; of lit scenes against finite differences, whose chance is in
+z. {fair["components"]} components in all, tested
 together by Holm's method at {percent(fair["alpha"])}, the chance of any false alarm in a run of all scenes,
 however their components hang together: {verdict}.
 
-| scene | components | largest \\|z\\| | beyond 3 | expected, if independent | deviation of one seed |
-|---|---|---|---|---|---|"""]  # fmt: skip
+| scene | components | largest \\|z\\| | beyond 3 | expected, if independent | deviation of one seed | reference ± |
+|---|---|---|---|---|---|---|"""]  # fmt: skip
     lines += [
         f"| {row['scene']} | {row['components']} | {row['largest']:.2f} | {row['beyond']} | {row['expected']:.1f} "
-        f"| {percent(row['deviation'])} |" for row in fair["rows"]
+        f"| {percent(row['deviation'])} | {percent(row['reference'])} |" for row in fair["rows"]
     ]  # fmt: skip
     lines += [
         f"""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,7 +17,8 @@ from ..render import render
 from ..scene import Scene
 from .cases import CASES
 from .cases.case import Problem, everything, rotation
-from .cases.measure import Running, exact, sample
+from .cases.light import LIT
+from .cases.measure import Effort, Running, differences, exact, sample
 from .exact import exact_image
 from .painted import PAINTED
 from .scenes import (
@@ -64,22 +65,25 @@ def scenes() -> dict[str, Callable[[], Problem]]:
 
 
 def unbiased(quick: bool = False, say: Say = lambda text: None) -> dict[str, Any]:
-    """Mean over seeds against the exact integrals, for every component of every part and 16 random sums of pixels.
+    """Mean over seeds against the exact integrals, for every component of every part and 16 random sums of pixels; of lit scenes
+    against finite differences, for every component of what moves.
 
-    z = (mean − exact) / standard error of the mean is Student's t. All of all scenes are tested together by Holm's method,
-    whatever their dependence: with probability ALPHA or less a run without bias has a rejection at all.
+    z = (mean − exact) / standard error of the mean is Student's t; that of finite differences is in it. All of all scenes are
+    tested together by Holm's method, whatever their dependence: with probability ALPHA or less a run without bias has a
+    rejection at all.
     """
     stats = require("scipy.stats", "scipy", "the test of unbiasedness")
     seeds = SEEDS // 4 if quick else SEEDS
     rows, all_p = [], []
-    for name, build in scenes().items():
+    for name, build in (scenes() | LIT).items():
         say(name)
-        z, deviation = components(build(), seeds)
-        p = 2.0 * stats.t.sf(z.abs().numpy(), seeds - 1)
+        z, freedom, deviation, reference = (lit_components if name in LIT else components)(build(), seeds)
+        p = 2.0 * stats.t.sf(z.abs().numpy(), freedom.numpy())
         all_p.append(torch.from_numpy(p))
         rows.append({
             "scene": name, "components": len(z), "largest": float(z.abs().max()), "beyond": int((z.abs() > 3.0).sum()),
-            "expected": len(z) * 2.0 * float(stats.t.sf(3.0, seeds - 1)), "deviation": deviation,
+            "expected": 2.0 * float(stats.t.sf(3.0, freedom.numpy()).sum()), "deviation": deviation,
+            "reference": reference,
         })  # fmt: skip
     rejected = holm(torch.cat(all_p), ALPHA)
     count = 0
@@ -89,8 +93,14 @@ def unbiased(quick: bool = False, say: Say = lambda text: None) -> dict[str, Any
     return {"seeds": seeds, "alpha": ALPHA, "components": count, "rejected": int(rejected.sum()), "rows": rows}
 
 
-def components(problem: Problem, seeds: int) -> tuple[Tensor, float]:
-    """z of every component that varies; and the relative deviation of the gradient from a single seed."""
+class Components(NamedTuple):
+    z: Tensor  # of every component that varies
+    freedom: Tensor  # degrees of freedom of each
+    deviation: float  # of the gradient from a single seed, relative
+    reference: float  # the standard error of what it is compared with, relative
+
+
+def components(problem: Problem, seeds: int) -> Components:
     assert problem.exact is not None
     image, grads = exact(problem, problem.exact)
     signs = torch.randn((16, image.numel()), dtype=F64, generator=torch.Generator().manual_seed(0))
@@ -106,7 +116,32 @@ def components(problem: Problem, seeds: int) -> tuple[Tensor, float]:
     # What does not vary is right but for the rounding of the input's type.
     fixed = error <= 1e-9 * wanted.abs().max()
     assert bool((off[fixed].abs() <= 1e-5 * wanted.abs().max()).all()), "a component without noise is off"
-    return (off / error)[~fixed], float((error[16:].norm() * math.sqrt(seeds)) / wanted[16:].norm())
+    z = (off / error)[~fixed]
+    deviation = float((error[16:].norm() * math.sqrt(seeds)) / wanted[16:].norm())
+    return Components(z, torch.full_like(z, seeds - 1), deviation, 0.0)
+
+
+def lit_components(problem: Problem, seeds: int) -> Components:
+    """Of the parts alone: the chance of both sides, and the degrees of freedom of Welch (1947)."""
+    effort = Effort(difference_seeds=max(4, seeds // 8))
+    adjoint = problem.cotangent(torch.empty(0))
+    runs = [differences(problem, adjoint, name, 1.0, effort) for name in problem.parts]
+    running = Running()
+    for seed in range(seeds):
+        _, found = sample(problem, seed, **SAMPLES)
+        running.add(torch.cat([g.double().reshape(-1) for g in found.values()]))
+    wanted, squares = (torch.cat([getattr(run, n) for run in runs]) for n in ("mean", "squares"))
+    own, other = (
+        running.squares / (seeds - 1) / seeds,
+        squares / (effort.difference_seeds - 1) / effort.difference_seeds,
+    )
+    error = (own + other).sqrt()
+    freedom = (own + other) ** 2 / (own**2 / (seeds - 1) + other**2 / (effort.difference_seeds - 1))
+    size = float(wanted.norm())
+    return Components(
+        (running.mean - wanted) / error, freedom, float(own.sum().sqrt() * math.sqrt(seeds)) / size,
+        float(other.sum().sqrt()) / size,
+    )  # fmt: skip
 
 
 def holm(p: Tensor, alpha: float) -> Tensor:

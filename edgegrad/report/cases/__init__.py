@@ -1,8 +1,8 @@
 """The cases of the stability report."""
 
-from . import camera, coincident, geometry, scale, stiff
+from . import camera, coincident, geometry, light, scale, stiff
 from .case import Case
 
 CASES: dict[str, Case] = {
-    case.name: case for module in (scale, camera, geometry, coincident, stiff) for case in module.group.cases
+    case.name: case for module in (scale, camera, geometry, coincident, stiff, light) for case in module.group.cases
 }

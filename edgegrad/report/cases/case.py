@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ...camera import Camera
 from ...mesh import PLAIN, Mesh
+from ...reference import render as twin
 from ...scene import Scene
 from ..exact import exact_image
 from ..scenes import smooth_adjoint
@@ -29,7 +30,10 @@ class Problem:
     parts      where the gradient is taken; that of each is compared relative to its own size
     make       parts ↦ (scene, camera)
     exact      parts ↦ the image (H, W, C) without sampling, differentiable; None where only finite differences can tell
+    image      (scene, camera) ↦ the image without sampling, where there are finite differences
+    equal      parts ↦ (scene, camera) with the same image, of which they are taken; `make` when None
     steps      of those, one for each part
+    finer      so many times as many pixels each way, of which they take the mean: a lit face is shaded about once a pixel
     zero       of the adjoint's norm: what a reference may be by rounding that is zero
     reference  in words
     """
@@ -38,6 +42,9 @@ class Problem:
     make: Callable[[Parts], View]
     exact: Callable[[Parts], Tensor] | None
     reference: str = "exact integrals"
+    image: Callable[[Scene, Camera], Tensor] = lambda scene, camera: twin(scene, camera, grid=16)
+    equal: Callable[[Parts], View] | None = None
+    finer: int = 1
     steps: dict[str, float] = field(default_factory=dict)
     zero: float = 1e-9
     adjoint: Tensor | None = None  # (H, W, C), smooth_adjoint when None

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ...reference import render as twin
 from ...render import render
+from ..finer import finer_image
 from .case import Case, Parts, Problem
 
 TOLERANCE = 0.02  # what may be missing, beyond four standard errors
@@ -72,8 +72,8 @@ def measure(case: Case, effort: Effort) -> dict[str, Any]:
 
 def compare(problem: Problem, effort: Effort) -> dict[str, Any]:
     """Relative errors of the image and of the gradient of each part, with the standard errors of both sides together."""
-    begin = time.perf_counter()
     wanted_image, wanted = reference(problem, effort)
+    begin = time.perf_counter()
     background = problem.make(problem.parts)[0].background
     # What the scene adds to its background is what an image can get wrong.
     behind = 0.0 if background is None or problem.faint else background.double()
@@ -158,29 +158,35 @@ def exact(problem: Problem, integrals: Callable[[Parts], Tensor]) -> tuple[Tenso
 
 
 def by_differences(problem: Problem, effort: Effort) -> tuple[Tensor, dict[str, Estimate]]:
-    """Image by the float64 twin; gradients by central differences of the forward renderer, common random numbers, h and h/2.
+    """The image of problem.image(); gradients by central differences of the forward renderer, common random numbers, h and h/2.
 
     The value is that of h; the distance to that of h/2, where chance does not explain it, counts as its error.
     """
-    image = twin(*problem.make(problem.parts), grid=16)
+    image = problem.image(*(problem.equal or problem.make)(problem.parts))
     adjoint = problem.cotangent(image)
-
-    def loss(name: str, value: Tensor, seed: int) -> float:
-        view = problem.make({**problem.parts, name: value})
-        return float((render(*view, spp=effort.difference_spp, seed=seed).double() * adjoint).sum())
-
     found = {}
-    with torch.no_grad():
-        for name, value in problem.parts.items():
-            runs = {scale: Running() for scale in (1.0, 0.5)}
-            for seed in range(effort.difference_seeds):
-                for scale, run in runs.items():
-                    h = scale * problem.steps[name]
-                    units = torch.eye(value.numel(), dtype=value.dtype).reshape(-1, *value.shape)
-                    both = [(loss(name, value + h * e, seed), loss(name, value - h * e, seed)) for e in units]
-                    run.add(torch.tensor([(high - low) / (2.0 * h) for high, low in both], dtype=torch.float64))
-            whole, half = runs[1.0].estimate(), runs[0.5].estimate()
-            apart = float((whole.mean - half.mean).norm())
-            error = whole.error if apart <= 4.0 * half.error else apart
-            found[name] = Estimate(whole.mean.reshape(value.shape), error)
+    for name, value in problem.parts.items():
+        whole, half = (differences(problem, adjoint, name, scale, effort).estimate() for scale in (1.0, 0.5))
+        apart = float((whole.mean - half.mean).norm())
+        error = whole.error if apart <= 4.0 * half.error else apart
+        found[name] = Estimate(whole.mean.reshape(value.shape), error)
     return image, found
+
+
+def differences(problem: Problem, adjoint: Tensor, name: str, scale: float, effort: Effort) -> Running:
+    """Of each component of a part; each seed of the effort gives one."""
+    make, finer = problem.equal or problem.make, problem.finer
+    value, h = problem.parts[name], scale * problem.steps[name]
+    units = torch.eye(value.numel(), dtype=value.dtype).reshape(-1, *value.shape)
+    spp = max(1, effort.difference_spp // finer**2)
+
+    def loss(value: Tensor, seed: int) -> float:
+        scene, camera = make({**problem.parts, name: value})
+        return float((finer_image(scene, camera, finer, spp=spp, seed=seed) * adjoint).sum())
+
+    run = Running()
+    with torch.no_grad():
+        for seed in range(effort.difference_seeds):
+            both = [(loss(value + h * e, seed), loss(value - h * e, seed)) for e in units]
+            run.add(torch.tensor([(high - low) / (2.0 * h) for high, low in both], dtype=torch.float64))
+    return run
