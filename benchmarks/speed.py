@@ -21,14 +21,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 from common import Converged, Kernel, Step, single, sphere
+from light import light
+from table import HEAD, Bench, Row, Skipped, line, median_row, milliseconds, quartiles, ratio_row, seconds_of
 from torch import Tensor
 from tqdm import tqdm
 
@@ -39,100 +41,9 @@ from edgegrad.report.methods import default_samples, differentiate
 from edgegrad.report.scenes import ReportScene, cube, front_camera, smooth_adjoint, smooth_colors
 from edgegrad.report.scenes import sphere as icosphere
 
-Value = TypeVar("Value")
 Run = Callable[[float, int], tuple[Tensor, float]]  # (budget, seed) → gradient (V, 3), seconds
 FACTORS = tuple(2.0**k for k in range(-6, 7))  # times edgegrad's default samples
 SPP = tuple(4.0**k for k in range(6))
-
-
-@dataclass
-class Row:
-    """A line of the table. Rows without a target have no `must`."""
-
-    what: str
-    measured: float
-    spread: tuple[float, float] | None = None  # quartiles
-    unit: str = ""
-    must: float | None = None
-    aim: float | None = None
-    more_is_better: bool = False
-    bound: bool = False  # at least `measured`: the other side could not be brought there in time
-    note: str = ""
-    verdict: str = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.verdict = ""
-        if self.must is not None:
-            sign = 1 if self.more_is_better else -1
-            below = "not shown" if self.bound else "below"
-            self.verdict = "meets must" if sign * self.measured >= sign * self.must else below
-            if self.aim is not None and sign * self.measured >= sign * self.aim:
-                self.verdict = "meets aim"
-
-    def cells(self) -> tuple[str, ...]:
-        def number(x: float | None) -> str:
-            return "" if x is None else (f"{x:.0f}" if abs(x) >= 100 else f"{x:.3g}") + self.unit
-
-        sign = "≥ " if self.more_is_better else "≤ "
-        spread = f"{number(self.spread[0])} … {number(self.spread[1])}" if self.spread else ""
-        must, aim = (sign + number(x) if x is not None else "" for x in (self.must, self.aim))
-        return self.what, ("> " if self.bound else "") + number(self.measured), spread, must, aim, self.verdict
-
-
-HEAD = ("what", "measured", "quartiles", "must", "aim", "verdict")
-WIDTHS = (66, 10, 21, 9, 9, 10)
-
-
-def line(cells: Sequence[str]) -> str:
-    return "  ".join(f"{cell:{width}s}" for cell, width in zip(cells, WIDTHS, strict=True)).rstrip()
-
-
-class Skipped(Exception):
-    """A row cannot be measured here; says how it could."""
-
-
-class Bench:
-    """Effort and progress."""
-
-    def __init__(self, quick: bool, limit: float, bar: tqdm) -> None:
-        self.quick, self.limit, self.bar = quick, limit, bar
-
-    def repeats(self, n: int) -> int:
-        return max(3, n // 4) if self.quick else n
-
-    def interleaved(self, repeats: int, *sides: Callable[[], Value]) -> list[list[Value]]:
-        """What each side returns, its seconds, in turns: A B A B …; the first turn is not counted."""
-        n = self.repeats(repeats)
-        found: list[list[Value]] = [[] for _ in sides]
-        for turn in range(n + 1):
-            self.bar.set_postfix_str(f"{turn} of {n}")
-            for side, values in zip(sides, found, strict=True):
-                values.append(side())
-        return [values[1:] for values in found]
-
-
-def median_row(what: str, values: Sequence[float], **rest: Any) -> Row:
-    return Row(what, statistics.median(values), quartiles(values), **rest)
-
-
-def ratio_row(what: str, over: Sequence[float], under: Sequence[float], **rest: Any) -> Row:
-    return median_row(what, [a / b for a, b in zip(over, under, strict=True)], **rest)
-
-
-def quartiles(values: Sequence[float]) -> tuple[float, float]:
-    low, high = np.quantile(np.array(values), [0.25, 0.75])
-    return float(low), float(high)
-
-
-def milliseconds(seconds: Sequence[float]) -> str:
-    value = 1e3 * statistics.median(seconds)
-    return f"{value:.0f} ms" if value >= 100 else f"{value:.3g} ms"
-
-
-def seconds_of(work: Callable[[], object]) -> float:
-    begin = time.perf_counter()
-    work()
-    return time.perf_counter() - begin
 
 
 @cache
@@ -632,6 +543,7 @@ ROWS: dict[str, Callable[[Bench], list[Row]]] = {
     "tangled": tangled,
     "flat-colors": flat_colors,
     "noise": noise,
+    "light": light,
 }
 # What is slow or wrong in the scenes of others first: rows that a change of the default samples is measured by.
 GROUPS = {"safe": ("deep", "tangled", "flat-colors", "noise")}

@@ -59,17 +59,19 @@ class MeshLight(Light):
         return LightPoints(face, uv, density[face])
 
     def _weights(self, points: LightPoints) -> Tensor:
-        return torch.cat([1 - points.uv.sum(1, keepdim=True), points.uv], 1).to(self.mesh.verts)
+        """(N, 3) float64."""
+        return torch.cat([1 - points.uv.sum(1, keepdim=True), points.uv], 1).to(self.mesh.verts.device)
 
     def place(self, points: LightPoints) -> Tensor:
-        corners = self.mesh.verts[self.mesh.faces[points.index].long()]
+        # In double: where the rest of the scene is, a point rounded to floats would lie behind its own face half of the time.
+        corners = self.mesh.verts[self.mesh.faces[points.index].long()].double()
         return (self._weights(points)[:, :, None] * corners).sum(1)
 
     def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
         """L cos θ / r², over the density. Barycentrics stay while the faces move, so areas that grow count more."""
         material = self.mesh.material
         assert material is not None
-        radiance = self._emission(points.index, self._weights(points)).to(position)
+        radiance = self._emission(points.index, self._weights(points).to(self.mesh.verts)).to(position)
         normal = self._area(points.index).to(position)
         away = position - self.place(points).to(position)
         squared = (away * away).sum(1, keepdim=True)

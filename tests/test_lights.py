@@ -519,3 +519,12 @@ def test_directions_above_a_surface_give_the_same_irradiance(image: bool) -> Non
     whole = sky.arriving(above, direction)[:, 0] * cosine
     assert float(whole.std()) < 0.7 * float(half.std())
     assert abs(float(whole.mean() - half.mean())) < 4 * float(half.std()) / len(direction) ** 0.5
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_lamp_in_floats_does_not_hide_itself_in_a_scene_of_doubles(dtype: torch.dtype) -> None:
+    lamp = eg.AreaLight.rectangle(vector(0.9, -0.6, 2.4), vector(0, 0.3, 0), vector(0.4, 0, 0.1), 8.0, two_sided=False)
+    ground = plane(material=eg.Material(base_color=0.7), colors=torch.ones((4, 1), dtype=F64))
+    images = [
+        eg.render(eg.Scene([ground, lamp.to(to)]), from_above(), spp=1, shadows=shadows)
+        for to, shadows in ((dtype, True), (F64, False))
+    ]
+    assert torch.allclose(*images, rtol=1e-5, atol=1e-7)

@@ -242,4 +242,4 @@ def tangled() -> Problem:
     def make(parts: Parts) -> tuple[Scene, Camera]:
         return Scene([ball.replace(verts=verts * (1.0 + parts["growth"]) + parts["shift"])], background()), CAMERA
 
-    return Problem(parts, make, None, "finite differences", dict.fromkeys(parts, 0.004))
+    return Problem(parts, make, None, "finite differences", steps=dict.fromkeys(parts, 0.004))

@@ -183,7 +183,8 @@ def in_plane() -> Problem:
 
 @group.add("in-mesh", "a point light inside of a closed box, seen from outside: no light comes out")
 def in_mesh() -> Problem:
-    return stage(point(), vector(0.02, 0.03, 0.85))
+    # Rays to its very edges, as floats have them, meet a face from behind.
+    return stage(point(), vector(0.02, 0.03, 0.85), zero=0.01)
 
 
 @group.add("in-room", "light, camera and caster inside of a closed box")

@@ -1,0 +1,158 @@
+"""Lit scenes: images and gradients over those without light, and samples on the borders of shadows alone."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from common import Kernel
+from table import Bench, Row, milliseconds, ratio_row, seconds_of
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad._derivatives import once
+from edgegrad._kernel import core
+from edgegrad._lit import Lighting
+from edgegrad._request import make_request
+from edgegrad.report import build
+from edgegrad.report.scenes import ReportScene
+from edgegrad.samples import Frame
+from edgegrad.shader import _Image
+
+COUNTS = tuple(1 << k for k in range(8, 19, 2))  # samples on the borders of shadows
+CONVERGED = 1 << 20
+WANTED = {"point": 3.0, "area": 3.0, "sky": 5.0}  # errors, in percent
+OVER_IMAGE: dict[str, dict[str, float]] = {
+    "point": {"must": 0.5, "aim": 0.2},
+    "area": {"must": 5, "aim": 2},
+    "sky": {"aim": 10},
+}
+SLOPES: dict[str, dict[str, float]] = {"point": {"must": -0.9, "aim": -1}, "area": {"must": -0.6, "aim": -0.75}}
+
+
+def light(bench: Bench) -> list[Row]:
+    return [*images(bench), *(row for lamp in ("point", "area", "sky") for row in borders(bench, lamp))]
+
+
+def images(bench: Bench) -> list[Row]:
+    """A textured sphere of latitude and longitude under two punctual lights."""
+    globe = build("globe", 512, rows=143)
+    (mesh,) = globe.scene.meshes
+    lights = [
+        eg.PointLight(torch.tensor([2.0, 3.0, 2.5]), 30.0), eg.DirectionalLight(torch.tensor([0.5, -1.0, -0.6]), 2.0)
+    ]  # fmt: skip
+    unlit, lit = eg.Scene([mesh]), eg.Scene([mesh.replace(material=eg.Material())], lights=lights)
+    kernel = Kernel(mesh, globe.camera, globe.adjoint)
+    threads = torch.get_num_threads()
+    packet = core.packet_width()
+    hit = float((eg.render_aovs(mesh, globe.camera, ["alpha"], 16)["alpha"]).mean())
+
+    def image(scene: eg.Scene, **options: Any) -> Callable[[], float]:
+        def call() -> None:
+            with torch.no_grad():
+                eg.render(scene, globe.camera, **options)
+
+        return lambda: seconds_of(call)
+
+    images: list[Tensor] = []
+    leaves = [mesh.verts.detach().clone().requires_grad_(), mesh.texture.detach().clone().requires_grad_()]  # type: ignore[union-attr]
+    powers = [torch.tensor(power, requires_grad=True) for power in (30.0, 2.0)]
+
+    def whole() -> None:
+        moved = mesh.replace(verts=leaves[0], texture=leaves[1], material=eg.Material())
+        shining = [lamp.replace(intensity=power) for lamp, power in zip(lights, powers, strict=True)]
+        images[:] = [eg.render(eg.Scene([moved], lights=shining), globe.camera)]
+
+    bare, plain, open_, shadowed, ahead, back = bench.interleaved(
+        9, lambda: core.for_tests.bare_loop(kernel.scene, kernel.camera, kernel.options, packet, threads),
+        image(unlit), image(lit, shadows=False), image(lit), lambda: seconds_of(whole),
+        lambda: seconds_of(lambda: torch.autograd.backward(images[0], globe.adjoint, inputs=[*leaves, *powers])),
+    )  # fmt: skip
+    rays = [seconds * (1.0 + 2.0 * hit) for seconds in bare]
+    faces = f"{len(mesh.faces):,} faces at 512² × 16"
+    # A gradient's samples are shaded with a graph ahead of the backward pass: its cost is both, less the image.
+    gradient = [a + b - c for a, b, c in zip(ahead, back, shadowed, strict=True)]
+    return [
+        ratio_row(
+            "lit by two punctual lights without shadows over unlit, image", open_, plain, must=2, aim=1.5,
+            note=f"{milliseconds(open_)} over {milliseconds(plain)}, {faces}",
+        ),
+        ratio_row(
+            "the same with shadows over the bare rays, three a sample that hits", shadowed, rays, must=1.6, aim=1.25,
+            note=f"{milliseconds(shadowed)} over {milliseconds(rays)}, a surface is shaded about once a pixel",
+        ),
+        ratio_row(
+            "lit with shadows: gradient (forward and backward) over image", gradient, shadowed, must=1.0, aim=0.6,
+            note=f"{milliseconds(gradient)} over {milliseconds(shadowed)}, of which the backward pass {milliseconds(back)}",
+        ),
+    ]  # fmt: skip
+
+
+class Borders(_Image):
+    """The image with samples on the borders of shadows alone."""
+
+    def render(self) -> Tensor:
+        image = self._values()
+        begin = time.perf_counter()
+        found = image + once(self._shadows().reshape(image.shape))
+        self.seconds = time.perf_counter() - begin
+        return found
+
+
+def border_gradient(scene: ReportScene, count: int, seed: int) -> tuple[Tensor, float]:
+    """(V, 3) float64 of the shadow's term by `count` samples (−1: the default), and its seconds, image left out."""
+    verts = scene.verts.float().requires_grad_()
+    moved = scene.moved(verts)
+    request = make_request(moved, scene.camera, 16, 0, edge_samples=None if count < 0 else count, grad_seed=seed)
+    image = Borders(Frame(moved, request, 0), Lighting(True, 1), False, False)
+    found = image.render()
+    begin = time.perf_counter()
+    (gradient,) = torch.autograd.grad((found * scene.adjoint).sum(), verts)
+    return gradient.double(), image.seconds + time.perf_counter() - begin
+
+
+def borders(bench: Bench, lamp: str) -> list[Row]:
+    """The time of the term at an error of its per-vertex gradient, over the image's; and the law by which the error falls."""
+    scene = build(f"lit-{lamp}", 256)
+    wanted = WANTED[lamp] / 100.0
+    runs, most = (2, CONVERGED // 4) if bench.quick else (4, CONVERGED)
+    correct = torch.stack([border_gradient(scene, most, (1 << 40) + k)[0] for k in range(runs)]).mean(0)
+    norm = float(correct.norm())
+
+    def image() -> None:
+        with torch.no_grad():
+            eg.render(scene.scene, scene.camera)
+
+    n = bench.repeats(9)
+    image(), border_gradient(scene, COUNTS[0], 0)
+    ahead = statistics.median(seconds_of(image) for _ in range(n))
+    errors, seconds = [], []
+    counts = COUNTS[:-1] if bench.quick else COUNTS
+    for count in (*counts, -1):
+        bench.bar.set_postfix_str(f"{lamp}, {count} samples")
+        found = [border_gradient(scene, count, seed) for seed in range(n)]
+        errors.append(math.sqrt(statistics.fmean(float((g - correct).norm() / norm) ** 2 for g, _ in found)))
+        seconds.append(statistics.median(s for _, s in found))
+    error, time_ = errors.pop(), seconds.pop()
+    slope = float(np.polyfit(np.log(counts), np.log(errors), 1)[0])
+    rows = [
+        Row(
+            f"shadow of a {lamp} light: its term at default samples over the image", time_ / ahead,
+            note=f"{1e3 * time_:.3g} ms over {1e3 * ahead:.3g} ms; error {100 * error:.2g} %",
+        ),
+        Row(f"shadow of a {lamp} light: slope of the error by samples", slope, **SLOPES.get(lamp, {})),
+    ]  # fmt: skip
+    if min(errors) > wanted:
+        note = f"{100 * min(errors):.2g} % with {counts[-1]:,} samples in {1e3 * seconds[-1]:.3g} ms"
+        what = f"shadow of a {lamp} light: {100 * wanted:g} % over the image"
+        return [Row(what, seconds[-1] / ahead, bound=True, note=note), *rows]
+    at = float(np.exp(np.interp(-math.log(wanted), -np.log(errors), np.log(seconds))))
+    many = float(np.exp(np.interp(-math.log(wanted), -np.log(errors), np.log(counts))))
+    what = f"shadow of a {lamp} light: its term at {100 * wanted:g} % over the image"
+    note = f"{1e3 * at:.3g} ms over {1e3 * ahead:.3g} ms, {many:,.0f} samples"
+    return [Row(what, at / ahead, note=note, **OVER_IMAGE[lamp]), *rows]
