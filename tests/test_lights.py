@@ -519,6 +519,8 @@ def test_directions_above_a_surface_give_the_same_irradiance(image: bool) -> Non
     whole = sky.arriving(above, direction)[:, 0] * cosine
     assert float(whole.std()) < 0.7 * float(half.std())
     assert abs(float(whole.mean() - half.mean())) < 4 * float(half.std()) / len(direction) ** 0.5
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_lamp_in_floats_does_not_hide_itself_in_a_scene_of_doubles(dtype: torch.dtype) -> None:
     lamp = eg.AreaLight.rectangle(vector(0.9, -0.6, 2.4), vector(0, 0.3, 0), vector(0.4, 0, 0.1), 8.0, two_sided=False)

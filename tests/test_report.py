@@ -246,7 +246,7 @@ def test_reference_is_kept(tmp_path, monkeypatch):
 # -- scenes and methods -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [name for name in scenes.SCENES if name not in ("million", "scan")])
+@pytest.mark.parametrize("name", [name for name in scenes.SCENES if name not in ("million", "scan", *scenes.LIT)])
 def test_scenes(name):
     scene = scenes.build(name, 32)
     image = eg.render(scene.scene, scene.camera, spp=4)

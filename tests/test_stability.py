@@ -25,7 +25,7 @@ from edgegrad.report.cases.measure import LIMIT, NOISY, QUICK, RAISED, RIGHT, WR
 from edgegrad.report.painted import PAINTED
 
 stability = importlib.import_module("edgegrad.report.stability")  # the package has a function of this name
-FAST = [name for name, case in CASES.items() if not case.slow]
+FAST = [name for name, case in CASES.items() if not case.slow and case.group != "light"]
 
 
 def check(name: str, effort: Effort) -> None:
@@ -80,7 +80,8 @@ def own_differences(problem: Problem, name: str) -> list[float]:
 
 
 def references(names):
-    return [name for name in names if name not in LARGE | {"tangled"}]  # which has no exact image
+    # Of those that have an exact image.
+    return [name for name in names if name not in LARGE | {"tangled"} and CASES[name].group != "light"]
 
 
 @pytest.mark.slow
@@ -331,3 +332,12 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(stability.NEEDS, "fits", ["no_such_package"])
     assert run("--case", "fits", "--out", tmp_path) == 2
     assert "fits needs no_such_package; install with: pip install 'edgegrad[report]'" in capsys.readouterr().err
+
+
+LIT = [name for name, case in CASES.items() if case.group == "light" and not case.slow]
+
+
+@pytest.mark.parametrize("name", LIT)
+def test_lit_extremes_are_finite(name: str) -> None:
+    image, grads = measure.sample(CASES[name].build(), 0, spp=4, surface_samples=500, edge_samples=500)
+    assert bool(image.isfinite().all()) and all(bool(grad.isfinite().all()) for grad in grads.values())

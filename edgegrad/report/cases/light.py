@@ -91,7 +91,7 @@ def stage(
     material: Mapping[str, float] | None = None,
     equal: Mesh | None = None,
     dtype: torch.dtype = F64,
-    step: float = 0.03,
+    step: float = 0.015,
     **fields: Any,
 ) -> Problem:
     """A caster over a receiver under a lamp; each moves along some directions, and so does the camera.
@@ -127,7 +127,7 @@ def stage(
 
     steps = {name: 0.1 * max(level, 1.0) if name == "brightness" else 0.05 for name in parts}
     steps |= dict.fromkeys([name for name in moves if name in parts], step)
-    settings: dict[str, Any] = {"finer": 12, "options": {"light_samples": 4}, "adjoint": adjoint(), **fields}
+    settings: dict[str, Any] = {"finer": 16, "options": {"light_samples": 4}, "adjoint": adjoint(), **fields}
     return Problem(
         parts, lambda parts: build(parts, caster), None, "finite differences", steps=steps, equal=alike,
         image=lambda scene, camera: lit_image(scene, camera, 6, 8), **settings,
