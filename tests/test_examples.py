@@ -39,5 +39,32 @@ def test_steps() -> None:
     assert abs(found.stripe - step.TRUTH.stripe) < 0.004
 
 
+def test_a_sun_and_a_pose() -> None:
+    sun = example("sun")
+    camera = sun.view(48)
+    found = sun.fit(sun.picture(sun.TRUTH, camera, seed=10_000, seeds=8), camera, steps=60)
+    degrees_of_sun, degrees, distance = found.errors(sun.TRUTH)
+    assert degrees_of_sun < 4 and degrees < 3 and distance < 0.15
+
+
+def test_an_environment_in_a_mirror() -> None:
+    mirror = example("mirror")
+    _, found = mirror.fit(steps=60, size=32)
+    assert mirror.error(found) < 0.4 * mirror.error(torch.full_like(found, 0.4))
+
+
+def test_a_shape_and_its_shadow() -> None:
+    _, shape, found = example("shadow").fit(steps=72, size=32)
+    before, after = ((d - shape.truth()).square().mean().sqrt() for d in (torch.full_like(found, 0.45), found))
+    assert after < 0.4 * before
+
+
 def test_there_is_no_other() -> None:
-    assert sorted(path.stem for path in FOLDER.glob("*.py")) == ["harmonics", "network", "step"]
+    assert sorted(path.stem for path in FOLDER.glob("*.py")) == [
+        "harmonics",
+        "mirror",
+        "network",
+        "shadow",
+        "step",
+        "sun",
+    ]

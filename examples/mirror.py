@@ -1,0 +1,132 @@
+"""The light from all around, from pictures of a ball of polished metal that mirrors it.
+
+    python examples/mirror.py [--out mirror.png]
+
+render() draws points of lights, and few of them lie where so smooth a metal looks. The shader draws the other way round: facets
+of the surface by what the eye sees of them (Heitz 2018), and looks where they mirror it. The ball is the material
+`eg.Material(0.95, metallic=1.0, roughness=0.2)` all the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+import torch
+import trimesh
+from torch import Tensor
+from torch.nn.functional import interpolate, normalize
+from tqdm import tqdm
+
+import edgegrad as eg
+
+SIZE = 64
+ROWS, COLUMNS = 16, 32
+BASE, ALPHA = 0.95, 0.2**2
+SMOOTH = 6e-3  # how much a rough environment costs: hardly any light comes from the texels around the poles
+
+
+class Metal:
+    """The metal in the light of an environment: one facet for each point that is shaded."""
+
+    def __init__(self, environment: eg.Environment) -> None:
+        self.environment = environment
+
+    def __call__(self, hits: eg.Hits) -> Tensor:
+        n, v = hits.shading_normal, hits.view
+        cosine = (n * v).sum(1, keepdim=True).clamp(min=1e-3)
+        m = visible_facets(n, v, cosine, hits.random(2).to(n))
+        towards = (v * m).sum(1, keepdim=True)
+        l = 2 * towards * m - v
+        down = (n * l).sum(1, keepdim=True)
+        # What the density of the facets leaves of the material: Fresnel's term (Schlick 1994), and the masking towards the light.
+        fresnel = BASE + (1 - BASE) * (1 - towards).clamp(0, 1) ** 5
+        back, away = slope_mask(cosine), slope_mask(down.clamp(min=1e-3))
+        masking = (1 + back) / (1 + back + away)
+        return torch.where(down > 0, fresnel * masking * self.environment.towards(l), 0.0)
+
+
+def slope_mask(cosine: Tensor) -> Tensor:
+    """Smith's Λ of the GGX distribution (Heitz 2014, eq. 72)."""
+    return ((1 + ALPHA**2 * (1 / cosine**2 - 1)).sqrt() - 1) / 2
+
+
+def visible_facets(n: Tensor, v: Tensor, cosine: Tensor, u: Tensor) -> Tensor:
+    """(N, 3) unit normals of facets, by what is seen of them from v: caps of the sphere (Dupuy and Benyoub 2023)."""
+    axis = torch.where(n[:, :1].abs() < 0.6, torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]]))
+    t = normalize(torch.linalg.cross(n, axis), dim=1)
+    b = torch.linalg.cross(n, t)
+
+    def flatter(d: Tensor) -> Tensor:
+        along = (d * n).sum(1, keepdim=True) * n
+        return normalize(ALPHA * (d - along) + along, dim=1)
+
+    stretched = flatter(v)
+    top = (stretched * n).sum(1, keepdim=True)
+    z = 1 - u[:, 1:] * (1 + top)
+    r = (1 - z * z).clamp(min=0).sqrt()
+    phi = 2 * math.pi * u[:, :1]
+    return flatter(r * phi.cos() * t + r * phi.sin() * b + z * n + stretched)
+
+
+def sky() -> Tensor:
+    """(ROWS, COLUMNS, 3): blue over brown, a sun, and two lamps."""
+    y, x = torch.meshgrid((torch.arange(ROWS) + 0.5) / ROWS, (torch.arange(COLUMNS) + 0.5) / COLUMNS, indexing="ij")
+    x, y = x[..., None], y[..., None]
+    above = torch.sigmoid(24 * (0.52 + 0.05 * torch.sin(6 * math.pi * x) - y))
+    image = above * (1.1 - y) * torch.tensor([0.35, 0.5, 0.8]) + (1 - above) * torch.tensor([0.3, 0.22, 0.15])
+    for u, v, color in ((0.3, 0.25, (3.0, 2.7, 2.0)), (0.72, 0.4, (0.9, 0.1, 0.1)), (0.9, 0.7, (0.1, 0.6, 0.2))):
+        image = image + torch.exp(-(((x - u) * 24) ** 2 + ((y - v) * 12) ** 2) / 2) * torch.tensor(color)
+    return image
+
+
+def roughness(image: Tensor) -> Tensor:
+    """The mean square of what neighbouring texels differ by."""
+    return image.diff(dim=0).square().mean() + (image - image.roll(1, 1)).square().mean()
+
+
+def fit(steps: int = 200, size: int = SIZE) -> tuple[list[Tensor], Tensor]:
+    """Pictures of the ball (target, end), and the environment that was found."""
+    made = trimesh.creation.icosphere(4)
+    ball = eg.Mesh(torch.tensor(made.vertices, dtype=torch.float32), torch.tensor(made.faces))
+    places = [(3.3, 1.2, 1.1), (-1.9, -1.0, 2.9), (-1.5, 1.0, -3.1), (2.0, -1.2, -2.9)]
+    cameras = [eg.Camera.look_at(place, (0.0, 0.0, 0.0), fov_y=34.0, size=(size, size)) for place in places]
+
+    def picture(radiance: Tensor, k: int, spp: int, seed: int) -> Tensor:
+        return eg.render(ball, cameras[k], spp, seed, shader=Metal(eg.Environment(radiance)))
+
+    def mean(radiance: Tensor, k: int, seed: int) -> Tensor:
+        with torch.no_grad():
+            return torch.stack([picture(radiance, k, 64, seed + i) for i in range(16)]).mean(0)
+
+    targets = [mean(sky(), k, 10_000) for k in range(len(cameras))]
+    found = torch.full((ROWS, COLUMNS, 3), 0.4, requires_grad=True)
+    optimizer = torch.optim.Adam([found], lr=0.06)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, eta_min=1e-3)
+    for step in tqdm(range(steps), desc="mirror"):
+        k = step % len(cameras)
+        loss = (picture(found, k, 4, step) - targets[k]).square().mean() + SMOOTH * roughness(found)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        with torch.no_grad():
+            found.clamp_(min=0.0)
+    return [targets[0], mean(found, 0, 20_000)], found.detach()
+
+
+def error(found: Tensor) -> float:
+    """Root mean square over the directions, over that of the environment."""
+    height = torch.sin((torch.arange(ROWS) + 0.5) * math.pi / ROWS)[:, None, None]
+    return (((found - sky()) ** 2 * height).sum() / (sky() ** 2 * height).sum()).sqrt().item()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", default="mirror.png")
+    out = parser.parse_args().out
+    pictures, found = fit()
+    maps = [interpolate(m.movedim(2, 0)[None], (SIZE, 2 * SIZE))[0].movedim(0, 2) for m in (sky(), found)]
+    eg.write_image(out, torch.cat([pictures[0], maps[0], pictures[1], maps[1]], 1).clamp(0, 1))
+    print(f"error of the environment: {error(torch.full_like(found, 0.4)):.3f} before, {error(found):.3f} after")
+    print(f"{out}: the ball and its environment, the ball and the environment that were found")
