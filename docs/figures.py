@@ -18,6 +18,9 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.image import linear_to_srgb
 
+sys.path.append(str(Path(__file__).parents[1] / "examples"))
+import sun  # the fit of examples/sun.py, in a larger picture
+
 INK, BLUE, ORANGE, GREY = "#222222", "#1f6fb2", "#d9730d", "#8a8f98"
 SAMPLES = {"surface_samples": 2_000_000, "edge_samples": 1_000_000}
 
@@ -90,6 +93,22 @@ def derivatives(folder: Path) -> None:
     axes[5].axis("off")
     figure.tight_layout()
     figure.savefig(folder / "derivatives.png", dpi=110)
+
+
+def light(folder: Path) -> None:
+    """The direction of the sun and the pose of an object, from one picture."""
+    camera = sun.view(256)
+    target = sun.picture(sun.TRUTH, camera, 10_000, seeds=64)
+    found = sun.fit(target, camera)
+    start, end = (sun.picture(guess, camera, 20_000, seeds=64) for guess in (sun.START, found))
+    for name, guess in (("start", sun.START), ("fit", found)):
+        print(name, "sun {:.2f}°, pose {:.2f}°, distance {:.4f}".format(*guess.errors(sun.TRUTH)))
+    figure, axes = plt.subplots(1, 4, figsize=(12, 3.4))
+    shown = {"target": target, "start": start, "fit": end, "difference × 4": 4 * (end - target).abs()}
+    for axis, (title, image) in zip(axes, shown.items(), strict=True):
+        picture(axis, image, title)
+    figure.tight_layout(pad=0.6)
+    figure.savefig(folder / "light.png", dpi=100)
 
 
 def triangle_terms(folder: Path) -> None:
@@ -186,7 +205,7 @@ def stages(folder: Path) -> None:
 def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
     folder.mkdir(parents=True, exist_ok=True)
-    for draw in (derivatives, triangle_terms, curve_source, stages):
+    for draw in (light, derivatives, triangle_terms, curve_source, stages):
         draw(folder)
 
 

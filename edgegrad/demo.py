@@ -1,8 +1,8 @@
 """The demo: an airliner above a photograph of the Earth, found again from a wrong pose.
 
 The target is rendered at a known pose with seeds of its own. fit_pose gets the mesh, the picture, the camera, the background
-and the start, and nothing else; the errors are taken afterwards. edgegrad has no lights yet, so the light on the airliner is
-part of its colours.
+and the start, and nothing else; the errors are taken afterwards. The light on the airliner is part of its
+colours.
 """
 
 from __future__ import annotations

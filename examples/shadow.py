@@ -77,7 +77,7 @@ def fit(steps: int = 240, size: int = SIZE) -> tuple[list[Tensor], Shape, Tensor
         return eg.render(eg.Scene([shape.mesh(distance), ground()], lights=[suns[k]]), camera, spp, seed)
 
     def mean(distance: Tensor, k: int, seed: int) -> Tensor:
-        # A face is shaded once a pixel, so more seeds smooth the border of a shadow, more samples a pixel do not.
+        # A mean over seeds: a face is shaded at few points of a pixel, however many samples it has.
         with torch.no_grad():
             return torch.stack([picture(distance, k, 8, seed + i) for i in range(8)]).mean(0)
 

@@ -104,7 +104,7 @@ def view(size: int) -> eg.Camera:
 
 
 def picture(guess: Guess, camera: eg.Camera, seed: int, seeds: int = 16) -> Tensor:
-    """A face is shaded once a pixel, so more seeds smooth the border of a shadow, more samples a pixel do not."""
+    """A mean over seeds: a face is shaded at few points of a pixel, however many samples it has."""
     with torch.no_grad():
         return torch.stack([eg.render(guess.scene(), camera, 16, seed + i) for i in range(seeds)]).mean(0)
 

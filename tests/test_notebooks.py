@@ -48,5 +48,13 @@ def test_shaders(monkeypatch: pytest.MonkeyPatch) -> None:
     assert end < 0.2 * start
 
 
+def test_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    texts = outputs(FOLDER / "light.ipynb", monkeypatch)
+    fd, derivative = last_numbers(next(text for text in texts if text.startswith("finite difference")))
+    assert abs(derivative / fd - 1) < 0.05
+    start, end = last_numbers("\n".join(next(text for text in texts if "off by" in text).splitlines()[1:]))
+    assert end < 0.2 * start
+
+
 def test_there_is_no_other() -> None:
-    assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == ["derivatives", "first_steps", "shaders"]
+    assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == ["derivatives", "first_steps", "light", "shaders"]
