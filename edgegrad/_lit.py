@@ -48,7 +48,8 @@ class Lighting(NamedTuple):
         """(H, W, C), or (B, H, W, C) for a batch of cameras. Raises RuntimeError for a batch of torch.vmap."""
         if not torch.compiler.is_compiling() and not values_visible(*tensors_in(scene)):
             raise RuntimeError(
-                "torch.vmap: expected one scene for all of a batch where it is lit; render them one by one"
+                "render: expected tensors with values where a scene is lit, got those of torch.vmap or torch.compile; render a "
+                "batch one by one, and leave render() out of what is compiled"
             )
         # Each point sees another one of a light with an extent.
         extended = any(not light.punctual for light in scene.casting)

@@ -125,7 +125,7 @@ class DirectionalLight(Light):
         return self.replace(direction=affine.vectors(self.direction))
 
     def place(self, points: LightPoints) -> Tensor:
-        return -normalize(self.direction, dim=0).expand(len(points.index), 3)
+        return -unit(self.direction).expand(len(points.index), 3)
 
     def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
         return self._power(position).expand(len(position), -1)
@@ -210,11 +210,16 @@ class SpotLight(Light):
 
     def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
         away = position - self.position.to(position)
-        cosine = normalize(away, dim=-1) @ normalize(self.direction.to(position), dim=0)
+        cosine = normalize(away, dim=-1) @ unit(self.direction).to(position)
         inner, outer = (torch.as_tensor(a).to(position).cos() for a in (self.inner_angle, self.outer_angle))
         scale = 1 / (inner - outer).clamp(min=1e-3)  # glTF's own limit
         ramp = ((cosine - outer) * scale).clamp(0, 1) ** 2
         return self._power(position) * ramp[:, None] * inverse_square(away)
+
+
+def unit(direction: Tensor) -> Tensor:
+    """(3,) of any length but zero: scaled first, for squares of short ones vanish and of long ones overflow."""
+    return normalize(direction / direction.detach().abs().max(), dim=0)
 
 
 def inverse_square(v: Tensor) -> Tensor:

@@ -26,6 +26,7 @@ from ._samples import PixelRecords, RayRecords, shaded_room, without_colors
 from ._shadows import ShadowLight
 from ._steps import UNEQUAL, Crossings, Points, Steps, find_crossings
 from ._surfaces import every_face
+from ._warnings import warn
 from .camera import Camera
 from .hits import Hits
 from .samples import EdgeSamples, Frame, SurfaceSamples, boundary
@@ -155,7 +156,13 @@ class _Image:
         """(H · W, C), or 0: the same over samples on the borders of the shadows that the shader asked for."""
         frame = self._frame
         found: Any = 0
-        count = frame.request.gradient.edge_samples
+        count, flat = frame.request.gradient.edge_samples, frame.request.scene
+        if frame.surfaces.shadowing and len(flat.cut_outs) and moves(frame.surfaces.verts, flat.alphas, flat.uvs):
+            warn(
+                "shadows of cut-outs",
+                "alpha: the rims of what alpha cuts out cast shadows whose borders have no gradient yet, so gradients by alpha, "
+                "uvs and verts lack what moves there; leave it out with shadows=False, or model the shape as faces",
+            )
         for index in sorted(frame.surfaces.shadowing):
             seed = derived_seed(frame.sampler.grad_seed, index + 2)
             light = ShadowLight.of(frame.surfaces, index, seed)

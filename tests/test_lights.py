@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -345,7 +346,7 @@ def test_renders_in_every_way():
         eg.profile(scene, camera)
     with pytest.raises(ValueError, match="reference: expected a scene without materials"):
         eg.reference.render(scene, camera)
-    with pytest.raises(RuntimeError, match=r"torch\.vmap: expected one scene"):
+    with pytest.raises(RuntimeError, match=r"got those of torch\.vmap"):
         torch.vmap(lambda x: eg.render(scene.replace(lights=[eg.PointLight(x)]), camera))(torch.rand(2, 3))
     with pytest.raises(ValueError, match="intensity: expected numbers, got a meta tensor"):
         eg.render(scene.replace(lights=[eg.PointLight([0.0, 0, 1], torch.ones((), device="meta"))]), camera)
@@ -530,3 +531,26 @@ def test_a_lamp_in_floats_does_not_hide_itself_in_a_scene_of_doubles(dtype: torc
         for to, shadows in ((dtype, True), (F64, False))
     ]
     assert torch.allclose(*images, rtol=1e-5, atol=1e-7)
+
+
+def test_directions_of_any_length() -> None:
+    """But zero."""
+    scene = plane(material=eg.Material(base_color=0.5))
+    images = [
+        eg.render(eg.Scene([scene], lights=[eg.DirectionalLight(length * vector(0.3, 0.2, -1.0))]), from_above())
+        for length in (1.0, 1e-14, 1e-30, 1e30)
+    ]
+    assert images[0].max() > 0.1
+    for image in images[1:]:
+        assert torch.allclose(image, images[0], rtol=1e-6)
+
+
+def test_shadows_of_cut_outs_are_said_to_lack_a_gradient() -> None:
+    leaf = plane(0.5, material=eg.Material(), alpha=torch.eye(4, dtype=F64)).transformed(t=vector(0, 0, 1))
+    scene = eg.Scene([plane(material=eg.Material()), leaf], lights=[eg.PointLight(vector(0.3, 0.2, 3))])
+    moving = leaf.replace(verts=leaf.verts.clone().requires_grad_())
+    with pytest.warns(UserWarning, match="cast shadows whose borders have no gradient"):
+        eg.render(scene.replace(meshes=[scene.meshes[0], moving]), from_above())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        eg.render(scene, from_above())

@@ -42,10 +42,10 @@ class Problem:
     make: Callable[[Parts], View]
     exact: Callable[[Parts], Tensor] | None
     reference: str = "exact integrals"
+    steps: dict[str, float] = field(default_factory=dict)
     image: Callable[[Scene, Camera], Tensor] = lambda scene, camera: twin(scene, camera, grid=16)
     equal: Callable[[Parts], View] | None = None
     finer: int = 1
-    steps: dict[str, float] = field(default_factory=dict)
     zero: float = 1e-9
     adjoint: Tensor | None = None  # (H, W, C), smooth_adjoint when None
     faint: bool = False  # the image's error is relative to all of it, not to what the scene adds to its background
