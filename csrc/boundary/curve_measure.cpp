@@ -312,15 +312,67 @@ class MeasuredEdges {
     Jump asked_[CreaseVisibility<T>::most];
 };
 
-// Lines where faces pass through each other: those where the loss looks, appended to `out.intersection`. Nothing is
-// known of the jump.
-template <class T>
+// How much a line where faces pass through each other counts beside another one: by how the radiance differs at its
+// ends, which is known, and by how far it moves with the faces, which is far where their planes are nearly the same.
+template <int N, class T>
+class IntersectionSize {
+   public:
+    IntersectionSize(const BackwardView<T>& view, const JumpScale& scale) : view_(view), scale_(scale) {}
+
+    // Per pixel of its length.
+    double operator()(const IntersectionCurve& c) {
+        planes_.set(view_, c);
+        const Vec2 n0 = normalised(view_.camera, c.x0), n1 = normalised(view_.camera, c.x1);
+        const double moved =
+            planes_.as_silhouette(view_.camera, c.a.z, n0) + planes_.as_silhouette(view_.camera, c.b.z, n1);
+        return within(0.5 * moved / c.length, 64) * within(jump(*c.faces, n0, n1) / scale_.unknown, 2);
+    }
+
+   private:
+    // Not so little that a sample stands for too much, where ends do not tell of what lies between them.
+    static double within(double x, double most) { return x > 1.0 / 64 ? std::min(x, most) : 1.0 / 64; }
+
+    // The size of the mean where textures would have to be asked.
+    double jump(const Intersection& i, Vec2 n0, Vec2 n1) {
+        const SceneView<T>& scene = view_.scene;
+        if (is_textured(scene, i.face[0]) || is_textured(scene, i.face[1])) return scale_.unknown;
+        jump_.assign(2 * scene.channels, 0.0);
+        for (int k = 0; k < 2; ++k) {
+            const Barycentrics a = barycentrics_of_hit(planes_.map[k], n0), b = barycentrics_of_hit(planes_.map[k], n1);
+            const double sign = k ? -1 : 1;
+            each_corner_value<N>(scene, i.face[k], [&](int c, double c0, double c1, double c2) {
+                jump_[2 * c] += sign * (c0 + a.u * (c1 - c0) + a.v * (c2 - c0));
+                jump_[2 * c + 1] += sign * (c0 + b.u * (c1 - c0) + b.v * (c2 - c0));
+            });
+        }
+        double sum = 0;
+        for (int c = 0; c < scene.channels; ++c)
+            sum += scale_.weights[c] * (std::fabs(jump_[2 * c]) + std::fabs(jump_[2 * c + 1]));
+        return 0.5 * sum;
+    }
+
+    const BackwardView<T>& view_;
+    const JumpScale& scale_;
+    IntersectionPlanes planes_;
+    std::vector<double> jump_;  // of each channel, at either end
+};
+
+// Lines where faces pass through each other: those where the loss looks, appended to `out.intersection`. What is known
+// of their jumps tells how they compare with one another. Of silhouettes it is not known, so together they count as
+// half their length, for where they are many most join what is near in space too; and as more where each stands for
+// several that were not drawn.
+constexpr double share_of_length = 0.5;
+template <int N, class T>
 void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
     const auto& all = view.geometry.intersections().all();
     const int64_t n = int64_t(all.size());
+    if (n == 0) return;
+    const JumpScale scale = jump_scale(view);
     std::vector<CurvesFound> found(Team::blocks(n));
     std::vector<std::vector<MeasuredIntersection>> parts(found.size());
+    std::vector<double> sized(found.size(), 0.0);  // Σ pixels · size
     view.team.each_block(n, [&](int64_t k, int64_t first, int64_t last) {
+        IntersectionSize<N, T> size_of(view, scale);
         for (int64_t i = first; i < last; ++i) {
             IntersectionCurve c;
             if (!find_intersection(view, out.finder.facing(), all[i], c)) continue;
@@ -331,15 +383,20 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
             const int64_t hiding = hiding_pixels(view.occlusion, low, high, c.nearest_depth());
             const double pixels = c.length * view.camera.stretch(c.low(), c.high()) *
                                   (hiding ? view.occlusion.factor(occluded, hiding, view.image.spp) : 1);
-            found[k].pixels += pixels;
-            found[k].unknown += std::pow(pixels * importance, 2);
-            parts[k].push_back({pixels * importance, int32_t(i)});
+            const double size = size_of(c);
+            found[k].pixels += pixels, sized[k] += pixels * size;
+            found[k].unknown += std::pow(pixels * size * importance, 2);
+            parts[k].push_back({pixels * size * importance, int32_t(i)});
         }
     });
+    double pixels = 0, all_sized = 0;
+    for (size_t k = 0; k < parts.size(); ++k) pixels += found[k].pixels, all_sized += sized[k];
+    const double share = share_of_length * std::sqrt(view.geometry.intersections().each_stands_for()),
+                 scaled = all_sized > 0 ? share * pixels / all_sized : 0;
     for (size_t k = 0; k < parts.size(); ++k) {
         out.pixels += found[k].pixels, out.intersections += found[k].intersections;
-        out.squares += found[k].unknown, out.unknown += found[k].unknown;
-        out.intersection.insert(out.intersection.end(), parts[k].begin(), parts[k].end());
+        out.squares += scaled * scaled * found[k].unknown, out.unknown += scaled * scaled * found[k].unknown;
+        for (const MeasuredIntersection& i : parts[k]) out.intersection.push_back({scaled * i.measure, i.index});
     }
 }
 
@@ -451,7 +508,7 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool
             out.unknown += f.unknown;
     int64_t n = 0;
     for (const auto& part : curves) n += int64_t(part.size());
-    measure_intersections(view, out);
+    measure_intersections<N>(view, out);
     if (rim) measure_rim(view, out);
     out.curve.reserve(n), out.measure = Array<double>(n + int64_t(out.intersection.size()) + out.arcs());
     int64_t next = n;

@@ -58,6 +58,35 @@ bool find_intersection(const BackwardView<T>& view, const Array<int8_t>& facing,
     return c.length > 0 && std::isfinite(c.length);
 }
 
+// Of the planes of both faces, what the points of a curve share.
+struct IntersectionPlanes {
+    FaceMap map[2];
+    Vec3 normal[2];
+    Vec2 slope;        // ∂F/∂n
+    double scale = 0;  // length / |∇F| in the straight image, times the weight of the intersection
+
+    template <class T>
+    IntersectionPlanes& set(const BackwardView<T>& view, const IntersectionCurve& curve) {
+        const Camera& camera = view.camera;
+        slope = {};
+        for (int k = 0; k < 2; ++k) {
+            const auto q = corners_of(view, curve.faces->face[k]);
+            map[k] = face_map(camera, q.data());
+            normal[k] = cross(q[1] - q[0], q[2] - q[0]);
+            slope += (k ? -1.0 : 1.0) * camera.affine_depth_gradient(normal[k], q[0]);
+        }
+        scale = curve.faces->weight * curve.length / length(place_vjp(camera, slope));
+        return *this;
+    }
+
+    // The length, px, of a silhouette whose motion would change the image as much, at a point of the curve.
+    double as_silhouette(const Camera& camera, double z, Vec2 n) const {
+        double squares = 0;
+        for (const Vec3 N : normal) squares += dot(N, N) / std::pow(camera.along_ray(N, n), 2);
+        return scale * std::fabs(camera.affine_depth_slope(z)) * camera.pixel_at_depth(z) * std::sqrt(squares / 2);
+    }
+};
+
 template <class T>
 class IntersectionSource {
    public:
@@ -82,11 +111,11 @@ class IntersectionSource {
         sample.behind = {};
         sample.ignored = place.faces.faces;
         for (int k = 0; k < 2; ++k) {
-            sample.side[k] = {curve.faces->face[k], barycentrics_of_hit(place.plane[k].map, sample.n), sample.point.z};
+            sample.side[k] = {curve.faces->face[k], barycentrics_of_hit(place.planes.map[k], sample.n), sample.point.z};
         }
         // A face seen edge-on has no image.
-        bool visible = std::isfinite(place.scale);
-        for (const Plane& plane : place.plane) visible &= view_.camera.along_ray(plane.normal, sample.n) != 0;
+        bool visible = std::isfinite(place.planes.scale);
+        for (const Vec3 N : place.planes.normal) visible &= view_.camera.along_ray(N, sample.n) != 0;
         for (const SurfacePoint& p : sample.side) visible &= shows(view_.scene, p.face, p.b);
         if (!visible) places_ -= another;
         return visible;
@@ -103,7 +132,7 @@ class IntersectionSource {
     // The curve moves with δx as F does with −δx.
     Vec2 normal(const Sample& sample) const {
         const Place& place = place_[sample.place];
-        return (-place.scale * sample.area_scale) * pixel_vjp(view_.camera, sample.n, place.slope);
+        return (-place.planes.scale * sample.area_scale) * pixel_vjp(view_.camera, sample.n, place.planes.slope);
     }
 
     CurveJumps velocities(const Sample& sample, const Direction& direction) const {
@@ -113,23 +142,23 @@ class IntersectionSource {
         const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
         double F_dot = 0;
         for (int k = 0; k < 2; ++k) {
-            const Vec3 N = place.plane[k].normal;
+            const Vec3 N = place.planes.normal[k];
             double moved = -view_.camera.unit_at_depth(z) * (N.x * n_dot.x + N.y * n_dot.y);
             for (int i = 0; i < 3; ++i)
                 moved += sample.side[k].b[i] *
                          dot(N, direction.q[view_.scene.faces[3 * int64_t(place.curve.faces->face[k]) + i]]);
             F_dot += (k ? -1 : 1) * view_.camera.affine_depth_slope(z) * moved / view_.camera.along_ray(N, sample.n);
         }
-        return {place.scale * sample.area_scale * F_dot, 0};
+        return {place.planes.scale * sample.area_scale * F_dot, 0};
     }
 
     void add_motion(const Sample& sample, CurveJumps jumps, ChunkGrad& grad) {
         const Place& place = place_[sample.place];
         if (current_ != place.curve.faces) finish(grad), current_ = place.curve.faces;
-        const double z = sample.point.z, F_bar = place.scale * sample.area_scale * jumps.first;
+        const double z = sample.point.z, F_bar = place.planes.scale * sample.area_scale * jumps.first;
         Vec2 n_bar;
         for (int k = 0; k < 2; ++k) {
-            const Vec3 N = place.plane[k].normal;
+            const Vec3 N = place.planes.normal[k];
             const double z_bar =
                 (k ? -F_bar : F_bar) * view_.camera.affine_depth_slope(z) / view_.camera.along_ray(N, sample.n);
             for (int i = 0; i < 3; ++i) q_bar_[k][i] += z_bar * sample.side[k].b[i] * N;
@@ -152,41 +181,26 @@ class IntersectionSource {
     }
 
    private:
-    struct Plane {
-        FaceMap map;
-        Vec3 normal;
-    };
-
     // A curve of which samples wait.
     struct Place {
         Curve curve;
-        Plane plane[2];
-        Vec2 slope;    // ∂F/∂n
-        double scale;  // length / |∇F| in the straight image, times the weight of the intersection
+        IntersectionPlanes planes;
         CurveFaces faces;
     };
 
     void start(Place& place, const Curve& curve) {
         place.curve = curve;
-        const Camera& camera = view_.camera;
+        place.planes.set(view_, curve);
         const int32_t (&face)[2] = curve.faces->face;
         place.faces = {face, 0, 0};
-        Vec2& slope = place.slope = {};
-        for (int k = 0; k < 2; ++k) {
-            const auto q = corners_of(view_, face[k]);
-            Plane& plane = place.plane[k];
-            plane.map = face_map(camera, q.data());
-            plane.normal = cross(q[1] - q[0], q[2] - q[0]);
-            slope += (k ? -1.0 : 1.0) * camera.affine_depth_gradient(plane.normal, q[0]);
+        for (const int32_t f : face)
             for (int i = 0; i < 3; ++i) {
-                const int32_t v = view_.scene.faces[3 * int64_t(face[k]) + i];
+                const int32_t v = view_.scene.faces[3 * int64_t(f) + i];
                 place.faces.spacing = std::max(place.faces.spacing, view_.scene.spacing->of(v));
                 for (int axis = 0; axis < 3; ++axis)
                     place.faces.coordinate =
                         std::max(place.faces.coordinate, std::fabs(view_.scene.verts[3 * int64_t(v) + axis]));
             }
-        }
-        place.scale = curve.faces->weight * curve.length / length(place_vjp(camera, slope));
     }
 
     const BackwardView<T>& view_;

@@ -1,10 +1,11 @@
 #include "scene/intersections.h"
 
 #include <algorithm>
-#include <array>
 #include <bit>
 #include <tuple>
+#include <utility>
 
+#include "core/array.h"
 #include "core/sampler.h"
 #include "scene/face_pair.h"
 #include "scene/height_field.h"
@@ -56,14 +57,19 @@ class PairFinder {
     // Adds the pairs with a face of either leaf.
     void add(int64_t leaf, int64_t other, Found& out) {
         if (leaf != leaf_) place(leaf);
+        unsigned placed = 0;  // faces of the other leaf that are
         const BoxGroup &own = tree_.leaf(leaf), &others = tree_.leaf(other);
         for (unsigned hits = own.overlapping(tree_.bounds(other)); hits; hits &= hits - 1) {
             const int i = std::countr_zero(hits);
             unsigned met = others.overlapping(own.box(i));
             if (leaf == other) met &= ~0u << (i + 1);
             if (met) met &= tree_.corners(other).may_cross(plane_[i]);
-            for (; met; met &= met - 1)
-                add_pair(placed_[i], tree_.face(leaf, i), tree_.face(other, std::countr_zero(met)), out);
+            for (; met; met &= met - 1) {
+                const int j = std::countr_zero(met);
+                const int32_t face = tree_.face(other, j);
+                if (!(placed >> j & 1)) place(other_[j], face), placed |= 1u << j;
+                add_pair(placed_[i], tree_.face(leaf, i), other_[j], face, out);
+            }
         }
     }
 
@@ -82,9 +88,7 @@ class PairFinder {
         placed.set(verts_, v, spacing_.of(v[0]));
     }
 
-    void add_pair(const PlacedFace& f, int32_t face, int32_t other, Found& out) {
-        PlacedFace g;
-        place(g, other);
+    void add_pair(const PlacedFace& f, int32_t face, const PlacedFace& g, int32_t other, Found& out) {
         FacePair pair;
         // In the order of the faces, so that the same numbers are found whoever comes first.
         const bool ascending = face < other;
@@ -105,6 +109,7 @@ class PairFinder {
     const Spacing& spacing_;
     int64_t leaf_ = -1;
     PlacedFace placed_[FaceTree::leaf_size];  // its faces
+    PlacedFace other_[FaceTree::leaf_size];   // those of another one that were asked
     FacePlane plane_[FaceTree::leaf_size];    // theirs
 };
 
@@ -135,33 +140,51 @@ void add_along(std::vector<AlongEdge>& along, std::vector<Intersection>& out) {
 }
 
 // Divides what copies of faces have in common among them.
-void share_among_copies(std::vector<Intersection>& all, const int32_t* faces, const double* verts) {
-    struct Key {
-        uint64_t low, high;  // of the places of both faces
-        int64_t index;
-    };
+void share_among_copies(std::vector<Intersection>& all, const int32_t* faces, const double* verts, Team& team) {
+    // Of where both faces lie, whatever the order of their corners.
     const auto place = [&](int32_t face) {
-        std::array<std::array<double, 3>, 3> corner;
-        for (int i = 0; i < 3; ++i)
-            for (int k = 0; k < 3; ++k) corner[i][k] = verts[3 * int64_t(faces[3 * int64_t(face) + i]) + k] + 0.0;
-        std::sort(corner.begin(), corner.end());
         uint64_t bits = 0;
-        for (const auto& c : corner)
-            for (const double x : c) bits = hash(bits, std::bit_cast<uint64_t>(x));
-        return bits;
+        for (int i = 0; i < 3; ++i) {
+            const double* p = verts + 3 * int64_t(faces[3 * int64_t(face) + i]);
+            bits += hash(std::bit_cast<uint64_t>(p[0] + 0.0), std::bit_cast<uint64_t>(p[1] + 0.0),
+                         std::bit_cast<uint64_t>(p[2] + 0.0));
+        }
+        return hash(bits, 0);
     };
-    std::vector<Key> keys;
-    keys.reserve(all.size());
-    for (const Intersection& i : all) {
-        const uint64_t first = place(i.face[0]), second = place(i.face[1]);
-        keys.push_back({std::min(first, second), std::max(first, second), int64_t(keys.size())});
+    const auto n = int64_t(all.size());
+    Array<uint64_t> key(n);
+    team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i) key[i] = place(all[i].face[0]) + place(all[i].face[1]);
+    });
+    // Nearly all are alone: a table of bits finds those that may not be.
+    const uint64_t bits = std::bit_ceil(uint64_t(std::max<int64_t>(n, 4)) * 16);
+    std::vector<uint64_t> once(bits / 64, 0), again(bits / 64, 0);
+    const auto word = [&](uint64_t k) { return (k & (bits - 1)) / 64; };
+    for (const uint64_t k : key) {
+        const uint64_t bit = uint64_t(1) << (k & 63);
+        again[word(k)] |= once[word(k)] & bit, once[word(k)] |= bit;
     }
-    std::sort(keys.begin(), keys.end(),
-              [](const Key& a, const Key& b) { return std::tie(a.low, a.high) < std::tie(b.low, b.high); });
-    for (size_t i = 0, end; i < keys.size(); i = end) {
-        for (end = i + 1; end < keys.size() && keys[end].low == keys[i].low && keys[end].high == keys[i].high;) ++end;
-        for (size_t k = i; k < end; ++k) all[keys[k].index].weight /= double(end - i);
+    std::vector<std::pair<uint64_t, int64_t>> several;
+    for (int64_t i = 0; i < n; ++i)
+        if (again[word(key[i])] >> (key[i] & 63) & 1) several.emplace_back(key[i], i);
+    std::sort(several.begin(), several.end());
+    for (size_t i = 0, end; i < several.size(); i = end) {
+        for (end = i + 1; end < several.size() && several[end].first == several[i].first;) ++end;
+        for (size_t k = i; k < end; ++k) all[several[k].second].weight /= double(end - i);
     }
+}
+
+// By ascending faces; of two between the same faces the first found comes first.
+void sort_by_faces(std::vector<Intersection>& all, Team& team) {
+    const auto n = int64_t(all.size());
+    std::vector<std::pair<uint64_t, int64_t>> order(n);
+    for (int64_t i = 0; i < n; ++i) order[i] = {uint64_t(all[i].face[0]) << 32 | uint64_t(all[i].face[1]), i};
+    std::sort(order.begin(), order.end());
+    std::vector<Intersection> sorted(n);
+    team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i) sorted[i] = all[order[i].second];
+    });
+    all = std::move(sorted);
 }
 
 }  // namespace
@@ -222,13 +245,12 @@ Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double
         all_.insert(all_.end(), part.through.begin(), part.through.end());
         along.insert(along.end(), part.along.begin(), part.along.end());
     }
+    found = {};
     add_along(along, all_);
     team.check();
-    std::sort(all_.begin(), all_.end(), [](const Intersection& p, const Intersection& q) {
-        return p.face[0] != q.face[0] ? p.face[0] < q.face[0] : p.face[1] < q.face[1];
-    });
+    sort_by_faces(all_, team);
     team.check();
-    share_among_copies(all_, faces, verts);
+    share_among_copies(all_, faces, verts, team);
 }
 
 }  // namespace edgegrad

@@ -34,8 +34,8 @@ class Intersections {
     // For how many each of them stands: more than 1 where there would be too many, and some are drawn.
     double each_stands_for() const { return stands_for_; }
 
-    // Of so many that are found, once in parts and once whole.
-    static int64_t bytes(int64_t found) { return 2 * found * int64_t(sizeof(Intersection)); }
+    // Of so many that are found, before and after they are sorted, with what they are sorted by.
+    static int64_t bytes(int64_t found) { return found * int64_t(2 * sizeof(Intersection) + 2 * sizeof(int64_t)); }
 
    private:
     std::vector<Intersection> all_;
