@@ -1,5 +1,6 @@
 """edgegrad: a PyTorch layer that renders triangle meshes on the CPU and returns correct gradients, also at silhouettes."""
 
+from . import fit
 from .aovs import render_aovs
 from .camera import Camera
 from .environment import Environment
@@ -51,6 +52,7 @@ __all__ = [
     "Texture",
     "attach_boundary",
     "edge_samples",
+    "fit",
     "jvp",
     "load_camera",
     "load_mesh",

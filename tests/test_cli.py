@@ -11,10 +11,11 @@ from PIL import Image
 from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, silhouette
 
 import edgegrad as eg
-from edgegrad import cli
+import edgegrad_cli as cli
 from edgegrad.fit import PoseFit
 from edgegrad.image import linear_to_srgb, read_image, write_image
 from edgegrad.io import save_camera
+from edgegrad_cli import doctor, outputs
 
 
 @pytest.fixture
@@ -91,8 +92,8 @@ def test_an_interrupted_fit_is_written(files, capsys, monkeypatch):
         if count == 5:
             raise KeyboardInterrupt
 
-    write = cli._write_pose
-    monkeypatch.setattr(cli, "_write_pose", write_pose)
+    write = outputs.write_pose
+    monkeypatch.setattr(outputs, "write_pose", write_pose)
     assert fit(files, "--init", files / "init.json", "--out", files / "out") == cli.INTERRUPTED
     found = PoseFit.from_json((files / "out" / "pose.json").read_text())
     assert found.interrupted and found.steps == 5
@@ -103,7 +104,7 @@ def test_a_failed_write_still_prints_the_pose(files, capsys, monkeypatch):
     def full(folder, found):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(cli, "_write_pose", full)
+    monkeypatch.setattr(outputs, "write_pose", full)
     assert fit(files, "--init", files / "init.json", "--steps", 1, "--out", files / "out") == 2
     said = capsys.readouterr()
     assert "mesh to world:" in said.out
@@ -193,6 +194,32 @@ def test_demo_without_pyvista_says_how_to_get_it(tmp_path, capsys, monkeypatch):
 
 def test_version_as_a_program():
     done = subprocess.run(
-        [sys.executable, "-m", "edgegrad.cli", "--version"], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "edgegrad_cli", "--version"], capture_output=True, text=True, check=True
     )
     assert done.stdout == f"edgegrad {eg.__version__}\n"
+
+
+@pytest.mark.parametrize("typed, meant", [
+    (["rendr"], "render"),
+    (["render", "mesh.ply", "--out", "a.png", "--sede", "3"], "--seed"),
+    (["report", "stabilty"], "stability"),
+])  # fmt: skip
+def test_did_you_mean(capsys, typed, meant):
+    with pytest.raises(SystemExit):
+        run(*typed)
+    assert f"did you mean {meant}?" in capsys.readouterr().err
+
+
+def test_help_comes_without_torch():
+    code = "import sys, edgegrad_cli\ntry: edgegrad_cli.main(['render', '--help'])\nfinally: assert 'torch' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+def test_doctor(capsys, monkeypatch):
+    assert run("doctor") == 0
+    said = capsys.readouterr().out
+    for word in ("torch", "Embree       4.", "threads", "right"):
+        assert word in said
+    assert doctor.gradient_error() < 0.01
+    monkeypatch.setattr(doctor, "TOLERANCE", 0.05 * doctor.gradient_error())
+    assert run("doctor") == 1 and "WRONG" in capsys.readouterr().out

@@ -13,7 +13,8 @@ import pytest
 import trimesh
 from test_fit import START, bracket, camera, picture
 
-from edgegrad import cli
+import edgegrad.fit
+import edgegrad_cli as cli
 from edgegrad.fit import PoseFit
 from edgegrad.image import linear_to_srgb, write_image
 from edgegrad.io import save_camera
@@ -83,13 +84,13 @@ def told_fit(*args, callback, **options):
     return FIT_POSE(*args, callback=tell, **options)
 
 
-FIT_POSE = cli.fit_pose
+FIT_POSE = edgegrad.fit.fit_pose
 
 
 @linux
 @pytest.mark.parametrize("kills", [5, pytest.param(60, marks=pytest.mark.slow)])
 def test_a_killed_fit_leaves_the_best_pose_so_far(files, kills, monkeypatch):
-    monkeypatch.setattr(cli, "fit_pose", told_fit)
+    monkeypatch.setattr(edgegrad.fit, "fit_pose", told_fit)
     chance = random.Random(kills)
     for kill in range(kills):
         out = f"out{kill}"
@@ -120,7 +121,7 @@ def test_the_pose_on_disk_follows_the_search(files, monkeypatch):
 
         return FIT_POSE(*args, callback=watch, **options)
 
-    monkeypatch.setattr(cli, "fit_pose", watched)
+    monkeypatch.setattr(edgegrad.fit, "fit_pose", watched)
     assert cli.main(arguments(files)) == 0
     assert [pose.steps for pose in poses] == list(range(1, len(poses) + 1))
     assert len(poses) > 10 and len({str(pose.matrix) for pose in poses}) > 5
@@ -154,13 +155,13 @@ def test_a_fit_that_cannot_be_written_is_printed(files, code, monkeypatch, capsy
 
 
 def test_a_folder_that_vanishes_during_the_fit(files, monkeypatch, capsys):
-    search = cli.fit_pose
+    search = edgegrad.fit.fit_pose
 
     def vanishing(*args, **options):
         (files / "out").rmdir()
         return search(*args, **options)
 
-    monkeypatch.setattr(cli, "fit_pose", vanishing)
+    monkeypatch.setattr(edgegrad.fit, "fit_pose", vanishing)
     assert cli.main(arguments(files)) == 2
     said = capsys.readouterr()
     assert is_a_result(said.out) and str(files / "out" / "pose.json") in said.err
@@ -168,7 +169,7 @@ def test_a_folder_that_vanishes_during_the_fit(files, monkeypatch, capsys):
 
 @pytest.mark.parametrize("out", ["mesh.ply", "mesh.ply/out"])
 def test_a_folder_that_cannot_be_made_is_named_before_the_fit(files, out, monkeypatch, capsys):
-    monkeypatch.setattr(cli, "fit_pose", lambda *_, **__: pytest.fail("no fit should begin"))
+    monkeypatch.setattr(edgegrad.fit, "fit_pose", lambda *_, **__: pytest.fail("no fit should begin"))
     assert cli.main(arguments(files, out)) == 2
     said = capsys.readouterr()
     assert f"--out: expected a folder to write to, got {files / out}" in said.err and said.out == ""
@@ -176,7 +177,7 @@ def test_a_folder_that_cannot_be_made_is_named_before_the_fit(files, out, monkey
 
 def test_a_folder_without_permission_is_named_before_the_fit(files, monkeypatch, capsys):
     """access() is what tells; root, as whom tests may run, may write anywhere."""
-    monkeypatch.setattr(cli, "fit_pose", lambda *_, **__: pytest.fail("no fit should begin"))
+    monkeypatch.setattr(edgegrad.fit, "fit_pose", lambda *_, **__: pytest.fail("no fit should begin"))
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != files / "out")
     assert cli.main(arguments(files)) == 2
     assert f"got {files / 'out'} (Permission denied)" in capsys.readouterr().err

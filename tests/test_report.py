@@ -11,7 +11,7 @@ from PIL import Image
 from trimesh.creation import icosphere
 
 import edgegrad as eg
-from edgegrad import cli
+import edgegrad_cli as cli
 from edgegrad.report import mitsuba, references, scenes
 from edgegrad.report.error_time import error_time
 from edgegrad.report.methods import Edgegrad, FiniteDifferences, rigid

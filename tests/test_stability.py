@@ -17,7 +17,7 @@ from PIL import Image
 from scenes import cube, front_camera, one_triangle
 
 import edgegrad as eg
-from edgegrad import cli
+import edgegrad_cli as cli
 from edgegrad.report import fits, statistics, steps
 from edgegrad.report.cases import CASES, measure
 from edgegrad.report.cases.case import Case, Problem, everything

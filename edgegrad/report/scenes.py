@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .._framing import framing
 from .._tree import tensors_in
 from ..camera import Camera
 from ..environment import Environment
@@ -340,8 +341,6 @@ def _lit_sky(size: int, subdivisions: int = 6) -> Built:
 
 
 def _scan(size: int, path: Path | None) -> Built:
-    from ..cli import framing  # here, since the command line imports the reports
-
     if path is None:
         from ..demo import airliner
 

@@ -1,4 +1,4 @@
-"""`edgegrad report`: the arguments of the reports."""
+"""edgegrad report."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ..cli import INTERRUPTED, count, make_folder
+from .arguments import count, seconds
+from .outputs import make_folder
 
 
-def add_report(commands: Any) -> None:
-    """Adds the command to the subparsers of `edgegrad`."""
+def add(commands: Any) -> None:
     report = commands.add_parser("report", help="measure the gradient", description="Measures the gradient.")
     kinds = report.add_subparsers(dest="report", required=True, metavar="REPORT")
 
@@ -31,7 +31,7 @@ def add_report(commands: Any) -> None:
     curve.add_argument("--size", type=count, default=256, help="pixels on a side of the image (%(default)s)")
     curve.add_argument("--seeds", type=count, default=5, help="gradients a point (%(default)s)")
     curve.add_argument(
-        "--limit", type=_seconds, default=10.0, metavar="SECONDS", help="most that a gradient may take (%(default)g)"
+        "--limit", type=seconds, default=10.0, metavar="SECONDS", help="most that a gradient may take (%(default)g)"
     )
     curve.add_argument("--quick", action="store_true", help="few points and a rough reference, to try it out")
     curve.add_argument(
@@ -59,7 +59,9 @@ def _error_time(args: argparse.Namespace) -> int:
     """Relative error of the gradient (per vertex, and of whole-object translation and rotation) against wall time, for a
     sweep of samples: edgegrad, finite differences, and every other renderer that is installed. Ctrl-C keeps what is
     measured; the same command goes on from there."""
-    from .error_time import error_time
+    from edgegrad.report.error_time import error_time
+
+    from . import INTERRUPTED
 
     make_folder(args.out)
     document, interrupted = error_time(
@@ -77,7 +79,9 @@ def _stability(args: argparse.Namespace) -> int:
     """Error of image and gradient in extreme cases against independent references: scale, cameras, geometry, what coincides,
     stiff scenes; whether the gradient is unbiased, steps within faces, and ill-conditioned fits. Ctrl-C keeps what is measured.
     The exit code is 1 if a case is wrong."""
-    from .stability import failures, stability
+    from edgegrad.report.stability import failures, stability
+
+    from . import INTERRUPTED
 
     make_folder(args.out)
     document, interrupted = stability(args.out, args.case, quick=args.quick)
@@ -86,13 +90,3 @@ def _stability(args: argparse.Namespace) -> int:
     if failed := failures(document):
         print(f"{len(failed)} not right: {', '.join(failed)}")
     return INTERRUPTED if interrupted else 1 if failed else 0
-
-
-def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = 0.0
-    if not 0.0 < seconds < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text!r}")
-    return seconds

@@ -1,0 +1,44 @@
+"""The command line: edgegrad fit-pose, render, demo, report, doctor.
+
+It lies beside the library rather than in it, for importing any part of that imports torch, which takes seconds: help and
+faults of arguments are said before. Each command imports what it uses when it runs.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from . import demo, doctor, fit_pose, render, report
+from .arguments import Parser
+
+INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, as shells have it
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs a command; the exit code is 0, 2 after an error, 130 after Ctrl-C."""
+    try:
+        args = parser().parse(argv)
+        return args.run(args)
+    except KeyboardInterrupt:
+        print("edgegrad: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except (OSError, ValueError, TypeError, ImportError, MemoryError) as error:
+        print(f"edgegrad: error: {_one_line(error)}", file=sys.stderr)
+        return 2
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())
+
+
+def parser() -> Parser:
+    """With all commands."""
+    found = Parser(prog="edgegrad", description="Differentiable rendering of triangle meshes on the CPU.")
+    found.add_argument("--version", action=doctor.Version, nargs=0, help="show the version and exit")
+    commands = found.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for module in (fit_pose, render, demo, report, doctor):
+        module.add(commands)
+    return found

@@ -1,0 +1,7 @@
+"""python -m edgegrad_cli."""
+
+import sys
+
+from . import main
+
+sys.exit(main())

@@ -1,0 +1,83 @@
+"""What the commands' arguments have in common: errors of one line, numbers, and the view."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+MESHES = "OBJ, glTF, GLB, PLY, STL, OFF or 3MF"
+
+
+class Parser(argparse.ArgumentParser):
+    """With the nearest name where one is not known."""
+
+    def __init__(self, **options: object) -> None:
+        super().__init__(**options)  # type: ignore[arg-type]
+        self.set_defaults(parser=self)  # that of the command, since its own default comes last
+
+    def parse(self, argv: Sequence[str] | None) -> argparse.Namespace:
+        args, unknown = self.parse_known_args(argv)
+        if unknown:
+            parser: Parser = args.parser
+            parser.error(f"unrecognized arguments: {' '.join(unknown)}{_nearest(unknown[0], parser.options)}")
+        return args
+
+    @property
+    def options(self) -> list[str]:
+        return [name for action in self._actions for name in action.option_strings]
+
+    def error(self, message: str) -> NoReturn:  # one line instead of argparse's usage
+        if wrong := re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message):
+            message += _nearest(wrong[1], re.findall(r"[\w-]+", wrong[2]))
+        self.exit(2, f"edgegrad: error: {message}; see {self.prog} --help\n")
+
+
+def _nearest(word: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(word.split("=")[0], list(known), n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def add_view(parser: argparse.ArgumentParser) -> None:
+    view = parser.add_argument_group(
+        "view", "a camera file, or a look at the mesh, which is framed as far as nothing is said"
+    )
+    view.add_argument("--camera", type=Path, metavar="CAMERA.json", help="world_to_camera 4 × 4, K 3 × 3, size [H, W]")
+    view.add_argument("--fov", type=float, metavar="DEGREES", help="vertical field of view (40)")
+    for name, help in (
+        ("eye", "where the camera is"),
+        ("target", "what it looks at"),
+        ("up", "up in the image (0 1 0)"),
+    ):
+        view.add_argument(f"--{name}", type=float, nargs=3, metavar=("X", "Y", "Z"), help=help)
+
+
+def shape(text: str) -> tuple[int, int]:
+    """(height, width) from 640x480 or 512."""
+    numbers = [count(number) for number in text.lower().split("x")]
+    if len(numbers) > 2:
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT or one number, got {text!r}")
+    return numbers[-1], numbers[0]
+
+
+def count(text: str) -> int:
+    return number(text, least=1)
+
+
+def number(text: str, least: int = 0) -> int:
+    if not text.isdecimal() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"expected a whole number from {least} up, got {text!r}")
+    return int(text)
+
+
+def seconds(text: str) -> float:
+    try:
+        found = float(text)
+    except ValueError:
+        found = 0.0
+    if not 0.0 < found < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text!r}")
+    return found

@@ -1,0 +1,89 @@
+"""edgegrad fit-pose."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from . import outputs
+from .arguments import MESHES, add_view, count, number
+from .inputs import read_background, read_mask, read_picture, read_pose, read_view, size_text
+
+if TYPE_CHECKING:
+    from edgegrad.fit import PoseFit
+
+
+def add(commands: Any) -> None:
+    parser = commands.add_parser("fit-pose", help="find a mesh in a picture", description=run.__doc__)
+    parser.add_argument("mesh", type=Path, metavar="MESH", help=MESHES)
+    parser.add_argument("image", type=Path, metavar="IMAGE", help="the picture; an alpha channel is taken as the mask")
+    parser.add_argument("--mask", type=Path, help="image of the picture's size, white on the object")
+    add_view(parser)
+    parser.add_argument(
+        "--init", type=Path, metavar="POSE.json", help="pose to start from; as in the mesh file when left out"
+    )
+    parser.add_argument("--fit-scale", action="store_true", help="also find the scale; the distance then stays")
+    parser.add_argument("--fit-focal", action="store_true", help="also find the focal length")
+    parser.add_argument(
+        "--background", help="#rrggbb or an image; without it the median colour of the picture's border"
+    )
+    parser.add_argument("--size", type=count, default=256, help="most pixels on the longer side (%(default)s)")
+    parser.add_argument("--steps", type=count, default=40, help="most steps on each level of resolution (%(default)s)")
+    parser.add_argument("--seed", type=number, default=0)
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="for pose.json, fit.png, loss.png, fit.webp"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Finds rotation and translation of a mesh in a picture, from a start within about 20° and 15 % of the mesh's size.
+    Ctrl-C keeps the best pose so far."""
+    from edgegrad import load_scene
+    from edgegrad.fit import fit_pose
+
+    from . import INTERRUPTED
+
+    scene = load_scene(args.mesh)
+    picture, mask = read_picture(args.image)
+    if args.mask is not None:
+        mask = read_mask(args.mask)
+        if mask.shape != picture.shape[:2]:
+            raise ValueError(
+                f"{args.mask}: expected {size_text(picture)} pixels like {args.image}, got {size_text(mask)}"
+            )
+    if mask is not None and args.background is not None:
+        raise ValueError("--background: expected none with a mask (or an image with alpha), got both; leave one out")
+    init = None if args.init is None else read_pose(args.init)
+    camera = read_view(args, scene, (picture.shape[0], picture.shape[1]), args.init)
+    outputs.make_folder(args.out)
+
+    def save(fit: PoseFit) -> None:
+        # After each step, which takes far longer: whatever ends the process, the best pose so far is on disk.
+        with suppress(OSError):  # the last copy will say what is wrong
+            outputs.write_pose(args.out, fit)
+
+    fit = fit_pose(
+        scene, picture, camera, mask, None if init is None else init.matrix,
+        fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=read_background(args.background, picture),
+        max_size=args.size, steps=args.steps, seed=args.seed, callback=save,
+    )  # fmt: skip
+    # Neither a full disk nor a closed terminal may lose the result: it is printed before the files are written, and they
+    # are written also when printing failed.
+    try:
+        _print_fit(fit, args.fit_focal)
+    finally:
+        written = outputs.write_outputs(args.out, fit)
+    print(f"wrote {', '.join(written)} in {args.out}")
+    return INTERRUPTED if fit.interrupted else 0
+
+
+def _print_fit(fit: PoseFit, focal: bool) -> None:
+    state = "interrupted" if fit.interrupted else "converged" if fit.converged else "not converged: try more --steps"
+    lines = [f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {state}", "mesh to world:"]
+    lines += ["  " + "  ".join(f"{value:12.6f}" for value in row) for row in fit.matrix.tolist()]
+    if focal:
+        lines.append(f"focal length: {float(fit.camera.K[0, 0]):.6g} px")
+    print("\n".join(lines), flush=True)

@@ -1,0 +1,99 @@
+"""What commands read: pictures, masks, backgrounds, poses and views."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from edgegrad import Camera, Scene
+    from edgegrad.fit import Pose
+
+
+def read_picture(path: Path) -> tuple[Tensor, Tensor | None]:
+    """(H, W, 3), and (H, W) from its alpha where that says anything."""
+    from edgegrad import read_image
+
+    image = read_image(path, channels=4)
+    alpha = image[..., 3]
+    return image[..., :3].contiguous(), alpha if bool((alpha < 1.0).any()) else None
+
+
+def read_mask(path: Path) -> Tensor:
+    """(H, W). A mask's greys are coverage as they are, not sRGB."""
+    from edgegrad.image import DISPLAY, linear_to_srgb, read_image
+
+    mask = read_image(path, channels=1)[..., 0]
+    return linear_to_srgb(mask) if path.suffix.lower() in DISPLAY else mask
+
+
+def size_text(image: Tensor) -> str:
+    return f"{image.shape[1]} × {image.shape[0]}"
+
+
+def read_background(text: str | None, picture: Tensor) -> Tensor | None:
+    """A colour (3,) from #rrggbb, or an image (H, W, 3)."""
+    import torch
+
+    from edgegrad.image import read_image, srgb_to_linear
+
+    if text is None:
+        return None
+    if text.startswith("#"):
+        try:
+            return srgb_to_linear(torch.tensor(list(bytes.fromhex(text[1:])), dtype=torch.float32).reshape(3) / 255.0)
+        except (ValueError, RuntimeError):
+            raise ValueError(f"--background: expected #rrggbb or an image file, got {text!r}") from None
+    image = read_image(text, channels=3)
+    if image.shape != picture.shape:
+        raise ValueError(
+            f"{text}: expected {size_text(picture)} pixels like the picture, got {size_text(image)}; resize it"
+        )
+    return image
+
+
+def read_pose(path: Path) -> Pose:
+    from edgegrad._files import check_readable
+    from edgegrad.fit.result import pose_from_json
+
+    try:
+        return pose_from_json(check_readable(path, (".json",)).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | None, pose_file: Path | None) -> Camera:
+    """From --camera; else from the pose file, unless a view is described; else one that frames the mesh."""
+    import torch
+
+    from edgegrad import load_camera
+    from edgegrad._framing import framing
+    from edgegrad.fit import PoseFit
+
+    described = any(value is not None for value in (args.fov, args.eye, args.target, args.up))
+    camera, source = None, args.camera
+    if args.camera is not None:
+        if described:
+            raise ValueError(
+                "--camera: expected none of --fov, --eye, --target, --up beside it, got both; leave one out"
+            )
+        camera = load_camera(args.camera, torch.float64)
+    elif pose_file is not None and not described:
+        source, text = pose_file, pose_file.read_text(encoding="utf-8")
+        if '"camera"' in text:  # else a pose alone, written by hand
+            camera = PoseFit.from_json(text).camera
+    if camera is None:
+        fov, up = 40.0 if args.fov is None else args.fov, args.up or (0.0, 1.0, 0.0)
+        return framing(scene, size or (512, 512), fov, args.eye, args.target, up)
+    if size is None:
+        return camera
+    (H, W), (h, w) = size, camera.size
+    # More than a pixel apart when one is scaled to the other: not the same view.
+    if abs(H * w - W * h) > max(H, W, h, w):
+        raise ValueError(
+            f"{source}: expected a camera for {W} × {H} pixels or in proportion, got {w} × {h}; crop alike"
+        )
+    return camera.resized(size)

@@ -1,0 +1,49 @@
+"""What commands write."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from edgegrad.fit import PoseFit
+
+
+def make_folder(folder: Path) -> None:
+    """Before the work rather than after it. Raises OSError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        raise OSError(
+            f"--out: expected a folder to write to, got {folder} ({error.strerror}); choose another"
+        ) from error
+
+
+def write_pose(folder: Path, fit: PoseFit) -> None:
+    from edgegrad._files import replacing
+
+    with replacing(folder / "pose.json") as temporary:
+        temporary.write_text(fit.to_json() + "\n", encoding="utf-8")
+
+
+def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
+    """The names of what was written. Raises OSError that names what was not, ImportError without the libraries of figures."""
+    names = ["pose.json"] + ["fit.png", "loss.png", "fit.webp"] * bool(fit.history)
+    for name in names:
+        try:
+            if name == "pose.json":
+                write_pose(folder, fit)
+            else:
+                from edgegrad.fit import report  # matplotlib takes a while to import
+
+                draw = {"fit.png": report.draw_fit, "loss.png": report.draw_loss, "fit.webp": report.draw_animation}
+                draw[name](folder / name, fit)
+        except OSError as error:
+            raise OSError(
+                f"{folder / name}: expected to write it, got: {error.strerror or error}; make room or rights"
+            ) from error
+    return names
