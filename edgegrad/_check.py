@@ -34,6 +34,8 @@ def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating:
         raise TypeError(
             f"{name}: expected a tensor where gradients are required, got a sequence of them; use torch.stack"
         )
+    if any(stride < 0 for stride in getattr(value, "strides", ())):  # image[::-1] of NumPy, which torch refuses
+        value = value.copy()  # pyright: ignore[reportAttributeAccessIssue]
     try:
         tensor = torch.as_tensor(value, device=None if like is None else like.device)
         if like is not None and like.is_floating_point() and tensor.dtype != like.dtype and not hasattr(value, "dtype"):
@@ -86,7 +88,12 @@ def check_shape(name: str, tensor: Tensor, *expected: Sequence[int | str], fix: 
 def check_float(name: str, tensor: Tensor) -> None:
     """float32 or float64. Raises TypeError."""
     if tensor.dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"{name}: expected float32 or float64, got {tensor.dtype}; convert it with .float()")
+        fix = (
+            "of 8-bit sRGB values take srgb_to_linear(x / 255)"
+            if tensor.dtype == torch.uint8
+            else "convert it with .float()"
+        )
+        raise TypeError(f"{name}: expected float32 or float64, got {tensor.dtype}; {fix}")
 
 
 def check_integer(name: str, tensor: Tensor) -> None:

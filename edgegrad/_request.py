@@ -13,6 +13,7 @@ from torch import Tensor
 from ._check import as_int, check_not_meta, check_positive, check_positive_int, check_shape
 from ._kernel import core
 from ._lens import MOST
+from ._mistakes import warn_if_behind
 from .camera import Camera
 from .mesh import Mesh
 from .scene import Flat, Scene, flatten
@@ -199,6 +200,7 @@ def make_request(
         # Dynamo does not trace a function that is given one tensor twice; corners of vertex colours are the faces.
         flat = flat._replace(corners=flat.corners.clone())
     packed = pack_camera(camera)
+    warn_if_behind(flat.verts, packed.world_to_camera, packed.lens)
     cameras, V, F = len(packed.K), len(flat.verts), len(flat.faces)
     return Request(
         flat,

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ._check import as_tensor, check_finite, check_not_meta, check_shape
 from ._files import PathLike, check_readable, check_suffix, replacing, require
+from ._mistakes import warn_of_bytes
 
 DISPLAY = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # 8 bit, sRGB
 RADIANCE = (".exr", ".hdr")  # floating point, linear
@@ -104,6 +105,7 @@ def write_image(path: PathLike, img: Tensor) -> None:
     check_shape("img", image, ("H", "W"), ("H", "W", "C"))
     image = image.cpu().float().reshape(*image.shape[:2], -1)
     check_finite("img", image)
+    warn_of_bytes("img", image)
     H, W, C = image.shape
     suffix = file.suffix.lower()
     allowed = {".jpg": (1, 3), ".jpeg": (1, 3), ".bmp": (1, 3, 4), ".hdr": (3,)}.get(suffix, (1, 2, 3, 4))
