@@ -11,9 +11,9 @@ from ._warnings import warn
 BYTES = 16.0, 255.0  # the largest of whole numbers that are bytes rather than radiance
 
 
-def warn_if_behind(verts: Tensor, world_to_camera: Tensor, lens: str) -> None:
-    """Where all vertices (V, 3) lie behind each of the cameras (B, 4, 4), of lenses that see nothing there."""
-    if lens not in ("pinhole", "brown-conrady") or not values_visible(verts, world_to_camera):
+def warn_if_behind(verts: Tensor, world_to_camera: Tensor) -> None:
+    """Where all vertices (V, 3) lie behind each of the cameras (B, 4, 4)."""
+    if not values_visible(verts, world_to_camera):
         return
     # Of one vertex first, in numbers of Python: a small scene renders in a millisecond.
     first, row = verts[0].tolist(), world_to_camera[0, 2].tolist()

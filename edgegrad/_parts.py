@@ -72,8 +72,7 @@ def _read_gltf(data: bytes, kind: str, source: Source) -> Model:
     tree, wanted = gltf.read_tree(data, kind), source.wanted
     loaded = _load(gltf.for_trimesh(data, kind, tree), kind, source)
     primitives = gltf.primitives(tree, loaded["geometry"])
-    if wanted.lit:
-        gltf.note_unsupported(tree, source)
+    gltf.note_unsupported(tree, source)
     known: dict[object, Any] = {}
 
     def look(name: str, raw: dict[str, Any], origin: np.ndarray) -> dict[str, object]:

@@ -200,7 +200,8 @@ def make_request(
         # Dynamo does not trace a function that is given one tensor twice; corners of vertex colours are the faces.
         flat = flat._replace(corners=flat.corners.clone())
     packed = pack_camera(camera)
-    warn_if_behind(flat.verts, packed.world_to_camera, packed.lens)
+    if packed.perspective and packed.lens in ("pinhole", "brown-conrady"):  # others see what lies there
+        warn_if_behind(flat.verts, packed.world_to_camera)
     cameras, V, F = len(packed.K), len(flat.verts), len(flat.faces)
     return Request(
         flat,

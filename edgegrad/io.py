@@ -23,7 +23,8 @@ lit=True takes them for base colours:
   dielectric, rough by Ns; with Pr or Pm metallic-roughness. vn are its normals.
 - other formats: Lambertian, with the normals of a PLY.
 
-What else a file asks for is said once, in one UserWarning that names it.
+What else a file asks for is said once, in one UserWarning that names it; without lit=True only what changes the shape of a glTF:
+animations, morph targets, skins (the transformation of a skinned node itself does not count), instancing.
 """
 
 from __future__ import annotations

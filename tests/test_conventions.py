@@ -229,7 +229,7 @@ def test_bytes_for_radiance_are_told(tmp_path) -> None:
     ):
         eg.write_image(tmp_path / "a.png", image)
     corners = torch.tensor([[0, 1, 2]])
-    with pytest.raises(TypeError, match=r"texture: expected float32 .* uint8; .*srgb_to_linear"):
+    with pytest.raises(TypeError, match=r"texture: expected float32 .*uint8; .*srgb_to_linear"):
         eg.Mesh(POINTS[:3], corners, texture=image.byte(), uvs=POINTS[:3, :2], uv_faces=corners)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

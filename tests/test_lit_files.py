@@ -384,8 +384,24 @@ def test_what_is_not_supported_is_said_once_by_name(tmp_path):
         for _ in range(3):
             eg.load_scene(path, lit=True)
         assert len(said) == 1
-        eg.load_scene(path)  # which asks for nothing
-        assert len(said) == 1
+        eg.load_scene(path)  # which asks for a shape alone
+        assert len(said) == 2 and "animations" in str(said[1].message) and "clearcoat" not in str(said[1].message)
+
+
+def test_the_transformation_of_a_skinned_node_does_not_count(tmp_path):
+    nodes = [
+        {"mesh": 0, "skin": 0, "translation": [5, 0, 0], "children": [1]},
+        {"mesh": 0, "translation": [0, 0, 1]},
+        {"mesh": 0, "skin": 0, "translation": [0, 7, 0]},  # not in the scene
+    ]
+    joints = [{"joints": [1]}]
+    path = file(tmp_path, nodes=nodes, roots=[0], skins=joints, extensionsUsed=["EXT_mesh_gpu_instancing"])
+    with pytest.warns(UserWarning, match=r"EXT_mesh_gpu_instancing \(shown once\); skins \(shown in the pose"):
+        scene = eg.load_scene(path)
+    places = sorted(mesh.verts.mean(0).round().tolist() for mesh in scene.meshes)
+    center = torch.as_tensor(SQUARE).float().mean(0)
+    expected = sorted((center + torch.tensor(shift)).round().tolist() for shift in ([0.0, 0, 0], [5.0, 0, 1]))
+    assert places == expected
 
 
 def test_meshes_of_one_material_become_one(tmp_path):

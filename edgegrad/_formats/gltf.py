@@ -6,6 +6,7 @@ import json
 import re
 from typing import Any
 
+from .gltf_nodes import placed
 from .part import Fault
 from .source import Source
 
@@ -17,6 +18,7 @@ READ = {
     "KHR_lights_punctual", "KHR_materials_unlit", "KHR_materials_emissive_strength", "KHR_texture_transform", "EXT_texture_webp",
     "KHR_xmp", "KHR_xmp_json_ld",
 }  # fmt: skip
+SHAPING = {"EXT_mesh_gpu_instancing": "shown once"}  # those that change the shape of what is shown
 
 
 def read_tree(data: bytes, kind: str) -> dict[str, Any]:
@@ -39,7 +41,8 @@ def for_trimesh(data: bytes, kind: str, tree: dict[str, Any]) -> bytes:
 
     Texture coordinates are attributes of their own, for trimesh knows but one set. Nodes have no cameras, for it leaves out what
     lies below them. Materials are without an extension for which it would decode images at once, before their format was
-    looked at.
+    looked at. Meshes with a skin stand at the root, for the transformation of their own node does not count (glTF 2.0, section
+    3.7.3.3).
     """
     zeros = sum(accessor["count"] for accessor in tree.get("accessors", []) if "bufferView" not in accessor)
     if zeros > MOST_ZEROS:
@@ -52,14 +55,14 @@ def for_trimesh(data: bytes, kind: str, tree: dict[str, Any]) -> bytes:
         own = {f"_{n}" if n.startswith("TEXCOORD_") else n: i for n, i in given["attributes"].items()}
         return {**given, "attributes": own}
 
-    seen = dict(tree)
+    seen = _skinned_at_root(tree)
     for name, change in {
         "materials": lambda m: {**m, "extensions": without(m.get("extensions", {}), GLOSS)},
         "meshes": lambda m: {**m, "primitives": [primitive(p) for p in m["primitives"]]},
         "nodes": lambda n: without(n, "camera"),
     }.items():
         if name in tree:
-            seen[name] = [change(thing) for thing in tree[name]]
+            seen[name] = [change(thing) for thing in seen[name]]
     text = json.dumps(seen).encode()
     if kind == "gltf":
         return text
@@ -67,6 +70,21 @@ def for_trimesh(data: bytes, kind: str, tree: dict[str, Any]) -> bytes:
     rest = data[20 + int.from_bytes(data[12:16], "little") :]
     sizes = [(20 + len(text) + len(rest)).to_bytes(4, "little"), len(text).to_bytes(4, "little")]
     return data[:8] + sizes[0] + sizes[1] + b"JSON" + text + rest
+
+
+def _skinned_at_root(tree: dict[str, Any]) -> dict[str, Any]:
+    nodes, scenes = list(tree.get("nodes", [])), list(tree.get("scenes", []))
+    if not scenes or not any("skin" in node and "mesh" in node for node in nodes):
+        return dict(tree)
+    shown = {id(node) for node, _ in placed(tree)}
+    roots = list(scenes[tree.get("scene", 0)].get("nodes", []))
+    for index, node in enumerate(tree["nodes"]):
+        if "skin" in node and "mesh" in node and id(node) in shown:
+            roots.append(len(nodes))
+            nodes.append({key: node[key] for key in ("mesh", "name") if key in node})
+            nodes[index] = {key: value for key, value in node.items() if key not in ("mesh", "skin")}
+    scenes[tree.get("scene", 0)] = {**scenes[tree.get("scene", 0)], "nodes": roots}
+    return {**tree, "nodes": nodes, "scenes": scenes}
 
 
 def primitives(tree: dict[str, Any], geometry: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -89,10 +107,10 @@ def primitives(tree: dict[str, Any], geometry: dict[str, Any]) -> dict[str, dict
 
 
 def note_unsupported(tree: dict[str, Any], source: Source) -> None:
-    """Of the file as a whole."""
+    """Of the file as a whole: of its shape, and of a lit one all extensions."""
     used = set(tree.get("extensionsUsed", [])) | set(tree.get("extensions", {}))
-    for name in sorted(used - READ):
-        source.unsupported.note(name)
+    for name in sorted(used - READ if source.wanted.lit else used & set(SHAPING)):
+        source.unsupported.note(name, SHAPING.get(name, "left out"))
     for name, instead in {"animations": "shown at rest", "skins": "shown in the pose of their binding"}.items():
         if tree.get(name):
             source.unsupported.note(name, instead)
