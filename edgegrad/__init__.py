@@ -5,7 +5,7 @@ from .aovs import render_aovs
 from .camera import Camera
 from .environment import Environment
 from .hits import Hits
-from .io import load_camera, load_mesh, load_scene, read_image, save_camera, write_image
+from .io import View, load_camera, load_cameras, load_mesh, load_scene, read_image, save_camera, write_image
 from .lights import (
     AreaLight,
     DirectionalLight,
@@ -50,11 +50,13 @@ __all__ = [
     "SpotLight",
     "SurfaceSamples",
     "Texture",
+    "View",
     "attach_boundary",
     "edge_samples",
     "fit",
     "jvp",
     "load_camera",
+    "load_cameras",
     "load_mesh",
     "load_scene",
     "plan",

@@ -47,8 +47,8 @@ def read_model(path: PathLike, wanted: Wanted) -> Model:
     return model
 
 
-def read_cameras(path: PathLike, size: tuple[int, int], dtype: torch.dtype) -> list[Camera]:
-    """Those of a glTF or GLB file. Raises Fault, FileNotFoundError or ValueError."""
+def read_cameras(path: PathLike, size: tuple[int, int], dtype: torch.dtype) -> dict[str, Camera]:
+    """Those of a glTF or GLB file, by name. Raises Fault, FileNotFoundError or ValueError."""
     file = check_readable(path, GLTFS)
     with _as_fault(kind := file.suffix.lower()[1:]):
         return cameras(gltf.read_tree(file.read_bytes(), kind), size, dtype)

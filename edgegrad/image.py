@@ -12,6 +12,7 @@ from ._mistakes import warn_of_bytes
 
 DISPLAY = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # 8 bit, sRGB
 RADIANCE = (".exr", ".hdr")  # floating point, linear
+IMAGES = (*DISPLAY, *RADIANCE)
 MOST_NUMBERS = 1 << 30  # pixels times channels, four bytes each; a small file may announce more
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec. 709 primaries, which sRGB shares
 
@@ -45,7 +46,7 @@ def read_image(path: PathLike, channels: int | None = None) -> Tensor:
     """
     if channels not in (None, 1, 3, 4):
         raise ValueError(f"channels: expected None, 1, 3 or 4, got {channels!r}")
-    file = check_readable(path, DISPLAY + RADIANCE)
+    file = check_readable(path, IMAGES)
     oiio = require("OpenImageIO", "OpenImageIO", "reading images")
     hint = oiio.ImageSpec()
     hint["oiio:UnassociatedAlpha"] = 1
@@ -84,6 +85,17 @@ def read_image(path: PathLike, channels: int | None = None) -> Tensor:
     return (color if alpha is None or channels in (1, 3) else torch.cat([color, alpha], -1)).contiguous()
 
 
+def read_size(path: PathLike) -> tuple[int, int]:
+    """(H, W) of an image file as read_image reads it, by its header alone. Raises what read_image does."""
+    file = check_readable(path, IMAGES)
+    stored = require("OpenImageIO", "OpenImageIO", "reading images").ImageBuf(str(file))
+    spec = stored.spec()
+    if not spec.full_width or not spec.full_height:
+        raise ValueError(f"{path}: expected a whole image, got one that cannot be read ({_reason(stored)})")
+    turned = spec.getattribute("Orientation") in (5, 6, 7, 8)
+    return (spec.full_width, spec.full_height) if turned else (spec.full_height, spec.full_width)
+
+
 def write_image(path: PathLike, img: Tensor) -> None:
     """Writes linear radiance `img`, (H, W) or (H, W, C) of any floating dtype, from any device, row 0 on top.
 
@@ -94,7 +106,7 @@ def write_image(path: PathLike, img: Tensor) -> None:
     Raises ValueError (unknown ending, wrong shape, NaN or infinity), TypeError (not floating-point),
     FileNotFoundError (no such folder), OSError (cannot write) or ImportError without OpenImageIO.
     """
-    file = check_suffix(path, DISPLAY + RADIANCE)
+    file = check_suffix(path, IMAGES)
     image = as_tensor("img", img).detach()
     if not image.is_floating_point():
         raise TypeError(

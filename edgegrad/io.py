@@ -1,4 +1,4 @@
-"""Meshes, scenes and cameras from files; images come from edgegrad.image.
+"""Meshes and scenes from files; images come from edgegrad.image, cameras from edgegrad.camera_files.
 
 What colours mean: vertex and face colours of OBJ and PLY files and the texels of textures of colour are sRGB on disk and
 become linear; factors of materials (glTF baseColorFactor, emissiveFactor, OBJ Kd, Ke), vertex colours of glTF and textures of
@@ -29,26 +29,23 @@ animations, morph targets, skins (the transformation of a skinned node itself do
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator
-from contextlib import contextmanager
-
-import torch
 from torch import Tensor
 
-from ._check import check_positive_int
-from ._files import PathLike, check_readable, check_suffix, replacing
-from ._formats.part import Fault, Wanted
-from ._parts import GLTFS, read_cameras, read_model
+from ._files import PathLike
+from ._formats.part import Wanted, naming
+from ._formats.views import View
+from ._parts import read_model
 from ._welding import merge, to_mesh
-from .camera import Camera
+from .camera_files import load_camera, load_cameras, save_camera
 from .image import linear_to_srgb, read_image, srgb_to_linear, write_image
 from .mesh import Mesh
 from .scene import Scene
 
 __all__ = [
+    "View",
     "linear_to_srgb",
     "load_camera",
+    "load_cameras",
     "load_mesh",
     "load_scene",
     "read_image",
@@ -80,7 +77,7 @@ def load_mesh(
     without trimesh.
     """
     wanted = Wanted(materials and texture is None, _checked_lit(lit), unwrap=texture is not None)
-    with _naming(path):
+    with naming(path):
         parts = read_model(path, wanted).parts
         if texture is not None:
             image = texture if isinstance(texture, Tensor) else read_image(texture, channels=3)
@@ -97,7 +94,7 @@ def load_scene(path: PathLike, materials: bool = True, lit: bool = False) -> Sce
     See load_mesh for everything else, and for the errors.
     """
     wanted = Wanted(materials, _checked_lit(lit), split=True)
-    with _naming(path):
+    with naming(path):
         model = read_model(path, wanted)
         return Scene([to_mesh(part) for part in model.parts], lights=model.lights)
 
@@ -106,89 +103,3 @@ def _checked_lit(lit: object) -> bool:
     if not isinstance(lit, bool):
         raise TypeError(f"lit: expected True or False, got {type(lit).__name__} ({lit!r})")
     return lit
-
-
-def save_camera(path: PathLike, camera: Camera) -> None:
-    """Writes a camera, or a batch, as JSON: world_to_camera, K (rows, in pixels), size [H, W], projection, and
-    distortion if it has any.
-
-    Raises ValueError (a name that does not end in .json), TypeError or FileNotFoundError (no such folder).
-    """
-    file = check_suffix(path, (".json",))
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}")
-    fields = {
-        "world_to_camera": camera.world_to_camera.tolist(),
-        "K": camera.K.tolist(),
-        "size": list(camera.size),
-        "projection": camera.projection,
-    }
-    if camera.distortion is not None:
-        fields["distortion"] = camera.distortion.tolist()
-    with replacing(file) as temporary:
-        temporary.write_text(json.dumps(fields, indent=1) + "\n", encoding="utf-8")
-
-
-def load_camera(
-    path: PathLike, dtype: torch.dtype = torch.float32, size: tuple[int, int] | None = None, index: int = 0
-) -> Camera:
-    """A camera as save_camera writes it; "projection" may be left out (perspective), and "distortion" (none). Or one of a glTF or
-    GLB file, where it stands in the scene.
-
-    size   (H, W) of a glTF's camera, which has none; pixels are square, and its height of view counts, not its aspectRatio
-    index  which of a glTF's, in the order of their nodes
-
-    Raises FileNotFoundError, TypeError, or ValueError that names the file and the key.
-    """
-    file = check_readable(path, (".json", *GLTFS))
-    if file.suffix.lower() in GLTFS:
-        return _gltf_camera(path, dtype, size, index)
-    if size is not None or index != 0:
-        raise ValueError(
-            f"{path}: expected neither size nor index for a JSON file, which says its size; leave them out"
-        )
-    known = {"world_to_camera", "K", "size", "projection", "distortion"}
-    try:
-        fields = json.loads(file.read_text(encoding="utf-8"))
-        if not isinstance(fields, dict):
-            raise ValueError(f"expected a JSON object with {', '.join(sorted(known))}, got {type(fields).__name__}")
-        for key in sorted(known - {"projection", "distortion"} - set(fields)):
-            raise ValueError(f"{key}: expected this key, got only {', '.join(sorted(fields)) or 'an empty object'}")
-        for key in sorted(set(fields) - known):
-            raise ValueError(f"{key}: expected only the keys {', '.join(sorted(known))}; remove it")
-        for key in ("world_to_camera", "K", "distortion")[: 3 if "distortion" in fields else 2]:
-            try:
-                fields[key] = torch.tensor(fields[key], dtype=dtype)
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{key}: expected rows of numbers ({error})") from error
-        if not isinstance(fields["size"], list):
-            raise ValueError(f"size: expected [height, width], got {fields['size']!r}")
-        return Camera(**fields)
-    except (TypeError, ValueError) as error:  # what json and UTF-8 raise are ValueErrors too
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _gltf_camera(path: PathLike, dtype: torch.dtype, size: tuple[int, int] | None, index: int) -> Camera:
-    if size is None:
-        raise ValueError(
-            f"{path}: size: expected (height, width) in pixels for the camera of a glTF, got None; pass size="
-        )
-    height, width = (check_positive_int("size", side, most=1 << 24) for side in size)
-    with _naming(path):
-        found = read_cameras(path, (height, width), dtype)
-        if not isinstance(index, int) or not 0 <= index < len(found):
-            raise ValueError(f"index: expected that of one of {len(found)} cameras in the file, from 0, got {index!r}")
-        return found[index]
-
-
-@contextmanager
-def _naming(path: PathLike) -> Iterator[None]:
-    """Makes every fault of a file an error that names the file."""
-    try:
-        yield
-    except Fault as fault:
-        raise ValueError(f"{path}: {fault}") from fault.__cause__
-    except ValueError as error:
-        if str(error).startswith(str(path)):
-            raise
-        raise ValueError(f"{path}: {error}") from error

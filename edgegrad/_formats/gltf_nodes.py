@@ -78,24 +78,26 @@ def _light(given: dict[str, Any], world: np.ndarray) -> Light:
     raise Fault(f"expected a light of type directional, point or spot, got {kind!r}; export it again")
 
 
-def cameras(tree: dict[str, Any], size: tuple[int, int], dtype: torch.dtype) -> list[Camera]:
-    """In the order of their nodes, (H, W) pixels, which are square: of aspectRatio, yfov and ymag these give the height. Raises
-    Fault, or ValueError about the size."""
-    found = []
+def cameras(tree: dict[str, Any], size: tuple[int, int], dtype: torch.dtype) -> dict[str, Camera]:
+    """By the names of their nodes and in their order, (H, W) pixels, which are square: of aspectRatio, yfov and ymag these give
+    the height. Raises Fault, or ValueError about the size."""
+    found: dict[str, Camera] = {}
     for node, world in placed(tree):
         if "camera" not in node:
             continue
+        name = str(node.get("name", f"camera {len(found)}"))
+        name = f"{name} ({len(found)})" if name in found else name
         given = tree["cameras"][node["camera"]]
         length = np.linalg.norm(world[:3, :3], axis=0)  # a camera has no scale
         pose = torch.tensor(world, dtype=dtype)
         pose[:3, :3] /= torch.tensor(np.where(length > 0.0, length, 1.0))
         kind = given.get("type")
         if kind == "perspective":
-            found.append(Camera.from_opengl(pose, size, math.degrees(given["perspective"]["yfov"])))
+            found[name] = Camera.from_opengl(pose, size, math.degrees(given["perspective"]["yfov"]))
         elif kind == "orthographic":
             scale = size[0] / (2.0 * given["orthographic"]["ymag"])
             K = [[scale, 0.0, size[1] / 2], [0.0, scale, size[0] / 2], [0.0, 0.0, 1.0]]
-            found.append(dataclasses.replace(Camera.from_opengl(pose, size, K=K), projection="orthographic"))
+            found[name] = dataclasses.replace(Camera.from_opengl(pose, size, K=K), projection="orthographic")
         else:
             raise Fault(f"expected a camera of type perspective or orthographic, got {kind!r}; export it again")
     return found

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
 
+from .._files import PathLike
 from ..lights import Light
 from ..material import Material
 
@@ -50,3 +52,16 @@ class Wanted(NamedTuple):
     lit: bool = False  # materials that scatter light, normals and lights
     split: bool = False  # the objects of an OBJ file apart
     unwrap: bool = False  # texture coordinates also where the file has no texture
+
+
+@contextmanager
+def naming(path: PathLike) -> Iterator[None]:
+    """Makes every fault of a file an error that names the file."""
+    try:
+        yield
+    except Fault as fault:
+        raise ValueError(f"{path}: {fault}") from fault.__cause__
+    except ValueError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path}: {error}") from error

@@ -1,0 +1,176 @@
+"""Cameras of COLMAP, NeRF, OpenCV and glTF files: where points land, by those libraries themselves where they are installed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from test_conventions import FLIP, POINTS, SHIFT, SIZE, R, agree, pose
+
+import edgegrad as eg
+
+F64 = torch.float64
+K = np.array([[60.0, 0, 30], [0, 55, 25], [0, 0, 1]])
+H, W = SIZE
+
+
+# -- COLMAP ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def reconstruction(tmp_path: Path):
+    """Two images in a folder as COLMAP lays it out, its text written by hand; and pycolmap."""
+    pycolmap = pytest.importorskip("pycolmap", reason="needs the extra edgegrad[cameras]")
+    folder = tmp_path / "sparse" / "0"
+    folder.mkdir(parents=True)
+    (tmp_path / "images").mkdir()
+    eg.write_image(tmp_path / "images" / "b.png", torch.zeros(*SIZE, 3))
+    lens = f"1 OPENCV {W} {H} 60 55 30 25 0.05 -0.02 0.01 -0.015\n2 FOV {W} {H} 60 60 30 25 0.9\n"
+    (folder / "cameras.txt").write_text("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n" + lens)
+    x, y, z, w = pycolmap.Rotation3d(R.numpy()).quat
+    places = f"1 {w} {x} {y} {z} 0.3 -0.2 4.0 1 b.png\n\n2 1 0 0 0 0 0 5 1 a.png\n\n"
+    (folder / "images.txt").write_text("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n" + places)
+    (folder / "points3D.txt").write_text("")
+    return pycolmap, folder
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_colmap(reconstruction, tmp_path, binary) -> None:
+    pycolmap, folder = reconstruction
+    theirs = pycolmap.Reconstruction(str(folder))
+    if binary:
+        for file in list(folder.iterdir()):
+            file.unlink()
+        theirs.write_binary(str(folder))
+    views = eg.load_cameras(tmp_path, dtype=F64)
+    assert list(views) == ["a.png", "b.png"]
+    assert views["b.png"].image == tmp_path / "images" / "b.png" and views["a.png"].image is None
+    for image in theirs.images.values():
+        points = POINTS + SHIFT.new_tensor([0, 0, 2])
+        expected = np.array([image.project_point(p) for p in points.numpy()])
+        agree(views[image.name].camera.project(points), torch.from_numpy(expected), 1e-8)
+    assert views["b.png"].camera.size == SIZE and eg.load_cameras(folder)["a.png"].camera.K.dtype == torch.float32
+
+
+def test_colmap_faults(reconstruction, tmp_path) -> None:
+    _, folder = reconstruction
+    text = (folder / "images.txt").read_text()
+    (folder / "images.txt").write_text(text.replace("1 a.png", "2 a.png"))
+    with pytest.raises(ValueError, match=r"camera 2 of 'a\.png': model: expected one of SIMPLE_PINHOLE, .* got 'FOV'"):
+        eg.load_cameras(tmp_path)
+    (folder / "images.txt").write_text(text.replace("1 0 0 0 0 0 5", "1 0 zero"))
+    with pytest.raises(ValueError, match="expected a reconstruction of COLMAP"):
+        eg.load_cameras(tmp_path)
+    (folder / "points3D.txt").unlink()
+    with pytest.raises(ValueError, match=r"expected points3D\.txt beside"):
+        eg.load_cameras(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"expected cameras and images of COLMAP .* or transforms\.json"):
+        eg.load_cameras(tmp_path / "images")
+
+
+# -- NeRF -----------------------------------------------------------------------------------------------------------------
+
+
+def transforms(folder: Path, frame: dict | None = None, **fields: object) -> Path:
+    matrix = torch.linalg.inv(FLIP @ pose()).tolist()
+    file = folder / "transforms.json"
+    file.write_text(
+        json.dumps({**fields, "frames": [{"file_path": "./train/r_0", "transform_matrix": matrix, **(frame or {})}]})
+    )
+    return file
+
+
+def test_transforms(tmp_path) -> None:
+    (tmp_path / "train").mkdir()
+    eg.write_image(tmp_path / "train" / "r_0.png", torch.zeros(*SIZE, 3))
+    # As of the synthetic scenes: an angle, the size by the image, whose name has no ending.
+    (view,) = eg.load_cameras(transforms(tmp_path, camera_angle_x=0.7), dtype=F64).values()
+    assert view.image == tmp_path / "train" / "r_0.png" and view.camera.size == SIZE
+    agree(view.camera.world_to_camera, pose())
+    assert float(view.camera.fov_x) == pytest.approx(np.degrees(0.7))
+    # As of instant-ngp and nerfstudio, against OpenCV. Its principal point is from the image's corner.
+    lens = {"w": W, "h": H, "fl_x": 60, "fl_y": 55, "cx": 30.5, "cy": 25.5}
+    for coefficients, model in (
+        ({"k1": 0.05, "k2": -0.02, "p1": 0.01, "p2": -0.015}, "OPENCV"),
+        ({"k1": 0.05, "k2": -0.02, "p1": 0.01, "p2": -0.015, "k3": 0.01}, "OPENCV"),
+        ({"k1": 0.05, "k2": -0.02, "k3": 0.01, "k4": 0.02}, "OPENCV_FISHEYE"),
+    ):
+        file = transforms(tmp_path, coefficients, camera_model=model, **lens)
+        camera = eg.load_cameras(tmp_path, dtype=F64)["./train/r_0"].camera
+        assert file.parent == tmp_path
+        points, rotation = POINTS.numpy()[:, None], cv2.Rodrigues(R.numpy())[0]
+        project = cv2.fisheye.projectPoints if "FISH" in model else cv2.projectPoints
+        theirs, _ = project(points, rotation, SHIFT.numpy(), K, np.array(list(coefficients.values())))
+        agree(camera.project(POINTS) - 0.5, torch.from_numpy(theirs[:, 0]), 1e-8)
+
+
+@pytest.mark.parametrize(
+    "fields, fault",
+    [
+        ({"camera_angle_x": 0.7}, r"frames\[0\], \./train/r_0: w and h: expected"),
+        ({"w": W, "h": H}, "fl_x: expected this key or camera_angle_x"),
+        ({"w": W, "h": H, "fl_x": 60, "camera_model": "EQUIRECTANGULAR"}, "camera_model: expected .* got 'EQUI"),
+        ({"w": W, "h": H, "fl_x": 60, "k4": 0.1}, "k4: expected 0"),
+        (
+            {"w": W, "h": H, "fl_x": 60, "frame": {"transform_matrix": [[1, 0], [0, 1]]}},
+            "camera_to_world: expected shape",
+        ),
+        ({"w": W, "h": H, "fl_x": 60, "frame": {"transform_matrix": "x"}}, "transforms.json: frames"),
+    ],
+)
+def test_faults_of_transforms_are_named(tmp_path, fields, fault) -> None:
+    with pytest.raises(ValueError, match=fault):
+        eg.load_cameras(transforms(tmp_path, **fields))
+
+
+# -- OpenCV, glTF, our own --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", ["yml", "xml"])
+@pytest.mark.parametrize("fisheye", [0, 1])
+def test_opencv(tmp_path, ending, fisheye) -> None:
+    file = tmp_path / f"calibration.{ending}"
+    distortion = np.array([[0.05, -0.02, 0.01, -0.015]])
+    rvec = cv2.Rodrigues(R.numpy())[0]
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    for key, value in {
+        "image_width": W, "image_height": H, "camera_matrix": K, "distortion_coefficients": distortion,
+        "fisheye_model": fisheye, "extrinsic_parameters": np.array([[*rvec[:, 0], *SHIFT], [0, 0, 0, 0, 0, 9.0]]),
+    }.items():  # fmt: skip
+        storage.write(key, value)
+    storage.release()
+    views = eg.load_cameras(file, dtype=F64)
+    assert list(views) == ["view 0", "view 1"] and views["view 0"].camera.size == SIZE
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    theirs, _ = project(POINTS.numpy()[:, None], rvec, SHIFT.numpy(), K, distortion[0])
+    agree(views["view 0"].camera.project(POINTS) - 0.5, torch.from_numpy(theirs[:, 0]), 1e-8)
+
+
+def test_opencv_faults(tmp_path) -> None:
+    file = tmp_path / "a.yml"
+    for text, fault in (
+        ("nothing of the kind", "a.yml: expected YAML or XML|camera_matrix: expected this key"),
+        ("%YAML:1.0\n---\ncamera_matrix: 3\n", "camera_matrix: expected a matrix"),
+        ("%YAML:1.0\n---\nother: 3\n", "camera_matrix: expected this key"),
+    ):
+        file.write_text(text)
+        with pytest.raises(ValueError, match=fault):
+            eg.load_cameras(file)
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    storage.write("K", K)
+    storage.release()
+    with pytest.raises(ValueError, match=r"image_width: .* pass size="):
+        eg.load_cameras(file)
+    assert eg.load_cameras(file, size=SIZE)["camera"].camera.size == SIZE
+
+
+def test_our_own(tmp_path) -> None:
+    camera = eg.Camera(pose(), torch.from_numpy(K), SIZE)
+    eg.save_camera(tmp_path / "a.json", eg.Camera.stack([camera, camera]))
+    views = eg.load_cameras(tmp_path / "a.json", dtype=F64)
+    assert list(views) == ["0", "1"]
+    agree(views["1"].camera.K, camera.K)
