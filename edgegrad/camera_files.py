@@ -111,7 +111,7 @@ def load_cameras(
     dtype   of the cameras
 
     Stack those of one size by Camera.stack. Distorted lenses are mapped to this library's; where one cannot be, the error names
-    it. Raises FileNotFoundError, TypeError, ValueError that names the file, or ImportError without the extra edgegrad[cameras].
+    it. Raises FileNotFoundError, TypeError, ValueError that names the file, or ImportError without OpenCV (edgegrad[cameras]).
     """
     folder = Path(path) if isinstance(path, (str, os.PathLike)) else None
     if folder is not None and folder.is_dir():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import random
 from pathlib import Path
 
 import cv2
@@ -24,7 +26,7 @@ H, W = SIZE
 @pytest.fixture
 def reconstruction(tmp_path: Path):
     """Two images in a folder as COLMAP lays it out, its text written by hand; and pycolmap."""
-    pycolmap = pytest.importorskip("pycolmap", reason="needs the extra edgegrad[cameras]")
+    pycolmap = pytest.importorskip("pycolmap", reason="COLMAP itself is what is compared with")
     folder = tmp_path / "sparse" / "0"
     folder.mkdir(parents=True)
     (tmp_path / "images").mkdir()
@@ -65,11 +67,30 @@ def test_colmap_faults(reconstruction, tmp_path) -> None:
     (folder / "images.txt").write_text(text.replace("1 0 0 0 0 0 5", "1 0 zero"))
     with pytest.raises(ValueError, match="expected a reconstruction of COLMAP"):
         eg.load_cameras(tmp_path)
-    (folder / "points3D.txt").unlink()
-    with pytest.raises(ValueError, match=r"expected points3D\.txt beside"):
+    (folder / "images.txt").write_text(text.replace("1 a.png", "7 a.png"))
+    with pytest.raises(ValueError, match=r"'a\.png': expected its camera 7, got none"):
         eg.load_cameras(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"expected cameras and images of COLMAP .* or transforms\.json"):
         eg.load_cameras(tmp_path / "images")
+
+
+def test_damaged_reconstructions_are_refused(reconstruction, tmp_path) -> None:
+    pycolmap, folder = reconstruction
+    theirs, whole = pycolmap.Reconstruction(str(folder)), tmp_path / "whole"
+    whole.mkdir()
+    theirs.write_binary(str(whole))
+    chance = random.Random(0)
+    for k in range(300):
+        place, end = (folder, "txt") if k % 2 else (whole, "bin")
+        file = place / f"{chance.choice(['cameras', 'images'])}.{end}"
+        data = file.read_bytes()
+        changed = bytearray(data[: chance.randrange(len(data))] if chance.random() < 0.4 else data)
+        for _ in range(chance.randint(0, 4) if changed else 0):
+            changed[chance.randrange(len(changed))] = chance.randrange(256)
+        file.write_bytes(changed)
+        with contextlib.suppress(ValueError):
+            eg.load_cameras(place)
+        file.write_bytes(data)
 
 
 # -- NeRF -----------------------------------------------------------------------------------------------------------------

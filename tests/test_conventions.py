@@ -167,7 +167,7 @@ def test_from_pytorch3d(in_ndc: bool) -> None:
 
 @pytest.mark.parametrize("model", COLMAP_MODELS)
 def test_from_colmap(model: str) -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="needs the extra edgegrad[files]")
+    pycolmap = pytest.importorskip("pycolmap", reason="COLMAP itself is what is compared with")
     _, focals, count = COLMAP_MODELS[model]
     params = [*[60.0, 55.0][:focals], 30.0, 25.0, *[0.05, -0.02, 0.01, -0.015, 0.02, 0.03, 0.01, 0.02][:count]]
     theirs = pycolmap.Camera(model=model, width=SIZE[1], height=SIZE[0], params=params)
