@@ -1,9 +1,13 @@
 """edgegrad: a PyTorch layer that renders triangle meshes on the CPU and returns correct gradients, also at silhouettes."""
 
+import torch
+
 from . import fit
+from ._mesh_light import MeshLight
 from .aovs import render_aovs
 from .camera import Camera
 from .environment import Environment
+from .exchange import save_mesh
 from .hits import Hits
 from .io import View, load_camera, load_cameras, load_mesh, load_scene, read_image, save_camera, write_image
 from .lights import (
@@ -29,6 +33,14 @@ from .samples import (
     trace,
 )
 from .scene import Scene
+
+# What torch.load(weights_only=True) may make: dataclasses of tensors, which run nothing when they are loaded.
+torch.serialization.add_safe_globals(
+    [
+        AreaLight, Camera, DirectionalLight, Environment, Material, Mesh, MeshLight, PointLight, Scene, SphericalHarmonics,
+        SpotLight, Texture,
+    ]
+)  # fmt: skip
 
 __version__ = "0.1.0"
 
@@ -66,6 +78,7 @@ __all__ = [
     "render",
     "render_aovs",
     "save_camera",
+    "save_mesh",
     "screen_gradient",
     "surface_samples",
     "trace",

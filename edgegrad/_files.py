@@ -56,15 +56,18 @@ def check_suffix(path: PathLike, suffixes: Collection[str]) -> Path:
 
 @contextmanager
 def replacing(path: PathLike) -> Iterator[Path]:
-    """A temporary file beside `path` that takes its place when the block succeeds and vanishes when it fails.
+    """A temporary file beside `path` that takes its place when the block succeeds and vanishes when it fails. Missing folders
+    are made.
 
-    Raises FileNotFoundError when the folder does not exist, ValueError when `path` is a directory.
+    Raises OSError when that fails, ValueError when `path` is a directory.
     """
     file = Path(path)
     if file.is_dir():
         raise ValueError(f"{path}: expected a file name, got a directory; add a name to it")
-    if not file.parent.is_dir():
-        raise FileNotFoundError(f"{path}: expected the folder {file.parent} to exist; make it first with Path.mkdir")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"{path}: expected a folder to write to, got {file.parent} ({error.strerror})") from error
     # The same ending, since libraries choose the format by it; not tempfile, whose files only their owner may read.
     temporary = file.with_name(f".{file.stem[:64]}-{secrets.token_hex(6)}{file.suffix}")
     try:

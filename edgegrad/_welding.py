@@ -38,6 +38,7 @@ def merge(parts: list[Part]) -> Part:
 
     start = np.cumsum([0] + [len(part.verts) for part in parts])
     return parts[0]._replace(
+        name="",
         verts=joined("verts"),
         faces=np.concatenate([part.faces + n for part, n in zip(parts, start, strict=False)]),
         uvs=joined("uvs"),
@@ -51,7 +52,7 @@ def merge(parts: list[Part]) -> Part:
 def to_mesh(part: Part) -> Mesh:
     """Raises Fault."""
     verts, faces = _weld(part.verts, part.faces)
-    images: dict[str, Any] = _material(part)
+    images: dict[str, Any] = {**_material(part), "name": part.name or None}
     shared = part.material is not None and set(part.material.textures) - set(part.material_uvs)
     if part.texture is not None or part.alpha is not None or shared:
         if part.uvs is None:

@@ -23,7 +23,7 @@ def save_camera(path: PathLike, camera: Camera) -> None:
     """Writes a camera, or a batch, as JSON: world_to_camera, K (rows, in pixels), size [H, W], projection, and
     distortion if it has any.
 
-    Raises ValueError (a name that does not end in .json), TypeError or FileNotFoundError (no such folder).
+    Missing folders are made. Raises ValueError (a name that does not end in .json), TypeError or OSError.
     """
     file = check_suffix(path, (".json",))
     if not isinstance(camera, Camera):

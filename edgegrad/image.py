@@ -101,10 +101,10 @@ def write_image(path: PathLike, img: Tensor) -> None:
 
     PNG, JPEG, BMP and TIFF: clipped to 0 … 1, sRGB, 8 bit, rounded to nearest; C up to 4 (2 and 4: the last is alpha,
     not gamma-corrected; JPEG holds 1 or 3). HDR: linear, C = 3. EXR: linear float32, any C. The file appears whole or
-    not at all; an existing one is replaced.
+    not at all; an existing one is replaced, and missing folders are made.
 
     Raises ValueError (unknown ending, wrong shape, NaN or infinity), TypeError (not floating-point),
-    FileNotFoundError (no such folder), OSError (cannot write) or ImportError without OpenImageIO.
+    OSError (cannot write) or ImportError without OpenImageIO.
     """
     file = check_suffix(path, IMAGES)
     image = as_tensor("img", img).detach()

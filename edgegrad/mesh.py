@@ -27,7 +27,7 @@ from .material import LARGEST_UV, WRAPS, Material
 
 PLAIN = 0.7  # radiance, or base colour, of a mesh without colours, in every channel
 FILTERS: tuple[str, ...] = core.TEXTURE_FILTERS  # linear, nearest
-_SETTINGS = ("alpha_cutoff", "wrap", "filter", "material")  # fields that are no tensors
+_SETTINGS = ("alpha_cutoff", "wrap", "filter", "material", "name")  # fields that are no tensors
 _INDEXING = ("verts", "faces", "uv_faces", "normal_faces")  # what takes no type from the vertices
 SMALLEST_MESH = 1e-38
 
@@ -55,6 +55,7 @@ class Mesh:
     normals        (N, 3) float   normals, of any length, interpolated over the faces where a material is lit; without, faces
                    are flat. They are turned to the side of the face that is seen
     normal_faces   (F, 3) int     indices into normals; those of `faces` when None
+    name           what a file calls it
 
     Faces of zero area render nothing. Numbers reach up to 3.4e38, the range of float32, also in float64; uvs up to 1e9, for
     beyond that a double does not tell the texels of a large texture apart; the largest of the verts lies above 1e-38, unless
@@ -77,6 +78,7 @@ class Mesh:
     material: Material | None = None
     normals: Tensor | None = None
     normal_faces: Tensor | None = None
+    name: str | None = None
 
     def __post_init__(self) -> None:
         self._check_settings()
@@ -169,6 +171,8 @@ class Mesh:
             )
 
     def _check_settings(self) -> None:
+        if self.name is not None and not isinstance(self.name, str):
+            raise TypeError(f"name: expected a str or None, got {type(self.name).__name__}")
         if isinstance(self.alpha_cutoff, bool) or not isinstance(self.alpha_cutoff, (int, float)):
             raise TypeError(f"alpha_cutoff: expected a number, got {type(self.alpha_cutoff).__name__}")
         if not math.isfinite(self.alpha_cutoff):
@@ -240,4 +244,28 @@ class Mesh:
         look = f"{kinds[0]} {tuple(getattr(self, kinds[0]).shape)}" if kinds else "plain"
         look += f", alpha {tuple(self.alpha.shape)}" if self.alpha is not None else ""
         look += ", lit" if self.material is not None else ""
-        return f"Mesh({self.verts.shape[0]} vertices, {self.faces.shape[0]} faces, {look}, {self.verts.dtype})"
+        name = "" if self.name is None else f"{self.name!r}, "
+        return f"Mesh({name}{self.verts.shape[0]} vertices, {self.faces.shape[0]} faces, {look}, {self.verts.dtype})"
+
+    def _repr_png_(self) -> bytes | None:
+        """What notebooks show: the mesh as a whole, under a headlight unless it has colours."""
+        from .scene import Scene
+
+        return Scene([self])._repr_png_()
+
+    # -- trimesh ------------------------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def from_trimesh(mesh: Any) -> Mesh:
+        """From a trimesh.Trimesh: float32 vertices, equal ones welded, with its vertex or face colours or its texture, which are
+        sRGB there. Raises TypeError, ValueError or ImportError."""
+        from .exchange import from_trimesh
+
+        return from_trimesh(mesh)
+
+    def to_trimesh(self) -> Any:
+        """A trimesh.Trimesh, with colours or texture as 8-bit sRGB; vertices are split where texture coordinates or the colours
+        of corners differ. Raises ValueError for other than 1 or 3 channels, ImportError."""
+        from .exchange import to_trimesh
+
+        return to_trimesh(self)

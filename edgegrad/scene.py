@@ -169,6 +169,15 @@ class Scene:
         lights = "".join(f", {type(light).__name__}" for light in self.lights)
         return f"Scene({', '.join(map(repr, self.meshes))}; {back}{lights})"
 
+    def _repr_png_(self) -> bytes | None:
+        """What notebooks show; None where it cannot be drawn."""
+        from ._preview import thumbnail
+
+        try:
+            return thumbnail(self)
+        except (ImportError, MemoryError, OSError, TypeError, ValueError):
+            return None
+
 
 class Flat(NamedTuple):
     """A scene as the kernel reads it: the meshes laid end to end, on the CPU. A corner of a face refers to a row of

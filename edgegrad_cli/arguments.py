@@ -9,8 +9,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-MESHES = "OBJ, glTF, GLB, PLY, STL, OFF or 3MF"
-
 
 class Parser(argparse.ArgumentParser):
     """With the nearest name where one is not known."""
@@ -41,11 +39,21 @@ def _nearest(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
+def add_mesh(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("mesh", type=Path, metavar="MESH", help="OBJ, glTF, GLB, PLY, STL, OFF or 3MF")
+    parser.add_argument(
+        "--texture", type=Path, metavar="IMAGE", help="to lay on its texture coordinates instead of its look"
+    )
+    parser.add_argument("--no-materials", action="store_true", help="leave out its textures and materials")
+
+
 def add_view(parser: argparse.ArgumentParser) -> None:
     view = parser.add_argument_group(
         "view", "a camera file, or a look at the mesh, which is framed as far as nothing is said"
     )
-    view.add_argument("--camera", type=Path, metavar="CAMERA.json", help="world_to_camera 4 × 4, K 3 × 3, size [H, W]")
+    view.add_argument(
+        "--camera", type=Path, metavar="CAMERA.json", help="world_to_camera 4 × 4, K 3 × 3, size [H, W]; or glTF"
+    )
     view.add_argument("--fov", type=float, metavar="DEGREES", help="vertical field of view (40)")
     for name, help in (
         ("eye", "where the camera is"),

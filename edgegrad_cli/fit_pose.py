@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
-from .arguments import MESHES, add_view, count, number
-from .inputs import read_background, read_mask, read_picture, read_pose, read_view, size_text
+from .arguments import add_mesh, add_view, count, number
+from .inputs import read_background, read_mask, read_picture, read_pose, read_scene, read_view, size_text
 
 if TYPE_CHECKING:
     from edgegrad.fit import PoseFit
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     parser = commands.add_parser("fit-pose", help="find a mesh in a picture", description=run.__doc__)
-    parser.add_argument("mesh", type=Path, metavar="MESH", help=MESHES)
+    add_mesh(parser)
     parser.add_argument("image", type=Path, metavar="IMAGE", help="the picture; an alpha channel is taken as the mask")
     parser.add_argument("--mask", type=Path, help="image of the picture's size, white on the object")
     add_view(parser)
@@ -41,12 +41,11 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Finds rotation and translation of a mesh in a picture, from a start within about 20° and 15 % of the mesh's size.
     Ctrl-C keeps the best pose so far."""
-    from edgegrad import load_scene
     from edgegrad.fit import fit_pose
 
     from . import INTERRUPTED
 
-    scene = load_scene(args.mesh)
+    scene = read_scene(args)
     picture, mask = read_picture(args.image)
     if args.mask is not None:
         mask = read_mask(args.mask)

@@ -13,6 +13,18 @@ if TYPE_CHECKING:
     from edgegrad.fit import Pose
 
 
+def read_scene(args: argparse.Namespace) -> Scene:
+    """The mesh file, with --texture and --no-materials. Raises what load_scene raises, in words of the command line."""
+    from edgegrad import Scene, load_mesh, load_scene
+
+    try:
+        if args.texture is not None:
+            return Scene([load_mesh(args.mesh, args.texture)])
+        return load_scene(args.mesh, materials=not args.no_materials)
+    except (ValueError, FileNotFoundError) as error:
+        raise type(error)(str(error).replace("pass materials=False", "pass --no-materials")) from error
+
+
 def read_picture(path: Path) -> tuple[Tensor, Tensor | None]:
     """(H, W, 3), and (H, W) from its alpha where that says anything."""
     from edgegrad import read_image
@@ -80,7 +92,8 @@ def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | No
             raise ValueError(
                 "--camera: expected none of --fov, --eye, --target, --up beside it, got both; leave one out"
             )
-        camera = load_camera(args.camera, torch.float64)
+        by_size = args.camera.suffix.lower() in (".gltf", ".glb")  # which have none of their own
+        camera = load_camera(args.camera, torch.float64, (size or (512, 512)) if by_size else None)
     elif pose_file is not None and not described:
         source, text = pose_file, pose_file.read_text(encoding="utf-8")
         if '"camera"' in text:  # else a pose alone, written by hand

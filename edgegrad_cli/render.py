@@ -6,14 +6,14 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from .arguments import MESHES, add_view, count, number, shape
-from .inputs import read_background, read_pose, read_view
+from .arguments import add_mesh, add_view, count, number, shape
+from .inputs import read_background, read_pose, read_scene, read_view
 from .outputs import make_folder
 
 
 def add(commands: Any) -> None:
     parser = commands.add_parser("render", help="render a mesh", description=run.__doc__)
-    parser.add_argument("mesh", type=Path, metavar="MESH", help=MESHES)
+    add_mesh(parser)
     parser.add_argument(
         "--out", type=Path, required=True, metavar="IMAGE", help="EXR, HDR (linear), PNG, JPEG or TIFF (sRGB)"
     )
@@ -27,12 +27,13 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Renders a mesh to an image file."""
+    """Renders a mesh to an image file; one without colours under a headlight."""
     import torch
 
-    from edgegrad import load_scene, render, write_image
+    from edgegrad import render, write_image
+    from edgegrad._preview import under_headlight
 
-    scene = load_scene(args.mesh)
+    scene = read_scene(args)
     pose = None if args.pose is None else read_pose(args.pose)
     camera = read_view(args, scene, args.size, args.pose)
     if pose is not None:
@@ -41,6 +42,6 @@ def run(args: argparse.Namespace) -> int:
         scene = scene.replace(background=read_background(args.background, torch.empty(*camera.size, 3)))
     make_folder(args.out.absolute().parent)
     with torch.no_grad():
-        write_image(args.out, render(scene, camera, spp=args.spp, seed=args.seed))
+        write_image(args.out, render(under_headlight(scene, camera), camera, spp=args.spp, seed=args.seed))
     print(f"wrote {args.out}")
     return 0

@@ -223,3 +223,23 @@ def test_doctor(capsys, monkeypatch):
     assert doctor.gradient_error() < 0.01
     monkeypatch.setattr(doctor, "TOLERANCE", 0.05 * doctor.gradient_error())
     assert run("doctor") == 1 and "WRONG" in capsys.readouterr().out
+
+
+def test_a_plain_mesh_is_rendered_under_a_headlight(tmp_path):
+    trimesh.creation.icosphere(subdivisions=3).export(tmp_path / "ball.stl")
+    assert run("render", tmp_path / "ball.stl", "--out", tmp_path / "ball.exr", "--size", 32, "--spp", 4) == 0
+    image = read_image(tmp_path / "ball.exr")
+    assert float(image[16, 16, 0]) == pytest.approx(0.7, abs=0.02) and 0.0 < float(image[16, 1, 0]) < 0.5
+
+
+def test_texture_and_no_materials(tmp_path, capsys):
+    (tmp_path / "a.obj").write_text(
+        "mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl skin\nf 1/1 2/2 3/3\n"
+    )
+    write_image(tmp_path / "red.png", torch.tensor([1.0, 0.0, 0.0]).expand(4, 4, 3))
+    more = ("--out", tmp_path / "a.exr", "--size", 16, "--spp", 4, "--eye", 0.3, 0.3, 2)
+    assert run("render", tmp_path / "a.obj", *more) == 2
+    assert "--no-materials" in capsys.readouterr().err
+    assert run("render", tmp_path / "a.obj", "--no-materials", *more) == 0
+    assert run("render", tmp_path / "a.obj", "--texture", tmp_path / "red.png", *more) == 0
+    assert torch.allclose(read_image(tmp_path / "a.exr").amax((0, 1)), torch.tensor([1.0, 0.0, 0.0]))

@@ -1,0 +1,113 @@
+"""Meshes to and from trimesh, and into files by it.
+
+trimesh keeps colours as 8-bit sRGB, here they are linear; its texture coordinates are the vertices', which are split at seams.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ._files import PathLike, check_suffix, replacing, require
+from ._formats.part import Fault, Part
+from ._formats.source import Textures, linear_colors
+from ._welding import to_mesh
+from .image import linear_to_srgb
+from .mesh import Mesh
+
+WRITTEN = (".ply", ".obj", ".glb", ".stl", ".off")
+
+
+def from_trimesh(given: Any) -> Mesh:
+    """See Mesh.from_trimesh."""
+    trimesh = require("trimesh", "trimesh", "Mesh.from_trimesh")
+    if isinstance(given, trimesh.Scene):
+        raise TypeError("mesh: expected a trimesh.Trimesh, got a Scene; take scene.to_mesh(), or one of scene.geometry")
+    if not isinstance(given, trimesh.Trimesh):
+        raise TypeError(f"mesh: expected a trimesh.Trimesh, got {type(given).__name__}")
+    look: dict[str, Any] = {}
+    visual = given.visual
+    try:
+        if visual.kind == "vertex":
+            look["colors"] = linear_colors("vertex", visual.vertex_colors, srgb=True)
+        elif visual.kind == "face":
+            look["face_colors"] = linear_colors("face", visual.face_colors, srgb=True)
+        elif visual.kind == "texture" and visual.uv is not None:
+            material = visual.material
+            image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+            if image is not None:
+                image.format = image.format or "PNG"  # one that was made, not read
+                look |= {"texture": Textures().get("texture", image), "uvs": np.asarray(visual.uv, np.float32)}
+        return to_mesh(Part("", np.asarray(given.vertices, np.float32), np.asarray(given.faces, np.int64), **look))
+    except Fault as fault:
+        raise ValueError(f"mesh: {fault}") from fault.__cause__
+
+
+def to_trimesh(mesh: Mesh, linear: bool = False) -> Any:
+    """See Mesh.to_trimesh. linear: colours of vertices are, as in glTF."""
+    trimesh = require("trimesh", "trimesh", "Mesh.to_trimesh")
+    if mesh.channels not in (None, 1, 3):
+        raise ValueError(f"mesh: expected 1 or 3 channels, got {mesh.channels}; pick some")
+    faces = _array(mesh.faces)
+    verts, colors = _array(mesh.verts), mesh.colors
+    if mesh.texture is not None:
+        assert mesh.uvs is not None and mesh.uv_faces is not None
+        pairs, index = np.unique(
+            np.stack([faces.reshape(-1), _array(mesh.uv_faces).reshape(-1)], 1), axis=0, return_inverse=True
+        )
+        pillow = require("PIL.Image", "edgegrad[files]", "saving textures")
+        material = trimesh.visual.material.PBRMaterial(
+            baseColorTexture=pillow.fromarray(_bytes(mesh.texture)), metallicFactor=0.0, roughnessFactor=1.0
+        )
+        visual = trimesh.visual.TextureVisuals(uv=_array(mesh.uvs)[pairs[:, 1]], material=material)
+        faces = index.reshape(-1, 3)
+        return trimesh.Trimesh(verts[pairs[:, 0]], faces, visual=visual, process=False)
+    if mesh.corner_colors is not None or (mesh.face_colors is not None and linear):
+        given = mesh.corner_colors if mesh.face_colors is None else mesh.face_colors[:, None].expand(-1, 3, -1)
+        assert given is not None
+        verts, faces = verts[faces.reshape(-1)], np.arange(faces.size).reshape(-1, 3)
+        colors = given.reshape(-1, given.shape[-1])
+    look = {}
+    if colors is not None:
+        look["vertex_colors"] = _bytes(colors, linear)
+    elif mesh.face_colors is not None:
+        look["face_colors"] = _bytes(mesh.face_colors)
+    return trimesh.Trimesh(verts, faces, process=False, **look)
+
+
+def save_mesh(path: PathLike, mesh: Mesh) -> None:
+    """Writes a mesh: PLY, OBJ, GLB, STL or OFF by the name's ending. Missing folders are made.
+
+    Colours become 8-bit (sRGB; in a GLB those of vertices linear, as the format wants), clipped to 0 … 1; an OBJ's texture lies
+    beside it with its .mtl. STL holds the shape alone. Materials, normals and alpha are left out.
+
+    Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
+    """
+    file = check_suffix(path, WRITTEN)
+    if not isinstance(mesh, Mesh):
+        raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; save the meshes of a scene one by one")
+    kind = file.suffix.lower()[1:]
+    made, beside = to_trimesh(mesh, linear=kind == "glb"), {}
+    if kind == "obj":
+        export = require("trimesh.exchange.obj", "trimesh", "saving meshes").export_obj
+        content, beside = export(made, return_texture=True, mtl_name=f"{file.stem}.mtl")
+    else:
+        content = made.export(file_type=kind)
+    for name, data in {**beside, file.name: content}.items():
+        with replacing(file.parent / Path(name).name) as temporary:
+            temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy()
+
+
+def _bytes(values: Tensor, linear: bool = False) -> np.ndarray:
+    """(…, 3) uint8, sRGB unless told otherwise."""
+    values = values.detach().cpu().double().clamp(0.0, 1.0)
+    values = values.expand(*values.shape[:-1], 3)
+    return ((values if linear else linear_to_srgb(values)) * 255.0).round().to(torch.uint8).contiguous().numpy()

@@ -1,0 +1,144 @@
+"""Meshes to and from trimesh, files and notebooks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from scenes import cube
+
+import edgegrad as eg
+from edgegrad._framing import framing
+from edgegrad._preview import under_headlight
+
+VERTS, FACES = cube().verts.float(), cube().faces
+COLORS = torch.rand(8, 3, generator=torch.Generator().manual_seed(0))
+LOOKS = {
+    "plain": {},
+    "colors": {"colors": COLORS},
+    "grey": {"colors": COLORS[:, :1]},
+    "face_colors": {"face_colors": torch.rand(12, 3, generator=torch.Generator().manual_seed(1))},
+    "corner_colors": {"corner_colors": torch.rand(12, 3, 3, generator=torch.Generator().manual_seed(2))},
+    "texture": {
+        "texture": torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(3)),
+        "uvs": torch.rand(20, 2, generator=torch.Generator().manual_seed(4)),
+        "uv_faces": torch.arange(36).reshape(12, 3) % 20,
+    },
+}
+
+
+def close(a: eg.Mesh, b: eg.Mesh, linear: bool = False) -> None:
+    """The same faces with the same look, up to the rounding to 8 bit."""
+    torch.testing.assert_close(a.verts[a.faces.long()], b.verts[b.faces.long()])
+
+    def shown(mesh: eg.Mesh) -> torch.Tensor | None:
+        if mesh.texture is not None:
+            return mesh.texture
+        for colors, index in ((mesh.colors, mesh.faces.long()), (mesh.corner_colors, slice(None))):
+            if colors is not None:
+                return colors[index].expand(-1, -1, 3)
+        return None if mesh.face_colors is None else mesh.face_colors[:, None].expand(-1, 3, 3)
+
+    x, y = shown(a), shown(b)
+    assert (x is None) == (y is None)
+    if x is not None and y is not None:
+        # Half a step of 1/255, or of sRGB, whose slope is at most 2.4 times as steep.
+        torch.testing.assert_close(x.expand_as(y), y, rtol=0, atol=(0.51 if linear else 1.25) / 255)
+    if a.texture is not None and b.texture is not None:
+        torch.testing.assert_close(a.uvs[a.uv_faces.long()], b.uvs[b.uv_faces.long()])
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_to_trimesh_and_back(look: str) -> None:
+    mesh = eg.Mesh(VERTS, FACES, **LOOKS[look])
+    close(eg.Mesh.from_trimesh(mesh.to_trimesh()), mesh)
+
+
+def test_trimesh_itself() -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    mesh = eg.Mesh.from_trimesh(sphere)
+    assert mesh.verts.shape == sphere.vertices.shape and mesh.channels is None
+    assert mesh.to_trimesh().volume == pytest.approx(sphere.volume, rel=1e-5)
+    sphere.visual.face_colors = [255, 0, 0, 255]
+    assert eg.Mesh.from_trimesh(sphere).face_colors[5].tolist() == [1.0, 0.0, 0.0]
+    with pytest.raises(TypeError, match=r"expected a trimesh\.Trimesh, got a Scene; take scene\.to_mesh"):
+        eg.Mesh.from_trimesh(trimesh.Scene([sphere]))
+    with pytest.raises(TypeError, match="got Mesh"):
+        eg.Mesh.from_trimesh(mesh)
+    with pytest.raises(ValueError, match="expected 1 or 3 channels, got 5"):
+        eg.Mesh(VERTS, FACES, colors=torch.rand(8, 5)).to_trimesh()
+
+
+@pytest.mark.parametrize("ending", ["ply", "obj", "glb"])
+@pytest.mark.parametrize("look", LOOKS)
+def test_save_mesh(tmp_path: Path, look: str, ending: str) -> None:
+    if (ending, look) in (("ply", "texture"), ("obj", "face_colors")):
+        pytest.skip("what trimesh does not write there")
+    mesh = eg.Mesh(VERTS, FACES, **LOOKS[look])
+    file = tmp_path / "new" / f"cube.{ending}"
+    eg.save_mesh(file, mesh)
+    close(eg.load_mesh(file), mesh, linear=ending == "glb" and look != "texture")
+
+
+def test_save_shapes_and_faults(tmp_path: Path) -> None:
+    mesh = eg.Mesh(VERTS, FACES)
+    for ending in ("stl", "off"):
+        eg.save_mesh(tmp_path / f"a.{ending}", mesh)
+        close(eg.load_mesh(tmp_path / f"a.{ending}"), mesh)
+    with pytest.raises(ValueError, match=r"a\.fbx: expected a file name that ends in \.ply"):
+        eg.save_mesh(tmp_path / "a.fbx", mesh)
+    with pytest.raises(TypeError, match="expected a Mesh, got Scene; save the meshes of a scene one by one"):
+        eg.save_mesh(tmp_path / "a.ply", eg.Scene([mesh]))
+
+
+def test_parts_keep_their_names(tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    trimesh.Scene({"wheel": box, "door": box}).export(tmp_path / "a.glb")
+    scene = eg.load_scene(tmp_path / "a.glb")
+    assert [mesh.name for mesh in scene.meshes] == ["wheel", "door"]
+    assert repr(scene.meshes[0]).startswith("Mesh('wheel', 8 vertices") and scene.transformed().meshes[1].name == "door"
+    assert eg.load_mesh(tmp_path / "a.glb").name is None
+
+
+def test_torch_load_with_weights_only(tmp_path: Path) -> None:
+    mesh = eg.Mesh(VERTS, FACES, colors=COLORS.requires_grad_(), material=eg.Material(roughness=eg.Texture(torch.rand(2, 2, 1))),
+                   uvs=COLORS[:, :2], uv_faces=FACES)  # fmt: skip
+    camera = eg.Camera.look_at((0, 0, 4), (0, 0, 0), size=(8, 8))
+    lights = [
+        eg.DirectionalLight((0, 0, -1)), eg.PointLight((0, 0, 4)), eg.SpotLight((0, 0, 4), (0, 0, -1)),
+        eg.Environment(torch.ones(3)), eg.AreaLight.disc((0, 3, 0), (1, 0, 0), (0, 0, 1), 2.0),
+    ]  # fmt: skip
+    scene = eg.Scene([mesh], lights=lights)
+    image = eg.render(scene, camera, spp=1)
+    torch.save({"scene": scene, "camera": camera}, tmp_path / "a.pt")
+    loaded = torch.load(tmp_path / "a.pt", weights_only=True)
+    assert torch.equal(eg.render(loaded["scene"], loaded["camera"], spp=1), image)
+    assert loaded["scene"].meshes[0].colors.requires_grad
+
+
+def test_notebooks_show_a_picture(tmp_path: Path) -> None:
+    for mesh in (eg.Mesh(VERTS, FACES), eg.Mesh(VERTS, FACES, colors=COLORS.requires_grad_())):
+        (tmp_path / "a.png").write_bytes(mesh._repr_png_())
+        picture = np.asarray(Image.open(tmp_path / "a.png").convert("RGB"))
+        assert picture.shape == (256, 256, 3) and len(np.unique(picture[100:156, 100:156])) > 1
+    assert eg.Mesh(VERTS, FACES, colors=torch.rand(8, 5))._repr_png_() is not None
+    assert eg.Scene([eg.Mesh(VERTS, FACES)], torch.rand(4, 4, 3))._repr_png_() is not None
+
+
+def test_a_headlight_shines_only_where_nothing_says_a_look() -> None:
+    plain, painted = eg.Scene([eg.Mesh(VERTS, FACES)]), eg.Scene([eg.Mesh(VERTS, FACES, colors=COLORS)])
+    camera = framing(plain, (32, 32))
+    assert under_headlight(painted, camera) is painted
+    lit = under_headlight(plain, camera)
+    assert lit.is_lit and plain.lights == ()
+    seen = eg.render(lit, camera, spp=4).reshape(-1, 3)
+    sides = eg.render(eg.Scene([eg.Mesh(VERTS, FACES, face_colors=torch.arange(12.0)[:, None] // 2)]), camera, spp=1)
+    assert len(sides.unique()) >= 4 and 0.2 < float(seen.max()) <= 0.7 and float(seen.std()) > 0.05
+    dark = eg.Scene([eg.Mesh(VERTS, FACES, material=eg.Material())])
+    assert float(eg.render(under_headlight(dark, camera), camera, spp=1).max()) > 0.2
+    sunny = dark.replace(lights=[eg.PointLight((0, 0, 9))])
+    assert under_headlight(sunny, camera) is sunny
