@@ -18,7 +18,8 @@ def require(module: str, package: str, purpose: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(f"{purpose} needs {package}; install it with: pip install {package} ({error})") from error
+        quoted = f"'{package}'" if "[" in package else package  # for shells that take brackets for a pattern
+        raise ImportError(f"{purpose} needs {package}; install it with: pip install {quoted} ({error})") from error
 
 
 def check_readable(path: PathLike, suffixes: Collection[str]) -> Path:

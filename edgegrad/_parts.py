@@ -59,8 +59,14 @@ def _as_fault(kind: str) -> Iterator[None]:
     """Makes whatever goes wrong while a file is read a fault of the file."""
     try:
         yield
-    except (Fault, FileNotFoundError, ImportError):
+    except (Fault, FileNotFoundError):
         raise
+    except ImportError as error:
+        if "pip install" in str(error):
+            raise
+        raise ImportError(  # trimesh's own, of what its extras bring
+            f"reading this {kind.upper()} file needs {error.name or "more"}; install it with: pip install 'edgegrad[files]' ({error})"
+        ) from error
     except Exception as error:
         raise Fault(
             f"expected a whole {kind.upper()} file, got one that cannot be read ({type(error).__name__}: {error}); "

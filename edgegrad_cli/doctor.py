@@ -12,11 +12,10 @@ from typing import Any
 LIBRARIES = ("torch", "numpy", "embreex", "trimesh", "OpenImageIO")
 # Which extra brings what, and what for.
 OPTIONAL = {
-    "networkx": "files: glTF and 3MF",
-    "lxml": "files: 3MF",
     "pillow": "files, figures: textures of meshes, animations",
-    "pycolmap": "files: COLMAP's cameras",
-    "opencv-python-headless": "files: OpenCV's calibrations",
+    "lxml": "files: 3MF",
+    "networkx": "files: 3MF",
+    "opencv-python-headless": "cameras: OpenCV's calibrations",
     "matplotlib": "figures: of fits and reports",
     "pyvista": "demo",
     "mitsuba": "peers: compared in edgegrad report",

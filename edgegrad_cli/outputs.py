@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,8 +32,16 @@ def write_pose(folder: Path, fit: PoseFit) -> None:
 
 
 def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
-    """The names of what was written. Raises OSError that names what was not, ImportError without the libraries of figures."""
+    """The names of what was written; without the libraries of figures the pose alone. Raises OSError that names what was not."""
+    from edgegrad._files import require
+
     names = ["pose.json"] + ["fit.png", "loss.png", "fit.webp"] * bool(fit.history)
+    try:
+        for module in ("matplotlib", "PIL"):
+            require(module, "edgegrad[figures]", "drawing a fit")
+    except ImportError as error:
+        print(f"edgegrad: no pictures: {error}", file=sys.stderr)
+        names = names[:1]
     for name in names:
         try:
             if name == "pose.json":

@@ -59,10 +59,12 @@ def _error_time(args: argparse.Namespace) -> int:
     """Relative error of the gradient (per vertex, and of whole-object translation and rotation) against wall time, for a
     sweep of samples: edgegrad, finite differences, and every other renderer that is installed. Ctrl-C keeps what is
     measured; the same command goes on from there."""
+    from edgegrad._files import require
     from edgegrad.report.error_time import error_time
 
     from . import INTERRUPTED
 
+    require("matplotlib", "edgegrad[report]", "edgegrad report")  # before the measurements rather than after them
     make_folder(args.out)
     document, interrupted = error_time(
         args.out, args.scene, args.methods,
@@ -79,10 +81,12 @@ def _stability(args: argparse.Namespace) -> int:
     """Error of image and gradient in extreme cases against independent references: scale, cameras, geometry, what coincides,
     stiff scenes; whether the gradient is unbiased, steps within faces, and ill-conditioned fits. Ctrl-C keeps what is measured.
     The exit code is 1 if a case is wrong."""
+    from edgegrad._files import require
     from edgegrad.report.stability import failures, stability
 
     from . import INTERRUPTED
 
+    require("matplotlib", "edgegrad[report]", "edgegrad report")  # before the measurements rather than after them
     make_folder(args.out)
     document, interrupted = stability(args.out, args.case, quick=args.quick)
     if document["cases"] or document["sections"]:

@@ -189,7 +189,7 @@ def test_demo_prints_errors_and_writes_pictures(tmp_path, capsys):
 def test_demo_without_pyvista_says_how_to_get_it(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista.examples", None)
     assert run("demo", "--out", tmp_path) == 2
-    assert "pip install edgegrad[demo]" in capsys.readouterr().err
+    assert "pip install 'edgegrad[demo]'" in capsys.readouterr().err
 
 
 def test_version_as_a_program():

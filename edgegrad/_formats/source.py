@@ -61,7 +61,7 @@ class Folder:
 
 def opened(name: str, content: bytes) -> Any:
     """A Pillow image, not yet decoded. Raises Fault."""
-    pillow = require("PIL.Image", "pillow", "reading textures")
+    pillow = require("PIL.Image", "edgegrad[files]", "reading textures")
     try:
         return pillow.open(io.BytesIO(content))
     except (OSError, pillow.DecompressionBombError) as error:
@@ -69,6 +69,7 @@ def opened(name: str, content: bytes) -> Any:
 
 
 def no_image(name: str) -> Fault:
+    require("PIL.Image", "edgegrad[files]", "reading textures")  # without it trimesh finds none and says nothing
     return Fault(f"expected an image in the texture {name!r}, got none that Pillow reads; save it as PNG or JPEG")
 
 

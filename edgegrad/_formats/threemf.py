@@ -14,7 +14,8 @@ MOST_INSTANCES = 100_000  # of the parts of a file: nested components multiply
 def instances(data: bytes) -> int:
     """How many parts a 3MF places. trimesh gives up without a word where many components are nested, and leaves out those that
     are not defined. Raises Fault, also for an archive that would fill the memory and for XML that names other files."""
-    etree = require("lxml.etree", "lxml", "reading 3MF")
+    etree = require("lxml.etree", "edgegrad[files]", "reading 3MF")
+    require("networkx", "edgegrad[files]", "reading 3MF")
     safe = require("trimesh.exchange.common", "trimesh", "reading meshes").XML_PARSER_OPTIONS
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         size = sum(member.file_size for member in archive.infolist())  # no reader goes beyond
