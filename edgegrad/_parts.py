@@ -65,7 +65,8 @@ def _as_fault(kind: str) -> Iterator[None]:
         if "pip install" in str(error):
             raise
         raise ImportError(  # trimesh's own, of what its extras bring
-            f"reading this {kind.upper()} file needs {error.name or 'more'}; install it with: pip install 'edgegrad[files]' ({error})"
+            f"reading this {kind.upper()} file needs {error.name or 'more'}; install it with: pip install 'edgegrad[files]' "
+            f"({error})"
         ) from error
     except Exception as error:
         raise Fault(
