@@ -15,11 +15,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from . import _lit_kernel
 from ._appearance import OnMesh, jumps
 from ._bsdf import Scattering, dot, terminator
 from ._check import check_positive_int, values_visible
 from ._request import Request
-from ._surfaces import Surfaces
+from ._lit_kernel import is_fused
+from ._surfaces import Surfaces, View
 from ._tree import tensors_in
 from .camera import Camera
 from .environment import Environment
@@ -77,9 +79,16 @@ class _Surface(NamedTuple):
 
 def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tensor:
     """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours."""
+    _note_jumps(hits)
+    if isinstance(hits._view, View) and is_fused(hits._surfaces.scene):
+        return _lit_kernel.radiance(hits, shadows, light_samples)
+    return reference(hits, shadows, light_samples)
+
+
+def reference(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tensor:
+    """The same in PyTorch."""
     surfaces = hits._surfaces
     meshes, C = surfaces.scene.meshes, surfaces.scene.channels
-    _note_jumps(hits)
     total = hits._barycentrics.new_zeros((len(hits), C))
     for index in range(len(meshes)):
         if len(meshes) == 1:

@@ -174,7 +174,7 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.cpu().double().contiguous().numpy()
 
 
-def _bare(scene: Scene) -> Flat:
+def bare(scene: Scene) -> Flat:
     """The surfaces of a scene alone."""
     return without_colors(flatten(scene))
 
@@ -210,10 +210,10 @@ def trace(scene: Scene, origins: Tensor, directions: Tensor) -> TraceRecords:
         )
         return _record(TraceRecords, found)
 
-    return TraceRecords(*_of_values(_bare(scene), compute, origins, directions))
+    return TraceRecords(*_of_values(bare(scene), compute, origins, directions))
 
 
-def visible(scene: Scene, face: Tensor, b: Tensor, to: Tensor, contact: Tensor) -> Tensor:
+def visible(flat: Flat, face: Tensor, b: Tensor, to: Tensor, contact: Tensor) -> Tensor:
     """(N,) bool: whether nothing lies between points of faces and others (N, 3), further than `contact` (N,) from both."""
 
     def compute(values: list[Any], face: Tensor, b: Tensor, to: Tensor, contact: Tensor) -> Sequence[Tensor]:
@@ -226,7 +226,7 @@ def visible(scene: Scene, face: Tensor, b: Tensor, to: Tensor, contact: Tensor) 
         )
         return (torch.from_numpy(found).bool(),)
 
-    return _of_values(_bare(scene), compute, face, b, to, contact)[0].to(face.device)
+    return _of_values(flat, compute, face, b, to, contact)[0].to(face.device)
 
 
 # -- of a camera --------------------------------------------------------------------------------------------------------

@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ._rows import dot, rows_of
-from .scene import Scene
+from ._samples import bare
+from .scene import Flat, Scene
 
 
 class Surfaces:
@@ -37,7 +38,7 @@ class Surfaces:
         """The same without derivatives; what it notes is noted for both."""
         other = Surfaces.__new__(Surfaces)
         other.__dict__.update(self.__dict__)
-        for name in ("corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
+        for name in ("bare", "corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
             other.__dict__.pop(name, None)
         other.verts, other.scene, other.pyramids = self.verts.detach(), self.scene.detach(), {}
         return other
@@ -46,6 +47,11 @@ class Surfaces:
     def first_faces(self) -> list[int]:
         """The first face of each mesh."""
         return [sum(len(m.faces) for m in self.scene.meshes[:k]) for k in range(len(self.scene.meshes))]
+
+    @cached_property
+    def bare(self) -> Flat:
+        """As the kernel reads them, without colours."""
+        return bare(self.scene)
 
     @cached_property
     def ball(self) -> tuple[Tensor, float]:

@@ -153,6 +153,32 @@ inline int64_t RowBuffer::bytes(const Load& load, int threads) {
            chunks * (owners * int64_t(sizeof(Rows)) + n_recent * int64_t(sizeof(Recent)));
 }
 
+// Calls body(first, last, chunk) for all samples 0 … n − 1, after prepare(chunk, owners); then add(chunk, owner) for
+// the chunks in order and each owner, and last(chunk). `seconds`: of the samples and of the adding.
+template <class Chunk, class Prepare, class Body, class Add, class Last>
+void scatter_in_waves(Team& team, int64_t n, std::vector<Chunk>& chunks, Prepare prepare, Body body, Add add, Last last,
+                      double (&seconds)[2]) {
+    const int64_t size = scatter_chunk, wave = chunks_in_flight * team.threads();
+    const int owners = std::min(team.threads(), most_owners);
+    if (const int64_t most = std::min(wave, (n + size - 1) / size); int64_t(chunks.size()) < most) chunks.resize(most);
+    Stopwatch watch;
+    for (int64_t first = 0; first < n; first += size * wave) {
+        team.check();  // the calling thread may get no chunk of a wave
+        const int64_t count = std::min(wave, (n - first + size - 1) / size);
+        team.each(count, [&](int64_t i) {
+            prepare(chunks[i], owners);
+            const int64_t begin = first + i * size;
+            body(begin, std::min(begin + size, n), chunks[i]);
+        });
+        seconds[0] += watch.lap();
+        team.each(owners, [&](int64_t owner) {
+            for (int64_t i = 0; i < count; ++i) add(chunks[i], int(owner));
+        });
+        for (int64_t i = 0; i < count; ++i) last(chunks[i]);
+        seconds[1] += watch.lap();
+    }
+}
+
 // The buffers of one backward pass, whose parts use them one after the other.
 class Scatter {
    public:
@@ -165,33 +191,17 @@ class Scatter {
     // samples and of the adding.
     template <class Body>
     void add(int64_t n, Destination& to, double (&seconds)[2], Body body) {
-        const int64_t chunk = scatter_chunk, wave = chunks_in_flight * team_.threads();
-        const int owners = std::min(team_.threads(), most_owners);
-        if (const int64_t most = std::min(wave, (n + chunk - 1) / chunk); int64_t(grads_.size()) < most)
-            grads_.resize(most);
-        Stopwatch watch;
-        for (int64_t first = 0; first < n; first += chunk * wave) {
-            team_.check();  // the calling thread may get no chunk of a wave
-            const int64_t chunks = std::min(wave, (n - first + chunk - 1) / chunk);
-            team_.each(chunks, [&](int64_t i) {
-                ChunkGrad& g = grads_[i];
-                prepare(g, to, owners);
-                const int64_t begin = first + i * chunk;
-                body(begin, std::min(begin + chunk, n), g);
-            });
-            seconds[0] += watch.lap();
-            team_.each(owners, [&](int64_t owner) {
-                for (int64_t i = 0; i < chunks; ++i)
-                    for (const RowSlot& slot : row_slots)
-                        if (double* const there = to.*slot.to) (grads_[i].*slot.rows).add_to(there, int(owner));
-            });
-            for (int64_t i = 0; i < chunks; ++i) to.k += grads_[i].k;
-            if (to.records)
-                for (int64_t i = 0; i < chunks; ++i)
-                    to.records->surface.add(grads_[i].records.surface),
-                        to.records->curves.add(grads_[i].records.curves);
-            seconds[1] += watch.lap();
-        }
+        scatter_in_waves(
+            team_, n, grads_, [&](ChunkGrad& g, int owners) { prepare(g, to, owners); }, body,
+            [&](const ChunkGrad& g, int owner) {
+                for (const RowSlot& slot : row_slots)
+                    if (double* const there = to.*slot.to) (g.*slot.rows).add_to(there, owner);
+            },
+            [&](ChunkGrad& g) {
+                to.k += g.k;
+                if (to.records) to.records->surface.add(g.records.surface), to.records->curves.add(g.records.curves);
+            },
+            seconds);
     }
 
    private:

@@ -62,6 +62,19 @@ inline void cross_vjp(Vec3 a, Vec3 b, Vec3 bar, Vec3& a_bar, Vec3& b_bar) {
 
 inline double length(Vec3 a) { return std::sqrt(dot(a, a)); }
 
+// m / |m|, zero where there is no direction.
+inline Vec3 unit(Vec3 m) {
+    const double size = length(m);
+    return size > 0 ? 1 / size * m : Vec3{};
+}
+// δn = (δm − n (n · δm)) / |m|. It is symmetric, so this is the _jvp too.
+inline Vec3 unit_vjp(Vec3 m, Vec3 bar) {
+    const double size = length(m);
+    if (!(size > 0)) return {};
+    const Vec3 n = 1 / size * m;
+    return 1 / size * (bar - dot(n, bar) * n);
+}
+
 // Bound of the rounding error of a · (b × c).
 inline double rounding_of_triple_product(Vec3 a, Vec3 b, Vec3 c) {
     const auto sum = [](Vec3 v) { return std::fabs(v.x) + std::fabs(v.y) + std::fabs(v.z); };

@@ -47,9 +47,9 @@ RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRa
 }
 
 template <class T>
-std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, Team& team) {
-    std::vector<uint8_t> out(lines.size);
-    each_batch(lines.size, team, [&](int64_t first, int n) {
+void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, uint8_t* out) {
+    for (int64_t first = 0; first < lines.size; first += RayBatch::size) {
+        const int n = int(std::min<int64_t>(RayBatch::size, lines.size - first));
         Ray ray[RayBatch::size];
         double contact[RayBatch::size];
         for (int i = 0; i < n; ++i) {
@@ -74,12 +74,23 @@ std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster,
                        shows(scene, face, inside({m.u, m.v}));
             });
         for (int i = 0; i < n; ++i) out[first + i] = hidden_by[i] < 0;
+    }
+}
+
+template <class T>
+std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, Team& team) {
+    std::vector<uint8_t> out(lines.size);
+    each_batch(lines.size, team, [&](int64_t first, int n) {
+        see(scene, caster, {lines.face + first, lines.b + 2 * first, lines.to + 3 * first, lines.contact + first, n},
+            out.data() + first);
     });
     return out;
 }
 
 template RayHits trace(const SceneView<float>&, const RayCaster&, const TracedRays&, Team&);
 template RayHits trace(const SceneView<double>&, const RayCaster&, const TracedRays&, Team&);
+template void see(const SceneView<float>&, const RayCaster&, const Sightlines&, uint8_t*);
+template void see(const SceneView<double>&, const RayCaster&, const Sightlines&, uint8_t*);
 template std::vector<uint8_t> visible(const SceneView<float>&, const RayCaster&, const Sightlines&, Team&);
 template std::vector<uint8_t> visible(const SceneView<double>&, const RayCaster&, const Sightlines&, Team&);
 

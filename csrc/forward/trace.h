@@ -34,5 +34,8 @@ struct Sightlines {
 // (N,): 1 where nothing lies between the two. The face of the point itself hides nothing.
 template <class T>
 std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, Team& team);
+// The same on one thread.
+template <class T>
+void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, uint8_t* out);
 
 }  // namespace edgegrad

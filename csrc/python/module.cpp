@@ -23,8 +23,11 @@ namespace edgegrad {
 
 void bind_memory(nb::module_& m);       // memory.cpp
 void bind_for_shaders(nb::module_& m);  // for_shaders.cpp
+void bind_lit(nb::module_& m);          // lit.cpp
 template <class T>
 void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene);
+template <class T>
+void bind_scene_lit(nb::class_<SceneArrays<T>>& scene);
 void bind_for_tests(nb::module_& m);  // for_tests.cpp
 
 namespace {
@@ -199,6 +202,7 @@ void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
         .def("screen_gradient", &screen_gradient<T>, "camera"_a, "channels"_a, "image"_a, "options"_a, "threads"_a,
              "adjoint"_a.noconvert(), "hits"_a, "gradient"_a.noconvert());
     bind_scene_for_shaders(scene);
+    bind_scene_lit(scene);
 }
 
 }  // namespace
@@ -249,6 +253,7 @@ NB_MODULE(_core, m) {
     for (const auto& slot : gradient_slots<double>) slots.push_back(slot.name);
     m.attr("GRADIENT_SLOTS") = nb::tuple(nb::cast(slots));
     bind_for_shaders(m);
+    bind_lit(m);
     bind_scene<float>(m, "SceneFloat", "HitsFloat");
     bind_scene<double>(m, "SceneDouble", "HitsDouble");
     bind_memory(m);

@@ -55,19 +55,6 @@ void each_attribute(const SceneView<T>& scene, const AttributeArrays& from, int6
 // The place of the direction among the attributes; −1: there is none.
 inline int direction_of(const Attributes& a) { return a.unit < 0 ? -1 : a.alpha + a.unit; }
 
-// Zero where there is no direction.
-inline Vec3 unit(Vec3 m) {
-    const double size = length(m);
-    return size > 0 ? 1 / size * m : Vec3{};
-}
-// Symmetric, so this is the _vjp and the _jvp.
-inline Vec3 unit_jvp(Vec3 m, Vec3 m_dot) {
-    const double size = length(m);
-    if (!(size > 0)) return {};
-    const Vec3 n = 1 / size * m;
-    return 1 / size * (m_dot - dot(n, m_dot) * n);
-}
-
 template <class T>
 void shade_attributes(const SceneView<T>& scene, int64_t face, Barycentrics b, double* out) {
     each_attribute(scene, attribute_arrays(scene), face,
@@ -98,7 +85,7 @@ Barycentrics shade_attributes_vjp(const SceneView<T>& scene, int64_t face, Baryc
     const int n = scene.channels - scene.radiance, d = direction_of(scene.attributes);
     double m_bar[3] = {};
     if (d >= 0) {
-        const Vec3 moved = unit_jvp(interpolated_direction(scene, face, b), {bar[d], bar[d + 1], bar[d + 2]});
+        const Vec3 moved = unit_vjp(interpolated_direction(scene, face, b), {bar[d], bar[d + 1], bar[d + 2]});
         m_bar[0] = moved.x, m_bar[1] = moved.y, m_bar[2] = moved.z;
     }
     Barycentrics b_bar;
@@ -118,7 +105,7 @@ void shade_attributes_jvp(const SceneView<T>& scene, int64_t face, Barycentrics 
     each_attribute(scene, attribute_arrays(tangents), face,
                    [&](int k, double c0, double c1, double c2) { out[k] += b[0] * c0 + b[1] * c1 + b[2] * c2; });
     if (const int d = direction_of(scene.attributes); d >= 0) {
-        const Vec3 n_dot = unit_jvp(interpolated_direction(scene, face, b), {out[d], out[d + 1], out[d + 2]});
+        const Vec3 n_dot = unit_vjp(interpolated_direction(scene, face, b), {out[d], out[d + 1], out[d + 2]});
         out[d] = n_dot.x, out[d + 1] = n_dot.y, out[d + 2] = n_dot.z;
     }
 }

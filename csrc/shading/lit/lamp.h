@@ -1,0 +1,120 @@
+// A light, one of its points, and what all kinds have in common. The kinds stand in punctual.h, area.h, environment.h
+// and spherical_harmonics.h: what arrives from a point of the light at a surface, and the _vjp.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+
+#include "shading/lit/source.h"
+
+namespace edgegrad {
+
+struct Lamp {
+    enum class Kind { directional, point, spot, mesh, environment, harmonics };
+    Kind kind = Kind::point;
+    // Tables; of one row, but for the radiance of an environment: its texels.
+    int position = no_table, direction = no_table, intensity = no_table, color = no_table;
+    int inner_angle = no_table, outer_angle = no_table, rotation = no_table, radiance = no_table;
+    int mesh = -1;                  // the one that emits
+    int64_t height = 1, width = 1;  // of the environment's image
+    bool is_image = false;          // else the environment is the same from all around
+    // Of lights with an extent: the running sum of the probabilities of faces or texels, and their densities.
+    const double *running = nullptr, *density = nullptr;
+    int64_t size = 0;
+    uint64_t stream[3] = {};  // of its random numbers
+    double eps = 0;           // relative spacing of places of its points
+
+    bool is_infinite() const {
+        return kind == Kind::directional || kind == Kind::environment || kind == Kind::harmonics;
+    }
+    bool is_punctual() const { return kind != Kind::mesh && kind != Kind::environment; }
+    bool casts() const { return kind != Kind::harmonics; }
+};
+
+// By coordinates that stay while the light moves: a face and its last two barycentrics, or a texel and the place in it.
+struct LightPoint {
+    int64_t index = 0;
+    double u = 0, v = 0, density = 1;
+};
+
+// From numbers u in [0, 1).
+inline LightPoint draw(const Lamp& lamp, const double u[3]) {
+    if (lamp.is_punctual()) return {};
+    const double* end = lamp.running + lamp.size;
+    const int64_t index =
+        std::min<int64_t>(std::upper_bound(lamp.running, end, u[0] * end[-1]) - lamp.running, lamp.size - 1);
+    if (lamp.kind == Lamp::Kind::environment) return {index, u[1], u[2], lamp.density[index]};
+    const double root = std::sqrt(u[1]);  // uniform in a triangle (Turk 1990)
+    return {index, root * (1 - u[2]), root * u[2], lamp.density[index]};
+}
+
+// What arrives at a point of a surface: from where, and how much at normal incidence over the density of the point of
+// the light, nothing in between.
+template <class S>
+struct Arriving {
+    Vector<S> l;  // unit
+    S E[most_lit_channels];
+};
+
+// Intensity times colour.
+template <class S>
+void power(const std::vector<Table>& tables, const Lamp& lamp, int channels, S* out) {
+    const S intensity = tables[lamp.intensity].at<S>(0);
+    for (int c = 0; c < channels; ++c)
+        out[c] = lamp.color == no_table ? intensity : intensity * tables[lamp.color].channel<S>(0, c);
+}
+inline void power_vjp(const std::vector<Table>& tables, const Lamp& lamp, int channels, const double* bar,
+                      Cotangents& to) {
+    const double intensity = tables[lamp.intensity].at<double>(0);
+    double intensity_bar = 0, color_bar[most_lit_channels];
+    for (int c = 0; c < channels; ++c) {
+        intensity_bar += bar[c] * (lamp.color == no_table ? 1 : tables[lamp.color].channel<double>(0, c));
+        color_bar[c] = bar[c] * intensity;
+    }
+    to.add(lamp.intensity, 0, &intensity_bar);
+    if (lamp.color != no_table) to.add_channels(lamp.color, 0, tables[lamp.color].width, channels, color_bar);
+}
+
+// A direction of any length, whose square may be beyond the range of doubles.
+template <class S>
+Vector<S> direction_of(const std::vector<Table>& tables, const Lamp& lamp) {
+    const Vector<S> d = tables[lamp.direction].vector_at<S>(0);
+    const Vec3 p = plain(d);
+    return 1 / std::max({std::fabs(p.x), std::fabs(p.y), std::fabs(p.z)}) * d;
+}
+// The cotangent of the direction as it is given, from that of direction_of().
+inline void direction_vjp(const std::vector<Table>& tables, const Lamp& lamp, Vec3 bar, Cotangents& to) {
+    const Vec3 p = tables[lamp.direction].vector_at<double>(0);
+    to.add(lamp.direction, 0, 1 / std::max({std::fabs(p.x), std::fabs(p.y), std::fabs(p.z)}) * bar);
+}
+
+// The world's axes from those of an environment or of harmonics, and back.
+template <class S>
+struct Rotation {
+    Vector<S> row[3];
+
+    static Rotation of(const std::vector<Table>& tables, const Lamp& lamp) {
+        if (lamp.rotation == no_table)
+            return {{vector(S(1), S(0), S(0)), vector(S(0), S(1), S(0)), vector(S(0), S(0), S(1))}};
+        const Table& t = tables[lamp.rotation];
+        Rotation r;
+        for (int i = 0; i < 3; ++i) r.row[i] = vector(t.at<S>(0, 3 * i), t.at<S>(0, 3 * i + 1), t.at<S>(0, 3 * i + 2));
+        return r;
+    }
+    Vector<S> to_world(Vector<S> d) const { return vector(dot(row[0], d), dot(row[1], d), dot(row[2], d)); }
+    Vector<S> from_world(Vector<S> d) const {
+        const Vec3 axis[3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
+        Vector<S> sum;
+        for (int i = 0; i < 3; ++i) sum += dot(d, Vector<S>(axis[i])) * row[i];
+        return sum;
+    }
+};
+// Adds outer(row_bar, d) to the cotangent of the rotation: of to_world(d) from that of the result.
+inline void rotation_vjp(const Lamp& lamp, Vec3 rows, Vec3 columns, Cotangents& to) {
+    const double r[3] = {rows.x, rows.y, rows.z}, c[3] = {columns.x, columns.y, columns.z};
+    double bar[9];
+    for (int i = 0; i < 9; ++i) bar[i] = r[i / 3] * c[i % 3];
+    to.add(lamp.rotation, 0, bar);
+}
+
+}  // namespace edgegrad

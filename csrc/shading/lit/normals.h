@@ -1,0 +1,139 @@
+// The normal that shades a point: that of the face, or interpolated between those of vertices, or bent by a normal map.
+// Value, and beneath it the _vjp.
+#pragma once
+
+#include "shading/lit/source.h"
+
+namespace edgegrad {
+
+struct NormalSource {
+    int normals = no_table;
+    const int32_t* normal_faces = nullptr;  // (F, 3) rows of normals
+    Source map;
+    int map_scale = no_table;
+
+    bool is_flat() const { return normals == no_table && !map.exists(); }
+};
+
+template <class V>
+struct FaceFrame {
+    V corner[3];
+    V g;  // the unit normal to the side from which the corners run counter-clockwise
+};
+
+// Interpolated, on the side of g.
+template <class S>
+struct SmoothNormal {
+    Vector<S> sum;  // before it is given the length 1
+    bool exists = false, turned = false;
+    Vector<S> n;
+};
+template <class S>
+SmoothNormal<S> smooth_normal(const std::vector<Table>& tables, const NormalSource& source, const FacePoint<S>& at,
+                              Vector<S> g) {
+    SmoothNormal<S> o;
+    o.n = g;
+    if (source.normals == no_table) return o;
+    const int32_t* rows = source.normal_faces + 3 * at.face;
+    for (int i = 0; i < 3; ++i) o.sum += at.b[i] * tables[source.normals].vector_at<S>(rows[i]);
+    o.exists = dot(plain(o.sum), plain(o.sum)) > 0;
+    if (!o.exists) return o;
+    o.n = unit(o.sum);
+    o.turned = dot(plain(o.n), plain(g)) < 0;
+    if (o.turned) o.n = -1.0 * o.n;
+    return o;
+}
+inline void smooth_normal_vjp(const std::vector<Table>& tables, const NormalSource& source, const FacePoint<double>& at,
+                              const SmoothNormal<double>& o, Vec3 n_bar, Vec3& g_bar, double* b_bar, Cotangents& to) {
+    if (!o.exists) {
+        g_bar += n_bar;
+        return;
+    }
+    const Vec3 sum_bar = unit_vjp(o.sum, o.turned ? -n_bar : n_bar);
+    const int32_t* rows = source.normal_faces + 3 * at.face;
+    for (int i = 0; i < 3; ++i) {
+        b_bar[i] += dot(sum_bar, tables[source.normals].vector_at<double>(rows[i]));
+        to.add(source.normals, rows[i], at.b[i] * sum_bar);
+    }
+}
+
+// The frame of texture coordinates on the face, and what the map says in it.
+template <class S>
+struct BentNormal {
+    S d1, d2;                               // how v changes along the edges from the first corner
+    Vector<S> e1, e2;                       // these
+    double hand = 1;                        // −1 where the image is mirrored
+    Vector<S> along, across, t, bitangent;  // ∂x/∂u of any length; what of it is normal to n; unit vectors
+    S bent[3], scale;
+    Vector<S> m;
+    bool exists = false;
+};
+template <class S>
+BentNormal<S> bent_normal(const std::vector<Table>& tables, const NormalSource& source, const FacePoint<S>& at,
+                          const FaceFrame<Vector<S>>& frame, Vector<S> n) {
+    BentNormal<S> o;
+    Uv<S> uv[3];
+    for (int i = 0; i < 3; ++i) uv[i] = corner_uv<S>(tables, source.map, at.face, i);
+    o.d1 = uv[1].v - uv[0].v, o.d2 = uv[2].v - uv[0].v;
+    o.e1 = frame.corner[1] - frame.corner[0], o.e2 = frame.corner[2] - frame.corner[0];
+    if (plain(uv[1].u - uv[0].u) * plain(o.d2) - plain(o.d1) * plain(uv[2].u - uv[0].u) < 0) o.hand = -1;
+    o.along = o.hand * (o.d2 * o.e1 - o.d1 * o.e2);
+    o.across = o.along - dot(n, o.along) * n;
+    value(tables, source.map, at, 3, o.bent);
+    for (S& x : o.bent) x = S(2) * x - S(1);
+    o.scale = tables[source.map_scale].at<S>(0);
+    if (!(dot(plain(o.across), plain(o.across)) > 0)) return o;
+    o.t = unit(o.across), o.bitangent = o.hand * cross(n, o.t);
+    o.m = o.scale * (o.bent[0] * o.t + o.bent[1] * o.bitangent) + o.bent[2] * n;
+    o.exists = dot(plain(o.m), plain(o.m)) > 0;
+    return o;
+}
+
+template <class S>
+Vector<S> shading_normal(const std::vector<Table>& tables, const NormalSource& source, const FacePoint<S>& at,
+                         const FaceFrame<Vector<S>>& frame) {
+    const Vector<S> n = smooth_normal(tables, source, at, frame.g).n;
+    if (!source.map.exists()) return n;
+    const BentNormal<S> o = bent_normal(tables, source, at, frame, n);
+    return o.exists ? unit(o.m) : n;
+}
+
+// Adds to the cotangents of the frame and of the barycentrics.
+inline void shading_normal_vjp(const std::vector<Table>& tables, const NormalSource& source,
+                               const FacePoint<double>& at, const FaceFrame<Vec3>& frame, Vec3 bar,
+                               FaceFrame<Vec3>& frame_bar, double* b_bar, Cotangents& to) {
+    const SmoothNormal<double> smooth = smooth_normal(tables, source, at, frame.g);
+    const Vec3 n = smooth.n;
+    Vec3 n_bar = bar;
+    if (source.map.exists()) {
+        const BentNormal<double> o = bent_normal(tables, source, at, frame, n);
+        if (o.exists) {
+            const Vec3 m_bar = unit_vjp(o.m, bar);
+            const double scale_bar = dot(m_bar, o.bent[0] * o.t + o.bent[1] * o.bitangent);
+            to.add(source.map_scale, 0, &scale_bar);
+            double map_bar[3] = {2 * o.scale * dot(m_bar, o.t), 2 * o.scale * dot(m_bar, o.bitangent),
+                                 2 * dot(m_bar, n)};
+            value_vjp(tables, source.map, at, 3, map_bar, b_bar, to);
+            n_bar = o.bent[2] * m_bar;
+            Vec3 t_bar = o.scale * o.bent[0] * m_bar;
+            cross_vjp(n, o.t, o.hand * o.scale * o.bent[1] * m_bar, n_bar, t_bar);
+            // across = along − n (n · along)
+            const Vec3 across_bar = unit_vjp(o.across, t_bar);
+            const double kept = dot(n, across_bar);
+            const Vec3 along_bar = o.hand * (across_bar - kept * n);
+            n_bar -= dot(n, o.along) * across_bar + kept * o.along;
+            // along = ± (d2 e1 − d1 e2)
+            frame_bar.corner[0] -= (o.d2 - o.d1) * along_bar;
+            frame_bar.corner[1] += o.d2 * along_bar, frame_bar.corner[2] -= o.d1 * along_bar;
+            const double d1_bar = -dot(o.e2, along_bar), d2_bar = dot(o.e1, along_bar);
+            const double v_bar[3] = {-d1_bar - d2_bar, d1_bar, d2_bar};
+            for (int i = 0; i < 3; ++i) {
+                const double uv_bar[2] = {0, v_bar[i]};
+                to.add(source.map.uvs, source.map.uv_faces[3 * at.face + i], uv_bar);
+            }
+        }
+    }
+    smooth_normal_vjp(tables, source, at, smooth, n_bar, frame_bar.g, b_bar, to);
+}
+
+}  // namespace edgegrad

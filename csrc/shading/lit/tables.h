@@ -1,0 +1,79 @@
+// The tensors that lit scenes are made of, as tables of rows: vertices, normals, texture coordinates, texels,
+// constants; and the cotangents of their rows.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "contract/scatter.h"
+#include "core/dual.h"
+
+namespace edgegrad {
+
+constexpr int no_table = -1;
+constexpr int most_lit_channels = 16;
+
+struct Table {
+    const void* values = nullptr;
+    bool wide = false;  // double, or else float
+    int64_t rows = 0;
+    int width = 0;
+    const double* tangent = nullptr;  // null: zero
+
+    double number(int64_t i) const {
+        return wide ? static_cast<const double*>(values)[i] : double(static_cast<const float*>(values)[i]);
+    }
+    template <class S>
+    S at(int64_t row, int column = 0) const {
+        const int64_t i = row * width + column;
+        if constexpr (std::is_same_v<S, double>) return number(i);
+        else return {number(i), tangent ? tangent[i] : 0};
+    }
+    // Of the first three columns.
+    template <class S>
+    Vector<S> vector_at(int64_t row) const {
+        return vector(at<S>(row, 0), at<S>(row, 1), at<S>(row, 2));
+    }
+    // A row of one number stands for all channels.
+    template <class S>
+    S channel(int64_t row, int c) const {
+        return at<S>(row, width == 1 ? 0 : c);
+    }
+};
+
+// What the points of one chunk give, a buffer for each table; those of tables that are not wanted take nothing.
+class Cotangents {
+   public:
+    void prepare(const std::vector<Table>& tables, const std::vector<double*>& to, int owners) {
+        of_.resize(tables.size());
+        for (size_t i = 0; i < tables.size(); ++i) {
+            if (to[i]) of_[i].prepare(tables[i].width, owners);
+            of_[i].clear();
+        }
+    }
+    bool wants(int table) const { return table != no_table && of_[table].is_wanted(); }
+    void add(int table, int64_t row, const double* bar) {
+        if (wants(table)) of_[table].add(row, bar);
+    }
+    void add(int table, int64_t row, Vec3 bar) {
+        const double row_bar[3] = {bar.x, bar.y, bar.z};
+        add(table, row, row_bar);
+    }
+    // Of channels, where a row may have one number for all.
+    void add_channels(int table, int64_t row, int width, int channels, const double* bar) {
+        if (!wants(table)) return;
+        if (width > 1 || channels == 1) return of_[table].add(row, bar);
+        double sum = 0;
+        for (int c = 0; c < channels; ++c) sum += bar[c];
+        of_[table].add(row, &sum);
+    }
+    void add_to(const std::vector<double*>& to, int owner) const {
+        for (size_t i = 0; i < to.size(); ++i)
+            if (to[i]) of_[i].add_to(to[i], owner);
+    }
+
+   private:
+    std::vector<RowBuffer> of_;
+};
+
+}  // namespace edgegrad

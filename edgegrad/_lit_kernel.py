@@ -1,0 +1,401 @@
+"""Radiance in the light of a scene by the kernel (csrc/shading/lit): the same as _lit.py computes in PyTorch, with derivatives
+by all tensors of the scene, in reverse and in forward mode."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from ._autograd import FIRST_ORDER, _one_by_one
+from ._kernel import core
+from ._mesh_light import MeshLight
+from ._ops import kernel_scene
+from ._seeds import STEPS, mixed_bits
+from ._surfaces import Surfaces, View
+from .environment import Environment
+from .hits import Hits
+from .lights import DirectionalLight, Light, PointLight, SphericalHarmonics, SpotLight
+from .material import Parameter, Texture, WRAPS
+from .mesh import FILTERS, Mesh
+from .scene import Flat, Scene
+
+_64_BITS = 2**64 - 1
+
+
+def is_fused(scene: Scene) -> bool:
+    """Whether the kernel shades a scene: not where textures have borders of texels, or levels by their footprints."""
+    if scene.channels > core.MOST_LIT_CHANNELS:
+        return False
+    textures = [t for m in scene.meshes if m.material is not None for t in m.material.textures.values()]
+    own = [mesh.filter for mesh in scene.meshes if mesh.texture is not None]
+    return all(filter == "linear" for filter in (*own, *(t.filter for t in textures)))
+
+
+def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
+    """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours. What was
+    found of shadows is noted in the hits."""
+    surfaces, view = hits._surfaces, hits._view
+    assert isinstance(view, View)
+    tables = _Tables()
+    layout = _Layout.of(surfaces, view, tables)
+    forced = hits._forced
+    points = _Points(
+        hits._face.cpu(),
+        hits._seed.cpu(),
+        *((None,) * 4 if forced is None else _forced(forced.points, forced.lit)),
+    )
+    number = -1 if forced is None else forced.light
+    call = _Call(layout, len(tables.tensors), number, shadows, samples)
+    found, seen = _Shade.apply(call, hits._exact.cpu(), *points, *tables.tensors, *surfaces.bare)
+    column = 0
+    for light, casting in enumerate(surfaces.scene.casting):
+        own = seen[:, column]
+        asked = own >= 0
+        if shadows and bool(asked.any()):
+            surfaces.shadowing.add(light)
+            if casting.punctual:
+                hits._noted(light, torch.where(asked, own.float(), torch.nan).to(surfaces.verts))
+        column += 1 if casting.punctual else samples
+    return found.to(surfaces.verts)
+
+
+def _forced(points: Any, lit: Tensor) -> tuple[Tensor, ...]:
+    return points.index.cpu(), points.uv.cpu().double(), points.density.cpu().double(), lit.cpu().to(torch.uint8)
+
+
+class _Points(NamedTuple):
+    """Tensors of points, apart from their barycentrics."""
+
+    face: Tensor  # (N,) int64
+    seed: Tensor  # (N,) int64
+    index: Tensor | None  # those of a light whose shadow is known
+    uv: Tensor | None
+    density: Tensor | None
+    lit: Tensor | None  # (N,) uint8
+
+
+class _Tables:
+    """Tensors of a scene as tables on the CPU, each of them once."""
+
+    def __init__(self) -> None:
+        self.tensors: list[Tensor] = []
+
+    def add(self, tensor: Tensor | float | None, width: int) -> int:
+        """The number of the table with rows of this width; −1 where there is no tensor."""
+        if tensor is None:
+            return -1
+        tensor = torch.as_tensor(tensor).cpu()
+        if tensor.dtype not in (torch.float32, torch.float64):
+            tensor = tensor.double()
+        self.tensors.append(tensor.reshape(-1, width))
+        return len(self.tensors) - 1
+
+    def add_numbers(self, tensor: Tensor | float | None) -> int:
+        """All in one row."""
+        return -1 if tensor is None else self.add(tensor, torch.as_tensor(tensor).numel())
+
+
+class _Layout(NamedTuple):
+    """How the tables are a scene; all but the tables themselves."""
+
+    meshes: list[Any]
+    lamps: list[Any]
+    verts: int
+    eye: int
+    perspective: bool
+    channels: int
+    ball: list[float]
+
+    @classmethod
+    def of(cls, surfaces: Surfaces, view: View, tables: _Tables) -> _Layout:
+        scene = surfaces.scene
+        back = torch.linalg.inv(view.world_to_camera[:3, :3])
+        eye = -back @ view.world_to_camera[:3, 3] if view.perspective else normalize(-back[:, 2], dim=0)
+        verts, seen_from = tables.add(surfaces.bare.verts, 3), tables.add(eye, 3)
+        firsts = np.cumsum([0, *(len(mesh.verts) for mesh in scene.meshes)])
+        meshes = [
+            _mesh(mesh, first, int(vertex), tables)
+            for mesh, first, vertex in zip(scene.meshes, surfaces.first_faces, firsts[:-1], strict=True)
+        ]
+        eps = torch.finfo(surfaces.verts.dtype).eps
+        still = (light for light in scene.lights if isinstance(light, SphericalHarmonics))
+        lamps = [_lamp(scene, light, k, eps, tables) for k, light in enumerate((*scene.casting, *still))]
+        center, radius = surfaces.ball
+        ball = [*(float(x) for x in _values(center)), radius]
+        return cls(meshes, lamps, verts, seen_from, view.perspective, scene.channels, ball)
+
+    def kernel(self, tables: Sequence[Tensor], faces: Tensor) -> Any:
+        parts = self._asdict()
+        return core.Lit(
+            tables=[_array(t) for t in tables], faces=_array(faces), step=[s & _64_BITS for s in STEPS], **parts
+        )
+
+
+def _mesh(mesh: Mesh, first_face: int, first_vertex: int, tables: _Tables) -> Any:
+    none, material = core.LitSource(), mesh.material
+
+    def source(parameter: Parameter | float | None) -> Any:
+        return none if parameter is None else _source(mesh, parameter, tables)
+
+    color = none
+    if mesh.texture is not None:
+        color = _texture(mesh, Texture(mesh.texture, wrap=mesh.wrap), tables)
+    elif mesh.colors is not None:
+        color = core.LitSource("vertex", tables.add(mesh.colors, mesh.colors.shape[1]))
+    elif mesh.face_colors is not None:
+        color = core.LitSource("face", tables.add(mesh.face_colors, mesh.face_colors.shape[1]))
+    elif mesh.corner_colors is not None:
+        color = core.LitSource("corner", tables.add(mesh.corner_colors, mesh.corner_colors.shape[2]))
+    normal_rows = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
+    map_ = None if material is None else material.normal_map
+    return core.LitMesh(
+        first_face=first_face,
+        faces=len(mesh.faces),
+        first_vertex=first_vertex,
+        has_material=material is not None,
+        two_sided=material is None or material.two_sided,
+        lambertian=material is None or (material.metallic is None and material.roughness is None),
+        color=color,
+        base_color=source(None if material is None else material.base_color),
+        metallic=source(None if material is None else material.metallic),
+        roughness=source(None if material is None else material.roughness),
+        emission=source(None if material is None else material.emission),
+        normal_map=source(map_),
+        normal_scale=-1 if map_ is None or material is None else tables.add(material.normal_scale, 1),
+        normals=tables.add(mesh.normals, 3),
+        normal_faces=None if mesh.normals is None else _rows(normal_rows),
+    )
+
+
+def _source(mesh: Mesh, parameter: Parameter | float, tables: _Tables) -> Any:
+    if isinstance(parameter, Texture):
+        return _texture(mesh, parameter, tables)
+    value = torch.as_tensor(parameter)
+    if value.dim() == 2:
+        return core.LitSource("vertex", tables.add(value, value.shape[1]))
+    return core.LitSource("constant", tables.add_numbers(value))
+
+
+def _texture(mesh: Mesh, texture: Texture, tables: _Tables) -> Any:
+    uvs, uv_faces = (mesh.uvs, mesh.uv_faces) if texture.uvs is None else (texture.uvs, texture.uv_faces)
+    assert uvs is not None and uv_faces is not None
+    height, width, channels = texture.image.shape
+    return core.LitSource(
+        "texture",
+        tables.add(texture.image, channels),
+        tables.add_numbers(texture.factor),
+        tables.add(uvs, 2),
+        _rows(uv_faces),
+        height,
+        width,
+        [*(WRAPS.index(wrap) for wrap in texture.wraps), FILTERS.index("linear")],
+    )
+
+
+def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) -> Any:
+    stream = [mixed_bits(number * 0x10001 + k) for k in range(3)]
+
+    def lamp(kind: str, **fields: Any) -> Any:
+        return core.Lamp(kind, stream=stream, **{"eps": eps, **fields})
+
+    if isinstance(light, MeshLight):
+        mesh = next(i for i, mesh in enumerate(scene.meshes) if mesh is light.mesh)
+        running, density = (_array(_values(t)) for t in light._table)
+        # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
+        return lamp("mesh", mesh=mesh, running=running, density=density, eps=max(eps, 2.0**-40))
+    if isinstance(light, Environment):
+        running, density = (_array(_values(t)) for t in light._table)
+        height, width = light._size
+        return lamp(
+            "environment",
+            radiance=tables.add(light.radiance, light.radiance.shape[-1]),
+            rotation=tables.add_numbers(light.rotation),
+            height=height,
+            width=width,
+            is_image=light.radiance.dim() == 3,
+            running=running,
+            density=density,
+        )
+    if isinstance(light, SphericalHarmonics):
+        coefficients = tables.add(light.coefficients, light.coefficients.shape[1])
+        return lamp("spherical harmonics", radiance=coefficients, rotation=tables.add_numbers(light.rotation))
+    assert isinstance(light, (DirectionalLight, PointLight, SpotLight))
+    power = {"intensity": tables.add(light.intensity, 1), "color": tables.add_numbers(light.color)}
+    if isinstance(light, DirectionalLight):
+        return lamp("directional", direction=tables.add(light.direction, 3), **power)
+    if isinstance(light, PointLight):
+        return lamp("point", position=tables.add(light.position, 3), **power)
+    return lamp(
+        "spot",
+        position=tables.add(light.position, 3),
+        direction=tables.add(light.direction, 3),
+        inner_angle=tables.add(light.inner_angle, 1),
+        outer_angle=tables.add(light.outer_angle, 1),
+        **power,
+    )
+
+
+def _rows(index: Tensor) -> np.ndarray:
+    return _array(index.int())
+
+
+def _values(tensor: Tensor) -> Tensor:
+    """Without what transforms of torch.func put around it: it has no derivative."""
+    return tensor.detach().cpu()
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().contiguous().numpy()
+
+
+class _Call(NamedTuple):
+    """What is no tensor."""
+
+    layout: _Layout
+    tables: int  # how many
+    forced: int  # the light whose shadow is known, −1: none
+    shadows: bool
+    samples: int
+
+    def points(self, b: Tensor, points: _Points) -> Any:
+        arrays = {name: None if t is None else _array(t) for name, t in points._asdict().items()}
+        return core.LitPoints(b=_array(b), forced_lamp=self.forced, **arrays)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        return {"shadows": self.shadows, "samples": self.samples, "threads": torch.get_num_threads()}
+
+
+_FIRST = 2 + len(_Points._fields)  # of the tables, among the arguments
+
+
+class _Shade(torch.autograd.Function):
+    """(N, C) float64 radiance, and (N, samples of lights) int8 which of them are seen, −1 where they are below the surface."""
+
+    @staticmethod
+    def forward(call: _Call, b: Tensor, *args: Any) -> tuple[Tensor, Tensor]:
+        points, tables, flat = _split(call, args)
+        lit = call.layout.kernel(tables, flat.faces)
+        found, seen = kernel_scene(flat).shade(lit, call.points(b, points), **call.options)
+        return torch.from_numpy(found), torch.from_numpy(seen)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+        call, b, *args = inputs
+        _, seen = output
+        ctx.mark_non_differentiable(seen)
+        points, tables, flat = _split(call, args)
+        kept = (b, *points, seen, flat.faces, *tables)
+        ctx.call, ctx.count = call, len(inputs)
+        ctx.save_for_backward(*kept)
+        ctx.save_for_forward(*kept)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        call = ctx.call
+        wanted = ctx.needs_input_grad[1], *ctx.needs_input_grad[_FIRST : _FIRST + call.tables]
+        grads = _ShadeVjp.apply(call, wanted, grad_outputs[0], *ctx.saved_tensors)
+        out: list[Tensor | None] = [None] * ctx.count
+        for place, grad, want in zip((1, *range(_FIRST, _FIRST + call.tables)), grads, wanted, strict=True):
+            out[place] = grad if want else None
+        return tuple(out)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        call = ctx.call
+        given = tangents[1], *tangents[_FIRST : _FIRST + call.tables]
+        return _ShadeJvp.apply(call, *given, *ctx.saved_tensors), None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> Any:
+        return _one_by_one(_Shade, info.batch_size, in_dims, args)
+
+
+def _split(call: _Call, args: Sequence[Any]) -> tuple[_Points, Sequence[Tensor], Flat]:
+    own = len(_Points._fields)
+    return _Points(*args[:own]), args[own : own + call.tables], Flat(*args[own + call.tables :])
+
+
+class _ShadeVjp(torch.autograd.Function):
+    """Of b and of the tables."""
+
+    @staticmethod
+    def forward(call: _Call, wanted: Sequence[bool], bar: Tensor, b: Tensor, *kept: Any) -> tuple[Tensor, ...]:
+        points, seen, faces, tables = _kept(kept)
+        lit = call.layout.kernel(tables, faces)
+        found, b_bar = core.shade_vjp(
+            lit,
+            call.points(b, points),
+            seen=_array(seen),
+            bar=_array(bar.double()),
+            wanted=list(wanted[1:]),
+            **call.options,
+        )
+        empty = b.new_zeros(0)
+        grads = [
+            empty if grad is None else torch.from_numpy(grad).to(table.dtype)
+            for grad, table in zip(found, tables, strict=True)
+        ]
+        return (torch.from_numpy(b_bar) if wanted[0] else empty, *grads)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        raise RuntimeError(FIRST_ORDER)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> Any:
+        return _one_by_one(_ShadeVjp, info.batch_size, in_dims, args)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        raise RuntimeError(FIRST_ORDER)
+
+
+def _kept(kept: Sequence[Any]) -> tuple[_Points, Tensor, Tensor, Sequence[Tensor]]:
+    own = len(_Points._fields)
+    return _Points(*kept[:own]), kept[own], kept[own + 1], kept[own + 2 :]
+
+
+class _ShadeJvp(torch.autograd.Function):
+    """For tangents of b and of the tables."""
+
+    @staticmethod
+    def forward(call: _Call, b_dot: Tensor | None, *args: Any) -> Tensor:
+        tangents, (b, *kept) = args[: call.tables], args[call.tables :]
+        points, seen, faces, tables = _kept(kept)
+        arrays = [None if t is None else _array(t.double()) for t in (b_dot, *tangents)]
+        found = core.shade_jvp(
+            call.layout.kernel(tables, faces),
+            call.points(b, points),
+            seen=_array(seen),
+            tangents=arrays[1:],
+            b_dot=arrays[0],
+            **call.options,
+        )
+        return torch.from_numpy(found)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:
+        raise RuntimeError(FIRST_ORDER)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> Any:
+        return _one_by_one(_ShadeJvp, info.batch_size, in_dims, args)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        raise RuntimeError(FIRST_ORDER)
+
