@@ -19,8 +19,8 @@ from . import _lit_kernel
 from ._appearance import OnMesh, jumps
 from ._bsdf import Scattering, dot, terminator
 from ._check import check_positive_int, values_visible
-from ._request import Request
 from ._lit_kernel import is_fused
+from ._request import Request
 from ._surfaces import Surfaces, View
 from ._tree import tensors_in
 from .camera import Camera
@@ -28,7 +28,7 @@ from .environment import Environment
 from .hits import Hits
 from .lights import Light, LightPoints, SphericalHarmonics
 from .scene import Scene
-from .shader import render_shaded
+from .shader import Effort, render_shaded
 
 FEWEST_IN_PENUMBRA = 4  # points of a face in a pixel that are shaded, at least; else a quarter of its samples
 
@@ -56,7 +56,7 @@ class Lighting(NamedTuple):
         # Each point sees another one of a light with an extent.
         extended = any(not light.punctual for light in scene.casting)
         points = max(FEWEST_IN_PENUMBRA, request.image.spp // 4) if extended else 1
-        return render_shaded(scene, camera, self, request, creases, False, points)
+        return render_shaded(scene, camera, self, request, creases, False, Effort(points, is_fused(scene)))
 
     def __call__(self, hits: Hits) -> Tensor:
         return radiance(hits, *self)

@@ -11,16 +11,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ._autograd import FIRST_ORDER, _one_by_one
 from ._kernel import core
 from ._mesh_light import MeshLight
+from ._operator import Tensors, apply, array, doubles
 from ._ops import kernel_scene
 from ._seeds import STEPS, mixed_bits
 from ._surfaces import Surfaces, View
 from .environment import Environment
 from .hits import Hits
 from .lights import DirectionalLight, Light, PointLight, SphericalHarmonics, SpotLight
-from .material import Parameter, Texture, WRAPS
+from .material import WRAPS, Parameter, Texture
 from .mesh import FILTERS, Mesh
 from .scene import Flat, Scene
 
@@ -50,8 +50,10 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
         *((None,) * 4 if forced is None else _forced(forced.points, forced.lit)),
     )
     number = -1 if forced is None else forced.light
-    call = _Call(layout, len(tables.tensors), number, shadows, samples)
-    found, seen = _Shade.apply(call, hits._exact.cpu(), *points, *tables.tensors, *surfaces.bare)
+    bare = surfaces.bare
+    shading = _Shading(layout, len(tables.tensors), number, shadows, samples, bare.cutoffs, bare.spacing)
+    arrays = (part for part in bare if isinstance(part, Tensor))
+    found, seen = apply(shading, [hits._exact.cpu(), *points, *tables.tensors, *arrays])
     column = 0
     for light, casting in enumerate(surfaces.scene.casting):
         own = seen[:, column]
@@ -73,7 +75,7 @@ class _Points(NamedTuple):
 
     face: Tensor  # (N,) int64
     seed: Tensor  # (N,) int64
-    index: Tensor | None  # those of a light whose shadow is known
+    index: Tensor | None  # pyright: ignore[reportIncompatibleMethodOverride]: those of a light whose shadow is known
     uv: Tensor | None
     density: Tensor | None
     lit: Tensor | None  # (N,) uint8
@@ -132,7 +134,7 @@ class _Layout(NamedTuple):
     def kernel(self, tables: Sequence[Tensor], faces: Tensor) -> Any:
         parts = self._asdict()
         return core.Lit(
-            tables=[_array(t) for t in tables], faces=_array(faces), step=[s & _64_BITS for s in STEPS], **parts
+            tables=[array(t) for t in tables], faces=array(faces), step=[s & _64_BITS for s in STEPS], **parts
         )
 
 
@@ -205,11 +207,11 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
 
     if isinstance(light, MeshLight):
         mesh = next(i for i, mesh in enumerate(scene.meshes) if mesh is light.mesh)
-        running, density = (_array(_values(t)) for t in light._table)
+        running, density = (array(_values(t)) for t in light._table)
         # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
         return lamp("mesh", mesh=mesh, running=running, density=density, eps=max(eps, 2.0**-40))
     if isinstance(light, Environment):
-        running, density = (_array(_values(t)) for t in light._table)
+        running, density = (array(_values(t)) for t in light._table)
         height, width = light._size
         return lamp(
             "environment",
@@ -241,7 +243,7 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
 
 
 def _rows(index: Tensor) -> np.ndarray:
-    return _array(index.int())
+    return array(index.int())
 
 
 def _values(tensor: Tensor) -> Tensor:
@@ -249,153 +251,65 @@ def _values(tensor: Tensor) -> Tensor:
     return tensor.detach().cpu()
 
 
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().contiguous().numpy()
-
-
-class _Call(NamedTuple):
-    """What is no tensor."""
+class _Shading(NamedTuple):
+    """csrc/shading/lit/lit.h, of the tensors (b, *points, *tables, *flat): the result is radiance (N, C) float64; beside it which
+    samples of lights are seen, (N, K) int8, −1 where they are below the surface."""
 
     layout: _Layout
     tables: int  # how many
     forced: int  # the light whose shadow is known, −1: none
     shadows: bool
     samples: int
-
-    def points(self, b: Tensor, points: _Points) -> Any:
-        arrays = {name: None if t is None else _array(t) for name, t in points._asdict().items()}
-        return core.LitPoints(b=_array(b), forced_lamp=self.forced, **arrays)
+    cutoffs: list[float]  # of the flat scene, whose other fields are tensors
+    spacing: list[float]
 
     @property
-    def options(self) -> dict[str, Any]:
-        return {"shadows": self.shadows, "samples": self.samples, "threads": torch.get_num_threads()}
+    def _first(self) -> int:
+        """Of the tables."""
+        return 1 + len(_Points._fields)
 
+    @property
+    def moving(self) -> Sequence[int]:
+        return 0, *range(self._first, self._first + self.tables)
 
-_FIRST = 2 + len(_Points._fields)  # of the tables, among the arguments
+    def _flat(self, tensors: Tensors) -> Flat:
+        arrays = tensors[self._first + self.tables :]
+        return Flat(*arrays, cutoffs=self.cutoffs, spacing=self.spacing)  # pyright: ignore[reportArgumentType]
 
+    def _tables(self, tensors: Tensors) -> list[Tensor]:
+        return list(tensors[self._first : self._first + self.tables])  # pyright: ignore[reportReturnType]
 
-class _Shade(torch.autograd.Function):
-    """(N, C) float64 radiance, and (N, samples of lights) int8 which of them are seen, −1 where they are below the surface."""
+    def _arguments(self, tensors: Tensors) -> dict[str, Any]:
+        points = _Points(*tensors[1 : self._first])  # pyright: ignore[reportArgumentType]
+        arrays = {name: None if t is None else array(t) for name, t in points._asdict().items()}
+        b = tensors[0]
+        assert b is not None
+        return {
+            "lit": self.layout.kernel(self._tables(tensors), self._flat(tensors).faces),
+            "points": core.LitPoints(b=array(b), forced_lamp=self.forced, **arrays),
+            "shadows": self.shadows,
+            "samples": self.samples,
+            "threads": torch.get_num_threads(),
+        }
 
-    @staticmethod
-    def forward(call: _Call, b: Tensor, *args: Any) -> tuple[Tensor, Tensor]:
-        points, tables, flat = _split(call, args)
-        lit = call.layout.kernel(tables, flat.faces)
-        found, seen = kernel_scene(flat).shade(lit, call.points(b, points), **call.options)
+    def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
+        found, seen = kernel_scene(self._flat(tensors)).shade(**self._arguments(tensors))
         return torch.from_numpy(found), torch.from_numpy(seen)
 
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        call, b, *args = inputs
-        _, seen = output
-        ctx.mark_non_differentiable(seen)
-        points, tables, flat = _split(call, args)
-        kept = (b, *points, seen, flat.faces, *tables)
-        ctx.call, ctx.count = call, len(inputs)
-        ctx.save_for_backward(*kept)
-        ctx.save_for_forward(*kept)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        call = ctx.call
-        wanted = ctx.needs_input_grad[1], *ctx.needs_input_grad[_FIRST : _FIRST + call.tables]
-        grads = _ShadeVjp.apply(call, wanted, grad_outputs[0], *ctx.saved_tensors)
-        out: list[Tensor | None] = [None] * ctx.count
-        for place, grad, want in zip((1, *range(_FIRST, _FIRST + call.tables)), grads, wanted, strict=True):
-            out[place] = grad if want else None
-        return tuple(out)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        call = ctx.call
-        given = tangents[1], *tangents[_FIRST : _FIRST + call.tables]
-        return _ShadeJvp.apply(call, *given, *ctx.saved_tensors), None
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> Any:
-        return _one_by_one(_Shade, info.batch_size, in_dims, args)
-
-
-def _split(call: _Call, args: Sequence[Any]) -> tuple[_Points, Sequence[Tensor], Flat]:
-    own = len(_Points._fields)
-    return _Points(*args[:own]), args[own : own + call.tables], Flat(*args[own + call.tables :])
-
-
-class _ShadeVjp(torch.autograd.Function):
-    """Of b and of the tables."""
-
-    @staticmethod
-    def forward(call: _Call, wanted: Sequence[bool], bar: Tensor, b: Tensor, *kept: Any) -> tuple[Tensor, ...]:
-        points, seen, faces, tables = _kept(kept)
-        lit = call.layout.kernel(tables, faces)
+    def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
+        (seen,) = kept
+        assert seen is not None
         found, b_bar = core.shade_vjp(
-            lit,
-            call.points(b, points),
-            seen=_array(seen),
-            bar=_array(bar.double()),
-            wanted=list(wanted[1:]),
-            **call.options,
+            seen=array(seen), bar=doubles(bar), wanted=list(wanted[1:]), **self._arguments(tensors)
         )
-        empty = b.new_zeros(0)
-        grads = [
-            empty if grad is None else torch.from_numpy(grad).to(table.dtype)
-            for grad, table in zip(found, tables, strict=True)
-        ]
-        return (torch.from_numpy(b_bar) if wanted[0] else empty, *grads)
+        none = bar.new_zeros(0)
+        tables = zip(found, self._tables(tensors), strict=True)
+        return [torch.from_numpy(b_bar), *(none if g is None else torch.from_numpy(g).to(t.dtype) for g, t in tables)]
 
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> Any:
-        return _one_by_one(_ShadeVjp, info.batch_size, in_dims, args)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)
-
-
-def _kept(kept: Sequence[Any]) -> tuple[_Points, Tensor, Tensor, Sequence[Tensor]]:
-    own = len(_Points._fields)
-    return _Points(*kept[:own]), kept[own], kept[own + 1], kept[own + 2 :]
-
-
-class _ShadeJvp(torch.autograd.Function):
-    """For tangents of b and of the tables."""
-
-    @staticmethod
-    def forward(call: _Call, b_dot: Tensor | None, *args: Any) -> Tensor:
-        tangents, (b, *kept) = args[: call.tables], args[call.tables :]
-        points, seen, faces, tables = _kept(kept)
-        arrays = [None if t is None else _array(t.double()) for t in (b_dot, *tangents)]
-        found = core.shade_jvp(
-            call.layout.kernel(tables, faces),
-            call.points(b, points),
-            seen=_array(seen),
-            tangents=arrays[1:],
-            b_dot=arrays[0],
-            **call.options,
+    def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
+        (seen,) = kept
+        assert seen is not None
+        b_dot, *rest = (doubles(tangent) for tangent in tangents)
+        return torch.from_numpy(
+            core.shade_jvp(seen=array(seen), tangents=rest, b_dot=b_dot, **self._arguments(tensors))
         )
-        return torch.from_numpy(found)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> Any:
-        return _one_by_one(_ShadeJvp, info.batch_size, in_dims, args)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)
-

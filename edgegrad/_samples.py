@@ -34,7 +34,7 @@ class SurfaceRecords(NamedTuple):
     face: Tensor  # (S,) int64
     x: Tensor  # (S, 2) float64, pixel positions
     along: Tensor  # (S, 3) float64, where the ray goes in camera coordinates; in an orthographic view the place it goes through
-    along_by_k: Tensor  # (S, 3, 14) float64, its derivatives by K in rows and the distortion, at fixed x
+    along_by_k: Tensor  # (S, 3, 14) float64, its derivatives by K in rows and the distortion, at fixed x; empty where these stay
     weight: Tensor  # (S,) float64, px² that a sample stands for
 
 
@@ -45,7 +45,7 @@ class CurveRecords(NamedTuple):
     face: Tensor  # (S, 3) int64 of the surfaces there; -1: the background, -2: none
     b: Tensor  # (S, 3, 2) float64, the last two barycentrics on them
     factor: Tensor  # (S, 3) float64: the jump, times what the sample stands for, is the sum of factor · radiance
-    by_k: Tensor  # (S, 14) float64, the curve's velocity by K in rows and the distortion
+    by_k: Tensor  # (S, 14) float64, the curve's velocity by K in rows and the distortion; empty where these stay
     row_of: Tensor  # (R,) int64, the sample of a row
     vertex: Tensor  # (R,) int64
     by_q: Tensor  # (R, 3) float64, the curve's velocity by a vertex in camera coordinates
@@ -297,7 +297,7 @@ class Sampler:
             yield PixelRecords(*self._compute(self._request, compute, *places))
 
     def samples(
-        self, request: Request, interior: bool, boundary: bool, rim: bool = False, steps: bool = False
+        self, request: Request, interior: bool, boundary: bool, intrinsics: bool = False, steps: bool = False
     ) -> tuple[SurfaceRecords, CurveRecords]:
         """Of the gradient, after all pixel hits were taken; the scene of `request` has colours that jump where creases are."""
 
@@ -312,7 +312,7 @@ class Sampler:
                     edge_samples=options.edge_samples,
                     interior_geometry=interior,
                     boundary=boundary,
-                    rim=rim,
+                    intrinsics=intrinsics,
                     steps=steps,
                     step_spacing=options.step_spacing,
                 ),
@@ -326,7 +326,7 @@ class Sampler:
         count = len(SurfaceRecords._fields)
         return SurfaceRecords(*parts[:count]), CurveRecords(*parts[count:])
 
-    def shadow_samples(self, lights: LightRows, seed: int, samples: int = -1) -> CurveRecords:
+    def shadow_samples(self, lights: LightRows, seed: int, samples: int, intrinsics: bool) -> CurveRecords:
         """On the borders of shadows, after all pixel hits were taken; so many, or by default."""
 
         def compute(request: Request, camera: Any, *lights: Tensor) -> CurveRecords:
@@ -334,7 +334,7 @@ class Sampler:
             found = kernel_scene(request.scene).shadow_samples(
                 camera=camera,
                 image=core.ImageOptions(**request.image._asdict()),
-                options=core.GradientOptions(seed=seed),
+                options=core.GradientOptions(seed=seed, intrinsics=intrinsics),
                 lights=core.LightPoints(**{n: v.cpu().contiguous().numpy() for n, v in rows._asdict().items()}),
                 samples=samples,
                 threads=torch.get_num_threads(),

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ._moving import barycentrics
 from ._rows import dot, rows_of
 from ._samples import bare
 from .scene import Flat, Scene
@@ -155,10 +156,8 @@ class View:
     def barycentrics(self, surfaces: Surfaces, face: Tensor, along: Tensor) -> Tensor:
         """(N, 3) where rays meet the planes of faces. `along` (N, 3): the directions of rays from the eye in camera coordinates,
         or, in an orthographic view, points that rays along the axis go through."""
-        corners = self.in_camera(surfaces.corners(face))
-        if self.perspective:
-            return meet(corners, torch.zeros_like(along), along)
-        return meet(corners, along, along.new_tensor([0.0, 0.0, 1.0]).expand_as(along))
+        bare = surfaces.bare
+        return barycentrics(bare.verts, bare.faces, face, self.world_to_camera, along, self.perspective)
 
     def depth(self, points: Tensor) -> Tensor:
         """(N,) along the axis."""

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
 from ._derivatives import moves, once
+from ._moving import Form, velocity
 from ._ops import camera_seed
 from ._request import Request, as_scene, make_request
 from ._samples import (
@@ -216,21 +217,20 @@ class EdgeSamples:
             forced = Forced(light.number, points, lit, torch.ones_like(lit, dtype=torch.bool))
         self.hits = frame.fixed_hits(records.face[sample, which], b, records.x[sample], seed, forced=forced)
         self.to_background = frame.here(torch.where(records.face == -1, records.factor, 0).sum(1))
-        q = frame.view.in_camera(frame.surfaces.verts)
-        rows = (frame.here(records.by_q) * (q - q.detach())[frame.here(records.vertex)]).sum(1)
-        by_k = records.by_k @ (frame.intrinsics - frame.intrinsics.detach())
-        velocity = frame.here(by_k).index_add(0, frame.here(records.row_of), rows)
         flat = frame.request.scene
-        by_uv = (records.by_uv * (flat.uvs - flat.uvs.detach())[records.uv]).sum(1)
-        by_alpha = records.by_alpha * (flat.alphas - flat.alphas.detach())[records.alpha, 0].double()
-        velocity = velocity.index_add(0, frame.here(records.uv_row_of), frame.here(by_uv))
-        velocity = velocity.index_add(0, frame.here(records.alpha_row_of), frame.here(by_alpha))
+        forms = [
+            (Form(records.row_of, records.vertex, records.by_q), frame.view.in_camera(frame.surfaces.verts)),
+            (Form(records.uv_row_of, records.uv, records.by_uv), flat.uvs),
+            (Form(records.alpha_row_of, records.alpha, records.by_alpha[:, None]), flat.alphas[:, :1]),
+        ]
+        if len(records.by_k):
+            every = torch.arange(len(self))
+            forms.append((Form(every, torch.zeros_like(every), records.by_k), frame.intrinsics[None]))
         if light is not None:
             place = light.place
             place = frame.view.turned(place) if light.light.infinite else frame.view.in_camera(place)
-            rows = (frame.here(records.by_light) * (place - place.detach())[frame.here(records.light)]).sum(1)
-            velocity = velocity.index_add(0, frame.here(records.light_row_of), rows)
-        self.velocity = velocity
+            forms.append((Form(records.light_row_of, records.light, records.by_light), place))
+        self.velocity = frame.here(velocity(len(self), forms))
 
     def __len__(self) -> int:
         return len(self.x)
@@ -352,7 +352,7 @@ def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool |
     frame = primary.frame
     with shaded_room(request._replace(gradient=request.gradient._replace(surface_samples=0)), gradient=True):
         _, curves = frame.sampler.samples(
-            request, interior=False, boundary=True, rim=moves(frame.intrinsics), steps=request.scene.has_steps
+            request, interior=False, boundary=True, intrinsics=moves(frame.intrinsics), steps=request.scene.has_steps
         )
     return EdgeSamples(frame, curves)
 

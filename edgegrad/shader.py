@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -39,6 +39,15 @@ AT_ONCE = 1 << 17
 CREASES = ("auto", True, False)
 
 
+class Effort(NamedTuple):
+    """What shading an image takes."""
+
+    points: int = 1  # of a face in a pixel that are shaded
+    keeps_little: bool = (
+        False  # whether the graph of a shader is small, so that nothing is computed again in the backward pass
+    )
+
+
 def render_shaded(
     scene: Scene,
     camera: Camera,
@@ -46,16 +55,17 @@ def render_shaded(
     request: Request,
     creases: bool | str,
     check: bool,
-    points: int = 1,
+    effort: Effort | None = None,
 ) -> Tensor:
-    """The image (H, W, C), or (B, H, W, C) for a batch of cameras; so many points of a face in a pixel are shaded."""
+    """The image (H, W, C), or (B, H, W, C) for a batch of cameras; see Effort."""
     if not callable(shader):
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
     with shaded_room(request):
         images = [
-            _Image(Frame(scene, request, k), shader, creases, check, points).render() for k in range(request.cameras)
+            _Image(Frame(scene, request, k), shader, creases, check, effort or Effort()).render()
+            for k in range(request.cameras)
         ]
     return images[0] if camera.batch is None else torch.stack(images)
 
@@ -63,8 +73,8 @@ def render_shaded(
 class _Image:
     """The image of one camera of a batch."""
 
-    def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool, points: int) -> None:
-        self._frame, self._shader, self._creases, self._check, self._points = frame, shader, creases, check, points
+    def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool, effort: Effort) -> None:
+        self._frame, self._shader, self._creases, self._check, self._effort = frame, shader, creases, check, effort
         self._channels: int | None = None
         self._kinds: list[str] | None = None  # of the steps that the shader declares
 
@@ -78,7 +88,7 @@ class _Image:
         flat = frame.request.scene
         cut = visibility and flat.has_steps and (moving or moves(flat.uvs, flat.alphas))
         surface, curves = frame.sampler.samples(
-            self._with_creases(), interior=True, boundary=moving, rim=moves(frame.intrinsics), steps=cut
+            self._with_creases(), interior=True, boundary=moving, intrinsics=moves(frame.intrinsics), steps=cut
         )
         zero = self._interior(SurfaceSamples(frame, surface))
         if moving or cut:
@@ -98,7 +108,7 @@ class _Image:
         with torch.no_grad():
             image: Any = 0
             count = 0
-            for found in frame.sampler.pixel_hits(AT_ONCE, self._points):
+            for found in frame.sampler.pixel_hits(AT_ONCE, self._effort.points):
                 sums, hits = self._shaded(found, count)
                 count += len(found.face)
                 image = image + sums
@@ -145,7 +155,7 @@ class _Image:
                 return self._shade(samples.part(first, first + AT_ONCE).hits)
 
             # So that memory is that of some points, not of all.
-            many = len(samples) > AT_ONCE and not transformed()
+            many = len(samples) > AT_ONCE and not transformed() and not self._effort.keeps_little
             L = checkpoint(radiance, use_reentrant=False) if many else radiance()
             assert isinstance(L, Tensor)
             total = total + some.image(L)
@@ -168,7 +178,7 @@ class _Image:
             light = ShadowLight.of(frame.surfaces, index, seed)
             moving = frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics, light.place
             if moves(*moving):
-                records = frame.sampler.shadow_samples(light.rows(frame.surfaces), seed, count)
+                records = frame.sampler.shadow_samples(light.rows(frame.surfaces), seed, count, moves(frame.intrinsics))
                 found = found + self._boundary(EdgeSamples(frame, records, light))
         return found
 

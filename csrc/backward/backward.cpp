@@ -60,7 +60,7 @@ Terms terms_of(const Slots<Number>& slots, const GradientOptions& o) {
     return {.motion = moves && o.interior_geometry,
             .appearance = slots.appearance(),
             .boundary = moves && o.boundary,
-            .rim = (slots.K || slots.distortion) && o.boundary && o.rim,
+            .rim = (slots.K || slots.distortion) && o.boundary && o.intrinsics,
             .steps = slots.steps() && o.steps};
 }
 
@@ -69,7 +69,7 @@ Terms all_motion(const GradientOptions& o) {
     return {.motion = o.interior_geometry,
             .appearance = false,
             .boundary = o.boundary,
-            .rim = o.boundary && o.rim,
+            .rim = o.boundary && o.intrinsics,
             .steps = o.steps};
 }
 
@@ -371,7 +371,7 @@ Records record_samples(const BackwardInput<T>& input, GradientOptions o, Team& t
     to.records = &records;
     BackwardProfile profile;
     each_view(input, o, terms, team,
-              [&](const BackwardView<T>& view) { add_terms<0>(input, view, terms, Record{}, to, profile); });
+              [&](const BackwardView<T>& view) { add_terms<0>(input, view, terms, Record{o.intrinsics}, to, profile); });
     return records;
 }
 
@@ -383,7 +383,7 @@ CurveRecords record_shadows(const BackwardInput<T>& input, const GradientOptions
     to.records = &records;
     BackwardProfile profile;
     each_view(input, o, Terms{}, team,
-              [&](const BackwardView<T>& view) { add_shadows<0>(view, lights, samples, Record{}, to, profile); });
+              [&](const BackwardView<T>& view) { add_shadows<0>(view, lights, samples, Record{o.intrinsics}, to, profile); });
     return std::move(records.curves);
 }
 

@@ -18,7 +18,7 @@ struct GradientOptions {
     uint64_t seed = 0;
     bool interior_geometry = true;  // whether the colours vary over faces, so that moving them shows inside
     bool boundary = true;
-    bool rim = true;          // whether that of what a lens shows counts, where boundary does
+    bool intrinsics = true;   // whether they may move; where boundary does count, the rim of what a lens shows then does
     bool steps = true;        // whether what moves steps within faces counts
     double step_spacing = 1;  // px between the lines that find them
     bool dry = false;         // only count the samples

@@ -135,8 +135,8 @@ class ScreenBoundary {
 template <class T>
 class RecordBoundary {
    public:
-    RecordBoundary(const BackwardView<T>& view, CurveRecords& records)
-        : view_(view), camera_(view.camera), records_(records) {
+    RecordBoundary(const BackwardView<T>& view, const Record& kept, CurveRecords& records)
+        : view_(view), kept_(kept), camera_(view.camera), records_(records) {
         form_.q.prepare(3, 1), form_.uvs.prepare(2, 1), form_.alphas.prepare(1, 1);
         form_.lights.prepare(3, 1);
     }
@@ -183,7 +183,7 @@ class RecordBoundary {
             append(records_.b, {b.u, b.v});
             records_.factor.push_back(factor[k]);
         }
-        append_intrinsics(records_.by_k, camera_, form_.k);
+        if (kept_.intrinsics) append_intrinsics(records_.by_k, camera_, form_.k);
         form_.q.each([&](int64_t vertex, const double* by_q) {
             if (by_q[0] == 0 && by_q[1] == 0 && by_q[2] == 0) return;
             records_.row_of.push_back(sample_index);
@@ -233,6 +233,7 @@ class RecordBoundary {
     }
 
     const BackwardView<T>& view_;
+    const Record kept_;
     const Camera& camera_;
     CurveRecords& records_;
     ChunkGrad form_;

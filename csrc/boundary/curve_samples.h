@@ -25,8 +25,8 @@ ScreenBoundary<T> on_curves(const BackwardView<T>& view, const Screen&, ChunkGra
 }
 
 template <int N, class T>
-RecordBoundary<T> on_curves(const BackwardView<T>& view, const Record&, ChunkGrad& grad) {
-    return {view, grad.records.curves};
+RecordBoundary<T> on_curves(const BackwardView<T>& view, const Record& c, ChunkGrad& grad) {
+    return {view, c, grad.records.curves};
 }
 
 // Samples of one source, in batches of rays.

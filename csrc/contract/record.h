@@ -15,7 +15,9 @@
 namespace edgegrad {
 
 // The contraction that keeps samples (contraction.h).
-struct Record {};
+struct Record {
+    bool intrinsics = true;  // whether derivatives by them are kept: else those arrays are empty
+};
 
 constexpr int intrinsics_width = 6 + most_coefficients;  // K in rows, then the distortion
 
@@ -84,16 +86,17 @@ inline void append_intrinsics(std::vector<double>& to, const Camera& window, con
 }
 
 // Appends the ray that goes to n in a window's image: in the frame of the camera, with its derivatives at fixed x.
-inline void append_ray(const Camera& window, Vec2 n, std::vector<double>& along, std::vector<double>& along_by_k,
+inline void append_ray(const Camera& window, Vec2 n, std::vector<double>& along, std::vector<double>* along_by_k,
                        std::vector<double>* along_by_x = nullptr) {
     const Mat3& turn = window.turn;
     const Vec3 direction = transposed_times(turn, {n.x, n.y, 1});
     append(along, {direction.x, direction.y, direction.z});
+    if (!along_by_k) return;
     for (const Vec2 by_n :
          {Vec2{turn.row[0].x, turn.row[1].x}, Vec2{turn.row[0].y, turn.row[1].y}, Vec2{turn.row[0].z, turn.row[1].z}}) {
         IntrinsicsGrad bar;
         normalised_vjp(window, n, by_n, bar);
-        append_intrinsics(along_by_k, window, bar);
+        append_intrinsics(*along_by_k, window, bar);
         if (!along_by_x) continue;
         const Vec2 by_x = pixel_vjp(window, n, by_n);
         append(*along_by_x, {by_x.x, by_x.y});

@@ -79,7 +79,7 @@ RayRecords rays_at(const Camera& camera, const Places& places, Team& team) {
             for (const Camera& side : sides)
                 if (const Vec2 here = through(side, places[k]); std::isfinite(here.x + here.y))
                     window = &side, n = here;
-            append_ray(*window, n, to.along, to.along_by_k, &to.along_by_x);
+            append_ray(*window, n, to.along, &to.along_by_k, &to.along_by_x);
         }
     });
     RayRecords all;

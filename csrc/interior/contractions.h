@@ -185,7 +185,8 @@ class ScreenInterior {
 template <class T>
 class RecordInterior {
    public:
-    RecordInterior(const BackwardView<T>& view, SurfaceRecords& records) : view_(view), records_(records) {}
+    RecordInterior(const BackwardView<T>& view, const Record& kept, SurfaceRecords& records)
+        : view_(view), kept_(kept), records_(records) {}
 
     bool wants(int, const SurfaceSample&) const { return true; }
 
@@ -204,11 +205,12 @@ class RecordInterior {
     void add(int32_t face, Vec2 x, Vec2 n, double weight) {
         records_.face.push_back(face);
         append(records_.x, {x.x, x.y});
-        append_ray(view_.camera, n, records_.along, records_.along_by_k);
+        append_ray(view_.camera, n, records_.along, kept_.intrinsics ? &records_.along_by_k : nullptr);
         records_.weight.push_back(weight);
     }
 
     const BackwardView<T>& view_;
+    const Record kept_;
     SurfaceRecords& records_;
 };
 

@@ -37,8 +37,8 @@ ScreenInterior<T> contract(const BackwardView<T>& view, const Screen&, const Des
 }
 
 template <int N, class T>
-RecordInterior<T> contract(const BackwardView<T>& view, const Record&, const Destination&, ChunkGrad& grad) {
-    return {view, grad.records.surface};
+RecordInterior<T> contract(const BackwardView<T>& view, const Record& c, const Destination&, ChunkGrad& grad) {
+    return {view, c, grad.records.surface};
 }
 
 // The samples of one chunk.

@@ -24,6 +24,7 @@ namespace edgegrad {
 void bind_memory(nb::module_& m);       // memory.cpp
 void bind_for_shaders(nb::module_& m);  // for_shaders.cpp
 void bind_lit(nb::module_& m);          // lit.cpp
+void bind_moving_hits(nb::module_& m);  // moving_hits.cpp
 template <class T>
 void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene);
 template <class T>
@@ -241,12 +242,12 @@ NB_MODULE(_core, m) {
     nb::class_<ImageOptions>(m, "ImageOptions").def(nb::new_(&make_image_options), "spp"_a, "filter"_a, "seed"_a);
     nb::class_<GradientOptions>(m, "GradientOptions")
         .def(nb::new_([](uint64_t seed, int64_t surface_samples, int64_t edge_samples, bool interior_geometry,
-                         bool boundary, bool rim, bool steps, double step_spacing, bool dry) {
-                 return GradientOptions{surface_samples, edge_samples, seed, interior_geometry, boundary, rim, steps,
+                         bool boundary, bool intrinsics, bool steps, double step_spacing, bool dry) {
+                 return GradientOptions{surface_samples, edge_samples, seed, interior_geometry, boundary, intrinsics, steps,
                                         step_spacing,    dry,          !dry};
              }),
              "seed"_a, nb::kw_only(), "surface_samples"_a = -1, "edge_samples"_a = -1, "interior_geometry"_a = true,
-             "boundary"_a = true, "rim"_a = true, "steps"_a = true, "step_spacing"_a = 1.0, "dry"_a = false);
+             "boundary"_a = true, "intrinsics"_a = true, "steps"_a = true, "step_spacing"_a = 1.0, "dry"_a = false);
     m.attr("WRAPS") = nb::make_tuple(wrap_names[0], wrap_names[1], wrap_names[2]);
     m.attr("TEXTURE_FILTERS") = nb::make_tuple(texture_filter_names[0], texture_filter_names[1]);
     std::vector<std::string> slots;
@@ -254,6 +255,7 @@ NB_MODULE(_core, m) {
     m.attr("GRADIENT_SLOTS") = nb::tuple(nb::cast(slots));
     bind_for_shaders(m);
     bind_lit(m);
+    bind_moving_hits(m);
     bind_scene<float>(m, "SceneFloat", "HitsFloat");
     bind_scene<double>(m, "SceneDouble", "HitsDouble");
     bind_memory(m);

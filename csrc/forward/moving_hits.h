@@ -1,0 +1,35 @@
+// Where rays of a camera meet the planes of faces, as functions of the vertices, of the camera's place and of the rays.
+#pragma once
+
+#include <cstdint>
+
+#include "core/parallel.h"
+
+namespace edgegrad {
+
+// Arrays of what it depends on, or of its derivatives; null: zero.
+template <class Number>
+struct MovingArrays {
+    Number* verts = nullptr;            // (V, 3) world coordinates
+    Number* world_to_camera = nullptr;  // (4, 4)
+    // (N, 3), in camera coordinates: directions of rays from the eye, or, in an orthographic view, points that rays
+    // along the axis go through.
+    Number* along = nullptr;
+};
+
+struct MovingHits {
+    const int32_t* faces;  // (F, 3) rows of verts
+    const int64_t* face;   // (N,)
+    int64_t size;
+    bool perspective;
+};
+
+// Barycentrics (N, 3).
+void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, Team& team);
+// Adds to the cotangents of vertices and camera, and writes those of `along`.
+void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,
+                    const MovingArrays<double>& to, Team& team);
+void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at,
+                    const MovingArrays<const double>& tangents, double* b_dot, Team& team);
+
+}  // namespace edgegrad

@@ -1,0 +1,104 @@
+// Barycentrics of hits as functions of vertices, camera and rays, for edgegrad/_moving_hits.py.
+
+#include "forward/moving_hits.h"
+
+#include <nanobind/stl/optional.h>
+
+#include <optional>
+
+#include "python/checks.h"
+#include "python/unlocked.h"
+
+using namespace nanobind::literals;
+
+namespace edgegrad {
+
+namespace {
+
+using Doubles = In<double, 2>;
+
+struct HitFaces {
+    In<int32_t, 2> faces;
+    In<int64_t, 1> face;
+    bool perspective;
+
+    MovingHits view() const { return {faces.data(), face.data(), int64_t(face.size()), perspective}; }
+};
+HitFaces make_hits(In<int32_t, 2> faces, In<int64_t, 1> face, bool perspective) {
+    if (faces.shape(1) != 3) refuse("faces: expected three columns");
+    for (size_t i = 0; i < face.size(); ++i)
+        if (face(i) < 0 || face(i) >= int64_t(faces.shape(0))) refuse("face: expected faces of the scene");
+    return {faces, face, perspective};
+}
+
+void check(const HitFaces& hits, const Doubles& verts, const Doubles& world_to_camera, const Doubles& along) {
+    if (verts.shape(1) != 3) refuse("verts: expected three columns");
+    check_indices("faces", hits.faces.data(), hits.faces.size(), verts.shape(0), "verts", 1);
+    if (world_to_camera.shape(0) != 4 || world_to_camera.shape(1) != 4) refuse("world_to_camera: expected (4, 4)");
+    if (along.shape(0) != hits.face.size() || along.shape(1) != 3) refuse("along: expected a row a hit");
+}
+
+nb::object array_of(std::vector<double>&& values, size_t columns) {
+    auto* kept = new std::vector<double>(std::move(values));
+    const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<double>*>(p); });
+    const size_t shape[] = {kept->size() / columns, columns};
+    return nb::cast(nb::ndarray<nb::numpy, double>(kept->data(), 2, shape, owner));
+}
+
+nb::object meet(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along, int threads) {
+    check(hits, verts, world_to_camera, along);
+    std::vector<double> b(3 * hits.face.size());
+    unlocked(threads, [&](Team& team) {
+        meet_faces(hits.view(), {verts.data(), world_to_camera.data(), along.data()}, b.data(), team);
+    });
+    return array_of(std::move(b), 3);
+}
+
+// Cotangents of verts, world_to_camera and along.
+nb::tuple meet_vjp(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along, Doubles bar,
+                   int threads) {
+    check(hits, verts, world_to_camera, along);
+    if (bar.shape(0) != hits.face.size() || bar.shape(1) != 3) refuse("bar: expected a row a hit");
+    std::vector<double> verts_bar(verts.size()), pose_bar(16), along_bar(along.size());
+    unlocked(threads, [&](Team& team) {
+        meet_faces_vjp(hits.view(), {verts.data(), world_to_camera.data(), along.data()}, bar.data(),
+                       {verts_bar.data(), pose_bar.data(), along_bar.data()}, team);
+    });
+    return nb::make_tuple(array_of(std::move(verts_bar), 3), array_of(std::move(pose_bar), 4),
+                          array_of(std::move(along_bar), 3));
+}
+
+nb::object meet_jvp(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along,
+                    std::optional<Doubles> verts_dot, std::optional<Doubles> pose_dot, std::optional<Doubles> along_dot,
+                    int threads) {
+    check(hits, verts, world_to_camera, along);
+    const auto tangent = [](const char* name, const std::optional<Doubles>& dot, const Doubles& of) {
+        if (!dot) return static_cast<const double*>(nullptr);
+        if (dot->shape(0) != of.shape(0) || dot->shape(1) != of.shape(1))
+            refuse(std::string(name) + ": expected the shape of the value");
+        return dot->data();
+    };
+    const MovingArrays<const double> tangents{tangent("verts_dot", verts_dot, verts),
+                                              tangent("pose_dot", pose_dot, world_to_camera),
+                                              tangent("along_dot", along_dot, along)};
+    std::vector<double> b_dot(3 * hits.face.size());
+    unlocked(threads, [&](Team& team) {
+        meet_faces_jvp(hits.view(), {verts.data(), world_to_camera.data(), along.data()}, tangents, b_dot.data(), team);
+    });
+    return array_of(std::move(b_dot), 3);
+}
+
+}  // namespace
+
+void bind_moving_hits(nb::module_& m) {
+    nb::class_<HitFaces>(m, "MovingHits")
+        .def(nb::new_(&make_hits), "faces"_a.noconvert(), "face"_a.noconvert(), "perspective"_a);
+    m.def("meet", &meet, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(), "along"_a.noconvert(),
+          "threads"_a);
+    m.def("meet_vjp", &meet_vjp, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(),
+          "along"_a.noconvert(), "bar"_a.noconvert(), "threads"_a);
+    m.def("meet_jvp", &meet_jvp, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(),
+          "along"_a.noconvert(), "verts_dot"_a.none(), "pose_dot"_a.none(), "along_dot"_a.none(), "threads"_a);
+}
+
+}  // namespace edgegrad

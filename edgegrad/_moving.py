@@ -1,0 +1,109 @@
+"""What moves with the scene at fixed places in the image: barycentrics of hits, and curves across themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ._kernel import core
+from ._operator import Tensors, apply, array, doubles
+
+
+def barycentrics(
+    verts: Tensor, faces: Tensor, face: Tensor, world_to_camera: Tensor, along: Tensor, perspective: bool
+) -> Tensor:
+    """(N, 3) float64 where rays meet the planes of faces (N,), rows of faces (F, 3) int32 of verts (V, 3). `along` (N, 3): the
+    directions of rays from the eye in camera coordinates, or, in an orthographic view, points that rays along the axis go
+    through."""
+    tensors = [verts.cpu().double(), world_to_camera.cpu().double(), along.cpu().double(), faces.cpu(), face.cpu()]
+    return apply(_Meeting(perspective), tensors)[0].to(verts.device)
+
+
+class _Meeting(NamedTuple):
+    """csrc/forward/moving_hits.h"""
+
+    perspective: bool
+
+    @property
+    def moving(self) -> Sequence[int]:
+        return range(3)
+
+    def _arguments(self, tensors: Tensors) -> dict[str, object]:
+        verts, world_to_camera, along, faces, face = map(array, tensors)  # pyright: ignore[reportArgumentType]
+        return {
+            "hits": core.MovingHits(faces, face, self.perspective),
+            "verts": verts,
+            "world_to_camera": world_to_camera,
+            "along": along,
+            "threads": torch.get_num_threads(),
+        }
+
+    def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
+        return (torch.from_numpy(core.meet(**self._arguments(tensors))),)
+
+    def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
+        return [torch.from_numpy(g) for g in core.meet_vjp(bar=array(bar), **self._arguments(tensors))]
+
+    def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
+        names = ("verts_dot", "pose_dot", "along_dot")
+        given = {name: doubles(tangent) for name, tangent in zip(names, tangents, strict=True)}
+        return torch.from_numpy(core.meet_jvp(**given, **self._arguments(tensors)))
+
+
+class Form(NamedTuple):
+    """Rows of a linear form of a table (R, K): Σ by · (table − its value)[row] for each sample."""
+
+    sample: Tensor  # (P,) int64
+    row: Tensor  # (P,) int64
+    by: Tensor  # (P, K) float64
+
+
+def velocity(samples: int, forms: Sequence[tuple[Form, Tensor]]) -> Tensor:
+    """(samples,) float64, zeros whose derivatives are those of the forms by their tables."""
+    forms = [(form, table) for form, table in forms if len(form.sample)]
+    device = forms[0][1].device if forms else None
+    if not forms:
+        return torch.zeros(samples, dtype=torch.float64, device=device)
+    tensors: list[Tensor] = [table for _, table in forms]
+    for form, table in forms:
+        tensors += (part.to(table.device) for part in form)
+    return apply(_Velocity(samples, len(forms)), tensors)[0]
+
+
+class _Velocity(NamedTuple):
+    samples: int
+    tables: int
+
+    @property
+    def moving(self) -> Sequence[int]:
+        return range(self.tables)
+
+    def _forms(self, tensors: Tensors) -> list[Form]:
+        rest = tensors[self.tables :]
+        return [Form(*rest[3 * k : 3 * k + 3]) for k in range(self.tables)]  # pyright: ignore[reportArgumentType]
+
+    def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
+        table = tensors[0]
+        assert table is not None
+        return (torch.zeros(self.samples, dtype=torch.float64, device=table.device),)
+
+    def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
+        grads = []
+        for want, form, table in zip(wanted, self._forms(tensors), tensors, strict=False):
+            assert table is not None
+            grad = table.new_zeros(table.shape, dtype=torch.float64)
+            if want:
+                grad = grad.index_add(0, form.row, form.by * bar.index_select(0, form.sample)[:, None])
+            grads.append(grad.to(table.dtype))
+        return grads
+
+    def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
+        (total,) = self.value(tensors)
+        for tangent, form in zip(tangents, self._forms(tensors), strict=True):
+            if tangent is not None:
+                moved = (form.by * tangent.double().index_select(0, form.row)).sum(1)
+                total = total.index_add(0, form.sample, moved)
+        return total
