@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ._derivatives import values_of
 from ._kernel import core
 from ._mesh_light import MeshLight
 from ._operator import Tensors, apply, array, doubles
@@ -128,7 +129,7 @@ class _Layout(NamedTuple):
         still = (light for light in scene.lights if isinstance(light, SphericalHarmonics))
         lamps = [_lamp(scene, light, k, eps, tables) for k, light in enumerate((*scene.casting, *still))]
         center, radius = surfaces.ball
-        ball = [*(float(x) for x in _values(center)), radius]
+        ball = [*(float(x) for x in values_of(center)), radius]
         return cls(meshes, lamps, verts, seen_from, view.perspective, scene.channels, ball)
 
     def kernel(self, tables: Sequence[Tensor], faces: Tensor) -> Any:
@@ -207,11 +208,11 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
 
     if isinstance(light, MeshLight):
         mesh = next(i for i, mesh in enumerate(scene.meshes) if mesh is light.mesh)
-        running, density = (array(_values(t)) for t in light._table)
+        running, density = (array(values_of(t)) for t in light._table)
         # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
         return lamp("mesh", mesh=mesh, running=running, density=density, eps=max(eps, 2.0**-40))
     if isinstance(light, Environment):
-        running, density = (array(_values(t)) for t in light._table)
+        running, density = (array(values_of(t)) for t in light._table)
         height, width = light._size
         return lamp(
             "environment",
@@ -243,12 +244,7 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
 
 
 def _rows(index: Tensor) -> np.ndarray:
-    return array(index.int())
-
-
-def _values(tensor: Tensor) -> Tensor:
-    """Without what transforms of torch.func put around it: it has no derivative."""
-    return tensor.detach().cpu()
+    return array(values_of(index).int())
 
 
 class _Shading(NamedTuple):

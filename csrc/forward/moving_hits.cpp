@@ -1,6 +1,7 @@
 #include "forward/moving_hits.h"
 
 #include <algorithm>
+#include <cmath>
 #include <vector>
 
 #include "contract/scatter.h"
@@ -50,6 +51,7 @@ struct Crossing {
         scale = S(1) / dot(e1, p);
         u = dot(s, p) * scale, v = dot(d, q) * scale;
     }
+    bool exists() const { return std::isfinite(plain(u) + plain(v)); }
 };
 // Adds to the cotangents of the corners; returns that of `along`.
 Vec3 crossing_vjp(const Crossing<double>& c, bool perspective, const double* b_bar, Vec3* corner_bar) {
@@ -87,7 +89,8 @@ void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, do
         Vec3 world[3];
         for (int64_t i = first; i < last; ++i) {
             const Crossing<double> c = crossing<double>(hits, pose, at, {}, i, world);
-            b[3 * i] = 1 - c.u - c.v, b[3 * i + 1] = c.u, b[3 * i + 2] = c.v;
+            const bool there = c.exists();
+            b[3 * i] = there ? 1 - c.u - c.v : 1, b[3 * i + 1] = there ? c.u : 0, b[3 * i + 2] = there ? c.v : 0;
         }
     });
 }
@@ -109,6 +112,7 @@ void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at
             for (int64_t i = first; i < last; ++i) {
                 Vec3 corner_bar[3];
                 const Crossing<double> c = crossing<double>(hits, pose, at, {}, i, world);
+                if (!c.exists()) continue;
                 const Vec3 along_bar = crossing_vjp(c, hits.perspective, b_bar + 3 * i, corner_bar);
                 if (to.along)
                     to.along[3 * i] = along_bar.x, to.along[3 * i + 1] = along_bar.y, to.along[3 * i + 2] = along_bar.z;
@@ -146,7 +150,8 @@ void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at
         DualVec3 world[3];
         for (int64_t i = first; i < last; ++i) {
             const Crossing<Dual> c = crossing<Dual>(hits, pose, at, tangents, i, world);
-            b_dot[3 * i] = -c.u.dot - c.v.dot, b_dot[3 * i + 1] = c.u.dot, b_dot[3 * i + 2] = c.v.dot;
+            const double u = c.exists() ? c.u.dot : 0, v = c.exists() ? c.v.dot : 0;
+            b_dot[3 * i] = -u - v, b_dot[3 * i + 1] = u, b_dot[3 * i + 2] = v;
         }
     });
 }

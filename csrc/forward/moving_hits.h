@@ -24,7 +24,7 @@ struct MovingHits {
     bool perspective;
 };
 
-// Barycentrics (N, 3).
+// Barycentrics (N, 3). Of a face without area, or seen edge-on, those of its first corner, without derivatives.
 void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, Team& team);
 // Adds to the cotangents of vertices and camera, and writes those of `along`.
 void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,

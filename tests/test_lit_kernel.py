@@ -1,0 +1,255 @@
+"""The kernel's shading of lit scenes against the same in PyTorch: values, cotangents of all tensors, tangents."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from scenes import icosphere
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad import _lit, _lit_kernel
+from edgegrad._derivatives import transformed
+from edgegrad._request import make_request
+from edgegrad.hits import Forced, Hits
+from edgegrad.lights import LightPoints
+from edgegrad.samples import Frame
+
+F64 = torch.float64
+Leaves = dict[str, Tensor]
+CAMERAS = {
+    "perspective": eg.Camera.look_at((1.0, 1.5, 4.0), (0.0, 0.0, 0.0), fov_y=50.0, size=(24, 24)),
+    "orthographic": eg.Camera.orthographic((1.0, 1.5, 4.0), (0.0, 0.0, 0.0), height=4.0, size=(24, 24)),
+}
+# Words: what the mesh has, what its material has, which lights there are.
+SCENES = [
+    "colors directional",
+    "face_colors spot one_sided",
+    "corner_colors harmonics point",
+    "texture directional point",
+    "normals point directional",
+    "normals normal_map texture point",
+    "normal_map directional",
+    "microfacets point",
+    "microfacets normals environment",
+    "environment",
+    "sky",
+    "area",
+    "area one_sided normals microfacets",
+    "base emission point",
+    "texture normal_map normals microfacets base emission point directional spot harmonics environment area",
+]
+
+
+def number(value: Any) -> Tensor:
+    return torch.as_tensor(value, dtype=F64)
+
+
+def numbers_of(words: str) -> Leaves:
+    """All tensors of a scene by their names."""
+    draw = torch.Generator().manual_seed(7)
+    rand = lambda *shape: torch.rand(*shape, dtype=F64, generator=draw)  # noqa: E731
+    ball = icosphere(2)
+    verts = ball.verts.double()
+    uvs = torch.stack([torch.atan2(verts[:, 0], verts[:, 2]) / 6.3 + 0.5, 0.5 * verts[:, 1] + 0.5], 1)
+    V, F = len(verts), len(ball.faces)
+    made: dict[str, Callable[[], Leaves]] = {
+        "colors": lambda: {"colors": rand(V, 3)},
+        "face_colors": lambda: {"face_colors": rand(F, 3)},
+        "corner_colors": lambda: {"corner_colors": rand(F, 3, 3)},
+        "texture": lambda: {"texture": rand(9, 14, 3), "uvs": uvs},
+        "normals": lambda: {"normals": verts + 0.2 * (rand(V, 3) - 0.5)},
+        "normal_map": lambda: {
+            "uvs": uvs, "map": number([0.5, 0.5, 1.0]) + 0.2 * (rand(8, 8, 3) - 0.5), "map_factor": number([1.0, 0.9, 1.0]),
+            "map_scale": number(0.7),
+        },
+        "microfacets": lambda: {"metallic": rand(V, 1), "roughness": number(0.4)},
+        "base": lambda: {"base": rand(8, 8, 3), "base_uvs": 2 * uvs, "base_factor": rand(3)},
+        "emission": lambda: {"emission": rand(3)},
+        "point": lambda: {"point": number([2.0, 3.0, 1.0]), "point_power": number(20.0), "point_color": rand(3)},
+        "directional": lambda: {"sun": number([0.5, -1.0, -0.3]), "sun_power": number(2.0)},
+        "spot": lambda: {
+            "spot": number([-2.0, 3.0, 1.0]), "spot_axis": number([2.0, -3.0, -1.0]), "spot_power": number(30.0),
+            "spot_inner": number(0.2), "spot_outer": number(0.6),
+        },
+        "harmonics": lambda: {"harmonics": rand(9, 3), "harmonics_turn": torch.linalg.qr(rand(3, 3))[0]},
+        "environment": lambda: {"environment": rand(8, 16, 3), "environment_turn": torch.linalg.qr(rand(3, 3))[0]},
+        "sky": lambda: {"sky": rand(3)},
+        "area": lambda: {"lamp": number([1.0, 3.0, 0.0]), "lamp_radiance": number([5.0, 4.0, 3.0])},
+    }  # fmt: skip
+    ground = number([[-3, -1.2, -3], [3, -1.2, -3], [3, -1.2, 3], [-3, -1.2, 3]])
+    found: Leaves = {"verts": verts, "ground": ground, "ground_color": number([0.5, 0.6, 0.7])}
+    for word in words.split():
+        found |= made[word]() if word in made else {}
+    return found
+
+
+def scene_of(words: str, n: Leaves) -> eg.Scene:
+    faces = icosphere(2).faces
+    own = {
+        name: n[name] for name in ("colors", "face_colors", "corner_colors", "texture", "uvs", "normals") if name in n
+    }
+    if "uvs" in own:
+        own["uv_faces"] = faces
+    looks: dict[str, Any] = {name: n[name] for name in ("metallic", "roughness", "emission") if name in n}
+    if "map" in n:
+        looks |= {"normal_map": eg.Texture(n["map"], factor=n["map_factor"]), "normal_scale": n["map_scale"]}
+    if "base" in n:
+        looks["base_color"] = eg.Texture(
+            n["base"], uvs=n["base_uvs"], uv_faces=faces, wrap=("mirror", "clamp"), factor=n["base_factor"]
+        )
+    mesh = eg.Mesh(n["verts"], faces, material=eg.Material(two_sided="one_sided" not in words, **looks), **own)
+    ground = eg.Mesh(n["ground"], torch.tensor([[0, 2, 1], [0, 3, 2]]), material=eg.Material(n["ground_color"]))
+    lights: list[Any] = []
+    if "point" in n:
+        lights.append(eg.PointLight(n["point"], n["point_power"], n["point_color"]))
+    if "sun" in n:
+        lights.append(eg.DirectionalLight(n["sun"], n["sun_power"]))
+    if "spot" in n:
+        angles = n["spot_inner"], n["spot_outer"]
+        lights.append(eg.SpotLight(n["spot"], n["spot_axis"], n["spot_power"], None, *angles))
+    if "harmonics" in n:
+        lights.append(eg.SphericalHarmonics(n["harmonics"], n["harmonics_turn"]))
+    if "environment" in n:
+        lights.append(eg.Environment(n["environment"], n["environment_turn"]))
+    if "sky" in n:
+        lights.append(eg.Environment(n["sky"]))
+    if "lamp" in n:
+        u, v = number([0.5, 0.0, 0.0]), number([0.0, 0.1, 0.5])
+        lights.append(eg.AreaLight.rectangle(n["lamp"], u, v, n["lamp_radiance"], two_sided="one_sided" not in words))
+    return eg.Scene([mesh, ground], lights=lights)
+
+
+def hits_of(scene: eg.Scene, camera: eg.Camera) -> Hits:
+    frame = Frame(scene, make_request(scene, camera, 2, 0))
+    (found,) = frame.sampler.pixel_hits(1 << 40)
+    seed = frame.seeds("image", len(found.face))
+    return frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, seed)
+
+
+def both(words: str, view: str, samples: int, leaves: Leaves, w2c: Tensor) -> tuple[Hits, Hits, Tensor, Tensor]:
+    hits = [hits_of(scene_of(words, leaves), CAMERAS[view].replace(world_to_camera=w2c)) for _ in range(2)]
+    return hits[0], hits[1], _lit.reference(hits[0], True, samples), _lit_kernel.radiance(hits[1], True, samples)
+
+
+@pytest.mark.parametrize("view", CAMERAS)
+@pytest.mark.parametrize("words", SCENES)
+def test_values_and_cotangents(words: str, view: str) -> None:
+    leaves = {name: value.clone().requires_grad_() for name, value in numbers_of(words).items()}
+    w2c = CAMERAS[view].world_to_camera.double().clone().requires_grad_()
+    hits, found, expected, radiance = both(words, view, 2, leaves, w2c)
+    assert len(hits) > 200 and float(expected.detach().abs().max()) > 0.05
+    assert torch.allclose(radiance, expected, rtol=1e-12, atol=1e-12)
+    asked = [light for light in hits.lit if light in found.lit]
+    assert all(torch.equal(hits.lit[k].nan_to_num(2), found.lit[k].nan_to_num(2)) for k in asked)
+    assert hits._surfaces.shadowing == found._surfaces.shadowing
+    bar = torch.randn(expected.shape, dtype=F64, generator=torch.Generator().manual_seed(1))
+    tensors = {**leaves, "w2c": w2c}
+    wanted, got = (
+        torch.autograd.grad((L * bar).sum(), list(tensors.values()), allow_unused=True, materialize_grads=True)
+        for L in (expected, radiance)
+    )
+    for name, a, b in zip(tensors, wanted, got, strict=True):
+        # Where one light comes from all around and nothing is interpolated, place and view do not matter.
+        assert float(a.abs().max()) > 0 or name in ("verts", "ground", "w2c"), name
+        assert float((a - b).abs().max()) <= 1e-9 * float(a.abs().max()), name
+
+
+@pytest.mark.parametrize("words", SCENES)
+def test_tangents_are_cotangents(words: str) -> None:
+    leaves = numbers_of(words)
+    w2c = CAMERAS["perspective"].world_to_camera.double()
+    draw = torch.Generator().manual_seed(3)
+    values = {**leaves, "w2c": w2c}
+    tangents = {name: torch.randn(v.shape, dtype=F64, generator=draw) for name, v in values.items()}
+
+    def radiance(given: Leaves) -> Tensor:
+        scene = scene_of(words, {name: v for name, v in given.items() if name != "w2c"})
+        return _lit_kernel.radiance(
+            hits_of(scene, CAMERAS["perspective"].replace(world_to_camera=given["w2c"])), True, 1
+        )
+
+    found, moved = torch.func.jvp(radiance, (values,), (tangents,))
+    assert not transformed()
+    bar = torch.randn(found.shape, dtype=F64, generator=draw)
+    (grads,) = torch.func.vjp(radiance, values)[1](bar)
+    forward = float((bar * moved).sum())
+    reverse = sum(float((grads[name] * tangents[name]).sum()) for name in values)
+    size = sum(float((grads[name] * tangents[name]).abs().sum()) for name in values)
+    assert abs(forward - reverse) < 1e-10 * size
+
+
+def test_points_of_a_light_that_are_given() -> None:
+    leaves = numbers_of("area environment point")
+    scene = scene_of("area environment point", leaves)
+    for light in range(3):
+        hits = hits_of(scene, CAMERAS["perspective"])
+        n = len(hits)
+        points = scene.casting[light].draw(torch.rand(n, 3, dtype=F64, generator=torch.Generator().manual_seed(2)))
+        lit = (torch.arange(n) % 2).double()
+        forced = Forced(light, LightPoints(*points), lit, torch.ones(n, dtype=torch.bool))
+        found = []
+        for shade in (_lit.reference, _lit_kernel.radiance):
+            given = Hits(
+                hits._surfaces, hits._view, hits._face, hits._exact, hits._pixel, seed=hits._seed, forced=forced
+            )
+            found.append(shade(given, True, 1))
+        assert torch.allclose(*found, rtol=1e-12, atol=1e-12)
+
+
+def test_without_shadows() -> None:
+    words = SCENES[-1]
+    scene = scene_of(words, numbers_of(words))
+    dark, lit = (_lit_kernel.radiance(hits_of(scene, CAMERAS["perspective"]), shadows, 1) for shadows in (True, False))
+    assert bool((lit >= dark - 1e-12).all()) and float((lit - dark).max()) > 0.01
+    expected = _lit.reference(hits_of(scene, CAMERAS["perspective"]), False, 1)
+    assert torch.allclose(lit, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_the_same_bits_on_any_number_of_threads() -> None:
+    words = SCENES[-1]
+    leaves = {name: value.clone().requires_grad_() for name, value in numbers_of(words).items()}
+    camera = CAMERAS["perspective"].resized((48, 48))
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            radiance = _lit_kernel.radiance(hits_of(scene_of(words, leaves), camera), True, 1)
+            found.append([radiance, *torch.autograd.grad(radiance.sum(), list(leaves.values()))])
+    finally:
+        torch.set_num_threads(before)
+    assert len(found[0][0]) > 1024
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
+
+
+def test_which_scenes_the_kernel_shades() -> None:
+    scene = scene_of("texture point", numbers_of("texture point"))
+    mesh, ground = scene.meshes
+    assert _lit_kernel.is_fused(scene)
+    assert not _lit_kernel.is_fused(scene.replace(meshes=[mesh.replace(filter="nearest"), ground]))
+    assert mesh.texture is not None
+    levels = mesh.replace(material=eg.Material(eg.Texture(mesh.texture, filter="mipmap")))
+    assert not _lit_kernel.is_fused(scene.replace(meshes=[levels, ground]))
+    many = mesh.replace(texture=mesh.texture[..., :1].expand(-1, -1, 17).contiguous())
+    assert not _lit_kernel.is_fused(eg.Scene([many], lights=scene.lights[:0]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_extremes_are_finite(dtype: torch.dtype) -> None:
+    """Lights on the surface and far off, mirrors, normals against the face or of no length, faces of no area."""
+    verts = torch.tensor([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 0]], dtype=dtype).requires_grad_()
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 4, 2]])
+    normals = torch.tensor([[0, 0, -1.0], [0, 0, 0], [1, 0, 1e-7], [0, 1e-30, 0], [0, 0, 1]], dtype=dtype)
+    roughness = torch.tensor(0.0, dtype=dtype, requires_grad=True)
+    for place in ([0.25, 0.25, 0.0], [0.0, 0.0, 1e-12], [1e9, 0.0, 1e9], [0.0, 0.0, -3.0]):
+        position = torch.tensor(place, dtype=dtype, requires_grad=True)
+        mesh = eg.Mesh(verts, faces, normals=normals, material=eg.Material(0.5, metallic=1.0, roughness=roughness))
+        scene = eg.Scene(
+            [mesh], lights=[eg.PointLight(position), eg.SpotLight(position, torch.tensor([0.0, 0.0, -1.0]))]
+        )
+        image = eg.render(scene, eg.Camera.look_at((0.3, 0.2, 3.0), (0.0, 0.0, 0.0), size=(16, 16)), spp=4)
+        grads = torch.autograd.grad(image.sum(), [verts, roughness, position])
+        assert bool(torch.isfinite(image).all()) and all(bool(torch.isfinite(g).all()) for g in grads)
