@@ -16,14 +16,6 @@ def transformed() -> bool:
     return functorch.peek_interpreter_stack() is not None
 
 
-def values_of(tensor: Tensor) -> Tensor:
-    """A tensor without derivatives, and without what transforms of torch.func put around it."""
-    functorch: Any = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
-    while functorch.is_functorch_wrapped_tensor(tensor):
-        tensor = functorch.get_unwrapped(tensor)
-    return torch.autograd.forward_ad.unpack_dual(tensor).primal.detach()
-
-
 def differentiates() -> bool:
     return torch.is_grad_enabled() or transformed() or torch.autograd.forward_ad._current_level >= 0
 

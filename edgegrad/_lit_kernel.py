@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ._derivatives import values_of
 from ._kernel import core
 from ._mesh_light import MeshLight
 from ._operator import Tensors, apply, array, doubles
 from ._ops import kernel_scene
+from ._samples import values_of
 from ._seeds import STEPS, mixed_bits
 from ._surfaces import Surfaces, View
 from .environment import Environment
@@ -129,7 +129,7 @@ class _Layout(NamedTuple):
         still = (light for light in scene.lights if isinstance(light, SphericalHarmonics))
         lamps = [_lamp(scene, light, k, eps, tables) for k, light in enumerate((*scene.casting, *still))]
         center, radius = surfaces.ball
-        ball = [*(float(x) for x in values_of(center)), radius]
+        ball = [*map(float, values_of(center)[0]), radius]
         return cls(meshes, lamps, verts, seen_from, view.perspective, scene.channels, ball)
 
     def kernel(self, tables: Sequence[Tensor], faces: Tensor) -> Any:
@@ -140,7 +140,7 @@ class _Layout(NamedTuple):
 
 
 def _mesh(mesh: Mesh, first_face: int, first_vertex: int, tables: _Tables) -> Any:
-    none, material = core.LitSource(), mesh.material
+    none, material = core.LitSource("constant"), mesh.material
 
     def source(parameter: Parameter | float | None) -> Any:
         return none if parameter is None else _source(mesh, parameter, tables)
@@ -208,11 +208,11 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
 
     if isinstance(light, MeshLight):
         mesh = next(i for i, mesh in enumerate(scene.meshes) if mesh is light.mesh)
-        running, density = (array(values_of(t)) for t in light._table)
+        running, density = values_of(*light._table)
         # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
         return lamp("mesh", mesh=mesh, running=running, density=density, eps=max(eps, 2.0**-40))
     if isinstance(light, Environment):
-        running, density = (array(values_of(t)) for t in light._table)
+        running, density = values_of(*light._table)
         height, width = light._size
         return lamp(
             "environment",
@@ -244,7 +244,7 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
 
 
 def _rows(index: Tensor) -> np.ndarray:
-    return array(values_of(index).int())
+    return values_of(index)[0].astype(np.int32)
 
 
 class _Shading(NamedTuple):

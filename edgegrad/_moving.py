@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ._kernel import core
-from ._operator import Tensors, apply, array, doubles
+from ._operator import Tensors, apply, array, doubles, without_derivatives
 
 
 def barycentrics(
@@ -20,6 +20,22 @@ def barycentrics(
     through."""
     tensors = [verts.cpu().double(), world_to_camera.cpu().double(), along.cpu().double(), faces.cpu(), face.cpu()]
     return apply(_Meeting(perspective), tensors)[0].to(verts.device)
+
+
+def barycentrics_by(
+    verts: Tensor, faces: Tensor, face: Tensor, world_to_camera: Tensor, along: Tensor, by: Tensor, perspective: bool
+) -> tuple[Tensor, Tensor]:
+    """The same, and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K); neither has any of its own."""
+    meeting = _Meeting(perspective)
+
+    def compute(*tensors: Tensor) -> Sequence[Tensor]:
+        *moving, by = tensors
+        columns = [meeting.jvp((None, None, column), (), moving) for column in by.unbind(-1)]
+        return meeting.value(moving)[0], torch.stack(columns, -1)
+
+    tensors = (verts.double(), world_to_camera.double(), along.double(), faces, face, by)
+    b, by = without_derivatives(compute, *(t.cpu() for t in tensors))
+    return b.to(verts.device), by.to(verts.device)
 
 
 class _Meeting(NamedTuple):

@@ -3,7 +3,7 @@ transforms of torch.func."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -38,6 +38,42 @@ class Operation(Protocol):
 def apply(operation: Operation, tensors: Tensors) -> tuple[Tensor, ...]:
     """What value() returns, differentiable."""
     return _Value.apply(operation, *tensors)  # pyright: ignore[reportReturnType]
+
+
+def without_derivatives(compute: Callable[..., Sequence[Tensor]], *tensors: Tensor) -> tuple[Tensor, ...]:
+    """What `compute` makes of the values of tensors, whatever transforms of torch.func are under way."""
+    return _Values.apply(compute, *tensors)  # pyright: ignore[reportReturnType]
+
+
+class _Values(torch.autograd.Function):
+    """What `compute` makes of the values of tensors, whatever transforms of torch.func are under way."""
+
+    @staticmethod
+    def forward(compute: Callable[..., Sequence[Tensor]], *tensors: Tensor) -> tuple[Tensor, ...]:
+        return tuple(compute(*tensors))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
+        ctx.mark_non_differentiable(*output)
+        ctx.counts = len(inputs), len(output)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> tuple[None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return (None,) * ctx.counts[0]
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        return (None,) * ctx.counts[1]
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Any, Any]:
+        if any(dim is not None for dim in in_dims):
+            raise RuntimeError(
+                "torch.vmap: expected one scene and one camera for all of a batch where a shader is given, for each of them "
+                "has samples of its own number; render them one by one, or batch the shader's own tensors"
+            )
+        output = _Values.apply(*args)
+        return output, (None,) * len(output)
 
 
 class _Value(torch.autograd.Function):

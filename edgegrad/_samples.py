@@ -12,6 +12,7 @@ from torch import Tensor
 
 from . import _memory as memory
 from ._kernel import core
+from ._operator import without_derivatives
 from ._ops import Hits as ImageHits
 from ._ops import camera_seed, kernel_camera, kernel_hits, kernel_scene, lower, pass_size, warn_of_ends
 from ._request import Request
@@ -126,35 +127,16 @@ def _record(kind: Any, arrays: dict[str, np.ndarray]) -> Any:
     return kind(*(t.long() if t.dtype == torch.int32 else t for t in tensors))
 
 
-class _Values(torch.autograd.Function):
-    """What `compute` makes of the values of tensors, whatever transforms of torch.func are under way."""
+def values_of(*tensors: Tensor) -> list[np.ndarray]:
+    """Of tensors, whatever transforms of torch.func are under way."""
+    found: list[np.ndarray] = []
 
-    @staticmethod
-    def forward(compute: Callable[..., Sequence[Tensor]], *tensors: Tensor) -> tuple[Tensor, ...]:
-        return tuple(compute(*tensors))
+    def keep(*values: Tensor) -> Sequence[Tensor]:
+        found.extend(value.detach().cpu().contiguous().numpy() for value in values)
+        return (torch.zeros(0),)
 
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        ctx.mark_non_differentiable(*output)
-        ctx.counts = len(inputs), len(output)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> tuple[None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return (None,) * ctx.counts[0]
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        return (None,) * ctx.counts[1]
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Any, Any]:
-        if any(dim is not None for dim in in_dims):
-            raise RuntimeError(
-                "torch.vmap: expected one scene and one camera for all of a batch where a shader is given, for each of them "
-                "has samples of its own number; render them one by one, or batch the shader's own tensors"
-            )
-        output = _Values.apply(*args)
-        return output, (None,) * len(output)
+    without_derivatives(keep, *tensors)
+    return found
 
 
 def _of_values(packed: Sequence[Any], compute: Callable[..., Sequence[Tensor]], *more: Tensor) -> tuple[Tensor, ...]:
@@ -167,7 +149,7 @@ def _of_values(packed: Sequence[Any], compute: Callable[..., Sequence[Tensor]], 
             values[i] = tensor.detach()
         return compute(values, *(tensor.detach() for tensor in tensors[len(places) :]))
 
-    return _Values.apply(with_values, *(packed[i] for i in places), *more)
+    return without_derivatives(with_values, *(packed[i] for i in places), *more)
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -382,4 +364,4 @@ class Footprints(NamedTuple):
             parts = core.footprints(x.contiguous().numpy(), request.image.filter, camera.width, camera.height)
             return tuple(map(torch.from_numpy, parts))
 
-        return cls(*_Values.apply(compute, x))
+        return cls(*without_derivatives(compute, x))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ._moving import barycentrics
+from ._moving import barycentrics, barycentrics_by
 from ._rows import dot, rows_of
 from ._samples import bare
 from .scene import Flat, Scene
@@ -158,6 +158,11 @@ class View:
         or, in an orthographic view, points that rays along the axis go through."""
         bare = surfaces.bare
         return barycentrics(bare.verts, bare.faces, face, self.world_to_camera, along, self.perspective)
+
+    def barycentrics_by(self, surfaces: Surfaces, face: Tensor, along: Tensor, by: Tensor) -> tuple[Tensor, Tensor]:
+        """The same, and their derivatives (N, 3, K) by what `along` has the derivatives `by` (N, 3, K) by."""
+        bare = surfaces.bare
+        return barycentrics_by(bare.verts, bare.faces, face, self.world_to_camera, along, by, self.perspective)
 
     def depth(self, points: Tensor) -> Tensor:
         """(N,) along the axis."""

@@ -322,7 +322,8 @@ def surface_samples(primary: PrimaryHits, count: int | None = None) -> SurfaceSa
     """
     request = _request_of(primary, "surface_samples", count)
     with shaded_room(request._replace(gradient=request.gradient._replace(edge_samples=0)), gradient=True):
-        surface, _ = primary.frame.sampler.samples(request, interior=True, boundary=False)
+        moving = moves(primary.frame.intrinsics)
+        surface, _ = primary.frame.sampler.samples(request, interior=True, boundary=False, intrinsics=moving)
     return SurfaceSamples(primary.frame, surface)
 
 

@@ -263,8 +263,10 @@ class _Image:
         step = frame.here(found.step[part])[:, None]
         face, along, by_x = (frame.here(t[part]) for t in (found.face, rays.along, rays.along_by_x))
 
+        here, b_by_x = frame.fixed_view.barycentrics_by(frame.fixed, face, along, by_x)
+
         def sum_of_steps(x: Tensor) -> Tensor:
-            b = frame.fixed_view.barycentrics(frame.fixed, face, along + (by_x * x[:, None]).sum(-1))
+            b = here + (b_by_x * x[:, None]).sum(-1)
             hits = Hits(frame.fixed, frame.fixed_view, face, b, frame.here(found.x[part]) + x, frame.sampler.rays_at)
             return self._step_values(hits).gather(1, step).sum()
 

@@ -89,7 +89,7 @@ def numbers_of(words: str) -> Leaves:
 
 def scene_of(words: str, n: Leaves) -> eg.Scene:
     faces = icosphere(2).faces
-    own = {
+    own: dict[str, Any] = {
         name: n[name] for name in ("colors", "face_colors", "corner_colors", "texture", "uvs", "normals") if name in n
     }
     if "uvs" in own:
@@ -172,7 +172,7 @@ def test_tangents_are_cotangents(words: str) -> None:
             hits_of(scene, CAMERAS["perspective"].replace(world_to_camera=given["w2c"])), True, 1
         )
 
-    found, moved = torch.func.jvp(radiance, (values,), (tangents,))
+    found, moved = torch.func.jvp(radiance, (values,), (tangents,))[:2]
     assert not transformed()
     bar = torch.randn(found.shape, dtype=F64, generator=draw)
     (grads,) = torch.func.vjp(radiance, values)[1](bar)
