@@ -73,7 +73,7 @@ def render_shaded(
 class _Image:
     """The image of one camera of a batch."""
 
-    def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool, effort: Effort) -> None:
+    def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool, effort: Effort = Effort()) -> None:
         self._frame, self._shader, self._creases, self._check, self._effort = frame, shader, creases, check, effort
         self._channels: int | None = None
         self._kinds: list[str] | None = None  # of the steps that the shader declares
