@@ -22,7 +22,7 @@ from edgegrad._request import make_request
 from edgegrad.report import build
 from edgegrad.report.scenes import ReportScene
 from edgegrad.samples import Frame
-from edgegrad.shader import _Image
+from edgegrad.shader import Effort, _Image
 
 COUNTS = tuple(1 << k for k in range(8, 19, 2))  # samples on the borders of shadows
 CONVERGED = 1 << 20
@@ -109,7 +109,7 @@ def border_gradient(scene: ReportScene, count: int, seed: int) -> tuple[Tensor, 
     verts = scene.verts.float().requires_grad_()
     moved = scene.moved(verts)
     request = make_request(moved, scene.camera, 16, 0, edge_samples=None if count < 0 else count, grad_seed=seed)
-    image = Borders(Frame(moved, request, 0), Lighting(True, 1), False, False)
+    image = Borders(Frame(moved, request, 0), Lighting(True, 1), False, False, Effort(keeps_little=True))
     found = image.render()
     begin = time.perf_counter()
     (gradient,) = torch.autograd.grad((found * scene.adjoint).sum(), verts)

@@ -56,7 +56,9 @@ class Lighting(NamedTuple):
         # Each point sees another one of a light with an extent.
         extended = any(not light.punctual for light in scene.casting)
         points = max(FEWEST_IN_PENUMBRA, request.image.spp // 4) if extended else 1
-        return render_shaded(scene, camera, self, request, creases, False, Effort(points, is_fused(scene)))
+        return render_shaded(
+            scene, camera, self, request, creases, False, Effort(points, scene.blends, is_fused(scene))
+        )
 
     def __call__(self, hits: Hits) -> Tensor:
         return radiance(hits, *self)

@@ -51,9 +51,9 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
         *((None,) * 4 if forced is None else _forced(forced.points, forced.lit)),
     )
     number = -1 if forced is None else forced.light
-    bare = surfaces.bare
-    shading = _Shading(layout, len(tables.tensors), number, shadows, samples, bare.cutoffs, bare.spacing)
-    arrays = (part for part in bare if isinstance(part, Tensor))
+    casters = surfaces.casters
+    shading = _Shading(layout, len(tables.tensors), number, shadows, samples, casters.cutoffs, casters.spacing)
+    arrays = (part for part in casters if isinstance(part, Tensor))
     found, seen = apply(shading, [hits._exact.cpu(), *points, *tables.tensors, *arrays])
     column = 0
     for light, casting in enumerate(surfaces.scene.casting):

@@ -156,9 +156,9 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.cpu().double().contiguous().numpy()
 
 
-def bare(scene: Scene) -> Flat:
-    """The surfaces of a scene alone."""
-    return without_colors(flatten(scene))
+def bare(scene: Scene, blended: bool = True) -> Flat:
+    """The surfaces of a scene alone; see flatten()."""
+    return without_colors(flatten(scene, blended=blended))
 
 
 def without_colors(flat: Flat, attributes: Tensor | None = None) -> Flat:
@@ -183,16 +183,20 @@ def without_colors(flat: Flat, attributes: Tensor | None = None) -> Flat:
 # -- any rays -----------------------------------------------------------------------------------------------------------
 
 
-def trace(scene: Scene, origins: Tensor, directions: Tensor) -> TraceRecords:
-    """The nearest hits of rays (N, 3)."""
+def trace(flat: Flat, origins: Tensor, directions: Tensor, ignored: Tensor | None = None) -> TraceRecords:
+    """The nearest hits of rays (N, 3), each but for one face, `ignored` (N,), −1: none."""
 
-    def compute(values: list[Any], origins: Tensor, directions: Tensor) -> Sequence[Tensor]:
+    def compute(values: list[Any], origins: Tensor, directions: Tensor, *ignored: Tensor) -> Sequence[Tensor]:
         found = kernel_scene(Flat(*values)).trace(
-            origins=_array(origins), directions=_array(directions), threads=torch.get_num_threads()
+            origins=_array(origins),
+            directions=_array(directions),
+            ignored=ignored[0].cpu().int().contiguous().numpy() if ignored else None,
+            threads=torch.get_num_threads(),
         )
         return _record(TraceRecords, found)
 
-    return TraceRecords(*_of_values(bare(scene), compute, origins, directions))
+    more = () if ignored is None else (ignored,)
+    return TraceRecords(*_of_values(flat, compute, origins, directions, *more))
 
 
 def visible(flat: Flat, face: Tensor, b: Tensor, to: Tensor, contact: Tensor) -> Tensor:

@@ -39,7 +39,7 @@ class Surfaces:
         """The same without derivatives; what it notes is noted for both."""
         other = Surfaces.__new__(Surfaces)
         other.__dict__.update(self.__dict__)
-        for name in ("bare", "corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
+        for name in ("bare", "casters", "corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
             other.__dict__.pop(name, None)
         other.verts, other.scene, other.pyramids = self.verts.detach(), self.scene.detach(), {}
         return other
@@ -53,6 +53,11 @@ class Surfaces:
     def bare(self) -> Flat:
         """As the kernel reads them, without colours."""
         return bare(self.scene)
+
+    @cached_property
+    def casters(self) -> Flat:
+        """The same as shadow rays meet them: what blends is cut out where its alpha is below ½."""
+        return bare(self.scene, blended=False) if self.scene.blends else self.bare
 
     @cached_property
     def ball(self) -> tuple[Tensor, float]:

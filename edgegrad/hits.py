@@ -365,7 +365,7 @@ class Hits:
         points = points.detach().expand(len(self), 3)
         size = torch.maximum(points.abs().amax(1), self.position.detach().abs().amax(1)).double()
         spacing = max(torch.finfo(t.dtype).eps for t in (points, s.verts))
-        return visible(s.bare, self._face, self._exact[:, 1:], points.double(), 16 * spacing * size)
+        return visible(s.casters, self._face, self._exact[:, 1:], points.double(), 16 * spacing * size)
 
     # -- lights --------------------------------------------------------------------------------------------------------
 
@@ -419,7 +419,7 @@ class Hits:
             if not light.punctual:
                 # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
                 spacing = max(spacing, 2.0**-40)
-        lit = visible(s.bare, self._face, self._exact[:, 1:], place, 16 * spacing * size)
+        lit = visible(s.casters, self._face, self._exact[:, 1:], place, 16 * spacing * size)
         lit = self._noted(index, lit.to(self.position.dtype))
         if forced is None or forced.light != index:
             return lit

@@ -14,7 +14,7 @@ from ._kernel import core
 
 WRAPS: tuple[str, ...] = core.WRAPS  # repeat, clamp, mirror
 LOOKUPS = ("linear", "nearest", "mipmap")
-ALPHA_MODES = ("OPAQUE", "MASK")
+ALPHA_MODES = ("OPAQUE", "MASK", "BLEND")
 LARGEST_UV = 1e9
 
 
@@ -109,7 +109,10 @@ class Material:
                   as in glTF: red along u, green along v (upwards), blue along the normal
     normal_scale  multiplies the first two of these
     two_sided     False: seen from behind (vertices clockwise), faces are black and emit nothing
-    alpha_mode    "MASK": the mesh's alpha, if it has one, cuts out where it is below its cutoff. "OPAQUE": it must have none
+    alpha_mode    "MASK": the mesh's alpha, if it has one, cuts out where it is below its cutoff. "OPAQUE": it must have none.
+                  "BLEND": what lies behind shows by 1 − alpha, for up to 8 such surfaces in a row, in the order of their depth;
+                  they cast shadows where alpha is at least ½. Gradients inside faces are there, by alpha too, and those of what
+                  is seen first at each place; what moves at silhouettes behind such a surface has none
 
     metallic and roughness both None: a Lambertian surface, f = base / π. Else the metallic-roughness model of glTF 2.0 (appendix
     B): a Lambertian base under microfacets with the GGX distribution, α = roughness² (Walter et al. 2007), Smith's masking with
@@ -155,10 +158,6 @@ class Material:
         object.__setattr__(self, "normal_scale", scale.reshape(()))
         if not isinstance(self.two_sided, bool):
             raise TypeError(f"two_sided: expected True or False, got {type(self.two_sided).__name__}")
-        if self.alpha_mode == "BLEND":
-            raise ValueError(
-                'alpha_mode: expected "OPAQUE" or "MASK", got "BLEND", which is not there yet; take "MASK" with a cutoff'
-            )
         if self.alpha_mode not in ALPHA_MODES:
             raise ValueError(f"alpha_mode: expected one of {', '.join(ALPHA_MODES)}, got {self.alpha_mode!r}")
 

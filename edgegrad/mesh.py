@@ -190,6 +190,11 @@ class Mesh:
             raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {self.filter!r}")
 
     @property
+    def blends(self) -> bool:
+        """Whether what lies behind shows through where alpha is below 1."""
+        return self.alpha is not None and self.material is not None and self.material.alpha_mode == "BLEND"
+
+    @property
     def wraps(self) -> tuple[str, str]:
         """`wrap` of u and of v."""
         return (self.wrap, self.wrap) if isinstance(self.wrap, str) else self.wrap

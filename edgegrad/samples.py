@@ -283,11 +283,11 @@ def trace(scene: Scene | Mesh, origins: Tensor, directions: Tensor) -> Hits:
     zero = (d.detach() == 0).all(1)
     if bool(zero.any()):
         raise ValueError(f"directions: expected lengths above zero, got zeros in row {int(zero.nonzero()[0])}")
-    found = trace_records(scene, given["origins"], d)
+    surfaces = Surfaces(scene)
+    found = trace_records(surfaces.bare, given["origins"], d)
     index = (found.face >= 0).nonzero()[:, 0]
     face, index = found.face[index].to(like.device), index.to(like.device)
     rays = Rays(index, given["origins"][index], d[index])
-    surfaces = Surfaces(scene)
     b = barycentrics(found.b.to(like.device)[index])
     corners = surfaces.corners(face)
     if moves(corners, rays.origin, rays.direction):

@@ -129,6 +129,11 @@ class Scene:
         """Whether meshes are shaded: one has a material, or there is a light."""
         return bool(self.lights) or any(mesh.material is not None for mesh in self.meshes)
 
+    @property
+    def blends(self) -> bool:
+        """Whether one sees through a mesh."""
+        return any(mesh.blends for mesh in self.meshes)
+
     @cached_property
     def casting(self) -> tuple[Light, ...]:
         """The lights that cast shadows, in a fixed order: those of `lights`, then the meshes that emit."""
@@ -249,10 +254,11 @@ def _sampler(mesh: Mesh) -> list[int]:
     return [WRAPS.index(u), WRAPS.index(v), FILTERS.index(mesh.filter)]
 
 
-def flatten(scene: Scene, all_uvs: bool = False) -> Flat:
+def flatten(scene: Scene, all_uvs: bool = False, blended: bool = True) -> Flat:
     """The arrays of a scene; every step is a differentiable torch operation, so gradients find their way back.
 
     all_uvs   also texture coordinates that neither a texture nor a cut-out needs
+    blended   whether meshes that blend are there as a whole; else they are cut out where their alpha is below ½
     """
     C = scene.channels
     cpu = torch.device("cpu")  # said everywhere, for a user may have set another default device
@@ -262,10 +268,13 @@ def flatten(scene: Scene, all_uvs: bool = False) -> Flat:
     def empty(width: int, kind: torch.dtype) -> Tensor:
         return torch.empty((0, width), dtype=kind, device=cpu)
 
-    any_cut_out = any(mesh.alpha is not None for mesh in scene.meshes)
+    def is_cut(mesh: Mesh) -> bool:
+        return mesh.alpha is not None and not (blended and mesh.blends)
+
+    any_cut_out = any(map(is_cut, scene.meshes))
 
     def has_uvs(mesh: Mesh) -> bool:
-        return mesh.texture is not None or mesh.alpha is not None or (all_uvs and mesh.uvs is not None)
+        return mesh.texture is not None or is_cut(mesh) or (all_uvs and mesh.uvs is not None)
 
     own_uvs = any_cut_out or any(has_uvs(mesh) and mesh.texture is None for mesh in scene.meshes)
     verts, faces, corners, colors, uvs, texels, textures, face_texture = ([] for _ in range(8))
@@ -288,13 +297,12 @@ def flatten(scene: Scene, all_uvs: bool = False) -> Flat:
         if own_uvs:
             uv_corners.append(uv_rows)
         if any_cut_out:
-            face_cut_out.append(
-                torch.full((F,), -1 if mesh.alpha is None else len(cut_outs), dtype=torch.int32, device=cpu)
-            )
-        if mesh.alpha is not None:
+            face_cut_out.append(torch.full((F,), len(cut_outs) if is_cut(mesh) else -1, dtype=torch.int32, device=cpu))
+        if is_cut(mesh):
+            assert mesh.alpha is not None
             h, w = mesh.alpha.shape
             cut_outs.append([n_alphas, h, w, *_sampler(mesh)])
-            cutoffs.append(mesh.alpha_cutoff)
+            cutoffs.append(0.5 if mesh.blends else mesh.alpha_cutoff)
             alphas.append(mesh.alpha.cpu().to(dtype).reshape(h * w, 1))
             n_alphas += h * w
         if mesh.texture is not None:

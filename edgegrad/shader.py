@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from ._background import environments
+from ._blend import Blended
 from ._borders import Borders
 from ._check import values_visible
 from ._derivatives import differentiates, moves, once, transformed
@@ -43,9 +44,8 @@ class Effort(NamedTuple):
     """What shading an image takes."""
 
     points: int = 1  # of a face in a pixel that are shaded
-    keeps_little: bool = (
-        False  # whether the graph of a shader is small, so that nothing is computed again in the backward pass
-    )
+    blended: bool = False  # whether one may see through surfaces
+    keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
 
 
 def render_shaded(
@@ -73,8 +73,9 @@ def render_shaded(
 class _Image:
     """The image of one camera of a batch."""
 
-    def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool, effort: Effort = Effort()) -> None:
-        self._frame, self._shader, self._creases, self._check, self._effort = frame, shader, creases, check, effort
+    def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool, effort: Effort) -> None:
+        self._frame, self._creases, self._check, self._effort = frame, creases, check, effort
+        self._shader = Blended(frame, shader, lambda: self._behind_all) if effort.blended else shader
         self._channels: int | None = None
         self._kinds: list[str] | None = None  # of the steps that the shader declares
 
@@ -130,11 +131,15 @@ class _Image:
         return frame.image(found.pixel, weighted), hits
 
     @cached_property
-    def _background(self) -> Tensor | None:
-        """(C,) or (H, W, C): the scene's, or the environments that it shows."""
+    def _behind_all(self) -> Tensor | None:
+        """(C,) or (H, W, C): the scene's background, or the environments that it shows."""
         background = self._frame.surfaces.scene.background
-        if background is None:
-            background = environments(self._frame)
+        return environments(self._frame) if background is None else background
+
+    @cached_property
+    def _background(self) -> Tensor | None:
+        """The same, of as many channels as the shader gives."""
+        background = self._behind_all
         if background is not None and background.shape[-1] != self._channels:
             raise ValueError(
                 f"shader: expected as many channels as the background has, {background.shape[-1]}, got {self._channels}"

@@ -33,6 +33,8 @@ RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRa
         // At its rim a face may be hit in float that the ray misses by a rounding: then it is hit at the rim, for its
         // neighbour may be missed as well. One that the ray runs along shows nothing.
         std::vector<int32_t> without[RayBatch::size];
+        for (int i = 0; i < n && rays.ignored; ++i)
+            if (rays.ignored[first + i] >= 0) without[i] = {rays.ignored[first + i]};
         cast_each(caster, n, out.face.data() + first, without, ray, [&](int i, int32_t face) {
             const Meeting m = meet(scene, face, ray(i));
             if (!m.exists() || m.t < 0) return false;

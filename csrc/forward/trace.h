@@ -15,6 +15,7 @@ namespace edgegrad {
 struct TracedRays {
     const double *origins, *directions;
     int64_t size;
+    const int32_t* ignored = nullptr;  // (N,) a face that each passes through, −1: none; null: none at all
 };
 
 struct RayHits {

@@ -179,14 +179,17 @@ void check_rows(const char* name, const In<double, 2>& array, size_t n) {
 }
 
 template <class T>
-nb::dict trace_rays(const SceneArrays<T>& arrays, In<double, 2> origins, In<double, 2> directions, int threads) {
+nb::dict trace_rays(const SceneArrays<T>& arrays, In<double, 2> origins, In<double, 2> directions,
+                    std::optional<In<int32_t, 1>> ignored, int threads) {
     const size_t n = origins.shape(0);
+    if (ignored && ignored->size() != n) refuse("ignored: expected a number a ray");
     check_rows("origins", origins, n), check_rows("directions", directions, n);
     RayHits found;
     unlocked(threads, [&](Team& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
-        found = trace(arrays.view(), geometry->caster(), {origins.data(), directions.data(), int64_t(n)}, team);
+        found = trace(arrays.view(), geometry->caster(),
+                      {origins.data(), directions.data(), int64_t(n), ignored ? ignored->data() : nullptr}, team);
     });
     nb::dict out;
     out["face"] = rows(std::move(found.face)), out["b"] = rows(std::move(found.b), {2});
@@ -221,7 +224,8 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
         .def("shadow_samples", &shadow_samples<T>, "camera"_a, "image"_a, "options"_a, "lights"_a, "samples"_a,
              "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)
-        .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(), "threads"_a)
+        .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(),
+             "ignored"_a.noconvert().none(), "threads"_a)
         .def("visible", &visible_points<T>, "face"_a.noconvert(), "b"_a.noconvert(), "to"_a.noconvert(),
              "contact"_a.noconvert(), "threads"_a);
 }

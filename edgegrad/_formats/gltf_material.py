@@ -107,22 +107,21 @@ def look(primitive: Primitive, known: dict[object, tuple[Material, dict[str, Pla
 
 
 def _alpha(primitive: Primitive, texture: Lookup | None) -> dict[str, object]:
-    """What is cut out: by the texture's alpha, or by that of the vertices, times the factor's."""
+    """What is cut out or seen through: by the texture's alpha, or by that of the vertices, times the factor's."""
     material, source = primitive.material, primitive.source
     mode, cutoff = material.get("alphaMode", "OPAQUE"), float(material.get("alphaCutoff", 0.5))
-    if mode == "BLEND" and source.wanted.lit:
-        source.unsupported.note("alphaMode BLEND", "shown where alpha is 0.5 or more, cut out elsewhere")
-        mode, cutoff = "MASK", 0.5
-    if mode != "MASK":
+    blended = mode == "BLEND" and source.wanted.lit
+    if mode != "MASK" and not blended:
         return {}
     opacity = float((*primitive.base.get("baseColorFactor", ()), 1.0, 1.0, 1.0, 1.0)[3])
     of_vertices = primitive.opacities()
     if of_vertices is not None and float(of_vertices.min()) == float(of_vertices.max()):
         opacity, of_vertices = opacity * float(of_vertices[0]), None
-    if opacity < cutoff:  # all of it is cut out, whatever else there is
+    own = None if texture is None else source.textures.alpha(texture.image, opacity)
+    everywhere = blended and own is None and of_vertices is None
+    if everywhere or (opacity < cutoff and not blended):  # the same, or cut out, whatever else there is
         uvs = np.zeros((len(primitive.raw["vertices"]), 2), np.float32)
         return {"cutoff": cutoff, "alpha": torch.full((1, 1), opacity), "uvs": uvs}
-    own = None if texture is None else source.textures.alpha(texture.image, opacity)
     if of_vertices is None:
         return {"cutoff": cutoff, "alpha": own}
     if texture is not None and (own is not None or not source.wanted.lit):
@@ -183,7 +182,7 @@ def _material(primitive: Primitive) -> tuple[Material, dict[str, Place]]:
         )
 
     fields: dict[str, Any] = {"two_sided": bool(given.get("doubleSided", False))}
-    fields["alpha_mode"] = "OPAQUE" if given.get("alphaMode", "OPAQUE") == "OPAQUE" else "MASK"
+    fields["alpha_mode"] = str(given.get("alphaMode", "OPAQUE"))
     fields["base_color"] = colored(
         "base_color", torch.tensor(primitive.factor), primitive.lookup("baseColorTexture", base)
     )

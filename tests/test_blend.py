@@ -1,0 +1,117 @@
+"""Surfaces that one sees through: images and gradients against what layers over one another give."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from lit_scenes import from_above, plane, vector
+from torch import Tensor
+
+import edgegrad as eg
+
+F64 = torch.float64
+RADIANCES = (0.9, 0.5, 0.2, 0.7)
+
+
+def sheet(height: float, radiance: Tensor | float, alpha: Tensor | float, size: float = 4.0) -> eg.Mesh:
+    """At z = height, that emits and scatters nothing."""
+    mesh = plane(size)
+    alpha = (
+        torch.as_tensor(alpha, dtype=F64).expand(1, 1) if not isinstance(alpha, Tensor) or alpha.dim() == 0 else alpha
+    )
+    look = eg.Material(base_color=0.0, emission=radiance, alpha_mode="BLEND")
+    return mesh.replace(verts=mesh.verts + vector(0, 0, height), alpha=alpha, material=look)
+
+
+def over(radiances: list[float], alphas: list[float], behind: float) -> float:
+    for radiance, alpha in zip(reversed(radiances), reversed(alphas), strict=True):
+        behind = alpha * radiance + (1 - alpha) * behind
+    return behind
+
+
+@pytest.mark.parametrize("background", [None, 0.4])
+def test_layers_in_any_order_of_meshes(background: float | None) -> None:
+    alphas = [0.25, 0.5, 0.75, 0.4]
+    sheets = [sheet(-0.5 * k, L, a) for k, (L, a) in enumerate(zip(RADIANCES, alphas, strict=True))]
+    behind = None if background is None else torch.full((3,), background, dtype=F64)
+    for order in ([0, 1, 2, 3], [2, 0, 3, 1]):
+        image = eg.render(eg.Scene([sheets[k] for k in order], behind), from_above(8), spp=4)
+        assert torch.allclose(
+            image, torch.full_like(image, over(list(RADIANCES), alphas, background or 0.0)), atol=1e-9
+        )
+
+
+def test_what_lies_before_something_opaque_and_an_environment() -> None:
+    floor = plane().replace(verts=plane().verts - vector(0, 0, 2), material=eg.Material(0.0, emission=0.3))
+    image = eg.render(eg.Scene([sheet(0, 0.9, 0.25), floor]), from_above(8), spp=4)
+    assert torch.allclose(image, torch.full_like(image, over([0.9], [0.25], 0.3)), atol=1e-9)
+    sky = eg.Environment(torch.tensor([0.6, 0.6, 0.6], dtype=F64))
+    image = eg.render(eg.Scene([sheet(0, 0.9, 0.25)], lights=[sky]), from_above(8), spp=4)
+    assert torch.allclose(image, torch.full_like(image, over([0.9], [0.25], 0.6)), atol=1e-9)
+
+
+def test_gradients_by_alpha_radiance_and_background() -> None:
+    values = [torch.tensor(v, dtype=F64, requires_grad=True) for v in (0.25, 0.6, 0.9, 0.5)]
+    a0, a1, L0, L1 = values
+    background = torch.full((3,), 0.4, dtype=F64, requires_grad=True)
+    scene = eg.Scene([sheet(0, L0, a0), sheet(-1, L1, a1)], background)
+    adjoint = torch.rand(8, 8, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
+    loss = (eg.render(scene, from_above(8), spp=4, surface_samples=40_000) * adjoint).sum()
+    found = torch.autograd.grad(loss, [*values, background])
+    expected = (a0 * L0 + (1 - a0) * (a1 * L1 + (1 - a1) * background)).expand(8, 8, 3)
+    wanted = torch.autograd.grad((expected * adjoint).sum(), [*values, background])
+    for a, b in zip(found, wanted, strict=True):
+        assert float((a - b).abs().max()) < 0.01 * float(b.abs().max())
+
+
+def test_a_texture_behind_moves_inside_and_the_border_of_the_first_sheet() -> None:
+    """Finite differences of a shift of either sheet: the border of the hidden one has no gradient, so it fills the image."""
+    draw = torch.Generator().manual_seed(1)
+    texture = torch.nn.functional.interpolate(
+        torch.rand(1, 3, 4, 4, dtype=F64, generator=draw), size=(32, 32), mode="bicubic", align_corners=True
+    )[0].movedim(0, -1)
+    adjoint = torch.nn.functional.interpolate(
+        torch.randn(1, 3, 3, 3, dtype=F64, generator=draw), size=(24, 24), mode="bicubic", align_corners=True
+    )[0].movedim(0, -1)
+
+    def loss(front: Tensor, back: Tensor, spp: int = 4) -> Tensor:
+        first, second = sheet(0, 0.9, 0.4, 0.6), sheet(-1, 0.0, 1.0, 1.5)
+        material = eg.Material(0.0, emission=eg.Texture(texture), alpha_mode="BLEND")
+        second = second.replace(verts=second.verts + back, material=material)
+        scene = eg.Scene([first.replace(verts=first.verts + front), second])
+        image = eg.render(scene, from_above(24), spp=spp, seed=3, surface_samples=60_000, edge_samples=20_000)
+        return (image * adjoint).sum()
+
+    zero, step = torch.zeros(3, dtype=F64), 0.02
+    moved = [zero.clone().requires_grad_() for _ in range(2)]
+    found = torch.autograd.grad(loss(*moved), moved)
+    for which in range(2):
+        for axis in range(2):
+            shift = step * torch.eye(3, dtype=F64)[axis]
+            with torch.no_grad():
+                ahead, back = (
+                    loss(s * shift if which == 0 else zero, s * shift if which == 1 else zero, 1024)
+                    for s in (1.0, -1.0)
+                )
+            difference = float(ahead - back) / (2 * step)
+            assert abs(float(found[which][axis]) - difference) < 0.03 * (abs(difference) + 1.0), (which, axis)
+
+
+def test_shadows_of_thin_and_thick_sheets() -> None:
+    light = eg.DirectionalLight(vector(0, 0, -1))
+    floor = plane().replace(verts=plane().verts - vector(0, 0, 1), material=eg.Material(1.0))
+    dark, bright = (
+        eg.render(eg.Scene([sheet(0, 0.0, alpha), floor], lights=[light]), from_above(4), spp=1).mean()
+        for alpha in (0.6, 0.4)
+    )
+    assert float(dark) == 0 and abs(float(bright) - 0.6 / torch.pi) < 1e-6
+
+
+def test_forward_mode_and_unlit_meshes() -> None:
+    alpha = torch.tensor(0.3, dtype=F64)
+    seen = lambda a: eg.render(
+        eg.Scene([sheet(0, 0.9, a), sheet(-1, 0.5, 1.0)]), from_above(4), spp=1, surface_samples=20_000
+    )  # noqa: E731
+    image, moved = torch.func.jvp(seen, (alpha,), (torch.ones((), dtype=F64),))[:2]
+    assert torch.allclose(image, torch.full_like(image, 0.3 * 0.9 + 0.7 * 0.5))
+    assert abs(float(moved.mean()) - 0.4) < 0.004
