@@ -84,7 +84,7 @@ def test_a_texture_behind_moves_inside_and_the_border_of_the_first_sheet() -> No
 
     zero, step = torch.zeros(3, dtype=F64), 0.02
     moved = [zero.clone().requires_grad_() for _ in range(2)]
-    found = torch.autograd.grad(loss(*moved), moved)
+    found = torch.autograd.grad(loss(moved[0], moved[1]), moved)
     for which in range(2):
         for axis in range(2):
             shift = step * torch.eye(3, dtype=F64)[axis]
@@ -109,9 +109,11 @@ def test_shadows_of_thin_and_thick_sheets() -> None:
 
 def test_forward_mode_and_unlit_meshes() -> None:
     alpha = torch.tensor(0.3, dtype=F64)
-    seen = lambda a: eg.render(
-        eg.Scene([sheet(0, 0.9, a), sheet(-1, 0.5, 1.0)]), from_above(4), spp=1, surface_samples=20_000
-    )  # noqa: E731
+
+    def seen(a: Tensor) -> Tensor:
+        sheets = eg.Scene([sheet(0, 0.9, a), sheet(-1, 0.5, 1.0)])
+        return eg.render(sheets, from_above(4), spp=1, surface_samples=20_000)
+
     image, moved = torch.func.jvp(seen, (alpha,), (torch.ones((), dtype=F64),))[:2]
     assert torch.allclose(image, torch.full_like(image, 0.3 * 0.9 + 0.7 * 0.5))
     assert abs(float(moved.mean()) - 0.4) < 0.004
