@@ -50,6 +50,12 @@ class Affine(NamedTuple):
         v = self.vectors(v) * self.scale
         return v if self.t is None else v + self.t
 
+    @property
+    def area(self) -> Tensor:
+        """() how many times larger areas become; where R is no similarity, those of spheres on the mean of their axes."""
+        squared = self.scale**2
+        return squared if self.R is None else squared * torch.linalg.det(self.R).abs() ** (2 / 3)
+
     def normals(self, n: Tensor) -> Tensor:
         """What stays at right angles to surfaces: by the cofactors of R, so that R may be any matrix."""
         if self.R is None:

@@ -23,6 +23,7 @@ from ._lit_kernel import is_fused
 from ._request import Request
 from ._surfaces import Surfaces, View
 from ._tree import tensors_in
+from ._warnings import warn
 from .camera import Camera
 from .environment import Environment
 from .hits import Hits
@@ -52,6 +53,12 @@ class Lighting(NamedTuple):
             raise RuntimeError(
                 "render: expected tensors with values where a scene is lit, got those of torch.vmap or torch.compile; render a "
                 "batch one by one, and leave render() out of what is compiled"
+            )
+        if not (scene.lights or scene.casting):
+            warn(
+                "no light",
+                "scene: no light falls on its materials, so they are black; give it lights=[…], such as "
+                "eg.Environment(torch.ones(3)), or leave the materials out: colours are then radiance",
             )
         # Each point sees another one of a light with an extent.
         extended = any(not light.punctual for light in scene.casting)

@@ -152,7 +152,7 @@ class PointLight(Light):
 
     def _moved(self, affine: Affine) -> PointLight:
         # The same irradiance in other units of length.
-        return self.replace(position=affine.points(self.position), intensity=self.intensity * affine.scale**2)
+        return self.replace(position=affine.points(self.position), intensity=self.intensity * affine.area)
 
     def place(self, points: LightPoints) -> Tensor:
         return self.position.expand(len(points.index), 3)
@@ -202,7 +202,7 @@ class SpotLight(Light):
         return self.replace(
             position=affine.points(self.position),
             direction=affine.vectors(self.direction),
-            intensity=self.intensity * affine.scale**2,
+            intensity=self.intensity * affine.area,
         )
 
     def place(self, points: LightPoints) -> Tensor:

@@ -155,7 +155,7 @@ class Scene:
 
     def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Scene:
         """All meshes and lights moved together; see Mesh.transformed. Surfaces stay as bright: the intensities of points
-        and spots, which fall off with distance, are multiplied by scale². Of lights from all around R must be a rotation."""
+        and spots, which fall off with distance, grow as areas do. Of lights from all around R must be a rotation."""
         return self.replace(
             meshes=[mesh.transformed(R, t, scale) for mesh in self.meshes],
             lights=[light.transformed(R, t, scale) for light in self._lights],

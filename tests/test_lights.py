@@ -310,6 +310,18 @@ def test_moved_scenes_look_the_same():
             light.transformed(2 * torch.eye(3))
 
 
+def test_a_light_moved_by_a_matrix_that_enlarges():
+    light = eg.PointLight(vector(0, 0, 1), 3.0)
+    twice = light.transformed(2 * rotation((0.0, 0.0, 1.0), vector(0.3).sum()))
+    assert float(twice.intensity) == pytest.approx(float(light.transformed(scale=2.0).intensity)) == pytest.approx(12.0)
+
+
+def test_a_scene_of_materials_without_a_light_says_so():
+    scene = eg.Scene([plane(material=eg.Material(0.5))])
+    with pytest.warns(UserWarning, match="scene: no light falls"):
+        assert float(eg.render(scene, from_above(4), spp=1).abs().max()) == 0
+
+
 def test_to_and_detach_take_everything_along():
     scene, _ = everything()
     leaf = vector(1.0).sum().requires_grad_()
