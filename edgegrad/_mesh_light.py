@@ -50,6 +50,17 @@ class MeshLight(Light):
             chance = (1 - EVEN) * power / power.sum() + EVEN * share if float(power.sum()) > 0 else share
             return chance.cumsum(0), torch.where(area > 0, chance / torch.where(area > 0, area, 1.0), 0.0)
 
+    @property
+    def density(self) -> Tensor:
+        """(F,) float64, by area, with which points are drawn on each face."""
+        return self._table[1]
+
+    @property
+    def chance(self) -> Tensor:
+        """(F,) float64 that a point is drawn on a face."""
+        running = self._table[0]
+        return running.diff(prepend=running.new_zeros(1))
+
     def draw(self, u: Tensor) -> LightPoints:
         running, density = self._table
         face = pick(running, u[:, 0])

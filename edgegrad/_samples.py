@@ -56,24 +56,23 @@ class CurveRecords(NamedTuple):
     alpha_row_of: Tensor  # (Q,) int64, the sample of a row by texels of alpha
     alpha: Tensor  # (Q,) int64
     by_alpha: Tensor  # (Q,) float64
-    light_row_of: (
-        Tensor  # (L,) int64, the sample of a row by points of lights, of borders of shadows: the first surface is that
-    )
-    # in the light, the second that in the shadow
-    light: Tensor  # (L,) int64
+    # Of borders of shadows, else no rows: the first surface is that in the light, the second that in the shadow.
+    light: Tensor  # (S,) int64, the part of the light
+    light_uv: Tensor  # (S, 2) float64, where on it
     by_light: (
-        Tensor  # (L, 3) float64, by the place in camera coordinates, or by the direction towards a light at infinity
+        Tensor  # (S, 3) float64, by the place in camera coordinates, or by the direction towards a light at infinity
     )
 
 
-class LightRows(NamedTuple):
-    """Points of lights that cast shadows; those of one light follow one another, and count as their mean."""
+class LightParts(NamedTuple):
+    """A light as edges see it: a point, or triangles."""
 
-    place: Tensor  # (L, 3) float64: world coordinates, or, at infinity, the unit direction towards the light
-    infinite: Tensor  # (L,) uint8
-    power: Tensor  # (L,) float64: what a point gives at the distance one, or from infinity; relative
-    face: Tensor  # (L,) int32 that the point lies on, −1: none
-    first: Tensor  # (lights + 1,) int64
+    corner: Tensor  # (L, 3, 3) float64: world coordinates, or, at infinity, directions towards it; a point thrice
+    chance: Tensor  # (L,) float64 above zero, that a point of the light is drawn there
+    face: Tensor  # (L,) int32 of the scene, that the part is; −1: none
+    infinite: bool
+    extended: bool
+    two_sided: bool
 
 
 class PlaceRecords(NamedTuple):
@@ -312,16 +311,16 @@ class Sampler:
         count = len(SurfaceRecords._fields)
         return SurfaceRecords(*parts[:count]), CurveRecords(*parts[count:])
 
-    def shadow_samples(self, lights: LightRows, seed: int, samples: int, intrinsics: bool) -> CurveRecords:
-        """On the borders of shadows, after all pixel hits were taken; so many, or by default."""
+    def shadow_samples(self, light: LightParts, seed: int, samples: int, intrinsics: bool) -> CurveRecords:
+        """On the borders of a light's shadows, after all pixel hits were taken; so many, or by default."""
 
-        def compute(request: Request, camera: Any, *lights: Tensor) -> CurveRecords:
-            rows = LightRows(*lights)
+        def compute(request: Request, camera: Any, *rows: Tensor) -> CurveRecords:
+            arrays = (tensor.cpu().contiguous().numpy() for tensor in rows)
             found = kernel_scene(request.scene).shadow_samples(
                 camera=camera,
                 image=core.ImageOptions(**request.image._asdict()),
                 options=core.GradientOptions(seed=seed, intrinsics=intrinsics),
-                lights=core.LightPoints(**{n: v.cpu().contiguous().numpy() for n, v in rows._asdict().items()}),
+                light=core.LightParts(*arrays, *light[3:]),
                 samples=samples,
                 threads=torch.get_num_threads(),
                 adjoint=np.ones(
@@ -331,7 +330,7 @@ class Sampler:
             )
             return _record(CurveRecords, found)
 
-        return CurveRecords(*self._compute(self._request, compute, *lights))
+        return CurveRecords(*self._compute(self._request, compute, *light[:3]))
 
     def hits_at(self, x: Tensor) -> PlaceRecords:
         """What is seen at places (N, 2) in the image."""

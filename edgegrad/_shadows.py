@@ -1,4 +1,4 @@
-"""Points of lights from which edges cast shadows, for the samples on the borders of these."""
+"""Lights as edges see them, for the samples on the borders of their shadows: points, or triangles."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from torch import Tensor
 
 from ._derivatives import moves
 from ._mesh_light import MeshLight
-from ._samples import LightRows
+from ._samples import LightParts, barycentrics
 from ._seeds import STEPS, mixed_bits, signed
 from ._surfaces import Surfaces
+from .environment import Environment, pick
 from .lights import Light, LightPoints
 
-MANY = 1024  # points that stand for a light with an extent, other ones with each seed
+MOST_FACES = 4096  # of an emissive mesh that are its parts; of more as many are drawn, others with each seed
+DIRECTIONS, SHARES = 1 << 14, 12  # that say where an environment is bright: no part has more than one of so many shares
 
 
 class ShadowLight(NamedTuple):
@@ -22,57 +24,86 @@ class ShadowLight(NamedTuple):
 
     number: int  # in scene.casting
     light: Light
-    points: LightPoints
+    parts: LightParts
+    faces: Tensor  # (L,) int64 of an emissive mesh that the parts are
 
     @classmethod
     def of(cls, surfaces: Surfaces, index: int, seed: int) -> ShadowLight:
         light = surfaces.scene.casting[index]
-        points = light.draw(_even(1 if light.punctual else MANY, seed).to(surfaces.verts.device))
-        # Neighbours follow one another, for edges are asked before parts of a light.
         with torch.no_grad():
-            return cls(index, light, points.select(z_order(light.place(points))))
+            if isinstance(light, MeshLight):
+                mesh = next(i for i, mesh in enumerate(surfaces.scene.meshes) if mesh is light.mesh)
+                parts, faces = _of_mesh(light, surfaces.first_faces[mesh], seed)
+            else:
+                place = light.place(light.draw(_even(DIRECTIONS, seed).to(surfaces.verts.device))).double().cpu()
+                corner, chance = (
+                    triangles_of(place) if not light.punctual else (place[:1].expand(1, 3, 3), torch.ones(1))
+                )
+                faces = torch.full((len(corner),), -1)
+                parts = LightParts(corner, chance.double(), faces.int(), light.infinite, not light.punctual, True)
+        return cls(index, light, parts, faces)
 
     @staticmethod
     def moves(light: Light) -> bool:
         """Whether the place of one of its points may be differentiated."""
         return moves(light.place(light.draw(torch.zeros((1, 3), dtype=torch.float64))))
 
-    @property
-    def place(self) -> Tensor:
-        """(K, 3) float64, differentiable: where its points are, or the unit directions towards them."""
-        return self.light.place(self.points).double()
+    def points(self, part: Tensor, uv: Tensor) -> tuple[LightPoints, Tensor]:
+        """Those at the last two barycentrics (N, 2) of parts, and (N,) their density over that by which parts are drawn."""
+        one = uv.new_ones(len(uv))
+        if isinstance(self.light, MeshLight):
+            face = self.faces.to(part.device)[part]
+            return LightPoints(face, uv, self.light.density[face]), one
+        if not isinstance(self.light, Environment):
+            return self.light.draw(torch.zeros((len(uv), 3), dtype=torch.float64, device=uv.device)), one
+        corner = self.parts.corner.to(uv.device)
+        direction = (barycentrics(uv)[:, :, None] * corner[part]).sum(1)
+        points = self.light.points_at(torch.nn.functional.normalize(direction, dim=1))
+        # A triangle of area A seen at the distance r has the solid angle A cos θ / r².
+        angle = torch.linalg.det(corner).abs()[part] / 2 / direction.norm(dim=1) ** 3
+        return points, points.density * angle / self.parts.chance.to(uv.device)[part]
 
-    def rows(self, surfaces: Surfaces) -> LightRows:
-        """As the kernel reads them."""
-        place = self.place.detach().cpu()
-        count = len(place)
-        return LightRows(
-            place,
-            torch.full((count,), int(self.light.infinite), dtype=torch.uint8),
-            self._power(),
-            self._faces(surfaces),
-            torch.tensor([0, count]),
-        )
 
-    def _power(self) -> Tensor:
-        """(K,) float64: what a point gives on the mean at the distance one, or from infinity."""
-        if self.light.punctual:
-            return torch.ones(1, dtype=torch.float64)
-        with torch.no_grad():
-            axes = [torch.zeros(3)] if self.light.infinite else [*torch.eye(3), *-torch.eye(3)]
-            power = torch.zeros(len(self.points.index), dtype=torch.float64)
-            for axis in axes:
-                at = (0 if self.light.infinite else self.place) + axis.to(self.points.uv)
-                at = at.expand(len(power), 3)
-                power += self.light.arriving(self.points, at).double().abs().mean(1).cpu()
-            return power / len(axes)
+def _of_mesh(light: MeshLight, first_face: int, seed: int) -> tuple[LightParts, Tensor]:
+    mesh, chance = light.mesh, light.chance
+    assert mesh.material is not None
+    faces = (chance > 0).nonzero()[:, 0]
+    if len(faces) > MOST_FACES:
+        faces = pick(chance.cumsum(0), _even(MOST_FACES, seed)[:, 0].to(chance))
+        chance = torch.full_like(chance, 1 / MOST_FACES)
+    corner = mesh.verts.detach()[mesh.faces[faces].long()].double().cpu()
+    # Neighbours follow one another, for edges are asked before some of many.
+    order = z_order(corner.mean(1))
+    faces = faces.cpu()[order]
+    own = (faces + first_face).int()
+    return LightParts(corner[order], chance.cpu()[faces], own, False, True, mesh.material.two_sided), faces
 
-    def _faces(self, surfaces: Surfaces) -> Tensor:
-        """(K,) int32: the faces of the scene that they lie on, −1 for none."""
-        if not isinstance(self.light, MeshLight):
-            return torch.full((len(self.points.index),), -1, dtype=torch.int32)
-        mesh = next(i for i, mesh in enumerate(surfaces.scene.meshes) if mesh is self.light.mesh)
-        return (self.points.index + surfaces.first_faces[mesh]).int().cpu()
+
+def triangles_of(directions: Tensor) -> tuple[Tensor, Tensor]:
+    """(L, 3, 3), (L,): triangles around the origin, the faces of an octahedron or parts of them, so small that few of the unit
+    directions (N, 3) go through each; and about the share of these that do."""
+    triangles, chances = [], []
+    most = len(directions) / SHARES
+    octant = (directions < 0).long() @ torch.tensor([1, 2, 4])
+    for k in range(8):
+        signs = torch.tensor([1.0 - 2 * (k >> axis & 1) for axis in range(3)], dtype=torch.float64)
+        through = directions[octant == k].abs()
+        waiting = [(torch.diag(signs), through / through.sum(1, keepdim=True))]
+        while waiting:
+            corner, b = waiting.pop()
+            if len(b) <= most or float((corner[1] - corner[0]).norm()) < 1e-4:
+                triangles.append(corner)
+                chances.append((len(b) + 1) / len(directions))
+                continue
+            middle = (corner + corner.roll(-1, 0)) / 2
+            some = b.amax(1) < 0.5
+            waiting.append((middle, 1 - 2 * b[some].roll(1, 1)))
+            for i in range(3):
+                some = b[:, i] >= 0.5
+                less = 2 * b[some]
+                less[:, i] -= 1
+                waiting.append(((corner + corner[i]) / 2, less))
+    return torch.stack(triangles), torch.tensor(chances, dtype=torch.float64)
 
 
 def z_order(place: Tensor) -> Tensor:

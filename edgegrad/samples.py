@@ -203,6 +203,10 @@ class EdgeSamples:
     def __init__(self, frame: Frame, records: CurveRecords, light: ShadowLight | None = None) -> None:
         self.frame, self._records = frame, records
         self.x = frame.here(records.x)
+        points = None
+        if light is not None:
+            points, share = light.points(frame.here(records.light), frame.here(records.light_uv))
+            records = records._replace(factor=records.factor * share.cpu()[:, None])
         sample, which = (records.face >= 0).nonzero(as_tuple=True)
         self.sample, self._factor = frame.here(sample), frame.here(records.factor[sample, which])
         # On the border of a face a little inside, so that rounding does not take a step along it for passed: at u = 1 a texture
@@ -211,10 +215,10 @@ class EdgeSamples:
         # All sides of a sample see the same points of lights.
         seed = frame.seeds("edges" if light is None else "shadows", len(self))[self.sample]
         forced = None
-        if light is not None:
-            points = light.points.select(frame.here(records.light)[self.sample])
+        if light is not None and points is not None:
             lit = frame.here(which == 0).to(frame.dtype)
-            forced = Forced(light.number, points, lit, torch.ones_like(lit, dtype=torch.bool))
+            some = torch.ones_like(lit, dtype=torch.bool)
+            forced = Forced(light.number, points.select(self.sample), lit, some)
         self.hits = frame.fixed_hits(records.face[sample, which], b, records.x[sample], seed, forced=forced)
         self.to_background = frame.here(torch.where(records.face == -1, records.factor, 0).sum(1))
         flat = frame.request.scene
@@ -223,13 +227,13 @@ class EdgeSamples:
             (Form(records.uv_row_of, records.uv, records.by_uv), flat.uvs),
             (Form(records.alpha_row_of, records.alpha, records.by_alpha[:, None]), flat.alphas[:, :1]),
         ]
+        every = torch.arange(len(self))
         if len(records.by_k):
-            every = torch.arange(len(self))
             forms.append((Form(every, torch.zeros_like(every), records.by_k), frame.intrinsics[None]))
-        if light is not None:
-            place = light.place
+        if light is not None and points is not None and (moves(frame.view.world_to_camera) or light.moves(light.light)):
+            place = light.light.place(points).double()
             place = frame.view.turned(place) if light.light.infinite else frame.view.in_camera(place)
-            forms.append((Form(records.light_row_of, records.light, records.by_light), place))
+            forms.append((Form(every, every, records.by_light), place))
         self.velocity = frame.here(velocity(len(self), forms))
 
     def __len__(self) -> int:

@@ -181,9 +181,9 @@ class _Image:
         for index in sorted(frame.surfaces.shadowing):
             seed = derived_seed(frame.sampler.grad_seed, index + 2)
             light = ShadowLight.of(frame.surfaces, index, seed)
-            moving = frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics, light.place
-            if moves(*moving):
-                records = frame.sampler.shadow_samples(light.rows(frame.surfaces), seed, count, moves(frame.intrinsics))
+            moving = moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
+            if moving or ShadowLight.moves(light.light):
+                records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics))
                 found = found + self._boundary(EdgeSamples(frame, records, light))
         return found
 

@@ -155,3 +155,38 @@ def test_penumbra_of_a_rectangle(motion: str) -> None:
             truth += float(wa * wb) * exact(motion, (a * U + b * V)[None])
     found = estimate([gradient(motion, panel, seed) for seed in range(8)])
     check(f"panel, {motion}", truth, found)
+
+
+def lamp(s: Setting) -> object:
+    """The panel as 800 faces."""
+    n = 20
+    x, y = torch.meshgrid(torch.linspace(-1, 1, n + 1), torch.linspace(-1, 1, n + 1), indexing="ij")
+    verts = s.light + x.reshape(-1, 1).double() * U + y.reshape(-1, 1).double() * V
+    corner = (torch.arange(n)[:, None] * (n + 1) + torch.arange(n)).reshape(-1, 1)
+    faces = torch.cat([corner + torch.tensor([0, n + 1, n + 2]), corner + torch.tensor([0, n + 2, 1])])
+    return eg.Mesh(verts, faces, material=eg.Material(emission=torch.ones(1, dtype=DOUBLE), two_sided=True))
+
+
+def test_lamp_of_many_faces() -> None:
+    """It casts the shadows of a panel of two faces, and moves with all its vertices."""
+    for motion in ("caster moves", "light moves"):
+        few = estimate([gradient(motion, panel, seed) for seed in range(6)])
+        many = estimate([gradient(motion, lamp, seed) for seed in range(6)])
+        check(f"lamp, {motion}", few.mean, many)
+
+
+def test_triangles_of_directions() -> None:
+    """They cover the sphere, each once, and where many directions are they are small."""
+    from edgegrad._shadows import triangles_of
+
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn((1 << 12, 3), generator=generator, dtype=DOUBLE)
+    directions[: 1 << 11] = vector(0.3, -0.2, 0.9) + 0.01 * directions[: 1 << 11]
+    corner, chance = triangles_of(torch.nn.functional.normalize(directions, dim=1))
+    # Of a solid angle, by Van Oosterom and Strackee (1983).
+    a, b, c = torch.nn.functional.normalize(corner, dim=2).unbind(1)
+    volume = torch.linalg.det(torch.stack([a, b, c], 1)).abs()
+    angle = 2 * torch.atan2(volume, 1 + (a * b).sum(1) + (b * c).sum(1) + (c * a).sum(1))
+    assert angle.sum().item() == pytest.approx(4 * torch.pi)
+    assert chance.max() < 1.5 / 12
+    assert angle[chance > 0.02].min() < 0.01

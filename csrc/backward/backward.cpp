@@ -376,25 +376,25 @@ Records record_samples(const BackwardInput<T>& input, GradientOptions o, Team& t
 }
 
 template <class T>
-CurveRecords record_shadows(const BackwardInput<T>& input, const GradientOptions& o, const LightPoints& lights,
+CurveRecords record_shadows(const BackwardInput<T>& input, const GradientOptions& o, const LightParts& light,
                             int64_t samples, Team& team) {
     Records records;
     Destination to;
     to.records = &records;
     BackwardProfile profile;
     each_view(input, o, Terms{}, team,
-              [&](const BackwardView<T>& view) { add_shadows<0>(view, lights, samples, Record{o.intrinsics}, to, profile); });
+              [&](const BackwardView<T>& view) { add_shadows(view, light, samples, Record{o.intrinsics}, to, profile); });
     return std::move(records.curves);
 }
 
-#define EDGEGRAD_INSTANTIATE(T)                                                                                        \
-    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,                   \
-                                             const Gradients&);                                                        \
-    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&,       \
-                                  double*);                                                                            \
-    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);                    \
-    template Records record_samples(const BackwardInput<T>&, GradientOptions, Team&);                                  \
-    template CurveRecords record_shadows(const BackwardInput<T>&, const GradientOptions&, const LightPoints&, int64_t, \
+#define EDGEGRAD_INSTANTIATE(T)                                                                                       \
+    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,                  \
+                                             const Gradients&);                                                       \
+    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&,      \
+                                  double*);                                                                           \
+    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);                   \
+    template Records record_samples(const BackwardInput<T>&, GradientOptions, Team&);                                 \
+    template CurveRecords record_shadows(const BackwardInput<T>&, const GradientOptions&, const LightParts&, int64_t, \
                                          Team&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)

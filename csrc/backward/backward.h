@@ -8,7 +8,7 @@
 #include "forward/forward.h"
 #include "scene/geometry.h"
 #include "scene/gradients.h"
-#include "scene/light_points.h"
+#include "scene/light_parts.h"
 
 namespace edgegrad {
 
@@ -82,7 +82,7 @@ Records record_samples(const BackwardInput<T>& input, GradientOptions options, T
 
 // The samples on the borders of shadows, so many or, if −1, by default.
 template <class T>
-CurveRecords record_shadows(const BackwardInput<T>& input, const GradientOptions& options, const LightPoints& lights,
+CurveRecords record_shadows(const BackwardInput<T>& input, const GradientOptions& options, const LightParts& light,
                             int64_t samples, Team& team);
 
 // q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a window.

@@ -138,7 +138,6 @@ class RecordBoundary {
     RecordBoundary(const BackwardView<T>& view, const Record& kept, CurveRecords& records)
         : view_(view), kept_(kept), camera_(view.camera), records_(records) {
         form_.q.prepare(3, 1), form_.uvs.prepare(2, 1), form_.alphas.prepare(1, 1);
-        form_.lights.prepare(3, 1);
     }
 
     bool wants(int, Vec2) const { return true; }
@@ -164,8 +163,8 @@ class RecordBoundary {
     void add(Source& source, const typename Source::Sample& sample, const SampleSurfaces& surfaces, CurveJumps curve,
              const double* factor) {
         if (std::all_of(factor, factor + CurveRecords::surfaces, [](double f) { return f == 0; })) return;
-        form_.q.clear(), form_.uvs.clear(), form_.alphas.clear(), form_.lights.clear();
-        form_.k = {};
+        form_.q.clear(), form_.uvs.clear(), form_.alphas.clear();
+        form_.k = {}, form_.light = {};
         source.add_motion(sample, curve, form_);
         source.finish(form_);
         const int64_t sample_index = records_.size();
@@ -200,11 +199,11 @@ class RecordBoundary {
             records_.alpha_row_of.push_back(sample_index), records_.alpha.push_back(texel);
             records_.by_alpha.push_back(*by_alpha);
         });
-        form_.lights.each([&](int64_t light, const double* by_light) {
-            records_.light_row_of.push_back(sample_index), records_.light.push_back(int32_t(light));
-            const Vec3 place = transposed_times(camera_.turn, {by_light[0], by_light[1], by_light[2]});
+        if (const LightMotion& light = form_.light; light.part >= 0) {
+            records_.light.push_back(light.part), append(records_.light_uv, {light.uv.x, light.uv.y});
+            const Vec3 place = transposed_times(camera_.turn, light.by_place);
             append(records_.by_light, {place.x, place.y, place.z});
-        });
+        }
     }
 
     // (∂x/∂u)ᵀ x̄.

@@ -22,20 +22,21 @@
 
 #include "backward/view.h"
 #include "boundary/curve_source.h"
-#include "scene/light_points.h"
 
 namespace edgegrad {
 
 // Where the ray of a light past an edge meets a face.
 struct ShadowPoint {
     int32_t a, b;         // vertices of the edge
-    int32_t light;        // of the points of lights
-    int32_t caster;       // corner of a face beside the edge that casts the shadow, but not on the edge
-    int32_t face;         // the receiver
+    int32_t part;         // of the light
+    Vec2 uv;              // on it
+    Vec3 light;           // that place, world coordinates, or the direction towards it
+    int side;             // of the edge on which its faces lie as seen from there: 1, that of (b − a) × (p − l), or −1
+    int32_t face = -1;    // the receiver
     int64_t segment = 0;  // of the sampler (shadows.cpp)
     double t;             // on the edge, (1 − t) a + t b
-    Barycentrics on;      // the receiver
-    double along;         // y = l + along · d, or p + along · d from a light at infinity
+    Barycentrics on{};    // the receiver
+    double along = 0;     // y = l + along · d, or p + along · d from a light at infinity
 };
 
 template <class T>
@@ -56,7 +57,7 @@ class ShadowSource {
         bool lit_ahead;  // whether the lit side is where F > 0
     };
 
-    ShadowSource(const BackwardView<T>& view, const LightPoints& lights) : view_(view), lights_(lights) {}
+    ShadowSource(const BackwardView<T>& view, bool infinite) : view_(view), infinite_(infinite) {}
 
     Vec2 position(const Curve& curve, double) const { return project(view_.camera, place_of(curve)); }
 
@@ -66,23 +67,26 @@ class ShadowSource {
         return curve.on[0] * v[0] + curve.on[1] * v[1] + curve.on[2] * v[2];
     }
 
+    Vec3 light_of(const Curve& curve) const {
+        return infinite_ ? view_.camera.R * curve.light : view_.camera.to_camera(curve.light);
+    }
+
     bool place(const Curve& curve, double, Sample& sample) const {
         const Camera& camera = view_.camera;
         const auto v = corners_of(view_, curve.face);
         const Array<Vec3>& q = view_.vertices.q;
-        const bool infinite = lights_.infinite[curve.light];
         const Vec3 a = q[curve.a], b = q[curve.b], p = (1 - curve.t) * a + curve.t * b;
-        const Vec3 light = infinite ? camera.R * lights_.at(curve.light) : camera.to_camera(lights_.at(curve.light));
-        const Vec3 d = infinite ? -light : p - light, m = cross(v[1] - v[0], v[2] - v[0]);
+        const Vec3 light = light_of(curve);
+        const Vec3 d = infinite_ ? -light : p - light, m = cross(v[1] - v[0], v[2] - v[0]);
         const Vec3 N = cross(b - a, d), y = place_of(curve);
         // What is lit from behind is dark on both sides of the border.
         if (!(dot(m, d) * dot(m, camera.view_direction(y)) > 0)) return false;
 
         sample.shadow = curve, sample.receiver = curve.face;
         sample.point = y, sample.behind = {};
-        const double S = infinite ? 1 : curve.along;
+        const double S = infinite_ ? 1 : curve.along;
         sample.by_a = S * (1 - curve.t), sample.by_b = S * curve.t;
-        sample.by_light = infinite ? -curve.along : 1 - curve.along;
+        sample.by_light = infinite_ ? -curve.along : 1 - curve.along;
         sample.N = N, sample.m = (camera.along_ray(N, sample.n) / camera.along_ray(m, sample.n)) * m;
         const Vec3 slope = camera.unit_at_depth(y.z) * (N - sample.m);
         sample.by_n = {slope.x, slope.y};
@@ -92,7 +96,7 @@ class ShadowSource {
         sample.speed =
             length(scaled_to_pixels(camera, {(moved.x - w_dot * sample.n.x) * w, (moved.y - w_dot * sample.n.y) * w}));
         sample.scale = sample.speed / length(place_vjp(camera, sample.by_n));
-        sample.lit_ahead = dot(N, q[curve.caster] - a) < 0;
+        sample.lit_ahead = curve.side < 0;
         if (!std::isfinite(sample.scale)) return false;
 
         sample.ignored = {&sample.receiver, 1};
@@ -143,10 +147,7 @@ class ShadowSource {
         }
         const Vec3 a_bar = (-F_bar * sample.by_a) * sample.N, b_bar = (-F_bar * sample.by_b) * sample.N;
         grad.q.add<3>(sample.shadow.a, &a_bar.x), grad.q.add<3>(sample.shadow.b, &b_bar.x);
-        if (grad.lights.is_wanted()) {
-            const Vec3 bar = (-F_bar * sample.by_light) * sample.N;
-            grad.lights.add<3>(sample.shadow.light, &bar.x);
-        }
+        grad.light = {sample.shadow.part, sample.shadow.uv, (-F_bar * sample.by_light) * sample.N};
         normalised_vjp(view_.camera, sample.n, F_bar * sample.by_n, grad.k);
     }
 
@@ -155,7 +156,7 @@ class ShadowSource {
 
    private:
     const BackwardView<T>& view_;
-    const LightPoints& lights_;
+    const bool infinite_;
 };
 
 }  // namespace edgegrad

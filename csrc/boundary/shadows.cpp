@@ -1,8 +1,10 @@
 // Samples on the borders of shadows.
 //
-// Edges that cast shadows are cut into segments, few of long ones. Some rays along each, pilots, from the light past
-// the edge to whatever they meet, and from the camera to there, say how long the border's image is and how much light
-// ends there; the samples go in proportion to the root mean square of that product over a segment, with a floor.
+// Pieces of edges before parts of the light (shadow_edges.h) are laid end to end by what is known of their shadows
+// without a ray. Equal intervals of that measure take some rays each, pilots, from the light past the edge to whatever
+// they meet, and from the camera to there, which say how long the border's image is, how far it moves with the edge,
+// and how much light ends there. The samples go in proportion to the root mean square of that product over an interval,
+// with a floor.
 
 #include "boundary/shadows.h"
 
@@ -23,95 +25,91 @@ namespace edgegrad {
 
 namespace {
 
-constexpr int64_t pair_tests = 1 << 23;  // of edges before points of lights
-// Into how many segments edges are cut, along themselves before a light that is a point, else by parts of the light.
-constexpr int64_t cuts = 1 << 10, cuts_of_light = 1 << 14;
-constexpr int64_t most_segments = 1 << 16;
-constexpr int most_of_edge = 64;
-constexpr int64_t points_of_segment = 8;  // at least, of a part of a light
-constexpr int pilots = 4;                 // a segment
-constexpr double floor_share = 0.2;       // of the density that pilots do not decide
-constexpr double samples_a_pixel = 24;    // of the border of a point's shadow
+constexpr int64_t pair_tests = 1 << 22;  // of edges before parts of the light
+constexpr int64_t fewest_intervals = 1 << 10, most_intervals = 1 << 15, samples_of_interval = 8;
+constexpr int64_t intervals_of_block = 64;
+constexpr double most_of_edge = 64;     // pieces
+constexpr int pilots = 4;               // places of an interval
+constexpr int64_t neighbours = 16;      // of an interval, on either side
+constexpr int64_t mirrored = 2;         // samples of a place before a light with an extent
+constexpr double floor_share = 0.2;     // of the density that pilots do not decide
+constexpr double samples_a_pixel = 24;  // of the border of a point's shadow
 constexpr int64_t fewest_samples = 256, most_samples = 1 << 18;
 
-struct Segment {
-    ShadowEdge edge;
-    double t0, t1;
-
-    int64_t points() const { return edge.end - edge.first; }
-    // What it stands for: of the mean over the points of its light, and of the edge.
-    double share() const { return edge.weight * double(points()) * (t1 - t0); }
-};
-
-// Edges cut in proportion to their measure; drawn from, where there are too many.
-template <class T>
-std::vector<Segment> segments_of(const BackwardView<T>& view, const std::vector<ShadowEdge>& edges) {
-    std::vector<Segment> out;
-    if (edges.empty()) return out;
-    Array<double> measure(int64_t(edges.size()));
-    for (size_t i = 0; i < edges.size(); ++i) measure[i] = edges[i].measure;
-    Systematic systematic(measure, view.team);
-    if (!(systematic.total() > 0)) return out;
-    if (int64_t(edges.size()) > most_segments) {
-        systematic.draw(most_segments, to_unit(hash(view.options.seed, 9, gradient_stream)));
-        int64_t k = 0;
-        for (int64_t i = 0; i < most_segments; ++i) {
-            const double position = systematic.position(i);
-            k = i ? systematic.primitive(position, k) : systematic.primitive(position);
-            ShadowEdge edge = edges[k];
-            edge.weight *= systematic.weight(k), edge.measure *= systematic.weight(k);
-            out.push_back({edge, 0, 1});
-        }
-        return out;
-    }
-    for (size_t i = 0; i < edges.size(); ++i) {
-        const ShadowEdge& edge = edges[i];
-        const int64_t points = edge.end - edge.first;
-        const bool by_light = points > 1;
-        const double share = systematic.measure_of(int64_t(i)) / systematic.total();
-        const double most = by_light ? std::max<double>(1, double(points / points_of_segment)) : most_of_edge;
-        const int64_t n = int64_t(std::clamp(std::round(share * double(by_light ? cuts_of_light : cuts)), 1.0, most));
-        for (int64_t k = 0; k < n; ++k) {
-            Segment segment{edge, double(k) / double(n), double(k + 1) / double(n)};
-            if (by_light) {
-                segment.t0 = 0, segment.t1 = 1;
-                segment.edge.first = edge.first + points * k / n, segment.edge.end = edge.first + points * (k + 1) / n;
-                segment.edge.measure *= double(segment.points()) / double(points);
-            }
-            out.push_back(segment);
-        }
+// Samples run along the light's wedges, and where on the edge is drawn: so edges that make up much of the measure are
+// cut.
+std::vector<ShadowPiece> cut(const std::vector<ShadowPiece>& pieces, double intervals) {
+    double total = 0;
+    for (const ShadowPiece& p : pieces) total += p.measure;
+    std::vector<ShadowPiece> out;
+    out.reserve(pieces.size());
+    for (const ShadowPiece& p : pieces) {
+        const int n = int(std::clamp(std::sqrt(p.measure / total * intervals), 1.0, most_of_edge));
+        for (int k = 0; k < n; ++k)
+            out.push_back({p.edge, p.part, float(k) / float(n), float(k + 1) / float(n), p.share, p.measure / n});
     }
     return out;
 }
 
-// Rays from points of lights past edges, in batches, and what they meet behind.
+// Pieces end to end: positions in [0, 1) along their measure.
+class Pieces {
+   public:
+    Pieces(std::vector<ShadowPiece> pieces, Team& team)
+        : pieces_(std::move(pieces)), measure_(int64_t(pieces_.size())), systematic_(fill(), team) {}
+
+    bool empty() const { return !(systematic_.total() > 0); }
+
+    struct Place {
+        int64_t piece;
+        double fraction;  // of it
+        double weight;    // that it has, were places drawn evenly: one over its density
+    };
+    // The piece of one at a position before it, or −1.
+    Place at(double position, int64_t before) const {
+        const double p = std::min(position * systematic_.total(), std::nextafter(systematic_.total(), 0.0));
+        const int64_t k = before < 0 ? systematic_.primitive(p) : systematic_.primitive(p, before);
+        const double measure = systematic_.measure_of(k);
+        return {k, std::clamp((p - systematic_.begin_of(k)) / measure, 0.0, 1.0),
+                pieces_[k].share * double(pieces_[k].t1 - pieces_[k].t0) * systematic_.total() / measure};
+    }
+    const ShadowPiece& operator[](int64_t k) const { return pieces_[k]; }
+
+   private:
+    Array<double>& fill() {
+        for (size_t k = 0; k < pieces_.size(); ++k) measure_[int64_t(k)] = pieces_[k].measure;
+        return measure_;
+    }
+    std::vector<ShadowPiece> pieces_;
+    Array<double> measure_;
+    Systematic systematic_;
+};
+
+// Rays from points of a light past edges, in batches, and what they meet behind.
 template <class T>
 class LightRays {
    public:
-    LightRays(const BackwardView<T>& view, const LightPoints& lights) : view_(view), lights_(lights) {}
+    LightRays(const BackwardView<T>& view, const LightParts& light) : view_(view), light_(light) {}
 
-    // The point at t of an edge, for whoever knows the segment by this number.
-    void add(int64_t edge, ShadowEdges::Point from, int64_t segment, double t, double weight) {
-        const HalfEdge& h = view_.geometry.topology().half_edges(edge)[0];
+    // The place t of an edge before a point of the light, for whoever knows the segment by this number.
+    void add(const ShadowPiece& piece, LightWedge::Point from, int64_t segment, double t, double weight) {
+        const HalfEdge& h = view_.geometry.topology().half_edges(piece.edge)[0];
         const SceneView<T>& scene = view_.scene;
         const auto vertex_of = [&](int c) { return scene.faces[3 * int64_t(h.face) + c]; };
         const Vec3 a = corner(scene, h.face, h.first()), b = corner(scene, h.face, h.second());
+        const Vec3 light = light_.at(piece.part, from.uv);
         Waiting& w = waiting_[count_];
         w.point = {.a = vertex_of(h.first()),
                    .b = vertex_of(h.second()),
-                   .light = from.light,
-                   .caster = from.caster,
-                   .face = -1,
+                   .part = piece.part,
+                   .uv = from.uv,
+                   .light = light,
+                   .side = from.side,
                    .segment = segment,
-                   .t = t,
-                   .on = {},
-                   .along = 0};
+                   .t = t};
         w.weight = weight;
-        w.edge = edge;
-        w.infinite = lights_.infinite[from.light];
+        w.edge = piece.edge;
         w.p = (1 - t) * a + t * b;
-        const Vec3 light = lights_.at(from.light);
-        if (w.infinite) {
+        if (light_.infinite) {
             // From outside of the scene.
             const RayFrame& frame = view_.geometry.caster().frame();
             w.before = (4 * frame.radius * frame.unit + length(w.p - frame.centre)) / length(light);
@@ -121,9 +119,9 @@ class LightRays {
             w.ray = {light, w.p - light};
         }
         auto& without = without_[count_];
-        const auto beside = view_.geometry.topology().faces(edge);
+        const auto beside = view_.geometry.topology().faces(piece.edge);
         without.assign(beside.begin(), beside.end());
-        if (const int32_t own = lights_.face[from.light]; own >= 0) without.push_back(own);
+        if (const int32_t own = light_.face[piece.part]; own >= 0) without.push_back(own);
         std::sort(without.begin(), without.end());
         ++count_;
     }
@@ -144,7 +142,7 @@ class LightRays {
             // the camera sees as an edge.
             if (face[i] < 0 || met[i].t <= w.before + touching(w, face[i])) continue;
             w.point.face = face[i], w.point.on = inside({met[i].u, met[i].v});
-            w.point.along = w.infinite ? met[i].t - w.before : met[i].t;
+            w.point.along = light_.infinite ? met[i].t - w.before : met[i].t;
             body(w.point, w.weight);
         }
         count_ = 0;
@@ -155,7 +153,6 @@ class LightRays {
         ShadowPoint point;
         double weight;
         int64_t edge;
-        bool infinite;
         Vec3 p;  // of the edge, world coordinates
         Ray ray;
         double before;  // where the edge lies on the ray, in lengths of its direction
@@ -165,16 +162,16 @@ class LightRays {
         m = meet(view_.scene, face, w.ray);
         if (!m.exists() || m.t <= 0 || m.margin() < -Meeting::rounding) return false;
         // On the border of a face, as that of a box in whose side the light lies, it goes by or not as it would had the
-        // light moved a little (FacesBeforeLights).
+        // light moved a little (FacesBeforeLight).
         if (m.margin() <= Meeting::rounding) {
             constexpr double little = 1e-7;
-            const Vec3 moved = (little * length(w.ray.direction)) * FacesBeforeLights<T>::aside;
-            const Vec3 origin = w.ray.origin + (w.infinite ? w.before : 1) * moved;
+            const Vec3 moved = (little * length(w.ray.direction)) * FacesBeforeLight<T>::aside;
+            const Vec3 origin = w.ray.origin + (light_.infinite ? w.before : 1) * moved;
             const Meeting beside = meet(view_.scene, face, {origin, w.p - origin});
             if (!beside.exists() || beside.margin() < 0) return false;
         }
         // The light itself, of which the point lies on this face or one beside it.
-        if (lights_.face[w.point.light] >= 0 && m.t <= touching(w, face)) return false;
+        if (light_.face[w.point.part] >= 0 && m.t <= touching(w, face)) return false;
         return shows(view_.scene, face, inside({m.u, m.v}));
     }
 
@@ -196,7 +193,7 @@ class LightRays {
     }
 
     const BackwardView<T>& view_;
-    const LightPoints& lights_;
+    const LightParts& light_;
     Waiting waiting_[RayBatch::size];
     std::vector<int32_t> without_[RayBatch::size];
     int count_ = 0;
@@ -208,65 +205,82 @@ bool is_in_view(const BackwardView<T>& view, Vec3 y) {
     return view.camera.depth_weight(y) > 0 && view.volume.outcode(y) == 0;
 }
 
-// What pilots find of a segment.
+// What pilots find of an interval: sums over them.
 struct Found {
-    double squares = 0;  // Σ (length · light)²
-    double length = 0;   // Σ length, px
+    double squares = 0;  // (swept area · light)²
+    double length = 0;   // px
 };
 
 // The contraction of pilots.
 template <class T>
 class Pilots {
    public:
-    Pilots(const BackwardView<T>& view, const LightPoints& lights, std::vector<Found>& found)
-        : view_(view), lights_(lights), found_(found) {}
+    Pilots(const BackwardView<T>& view, const LightParts& light, std::vector<Found>& found)
+        : view_(view), light_(light), found_(found) {}
 
     bool wants(int, Vec2) const { return true; }
 
     void add(int, ShadowSource<T>& source, typename ShadowSource<T>::Sample& sample) {
         const ShadowPoint& point = sample.shadow;
-        const Vec3 y = source.place_of(point), m = sample.m;
-        const Vec3 light = lights_.at(point.light);
-        const Vec3 d = lights_.infinite[point.light] ? view_.camera.R * light : view_.camera.to_camera(light) - y;
-        const double squared = dot(d, d), cosine = std::fabs(dot(m, d)) / (length(m) * std::sqrt(squared));
-        const double arriving = lights_.power[point.light] * cosine / (lights_.infinite[point.light] ? 1 : squared);
+        const Vec3 y = source.place_of(point), m = sample.m, light = source.light_of(point);
+        const Vec3 d = light_.infinite ? light : light - y;
+        const double cosine = std::fabs(dot(m, d)) / (length(m) * length(d));
+        Vec3 there;
+        for (int i = 0; i < 3; ++i) there += point.on[i] * corner(view_.scene, point.face, i);
+        const double arriving = cosine * light_.towards(point.part, point.light, there);
         const double look = view_.importance.mean(sample.x, sample.x);
-        const double px = sample.speed * std::sqrt(std::fabs(sample.area_scale));
-        const double value = px * arriving * look;
+        // The area that the border sweeps as the edge moves: where light grazes a face it is much for little length.
+        const double swept = std::fabs(sample.weight * sample.scale * sample.area_scale) * (sample.by_a + sample.by_b) *
+                             length(sample.N);
+        const double px = sample.weight * sample.speed * std::sqrt(std::fabs(sample.area_scale));
+        const double value = swept * arriving * look;
         if (!std::isfinite(value)) return;
         found_[point.segment].squares += value * value, found_[point.segment].length += look > 0 ? px : 0;
     }
 
    private:
     const BackwardView<T>& view_;
-    const LightPoints& lights_;
+    const LightParts& light_;
     std::vector<Found>& found_;
 };
 
-// Casts a chunk of points on segments from their lights, and from the camera what they are seen to meet.
+// What chunks of samples share.
+template <class T>
+struct ShadowScene {
+    const BackwardView<T>& view;
+    const LightParts& light;
+    const FacesBeforeLight<T>& faces;
+    const Pieces& pieces;
+};
+
+// Casts a chunk of points on edges from their lights, and from the camera what they are seen to meet.
 template <class T, class Contraction>
 class ShadowChunk {
    public:
-    ShadowChunk(const BackwardView<T>& view, const LightPoints& lights, const std::vector<ShadowEdges::Point>& points,
-                Contraction contraction)
-        : view_(view),
-          points_(points),
-          source_(view, lights),
-          light_rays_(view, lights),
-          samples_(view, source_, std::move(contraction)) {}
+    ShadowChunk(const ShadowScene<T>& scene, uint64_t seed, Contraction contraction)
+        : scene_(scene),
+          sequence_(seed),
+          wedge_(scene.view, scene.faces),
+          source_(scene.view, scene.light.infinite),
+          light_rays_(scene.view, scene.light),
+          samples_(scene.view, source_, std::move(contraction)) {}
 
-    // At a fraction of a segment: the points of the light one after another, each with all of the segment. Where these
-    // are more than samples, samples would all meet the same place of the segment if it were not moved on by the golden
-    // ratio from one point to the next.
-    void add(const Segment& segment, int64_t index, double fraction, double weight) {
-        const int64_t count = segment.points();
-        const double at = fraction * double(count);
-        const int64_t point = std::min(int64_t(at), count - 1);
-        double t = at - double(point);
-        if (count > 1) t += double(segment.edge.first + point) * 0.6180339887498949, t -= std::floor(t);
-        light_rays_.add(segment.edge.edge, points_[segment.edge.first + point], index,
-                        segment.t0 + t * (segment.t1 - segment.t0), weight);
-        if (light_rays_.is_full()) cast();
+    // The i-th of places that ascend, with so many samples: a second one mirrors the first on the edge. How samples
+    // fall to the two ends would make most of the noise where there are few on an edge.
+    void add(int64_t i, double position, int64_t interval, double weight, int64_t samples) {
+        const auto place = scene_.pieces.at(position, piece_);
+        piece_ = place.piece;
+        const ShadowPiece& piece = scene_.pieces[piece_];
+        if (!wedge_.set(piece.edge, piece.part)) return;
+        const Vec2 other = sequence_(uint64_t(i));
+        // Along the edge before a point, else along the wedge.
+        const double t = scene_.light.extended ? other.x : place.fraction;
+        for (int64_t k = 0; k < samples; ++k) {
+            const auto from = wedge_->at(place.fraction, k ? 1 - other.y : other.y);
+            light_rays_.add(piece, from, interval, piece.t0 + (k ? 1 - t : t) * double(piece.t1 - piece.t0),
+                            weight * place.weight / double(samples));
+            if (light_rays_.is_full()) cast();
+        }
     }
     void finish(ChunkGrad& grad) {
         cast();
@@ -276,12 +290,14 @@ class ShadowChunk {
    private:
     void cast() {
         light_rays_.cast([&](const ShadowPoint& point, double weight) {
-            if (is_in_view(view_, source_.place_of(point))) samples_.add(point, 0, weight);
+            if (is_in_view(scene_.view, source_.place_of(point))) samples_.add(point, 0, weight);
         });
     }
 
-    const BackwardView<T>& view_;
-    const std::vector<ShadowEdges::Point>& points_;
+    const ShadowScene<T> scene_;
+    const ShiftedSequence sequence_;
+    int64_t piece_ = -1;
+    EdgeWedge<T> wedge_;
     ShadowSource<T> source_;
     LightRays<T> light_rays_;
     CurveSamples<Contraction, T, ShadowSource<T>> samples_;
@@ -293,73 +309,76 @@ int64_t most_shadow_samples(int64_t width, int64_t height, int spp) {
     return std::clamp(width * height * spp / 8, fewest_samples, most_samples);
 }
 
-template <int N, class Contraction, class T>
-void add_shadows(const BackwardView<T>& view, const LightPoints& lights, int64_t samples,
-                 const Contraction& contraction, Destination& to, BackwardProfile& profile) {
+template <class T>
+void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t samples, const Record& record,
+                 Destination& to, BackwardProfile& profile) {
     Stopwatch watch;
-    const ShadowEdges edges = ShadowEdgeFinder<T>(view, lights).find(pair_tests);
-    const std::vector<Segment> segments = segments_of(view, edges.edges);
+    // No more rays than an eighth of the image's, for each is one of a light and one of the camera, alone; and so many
+    // where the light has an extent, for each of its points casts a shadow of its own.
+    const int64_t most = most_shadow_samples(view.camera.width, view.camera.height, view.image.spp);
+    const int64_t expected = samples >= 0 ? samples : light.extended ? most : 0;
+    const int64_t count = std::clamp(expected / samples_of_interval, fewest_intervals, most_intervals);
+    const FacesBeforeLight<T> faces(view.scene, light, view.team);
+    std::vector<ShadowPiece> found = ShadowEdgeFinder<T>(view, light, faces).find(pair_tests);
+    if (light.extended) found = cut(found, double(count));
+    const Pieces pieces(std::move(found), view.team);
     profile.shadow[0] += watch.lap();
-    const int64_t count = int64_t(segments.size());
-    if (count == 0) return;
+    if (pieces.empty()) return;
 
-    std::vector<Found> found(count);
+    const ShadowScene<T> scene{view, light, faces, pieces};
+    std::vector<Found> of_interval(count);
     const uint64_t pilot_seed = hash(view.options.seed, 10, gradient_stream);
-    view.team.each_block(count, [&](int64_t, int64_t first, int64_t last) {
+    view.team.each((count + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {
         ChunkGrad unused;
-        ShadowChunk chunk(view, lights, edges.points, Pilots(view, lights, found));
+        ShadowChunk chunk(scene, mix(pilot_seed), Pilots(view, light, of_interval));
+        const int64_t first = block * intervals_of_block, last = std::min(first + intervals_of_block, count);
         for (int64_t i = first; i < last; ++i) {
             const double shift = to_unit(hash(pilot_seed, i));
-            for (int k = 0; k < pilots; ++k) chunk.add(segments[i], i, (k + shift) / pilots, 1);
+            for (int k = 0; k < pilots; ++k)
+                chunk.add(i * pilots + k, (double(i) + (k + shift) / pilots) / double(count), i, 1, 1);
         }
         chunk.finish(unused);
     });
-    // Of the mean border of each light, px.
-    std::vector<double> length(lights.lights, 0.0);
     Array<double> measure(count);
-    double known = 0, prior = 0;
+    double known = 0, length = 0;  // of the border, px, a mean over the light
+    // What pilots of one interval miss, those of its neighbours may have met: half of the mean square is theirs.
     for (int64_t i = 0; i < count; ++i) {
-        const Segment& s = segments[i];
-        measure[i] = s.share() * std::sqrt(found[i].squares / pilots), known += measure[i];
-        prior += (s.t1 - s.t0) * s.edge.measure;
-        length[s.edge.light] += s.share() * found[i].length / pilots;
+        double window = 0;
+        const int64_t low = std::max<int64_t>(i - neighbours, 0), high = std::min(i + neighbours, count - 1);
+        for (int64_t k = low; k <= high; ++k) window += of_interval[k].squares / double(high - low + 1);
+        measure[i] = std::sqrt(0.5 * (of_interval[i].squares + window) / pilots), known += measure[i] / double(count);
+        length += of_interval[i].length / double(pilots * count);
     }
+    for (int64_t i = 0; i < count; ++i) measure[i] += floor_share * (known > 0 ? known : 1);
     profile.shadow[1] += watch.lap();
-    // No more rays than an eighth of the image's, for each is one of a light and one of the camera, alone; and so many
-    // where lights have an extent, for each of their points casts a shadow of its own.
-    const int64_t most = most_shadow_samples(view.camera.width, view.camera.height, view.image.spp);
-    double wanted = 0;
-    for (int64_t k = 0; k < lights.lights; ++k)
-        wanted += lights.first[k + 1] - lights.first[k] > 1 ? double(most) : samples_a_pixel * length[k];
-    for (int64_t i = 0; i < count; ++i)
-        measure[i] += floor_share * (known > 0 ? known : 1) * segments[i].edge.measure *
-                      (segments[i].t1 - segments[i].t0) / prior;
-    const int64_t n = samples >= 0 ? samples : std::clamp(int64_t(std::min(wanted, 1e15)), fewest_samples, most);
+    const int64_t wanted = light.extended ? most : int64_t(std::min(samples_a_pixel * length, 1e15));
+    const int64_t n = samples >= 0 ? samples : std::clamp(wanted, fewest_samples, most);
     profile.shadow_samples += n;
     if (view.options.dry || n == 0) return;
+    const int64_t samples_of_place = light.extended ? mirrored : 1,
+                  places = (n + samples_of_place - 1) / samples_of_place;
     Systematic systematic(measure, view.team);
-    systematic.draw(n, to_unit(hash(view.options.seed, 11, gradient_stream)));
+    systematic.draw(places, to_unit(hash(view.options.seed, 11, gradient_stream)));
     double seconds[2] = {0, 0};
-    view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        ShadowChunk chunk(view, lights, edges.points, on_curves<N>(view, contraction, grad));
+    view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+        ShadowChunk chunk(scene, hash(view.options.seed, 9, gradient_stream), on_curves<0>(view, record, grad));
         int64_t k = -1;
         for (int64_t i = first; i < last; ++i) {
             const double position = systematic.position(i);
             k = k < 0 ? systematic.primitive(position) : systematic.primitive(position, k);
             const double fraction =
                 std::clamp((position - systematic.begin_of(k)) / systematic.measure_of(k), 0.0, 1.0);
-            chunk.add(segments[k], k, fraction, systematic.weight(k) * segments[k].share());
+            chunk.add(i, (double(k) + fraction) / double(count), k, systematic.weight(k) / double(count),
+                      samples_of_place);
         }
         chunk.finish(grad);
     });
     profile.shadow[2] += seconds[0] + seconds[1];
 }
 
-// clang-format off
-#define EDGEGRAD_INSTANTIATE(N, C, T) \
-    template void add_shadows<N, C, T>(const BackwardView<T>&, const LightPoints&, int64_t, const C&, Destination&, BackwardProfile&);
-EDGEGRAD_FOR_CONTRACTIONS(EDGEGRAD_INSTANTIATE)
-#undef EDGEGRAD_INSTANTIATE
-// clang-format on
+template void add_shadows(const BackwardView<float>&, const LightParts&, int64_t, const Record&, Destination&,
+                          BackwardProfile&);
+template void add_shadows(const BackwardView<double>&, const LightParts&, int64_t, const Record&, Destination&,
+                          BackwardProfile&);
 
 }  // namespace edgegrad

@@ -58,11 +58,12 @@ struct CurveRecords {
     std::vector<int64_t> alpha_row_of;  // (Q,): the sample of each row
     std::vector<int64_t> alpha;         // (Q,)
     std::vector<double> by_alpha;       // (Q,)
-    // Of borders of shadows: the point of a light, and the velocity by its place in camera coordinates, or by the
-    // direction towards it. The first surface is that in the light, the second that in the shadow.
-    std::vector<int64_t> light_row_of;  // (L,): the sample of each row
-    std::vector<int32_t> light;         // (L,)
-    std::vector<double> by_light;       // (L, 3)
+    // Of borders of shadows, a row a sample: the point of the light, and the velocity by its place in camera
+    // coordinates, or by the direction towards it. The first surface is that in the light, the second that in the
+    // shadow.
+    std::vector<int32_t> light;    // (S,) the part of the light
+    std::vector<double> light_uv;  // (S, 2) where on it
+    std::vector<double> by_light;  // (S, 3)
 
     int64_t size() const { return int64_t(x.size()) / 2; }
     void add(const CurveRecords& o);
@@ -117,7 +118,7 @@ inline void CurveRecords::add(const CurveRecords& o) {
     append_rows(row_of, o.row_of), append(vertex, o.vertex), append(by_q, o.by_q);
     append_rows(uv_row_of, o.uv_row_of), append(uv, o.uv), append(by_uv, o.by_uv);
     append_rows(alpha_row_of, o.alpha_row_of), append(alpha, o.alpha), append(by_alpha, o.by_alpha);
-    append_rows(light_row_of, o.light_row_of), append(light, o.light), append(by_light, o.by_light);
+    append(light, o.light), append(light_uv, o.light_uv), append(by_light, o.by_light);
 }
 
 }  // namespace edgegrad

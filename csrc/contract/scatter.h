@@ -98,20 +98,26 @@ class RowBuffer {
     std::vector<Recent> recent_;
 };
 
+// How a border of a shadow moves with the point of the light that casts it; of one sample, for records of it alone.
+struct LightMotion {
+    int32_t part = -1;
+    Vec2 uv;
+    Vec3 by_place;  // camera coordinates
+};
+
 // What the samples of one chunk give.
 struct ChunkGrad {
     RowBuffer q, x, colors, uvs, texels, alphas;  // vertices: q in camera coordinates, x in the image
-    RowBuffer lights;                             // points of lights, in camera coordinates
     RowBuffer vertex_attributes, face_attributes;
     RowBuffer pixels;  // of what has the size of the image
     IntrinsicsGrad k;
+    LightMotion light;
     Records records;
 };
 
 // Where it goes; null where none is wanted.
 struct Destination {
     double *q = nullptr, *x = nullptr, *colors = nullptr, *uvs = nullptr, *texels = nullptr, *alphas = nullptr;
-    double* lights = nullptr;
     double *vertex_attributes = nullptr, *face_attributes = nullptr, *pixels = nullptr;
     int pixel_width = 0;  // numbers a pixel
     IntrinsicsGrad k = {};
@@ -132,7 +138,6 @@ constexpr RowSlot row_slots[] = {{&ChunkGrad::q, &Destination::q, 3},
                                  {&ChunkGrad::uvs, &Destination::uvs, 2},
                                  {&ChunkGrad::texels, &Destination::texels, as_radiance},
                                  {&ChunkGrad::alphas, &Destination::alphas, 1},
-                                 {&ChunkGrad::lights, &Destination::lights, 3},
                                  {&ChunkGrad::vertex_attributes, &Destination::vertex_attributes, as_vertex_attributes},
                                  {&ChunkGrad::face_attributes, &Destination::face_attributes, as_face_attributes},
                                  {&ChunkGrad::pixels, &Destination::pixels, as_pixels}};

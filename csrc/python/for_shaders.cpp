@@ -63,7 +63,7 @@ nb::dict arrays_of(CurveRecords&& c) {
     curves["by_uv"] = rows(std::move(c.by_uv), {2});
     curves["alpha_row_of"] = rows(std::move(c.alpha_row_of)), curves["alpha"] = rows(std::move(c.alpha));
     curves["by_alpha"] = rows(std::move(c.by_alpha));
-    curves["light_row_of"] = rows(std::move(c.light_row_of)), curves["light"] = rows(std::move(c.light));
+    curves["light"] = rows(std::move(c.light)), curves["light_uv"] = rows(std::move(c.light_uv), {2});
     curves["by_light"] = rows(std::move(c.by_light), {3});
     return curves;
 }
@@ -88,44 +88,43 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
     return nb::make_tuple(surface, arrays_of(std::move(found.curves)));
 }
 
-// Points of lights as edges cast shadows of them.
+// A light as edges cast shadows of it.
 struct LightArrays {
-    In<double, 2> place;
-    In<uint8_t, 1> infinite;
-    In<double, 1> power;
+    In<double, 3> corner;
+    In<double, 1> chance;
     In<int32_t, 1> face;
-    In<int64_t, 1> first;
+    bool infinite, extended, two_sided;
 
     void check(int64_t faces) const {
-        const size_t n = place.shape(0);
-        if (place.shape(1) != 3 || infinite.size() != n || power.size() != n || face.size() != n)
-            refuse("lights: expected a row a point");
-        check_finite("lights", place.data(), place.size(), 3, 1), check_finite("power", power.data(), n, 1, 1);
-        if (first.size() < 1 || first(0) != 0 || first(first.size() - 1) != int64_t(n) ||
-            !std::is_sorted(first.data(), first.data() + first.size()))
-            refuse("first: expected where each light's points begin, and their number");
-        for (size_t i = 0; i < n; ++i)
+        const size_t n = corner.shape(0);
+        if (corner.shape(1) != 3 || corner.shape(2) != 3 || chance.size() != n || face.size() != n)
+            refuse("light: expected three corners, a chance and a face for each part");
+        if (n == 0) refuse("light: expected a part at least");
+        check_finite("corner", corner.data(), n, 9, 1), check_finite("chance", chance.data(), n, 1, 1);
+        for (size_t i = 0; i < n; ++i) {
+            if (!(chance(i) > 0)) refuse("chance: expected numbers above zero");
             if (face(i) >= faces) refuse("face: expected a face of the scene, or -1");
+        }
     }
-    LightPoints view() const {
-        return {place.data(), infinite.data(), power.data(), face.data(), first.data(), int64_t(first.size()) - 1};
+    LightParts view() const {
+        return {corner.data(), chance.data(), face.data(), int64_t(chance.size()), infinite, extended, two_sided};
     }
 };
 
 // The samples on the borders of shadows.
 template <class T>
 nb::dict shadow_samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
-                        const GradientOptions& options, const LightArrays& lights, int64_t samples, int threads,
+                        const GradientOptions& options, const LightArrays& light, int64_t samples, int threads,
                         Out<T, 3> adjoint, const HitArrays<T>& hits) {
     check_image("adjoint", adjoint, camera, arrays.background.shape(2));
-    hits.check(arrays, camera), lights.check(int64_t(arrays.faces.shape(0)));
+    hits.check(arrays, camera), light.check(int64_t(arrays.faces.shape(0)));
     const SceneView<T> scene = arrays.view();
     CurveRecords found;
     unlocked(threads, [&](Team& team) {
         GeometryWork done;
         const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
         found = record_shadows(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view()}, options,
-                               lights.view(), samples, team);
+                               light.view(), samples, team);
     });
     return arrays_of(std::move(found));
 }
@@ -221,7 +220,7 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
         .def("pixel_hits", &pixel_hits<T>, "camera"_a, "options"_a, "threads"_a, "first"_a, "end"_a, "most"_a,
              "only"_a.none(), "hits"_a)
         .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
-        .def("shadow_samples", &shadow_samples<T>, "camera"_a, "image"_a, "options"_a, "lights"_a, "samples"_a,
+        .def("shadow_samples", &shadow_samples<T>, "camera"_a, "image"_a, "options"_a, "light"_a, "samples"_a,
              "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)
         .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(),
@@ -234,11 +233,11 @@ template void bind_scene_for_shaders(nb::class_<SceneArrays<float>>&);
 template void bind_scene_for_shaders(nb::class_<SceneArrays<double>>&);
 
 void bind_for_shaders(nb::module_& m) {
-    nb::class_<LightArrays>(m, "LightPoints")
-        .def(nb::new_([](In<double, 2> place, In<uint8_t, 1> infinite, In<double, 1> power, In<int32_t, 1> face,
-                         In<int64_t, 1> first) { return LightArrays{place, infinite, power, face, first}; }),
-             "place"_a.noconvert(), "infinite"_a.noconvert(), "power"_a.noconvert(), "face"_a.noconvert(),
-             "first"_a.noconvert());
+    nb::class_<LightArrays>(m, "LightParts")
+        .def(nb::new_([](In<double, 3> corner, In<double, 1> chance, In<int32_t, 1> face, bool infinite, bool extended,
+                         bool two_sided) { return LightArrays{corner, chance, face, infinite, extended, two_sided}; }),
+             "corner"_a.noconvert(), "chance"_a.noconvert(), "face"_a.noconvert(), "infinite"_a, "extended"_a,
+             "two_sided"_a);
     m.def("footprints", &footprints, "x"_a.noconvert(), "filter"_a, "width"_a, "height"_a);
     m.def("most_shadow_samples", &most_shadow_samples, "width"_a, "height"_a, "spp"_a);
     m.def("rays_at", &rays_of, "camera"_a, "x"_a.noconvert(), "threads"_a);

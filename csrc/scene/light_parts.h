@@ -1,0 +1,46 @@
+// A light as edges see it: a point, or triangles that are drawn from evenly.
+//
+// The light's own density of points is p; `chance` is ∫ p over a part. So Σ chance · (mean over the part's area) is the
+// mean over points drawn with p, which is what the radiance of a sample, divided by p, is made for.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "core/math.h"
+
+namespace edgegrad {
+
+struct LightParts {
+    const double*
+        corner;  // (L, 3, 3) world coordinates, or, at infinity, directions towards it; of a point thrice the same
+    const double* chance;  // (L,) > 0
+    const int32_t* face;   // (L,) of the scene that the part is, −1: none
+    int64_t count = 0;
+    bool infinite = false, extended = false, two_sided = true;
+
+    Vec3 at(int64_t part, int i) const {
+        const double* c = corner + 9 * part + 3 * i;
+        return {c[0], c[1], c[2]};
+    }
+    // At the last two barycentrics; the direction at infinity is of unit length.
+    Vec3 at(int64_t part, Vec2 uv) const {
+        const Vec3 p = (1 - uv.x - uv.y) * at(part, 0) + uv.x * at(part, 1) + uv.y * at(part, 2);
+        return infinite ? (1 / length(p)) * p : p;
+    }
+    // What the light that leaves a point for another counts, for densities alone: L cos θ / r² over L, no less than a
+    // little of 1 / r² behind a face, for shaders that see shadows there too.
+    double towards(int64_t part, Vec3 from, Vec3 to) const {
+        if (infinite) return 1;
+        const Vec3 d = to - from;
+        const double squared = dot(d, d);
+        if (!extended) return 1 / squared;
+        const Vec3 n = cross(at(part, 1) - at(part, 0), at(part, 2) - at(part, 0));
+        const double cosine = dot(n, d) / (length(n) * std::sqrt(squared));
+        constexpr double least = 0.02;
+        return (least + (two_sided ? std::fabs(cosine) : std::max(cosine, 0.0))) / squared;
+    }
+};
+
+}  // namespace edgegrad
