@@ -403,7 +403,8 @@ EYE = {"eye": (1.0, 2.0, 3.0), "target": (0.0, 0.0, 0.0), "up": (0.0, 1.0, 0.0),
 COUNTS = [0, -1, 1.5, "4", None, True, 10**30]
 HELPERS: dict[str, tuple[Callable[..., object], dict[str, Any], dict[str, list[Any]]]] = {
     "look_at": (eg.Camera.look_at, {**EYE, "fov_y": 40.0},
-                {"eye": VECTOR, "target": VECTOR, "up": [*VECTOR, (0, 0, 0), (2.0, 4.0, 6.0)], "fov_y": ANGLE, "size": SIZE}),
+                {"eye": VECTOR, "target": VECTOR, "up": [*VECTOR, (0, 0, 0), (2.0, 4.0, 6.0)],
+                 "fov_y": [a for a in ANGLE if a is not None], "size": SIZE}),
     "orthographic": (eg.Camera.orthographic, {**EYE, "height": 2.0},
                      {"eye": VECTOR, "target": VECTOR, "height": [-2.0, ANGLE[0], *ANGLE[2:]], "size": SIZE}),
     "from_opencv": (eg.Camera.from_opencv, {"R": torch.eye(3), "t": torch.ones(3), "K": torch.eye(3), "size": (4, 4)},
