@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
 import torch
@@ -22,6 +22,50 @@ def tensors_in(thing: Any) -> Iterator[Tensor]:
     elif dataclasses.is_dataclass(thing):
         for field in dataclasses.fields(thing):
             yield from tensors_in(getattr(thing, field.name))
+
+
+def named_tensors(thing: Any, name: str = "") -> Iterator[tuple[str, Tensor]]:
+    """All tensors with the way to them, fields and places joined by dots: "meshes.0.verts"."""
+    dot = f"{name}." if name else ""
+    if isinstance(thing, Tensor):
+        yield name, thing
+    elif isinstance(thing, (tuple, list)):
+        for i, part in enumerate(thing):
+            yield from named_tensors(part, f"{dot}{i}")
+    elif dataclasses.is_dataclass(thing):
+        for field in dataclasses.fields(thing):
+            yield from named_tensors(getattr(thing, field.name), f"{dot}{field.name}")
+
+
+def with_named(thing: T, tensors: Mapping[str, Tensor]) -> T:
+    """With the tensors of these names, as named_tensors() has them, replaced. Raises KeyError for a name that it lacks."""
+    return _with_named(thing, dict(tensors))
+
+
+def _with_named(thing: Any, tensors: dict[str, Tensor]) -> Any:
+    if "" in tensors:
+        return tensors[""]
+    inside: dict[str, dict[str, Tensor]] = {}
+    for name, tensor in tensors.items():
+        first, _, rest = name.partition(".")
+        inside.setdefault(first, {})[rest] = tensor
+    if not inside:
+        return thing
+    if isinstance(thing, (tuple, list)):
+        parts = list(thing)
+        for first, below in inside.items():
+            if not first.isdecimal() or int(first) >= len(parts):
+                raise KeyError(first)
+            parts[int(first)] = _with_named(parts[int(first)], below)
+        return type(thing)(parts)
+    if not dataclasses.is_dataclass(thing) or isinstance(thing, type):
+        raise KeyError(next(iter(inside)))
+    names = {field.name for field in dataclasses.fields(thing)}
+    if missing := set(inside) - names:
+        raise KeyError(missing.pop())
+    return dataclasses.replace(
+        thing, **{first: _with_named(getattr(thing, first), below) for first, below in inside.items()}
+    )
 
 
 def map_tensors(thing: T, function: Callable[[Tensor], Tensor]) -> T:

@@ -450,7 +450,7 @@ def test_helpers_work_before_they_are_spoilt(helper: str):
         assert function(**good) is not None
     else:
         with pytest.raises(ValueError, match="init: expected a pose at which the picture changes"):
-            function(**good | {"camera": GOOD_CAMERA.crop(500, 500, 8, 8)})
+            function(**good | {"camera": GOOD_CAMERA.crop(500, 500, 8, 8), "init": torch.eye(4)})
 
 
 @pytest.mark.parametrize("helper", HELPERS)

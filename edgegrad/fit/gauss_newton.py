@@ -12,6 +12,7 @@ Where every render has a seed of its own, Jᵀr is unbiased, and steps that shri
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ FIRST_PROBES, PROBES = 24, 4  # images v at the first point, and at every later 
 MEMORY = 0.9  # weight of all earlier probes when new ones come
 FIRST_DAMPING, LEAST_DAMPING = 0.1, 0.005  # relative to the diagonal of JᵀJ
 LONGEST = 0.07  # of any entry of a step: JᵀJ says little about poses further away
-FULL_STEPS, DECAY = 10, 0.5  # so many steps at full length, then 1 / (1 + DECAY k)
+FULL_STEPS, DECAY = 4, 0.5  # so many steps at full length once the loss hardly falls, then 1 / (1 + DECAY k)
 NOISE = 1.03  # a loss that rises by a smaller factor may have risen by the noise of its samples
 
 
@@ -29,29 +30,44 @@ class GaussNewton:
 
     def __init__(self, generator: torch.Generator) -> None:
         self.generator = generator
-        self.loss = math.inf  # mean r² at the last accepted point
+        self.loss = math.inf  # at the last accepted point
         self.seen = self.accepted = 0  # points
+        self._settled = 0  # of them, those whose loss was hardly lower
         self.damping = FIRST_DAMPING
         self._gradient = self._curvature = torch.empty(0)
 
-    def observe(self, p: Tensor, residual: Tensor) -> bool:
-        """Takes in r, a function of p (n,), at a new point. False when the loss rose: then go back to the last accepted."""
+    def observe(
+        self, p: Tensor, residual: Tensor | Sequence[Tensor], loss: float | None = None, slack: float | None = None
+    ) -> bool:
+        """Takes in r, a function of p (n,), at a new point. False when the loss rose: then go back to the last accepted.
+
+        residual  one image, or several, each probed by itself
+        loss      what is compared; the mean r² when None
+        slack     by how much it may have risen by the noise of its samples
+        """
         self.seen += 1
-        loss = float(residual.detach().square().mean())
+        images = [residual] if isinstance(residual, Tensor) else list(residual)
+        if loss is None:
+            loss = float(sum(r.detach().square().sum() for r in images)) / sum(r.numel() for r in images)
+        slack = (NOISE - 1.0) * self.loss if slack is None and self.accepted else slack or 0.0
         # not <=, so that a loss that is NaN is turned down
-        if not loss <= NOISE * self.loss:
+        if not loss <= self.loss + slack:
             self.damping *= 5.0
             return False
         probes = PROBES if self.accepted else FIRST_PROBES
-        rows = []
-        for _ in range(probes):
-            signs = torch.randint(0, 2, residual.shape, generator=self.generator).to(residual) * 2.0 - 1.0
-            rows.append(_pulled_back(residual, p, signs))
-        fresh = torch.stack(rows).T @ torch.stack(rows) / probes
+        fresh, gradient = torch.zeros(len(p), len(p)).to(p), torch.zeros_like(p)
+        for r in images:
+            rows = []
+            for _ in range(probes):
+                signs = torch.randint(0, 2, r.shape, generator=self.generator).to(r) * 2.0 - 1.0
+                rows.append(_pulled_back(r, p, signs))
+            fresh = fresh + torch.stack(rows).T @ torch.stack(rows) / probes
+            gradient = gradient + _pulled_back(r, p, r.detach())
         self._curvature = MEMORY * self._curvature + (1.0 - MEMORY) * fresh if self.accepted else fresh
-        self._gradient = _pulled_back(residual, p, residual.detach())
+        self._gradient = gradient
         if self.accepted:
             self.damping = max(self.damping / 3.0, LEAST_DAMPING)
+            self._settled += not loss < self.loss - slack
         self.loss = loss
         self.accepted += 1
         return True
@@ -61,6 +77,11 @@ class GaussNewton:
         """Whether nothing in the image depends on p."""
         return not bool(self._curvature.diagonal().sum() > 0)
 
+    @property
+    def settled(self) -> bool:
+        """Whether the loss has hardly fallen for a while."""
+        return self._settled > 2 * FULL_STEPS
+
     def step(self) -> Tensor:
         """δp (n,) from the last accepted point."""
         diagonal = self._curvature.diagonal()
@@ -68,7 +89,7 @@ class GaussNewton:
         damped = self._curvature + torch.diag(self.damping * diagonal + 1e-4 * diagonal.max())
         step = -torch.linalg.solve(damped, self._gradient)
         shrink = min(1.0, LONGEST / float(step.abs().max().clamp(min=1e-30)))
-        return step * shrink / (1.0 + DECAY * max(0, self.accepted - FULL_STEPS))
+        return step * shrink / (1.0 + DECAY * max(0, self._settled - FULL_STEPS))
 
 
 def _pulled_back(residual: Tensor, p: Tensor, image: Tensor) -> Tensor:

@@ -7,16 +7,18 @@ import torch
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
 
 from .._files import PathLike, replacing
-from ..image import linear_to_srgb
+from .plots import comparison, displayed
 from .result import PoseFit, Step
 from .task import Level, PoseTask
 
 PANEL, FRAME = 512, 256  # most pixels on a side of a panel, in draw_fit and in draw_animation
 FRAMES = 30
 SPP = 64
-INK, FAINT = "#303030", "#c4c4c4"
+FAINT = "#c4c4c4"
+FADED = 0.25  # of a picture behind the render, where the background is not known
 
 
 def draw_fit(path: PathLike, fit: PoseFit) -> None:
@@ -24,24 +26,17 @@ def draw_fit(path: PathLike, fit: PoseFit) -> None:
 
     Raises ValueError for a fit that did not take a step or came from JSON, OSError when the file cannot be written.
     """
-    task = _task(fit)
-    level = _level(task, PANEL)
-    target = _shown(level.target)
-    start, end = (_render(task, level, step) for step in (fit.history[0], _way(fit)[-1]))
-    difference = np.abs(end - target)
-    # Errors of a good fit are too faint to see as they are; by a power of two, so that the caption is easy to read.
-    factor = 2 ** int(np.clip(np.floor(-np.log2(np.quantile(difference, 0.999) + 1e-9)), 0, 4))
-    titles = "target", "start", "fit", "difference" + (f" × {factor}" if factor > 1 else "")
-    h, w = np.array(target.shape[:2]) / max(target.shape[:2])
-    figure = Figure(figsize=(4 * 2.4 * w + 0.3, 2.4 * h + 0.34), dpi=200, layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.04, wspace=0.0, hspace=0.0)  # type: ignore[union-attr]
-    images = target, start, end, np.clip(factor * difference, 0, 1)
-    for axes, title, image in zip(figure.subplots(1, 4), titles, images, strict=True):
-        axes.imshow(image, interpolation="nearest")
-        axes.set_title(title, fontsize=9, color=INK, pad=4)
-        axes.set_axis_off()
+    figure = sheet(fit)
     with replacing(path) as temporary:
         figure.savefig(temporary)
+
+
+def sheet(fit: PoseFit) -> Figure:
+    """What draw_fit writes: a row for each picture."""
+    task = _task(fit)
+    level = _level(task, PANEL)
+    start, end = (_renders(task, level, step) for step in (fit.history[0], _way(fit)[-1]))
+    return comparison([(shot.target, a, b) for shot, a, b in zip(level.shots, start, end, strict=True)])
 
 
 def draw_loss(path: PathLike, fit: PoseFit) -> None:
@@ -53,14 +48,18 @@ def draw_loss(path: PathLike, fit: PoseFit) -> None:
     # The last entry of a whole fit is no step but the final comparison, which has less noise.
     history = fit.history[:-1] if len(fit.history) > 1 and not fit.interrupted else fit.history
     begins = [k for k, step in enumerate(history) if k == 0 or step.size != history[k - 1].size]
+    sizes = sorted({step.size for step in history})
     figure = Figure(figsize=(6.4, 3.2), dpi=200, layout="constrained")
     axes = figure.subplots()
     axes.plot(range(1, len(history) + 1), [step.loss for step in history], ".", color=FAINT, markersize=4)
-    for number, (begin, end) in enumerate(zip(begins, [*begins[1:], len(history)], strict=True)):
+    labelled = set()
+    for begin, end in zip(begins, [*begins[1:], len(history)], strict=True):
         best = [k for k in range(begin, end) if history[k].best]
         h, w = history[begin].size
-        color = colormaps["viridis"](0.85 * number / max(1, len(begins) - 1))
-        axes.plot([k + 1 for k in best], [history[k].loss for k in best], ".-", color=color, label=f"{w} × {h} px")
+        color = colormaps["viridis"](0.85 * sizes.index((h, w)) / max(1, len(sizes) - 1))
+        label = None if (h, w) in labelled else f"{w} × {h} px"  # later ones are of second opinions
+        labelled.add((h, w))
+        axes.plot([k + 1 for k in best], [history[k].loss for k in best], ".-", color=color, label=label)
     axes.set_yscale("log")
     axes.set_xlabel("step")
     axes.set_ylabel("mean squared difference")
@@ -77,11 +76,11 @@ def draw_animation(path: PathLike, fit: PoseFit) -> None:
     """
     task = _task(fit)
     level = _level(task, FRAME)
-    target = _shown(level.target)
+    target = displayed(level.shots[0].target)
     font = ImageFont.load_default(max(9, round(0.05 * target.shape[0])))
     frames = []
     for step in _frames(_way(fit)):
-        image = _render(task, level, step)
+        image = displayed(_renders(task, level, step)[0])
         panels = np.concatenate([target, image, np.clip(2.0 * np.abs(image - target), 0, 1)], 1)
         frame = Image.fromarray((panels * 255.0).round().astype(np.uint8))
         edge = round(0.03 * frame.height)
@@ -123,15 +122,17 @@ def _frames(way: list[Step]) -> list[Step]:
 
 def _level(task: PoseTask, most: int) -> Level:
     """The whole picture, at most so many pixels on its longer side."""
-    return task.level(min(1.0, most / max(task.camera.size)), blur=0.0, coarseness=1.0, spp=SPP, free=[])
+    size = task.shots[0].camera.size
+    return task.level(min(1.0, most / max(size)), blur=0.0, coarseness=1.0, spp=SPP, free=[])
 
 
-def _render(task: PoseTask, level: Level, step: Step) -> np.ndarray:
+def _renders(task: PoseTask, level: Level, step: Step) -> list[Tensor]:
+    """As pictures: over the background where that is known, without alpha, which comes last where it was compared beside them."""
     with torch.no_grad():
-        return _shown(task.image(level, step.pose, level.spp, seed=0))
-
-
-def _shown(image: torch.Tensor) -> np.ndarray:
-    """(H, W, 3) sRGB in 0 … 1 from linear radiance; the mask's channel is left out."""
-    colors = image[..., :3] if image.shape[-1] >= 3 else image[..., :1].expand(-1, -1, 3)
-    return linear_to_srgb(colors.clamp(0.0, 1.0)).numpy()
+        images = task.images(level, step.pose, level.spp, seed=0)
+    if not task.clutter:
+        return images
+    return [
+        image[..., :-1] + (1.0 - image[..., -1:]) * FADED * shot.target
+        for image, shot in zip(images, level.shots, strict=True)
+    ]

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from .._check import check_finite, check_shape
+from .._files import PathLike, replacing
 from ..camera import Camera
+from .verdict import ENOUGH
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from .task import PoseTask
 
 
@@ -24,6 +30,8 @@ class Pose(NamedTuple):
     t: Tensor  # (3,) world units
     scale: Tensor  # ()
     focal: Tensor  # ()
+    principal: Tensor = torch.zeros(2, dtype=torch.float64)  # how far the point moved, in widths of the image
+    distortion: Tensor = torch.zeros(8, dtype=torch.float64)  # what is added to the camera's
 
     @property
     def matrix(self) -> Tensor:
@@ -46,8 +54,9 @@ class PoseFit:
     """What fit_pose found.
 
     R (3, 3), t (3,) float64 and scale place the mesh: `world = scale · R v + t`, t in world units. `camera` is the given
-    one, with the focal length found when that was asked for. `loss` is the mean squared difference to the picture,
-    linear radiance, over pixels and channels, at the finest level.
+    one (of several the first), with the focal length found when that was asked for. `loss` is the mean squared difference to the
+    picture, linear radiance, over pixels and channels, at the finest level; where a pixel is far off, it counts no more than
+    a tenth of the picture's range does.
     """
 
     R: Tensor
@@ -59,6 +68,7 @@ class PoseFit:
     seconds: float
     converged: bool
     interrupted: bool = False
+    explained: float = math.nan  # the share of the render's edges that the pictures show too, 0 … 1
     history: list[Step] = field(default_factory=list, repr=False)  # its last `best` step is this pose
     task: PoseTask | None = field(default=None, repr=False)  # what was compared, for pictures; not kept in JSON
 
@@ -67,6 +77,50 @@ class PoseFit:
         """Mesh to world, (4, 4) float64, for column vectors: `scale · R` and `t`."""
         one = torch.ones((), dtype=torch.float64)
         return Pose(self.R, self.t, self.scale * one, one).matrix
+
+    @property
+    def state(self) -> str:
+        """In words: "converged", or what kept it from that."""
+        if self.interrupted:
+            return "interrupted"
+        if self.converged:
+            return "converged"
+        if self.explained < ENOUGH:
+            return (
+                f"not converged: the picture shows {self.explained:.0%} of the render's edges; start nearer, or look for what is "
+                "wrong in mesh, camera or picture"
+            )
+        return "not converged: give it more steps"
+
+    def plot(self) -> Figure:
+        """target | start | fit | difference, a row for each picture; with a mask all over black, as they were compared."""
+        from .report import sheet
+
+        return sheet(self)
+
+    def save(self, folder: PathLike) -> list[str]:
+        """Writes pose.json, fit.png, loss.png and fit.webp to a folder, which is made where it is missing, each whole or not
+        at all, and gives their names; of a fit that took no step, pose.json alone. Raises OSError."""
+        from . import report
+
+        out = Path(folder)
+        out.mkdir(parents=True, exist_ok=True)
+        with replacing(out / "pose.json") as temporary:
+            temporary.write_text(self.to_json() + "\n", encoding="utf-8")
+        draw = {"fit.png": report.draw_fit, "loss.png": report.draw_loss, "fit.webp": report.draw_animation}
+        if not self.history:
+            return ["pose.json"]
+        for name, function in draw.items():
+            function(out / name, self)
+        return ["pose.json", *draw]
+
+    def _repr_png_(self) -> bytes | None:
+        """In a notebook: the picture of plot()."""
+        if self.task is None or not self.history:
+            return None
+        file = io.BytesIO()
+        self.plot().savefig(file, format="png", dpi=100)
+        return file.getvalue()
 
     def to_json(self) -> str:
         """The pose as JSON text: `mesh_to_world` 4 × 4 by rows, for column vectors; camera and figures of the fit beside it."""
@@ -86,6 +140,7 @@ class PoseFit:
                 "seconds": round(self.seconds, 3),
                 "converged": self.converged,
                 "interrupted": self.interrupted,
+                "explained": self.explained if math.isfinite(self.explained) else None,
             },
             indent=2,
         )
@@ -101,10 +156,12 @@ class PoseFit:
             view = Camera(M, K, camera["size"], camera["projection"], camera.get("distortion"))
             loss = math.nan if data["loss"] is None else float(data["loss"])
             steps, seconds = int(data["steps"]), float(data["seconds"])
+            share = data.get("explained")
+            share = math.nan if share is None else float(share)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"pose: expected what PoseFit.to_json writes, got a fault in it ({error})") from error
         flags = bool(data["converged"]), bool(data["interrupted"])
-        return PoseFit(pose.R, pose.t, float(pose.scale), view, loss, steps, seconds, *flags)
+        return PoseFit(pose.R, pose.t, float(pose.scale), view, loss, steps, seconds, *flags, share)
 
 
 def pose_from_json(text: str) -> Pose:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import roma
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -16,27 +18,54 @@ from ..camera import Camera
 from ..mesh import Mesh
 from ..scene import Scene
 from .result import Pose
+from .views import area_mean, check_image
 
 COARSEST = 24  # pixels across the object where the fit begins: 15 % of its size is then a few pixels
 SMALLEST = 12  # pixels on the shorter side of the coarsest level
 BLURS = (1.5, 1.0)  # standard deviation in pixels on the coarsest levels; none on the finer ones
-MOST_SPP = 256  # samples a pixel on coarse levels
+MOST_SPP = 64  # samples a pixel on coarse levels
+EVEN = (
+    0.1,
+    0.3,
+)  # a border is clutter when so large a share of it is farther from its median than this part of the range
 
-# A step has 8 entries: a rotation vector about the centre and a shift, both along the camera's axes, and logarithms of
-# scale and focal length. The first of each:
-TURN, SHIFT, GROW, ZOOM = 0, 3, 6, 7
+# A step has these entries: a rotation vector about the centre and a shift, both along the first camera's axes, logarithms
+# of scale and focal length, the principal point in widths of the image, and the lens's distortion. The first of each:
+TURN, SHIFT, GROW, ZOOM, PRINCIPAL, BEND = 0, 3, 6, 7, 8, 10
+ENTRIES = 18
+
+
+class Lens(NamedTuple):
+    """What is sought beside the pose."""
+
+    scale: bool = False
+    focal: bool = False
+    principal: bool = False
+    distortion: int = 0  # coefficients
+
+
+class Shot(NamedTuple):
+    """One picture at one resolution."""
+
+    camera: Camera
+    target: Tensor  # (h, w, C), blurred
+    background: Tensor | None  # (C,) or (h, w, C), not blurred: that comes after the render
+    weight: Tensor | None  # (h, w, 1)
 
 
 class Level(NamedTuple):
     """The task at one resolution."""
 
-    camera: Camera
-    target: Tensor  # (h, w, C), blurred
-    background: Tensor | None  # (C,) or (h, w, C), not blurred: that comes after the render
+    shots: list[Shot]
     blur: float  # pixels
     coarseness: float  # size of a pixel, relative to the finest level's
     spp: int
     free: list[int]  # entries of a step that are sought
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w) of the first picture."""
+        return self.shots[0].camera.size
 
 
 @dataclass(frozen=True)
@@ -45,89 +74,96 @@ class PoseTask:
 
     scene: Scene
     aovs: tuple[str, ...]  # what is compared, one after the other: "image", "alpha" or both
-    target: Tensor  # (H, W, C) the same of the picture
-    background: Tensor | None  # (C,) or (H, W, C) of the picture; None with a mask
-    camera: Camera
+    shots: list[Shot]  # the pictures, whole
+    clutter: bool  # what stands behind the object is not known: where it is not seen, nothing is compared
+    extent: float  # norm over the channels of the pictures' range, of colours where there are any
     center: Tensor  # (3,) of the bounding box, in the mesh's units
     size: float  # its diagonal at the start, world units
     free: list[int]  # entries of a step that are sought
 
     @staticmethod
     def of(
-        mesh: Mesh | Scene, target: Tensor, camera: Camera, mask: Tensor | None, background: Tensor | float | None,
-        start: Pose, fit_scale: bool, fit_focal: bool,
+        mesh: Mesh | Scene, target: Any, camera: Any, mask: Any, weight: Any, background: Tensor | float | None,
+        lens: Lens, scale: float,
     ) -> PoseTask:  # fmt: skip
-        """Raises TypeError or ValueError."""
+        """`scale` is the mesh's at the start. Raises TypeError or ValueError."""
         if not isinstance(mesh, Mesh | Scene):
             raise TypeError(
                 f"mesh: expected a Mesh or a Scene, got {type(mesh).__name__}; load one with load_mesh(path)"
             )
-        if not isinstance(camera, Camera):
-            raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
-        if camera.batch is not None:
-            raise ValueError(f"camera: expected one camera, got {camera.batch}; fit one picture at a time")
         # Copies, for autograd does not keep tensors that were made in torch.inference_mode().
         scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu", copy=True)
-        picture = _image("target", target, camera.size)
         plain = all(part.channels is None for part in scene.meshes)
-        C = picture.shape[-1] if plain else scene.channels
-        if picture.shape[-1] != C:
-            raise ValueError(
-                f"target: expected {C} channels like the mesh's colours, got {picture.shape[-1]}; "
-                "read it with read_image(path, channels=3), or give its alpha as the mask"
-            )
-        if mask is not None:
-            if background is not None:
-                raise ValueError("background: expected None with a mask, got both; the mask leaves no background")
-            shape = _image("mask", mask, camera.size)
-            check_shape("mask", shape, (*camera.size, 1))
-            aovs = ("alpha",) if plain else ("image", "alpha")
-            picture = shape if plain else torch.cat([picture * shape, shape], -1)
+        if mask is not None and background is not None:
+            raise ValueError("background: expected None with a mask, got both; the mask leaves no background")
+        shots, clutter = [], False
+        for name, view, picture, shape, count in _shots(camera, target, mask, weight):
+            image = check_image(f"target{name}", picture, view.size)
+            C = image.shape[-1] if plain else scene.channels
+            if image.shape[-1] != C:
+                raise ValueError(
+                    f"target{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
+                    "read it with read_image(path, channels=3), or give its alpha as the mask"
+                )
+            if count is not None:
+                count = check_image(f"weight{name}", count, view.size)
+                check_shape(f"weight{name}", count, (*view.size, 1))
+                if not bool((count >= 0).all()):
+                    raise ValueError(f"weight{name}: expected numbers from 0 up, got {float(count.min()):g}")
             behind = None
-        else:
-            aovs = ("image",)
-            behind = _background(background if background is not None else scene.background, picture)
+            if mask is not None:
+                shape = check_image(f"mask{name}", shape, view.size)
+                check_shape(f"mask{name}", shape, (*view.size, 1))
+                image = shape if plain else torch.cat([image * shape, shape], -1)
+            else:
+                behind = background if background is not None else scene.background
+                if behind is None:
+                    clutter = clutter or is_clutter(image)
+                behind = _background(behind, image)
+            shots.append(Shot(view.to("cpu", torch.float64, copy=True), image, behind, count))
+        if clutter:
+            shots = [shot._replace(background=None) for shot in shots]
+        aovs = ("image", "alpha") if clutter or (mask is not None and not plain) else ("image",)
+        aovs = ("alpha",) if mask is not None and plain else aovs
 
         double = [part.replace(verts=part.verts.detach().double()) for part in scene.meshes]
         low, high = torch.cat([part.verts for part in double]).aminmax(dim=0)
-        size = float((high - low).norm() * start.scale)
+        size = float((high - low).norm() * scale)
         if size == 0.0:
             raise ValueError(
                 "mesh: expected vertices apart from one another, got all in one place; check the file's units"
             )
         # One picture tells size from distance only together, and a parallel projection shows no distance at all.
-        depth = camera.projection != "orthographic" and not fit_scale
-        if fit_scale and fit_focal and camera.projection == "orthographic":
+        orthographic = all(shot.camera.projection == "orthographic" for shot in shots)
+        depth = len(shots) > 1 or (not orthographic and not lens.scale)
+        if lens.scale and lens.focal and orthographic:
             raise ValueError("fit_focal: expected False with fit_scale and an orthographic camera, where both are one")
-        free = [0, 1, 2, 3, 4] + [5] * depth + [GROW] * fit_scale + [ZOOM] * fit_focal
-        return PoseTask(
-            scene.replace(meshes=double, background=None),
-            aovs,
-            picture,
-            behind,
-            camera.to("cpu", torch.float64, copy=True),
-            (low + high) / 2,
-            size,
-            free,
-        )
+        free = [0, 1, 2, 3, 4] + [5] * depth + [GROW] * lens.scale + [ZOOM] * lens.focal
+        free += [PRINCIPAL, PRINCIPAL + 1] * lens.principal + list(range(BEND, BEND + lens.distortion))
+        seen = torch.cat([shot.target.flatten(0, 1) for shot in shots])
+        colours = (
+            seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
+        )  # a mask's range says nothing of theirs
+        extent = float((colours.amax(0) - colours.amin(0)).norm())
+        bare = scene.replace(meshes=double, background=None)
+        return PoseTask(bare, aovs, shots, clutter, extent, (low + high) / 2, size, free)
 
     def pyramid(self, start: Pose, max_size: int, spp: int) -> list[Level]:
         """From coarse to fine. Raises ValueError when the object is behind the camera."""
-        H, W = self.camera.size
+        camera = self.shots[0].camera
+        H, W = camera.size
         finest = min(1.0, max_size / max(H, W))
-        view = self.camera.world_to_camera
-        depth = float((view[:3, :3] @ (start.matrix[:3, :3] @ self.center + start.t) + view[:3, 3])[2])
-        perspective = self.camera.projection != "orthographic"
+        depth = float(depth_of(camera, start, self.center))
+        perspective = camera.projection != "orthographic"
         if perspective and depth <= 0:
             raise ValueError(f"init: expected the object in front of the camera, got its centre at depth {depth:.3g}")
-        focal = float(torch.linalg.det(self.camera.K[:2, :2]).abs().sqrt())
-        across = finest * focal * self.size / (depth if perspective else 1.0)  # pixels
+        across = finest * focal_of(camera) * self.size / (depth if perspective else 1.0)  # pixels
         halvings = round(math.log2(max(1.0, min(across / COARSEST, finest * min(H, W) / SMALLEST))))
         factors = [finest / 2**n for n in range(halvings, -1, -1)]
         factors += [finest] * (len(BLURS) + 1 - len(factors))
         blurs = [*BLURS, *[0.0] * (len(factors) - len(BLURS))]
         # Perspective shows in fine detail only: on a blurred level the focal length would run away.
-        blind = [entry for entry in self.free if entry != ZOOM]
+        blind = [entry for entry in self.free if entry < ZOOM]
         levels = []
         for factor, blur in zip(factors, blurs, strict=True):
             coarseness = finest / factor
@@ -136,61 +172,130 @@ class PoseTask:
         return levels
 
     def level(self, factor: float, blur: float, coarseness: float, spp: int, free: list[int]) -> Level:
-        """The task with the picture's sides multiplied by `factor`."""
-        H, W = self.camera.size
-        size = max(1, round(H * factor)), max(1, round(W * factor))
-        target = _blurred(_resized(self.target, size), blur)
-        behind = self.background
-        if behind is not None and behind.dim() == 3:
-            behind = _resized(behind, size)
-        return Level(self.camera.resized(size), target, behind, blur, coarseness, spp, free)
+        """The task with the pictures' sides multiplied by `factor`."""
+        shots = []
+        for camera, target, behind, weight in self.shots:
+            H, W = camera.size
+            size = max(1, round(H * factor)), max(1, round(W * factor))
+            if behind is not None and behind.dim() == 3:
+                behind = area_mean(behind, size)
+            weight = None if weight is None else area_mean(weight, size)
+            shots.append(Shot(camera.resized(size), blurred(area_mean(target, size), blur), behind, weight))
+        return Level(shots, blur, coarseness, spp, free)
 
     def moved(self, pose: Pose, free: list[int], p: Tensor) -> Pose:
         """The pose after a step whose entries `free` are p, the others zero; differentiable in p."""
-        step = p.new_zeros(8).index_put((torch.tensor(free),), p)
-        view = self.camera.world_to_camera
-        R = torch.linalg.matrix_exp(_skew(view[:3, :3].T @ step[TURN:SHIFT])) @ pose.R
+        step = p.new_zeros(ENTRIES).index_put((torch.tensor(free),), p)
+        camera = self.shots[0].camera
+        view = camera.world_to_camera
+        R = roma.rotvec_to_rotmat(view[:3, :3].T @ step[TURN:SHIFT]) @ pose.R
         center = (
             view[:3, :3] @ (pose.scale * (pose.R @ self.center) + pose.t) + view[:3, 3] + self.size * step[SHIFT:GROW]
         )
         scale, zoom = pose.scale * step[GROW].exp(), step[ZOOM].exp()
-        if ZOOM in free and self.camera.projection != "orthographic":
+        perspective = camera.projection != "orthographic"
+        if PRINCIPAL in free and perspective:
+            # Undone by a shift, what is left is the change of perspective, and the entries hardly disturb one another.
+            aside = step[PRINCIPAL:BEND] * camera.size[1] / focal_of(camera) / pose.focal.detach()
+            center = torch.cat([center[:2] - aside * center[2:].detach(), center[2:]])
+        if ZOOM in free and perspective:
             # A longer lens enlarges the object. Undone by distance, or by scale where that is sought, what is left of
-            # the zoom is the change of perspective, and the entries of the step hardly disturb one another.
+            # the zoom is the change of perspective.
             if GROW in free:
                 scale = scale / zoom
             else:
                 center = torch.cat([center[:2], center[2:] * zoom])
         t = view[:3, :3].T @ (center - view[:3, 3]) - scale * (R @ self.center)
-        return Pose(R, t, scale, pose.focal * zoom)
+        bend = pose.distortion + step[BEND:]
+        return Pose(R, t, scale, pose.focal * zoom, pose.principal + step[PRINCIPAL:BEND], bend)
 
-    def image(self, level: Level, pose: Pose, spp: int, seed: int) -> Tensor:
-        """The render (h, w, C), blurred like the picture, differentiable in the pose."""
-        scene = self.scene.transformed(pose.R, pose.t, pose.scale).replace(background=level.background)
-        camera = level.camera
-        if ZOOM in self.free:
-            camera = camera.replace(K=zoomed(camera.K, pose.focal))
-        channels = render_aovs(scene, camera, self.aovs, spp=spp, seed=seed)
-        return _blurred(torch.cat([channels[name] for name in self.aovs], -1), level.blur)
+    def lens(self, camera: Camera, pose: Pose) -> Camera:
+        """The camera with what was found of its lens."""
+        if ZOOM not in self.free and PRINCIPAL not in self.free and BEND not in self.free:
+            return camera
+        K = zoomed(camera.K, pose.focal.to(camera.K))
+        if PRINCIPAL in self.free:
+            across = torch.zeros_like(K)
+            across[0, 2] = across[1, 2] = camera.size[1]
+            K = K + across * torch.cat([pose.principal, pose.principal.new_zeros(1)]).to(K)[:, None]
+        fields: dict[str, Any] = {"K": K}
+        if BEND in self.free:
+            bend = pose.distortion[: self.free[-1] + 1 - BEND].to(K)
+            given = camera.distortion
+            if given is not None and len(given) > len(bend):
+                bend = torch.cat([bend, bend.new_zeros(len(given) - len(bend))])
+            fields["distortion"] = bend if given is None else bend + F.pad(given, (0, len(bend) - len(given)))
+        return camera.replace(**fields)
+
+    def images(self, level: Level, pose: Pose, spp: int, seed: int) -> list[Tensor]:
+        """The renders (h, w, C), blurred like the pictures, differentiable in the pose."""
+        moved = self.scene.transformed(pose.R, pose.t, pose.scale)
+        images = []
+        for k, shot in enumerate(level.shots):
+            scene = moved.replace(background=shot.background)
+            channels = render_aovs(
+                scene, self.lens(shot.camera, pose), self.aovs, spp=spp, seed=(seed + 977 * k) % 2**32
+            )
+            images.append(blurred(torch.cat([channels[name] for name in self.aovs], -1), level.blur))
+        return images
 
 
-def _image(name: str, value: Tensor, size: tuple[int, int]) -> Tensor:
-    """(H, W, C) float32 on the CPU. Raises TypeError or ValueError."""
-    image = as_tensor(name, value).detach().cpu()
-    image = image[..., None] if image.dim() == 2 else image
-    image = image.float() if image.dtype == torch.bool else image
-    check_float(name, image)
-    check_shape(name, image, (*size, "C"), fix="the camera must have the picture's size: camera.resized((H, W))")
-    check_finite(name, image)
-    return image.float()
+def _shots(camera: Any, target: Any, mask: Any, weight: Any) -> list[tuple[str, Camera, Any, Any, Any]]:
+    """Suffix of the arguments' names, camera, picture, mask and weight of each view. Raises TypeError or ValueError."""
+    several = isinstance(camera, Sequence) and not isinstance(camera, str)
+    cameras: list[Any] = list(camera) if several else [camera]
+    if not cameras:
+        raise ValueError("camera: expected at least one, got none")
+    columns = []
+    for name, value in (("target", target), ("mask", mask), ("weight", weight)):
+        if value is None and name != "target":
+            columns.append([None] * len(cameras))
+        elif not several:
+            columns.append([value])
+        elif not isinstance(value, (Sequence, Tensor)) or len(value) != len(cameras):
+            got = len(value) if isinstance(value, (Sequence, Tensor)) else type(value).__name__
+            raise ValueError(f"{name}: expected {len(cameras)}, one for each camera, got {got}")
+        else:
+            columns.append(list(value))
+    for i, one in enumerate(cameras):
+        if not isinstance(one, Camera):
+            raise TypeError(f"camera: expected a Camera, got {type(one).__name__}; make one with Camera.look_at(…)")
+        if one.batch is not None:
+            raise ValueError(f"camera: expected one camera, got {one.batch}; give a list of cameras, and of pictures")
+        if one.world_to_camera.dtype != one.K.dtype:
+            cameras[i] = one.to(torch.float64)
+    names = [f"[{i}]" for i in range(len(cameras))] if several else [""]
+    return list(zip(names, cameras, *columns, strict=True))
+
+
+def depth_of(camera: Camera, pose: Pose, point: Tensor) -> Tensor:
+    """Of a point of the mesh, along the camera's axis."""
+    view = camera.world_to_camera.double()
+    return (view[:3, :3] @ (pose.matrix[:3, :3] @ point + pose.t) + view[:3, 3])[2]
+
+
+def focal_of(camera: Camera) -> float:
+    """Pixels, the geometric mean of both axes."""
+    return float(torch.linalg.det(camera.K[:2, :2].double()).abs().sqrt())
+
+
+def is_clutter(picture: Tensor) -> bool:
+    """Whether the border of (H, W, C) is of many colours, so that none of them is the background."""
+    border = _border(picture)
+    extent = (picture.amax((0, 1)) - picture.amin((0, 1))).clamp(min=1e-30)
+    off = ((border - border.median(dim=0).values).abs() / extent).amax(1)
+    return float((off > EVEN[0]).float().mean()) > EVEN[1]
+
+
+def _border(picture: Tensor) -> Tensor:
+    return torch.cat([picture[0], picture[-1], picture[1:-1, 0], picture[1:-1, -1]])
 
 
 def _background(value: Tensor | float | None, picture: Tensor) -> Tensor:
     """(C,) or (H, W, C). Raises TypeError or ValueError."""
     H, W, C = picture.shape
     if value is None:
-        border = [picture[0], picture[-1], picture[1:-1, 0], picture[1:-1, -1]]
-        return torch.cat(border).median(dim=0).values
+        return _border(picture).median(dim=0).values
     behind = as_tensor("background", value, like=picture).detach().cpu()
     if behind.dim() == 0:
         behind = behind.expand(C)
@@ -207,18 +312,7 @@ def zoomed(K: Tensor, factor: Tensor) -> Tensor:
     return K + (factor - 1.0) * lens
 
 
-def _skew(w: Tensor) -> Tensor:
-    """The matrix of w × · , whose exponential is the rotation by |w| radians about w."""
-    zero = torch.zeros_like(w[0])
-    return torch.stack([zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero]).reshape(3, 3)
-
-
-def _resized(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Means over the new pixels' areas, which is what a render of that size with the box filter estimates."""
-    return F.interpolate(image.movedim(-1, 0)[None], size=size, mode="area")[0].movedim(0, -1)
-
-
-def _blurred(image: Tensor, sigma: float) -> Tensor:
+def blurred(image: Tensor, sigma: float) -> Tensor:
     """Gaussian blur by `sigma` pixels; the border's pixels are repeated outwards."""
     if sigma == 0.0:
         return image

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._files import require
 from ..camera import Camera
+from ..fit.smooth import Smooth
 from ..mesh import Mesh
 from ..render import render
 from ..scene import Scene
@@ -83,7 +83,7 @@ def vertex_fit(steps: int = STEPS, preconditioned: bool = False, say: Say = lamb
     back = background().float()
     with torch.no_grad():
         target = render(Scene([mesh.replace(verts=goal)], back), cameras, spp=256)
-    solve = _Smooth(mesh) if preconditioned else None
+    solve = Smooth(mesh.faces, len(mesh.verts), SMOOTHNESS) if preconditioned else None
     v = mesh.verts.clone()
     u = v if solve is None else solve.times(v)
     mean, square = torch.zeros_like(u), torch.zeros_like(u)
@@ -101,41 +101,13 @@ def vertex_fit(steps: int = STEPS, preconditioned: bool = False, say: Say = lamb
         (g,) = torch.autograd.grad(loss, leaf)
         losses.append(loss.item())
         if solve is not None:
-            g = solve(g)
+            g = solve.solve(g)
         # Adam (Kingma and Ba, 2015).
         mean, square = 0.9 * mean + 0.1 * g, 0.999 * square + 0.001 * g.square()
         scale = (square / (1.0 - 0.999**step)).sqrt()
         scale = scale.max() if solve is not None else scale
         u = u - rate * (mean / (1.0 - 0.9**step)) / (scale + 1e-12)
-        v = u if solve is None else solve(u)
+        v = u if solve is None else solve.solve(u)
     name = "10,242 free vertices, " + ("preconditioned Adam" if preconditioned else "Adam")
     start, end = (float((x - goal).norm(dim=1).mean()) for x in (mesh.verts, v))
     return summary(name, losses, ("vertices, mean distance", start, end))
-
-
-class _Smooth:
-    """(I + λ L)⁻¹ of rows (V, 3), L the graph's Laplacian of a mesh."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        cholespy = require("cholespy", "cholespy", "the preconditioned fit")
-        faces, count = mesh.faces.long(), len(mesh.verts)
-        edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        edges = torch.unique(torch.cat([edges, edges.flip(1)]), dim=0)
-        degree = torch.bincount(edges[:, 0], minlength=count).double()
-        rows = torch.cat([edges[:, 0], torch.arange(count)])
-        columns = torch.cat([edges[:, 1], torch.arange(count)])
-        values = torch.cat([torch.full((len(edges),), -SMOOTHNESS, dtype=F64), 1.0 + SMOOTHNESS * degree])
-        self._matrix = torch.sparse_coo_tensor(
-            torch.stack([rows, columns]), values, (count, count), check_invariants=True
-        )
-        self._solver = cholespy.CholeskySolverD(
-            count, rows.int().numpy(), columns.int().numpy(), values.numpy(), cholespy.MatrixType.COO
-        )
-
-    def times(self, x: Tensor) -> Tensor:
-        return (self._matrix @ x.double()).to(x.dtype)
-
-    def __call__(self, x: Tensor) -> Tensor:
-        found = np.zeros(x.shape)
-        self._solver.solve(np.ascontiguousarray(x.detach().double().numpy()), found)
-        return torch.from_numpy(found).to(x.dtype)

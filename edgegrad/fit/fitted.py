@@ -1,0 +1,191 @@
+"""What a fit by descent returns: the best values, what they make, and how well that explains the pictures."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .._files import PathLike, replacing, require
+from ..aovs import render_aovs
+from ..camera import Camera
+from ..image import write_image
+from ..io import save_camera
+from ..mesh import Mesh
+from ..scene import Scene
+from .frame import Record
+from .verdict import ENOUGH
+from .views import View
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What a fit found.
+
+    values     the parameters, by name
+    scene      with them, and cameras
+    loss       of all views, without the regularizer, at 64 samples a pixel or more
+    explained  the share of the render's edges that the pictures show too, 0 … 1
+    flat       whether the loss had stopped falling before the steps ended
+    """
+
+    values: dict[str, Tensor]
+    scene: Scene
+    cameras: list[Camera]
+    loss: float
+    explained: float
+    flat: bool
+    interrupted: bool
+    seconds: float
+    views: list[View] = field(repr=False)
+    history: list[Record] = field(repr=False)
+    start: Scene = field(repr=False)  # where the fit began
+
+    @property
+    def steps(self) -> int:
+        return len(self.history)
+
+    @property
+    def converged(self) -> bool:
+        """The loss is flat, and what is left of it is explained: not a wrong place, nor a picture of something else."""
+        return self.flat and self.explained >= ENOUGH
+
+    @property
+    def mesh(self) -> Mesh:
+        """The scene's first mesh."""
+        return self.scene.meshes[0]
+
+    @property
+    def state(self) -> str:
+        """In words: "converged", or what kept it from that."""
+        if self.interrupted:
+            return "interrupted"
+        if not self.flat:
+            return "not converged: the loss still falls; give it more steps"
+        if self.explained < ENOUGH:
+            return (
+                f"not converged: the pictures show {self.explained:.0%} of the render's edges; "
+                "start nearer, or look for what is wrong in scene, cameras or pictures"
+            )
+        return "converged"
+
+    def render(self, index: int = 0, spp: int = 64, seed: int = 0) -> Tensor:
+        """(H, W, C) as the camera of that place sees the fit; alpha (H, W, 1) where masks alone were compared."""
+        return _render(self.scene, self.cameras[index], self.views[index], spp, seed)
+
+    def plot(self, most: int = 4) -> Figure:
+        """target | start | fit | difference of up to so many views."""
+        from .plots import comparison
+
+        n = len(self.views)
+        chosen = sorted({round(k * (n - 1) / max(1, min(most, n) - 1)) for k in range(min(most, n))})
+        rows = []
+        for i in chosen:
+            view = self.views[i]
+            target = view.image if view.image is not None else view.mask
+            assert target is not None
+            rows.append((target, _render(self.start, view.camera, view, 64, 0), self.render(i)))
+        return comparison(rows)
+
+    def plot_history(self) -> Figure:
+        """The loss and the norm of each gradient, step by step."""
+        from .plots import curves
+
+        return curves(self.history)
+
+    def save(self, folder: PathLike) -> list[str]:
+        """Writes all of it to a folder, which is made where it is missing, and gives the files' names:
+
+        fit.json      loss, state, cameras, and values of up to 64 numbers
+        values.pt     all values, for torch.load
+        history.json  loss, gradient norms and small values of each step
+        mesh*.ply     the shapes that moved, texture*.png their textures, as sRGB
+        camera*.json  the cameras, as load_camera reads them
+        fit.png       plot(), loss.png: plot_history()
+
+        Each file is written whole or not at all. Raises OSError.
+        """
+        out = Path(folder)
+        out.mkdir(parents=True, exist_ok=True)
+        written = []
+
+        def text(name: str, content: Any) -> None:
+            with replacing(out / name) as temporary:
+                temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+            written.append(name)
+
+        text("fit.json", self._summary())
+        with replacing(out / "values.pt") as temporary:
+            torch.save(self.values, temporary)
+        written.append("values.pt")
+        text("history.json", [_plain(record) for record in self.history])
+        for i, mesh in enumerate(self.scene.meshes):
+            number = "" if len(self.scene.meshes) == 1 else str(i)
+            if any(name.endswith("verts") for name in self.values):
+                write_ply(out / f"mesh{number}.ply", mesh)
+                written.append(f"mesh{number}.ply")
+            if mesh.texture is not None and mesh.texture.shape[-1] in (1, 3):
+                write_image(out / f"texture{number}.png", mesh.texture.clamp(0.0, 1.0))
+                written.append(f"texture{number}.png")
+        for i, camera in enumerate(self.cameras):
+            name = f"camera{'' if len(self.cameras) == 1 else i}.json"
+            save_camera(out / name, camera)
+            written.append(name)
+        figures = {"fit.png": self.plot} | ({"loss.png": self.plot_history} if self.history else {})
+        for name, draw in figures.items():
+            with replacing(out / name) as temporary:
+                draw().savefig(temporary)
+            written.append(name)
+        return written
+
+    def _summary(self) -> dict[str, Any]:
+        small = {name: value.tolist() for name, value in self.values.items() if value.numel() <= 64}
+        return {
+            "state": self.state, "converged": self.converged, "loss": _number(self.loss), "explained": self.explained,
+            "steps": self.steps, "seconds": round(self.seconds, 3), "values": small,
+        }  # fmt: skip
+
+    def _repr_png_(self) -> bytes:
+        """In a notebook: the picture of plot()."""
+        file = io.BytesIO()
+        self.plot().savefig(file, format="png", dpi=100)
+        return file.getvalue()
+
+
+def _render(scene: Scene, camera: Camera, view: View, spp: int, seed: int) -> Tensor:
+    with torch.no_grad():
+        return render_aovs(scene, camera, view.aovs[:1], spp=spp, seed=seed)[view.aovs[0]]
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _plain(record: Record) -> dict[str, Any]:
+    values = {name: value.tolist() for name, value in record.values.items()}
+    gradient = {name: _number(norm) for name, norm in record.gradient.items()}
+    return {
+        "step": record.step,
+        "loss": _number(record.loss),
+        "gradient": gradient,
+        "values": values,
+        "rate": record.rate,
+    }
+
+
+def write_ply(path: PathLike, mesh: Mesh) -> None:
+    """Vertices and faces. Raises OSError."""
+    trimesh = require("trimesh", "trimesh", "writing a mesh")
+    shape = trimesh.Trimesh(mesh.verts.detach().numpy(), np.asarray(mesh.faces), process=False)
+    with replacing(path) as temporary:
+        shape.export(temporary)

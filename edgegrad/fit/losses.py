@@ -1,0 +1,121 @@
+"""Losses between a render and a picture.
+
+Each takes image and target (..., H, W, C) and, if wanted, a weight (..., H, W, 1), and gives a number: the mean over pixels and
+channels, weighted. A fit takes any function of this form.
+
+A render has noise of its samples, which is independent of that of its gradient. The gradient of `l2` is therefore unbiased
+with any number of samples; losses that are not quadratic are so in the limit of many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .._files import require
+
+Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
+
+
+def _mean(values: Tensor, weight: Tensor | None) -> Tensor:
+    if weight is None:
+        return values.mean()
+    return (values * weight).sum() / (weight.sum() * values.shape[-1]).clamp(min=1e-30)
+
+
+def l1(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+    """|r|, r = image − target: outliers count less than with l2."""
+    return _mean((image - target).abs(), weight)
+
+
+def l2(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+    """r²: the best where what is left is noise alone."""
+    return _mean((image - target).square(), weight)
+
+
+def huber(image: Tensor, target: Tensor, weight: Tensor | None = None, scale: float = 0.1) -> Tensor:
+    """½ r² up to |r| = scale, scale (|r| − ½ scale) beyond (Huber 1964)."""
+    return _mean(F.huber_loss(image, target, reduction="none", delta=scale), weight)
+
+
+def robust(
+    image: Tensor, target: Tensor, weight: Tensor | None = None, scale: float = 0.1, alpha: float = -2.0
+) -> Tensor:
+    """ρ(r) = |α−2|/α (((r/scale)² / |α−2| + 1)^(α/2) − 1), a general and adaptive robust loss (Barron 2019).
+
+    alpha 2 is l2, 1 a smooth l1, 0 Cauchy's log(½ x² + 1), −2 Geman and McClure's 2x² / (x² + 4), −∞ Welsch's 1 − exp(−½ x²),
+    x = r/scale: at 0 and below, residuals far beyond `scale` hardly matter, whatever hides the object there.
+    """
+    square = ((image - target) / scale).square()
+    if alpha == 2.0:
+        rho = 0.5 * square
+    elif alpha == 0.0:
+        rho = torch.log1p(0.5 * square)
+    elif alpha == -torch.inf:
+        rho = -torch.expm1(-0.5 * square)
+    else:
+        b = abs(alpha - 2.0)
+        rho = b / alpha * ((square / b + 1.0) ** (0.5 * alpha) - 1.0)
+    return _mean(rho, weight)
+
+
+def iou(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+    """1 − Σ min(a, b) / Σ max(a, b) of soft masks a and b: one minus intersection over union, over each whole image."""
+    w = torch.ones_like(image[..., :1]) if weight is None else weight
+    both, either = ((w * f(image, target)).sum((-3, -2, -1)) for f in (torch.minimum, torch.maximum))
+    return (1.0 - both / either.clamp(min=1e-30)).mean()
+
+
+def ssim(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+    """1 − the structural similarity (Wang et al. 2004) of images in 0 … 1, by torchmetrics (`pip install 'edgegrad[fit]'`)."""
+    metrics = require("torchmetrics.functional.image", "edgegrad[fit]", "ssim")
+
+    def batch(x: Tensor) -> Tensor:
+        return x.reshape(-1, *x.shape[-3:]).movedim(-1, 1)
+
+    _, full = metrics.structural_similarity_index_measure(
+        batch(image), batch(target).to(image), data_range=1.0, return_full_image=True
+    )
+    return _mean(1.0 - full.movedim(1, -1).reshape(image.shape), weight)
+
+
+def multiscale(loss: Loss = l2, levels: int = 4) -> Loss:
+    """The mean of `loss` over an image pyramid, each level half the size: sees further than a pixel."""
+
+    def over_levels(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+        total = torch.zeros((), dtype=image.dtype)
+        w = torch.ones_like(target[..., :1]) if weight is None else weight
+        image, target = image * w, target * w
+        used = 0
+        for _ in range(levels):
+            # Divided where pixels count at all, so that what a weight hides does not darken its neighbours.
+            share = w.clamp(min=1e-6)
+            total, used = total + loss(image / share, target / share, w), used + 1
+            if min(image.shape[-3:-1]) < 2:
+                break
+            image, target, w = (_halved(x) for x in (image, target, w))
+        return total / used
+
+    return over_levels
+
+
+def _halved(x: Tensor) -> Tensor:
+    flat = x.reshape(-1, *x.shape[-3:]).movedim(-1, 1)
+    return F.avg_pool2d(flat, 2).movedim(1, -1).reshape(*x.shape[:-3], x.shape[-3] // 2, x.shape[-2] // 2, x.shape[-1])
+
+
+LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "huber": huber, "robust": robust, "iou": iou, "ssim": ssim}
+
+
+def loss_of(name: str, loss: str | Loss) -> Loss:
+    """By name, or itself. Raises TypeError or ValueError."""
+    if callable(loss):
+        return loss
+    if not isinstance(loss, str):
+        raise TypeError(f"{name}: expected a name or a function of image, target and weight, got {type(loss).__name__}")
+    if loss not in LOSSES:
+        raise ValueError(f"{name}: expected one of {', '.join(LOSSES)}, or a function, got {loss!r}")
+    return LOSSES[loss]

@@ -1,0 +1,59 @@
+"""Pictures of fits by descent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from ..image import linear_to_srgb
+from .frame import Record
+
+INK = "#303030"
+
+
+def comparison(rows: Sequence[tuple[Tensor, Tensor, Tensor]]) -> Figure:
+    """target | start | fit | difference; a row of linear images (H, W, C) for each view."""
+    shown = [tuple(map(displayed, row)) for row in rows]
+    apart = [np.abs(end - target) for target, _, end in shown]
+    # Errors of a good fit are too faint to see as they are; by a power of two, so that the caption is easy to read.
+    largest = max(float(np.quantile(a, 0.999)) for a in apart)
+    factor = 2 ** int(np.clip(np.floor(-np.log2(largest + 1e-9)), 0, 4))
+    h, w = np.array(shown[0][0].shape[:2]) / max(shown[0][0].shape[:2])
+    figure = Figure(figsize=(4 * 2.4 * w + 0.3, 2.4 * h * len(rows) + 0.34), dpi=200, layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.04, wspace=0.0, hspace=0.0)  # type: ignore[union-attr]
+    grid = figure.subplots(len(rows), 4, squeeze=False)
+    titles = "target", "start", "fit", "difference" + (f" × {factor}" if factor > 1 else "")
+    for axes, row, difference in zip(grid, shown, apart, strict=True):
+        for ax, image in zip(axes, (*row, np.clip(factor * difference, 0, 1)), strict=True):
+            ax.imshow(image, interpolation="nearest")
+            ax.set_axis_off()
+    for ax, title in zip(grid[0], titles, strict=True):
+        ax.set_title(title, fontsize=9, color=INK, pad=4)
+    return figure
+
+
+def curves(history: Sequence[Record]) -> Figure:
+    """The loss, and the norm of the gradient by each parameter."""
+    figure = Figure(figsize=(6.4, 4.4), dpi=200, layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    steps = [record.step + 1 for record in history]
+    above.plot(steps, [record.loss for record in history], color=INK, linewidth=1)
+    above.set_ylabel("loss")
+    for name in history[0].gradient:
+        below.plot(steps, [record.gradient[name] for record in history], linewidth=1, label=name)
+    below.set_ylabel("|gradient|")
+    below.set_xlabel("step")
+    below.legend(frameon=False, fontsize=8)
+    for ax in (above, below):
+        ax.set_yscale("log")
+        ax.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def displayed(image: Tensor) -> np.ndarray:
+    """(H, W, 3) sRGB in 0 … 1 from linear radiance."""
+    colors = image[..., :3] if image.shape[-1] >= 3 else image[..., :1].expand(-1, -1, 3)
+    return linear_to_srgb(colors.detach().clamp(0.0, 1.0)).numpy()

@@ -1,0 +1,63 @@
+"""What a good shape or texture looks like where the pictures do not say: terms to add to a loss.
+
+All are numbers without units, so that one weight serves meshes of any scale. verts are (V, 3), faces (F, 3).
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def edges(faces: Tensor) -> Tensor:
+    """(E, 2) int64: every edge once, its smaller vertex first."""
+    f = faces.long()
+    pairs = torch.cat([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).sort(dim=1).values
+    return torch.unique(pairs, dim=0)
+
+
+def edge_pairs(faces: Tensor) -> Tensor:
+    """(P, 2) int64: the two faces of every edge that has two."""
+    f = faces.long()
+    sides = torch.cat([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).sort(dim=1).values
+    owner = torch.arange(len(f)).repeat(3)
+    _, inverse, counts = torch.unique(sides, dim=0, return_inverse=True, return_counts=True)
+    inner = (counts == 2)[inverse]
+    order = torch.argsort(inverse[inner], stable=True)
+    return owner[inner][order].reshape(-1, 2)
+
+
+def laplacian(verts: Tensor, faces: Tensor) -> Tensor:
+    """Mean |v − mean of its neighbours|², in squared mean edge lengths: zero where the surface is flat and evenly meshed."""
+    pairs = edges(faces)
+    both = torch.cat([pairs, pairs.flip(1)])
+    count = torch.zeros(len(verts), dtype=verts.dtype).index_add(0, both[:, 0], verts.new_ones(len(both)))
+    sums = torch.zeros_like(verts).index_add(0, both[:, 0], verts[both[:, 1]])
+    used = count > 0
+    apart = verts[used] - sums[used] / count[used, None]
+    return apart.square().sum(1).mean() / _mean_square_edge(verts, pairs)
+
+
+def edge_length(verts: Tensor, faces: Tensor) -> Tensor:
+    """The variance of the edges' lengths over their mean square: zero when all are alike."""
+    pairs = edges(faces)
+    length = (verts[pairs[:, 0]] - verts[pairs[:, 1]]).norm(dim=1)
+    return length.var(correction=0) / length.square().mean().detach()
+
+
+def normal_consistency(verts: Tensor, faces: Tensor) -> Tensor:
+    """Mean 1 − n₁·n₂ of faces that share an edge: zero where the surface is flat."""
+    a, b, c = verts[faces.long()].unbind(1)
+    normals = F.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+    first, second = normals[edge_pairs(faces)].unbind(1)
+    return (1.0 - (first * second).sum(1)).mean()
+
+
+def total_variation(texture: Tensor) -> Tensor:
+    """Mean |difference of neighbouring texels| of (h, w, C): keeps edges and takes away speckles."""
+    return (texture[1:] - texture[:-1]).abs().mean() + (texture[:, 1:] - texture[:, :-1]).abs().mean()
+
+
+def _mean_square_edge(verts: Tensor, pairs: Tensor) -> Tensor:
+    return (verts[pairs[:, 0]] - verts[pairs[:, 1]]).square().sum(1).mean().detach().clamp(min=1e-30)

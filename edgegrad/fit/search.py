@@ -1,0 +1,194 @@
+"""The search of fit_pose: Gauss-Newton from coarse to fine, and a second opinion where the picture does not show what it found.
+
+A way down from a start may end at a wrong pose that looks alike. The coarsest level costs little, so there the search begins from
+several starts; and where the pictures do not show the render's edges at the end, it begins again from the best of many poses
+around the start.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import roma
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .gauss_newton import GaussNewton
+from .result import Pose, Step
+from .robust import NARROWEST, NOISE, Comparison
+from .task import GROW, SHIFT, TURN, Level, PoseTask
+from .verdict import ENOUGH, explained
+
+ASIDE, ASIDE_STEPS = 0.2, 20  # radians between the starts on the coarsest level, and steps from each
+FINAL_SPP = 64  # samples a pixel when ends are compared
+ROUNDS = 2  # of second opinions at most
+LOOKS, KEPT, FOLLOWED = (
+    150,
+    4,
+    3,
+)  # poses that a second opinion looks at, how many it follows a few steps, and how many more
+COMMON = 0.2  # c of losses that are compared, as a part of the pictures' range
+FARTHEST, FARTHEST_SHIFT = 0.7, 0.15  # radians and object sizes of these from the start or the best pose
+
+
+class _End(NamedTuple):
+    """Where a way down ended."""
+
+    loss: float  # on the finest level, with many samples
+    explained: float  # the share of the render's edges that the pictures show
+    pose: Pose
+    short: bool  # the last step
+
+
+class Search:
+    """The state of a search. `best`, `loss` and `history` may be read after each step."""
+
+    def __init__(
+        self, task: PoseTask, levels: list[Level], start: Pose, steps: int, tolerance: float, seed: int
+    ) -> None:
+        self.task, self.levels, self.start = task, levels, start
+        self.steps, self.tolerance, self.seed = steps, tolerance, seed
+        self.generator = torch.Generator().manual_seed(seed)
+        self.best, self.loss, self.converged, self.explained = start, math.nan, False, math.nan
+        self.history: list[Step] = []
+        self.after_step: Callable[[], Any] = lambda: None
+        self._answered = False  # later passes do not show until they win
+
+    @property
+    def planned(self) -> int:
+        """Steps of the first pass at most."""
+        return 5 * min(self.steps, ASIDE_STEPS) + self.steps * (len(self.levels) - 1)
+
+    def run(self) -> None:
+        """Raises ValueError when nothing in the pictures depends on the pose."""
+        tilts = ASIDE * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=torch.float64)
+        starts = [self.start, *(self.task.moved(self.start, [TURN, TURN + 1], tilt) for tilt in tilts)]
+        coarse, *finer = self.levels
+        ends = self._ranked(coarse, starts)
+        if not self.history:
+            raise ValueError(
+                "init: expected a pose at which the picture changes when the object moves, got one at which it does "
+                "not; is the object out of view, or of the background's colour?"
+            )
+        # The same many samples for all: a fit never ends at a worse pose than its start.
+        best = min(self._judge(*self._down(ends[0], finer)), self._judge(self.start, False), key=lambda end: end.loss)
+        self._take(best)
+        for _ in range(ROUNDS if self.steps > ASIDE_STEPS else 0):
+            if best.explained >= ENOUGH:
+                break
+            begins = len(self.history)
+            ends = _distinct(self._ranked(coarse, [*self._others(best.pose), *ends[1:]]), FOLLOWED)
+            ends = self._ranked(finer[0], ends)
+            found = self._judge(*self._down(ends[0], finer))
+            # The way to the answer is what `best` marks in the history.
+            won = found.loss < best.loss
+            lost = slice(0, begins) if won else slice(begins, None)
+            self.history[lost] = [step._replace(best=False) for step in self.history[lost]]
+            if won:
+                best = found
+                self._take(best)
+        self.history.append(Step(self.levels[-1].size, self.loss, self.best, True))
+
+    def _take(self, end: _End) -> None:
+        self.loss, self.explained, self.best, self._answered = end.loss, end.explained, end.pose, True
+        self.converged = end.short and end.explained >= ENOUGH
+
+    def _ranked(self, level: Level, starts: list[Pose]) -> list[Pose]:
+        """Where a few steps lead from each start, the best first."""
+        ends, lowest = [], math.inf
+        for origin in starts:
+            end, loss, _ = self._follow(level, origin, min(self.steps, ASIDE_STEPS), lowest)
+            ends.append(end)
+            lowest = min(lowest, loss)
+        # Each followed a loss of its own width: here all have one.
+        losses = [self._compare(level, end, level.spp, self.seed).loss(COMMON * self.task.extent)[0] for end in ends]
+        return [ends[k] for k in sorted(range(len(ends)), key=losses.__getitem__)]
+
+    def _down(self, pose: Pose, levels: list[Level]) -> tuple[Pose, bool]:
+        """Through the levels; the pose, and whether the last step was short."""
+        short = False
+        for level in levels:
+            pose, _, short = self._follow(level, pose, self.steps, math.inf)
+        return pose, short
+
+    def _follow(self, level: Level, origin: Pose, most: int, lowest: float) -> tuple[Pose, float, bool]:
+        """Steps on one level; the pose, its loss, and whether the last step was short."""
+        task, search = self.task, GaussNewton(self.generator)
+        pose = here = origin
+        c, converged = math.inf, False
+        while search.seen < most:
+            p = torch.zeros(len(level.free), dtype=torch.float64, requires_grad=True)
+            seed = (self.seed + len(self.history)) % 2**32
+            compared = Comparison(task, level, task.images(level, task.moved(pose, level.free, p), level.spp, seed))
+            if c == math.inf:
+                c = compared.scale()
+            loss, slack = compared.loss(c)
+            if taken := search.observe(p, compared.residuals(c), loss, slack):
+                here = pose
+                c = min(c, compared.scale())
+                search.loss = loss = compared.loss(c)[0]
+            if search.blind:
+                break
+            step = search.step()
+            converged = float(step.abs().max()) < self.tolerance * level.coarseness
+            good = taken and loss <= lowest + NOISE * abs(lowest)
+            if good:
+                lowest = loss
+            if not self._answered and good:
+                self.best, self.loss = pose, loss
+            self.history.append(Step(level.size, loss, pose, good))
+            self.after_step()
+            if converged or (search.settled and level is not self.levels[-1]):
+                break
+            pose = task.moved(here, level.free, step)
+        return here, search.loss, converged
+
+    def _compare(self, level: Level, pose: Pose, spp: int, seed: int) -> Comparison:
+        with torch.no_grad():
+            return Comparison(self.task, level, self.task.images(level, pose, spp, seed))
+
+    def _judge(self, pose: Pose, short: bool) -> _End:
+        """With many samples on the finest level."""
+        final = self.levels[-1]
+        first, second = (self._compare(final, pose, FINAL_SPP, (self.seed + k) % 2**32) for k in (0, 1))
+        pairs = []
+        for shot, a, b in zip(final.shots, first.renders, second.renders, strict=True):
+            weight = shot.weight
+            if self.task.clutter:
+                outside = (a[..., -1] < 0.999).to(a)  # and what lies beside it, whose gradient reaches there
+                inside = 1.0 - F.max_pool2d(outside[None, None], 3, stride=1, padding=1)[0, 0][..., None]
+                weight = inside if weight is None else weight * inside
+                a, b = a[..., :-1], b[..., :-1]
+            pairs.append((a, b, shot.target, weight))
+        return _End(first.loss(NARROWEST * self.task.extent)[0], explained(pairs), pose, short)
+
+    def _others(self, best: Pose) -> list[Pose]:
+        """The few best of many poses around the start and the best one, by their loss on the coarsest level."""
+        level, drawn = self.levels[0], []
+        c = COMMON * self.task.extent
+        entries = [entry for entry in range(TURN, GROW) if entry in self.task.free]
+        for k in range(LOOKS):
+            p = torch.zeros(GROW, dtype=torch.float64)
+            p[TURN:SHIFT] = FARTHEST * self._ball()
+            p[SHIFT:GROW] = FARTHEST_SHIFT * self._ball()
+            pose = self.task.moved(self.start if k % 2 else best, entries, p[entries])
+            drawn.append((self._compare(level, pose, max(4, level.spp // 16), self.seed).loss(c)[0], k, pose))
+        return _distinct([pose for _, _, pose in sorted(drawn, key=lambda entry: entry[:2])], KEPT)
+
+    def _ball(self) -> Tensor:
+        """(3,) even in a ball of radius 1."""
+        direction = torch.randn(3, generator=self.generator, dtype=torch.float64)
+        radius = torch.rand((), generator=self.generator, dtype=torch.float64) ** (1 / 3)
+        return radius * direction / direction.norm()
+
+
+def _distinct(poses: list[Pose], most: int) -> list[Pose]:
+    """The first ones that are turned apart from one another."""
+    kept: list[Pose] = []
+    for pose in poses:
+        if all(float(roma.rotmat_geodesic_distance(pose.R, other.R)) > 0.5 * ASIDE for other in kept):
+            kept.append(pose)
+    return kept[:most]

@@ -1,0 +1,146 @@
+"""What a fit compares with: pictures, masks and weights, each with its camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .._check import as_tensor, check_finite, check_float, check_shape
+from .._tree import map_tensors
+from ..camera import Camera
+
+Images = Tensor | Sequence[Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera, and what it saw. With a mask, the picture is black outside of it."""
+
+    camera: Camera
+    image: Tensor | None  # (H, W, C) linear radiance
+    mask: Tensor | None  # (H, W, 1), the share of each pixel that the object covers
+    weight: Tensor | None  # (H, W, 1), zero where the picture says nothing
+
+    @property
+    def aovs(self) -> list[str]:
+        """The channels to compare, as render_aovs() names them."""
+        return ["image"] * (self.image is not None) + ["alpha"] * (self.mask is not None)
+
+    @property
+    def wanted(self) -> dict[str, Tensor]:
+        """The same channels of the picture, (H, W, c) each."""
+        both = {"image": self.image, "alpha": self.mask}
+        return {name: value for name, value in both.items() if value is not None}
+
+    def resized(self, factor: float) -> View:
+        """With the sides multiplied by `factor`; pixels are means over the area of the old ones."""
+        H, W = self.camera.size
+        size = max(1, round(H * factor)), max(1, round(W * factor))
+        if size == (H, W):
+            return self
+        image, mask, weight = (
+            None if value is None else area_mean(value, size) for value in (self.image, self.mask, self.weight)
+        )
+        return View(self.camera.resized(size), image, mask, weight)
+
+
+def views_of(
+    cameras: Camera | Sequence[Camera],
+    images: Images | None,
+    masks: Images | None = None,
+    weights: Images | None = None,
+) -> list[View]:
+    """One View for each camera. Raises TypeError or ValueError that names the argument.
+
+    cameras   one, a batch, or a sequence of cameras, of any sizes
+    images    (H, W, C) for one camera, else (B, H, W, C) or a sequence; linear radiance
+    masks     (H, W) or (H, W, 1) each, 1 on the object and 0 elsewhere
+    weights   (H, W) or (H, W, 1) each, from 0: how much a pixel counts
+    """
+    split = _cameras(cameras)
+    pictures, shapes, counts = (
+        _images(name, value, split) for name, value in (("images", images), ("masks", masks), ("weights", weights))
+    )
+    views = []
+    for camera, image, mask, weight in zip(split, pictures, shapes, counts, strict=True):
+        for name, value in (("masks", mask), ("weights", weight)):
+            if value is not None:
+                check_shape(name, value, (*camera.size, 1))
+        if weight is not None and not bool((weight >= 0).all()):
+            raise ValueError(f"weights: expected numbers from 0 up, got {float(weight.min()):g}")
+        if image is None and mask is None:
+            raise ValueError("images: expected pictures or masks to compare with, got neither")
+        if image is not None and mask is not None:
+            image = image * mask
+        views.append(View(camera, image, mask, weight))
+    return views
+
+
+def _cameras(cameras: object) -> list[Camera]:
+    given = [cameras] if isinstance(cameras, Camera) else cameras
+    if not isinstance(given, Sequence) or not given:
+        raise TypeError(f"cameras: expected a Camera or a sequence of them, got {type(cameras).__name__}")
+    split: list[Camera] = []
+    for i, camera in enumerate(given):
+        if not isinstance(camera, Camera):
+            raise TypeError(f"cameras[{i}]: expected a Camera, got {type(camera).__name__}")
+        # Copies, for autograd does not keep tensors that were made in torch.inference_mode().
+        camera = map_tensors(camera, lambda tensor: tensor.detach().cpu().clone())
+        split += [camera] if camera.batch is None else [part_of(camera, k) for k in range(camera.batch)]
+    return split
+
+
+def part_of(camera: Camera, k: int) -> Camera:
+    """One camera of a batch."""
+    fields: dict[str, Any] = {"world_to_camera": 3, "K": 3, "distortion": 2}
+    values = {name: getattr(camera, name) for name in fields}
+    return camera.replace(
+        **{name: v[k] if v is not None and v.dim() == fields[name] else v for name, v in values.items()}
+    )
+
+
+def _images(name: str, value: object, cameras: list[Camera]) -> list[Tensor | None]:
+    """(H, W, c) float32 on the CPU, one for each camera. Raises TypeError or ValueError."""
+    if value is None:
+        return [None] * len(cameras)
+    single = len(cameras) == 1 and not isinstance(value, (list, tuple)) and getattr(value, "ndim", 0) < 4
+    given: Any = [value] if single else value
+    if len(given) != len(cameras):
+        raise ValueError(f"{name}: expected {len(cameras)}, one for each camera, got {len(given)}")
+    return [
+        check_image(name if single else f"{name}[{i}]", image, camera.size)
+        for i, (image, camera) in enumerate(zip(given, cameras, strict=True))
+    ]
+
+
+def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
+    """(H, W, C) float32 on the CPU. Raises TypeError or ValueError."""
+    image = as_tensor(name, value).detach().cpu()
+    image = image[..., None] if image.dim() == 2 else image
+    image = image.float() if image.dtype == torch.bool else image
+    check_float(name, image)
+    check_shape(name, image, (*size, "C"), fix="the camera must have the picture's size: camera.resized((H, W))")
+    check_finite(name, image)
+    return image.float()
+
+
+def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Means over the new pixels' areas, which is what a render of that size with the box filter estimates."""
+    return F.interpolate(image.movedim(-1, 0)[None], size=size, mode="area")[0].movedim(0, -1)
+
+
+def grouped(views: Sequence[View]) -> list[list[int]]:
+    """Places of views whose cameras can be rendered as one batch, with the same channels to compare."""
+    groups: dict[Any, list[int]] = {}
+    for i, view in enumerate(views):
+        camera = view.camera
+        lens = None if camera.distortion is None else camera.distortion.shape
+        shape = None if view.image is None else view.image.shape[-1]
+        key = camera.size, camera.projection, lens, camera.K.dtype, shape, view.mask is None, view.weight is None
+        groups.setdefault(key, []).append(i)
+    return list(groups.values())

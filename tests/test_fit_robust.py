@@ -1,0 +1,163 @@
+"""fit_pose and fit_camera where pictures are not as they should be: covered, cluttered, of something else, from several sides."""
+
+import math
+
+import pytest
+import torch
+from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, silhouette
+
+import edgegrad as eg
+from edgegrad.fit import fit_camera, fit_pose
+from edgegrad.fit.robust import Comparison
+from edgegrad.fit.task import Lens, PoseTask, is_clutter
+
+
+def covered(view, image):
+    """The left third of the bracket behind a white board."""
+    seen = torch.nonzero(silhouette(view)[..., 0] > 0.5)[:, 1].sort().values
+    edge = int(seen[len(seen) // 4])
+    cover = torch.zeros(*view.size, 1)
+    cover[:, : edge + 1] = 1.0
+    return cover + (1.0 - cover) * image, 1.0 - cover
+
+
+@pytest.mark.parametrize("how", ["alone", "weight"])
+def test_a_quarter_covered(how):
+    view = camera(64)
+    image, free = covered(view, picture(view))
+    told = {"background": BACKGROUND}
+    if how == "weight":
+        told["weight"] = free
+    fit = fit_pose(bracket(), image, view, init=START, progress=False, **told)
+    degrees, percent = errors(fit)
+    assert degrees < 1.0 and percent < 1.0, (degrees, percent)
+    assert fit.converged and fit.explained > 0.5
+
+
+def test_a_border_of_many_colours_is_clutter():
+    view = camera(32)
+    clutter = torch.rand(32, 32, 3, generator=torch.Generator().manual_seed(0))
+    assert is_clutter(picture(view, background=clutter)) and not is_clutter(picture(view))
+
+
+def test_what_is_not_in_the_picture_is_not_found():
+    """A picture of something else: the fit ends somewhere, and says that the picture does not show it."""
+    cells = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    image = torch.nn.functional.interpolate(cells, (32, 32), mode="bicubic")[0].movedim(0, -1)
+    fit = fit_pose(bracket(), image, camera(32), background=BACKGROUND, steps=21, progress=False)
+    assert not fit.converged and fit.explained < 0.5
+    assert fit.state.startswith("not converged: the picture shows")
+
+
+def test_several_pictures_share_the_pose():
+    """Two views tell the scale from the distance, as one cannot."""
+    first = camera(48)
+    center = torch.tensor([1.0, 0.75, 0.4]).double()
+    second = eg.Camera.look_at(center + torch.tensor([4.0, 1.0, 0.5]).double(), center, fov_y=45.0, size=(36, 48))
+    larger = bracket().transformed(torch.eye(3).double(), -0.08 * center, 1.08)
+    views = [first, second]
+    images = [picture(view, larger) for view in views]
+    fit = fit_pose(bracket(), images, views, init=START, background=BACKGROUND, fit_scale=True, progress=False)
+    assert max(errors(fit)) < 0.5 and fit.scale == pytest.approx(1.08, rel=0.01) and fit.converged
+    figure = fit.plot()
+    assert len(figure.axes) == 8
+
+
+def test_the_start_is_placed_where_the_picture_shows_the_object():
+    view, away = camera(48), torch.tensor([40.0, -30.0, 25.0]).double()
+    far = bracket().transformed(t=away)
+    mask = silhouette(view)
+    fit = fit_pose(far, picture(view), view, mask, progress=False)
+    where = fit.R @ (torch.tensor([1.0, 0.75, 0.4]).double() + away) + fit.t
+    assert float((where - torch.tensor([1.0, 0.75, 0.4]).double()).norm()) < 0.1
+    started = fit.history[0].pose
+    assert torch.equal(started.R, torch.eye(3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("clutter", [False, True])
+def test_residuals_have_the_gradient_of_the_loss(clutter):
+    """Σ f ∂f is half the derivative of Σ ρ − (1 − (1 − α)²) c²/2 for weights at rest; here by finite differences of the loss, on
+    renders that are functions of one number."""
+    view = camera(16)
+    background = None if clutter else BACKGROUND
+    image = picture(
+        view, background=torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(1)) if clutter else BACKGROUND
+    )
+    task = PoseTask.of(bracket(), image, view, None, torch.rand(16, 16), background, Lens(), 1.0)
+    assert task.clutter == clutter
+    level = task.level(1.0, 0.0, 1.0, 4, task.free)
+    g = torch.Generator().manual_seed(0)
+    base, way = (torch.rand(16, 16, 4 if clutter else 3, generator=g, dtype=torch.float64) for _ in range(2))
+    c, h = 0.3, 1e-5
+
+    def at(x):
+        return Comparison(task, level, [base + x * way])
+
+    x = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (found,) = torch.autograd.grad(sum(0.5 * f.square().sum() for f in at(x).residuals(c)), x)
+    weight = level.shots[0].weight
+    count = float(weight.sum()) * 3
+    expected = 0.5 * count * (at(h).loss(c)[0] - at(-h).loss(c)[0]) / (2 * h)
+    assert float(found) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "change, error, message",
+    [
+        ({"camera": []}, ValueError, "camera: expected at least one"),
+        ({"camera": [camera(8)] * 2}, ValueError, "target: expected 2, one for each camera, got 8"),
+        (
+            {"camera": [camera(8)], "target": [torch.zeros(8, 8, 3)], "mask": [torch.ones(4, 4)]},
+            ValueError,
+            "mask[0]: expected",
+        ),
+        ({"weight": -torch.ones(8, 8)}, ValueError, "weight: expected numbers from 0 up"),
+        ({"weight": torch.ones(8, 8, 3)}, ValueError, "weight: expected shape (8, 8, 1)"),
+    ],
+)
+def test_errors_name_the_argument(change, error, message):
+    with pytest.raises(error) as caught:
+        fit_pose(
+            **{"mesh": bracket(), "target": torch.zeros(8, 8, 3), "camera": camera(8), "progress": False, **change}
+        )
+    assert message in str(caught.value)
+
+
+def test_a_camera_and_its_focal_length():
+    true = camera(96, distance=2.6)
+    off = torch.linalg.inv(about_center(rotation(0.05, -0.06, 0.04), (0.04, -0.03, 0.05)))
+    K = true.K.clone()
+    K[:2, :2] *= 1.1
+    start = true.replace(world_to_camera=true.world_to_camera @ off, K=K)
+    fit = fit_camera(bracket(), picture(true), start, background=BACKGROUND, progress=False)
+    found = fit.camera
+    assert float(found.K[0, 0] / true.K[0, 0]) == pytest.approx(1.0, abs=0.02)
+    assert fit.converged and fit.state == "converged"
+    # Rendered from there, the scene looks like the picture.
+    again = eg.render(eg.Scene([bracket()], BACKGROUND), found, spp=64, seed=3)
+    assert float((again - picture(true)).square().mean()) < 1e-4
+    turned = found.world_to_camera[:3, :3] @ true.world_to_camera[:3, :3].T
+    assert math.degrees(math.acos(min(1.0, (float(turned.trace()) - 1.0) / 2.0))) < 1.0
+
+
+def test_a_camera_is_saved(tmp_path):
+    view = camera(32)
+    fit = fit_camera(bracket(), picture(view), view, background=BACKGROUND, focal=False, steps=2, progress=False)
+    assert "camera.json" in fit.save(tmp_path) and torch.equal(fit.camera.K, view.K)
+    torch.testing.assert_close(eg.load_camera(tmp_path / "camera.json").K.double(), view.K.double())
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"camera": 3}, "camera: expected a Camera"),
+        ({"distortion": 3}, "distortion: expected 0, 4, 5 or 8"),
+        ({"focal": 1}, "focal: expected True or False"),
+        ({"image": None}, "image: expected a picture, or a mask"),
+    ],
+)
+def test_errors_of_fit_camera(change, message):
+    arguments = {"scene": bracket(), "image": torch.zeros(8, 8, 3), "camera": camera(8), "progress": False, **change}
+    with pytest.raises((TypeError, ValueError)) as caught:
+        fit_camera(**arguments)
+    assert message in str(caught.value)
