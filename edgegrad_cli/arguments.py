@@ -9,6 +9,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
+CHECKPOINT = "checkpoint.pt"  # of fits by descent
+
 
 class Parser(argparse.ArgumentParser):
     """With the nearest name where one is not known."""
@@ -61,6 +63,26 @@ def add_view(parser: argparse.ArgumentParser) -> None:
         ("up", "up in the image (0 1 0)"),
     ):
         view.add_argument(f"--{name}", type=float, nargs=3, metavar=("X", "Y", "Z"), help=help)
+
+
+def add_views(parser: argparse.ArgumentParser, images: str) -> None:
+    """Several images, and the camera of each."""
+    parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE", help=images)
+    parser.add_argument(
+        "--camera", type=Path, nargs="+", required=True, metavar="CAMERA.json", help="one for each image, in their order"
+    )  # fmt: skip
+
+
+def add_descent(parser: argparse.ArgumentParser, result: str) -> None:
+    """What fits by descent have in common; inputs.descent reads it."""
+    parser.add_argument("--steps", type=count, default=150, help="most steps, on each level (%(default)s)")
+    parser.add_argument("--spp", type=count, default=4, help="samples a pixel (%(default)s)")
+    parser.add_argument("--seed", type=number, default=0)
+    parser.add_argument("--resume", action="store_true", help=f"go on from DIR/{CHECKPOINT}, if it is there")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR",
+        help=f"for {result}, values.pt, fit.json, history.json, fit.png, loss.png, cameras, {CHECKPOINT}",
+    )  # fmt: skip
 
 
 def shape(text: str) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import outputs
 from .arguments import add_mesh, add_view, count, number
-from .inputs import read_background, read_mask, read_picture, read_pose, read_scene, read_view, size_text
+from .inputs import check_size, read_background, read_mask, read_picture, read_pose, read_scene, read_view
 
 if TYPE_CHECKING:
     from edgegrad.fit import PoseFit
@@ -23,6 +23,10 @@ def add(commands: Any) -> None:
     add_view(parser)
     parser.add_argument(
         "--init", type=Path, metavar="POSE.json", help="pose to start from; as in the mesh file when left out"
+    )
+    parser.add_argument("--resume", action="store_true", help="start from DIR/pose.json, if it is there")
+    parser.add_argument(
+        "--weight", type=Path, help="image of the picture's size: how much a pixel counts, black not at all"
     )
     parser.add_argument("--fit-scale", action="store_true", help="also find the scale; the distance then stays")
     parser.add_argument("--fit-focal", action="store_true", help="also find the focal length")
@@ -49,12 +53,15 @@ def run(args: argparse.Namespace) -> int:
     picture, mask = read_picture(args.image)
     if args.mask is not None:
         mask = read_mask(args.mask)
-        if mask.shape != picture.shape[:2]:
-            raise ValueError(
-                f"{args.mask}: expected {size_text(picture)} pixels like {args.image}, got {size_text(mask)}"
-            )
+        check_size(mask, picture, args.mask, args.image)
+    weight = None
+    if args.weight is not None:
+        weight = read_mask(args.weight)
+        check_size(weight, picture, args.weight, args.image)
     if mask is not None and args.background is not None:
         raise ValueError("--background: expected none with a mask (or an image with alpha), got both; leave one out")
+    if args.resume and (args.out / "pose.json").exists():
+        args.init = args.out / "pose.json"
     init = None if args.init is None else read_pose(args.init)
     camera = read_view(args, scene, (picture.shape[0], picture.shape[1]), args.init)
     outputs.make_folder(args.out)
@@ -67,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     fit = fit_pose(
         scene, picture, camera, mask, None if init is None else init.matrix,
         fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=read_background(args.background, picture),
-        max_size=args.size, steps=args.steps, seed=args.seed, callback=save,
+        weight=weight, max_size=args.size, steps=args.steps, seed=args.seed, callback=save,
     )  # fmt: skip
     # Neither a full disk nor a closed terminal may lose the result: it is printed before the files are written, and they
     # are written also when printing failed.
@@ -80,8 +87,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print_fit(fit: PoseFit, focal: bool) -> None:
-    state = "interrupted" if fit.interrupted else "converged" if fit.converged else "not converged: try more --steps"
-    lines = [f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {state}", "mesh to world:"]
+    lines = [f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.state}", "mesh to world:"]
     lines += ["  " + "  ".join(f"{value:12.6f}" for value in row) for row in fit.matrix.tolist()]
     if focal:
         lines.append(f"focal length: {float(fit.camera.K[0, 0]):.6g} px")

@@ -3,24 +3,42 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from .arguments import CHECKPOINT
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from edgegrad import Camera, Scene
+    from edgegrad import Camera, Mesh, Scene
     from edgegrad.fit import Pose
 
 
 def read_scene(args: argparse.Namespace) -> Scene:
     """The mesh file, with --texture and --no-materials. Raises what load_scene raises, in words of the command line."""
-    from edgegrad import Scene, load_mesh, load_scene
+    from edgegrad import Scene, load_scene
 
-    try:
-        if args.texture is not None:
-            return Scene([load_mesh(args.mesh, args.texture)])
+    if args.texture is not None:
+        return Scene([read_mesh(args)])
+    with _in_words_of_the_shell():
         return load_scene(args.mesh, materials=not args.no_materials)
+
+
+def read_mesh(args: argparse.Namespace) -> Mesh:
+    """The mesh file as one mesh; see read_scene."""
+    from edgegrad import load_mesh
+
+    with _in_words_of_the_shell():
+        return load_mesh(args.mesh, args.texture, materials=not args.no_materials)
+
+
+@contextmanager
+def _in_words_of_the_shell() -> Iterator[None]:
+    try:
+        yield
     except (ValueError, FileNotFoundError) as error:
         raise type(error)(str(error).replace("pass materials=False", "pass --no-materials")) from error
 
@@ -42,7 +60,13 @@ def read_mask(path: Path) -> Tensor:
     return linear_to_srgb(mask) if path.suffix.lower() in DISPLAY else mask
 
 
-def size_text(image: Tensor) -> str:
+def check_size(image: Tensor, picture: Tensor, path: Path, like: Path) -> None:
+    """Raises ValueError."""
+    if image.shape[:2] != picture.shape[:2]:
+        raise ValueError(f"{path}: expected {_size(picture)} pixels like {like}, got {_size(image)}")
+
+
+def _size(image: Tensor) -> str:
     return f"{image.shape[1]} × {image.shape[0]}"
 
 
@@ -61,9 +85,7 @@ def read_background(text: str | None, picture: Tensor) -> Tensor | None:
             raise ValueError(f"--background: expected #rrggbb or an image file, got {text!r}") from None
     image = read_image(text, channels=3)
     if image.shape != picture.shape:
-        raise ValueError(
-            f"{text}: expected {size_text(picture)} pixels like the picture, got {size_text(image)}; resize it"
-        )
+        raise ValueError(f"{text}: expected {_size(picture)} pixels like the picture, got {_size(image)}; resize it")
     return image
 
 
@@ -103,6 +125,11 @@ def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | No
         return framing(scene, size or (512, 512), fov, args.eye, args.target, up)
     if size is None:
         return camera
+    return fitting(camera, size, source)
+
+
+def fitting(camera: Camera, size: tuple[int, int], source: Path) -> Camera:
+    """The camera for a picture of that size. Raises ValueError that names its file, unless they are in proportion."""
     (H, W), (h, w) = size, camera.size
     # More than a pixel apart when one is scaled to the other: not the same view.
     if abs(H * w - W * h) > max(H, W, h, w):
@@ -110,3 +137,25 @@ def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | No
             f"{source}: expected a camera for {W} × {H} pixels or in proportion, got {w} × {h}; crop alike"
         )
     return camera.resized(size)
+
+
+def read_views(args: argparse.Namespace) -> tuple[list[Camera], list[Tensor], list[Tensor | None]]:
+    """Cameras of the images' sizes, images (H, W, 3), and alphas (H, W). Raises ValueError."""
+    from edgegrad import load_camera
+
+    if len(args.camera) != len(args.images):
+        raise ValueError(f"--camera: expected {len(args.images)}, one for each image, got {len(args.camera)}")
+    cameras, pictures, alphas = [], [], []
+    for path, image in zip(args.camera, args.images, strict=True):
+        picture, alpha = read_picture(image)
+        cameras.append(fitting(load_camera(path), (picture.shape[0], picture.shape[1]), path))
+        pictures.append(picture)
+        alphas.append(alpha)
+    return cameras, pictures, alphas
+
+
+def descent(args: argparse.Namespace) -> dict[str, Any]:
+    """What arguments.add_descent asked for, as options of a fit."""
+    return {
+        "steps": args.steps, "spp": args.spp, "seed": args.seed, "checkpoint": args.out / CHECKPOINT, "resume": args.resume,
+    }  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from edgegrad.fit import PoseFit
+    from edgegrad.fit import Fit, PoseFit
 
 
 def make_folder(folder: Path) -> None:
@@ -33,15 +33,7 @@ def write_pose(folder: Path, fit: PoseFit) -> None:
 
 def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
     """The names of what was written; without the libraries of figures the pose alone. Raises OSError that names what was not."""
-    from edgegrad._files import require
-
-    names = ["pose.json"] + ["fit.png", "loss.png", "fit.webp"] * bool(fit.history)
-    try:
-        for module in ("matplotlib", "PIL"):
-            require(module, "edgegrad[figures]", "drawing a fit")
-    except ImportError as error:
-        print(f"edgegrad: no pictures: {error}", file=sys.stderr)
-        names = names[:1]
+    names = ["pose.json"] + ["fit.png", "loss.png", "fit.webp"] * bool(fit.history and _can_draw())
     for name in names:
         try:
             if name == "pose.json":
@@ -56,3 +48,24 @@ def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
                 f"{folder / name}: expected to write it, got: {error.strerror or error}; make room or rights"
             ) from error
     return names
+
+
+def finish(fit: Fit, folder: Path) -> int:
+    """Says how a fit by descent ended and writes it all; the exit code. Raises OSError."""
+    from . import INTERRUPTED
+
+    print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.state}", flush=True)
+    print(f"wrote {', '.join(fit.save(folder, figures=_can_draw()))} in {folder}")
+    return INTERRUPTED if fit.interrupted else 0
+
+
+def _can_draw() -> bool:
+    from edgegrad._files import require
+
+    try:
+        for module in ("matplotlib", "PIL"):
+            require(module, "edgegrad[figures]", "drawing a fit")
+    except ImportError as error:
+        print(f"edgegrad: no pictures: {error}", file=sys.stderr)
+        return False
+    return True

@@ -243,3 +243,75 @@ def test_texture_and_no_materials(tmp_path, capsys):
     assert run("render", tmp_path / "a.obj", "--no-materials", *more) == 0
     assert run("render", tmp_path / "a.obj", "--texture", tmp_path / "red.png", *more) == 0
     assert torch.allclose(read_image(tmp_path / "a.exr").amax((0, 1)), torch.tensor([1.0, 0.0, 0.0]))
+
+
+# -- the other fits ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def sphere(tmp_path):
+    """sphere.ply, and masks of it, a little larger, by three cameras."""
+    shape = trimesh.creation.icosphere(subdivisions=2)
+    shape.export(tmp_path / "sphere.ply")
+    larger = eg.Mesh(1.2 * torch.tensor(shape.vertices).float(), torch.tensor(shape.faces))
+    for k, eye in enumerate([(4.0, 0, 0), (0, 0.1, 4.0), (-2, 3, -1)]):
+        view = eg.Camera.look_at(eye, (0, 0, 0), (0.1, 0.9, 0.2), size=(32, 32))
+        save_camera(tmp_path / f"c{k}.json", view)
+        write_image(tmp_path / f"m{k}.png", eg.render(larger.replace(face_colors=torch.ones(320, 3)), view, spp=64))
+    return tmp_path
+
+
+def views_of(files):
+    return [files / f"m{k}.png" for k in range(3)] + ["--camera"] + [files / f"c{k}.json" for k in range(3)]
+
+
+def test_fit_shape(sphere, capsys):
+    out = sphere / "out"
+    options = ["--levels", 1, "--steps", 20, "--out", out]
+    assert run("fit-shape", sphere / "sphere.ply", *views_of(sphere), *options) == 0
+    found = eg.load_mesh(out / "mesh.ply")
+    assert 1.1 < float(found.verts.norm(dim=1).mean()) < 1.3
+    assert "not converged: the loss still falls" in capsys.readouterr().out
+    options[3] = 25
+    assert run("fit-shape", sphere / "sphere.ply", *views_of(sphere), *options, "--resume") == 0
+    assert json.loads((out / "fit.json").read_text())["steps"] == 25
+
+
+def test_fit_texture(sphere, capsys):
+    square = trimesh.Trimesh([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    uv = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]]).numpy()
+    square.visual = trimesh.visual.TextureVisuals(uv=uv)
+    square.export(sphere / "square.obj")
+    view = eg.Camera.look_at((0.3, 0.2, 3.0), (0, 0, 0), size=(32, 32))
+    save_camera(sphere / "c.json", view)
+    plain = eg.Mesh(torch.tensor(square.vertices), torch.tensor(square.faces))
+    write_image(sphere / "p.png", eg.render(plain, view, spp=64) * torch.tensor([1.0, 0.5, 0.2]))
+    options = ["--size", 8, "--steps", 60, "--out", sphere / "out"]
+    assert run("fit-texture", sphere / "square.obj", sphere / "p.png", "--camera", sphere / "c.json", *options) == 0
+    texture = read_image(sphere / "out" / "texture.png", channels=3)
+    torch.testing.assert_close(
+        texture.flatten(0, 1).median(0).values, 0.7 * torch.tensor([1.0, 0.5, 0.2]), atol=0.05, rtol=0
+    )
+    assert (
+        run("fit-texture", sphere / "square.obj", sphere / "p.png", "--camera", *2 * [sphere / "c.json"], *options) == 2
+    )
+    assert "--camera: expected 1, one for each image, got 2" in capsys.readouterr().err
+
+
+def test_fit_camera(files, capsys):
+    out = files / "out"
+    said = ["fit-camera", files / "mesh.ply", files / "target.png", "--camera", files / "camera.json", "--steps", 4]
+    assert run(*said, "--no-focal", "--out", out) == 0
+    assert run(*said, "--no-focal", "--out", out, "--resume") == 0
+    found, true = eg.load_camera(out / "camera.json"), camera(48)
+    torch.testing.assert_close(found.world_to_camera.double(), true.world_to_camera, atol=0.05, rtol=0)
+    assert "focal length" in capsys.readouterr().out
+
+
+def test_fit_pose_resumes(files):
+    out = files / "out"
+    assert fit(files, "--init", files / "init.json", "--steps", 5, "--out", out) == 0
+    first = PoseFit.from_json((out / "pose.json").read_text())
+    assert fit(files, "--resume", "--steps", 5, "--out", out) == 0
+    again = PoseFit.from_json((out / "pose.json").read_text())
+    assert sum(errors(again)) <= sum(errors(first)) + 0.5

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
 from types import ModuleType
 
+import pytest
 import torch
 
 FOLDER = Path(__file__).parents[1] / "examples"
+sys.path.append(str(FOLDER))  # where they find one another
 
 
 def example(name: str) -> ModuleType:
@@ -59,12 +62,51 @@ def test_a_shape_and_its_shadow() -> None:
     assert after < 0.4 * before
 
 
+def test_a_pose_of_which_a_quarter_is_covered() -> None:
+    pose = example("pose")
+    before, after, fit = pose.trial(pose.objects.pebble(64, 3), "covered", seed=1, size=64)
+    assert before > 10.0 and after < 1.0 and fit.converged and fit.explained < 0.9
+
+
+def test_a_focal_length_and_a_pose() -> None:
+    focal = example("focal")
+    before, after, fit = focal.trial(focal.objects.pebble(64, 3), seed=2, size=96)
+    assert abs(before) > 3.0 and abs(after) < 1.0 and fit.converged
+
+
+def test_a_texture() -> None:
+    texture = example("texture")
+    mesh = texture.objects.pebble(64, 3)
+    found = texture.fit(mesh, size=64, texels=64, steps=40, progress=False)
+    assert texture.held_out(mesh, found.mesh, size=64) > 25.0
+
+
+@pytest.mark.slow
+def test_a_pose_before_an_unknown_background() -> None:
+    pose = example("pose")
+    _, after, fit = pose.trial(pose.objects.pebble(), "unknown", seed=1, size=128)
+    assert after < 1.0 and fit.converged
+
+
+@pytest.mark.slow
+def test_a_shape() -> None:
+    shape = example("shape")
+    stone = shape.stone(4)
+    found = shape.fit(stone, views=8, size=96, levels=2, steps=60, progress=False)
+    assert shape.chamfer(found.mesh, stone) < 1.0
+
+
 def test_there_is_no_other() -> None:
     assert sorted(path.stem for path in FOLDER.glob("*.py")) == [
+        "focal",
         "harmonics",
         "mirror",
         "network",
+        "objects",
+        "pose",
         "shadow",
+        "shape",
         "step",
         "sun",
+        "texture",
     ]

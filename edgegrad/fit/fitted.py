@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from .._files import PathLike, replacing, require
+from .._files import PathLike, replacing
 from ..aovs import render_aovs
 from ..camera import Camera
+from ..exchange import save_mesh
 from ..image import write_image
 from ..io import save_camera
 from ..mesh import Mesh
@@ -103,7 +103,7 @@ class Fit:
 
         return curves(self.history)
 
-    def save(self, folder: PathLike) -> list[str]:
+    def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Writes all of it to a folder, which is made where it is missing, and gives the files' names:
 
         fit.json      loss, state, cameras, and values of up to 64 numbers
@@ -111,9 +111,9 @@ class Fit:
         history.json  loss, gradient norms and small values of each step
         mesh*.ply     the shapes that moved, texture*.png their textures, as sRGB
         camera*.json  the cameras, as load_camera reads them
-        fit.png       plot(), loss.png: plot_history()
+        fit.png       plot(), loss.png: plot_history(); not with figures=False
 
-        Each file is written whole or not at all. Raises OSError.
+        Each file is written whole or not at all. Raises OSError, or at last ImportError when matplotlib is missing.
         """
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,7 @@ class Fit:
         for i, mesh in enumerate(self.scene.meshes):
             number = "" if len(self.scene.meshes) == 1 else str(i)
             if any(name.endswith("verts") for name in self.values):
-                write_ply(out / f"mesh{number}.ply", mesh)
+                save_mesh(out / f"mesh{number}.ply", mesh)
                 written.append(f"mesh{number}.ply")
             if mesh.texture is not None and mesh.texture.shape[-1] in (1, 3):
                 write_image(out / f"texture{number}.png", mesh.texture.clamp(0.0, 1.0))
@@ -141,10 +141,10 @@ class Fit:
             name = f"camera{'' if len(self.cameras) == 1 else i}.json"
             save_camera(out / name, camera)
             written.append(name)
-        figures = {"fit.png": self.plot} | ({"loss.png": self.plot_history} if self.history else {})
-        for name, draw in figures.items():
+        draw = {"fit.png": self.plot} | ({"loss.png": self.plot_history} if self.history else {})
+        for name in draw if figures else ():
             with replacing(out / name) as temporary:
-                draw().savefig(temporary)
+                draw[name]().savefig(temporary)
             written.append(name)
         return written
 
@@ -181,11 +181,3 @@ def _plain(record: Record) -> dict[str, Any]:
         "values": values,
         "rate": record.rate,
     }
-
-
-def write_ply(path: PathLike, mesh: Mesh) -> None:
-    """Vertices and faces. Raises OSError."""
-    trimesh = require("trimesh", "trimesh", "writing a mesh")
-    shape = trimesh.Trimesh(mesh.verts.detach().numpy(), np.asarray(mesh.faces), process=False)
-    with replacing(path) as temporary:
-        shape.export(temporary)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -66,6 +67,8 @@ def fit_shape(
         check_positive(name, value, least=0.0, most=1e9)
     if faces is not None:
         check_positive_int("faces", faces)
+    if levels > 1:
+        _gpytoolbox()  # before the first level rather than after it
     views = views_of(cameras, images, masks, weights)
     behind = None if masks is not None else background
     bare = Mesh(mesh.verts.detach().cpu().float().clone(), mesh.faces.detach().cpu().clone())
@@ -145,11 +148,14 @@ class _Search:
 
 def remeshed(mesh: Mesh, faces: int) -> Mesh:
     """About so many even triangles on the same surface (Botsch and Kobbelt 2004), by gpytoolbox. Raises ImportError."""
-    gpytoolbox = require("gpytoolbox", "edgegrad[fit]", "remeshing")
     a, b, c = mesh.verts.double()[mesh.faces.long()].unbind(1)
     area = 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
     edge = math.sqrt(4.0 * area / (math.sqrt(3.0) * faces))  # of equilateral triangles
-    verts, triangles = gpytoolbox.remesh_botsch(
+    verts, triangles = _gpytoolbox().remesh_botsch(
         mesh.verts.double().numpy(), mesh.faces.numpy().astype(np.int32), REMESHING, edge, True
     )
     return Mesh(torch.from_numpy(verts).to(mesh.verts.dtype), torch.from_numpy(triangles.astype(np.int64)))
+
+
+def _gpytoolbox() -> ModuleType:
+    return require("gpytoolbox", "edgegrad[fit]", "remeshing")
