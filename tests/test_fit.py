@@ -67,7 +67,9 @@ def errors(fit, R=None):
     return degrees, 100.0 * float(moved.norm()) / 2.62
 
 
-@pytest.mark.parametrize("background", [BACKGROUND, None, "image"], ids=["colour", "border", "image"])
+@pytest.mark.parametrize(
+    "background", [pytest.param(BACKGROUND, marks=pytest.mark.slow), None, "image"], ids=["colour", "border", "image"]
+)
 def test_finds_the_pose(background, capsys):
     view = camera()
     if background == "image":
@@ -84,7 +86,7 @@ def test_finds_the_pose(background, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+@pytest.mark.parametrize("mode", [pytest.param(torch.no_grad, marks=pytest.mark.slow), torch.inference_mode])
 def test_where_gradients_are_off(mode):
     """A fit takes gradients of its own, also of what was made there."""
 
@@ -104,7 +106,7 @@ def test_where_gradients_are_off(mode):
     assert expected.loss < 0.3 * expected.history[0].loss
 
 
-@pytest.mark.parametrize("plain", [False, True], ids=["coloured", "plain"])
+@pytest.mark.parametrize("plain", [pytest.param(False, marks=pytest.mark.slow), True], ids=["coloured", "plain"])
 def test_finds_the_pose_with_a_mask(plain):
     view = camera()
     clutter = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
@@ -171,9 +173,9 @@ def test_a_picture_larger_than_max_size_is_reduced():
 
 
 def test_the_same_seed_gives_the_same_fit():
-    view = camera(48)
+    view = camera(24)
     fits = [
-        fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, seed=s, steps=5, progress=False)
+        fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, seed=s, steps=2, progress=False)
         for s in (3, 3, 4)
     ]
     assert torch.equal(fits[0].matrix, fits[1].matrix)
@@ -203,7 +205,7 @@ def test_interruption_keeps_the_best_pose():
 
 
 def test_json_round_trip():
-    view = camera(48)
+    view = camera(24)
     fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, steps=2, progress=False)
     back = PoseFit.from_json(fit.to_json())
     torch.testing.assert_close(back.matrix, fit.matrix, rtol=0, atol=1e-12)

@@ -88,7 +88,7 @@ FIT_POSE = edgegrad.fit.fit_pose
 
 
 @linux
-@pytest.mark.parametrize("kills", [5, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [3, pytest.param(60, marks=pytest.mark.slow)])
 def test_a_killed_fit_leaves_the_best_pose_so_far(files, kills, monkeypatch):
     monkeypatch.setattr(edgegrad.fit, "fit_pose", told_fit)
     chance = random.Random(kills)
@@ -138,7 +138,7 @@ def is_a_result(printed):
     return rows[3] == [0.0, 0.0, 0.0, 1.0] and all(len(row) == 4 for row in rows) and "loss" in lines[at - 1]
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES])
+@pytest.mark.parametrize("code", [errno.ENOSPC, pytest.param(errno.EACCES, marks=pytest.mark.slow)])
 def test_a_fit_that_cannot_be_written_is_printed(files, code, monkeypatch, capsys):
     """As on a full disk, where the rights are taken away meanwhile, and so on."""
 

@@ -21,7 +21,7 @@ def covered(view, image):
     return cover + (1.0 - cover) * image, 1.0 - cover
 
 
-@pytest.mark.parametrize("how", ["alone", "weight"])
+@pytest.mark.parametrize("how", ["alone", pytest.param("weight", marks=pytest.mark.slow)])
 def test_a_quarter_covered(how):
     view = camera(64)
     image, free = covered(view, picture(view))
@@ -40,11 +40,12 @@ def test_a_border_of_many_colours_is_clutter():
     assert is_clutter(picture(view, background=clutter)) and not is_clutter(picture(view))
 
 
-def test_what_is_not_in_the_picture_is_not_found():
+@pytest.mark.parametrize("steps", [10, pytest.param(21, marks=pytest.mark.slow)])  # the latter with other starts
+def test_what_is_not_in_the_picture_is_not_found(steps):
     """A picture of something else: the fit ends somewhere, and says that the picture does not show it."""
     cells = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
     image = torch.nn.functional.interpolate(cells, (32, 32), mode="bicubic")[0].movedim(0, -1)
-    fit = fit_pose(bracket(), image, camera(32), background=BACKGROUND, steps=21, progress=False)
+    fit = fit_pose(bracket(), image, camera(32), background=BACKGROUND, steps=steps, progress=False)
     assert not fit.converged and fit.explained < 0.5
     assert fit.state.startswith("not converged: the picture shows")
 
