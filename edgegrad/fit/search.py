@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import roma
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -187,6 +186,8 @@ class Search:
 
 def _distinct(poses: list[Pose], most: int) -> list[Pose]:
     """The first ones that are turned apart from one another."""
+    import roma  # late, as in PoseTask.moved
+
     kept: list[Pose] = []
     for pose in poses:
         if all(float(roma.rotmat_geodesic_distance(pose.R, other.R)) > 0.5 * ASIDE for other in kept):

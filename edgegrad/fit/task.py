@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import roma
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -185,6 +184,8 @@ class PoseTask:
 
     def moved(self, pose: Pose, free: list[int], p: Tensor) -> Pose:
         """The pose after a step whose entries `free` are p, the others zero; differentiable in p."""
+        import roma  # late: it brings torch's compiler, which takes longer to import than torch itself
+
         step = p.new_zeros(ENTRIES).index_put((torch.tensor(free),), p)
         camera = self.shots[0].camera
         view = camera.world_to_camera
