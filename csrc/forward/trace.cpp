@@ -50,32 +50,30 @@ RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRa
 
 template <class T>
 void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, uint8_t* out) {
+    RayBatch batch;
     for (int64_t first = 0; first < lines.size; first += RayBatch::size) {
-        const int n = int(std::min<int64_t>(RayBatch::size, lines.size - first));
+        batch.count = int(std::min<int64_t>(RayBatch::size, lines.size - first));
         Ray ray[RayBatch::size];
         double contact[RayBatch::size];
-        for (int i = 0; i < n; ++i) {
+        for (int i = 0; i < batch.count; ++i) {
             const int64_t k = first + i, face = lines.face[k];
             const double u = lines.b[2 * k], v = lines.b[2 * k + 1];
             const Vec3 from =
                 (1 - u - v) * corner(scene, face, 0) + u * corner(scene, face, 1) + v * corner(scene, face, 2);
             ray[i] = {from, vec(lines.to + 3 * k) - from, 1};
             contact[i] = lines.contact[k] / length(ray[i].direction);
+            batch.set(i, caster.frame(), ray[i]);
         }
-        int32_t hidden_by[RayBatch::size];
-        std::vector<int32_t> without[RayBatch::size];
-        for (int i = 0; i < n; ++i) without[i] = {lines.face[first + i]};
-        // How faces that share a vertex with the point's own lie to it is exact, however near they are.
-        cast_each(
-            caster, n, hidden_by, without, [&](int i) { return ray[i]; },
-            [&](int i, int32_t face) {
-                const Meeting m = meet(scene, face, ray[i]);
-                const double nearest =
-                    share_vertex(scene, face, lines.face[first + i]) ? Meeting::rounding : contact[i];
-                return m.exists() && m.inside() && m.t > nearest && m.t < 1 - contact[i] &&
-                       shows(scene, face, inside({m.u, m.v}));
-            });
-        for (int i = 0; i < n; ++i) out[first + i] = hidden_by[i] < 0;
+        caster.cast_occluded_through(batch, [&](int i, int32_t face) {
+            const int32_t own = lines.face[first + i];
+            if (face == own) return false;
+            const Meeting m = meet(scene, face, ray[i]);
+            // How faces that share a vertex with the point's own lie to it is exact, however near they are.
+            const double nearest = share_vertex(scene, face, own) ? Meeting::rounding : contact[i];
+            return m.exists() && m.inside() && m.t > nearest && m.t < 1 - contact[i] &&
+                   shows(scene, face, inside({m.u, m.v}));
+        });
+        for (int i = 0; i < batch.count; ++i) out[first + i] = !batch.hidden[i];
     }
 }
 

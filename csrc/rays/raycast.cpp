@@ -418,9 +418,11 @@ void RayCaster::cast(RayBatch& batch, const Ignored* ignored, const Decision& me
     batch.read_faces();
 }
 
+void RayCaster::cast_occluded(RayBatch& batch, const Ignored* ignored) const { cast_occluded(batch, ignored, nullptr); }
+
 // Embree moves the end of a ray that met something to −∞.
-void RayCaster::cast_occluded(RayBatch& batch, const Ignored* ignored) const {
-    trace(batch, Query::any, ignored, nullptr);
+void RayCaster::cast_occluded(RayBatch& batch, const Ignored* ignored, const Decision* meets) const {
+    trace(batch, Query::any, ignored, meets);
     std::visit(
         [&](const auto& packets) {
             const int width = RayBatch::size / int(packets.size());

@@ -105,6 +105,10 @@ class RayCaster {
     // Whether a ray meets any face.
     void cast_occluded(RayBatch& batch, const Ignored* ignored = nullptr) const;
 
+    // The same of the faces that `meets(ray, face)` does not refuse.
+    template <class Meets>
+    void cast_occluded_through(RayBatch& batch, const Meets& meets) const;
+
     // Embree's part of cast() alone, to be timed.
     void trace(RayBatch& batch) const { trace(batch, Query::closest, nullptr, nullptr); }
 
@@ -117,6 +121,9 @@ class RayCaster {
     };
     void trace(RayBatch& batch, Query query, const Ignored* ignored, const Decision* meets) const;
     void cast(RayBatch& batch, const Ignored* ignored, const Decision& meets) const;
+    void cast_occluded(RayBatch& batch, const Ignored* ignored, const Decision* meets) const;
+    template <class Meets>
+    static Decision decision(const Meets& meets);
 
     void set_frame(const double* verts, Team& team);
     void build();
@@ -160,10 +167,21 @@ class RayBatch {
 };
 
 template <class Meets>
+RayCaster::Decision RayCaster::decision(const Meets& meets) {
+    return {
+        [](const void* data, int ray, int32_t face) -> bool { return (*static_cast<const Meets*>(data))(ray, face); },
+        &meets};
+}
+
+template <class Meets>
 void RayCaster::cast_through(RayBatch& batch, const Ignored* ignored, const Meets& meets) const {
-    cast(batch, ignored,
-         {[](const void* data, int ray, int32_t face) -> bool { return (*static_cast<const Meets*>(data))(ray, face); },
-          &meets});
+    cast(batch, ignored, decision(meets));
+}
+
+template <class Meets>
+void RayCaster::cast_occluded_through(RayBatch& batch, const Meets& meets) const {
+    const Decision asked = decision(meets);
+    cast_occluded(batch, nullptr, &asked);
 }
 
 }  // namespace edgegrad
