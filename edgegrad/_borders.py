@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ._check import values_visible
-from ._steps import FLOOR, SIGN
+from ._steps import FLOOR
 from .hits import Hits
 
 MOST = 8  # points of a face in a pixel
@@ -32,26 +32,24 @@ class Borders:
 
     def add(self, pixel: Tensor, hits: Hits) -> None:
         """Points of the pixels (N,), after they were shaded."""
-        sides = list(zip(hits._steps.kinds, hits._steps.values, strict=True))
-        # Where a light has an extent each point sees another part of it, and what neighbours see says nothing of borders. Points
-        # that see neither side of a shadow are not asked.
+        steps = list(zip(hits._steps.kinds, hits._steps.values, strict=True))
+        self._known = self._known and values_visible(*(values for _, values in steps if values is not None))
+        # Where a light has an extent each point sees another part of it, and what neighbours see says nothing of borders.
         lights = [k for k, light in enumerate(hits.lights) if light.punctual]
-        sides += [(SIGN, hits.lit[k] - 0.5 if k in hits.lit else None) for k in lights]
-        self._known = self._known and values_visible(*(values for _, values in sides if values is not None))
-        if not self._known or not sides:
+        if not self._known or not (steps or lights):
             return
+        sides = [None if values is None else _sides(kind, values) for kind, values in steps]
+        sides += [hits.lit.get(k) for k in lights]
         self._points += torch.bincount(pixel, minlength=len(self._points)).int()
-        for k, (kind, values) in enumerate(sides):
+        for k, side in enumerate(sides):
             if k == len(self._least):
                 self._least.append(torch.full_like(self._points, LEVELS, dtype=torch.int16))
                 self._greatest.append(torch.full_like(self._points, -1, dtype=torch.int16))
-            if values is None:
+            if side is None:
                 continue
-            values = values.detach().cpu().double()
-            asked = torch.isfinite(values)
-            side = (values.floor() % LEVELS if kind == FLOOR else values > 0)[asked].to(torch.int16)
-            self._least[k].scatter_reduce_(0, pixel[asked], side, "amin")
-            self._greatest[k].scatter_reduce_(0, pixel[asked], side, "amax")
+            side = side.cpu().to(torch.int16)
+            self._least[k].scatter_reduce_(0, pixel, torch.where(side < 0, LEVELS, side), "amin")
+            self._greatest[k].scatter_reduce_(0, pixel, side, "amax")
 
     def found(self) -> tuple[Tensor, int]:
         """The pixels (H, W) bool, and how many points of each face in them are to be shaded."""
@@ -63,6 +61,13 @@ class Borders:
             differ |= (low < high) & (high >= 0)
         first, there = int(self._points.sum()), int(self._points[differ.reshape(-1)].sum())
         return differ, min(MOST, max(2, SHARE * first // max(there, 1)))
+
+
+def _sides(kind: str, values: Tensor) -> Tensor:
+    """(N,) int16: on which side of a step points are; −1 where it was not asked."""
+    values = values.detach()
+    side = values.double().nan_to_num().floor() % LEVELS if kind == FLOOR else values > 0
+    return side.to(torch.int16).masked_fill(~torch.isfinite(values), -1)
 
 
 def _around(values: Tensor, outside: int) -> Tensor:

@@ -42,8 +42,7 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
     found of shadows is noted in the hits."""
     surfaces, view = hits._surfaces, hits._view
     assert isinstance(view, View)
-    tables = _Tables()
-    layout = _Layout.of(surfaces, view, tables)
+    layout, tables = _layout(surfaces, view)
     forced = hits._forced
     points = _Points(
         hits._face.cpu(),
@@ -52,17 +51,16 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
     )
     number = -1 if forced is None else forced.light
     casters = surfaces.casters
-    shading = _Shading(layout, len(tables.tensors), number, shadows, samples, casters.cutoffs, casters.spacing)
+    shading = _Shading(layout, len(tables), number, shadows, samples, casters.cutoffs, casters.spacing)
     arrays = (part for part in casters if isinstance(part, Tensor))
-    found, seen = apply(shading, [hits._exact.cpu(), *points, *tables.tensors, *arrays])
+    found, seen = apply(shading, [hits._exact.cpu(), *points, *tables, *arrays])
     column = 0
     for light, casting in enumerate(surfaces.scene.casting):
         own = seen[:, column]
-        asked = own >= 0
-        if shadows and bool(asked.any()):
+        if shadows and bool((own >= 0).any()):
             surfaces.shadowing.add(light)
             if casting.punctual:
-                hits._noted(light, torch.where(asked, own.float(), torch.nan).to(surfaces.verts))
+                hits._noted(light, own)
         column += 1 if casting.punctual else samples
     return found.to(surfaces.verts)
 
@@ -137,6 +135,17 @@ class _Layout(NamedTuple):
         return core.Lit(
             tables=[array(t) for t in tables], faces=array(faces), step=[s & _64_BITS for s in STEPS], **parts
         )
+
+
+def _layout(surfaces: Surfaces, view: View) -> tuple[_Layout, list[Tensor]]:
+    """How surfaces and a view are tables, and these; the same for all points that have no derivatives."""
+    if surfaces.layout is None or surfaces.layout[0] is not view:
+        tables = _Tables()
+        found = view, _Layout.of(surfaces, view, tables), tables.tensors
+        if surfaces.has_derivatives:
+            return found[1:]
+        surfaces.layout = found
+    return surfaces.layout[1:]
 
 
 def _mesh(mesh: Mesh, first_face: int, first_vertex: int, tables: _Tables) -> Any:

@@ -118,7 +118,8 @@ def shaded_room(request: Request, gradient: bool | None = None) -> AbstractConte
 
 def barycentrics(b: Tensor) -> Tensor:
     """(N, 3) from the last two."""
-    return torch.cat([1 - b.sum(-1, keepdim=True), b], -1)
+    u, v = b.unbind(-1)
+    return torch.stack([1 - (u + v), u, v], -1)
 
 
 def _record(kind: Any, arrays: dict[str, np.ndarray]) -> Any:
@@ -249,8 +250,10 @@ class Sampler:
 
         return _of_values(request.pack(), with_request, *more)
 
-    def pixel_hits(self, at_once: int, most: int = 1, only: Tensor | None = None) -> Iterator[PixelRecords]:
-        """Those of the image, some `at_once` rows of pixels after another; at `most` samples of a pixel on one face each.
+    def pixel_hits(
+        self, at_once: int, most: int = 1, only: Tensor | None = None
+    ) -> Iterator[tuple[range, PixelRecords]]:
+        """Pixels, row by row, and what they hit, some `at_once` after another; at `most` samples of a pixel on one face each.
 
         only   (H, W) bool: of these pixels, after those of all; which of their samples these are is drawn independently
         """
@@ -279,7 +282,7 @@ class Sampler:
                 )
                 return _record(PixelRecords, found)
 
-            yield PixelRecords(*self._compute(self._request, compute, *places))
+            yield range(first * width, end * width), PixelRecords(*self._compute(self._request, compute, *places))
 
     def samples(
         self, request: Request, interior: bool, boundary: bool, intrinsics: bool = False, steps: bool = False

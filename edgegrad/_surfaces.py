@@ -34,6 +34,8 @@ class Surfaces:
         self.jumping: dict[Any, Callable[[], Tensor]] = {}  # (F, 3, K) at corners, of what may jump
         self.shadowing: set[int] = set()  # lights, in scene.casting, of which a shader asks for shadows
         self.pyramids: dict[int, tuple[Tensor, list[Tensor]]] = {}  # of textures, by their ids
+        self.layout: Any = None  # as the kernel shades them, kept where nothing has derivatives (_lit_kernel.py)
+        self.has_derivatives = True
 
     def detach(self) -> Surfaces:
         """The same without derivatives; what it notes is noted for both."""
@@ -42,6 +44,7 @@ class Surfaces:
         for name in ("bare", "casters", "corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
             other.__dict__.pop(name, None)
         other.verts, other.scene, other.pyramids = self.verts.detach(), self.scene.detach(), {}
+        other.layout, other.has_derivatives = None, False
         return other
 
     @cached_property

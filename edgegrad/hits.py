@@ -63,9 +63,8 @@ class Hits:
         self._barycentrics = barycentrics.to(surfaces.verts.dtype)
         self._pixel, self._steps = pixel, steps or Steps()
         self._whole: tuple[Hits, Tensor] | None = None  # of which these are some points, the rows of these
-        self.lit: dict[
-            int, Tensor
-        ] = {}  # (N,) by lights of scene.casting: visible_from(), not numbers where it was not asked
+        # (N,) int8, by lights of scene.casting: visible_from(), −1 where it was not asked
+        self.lit: dict[int, Tensor] = {}
 
     def __len__(self) -> int:
         return len(self._face)
@@ -420,18 +419,23 @@ class Hits:
                 # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
                 spacing = max(spacing, 2.0**-40)
         lit = visible(s.casters, self._face, self._exact[:, 1:], place, 16 * spacing * size)
-        lit = self._noted(index, lit.to(self.position.dtype))
+        self._noted(index, lit)
+        lit = lit.to(self.position.dtype)
         if forced is None or forced.light != index:
             return lit
         return torch.where(forced.some, forced.lit.to(lit), lit)
 
-    def _noted(self, light: int, lit: Tensor) -> Tensor:
-        """Known to the whole of which these are some points."""
-        whole, rows = self._whole or (self, torch.arange(len(self), device=lit.device))
-        if values_visible(lit):
-            known = whole.lit.setdefault(light, lit.new_full((len(whole),), torch.nan))
-            known.index_copy_(0, rows, lit.detach())
-        return lit
+    def _noted(self, light: int, lit: Tensor) -> None:
+        """Known to the whole of which these are some points: 1 or 0, and −1 where it was not asked."""
+        if not values_visible(lit):
+            return
+        lit = lit.to(torch.int8)
+        if self._whole is None:
+            self.lit[light] = lit
+            return
+        whole, rows = self._whole
+        known = whole.lit.setdefault(light, lit.new_full((len(whole),), -1))
+        known.index_copy_(0, rows, lit)
 
     def knows_light(self, light: Light) -> bool:
         """Whether the points of a light are given here, for all the border of one shadow."""

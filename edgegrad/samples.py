@@ -100,9 +100,10 @@ class Frame:
         b = self.view.barycentrics(self.surfaces, face, self.here(along))
         return Hits(self.surfaces, self.view, face, b, self.here(x), self.sampler.rays_at, seed=seed)
 
-    def image(self, pixel: Tensor, values: Tensor) -> Tensor:
-        """(H · W, C): the sums of rows of values (N, C) by pixel."""
-        return values.new_zeros((self.pixels, values.shape[1])).index_add(0, self.here(pixel), values)
+    def image(self, pixel: Tensor, values: Tensor, pixels: range | None = None) -> Tensor:
+        """(H · W, C), or of these pixels: the sums of rows of values (N, C) by pixel."""
+        pixels = pixels or range(self.pixels)
+        return values.new_zeros((len(pixels), values.shape[1])).index_add(0, self.here(pixel) - pixels.start, values)
 
     def splat(self, x: Tensor, values: Tensor) -> Tensor:
         """(H · W, C): Σ k(x − c) · value over points x (S, 2) with values (S, C), for pixels with centres c."""
@@ -130,7 +131,7 @@ class PrimaryHits:
 
     def __init__(self, scene: Scene, request: Request) -> None:
         self.frame = frame = Frame(scene, request)
-        (found,) = frame.sampler.pixel_hits(ALL_AT_ONCE)
+        ((_, found),) = frame.sampler.pixel_hits(ALL_AT_ONCE)
         seed = frame.seeds("image", len(found.face))
         self.hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, seed)
         self.index, self.weight = frame.here(found.pixel), frame.here(found.weight).to(frame.dtype)

@@ -47,6 +47,11 @@ class Effort(NamedTuple):
     blended: bool = False  # whether one may see through surfaces
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
 
+    @property
+    def at_once(self) -> int:
+        """Points of the image that are shaded together."""
+        return 2 * AT_ONCE if self.keeps_little else AT_ONCE
+
 
 def render_shaded(
     scene: Scene,
@@ -107,28 +112,30 @@ class _Image:
         frame = self._frame
         borders = Borders((frame.height, frame.width))
         with torch.no_grad():
-            image: Any = 0
+            parts: list[Tensor] = []
             count = 0
-            for found in frame.sampler.pixel_hits(AT_ONCE, self._effort.points):
-                sums, hits = self._shaded(found, count)
+            for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, self._effort.points):
+                sums, hits = self._shaded(found, pixels, count)
                 count += len(found.face)
-                image = image + sums
+                parts.append(sums)
                 borders.add(found.pixel, hits)
+            image = torch.cat(parts)
             again, most = borders.found() if frame.request.image.spp > 1 else (None, 1)
             if again is not None and bool(again.any()):
-                image = image.masked_fill(frame.here(again).reshape(-1, 1), 0.0)
-                for found in frame.sampler.pixel_hits(AT_ONCE, most, again):
-                    image = image + self._shaded(found, count)[0]
+                parts = []
+                for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, most, again):
+                    parts.append(self._shaded(found, pixels, count)[0])
                     count += len(found.face)
+                image = torch.where(frame.here(again).reshape(-1, 1), torch.cat(parts), image)
         return frame.composed(image, self._background)
 
-    def _shaded(self, found: PixelRecords, first: int) -> tuple[Tensor, Hits]:
-        """(H · W, C) what hits add to the image, the `first` of those shaded so far and those after it, and the hits."""
+    def _shaded(self, found: PixelRecords, pixels: range, first: int) -> tuple[Tensor, Hits]:
+        """(pixels, C) what hits add to the image, the `first` of those shaded so far and those after it, and the hits."""
         frame = self._frame
         hits = frame.fixed_hits(found.face, found.b, found.x, frame.seeds("image", len(found.face), first))
         radiance = self._shade(hits).detach()
         weighted = radiance * frame.here(found.weight).to(radiance.dtype)[:, None]
-        return frame.image(found.pixel, weighted), hits
+        return frame.image(found.pixel, weighted, pixels), hits
 
     @cached_property
     def _behind_all(self) -> Tensor | None:

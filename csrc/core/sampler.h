@@ -15,9 +15,17 @@ inline uint64_t mix(uint64_t x) {
     return x ^ (x >> 31);
 }
 
-inline uint64_t hash(uint64_t seed, uint64_t a, uint64_t b = 0) {
-    return mix(mix(mix(seed + 0x9e3779b97f4a7c15ull) + a + 0x9e3779b97f4a7c15ull) + b + 0x9e3779b97f4a7c15ull);
-}
+// Of two numbers and any third, of which many are asked.
+class Hash {
+   public:
+    Hash(uint64_t seed, uint64_t a) : before_(mix(mix(seed + odd) + a + odd)) {}
+    uint64_t operator()(uint64_t b) const { return mix(before_ + b + odd); }
+
+   private:
+    static constexpr uint64_t odd = 0x9e3779b97f4a7c15ull;
+    uint64_t before_;
+};
+inline uint64_t hash(uint64_t seed, uint64_t a, uint64_t b = 0) { return Hash(seed, a)(b); }
 
 // Second argument of the hashes for the gradient's samples, so that they never meet those of a pixel of the image.
 constexpr uint64_t gradient_stream = 1;

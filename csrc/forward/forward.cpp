@@ -16,6 +16,7 @@
 #include "camera/windows.h"
 #include "core/channels.h"
 #include "core/sampler.h"
+#include "forward/reachable.h"
 #include "forward/side.h"
 #include "shading/shade.h"
 
@@ -316,67 +317,6 @@ class PixelRow {
     std::vector<double> sum_, radiance_;
 };
 
-// The pixels whose samples may hit something: those in an octagon around the images of all vertices of faces, if these
-// lie before the eye of a pinhole. With a pixel more on each side, for Embree sees positions rounded to floats.
-class ReachablePixels {
-   public:
-    ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius, Team& team)
-        : width_(camera.width), margin_(radius + 1) {
-        std::vector<Bounds> of_block(Team::blocks(q.size()));
-        team.each_block(q.size(), [&](int64_t k, int64_t first, int64_t last) {
-            Bounds b;
-            for (int64_t v = first; v < last; ++v) {
-                if (!caster.uses(v)) continue;
-                const Vec2 x = project(camera, q[v]);
-                const double far = std::max(std::fabs(x.x), std::fabs(x.y));
-                if (!(camera.depth_weight(q[v]) > 0) || !std::isfinite(far) || !camera.is_straight()) {
-                    b = Bounds::everything();
-                    break;
-                }
-                b.add(0, x.x), b.add(1, x.y);
-                // Of what lies far outside, floats do not say where its sides pass the picture.
-                if (far < 1e5) b.add(2, x.x + x.y), b.add(3, x.x - x.y);
-                else b.low[2] = b.low[3] = -infinite, b.high[2] = b.high[3] = infinite;
-            }
-            of_block[k] = b;
-        });
-        for (const Bounds& b : of_block)
-            for (int k = 0; k < 4; ++k) bounds_.add(k, b.low[k]), bounds_.add(k, b.high[k]);
-    }
-
-    // In row y, half open.
-    struct Range {
-        int first, end;
-    };
-    Range row(int y) const {
-        const Bounds& b = bounds_;
-        const double low = y - margin_, high = y + 1 + margin_;
-        if (b.high[1] < low || b.low[1] > high) return {0, 0};
-        const double from = std::max({b.low[0], b.low[2] - high, b.low[3] + low});
-        const double to = std::min({b.high[0], b.high[2] - low, b.high[3] + high});
-        const auto pixel = [&](double x) { return int(std::clamp(x, 0.0, double(width_))); };
-        return {pixel(from - margin_), pixel(to + margin_ + 1)};
-    }
-
-   private:
-    static constexpr double infinite = std::numeric_limits<double>::infinity();
-    // Of x, y, x + y and x − y, px.
-    struct Bounds {
-        double low[4], high[4];
-
-        Bounds() { std::fill(low, low + 4, infinite), std::fill(high, high + 4, -infinite); }
-        static Bounds everything() {
-            Bounds b;
-            std::fill(b.low, b.low + 4, -infinite), std::fill(b.high, b.high + 4, infinite);
-            return b;
-        }
-        void add(int k, double x) { low[k] = std::min(low[k], x), high[k] = std::max(high[k], x); }
-    };
-    int width_;
-    double margin_;
-    Bounds bounds_;
-};
-
 template <int N, class T>
 void render_pixels(const SceneView<T>& scene, const std::deque<Side>& sides, const RayCaster& caster,
                    const ImageOptions& o, Team& team, T* image, const HitBuffers<T>& out) {
@@ -384,9 +324,8 @@ void render_pixels(const SceneView<T>& scene, const std::deque<Side>& sides, con
     // Tiles are lower where a pixel has many samples, so that the threads end together.
     const int rows = std::clamp((1 << 16) / o.spp, 1, tile);
     const int tiles_x = (camera.width + tile - 1) / tile, tiles_y = (camera.height + rows - 1) / rows;
-    // So many pixels fill batches of rays. Only whole ones are left out: which rays lie in a packet decides which of
-    // two faces at one depth wins, and how sums are rounded.
-    const int unit = std::min(tile, RayBatch::size / std::gcd(RayBatch::size, o.spp));
+    // Whole batches: also how sums are rounded depends on which rays lie in one.
+    const int unit = std::min(tile, pixels_of_batches(o.spp));
     const ReachablePixels reachable(camera, caster, sides.front().q, o.filter.radius() - 0.5, team);
     team.each_with(
         int64_t(tiles_x) * tiles_y, [&] { return std::make_unique<PixelRow<N, T>>(scene, sides, o, team, image, out); },

@@ -3,16 +3,24 @@
 #include <algorithm>
 #include <array>
 #include <atomic>
+#include <bit>
 #include <limits>
 
 #include "camera/depth_bound.h"
-#include "contract/record.h"
+#include "forward/reachable.h"
 #include "forward/side.h"
 #include "shading/surface.h"
 
 namespace edgegrad {
 
 namespace {
+
+struct PixelHit {
+    int32_t pixel, face;
+    Barycentrics b;
+    Vec2 x;
+    double weight;
+};
 
 // The pixels of one row.
 template <class T>
@@ -29,13 +37,15 @@ class HitRow {
           team_(team),
           rays_(side_->frame) {}
 
-    void find(int y, PixelHits& to) {
+    // Hits in pixels first … end − 1 of row y: in the others there are none.
+    void find(int y, int first, int end, std::vector<PixelHit>& to) {
+        to.reserve(expected_);
         const int width = side_->camera.width;
         row_.assign(width, {});
         y_ = y;
         for (const Side& side : sides_) {
-            if (&side != side_) side_ = &side, rays_.look_through(side.frame), known_ = filled();
-            for (int x = 0; x < width; ++x) {
+            if (&side != side_) look_through(side);
+            for (int x = first; x < end; ++x) {
                 if (choice_.only && !choice_.only[int64_t(y) * width + x]) continue;
                 if (!side.camera.may_show({x + 0.5, y + 0.5}, options_.filter.radius())) continue;
                 for (int done = 0; done < options_.spp;) {
@@ -48,6 +58,7 @@ class HitRow {
             }
             cast(to);
         }
+        expected_ = to.size() + to.size() / 8;
         if (choice_.only) return;
         for (int x = 0; x < width; ++x) {
             const int64_t pixel = int64_t(y) * width + x;
@@ -71,45 +82,67 @@ class HitRow {
         std::vector<Drawn> drawn;
     };
     static bool is_less(const Drawn& a, const Drawn& b) { return a.key < b.key; }
+    // What pixels on one face have in common. Some faces are kept, for they come again in the next pixel.
+    struct Kept {
+        int32_t face = -1;
+        bool unseen = false;
+        FaceMap map;
+        DepthBound depth;
+    };
+    static constexpr unsigned n_kept = 64;
     struct Pixel {
         int hits = 0;
         double farthest = -std::numeric_limits<double>::infinity();
         int32_t first = std::numeric_limits<int32_t>::max(), last = -1;
     };
 
-    void cast(PixelHits& to) {
+    void look_through(const Side& side) {
+        side_ = &side, rays_.look_through(side.frame);
+        for (Kept& kept : kept_) kept.face = -1;
+    }
+
+    void cast(std::vector<PixelHit>& to) {
         team_.check();
         rays_.prepare();
         side_->frame.cast(rays_);
-        // A face whose plane holds the eye shows nothing.
-        if (std::any_of(rays_.face, rays_.face + rays_.count, [&](int32_t f) { return f >= 0 && !is_known(f); })) {
-            rays_.prepare();
-            side_->frame.cast_through(rays_, nullptr, [&](int32_t face) { return !is_unseen(face); });
-        }
         int i = 0;
         for (int p = 0; p < parts_; ++p) {
-            if (part_[p].x != x_) count_ = 0, x_ = part_[p].x, samples_ = 0;
-            for (const int end = i + part_[p].n; i < end; ++i, ++samples_)
-                if (rays_.face[i] >= 0) add(rays_.face[i], rays_.n(i));
+            if (part_[p].x != x_) begin(part_[p].x);
+            const int end = i + part_[p].n;
+            for (int k = i; k < end; ++k) {
+                if (rays_.face[k] < 0) continue;
+                // A face whose plane holds the eye shows nothing.
+                if (kept(rays_.face[k]).unseen) [[unlikely]] {
+                    rays_.prepare();
+                    side_->frame.cast_through(rays_, nullptr, [&](int32_t face) { return !kept(face).unseen; });
+                    if (rays_.face[k] < 0) continue;
+                }
+                add(rays_.face[k], samples_ + k - i, rays_.n(k));
+            }
+            samples_ += part_[p].n, i = end;
             if (samples_ == options_.spp) finish(to);
         }
         rays_.count = parts_ = 0;
     }
 
+    void begin(int x) {
+        const int stream = choice_.only ? 6 : 5;
+        x_ = x, count_ = samples_ = 0;
+        key_ = Hash(options_.seed, hash(stream, uint64_t(y_) * side_->camera.width + x));
+    }
+
     // The samples with the least random numbers stand for all. So where one more or one less hits the face, they mostly
     // stay the same, and images of scenes that differ a little do.
-    void add(int32_t face, Vec2 n) {
-        const int stream = choice_.only ? 6 : 5;
-        const uint64_t key = hash(options_.seed, hash(stream, uint64_t(y_) * side_->camera.width + x_), samples_);
-        const auto end = groups_.begin() + count_;
-        auto group = std::find_if(groups_.begin(), end, [&](const Group& g) { return g.face == face; });
-        if (group == end) {
-            if (end == groups_.end()) groups_.emplace_back();
-            group = groups_.begin() + count_++;
-            group->face = face, group->count = 0, group->drawn.clear();
+    void add(int32_t face, int sample, Vec2 n) {
+        int g = 0;
+        while (g < count_ && groups_[g].face != face) ++g;
+        if (g == count_) {
+            if (size_t(count_++) == groups_.size()) groups_.emplace_back();
+            groups_[g].face = face, groups_[g].count = 0, groups_[g].drawn.clear();
         }
-        ++group->count;
-        std::vector<Drawn>& drawn = group->drawn;
+        ++groups_[g].count;
+        const uint64_t key = key_(sample);
+        std::vector<Drawn>& drawn = groups_[g].drawn;
         if (int(drawn.size()) == choice_.most) {
             if (drawn.front().key <= key) return;
             std::pop_heap(drawn.begin(), drawn.end(), is_less);
@@ -120,43 +153,43 @@ class HitRow {
     }
 
     // Hands over what a pixel shows through this side.
-    void finish(PixelHits& to) {
+    void finish(std::vector<PixelHit>& to) {
         const Camera& camera = side_->camera;
         const Vec2 middle = normalised(camera, {x_ + 0.5, y_ + 0.5});
         Pixel& pixel = row_[x_];
         for (int i = 0; i < count_; ++i) {
             const Group& g = groups_[i];
-            const auto corner = corners(g.face);
-            const FaceMap map = face_map(camera, corner.data());
+            const Kept& face = kept(g.face);
             for (const Drawn& drawn : g.drawn) {
-                const Barycentrics b = barycentrics_of_hit(map, drawn.n);
+                const Barycentrics b = barycentrics_of_hit(face.map, drawn.n);
                 const Vec2 x = bend(camera, to_pixels(camera, drawn.n)).x;
-                to.pixel.push_back(int32_t(int64_t(y_) * camera.width + x_)), to.face.push_back(g.face);
-                append(to.b, {b.u, b.v}), append(to.x, {x.x, x.y});
-                to.weight.push_back(double(g.count) / (double(options_.spp) * g.drawn.size()));
+                const double weight = double(g.count) / (double(options_.spp) * g.drawn.size());
+                to.push_back({int32_t(int64_t(y_) * camera.width + x_), g.face, b, x, weight});
             }
-            DepthBound depth;
-            depth.set(camera, corner.data(), map);
             pixel.hits += g.count;
-            pixel.farthest = std::max(pixel.farthest, depth.farthest(middle, side_->reach));
+            pixel.farthest = std::max(pixel.farthest, face.depth.farthest(middle, side_->reach));
             pixel.first = std::min(pixel.first, g.face), pixel.last = std::max(pixel.last, g.face);
-            std::atomic_ref<uint8_t> seen(out_.seen[g.face]);
-            if (!seen.load(std::memory_order_relaxed))
-                seen.store(camera.side(corner[0], corner[1], corner[2]), std::memory_order_relaxed);
         }
-        count_ = 0, x_ = -1;
+        x_ = -1;
     }
 
-    std::array<Vec3, 3> corners(int32_t face) const {
-        const int32_t* v = scene_.faces + 3 * int64_t(face);
-        return {side_->q[v[0]], side_->q[v[1]], side_->q[v[2]]};
+    const Kept& kept(int32_t face) {
+        Kept& found = kept_[unsigned(face) % n_kept];
+        if (found.face != face) keep(found, face);
+        return found;
     }
-    bool is_unseen(int32_t face) const { return side_->camera.passes_through_eye(corners(face).data()); }
-    // Whether a face shows something, kept for those that come again.
-    bool is_known(int32_t face) {
-        int32_t& known = known_[unsigned(face) % known_.size()];
-        if (known != face && !is_unseen(face)) known = face;
-        return known == face;
+    void keep(Kept& kept, int32_t face) {
+        const Camera& camera = side_->camera;
+        const int32_t* v = scene_.faces + 3 * int64_t(face);
+        const Vec3 corner[3] = {side_->q[v[0]], side_->q[v[1]], side_->q[v[2]]};
+        kept.face = face;
+        kept.unseen = camera.passes_through_eye(corner);
+        if (kept.unseen) return;
+        kept.map = face_map(camera, corner);
+        kept.depth.set(camera, corner, kept.map);
+        std::atomic_ref<uint8_t> seen(out_.seen[face]);
+        if (!seen.load(std::memory_order_relaxed))
+            seen.store(camera.side(corner[0], corner[1], corner[2]), std::memory_order_relaxed);
     }
 
     const SceneView<T>& scene_;
@@ -170,20 +203,17 @@ class HitRow {
     struct Part {
         int x, n;
     };
-    static std::array<int32_t, 256> filled() {
-        std::array<int32_t, 256> none;
-        none.fill(-1);
-        return none;
-    }
     CameraRays rays_;
     Part part_[RayBatch::size];  // of which pixels the rays are
     int parts_ = 0;
     std::vector<Pixel> row_;
     int y_ = 0;
-    std::array<int32_t, 256> known_ = filled();
+    size_t expected_ = 0;  // hits in the next row
+    Kept kept_[n_kept];
     std::vector<Group> groups_;
     int count_ = 0;             // of them, in use
     int x_ = -1, samples_ = 0;  // the pixel that they are of, and how many of its samples came
+    Hash key_{0, 0};            // of its samples
 };
 
 }  // namespace
@@ -193,19 +223,29 @@ PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const
                           const ImageOptions& options, const PixelChoice& choice, Team& team,
                           const HitBuffers<T>& out) {
     const std::deque<Side> sides = make_sides(scene, camera, caster, options, team);
-    std::vector<PixelHits> rows(choice.end - choice.first);
+    const int width = camera.width, unit = pixels_of_batches(options.spp);
+    const ReachablePixels reachable(sides.front().camera, caster, sides.front().q, options.filter.radius() - 0.5, team);
+    std::vector<std::vector<PixelHit>> rows(choice.end - choice.first);
     team.each_with(
         choice.end - choice.first,
         [&] { return std::make_unique<HitRow<T>>(scene, sides, options, choice, out, team); },
-        [&](HitRow<T>& row, int64_t k) { row.find(choice.first + int(k), rows[k]); });
-    PixelHits all;
-    size_t n = 0;
-    for (const PixelHits& row : rows) n += row.pixel.size();
-    all.pixel.reserve(n), all.face.reserve(n), all.b.reserve(2 * n), all.x.reserve(2 * n), all.weight.reserve(n);
-    for (const PixelHits& row : rows) {
-        append(all.pixel, row.pixel), append(all.face, row.face), append(all.b, row.b), append(all.x, row.x);
-        append(all.weight, row.weight);
-    }
+        [&](HitRow<T>& row, int64_t k) {
+            const int y = choice.first + int(k);
+            const auto [first, end] = reachable.row(y);
+            const int from = first / unit * unit;
+            row.find(y, from, std::min(width, from + (std::max(end - from, 0) + unit - 1) / unit * unit), rows[k]);
+        });
+    std::vector<int64_t> first_of{0};
+    for (const std::vector<PixelHit>& row : rows) first_of.push_back(first_of.back() + int64_t(row.size()));
+    PixelHits all(first_of.back());
+    team.each(int64_t(rows.size()), [&](int64_t k) {
+        int64_t i = first_of[k];
+        for (const PixelHit& hit : rows[k]) {
+            all.pixel[i] = hit.pixel, all.face[i] = hit.face, all.weight[i] = hit.weight;
+            all.b[2 * i] = hit.b.u, all.b[2 * i + 1] = hit.b.v, all.x[2 * i] = hit.x.x, all.x[2 * i + 1] = hit.x.y;
+            ++i;
+        }
+    });
     return all;
 }
 

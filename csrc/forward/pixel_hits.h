@@ -6,18 +6,20 @@
 #pragma once
 
 #include <cstdint>
-#include <vector>
 
+#include "core/array.h"
 #include "forward/forward.h"
 
 namespace edgegrad {
 
 // Arrays side by side, one entry or row for each hit.
 struct PixelHits {
-    std::vector<int32_t> pixel, face;
-    std::vector<double> b;       // (N, 2) where on the face
-    std::vector<double> x;       // (N, 2) pixel position
-    std::vector<double> weight;  // the share of the pixel's samples
+    explicit PixelHits(int64_t size) : pixel(size), face(size), b(2 * size), x(2 * size), weight(size) {}
+
+    Array<int32_t> pixel, face;
+    Array<double> b;       // (N, 2) where on the face
+    Array<double> x;       // (N, 2) pixel position
+    Array<double> weight;  // the share of the pixel's samples
 };
 
 // Which hits, of the rows first … end − 1 of an image.

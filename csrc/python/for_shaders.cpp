@@ -18,14 +18,16 @@ namespace edgegrad {
 
 namespace {
 
-// A vector as an array of rows of this shape, without a copy.
-template <class X>
-nb::object rows(std::vector<X>&& values, std::vector<size_t> row = {}) {
+// A vector or an Array as an array of rows of this shape, without a copy.
+template <class Values>
+nb::object rows(Values&& values, std::vector<size_t> row = {}) {
+    static_assert(!std::is_reference_v<Values>);  // it is moved from
+    using X = std::remove_pointer_t<decltype(values.data())>;
     size_t width = 1;
     for (const size_t n : row) width *= n;
-    auto* kept = new std::vector<X>(std::move(values));
-    const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<X>*>(p); });
-    row.insert(row.begin(), kept->size() / width);
+    auto* kept = new Values(std::move(values));
+    const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<Values*>(p); });
+    row.insert(row.begin(), size_t(kept->size()) / width);
     return nb::cast(nb::ndarray<nb::numpy, X>(kept->data(), row.size(), row.data(), owner));
 }
 
@@ -38,7 +40,7 @@ nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const Im
     if (only && (int(only->shape(0)) != camera.height || int(only->shape(1)) != camera.width))
         refuse("only: expected a number a pixel");
     const PixelChoice choice{first, end, most, only ? only->data() : nullptr};
-    PixelHits found;
+    PixelHits found(0);
     unlocked(threads, [&](Team& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
