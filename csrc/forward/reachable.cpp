@@ -5,7 +5,8 @@
 
 namespace edgegrad {
 
-ReachablePixels::ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius, Team& team)
+ReachablePixels::ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius,
+                                 Team& team)
     : width_(camera.width), margin_(radius + 1) {
     std::vector<Bounds> of_block(Team::blocks(q.size()));
     team.each_block(q.size(), [&](int64_t k, int64_t first, int64_t last) {
