@@ -199,7 +199,8 @@ def _of_scene(surfaces: Surfaces, index: int, of_mesh: Callable[[], Tensor]) -> 
         own = of_mesh().detach()
         first = surfaces.first_faces[index]
         after = len(surfaces.faces) - first - len(own)
-        return torch.nn.functional.pad(own, (0, 0, 0, 0, first, after))
+        before, behind = (own.new_zeros((count, *own.shape[1:])) for count in (first, after))
+        return torch.cat([before, own, behind])  # pad() of torch 2.4 refuses what has no columns
 
     return corners
 

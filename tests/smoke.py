@@ -1,0 +1,64 @@
+"""Whether an installed edgegrad works: python tests/smoke.py. Needs nothing but what edgegrad itself requires, and no checkout."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import torch
+import trimesh
+
+import edgegrad as eg
+from edgegrad.fit import fit_pose
+from edgegrad_cli import main
+from edgegrad_cli.doctor import gradient_error
+
+
+def painted() -> eg.Mesh:
+    ball = trimesh.creation.icosphere(2)
+    verts = torch.from_numpy(ball.vertices.copy()).float() * torch.tensor([1.0, 0.6, 0.4])
+    return eg.Mesh(verts, torch.from_numpy(ball.faces.copy()), colors=0.5 + 0.4 * torch.sin(5.0 * verts))
+
+
+def edges() -> None:
+    """A gradient that comes from silhouettes alone, against its closed form."""
+    assert gradient_error() < 0.02
+
+
+def light() -> None:
+    """A shadow's border has a gradient: of the sum of an image by the direction of the light, against a difference."""
+    mesh, ground = painted().replace(material=eg.Material()), torch.tensor([[-4.0, -1, -4], [4, -1, -4], [0, -1, 6]])
+    floor = eg.Mesh(ground, torch.tensor([[0, 1, 2]]), material=eg.Material())
+    camera = eg.Camera.look_at((0, 3, 5), (0, 0, 0), size=(48, 48))
+
+    def total(x: torch.Tensor, seed: int) -> torch.Tensor:
+        sun = eg.DirectionalLight(torch.stack([x, -torch.ones_like(x), -0.3 * torch.ones_like(x)]), 3.0)
+        return eg.render(eg.Scene([mesh, floor], lights=[sun]), camera, spp=64, seed=seed, edge_samples=20_000).sum()
+
+    x = torch.tensor(0.4, requires_grad=True)
+    total(x, 1).backward()
+    with torch.no_grad():
+        slope = (total(x + 0.05, 2) - total(x - 0.05, 2)) / 0.1
+    assert x.grad is not None and abs(float(x.grad / slope) - 1.0) < 0.1, (x.grad, slope)
+
+
+def files_and_fits() -> None:
+    """A pose is found again, and what is written is read; also from the command line."""
+    mesh, camera = painted(), eg.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40, size=(64, 64))
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.1, 0.05], [0.1, 0, -0.1], [-0.05, 0.1, 0]]))
+    target = eg.render(mesh.transformed(turn), camera, spp=64, seed=1)
+    fit = fit_pose(mesh, target, camera, background=0.0, progress=False)
+    error = torch.rad2deg(torch.acos(((fit.R.T.to(turn) @ turn).trace() / 2 - 0.5).clamp(-1, 1)))
+    assert fit.converged and float(error) < 0.5, (fit.state, error)
+    with tempfile.TemporaryDirectory() as folder:
+        model, picture = Path(folder) / "mesh.ply", Path(folder) / "picture.png"
+        eg.save_mesh(model, mesh)
+        eg.write_image(picture, target)
+        assert torch.allclose(eg.read_image(picture, channels=3), target.clamp(0, 1), atol=0.01)
+        assert main(["render", str(model), "--out", str(Path(folder) / "out.png"), "--size", "32x32"]) == 0
+
+
+if __name__ == "__main__":
+    for check in (edges, light, files_and_fits):
+        check()
+        print(f"{check.__name__}: right")
