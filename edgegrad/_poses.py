@@ -75,11 +75,15 @@ def rigid(R: Tensor, t: Tensor) -> Tensor:
     return torch.cat([torch.cat([R, t.to(R)[..., None]], -1), last], -2)
 
 
+def _widest(tensors: Sequence[Tensor]) -> Tensor:
+    return next((tensor for tensor in tensors if tensor.dtype == torch.float64), tensors[0])
+
+
 def looking_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
     given = [v for v in (eye, target, up) if isinstance(v, Tensor) and v.dtype in (torch.float32, torch.float64)]
-    like = max(given, key=lambda v: v.element_size()) if given else None
+    like = _widest(given) if given else None
     vectors = _vector("eye", eye, like), _vector("target", target, like), _vector("up", up, like)
-    like = max(vectors, key=lambda v: v.element_size()) if like is None else like
+    like = _widest(vectors) if like is None else like
     # In double: in float32, distances of 1e±30 have no square, and a distant eye would round the directions.
     e, g, u = (v.to(like).double() for v in vectors)
     if values_visible(e, g, u):

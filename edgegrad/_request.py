@@ -4,6 +4,7 @@ record is packed into them and unpacked again here, by the names of its fields, 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple, get_type_hints
 
@@ -242,9 +243,9 @@ def _check_devices(scene: Scene, camera: Camera) -> None:
     materials = [mesh.material for mesh in scene.meshes if mesh.material is not None]
     textures = [texture for material in materials for texture in material.textures.values()]
     for thing in (*scene.meshes, *materials, *textures, scene, *scene.lights, camera):
-        for name, value in vars(thing).items():
-            if isinstance(value, Tensor):
-                check_not_meta(name, value)
+        for field in dataclasses.fields(thing):  # not vars(), at which torch.compile stops in torch 2.9 and before
+            if isinstance(value := getattr(thing, field.name), Tensor):
+                check_not_meta(field.name, value)
 
 
 def _radiance_varies(scene: Scene) -> bool:
