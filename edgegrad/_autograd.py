@@ -19,8 +19,13 @@ FIRST_ORDER = (
 
 def render_image(request: Request, batched: bool) -> Tensor:
     """The image (B, H, W, C), or (H, W, C) unless `batched`, as a function of the request's tensors."""
-    function = _Render if torch.compiler.is_compiling() else _RenderEager
-    image, *_ = function.apply(batched, *request.pack())
+    packed = request.pack()
+    if not torch.compiler.is_compiling():
+        image, *_ = _RenderEager.apply(batched, *packed)
+    elif any(tensor.requires_grad for tensor in tensors_of(packed)):
+        image, *_ = _Render.apply(batched, *packed)
+    else:  # torch.compile of torch 2.9 and before calls the function wrongly
+        image, *_ = _Render.forward(batched, *packed)
     return image
 
 

@@ -118,14 +118,6 @@ def _batched(tensor: Tensor) -> bool:
     return False
 
 
-def unwrapped(tensor: Tensor) -> Tensor:
-    """What transforms of torch.func differentiate, for its values: their own tensors have no tolist() in torch 2.9 and before."""
-    functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
-    while functorch.is_functorch_wrapped_tensor(tensor):
-        tensor = functorch.get_unwrapped(tensor)
-    return tensor
-
-
 def check_not_meta(name: str, tensor: Tensor) -> None:
     """A tensor that has values, on whatever device. Raises ValueError."""
     if tensor.is_meta:

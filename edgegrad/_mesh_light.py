@@ -43,7 +43,9 @@ class MeshLight(Light):
             area = self._area(face).double().norm(dim=1)
             total: Tensor = torch.zeros((), dtype=torch.float64)
             for b in ((1.0, 1.0, 1.0), (4.0, 1.0, 1.0), (1.0, 4.0, 1.0), (1.0, 1.0, 4.0)):
-                weights = self.mesh.verts.new_tensor(b).expand(len(face), 3)
+                weights = torch.tensor(b, dtype=self.mesh.verts.dtype, device=self.mesh.verts.device).expand(
+                    len(face), 3
+                )
                 total = total + self._emission(face, weights / sum(b)).double().abs().mean(1)
             power = area * total
             share = area / area.sum() if float(area.sum()) > 0 else torch.full_like(area, 1 / len(area))

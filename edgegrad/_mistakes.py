@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ._check import unwrapped, values_visible
+from ._check import values_visible
 from ._warnings import warn
 
 BYTES = 16.0, 255.0  # the largest of whole numbers that are bytes rather than radiance
@@ -16,7 +16,8 @@ def warn_if_behind(verts: Tensor, world_to_camera: Tensor) -> None:
     if not values_visible(verts, world_to_camera):
         return
     # Of one vertex first, in numbers of Python: a small scene renders in a millisecond.
-    first, row = unwrapped(verts[0]).tolist(), unwrapped(world_to_camera[0, 2]).tolist()
+    # One by one, for tensors under torch.func have no tolist() in torch 2.9 and before.
+    first, row = [x.item() for x in verts[0]], [x.item() for x in world_to_camera[0, 2]]
     if sum(a * b for a, b in zip(first, row, strict=False)) + row[3] > 0.0:
         return
     with torch.no_grad():

@@ -28,7 +28,10 @@ def check_last_row(name: str, matrix: Tensor, expected: list[float], fix: str = 
     if not values_visible(matrix):
         return
     last = matrix.detach()[..., -1, :]
-    if not torch.equal(last, last.new_tensor(expected).expand_as(last)):
+    right = torch.tensor(
+        expected, dtype=last.dtype, device=last.device
+    )  # new_tensor() fails under torch.func in torch 2.4
+    if not torch.equal(last, right.expand_as(last)):
         got = last.reshape(-1, len(expected))[0].tolist()
         raise ValueError(f"{name}: expected the last row {expected}, got {got}; {fix}")
 

@@ -243,7 +243,8 @@ def _check_devices(scene: Scene, camera: Camera) -> None:
     materials = [mesh.material for mesh in scene.meshes if mesh.material is not None]
     textures = [texture for material in materials for texture in material.textures.values()]
     for thing in (*scene.meshes, *materials, *textures, scene, *scene.lights, camera):
-        for field in dataclasses.fields(thing):  # not vars(), at which torch.compile stops in torch 2.9 and before
+        # Not vars(), at which torch.compile stops in torch 2.9 and before. Each light is a dataclass, though Light is none.
+        for field in dataclasses.fields(thing):  # pyright: ignore[reportArgumentType]
             if isinstance(value := getattr(thing, field.name), Tensor):
                 check_not_meta(field.name, value)
 

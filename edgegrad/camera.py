@@ -127,7 +127,8 @@ class Camera(Views, Conventions):
         """What the kernel draws of a panorama, it draws once for each turn."""
         H, W = self.size
         K = self.K.detach().double().reshape(-1, 3, 3)
-        corners = K.new_tensor([[x, y] for x in (-1.0, W + 1.0) for y in (-1.0, H + 1.0)])
+        around = [[x, y] for x in (-1.0, W + 1.0) for y in (-1.0, H + 1.0)]
+        corners = torch.tensor(around, dtype=K.dtype, device=K.device)
         angles = torch.linalg.solve(K[:, None, :2, :2], (corners - K[:, None, :2, 2])[..., None])
         turns = float(angles.abs().max()) / math.tau
         if not turns <= TURNS:
