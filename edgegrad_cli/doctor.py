@@ -20,7 +20,9 @@ OPTIONAL = {
     "pyvista": "demo",
     "mitsuba": "peers: compared in edgegrad report",
     "scipy": "report: statistics",
-    "cholespy": "report: preconditioned fits",
+    "cholespy": "fit, report: smooth steps of shapes",
+    "gpytoolbox": "fit: remeshing",
+    "torchmetrics": "fit: SSIM",
 }
 TOLERANCE = 0.02  # of the gradient's size; its own error is 0.1 %
 

@@ -1,7 +1,8 @@
-"""Whether an installed edgegrad works: python tests/smoke.py. Needs nothing but what edgegrad itself requires, and no checkout."""
+"""Whether an installed edgegrad works: python tests/smoke.py. Needs what edgegrad itself requires, and nothing else."""
 
 from __future__ import annotations
 
+import importlib.util
 import tempfile
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import torch
 import trimesh
 
 import edgegrad as eg
-from edgegrad.fit import fit_pose
+from edgegrad.fit import fit_pose, fit_shape
+from edgegrad.fit.losses import ssim
 from edgegrad_cli import main
 from edgegrad_cli.doctor import gradient_error
 
@@ -58,7 +60,27 @@ def files_and_fits() -> None:
         assert main(["render", str(model), "--out", str(Path(folder) / "out.png"), "--size", "32x32"]) == 0
 
 
+def extras() -> None:
+    """What needs a library that is not installed names the extra that brings it."""
+    mesh, camera = painted(), eg.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40, size=(16, 16))
+    image = eg.render(mesh, camera)
+    fit = fit_pose(mesh, image, camera, background=0.0, progress=False, steps=1)
+    needs = {
+        "matplotlib": ("figures", fit.plot),
+        "torchmetrics": ("fit", lambda: ssim(image, image)),
+        "gpytoolbox": ("fit", lambda: fit_shape(mesh, [camera], [image], levels=2, steps=1, progress=False)),
+    }
+    for library, (extra, call) in needs.items():
+        if importlib.util.find_spec(library) is None:
+            try:
+                call()
+            except ImportError as error:
+                assert f"pip install 'edgegrad[{extra}]'" in str(error), error
+            else:
+                raise AssertionError(f"works without {library}")
+
+
 if __name__ == "__main__":
-    for check in (edges, light, files_and_fits):
+    for check in (edges, light, files_and_fits, extras):
         check()
         print(f"{check.__name__}: right")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from .._files import PathLike, replacing
+from .._files import PathLike, replacing, require
 from ..aovs import render_aovs
 from ..camera import Camera
 from ..exchange import save_mesh
@@ -21,6 +21,7 @@ from ..io import save_camera
 from ..mesh import Mesh
 from ..scene import Scene
 from .frame import Record
+from .result import DRAWING
 from .verdict import ENOUGH
 from .views import View
 
@@ -85,8 +86,6 @@ class Fit:
 
     def plot(self, most: int = 4) -> Figure:
         """target | start | fit | difference of up to so many views."""
-        from .plots import comparison
-
         n = len(self.views)
         chosen = sorted({round(k * (n - 1) / max(1, min(most, n) - 1)) for k in range(min(most, n))})
         rows = []
@@ -95,13 +94,11 @@ class Fit:
             target = view.image if view.image is not None else view.mask
             assert target is not None
             rows.append((target, _render(self.start, view.camera, view, 64, 0), self.render(i)))
-        return comparison(rows)
+        return require("edgegrad.fit.plots", *DRAWING).comparison(rows)
 
     def plot_history(self) -> Figure:
         """The loss and the norm of each gradient, step by step."""
-        from .plots import curves
-
-        return curves(self.history)
+        return require("edgegrad.fit.plots", *DRAWING).curves(self.history)
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Writes all of it to a folder, which is made where it is missing, and gives the files' names:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from .._check import check_finite, check_shape
-from .._files import PathLike, replacing
+from .._files import PathLike, replacing, require
 from ..camera import Camera
 from .verdict import ENOUGH
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from .task import PoseTask
+
+DRAWING = "edgegrad[figures]", "drawing a fit"  # what is imported for it only then, as require() says it
 
 
 class Pose(NamedTuple):
@@ -94,22 +96,20 @@ class PoseFit:
 
     def plot(self) -> Figure:
         """target | start | fit | difference, a row for each picture; with a mask all over black, as they were compared."""
-        from .report import sheet
-
-        return sheet(self)
+        return require("edgegrad.fit.report", *DRAWING).sheet(self)
 
     def save(self, folder: PathLike) -> list[str]:
         """Writes pose.json, fit.png, loss.png and fit.webp to a folder, which is made where it is missing, each whole or not
-        at all, and gives their names; of a fit that took no step, pose.json alone. Raises OSError."""
-        from . import report
-
+        at all, and gives their names; of a fit that took no step, pose.json alone. Raises OSError, or ImportError once
+        pose.json is written when matplotlib or pillow is missing."""
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
         with replacing(out / "pose.json") as temporary:
             temporary.write_text(self.to_json() + "\n", encoding="utf-8")
-        draw = {"fit.png": report.draw_fit, "loss.png": report.draw_loss, "fit.webp": report.draw_animation}
         if not self.history:
             return ["pose.json"]
+        report = require("edgegrad.fit.report", *DRAWING)
+        draw = {"fit.png": report.draw_fit, "loss.png": report.draw_loss, "fit.webp": report.draw_animation}
         for name, function in draw.items():
             function(out / name, self)
         return ["pose.json", *draw]
