@@ -1,24 +1,29 @@
 """The Python of the docs runs, and prints what they say it prints.
 
-Blocks marked `python` of a page run one after the other, as a reader would type them, in a folder of their own; those marked `py` are
-code of other libraries, or need files that nobody has here. Where a block of `text` follows, it is what the block before prints: the
-same words, and numbers within a fifth. What takes longer is below `slow` in a page's list.
+Blocks marked `python` run one after the other, as a reader would type them, in a folder of their own; those marked `py` are code
+of other libraries, or need files that nobody has here. A block of `text` is what the block before it prints: the same words, and
+numbers within a fifth.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+import pkgutil
 import re
+from fnmatch import fnmatch
 from pathlib import Path
+from types import ModuleType
 
 import matplotlib
 import pytest
 import torch
 
+import edgegrad
+import edgegrad.fit
+
 FOLDER = Path(__file__).parents[1] / "docs"
 PAGES = ["quick-start.md", "concepts.md", *(str(p.relative_to(FOLDER)) for p in sorted(FOLDER.glob("how-to/*.md")))]
-SLOW = {"how-to/pytorch3d.md"}
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"[-−+]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
 TOLERANCE = 0.2
@@ -27,8 +32,9 @@ TOLERANCE = 0.2
 def same(said: str, printed: str) -> bool:
     """Whether words are equal, spaces and numbers aside, and numbers close."""
     words = [" ".join(NUMBER.sub("#", text).split()) for text in (said, printed)]
-    pairs = zip(*([float(n.replace(",", "").replace("−", "-")) for n in NUMBER.findall(t)] for t in (said, printed)))
-    return words[0] == words[1] and all(abs(a - b) <= TOLERANCE * max(abs(a), abs(b)) for a, b in pairs)
+    values = [[float(n.replace(",", "").replace("−", "-")) for n in NUMBER.findall(text)] for text in (said, printed)]
+    close = (abs(a - b) <= TOLERANCE * max(abs(a), abs(b)) for a, b in zip(*values, strict=True))
+    return words[0] == words[1] and all(close)
 
 
 def test_outputs_are_compared() -> None:
@@ -36,7 +42,7 @@ def test_outputs_are_compared() -> None:
     assert not same("loss 1.0", "loss 1.5") and not same("loss 1.0", "error 1.0")
 
 
-@pytest.mark.parametrize("page", [pytest.param(p, marks=pytest.mark.slow if p in SLOW else ()) for p in PAGES])
+@pytest.mark.parametrize("page", PAGES)
 def test_page(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")
@@ -54,3 +60,52 @@ def test_page(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
             printed = out.getvalue()
         elif kind == "text":
             assert same(source, printed), f"{page}: it says\n{source}\nand prints\n{printed}"
+
+
+@pytest.mark.parametrize("module", [edgegrad, edgegrad.fit])
+def test_reference_has_all_that_is_public(module: ModuleType) -> None:
+    reference = "".join(page.read_text(encoding="utf-8") for page in (FOLDER / "api").glob("*.md"))
+    listed = set(re.findall(r"^\.\. auto\w+:: (\S+)$", reference, re.MULTILINE))
+    names = {f"{module.__name__}.{name}" for name in module.__all__} - {"edgegrad.fit"}  # a page of its own
+    assert names <= listed, f"docs/api lacks {sorted(names - listed)}"
+    assert all(resolves(name) for name in listed)
+
+
+def resolves(name: str) -> bool:
+    try:
+        pkgutil.resolve_name(name)
+    except (ImportError, AttributeError):
+        return False
+    return True
+
+
+def test_pages_are_found_from_the_first() -> None:
+    """Each is in a table of contents, also those that a pattern stands for."""
+    listed = []
+    for index in FOLDER.rglob("*.md"):
+        for entries in re.findall(
+            r"^```\{toctree\}\n(.*?)^```", index.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+        ):
+            listed += [
+                (index.parent / line).relative_to(FOLDER) for line in entries.splitlines() if not line.startswith(":")
+            ]
+    pages = {page.relative_to(FOLDER).with_suffix("") for page in FOLDER.rglob("*.md")} - {Path("index")}
+    lost = [page for page in pages if not any(fnmatch(str(page), str(entry)) for entry in listed)]
+    assert not lost
+
+
+def test_contributing_names_files_that_exist() -> None:
+    """Names in tables, of which a row may give several in one folder: `csrc/shading/lit/punctual.h`, `area.h`."""
+    text = (FOLDER / "contributing.md").read_text(encoding="utf-8")
+    root, seen = FOLDER.parent, 0
+    for line in text.splitlines():
+        folder = Path()
+        for name in re.findall(r"`([\w./*]+\.(?:py|h|cpp|md|toml|\*))`", line):
+            if "NAME" in name:
+                folder = Path(name).parent
+                continue
+            folder = Path(name).parent if "/" in name else folder
+            found = [*root.glob(name), *root.glob(str(folder / name))]
+            assert found, f"{name} in: {line}"
+            seen += 1
+    assert seen > 30
