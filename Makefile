@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := pyproject.toml $(shell find csrc -name '*.cpp' -o -name '*.h' -o -name CMakeLists.txt)
 
-.PHONY: demo test test-slow sanitize sanitize-threads bench lint format clean
+.PHONY: demo test test-slow sanitize sanitize-threads bench lint docs wheel format clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.ready
@@ -69,8 +69,24 @@ lint: $(VENV)/.ready
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
 	$(BIN)/clang-format --dry-run --Werror $(filter-out %.txt %.toml,$(SOURCES))
 
+# Warnings are errors; build/docs/index.html is the site.
+docs: $(VENV)/.ready
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --group docs
+	$(BIN)/python -m sphinx -b html -n -W --keep-going -q docs build/docs
+
+# The wheel of this machine (Linux), in dist/: repaired, checked, and tried with every Python here and two torches each,
+# for which uv fetches some 20 GB, once.
+wheel: $(BIN)/uv
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --group wheel
+	rm -rf build/wheel dist
+	$(BIN)/uv build --quiet --wheel --out-dir build/wheel
+	PATH=$(CURDIR)/$(BIN):$$PATH $(BIN)/auditwheel repair --exclude libgomp.so.1 --wheel-dir dist build/wheel/*.whl
+	$(BIN)/abi3audit --strict dist/*.whl
+	$(BIN)/twine check --strict dist/*.whl
+	$(BIN)/python tests/clean_environments.py dist/*.whl
+
 clean:
-	rm -rf build out $(VENV)
+	rm -rf build dist out docs/notebooks $(VENV)
 
 # uv (from PyPI) links packages from its cache instead of copying them.
 $(BIN)/uv:
