@@ -18,6 +18,7 @@ from .lights import (
     SphericalHarmonics,
     SpotLight,
 )
+from .live import viewer
 from .material import Material, Texture, vertex_normals
 from .mesh import Mesh
 from .plan import Plan, plan, profile
@@ -83,5 +84,6 @@ __all__ = [
     "surface_samples",
     "trace",
     "vertex_normals",
+    "viewer",
     "write_image",
 ]

@@ -86,7 +86,8 @@ class Options:
     patience          steps: the loss is flat when its mean over so many falls by less than
     tolerance         this share against the mean over as many before
     progress          show a bar with the loss on standard error
-    callback          called with the Record of each step; KeyboardInterrupt from it ends the fit
+    callback          called after each step with its Record, which is a Progress: it has scene and cameras too; KeyboardInterrupt
+                      from it ends the fit
     checkpoint        a file that holds the fit's state, written every `checkpoint_every` steps and at the end, and never in part
     checkpoint_every  steps
     resume            go on from the checkpoint, if there is one: the fit ends as if it had never stopped
@@ -142,8 +143,10 @@ def descend(
     stage: dict[str, Any] | None = None,
     saved: dict[str, Any] | None = None,
     title: str = "fit",
+    report: Callable[[Record, dict[str, Tensor]], Record] = lambda record, values: record,
 ) -> Descent:
-    """Follows the gradient of `objective(values, step)`. Ctrl-C ends it with the best values so far.
+    """Follows the gradient of `objective(values, step)`. Ctrl-C ends it with the best values so far. The callback gets what
+    `report` makes of a step's record and the values after it.
 
     `stage` is kept in the checkpoint beside the loop's own state, for fits of several loops; `saved` is a state to go on from.
     """
@@ -169,7 +172,7 @@ def descend(
             bar.set_postfix_str(f"loss {record.loss:.3e}", refresh=False)
             bar.update()
             if options.callback is not None:
-                options.callback(record)
+                options.callback(report(record, loop.values))
             if loop.step % options.checkpoint_every == 0:
                 save()
     except KeyboardInterrupt:

@@ -7,7 +7,6 @@ import torch
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
-from torch import Tensor
 
 from .._files import PathLike, replacing
 from .plots import comparison, displayed
@@ -18,7 +17,6 @@ PANEL, FRAME = 512, 256  # most pixels on a side of a panel, in draw_fit and in 
 FRAMES = 30
 SPP = 64
 FAINT = "#c4c4c4"
-FADED = 0.25  # of a picture behind the render, where the background is not known
 
 
 def draw_fit(path: PathLike, fit: PoseFit) -> None:
@@ -35,7 +33,7 @@ def sheet(fit: PoseFit) -> Figure:
     """What draw_fit writes: a row for each picture."""
     task = _task(fit)
     level = _level(task, PANEL)
-    start, end = (_renders(task, level, step) for step in (fit.history[0], _way(fit)[-1]))
+    start, end = (task.pictures(level, step.pose) for step in (fit.history[0], _way(fit)[-1]))
     return comparison([(shot.target, a, b) for shot, a, b in zip(level.shots, start, end, strict=True)])
 
 
@@ -80,7 +78,7 @@ def draw_animation(path: PathLike, fit: PoseFit) -> None:
     font = ImageFont.load_default(max(9, round(0.05 * target.shape[0])))
     frames = []
     for step in _frames(_way(fit)):
-        image = displayed(_renders(task, level, step)[0])
+        image = displayed(task.pictures(level, step.pose)[0])
         panels = np.concatenate([target, image, np.clip(2.0 * np.abs(image - target), 0, 1)], 1)
         frame = Image.fromarray((panels * 255.0).round().astype(np.uint8))
         edge = round(0.03 * frame.height)
@@ -124,15 +122,3 @@ def _level(task: PoseTask, most: int) -> Level:
     """The whole picture, at most so many pixels on its longer side."""
     size = task.shots[0].camera.size
     return task.level(min(1.0, most / max(size)), blur=0.0, coarseness=1.0, spp=SPP, free=[])
-
-
-def _renders(task: PoseTask, level: Level, step: Step) -> list[Tensor]:
-    """As pictures: over the background where that is known, without alpha, which comes last where it was compared beside them."""
-    with torch.no_grad():
-        images = task.images(level, step.pose, level.spp, seed=0)
-    if not task.clutter:
-        return images
-    return [
-        image[..., :-1] + (1.0 - image[..., -1:]) * FADED * shot.target
-        for image, shot in zip(images, level.shots, strict=True)
-    ]

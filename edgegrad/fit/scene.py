@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ from ..camera import Camera
 from ..mesh import Mesh
 from ..scene import Scene
 from .fitted import Fit
-from .frame import Descent, Options, Parameter, descend, read_checkpoint
+from .frame import Descent, Options, Parameter, Record, descend, read_checkpoint
 from .losses import loss_of
 from .verdict import explained
 from .views import Images, View, grouped, views_of
@@ -24,6 +25,39 @@ Values = dict[str, Tensor]
 Built = tuple[Scene, list[Camera]]
 Build = Callable[[Values], Built]
 FINAL_SPP = 64  # samples a pixel of the renders that are judged
+
+
+class Progress(Record):
+    """What the callback of a fit by descent gets: the record of a step, and what the fit has reached by it. Scene and cameras are
+    those of the moment when they are asked for, which is during the call."""
+
+    views: list[View]  # what is compared; on coarse levels of fit_shape at fewer pixels
+    _values: Values
+    _build: Build
+
+    @property
+    def scene(self) -> Scene:
+        return self._built[0]
+
+    @property
+    def cameras(self) -> list[Camera]:
+        return self._built[1]
+
+    @cached_property
+    def _built(self) -> Built:
+        # Copies, for the next step changes the values in place.
+        return built(self._build, {name: value.detach().clone() for name, value in self._values.items()})
+
+
+def reporter(build: Build, views: list[View]) -> Callable[[Record, Values], Progress]:
+    """What makes a Progress of a step."""
+
+    def progress(record: Record, values: Values) -> Progress:
+        made = Progress(*record)
+        made.views, made._values, made._build = views, values, build
+        return made
+
+    return progress
 
 
 def fit_scene(
@@ -144,7 +178,8 @@ def fit_views(
     saved = read_checkpoint(options)
     start = built(build, {name: p.value for name, p in parameters.items() if p.value is not None})[0]
     objective = objective_of(build, views, options, regularizer)
-    descent = descend(objective, parameters, options, saved=None if saved is None else saved["loop"])
+    loop = None if saved is None else saved["loop"]
+    descent = descend(objective, parameters, options, saved=loop, report=reporter(build, views))
     return judged(build, views, options, descent, start)
 
 

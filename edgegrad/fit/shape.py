@@ -18,7 +18,7 @@ from ..mesh import Mesh
 from ..scene import Scene
 from .fitted import Fit
 from .frame import Descent, Options, Parameter, Record, descend, read_checkpoint
-from .scene import judged, objective_of, options_of
+from .scene import judged, objective_of, options_of, reporter
 from .smooth import Smooth
 from .views import Images, View, views_of
 
@@ -138,7 +138,7 @@ class _Search:
         objective = objective_of(build, views, self.options, self.regularizer)
         parameters = {"verts": Parameter(rate, smooth.times(mesh.verts), uniform=True)}
         title = f"level {level + 1} of {self.levels}"
-        found = descend(objective, parameters, self.options, stage, saved, title)
+        found = descend(objective, parameters, self.options, stage, saved, title, reporter(build, views))
         return found._replace(values={"verts": smooth(found.values["verts"])})
 
     def scene(self, mesh: Mesh) -> Scene:

@@ -23,6 +23,7 @@ COARSEST = 24  # pixels across the object where the fit begins: 15 % of its size
 SMALLEST = 12  # pixels on the shorter side of the coarsest level
 BLURS = (1.5, 1.0)  # standard deviation in pixels on the coarsest levels; none on the finer ones
 MOST_SPP = 64  # samples a pixel on coarse levels
+FADED = 0.25  # of a picture behind the render, where the background is not known
 EVEN = (
     0.1,
     0.3,
@@ -239,6 +240,18 @@ class PoseTask:
             )
             images.append(blurred(torch.cat([channels[name] for name in self.aovs], -1), level.blur))
         return images
+
+    def pictures(self, level: Level, pose: Pose, seed: int = 0) -> list[Tensor]:
+        """The renders as pictures: over the background where that is known, else over the faded target; without an alpha that
+        was compared beside them only because of that."""
+        with torch.no_grad():
+            images = self.images(level, pose, level.spp, seed)
+        if not self.clutter:
+            return images
+        return [
+            image[..., :-1] + (1.0 - image[..., -1:]) * FADED * shot.target
+            for image, shot in zip(images, level.shots, strict=True)
+        ]
 
 
 def _shots(camera: Any, target: Any, mask: Any, weight: Any) -> list[tuple[str, Camera, Any, Any, Any]]:

@@ -62,7 +62,7 @@ def views_of(
     masks     (H, W) or (H, W, 1) each, 1 on the object and 0 elsewhere
     weights   (H, W) or (H, W, 1) each, from 0: how much a pixel counts
     """
-    split = _cameras(cameras)
+    split = cameras_of(cameras)
     pictures, shapes, counts = (
         _images(name, value, split) for name, value in (("images", images), ("masks", masks), ("weights", weights))
     )
@@ -81,7 +81,8 @@ def views_of(
     return views
 
 
-def _cameras(cameras: object) -> list[Camera]:
+def cameras_of(cameras: object) -> list[Camera]:
+    """One by one, as copies on the CPU. Raises TypeError."""
     given = [cameras] if isinstance(cameras, Camera) else cameras
     if not isinstance(given, Sequence) or not given:
         raise TypeError(f"cameras: expected a Camera or a sequence of them, got {type(cameras).__name__}")

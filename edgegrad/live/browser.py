@@ -1,0 +1,234 @@
+"""The live view as a page in a browser, served by viser."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .._files import require
+from .._tree import named_tensors
+from ..camera import Camera
+from ..exchange import to_trimesh
+from ..mesh import PLAIN, Mesh
+from .frame import CONTRAST, Frame, as_bytes, displayed
+
+WIDTH = 480  # pixels of the panel beside the scene
+THUMBNAIL = 128  # pixels on the longer side of a picture in a frustum
+FRUSTUM = 0.15  # its size as a part of the distance from the camera to the meshes
+WIDEST = 2.0  # radians of a frustum; a camera that has no field of view gets
+NOMINAL = 0.6
+MOST_POINTS = 500  # of the curve
+GREY = (round(255 * (1.055 * PLAIN ** (1 / 2.4) - 0.055)),) * 3  # sRGB
+PANEL_TITLE = f"target | render | difference × {CONTRAST}"
+
+
+class Controls(NamedTuple):
+    """What the page's buttons call, from threads of the server."""
+
+    pause: Callable[[], None]
+    stop: Callable[[], None]
+    look: Callable[[int], None]  # through another camera
+
+
+class Browser:
+    """The page. Raises ImportError without viser, OSError where the host has no free port."""
+
+    def __init__(self, host: str, port: int, controls: Controls) -> None:
+        viser = require("viser", "edgegrad[view]", "the live view")
+        with _quiet():
+            self.server: Any = viser.ViserServer(host, port, verbose=False)
+        shown = "localhost" if host in ("127.0.0.1", "0.0.0.0", "") else host
+        self.url = f"http://{shown}:{self.server.get_port()}"
+        self._rotation = viser.transforms.SO3.from_matrix
+        self._meshes: dict[int, tuple[Mesh, Any]] = {}  # what is shown, and its handle
+        self._frusta: list[tuple[Tensor | None, Any]] = []
+        gui = self.server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False)  # which would open the page to everyone
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(WIDTH)
+        gui.set_panel_label("edgegrad")
+        self.status = gui.add_markdown("waiting for the first step")
+        self.pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
+        self.stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="red")
+        self.view = gui.add_dropdown("view", ("1",), visible=False)
+        self.picture: Any = None
+        self.curve: Any = None
+        self.pause.on_click(lambda _: controls.pause())
+        self.stop.on_click(lambda _: controls.stop())
+        self.view.on_update(lambda event: controls.look(int(event.target.value) - 1))
+
+    def draw(self, frame: Frame, index: int, losses: Sequence[float], state: str) -> None:
+        first = not self._meshes
+        if first:
+            self._look_from_aside(frame)
+        with self.server.atomic():
+            self._draw_meshes(frame)
+            self._draw_cameras(frame)
+        self.draw_panel(frame, index)
+        self.say(state)
+        self._draw_curve(losses)
+
+    def draw_panel(self, frame: Frame, index: int) -> None:
+        if not frame.cameras:
+            return
+        picture = np.concatenate(frame.panel(index), axis=1)
+        if self.picture is None:
+            self.picture = self.server.gui.add_image(picture, label=PANEL_TITLE, order=self.view.order + 0.1)
+        self.picture.image = picture
+
+    def say(self, state: str) -> None:
+        self.status.content = state
+
+    def label(self, pause: str, stop: str) -> None:
+        self.pause.label, self.stop.label = pause, stop
+
+    def close(self) -> None:
+        with _quiet():
+            self.server.stop()
+
+    # -- the scene --------------------------------------------------------------------------------------------------------
+
+    def _look_from_aside(self, frame: Frame) -> None:
+        """Where a page that opens looks from: behind and beside the first camera, so that its frustum is seen too."""
+        low, high = _bounds(frame)
+        center, size = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
+        up, away = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.3, 1.0])
+        distance = size
+        if frame.cameras:
+            poses = [camera.world_to_camera.detach().double().numpy() for camera in frame.cameras]
+            mean = -np.mean([pose[1, :3] for pose in poses], axis=0)
+            up = mean / np.linalg.norm(mean) if np.linalg.norm(mean) > 0.1 else -poses[0][1, :3]
+            offset = frame.cameras[0].eye.detach().double().numpy() - center
+            distance = max(float(np.linalg.norm(offset)), 0.5 * size)
+            away = offset / distance + 0.7 * poses[0][0, :3] + 0.35 * up
+        self.distance = distance
+        self.server.scene.set_up_direction(tuple(up))
+        start = self.server.initial_camera
+        start.near, start.far = 1e-3 * distance, 1e3 * distance
+        places = [start, *(client.camera for client in self.server.get_clients().values())]
+        for camera in places:  # those who came before there was anything to see look there too
+            camera.position, camera.look_at = center + 1.25 * distance * away, center
+            camera.fov = 0.8
+
+    def _draw_meshes(self, frame: Frame) -> None:
+        place: dict[str, Any] = {}
+        if frame.matrix is not None:
+            M = frame.matrix.detach().double().numpy()
+            scale = float(np.cbrt(np.linalg.det(M[:3, :3])))
+            place = {"wxyz": self._rotation(M[:3, :3] / scale).wxyz, "position": M[:3, 3], "scale": scale}
+        for i, mesh in enumerate(frame.scene.meshes):
+            old, handle = self._meshes.get(i, (None, None))
+            if old is None or not _alike(old, mesh):
+                if old is not None and _is_plain(mesh) and _is_plain(old) and torch.equal(old.faces, mesh.faces):
+                    handle.vertices = _floats(mesh.verts)
+                else:
+                    handle = self._added(f"/meshes/{i}", mesh)
+                self._meshes[i] = mesh, handle
+            for name, value in place.items():
+                setattr(handle, name, value)
+
+    def _added(self, name: str, mesh: Mesh) -> Any:
+        """Takes the place of one of that name."""
+        if _is_plain(mesh):
+            faces = mesh.faces.numpy().astype(np.uint32)
+            return self.server.scene.add_mesh_simple(name, _floats(mesh.verts), faces, color=GREY, side="double")
+        made = to_trimesh(mesh, linear=True)
+        _ = made.vertex_normals  # written only if they are there
+        return self.server.scene.add_glb(name, made.export(file_type="glb"))
+
+    def _draw_cameras(self, frame: Frame) -> None:
+        if len(frame.cameras) != len(self._frusta):
+            for _, handle in self._frusta:
+                handle.remove()
+            self._frusta = [(None, self._frustum(i, camera)) for i, camera in enumerate(frame.cameras)]
+            if len(frame.cameras) > 1:
+                self.view.options = [str(i + 1) for i in range(len(frame.cameras))]
+            self.view.visible = len(frame.cameras) > 1
+        for i, (camera, target) in enumerate(zip(frame.cameras, frame.targets, strict=True)):
+            old, handle = self._frusta[i]
+            for name, value in self._placed(camera).items():
+                if not np.array_equal(getattr(handle, name), value):
+                    setattr(handle, name, value)
+            if target is not None and target is not old:
+                handle.image = _thumbnail(target)
+            self._frusta[i] = target, handle
+
+    def _frustum(self, i: int, camera: Camera) -> Any:
+        place = self._placed(camera)
+        scale = FRUSTUM * self.distance
+        thickness = 0.015 * scale
+        return self.server.scene.add_camera_frustum(
+            f"/cameras/{i}", scale=scale, thickness=thickness, color=(40, 90, 200), **place
+        )
+
+    def _placed(self, camera: Camera) -> dict[str, Any]:
+        (H, W), K = camera.size, camera.K.detach().double().numpy()
+        R = camera.world_to_camera.detach().double().numpy()[:3, :3]
+        fov = NOMINAL
+        if camera.projection != "orthographic":
+            fov = min(WIDEST, math.radians(abs(float(camera.fov_y.detach()))))
+        aspect = W * abs(float(K[1, 1])) / (H * abs(float(K[0, 0])))
+        position = camera.eye.detach().double().numpy()
+        return {"wxyz": self._rotation(R.T).wxyz, "position": position, "fov": fov, "aspect": aspect}
+
+    # -- the panel --------------------------------------------------------------------------------------------------------
+
+    def _draw_curve(self, losses: Sequence[float]) -> None:
+        every = max(1, math.ceil(len(losses) / MOST_POINTS))
+        steps = np.arange(1, len(losses) + 1, dtype=np.float64)[::every]
+        values = np.array(losses, np.float64)[::every]
+        kept = np.isfinite(values)
+        if kept.sum() < 2:
+            return
+        data = steps[kept], values[kept]
+        scales = {"x": {"time": False}, "y": {"distr": 3 if data[1].min() > 0.0 else 1}}  # 3: logarithmic
+        if self.curve is None:
+            line = {"label": "loss", "stroke": "#2850c8", "width": 2}
+            axes = ({"label": "step"}, {"size": 70})
+            self.curve = self.server.gui.add_uplot(
+                data, ({"label": "step"}, line), title="loss", scales=scales, axes=axes, aspect=1.8
+            )
+        else:
+            self.curve.data, self.curve.scales = data, scales
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """viser prints a banner."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield
+
+
+def _is_plain(mesh: Mesh) -> bool:
+    return mesh.channels not in (1, 3)
+
+
+def _alike(a: Mesh, b: Mesh) -> bool:
+    return a is b or all(
+        x == y and s.shape == t.shape and torch.equal(s, t)
+        for (x, s), (y, t) in zip(named_tensors(a), named_tensors(b), strict=False)
+    )
+
+
+def _bounds(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    points = torch.cat([mesh.verts.detach().double() for mesh in frame.scene.meshes])
+    if frame.matrix is not None:
+        points = points @ frame.matrix[:3, :3].double().T + frame.matrix[:3, 3].double()
+    low, high = points.aminmax(dim=0)
+    return low.numpy(), high.numpy()
+
+
+def _floats(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().float().numpy()
+
+
+def _thumbnail(target: Tensor) -> np.ndarray:
+    every = max(1, max(target.shape[:2]) // THUMBNAIL)
+    return as_bytes(displayed(target[::every, ::every].float()))

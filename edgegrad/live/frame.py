@@ -1,0 +1,111 @@
+"""What a live view shows at one moment, whichever fit it comes from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .._tree import map_tensors
+from ..aovs import render_aovs
+from ..camera import Camera
+from ..fit import CameraFit, Fit, PoseFit, Progress
+from ..fit.result import Step
+from ..fit.task import PoseTask
+from ..fit.views import Images, View, area_mean, cameras_of, views_of
+from ..image import linear_to_srgb
+from ..mesh import Mesh
+from ..scene import Scene
+
+LARGEST = 256  # pixels on the longer side of a picture
+SPP = 8
+CONTRAST = 4  # of the difference
+
+
+class Frame(NamedTuple):
+    scene: Scene
+    matrix: Tensor | None  # (4, 4), a similarity that places all meshes of the scene; None: they are where they are
+    cameras: list[Camera]
+    targets: list[Tensor | None]  # (H, W, C) linear, one for each camera
+    render: Callable[[int], Tensor]  # (h, w, C) as that camera sees it, of up to LARGEST pixels
+
+    def panel(self, index: int) -> list[np.ndarray]:
+        """target, render and difference (h, w, 3) of a camera, uint8; without a target the render alone."""
+        with torch.no_grad():
+            render = displayed(self.render(index))
+            target = self.targets[index]
+            if target is None:
+                return [as_bytes(render)]
+            target = displayed(area_mean(target.float(), (render.shape[0], render.shape[1])))
+            return [as_bytes(picture) for picture in (target, render, CONTRAST * (render - target).abs())]
+
+
+Shown = PoseFit | CameraFit | Progress | Fit
+
+
+def frame_of(fit: Shown) -> Frame:
+    """Of what a fit's callback gets, or a fit returns. Raises TypeError for something else, and for a pose from a file."""
+    if isinstance(fit, CameraFit):  # whose search moves the scene before a camera at rest
+        return frame_of(fit.search)._replace(matrix=None, cameras=[fit.camera.detach()])
+    if isinstance(fit, PoseFit) and fit.task is not None and fit.history:
+        return _frame_of_pose(fit.task, next(step for step in reversed(fit.history) if step.best))
+    if isinstance(fit, Progress | Fit):
+        return _frame(fit.scene, fit.cameras, fit.views)
+    raise TypeError(f"fit: expected what a fit gives its callback, or returns, got {type(fit).__name__}")
+
+
+def frame_of_scene(
+    scene: Mesh | Scene, cameras: Camera | Sequence[Camera] | None, images: Images | None, masks: Images | None
+) -> Frame:
+    """Of what a loop of the user's has. Raises TypeError or ValueError that names the argument."""
+    if not isinstance(scene, Mesh | Scene):
+        raise TypeError(f"scene: expected a Scene or a Mesh, got {type(scene).__name__}")
+    whole = Scene([scene]) if isinstance(scene, Mesh) else scene
+    whole = map_tensors(whole, lambda tensor: tensor.detach().cpu().clone())  # the loop goes on to change them
+    if cameras is None:
+        if images is not None or masks is not None:
+            raise ValueError("cameras: expected with images and masks, got None; give the camera of each")
+        views = []
+    elif images is None and masks is None:
+        views = [View(camera, None, None, None) for camera in cameras_of(cameras)]
+    else:
+        views = views_of(cameras, images, masks)
+    return _frame(whole, [view.camera for view in views], views)
+
+
+def _frame(scene: Scene, cameras: list[Camera], views: list[View]) -> Frame:
+    def render(index: int) -> Tensor:
+        view = views[index]
+        small = view.resized(min(1.0, LARGEST / max(view.camera.size)))
+        size = small.camera.size
+        behind = scene.background
+        behind = area_mean(behind, size) if behind is not None and behind.dim() == 3 else behind
+        name = (*view.aovs, "image")[0]
+        camera = cameras[index].resized(size)
+        return render_aovs(scene.replace(background=behind), camera, [name], spp=SPP, seed=0)[name]
+
+    return Frame(scene, None, cameras, [view.image if view.image is not None else view.mask for view in views], render)
+
+
+def _frame_of_pose(task: PoseTask, step: Step) -> Frame:
+    def render(index: int) -> Tensor:
+        one = dataclasses.replace(task, shots=[task.shots[index]])
+        factor = min(1.0, LARGEST / max(one.shots[0].camera.size))
+        return one.pictures(one.level(factor, blur=0.0, coarseness=1.0, spp=SPP, free=[]), step.pose)[0]
+
+    cameras = [task.lens(shot.camera, step.pose) for shot in task.shots]
+    return Frame(task.scene, step.pose.matrix, cameras, [shot.target for shot in task.shots], render)
+
+
+def displayed(image: Tensor) -> Tensor:
+    """(H, W, 3) sRGB in 0 … 1; of other than three channels the first."""
+    colors = image[..., :3] if image.shape[-1] >= 3 else image[..., :1].expand(-1, -1, 3)
+    return linear_to_srgb(colors.detach().clamp(0.0, 1.0))
+
+
+def as_bytes(image: Tensor) -> np.ndarray:
+    return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()

@@ -1,0 +1,247 @@
+"""eg.viewer(): watching a fit, pausing and stopping it.
+
+Fits do not know of it: it is a callback. It draws in the fit's own thread, so that nothing changes while it draws, and takes no
+more than a small share of the time. The page's buttons come in threads of the server: they set flags that the next step reads.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from .._check import check_int, check_positive
+from .._files import require
+from ..camera import Camera
+from ..mesh import Mesh
+from ..scene import Scene
+
+if TYPE_CHECKING:
+    from .browser import Browser
+    from .figure import Notebook
+    from .frame import Frame, Shown
+
+SHORTEST = 0.1  # seconds between two drawings
+BEAT = 0.1  # seconds in which a pause notices Ctrl-C
+
+
+def viewer(port: int = 8080, host: str = "127.0.0.1", *, server: bool | None = None, share: float = 0.03) -> Viewer:
+    """A live view: the meshes as they move, cameras with their pictures, target | render | difference, the loss, and buttons
+    that pause and stop.
+
+        with eg.viewer() as view:
+            print(view.url)
+            fit = eg.fit.fit_pose(mesh, image, camera, callback=view)
+
+    port     of the page; where it is taken, the next free one. 0: any
+    host     whose address the page has. Only this computer sees 127.0.0.1; "0.0.0.0" is for all who reach it, without a password
+    server   False: a figure that changes in its place in a notebook, with neither meshes nor buttons. None: that figure in a
+             notebook without viser, a page everywhere else
+    share    of the time that drawing may take, 0 … 1
+
+    Raises TypeError or ValueError that names the argument, ImportError without viser (`pip install 'edgegrad[view]'`).
+    """
+    port = check_int("port", port, 0, 65535)
+    if not isinstance(host, str):
+        raise TypeError(f"host: expected a str, got {type(host).__name__}")
+    if server is not None and not isinstance(server, bool):
+        raise TypeError(f"server: expected True, False or None, got {type(server).__name__}")
+    check_positive("share", share, least=0.0, most=1.0)
+    return Viewer(port, host, server, share)
+
+
+class Viewer:
+    """What viewer() makes: a callback of every fit, and for loops of one's own update()."""
+
+    def __init__(self, port: int, host: str, server: bool | None, share: float) -> None:
+        self._share = share
+        self._display: Browser | Notebook = self._opened(port, host, server)
+        self._steps = 0
+        self._losses: list[float] = []
+        self._frame: Frame | None = None
+        self._index = 0
+        self._next = 0.0  # when to draw again
+        self._drawing = threading.Lock()
+        self._go, self._stop = threading.Event(), threading.Event()
+        self._go.set()
+        self._closed = self._ended = False
+
+    def _opened(self, port: int, host: str, server: bool | None) -> Browser | Notebook:
+        if server is False and not in_notebook():
+            raise ValueError("server: expected True outside of a notebook, got False; nothing there shows a figure")
+        if server is False or (server is None and importlib.util.find_spec("viser") is None and in_notebook()):
+            require("matplotlib", "edgegrad[figures]", "a figure in a notebook")
+            from .figure import Notebook
+
+            return Notebook()
+        from .browser import Browser, Controls
+
+        return Browser(host, port, Controls(self._toggle, self.stop, self._look))
+
+    # -- what one does with it ------------------------------------------------------------------------------------------------
+
+    @property
+    def url(self) -> str | None:
+        """The page's address; None of a figure."""
+        return self._display.url
+
+    @property
+    def stopped(self) -> bool:
+        """Whether Stop was pressed, in a loop of one's own; a fit that it ends takes it back for the next."""
+        return self._stop.is_set()
+
+    @property
+    def paused(self) -> bool:
+        return not self._go.is_set()
+
+    def __call__(self, fit: Shown) -> None:
+        """As the callback of a fit: draws when it is time to, waits while paused, and ends the fit, which keeps its best, by
+        KeyboardInterrupt when Stop was pressed."""
+        from .frame import frame_of
+
+        if not self._step(_loss(fit), lambda: frame_of(fit)):
+            self._stop.clear()
+            raise KeyboardInterrupt
+
+    def update(
+        self,
+        scene: Mesh | Scene,
+        cameras: Camera | Sequence[Camera] | None = None,
+        images: Tensor | Sequence[Tensor] | None = None,
+        *,
+        masks: Tensor | Sequence[Tensor] | None = None,
+        loss: Tensor | float | None = None,
+    ) -> bool:
+        """A step of a loop of one's own: draws when it is time to, waits while paused, and gives False when Stop was pressed.
+
+            if not view.update(scene, camera, image, loss=loss):
+                break
+
+        cameras, images and masks are as for fit_scene(). Raises TypeError or ValueError that names the argument.
+        """
+        from .frame import frame_of_scene
+
+        number = None if loss is None else float(loss)
+        return self._step(number, lambda: frame_of_scene(scene, cameras, images, masks))
+
+    def show(self, fit: Shown) -> None:
+        """Draws at once: what a fit returns, for its last step may not be drawn."""
+        from .frame import frame_of
+
+        self._draw(frame_of(fit))
+
+    def wait(self) -> None:
+        """Keeps the page open until Stop, which then says Close, or Ctrl-C."""
+        if self.url is None:
+            return
+        self._ended = True
+        self._label()
+        try:
+            while not self._stop.wait(BEAT):
+                pass
+        except KeyboardInterrupt:
+            pass
+
+    def pause(self) -> None:
+        self._go.clear()
+        self._label()
+
+    def resume(self) -> None:
+        self._go.set()
+        self._label()
+
+    def stop(self) -> None:
+        self._stop.set()
+        self.resume()
+
+    def close(self) -> None:
+        """Ends the page. A fit that goes on is no longer shown."""
+        if not self._closed:
+            self._closed = True
+            self._go.set()
+            self._display.close()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _repr_html_(self) -> str | None:
+        """In a notebook: the page."""
+        if self.url is None:
+            return None
+        link = f'<a href="{self.url}" target="_blank">{self.url}</a>'
+        return link if self._closed else f'{link}<iframe src="{self.url}" width="100%" height="600"></iframe>'
+
+    def __repr__(self) -> str:
+        return f"Viewer({self.url or 'figure'}{', closed' if self._closed else ''})"
+
+    # -- steps ----------------------------------------------------------------------------------------------------------------
+
+    def _step(self, loss: float | None, frame: Callable[[], Frame]) -> bool:
+        """Whether to go on."""
+        if self._closed:
+            return not self.stopped
+        self._steps += 1
+        if loss is not None:
+            self._losses.append(loss)
+        began, first = time.perf_counter(), self._frame is None
+        if began >= self._next:
+            self._draw(frame())
+            now = time.perf_counter()
+            # The first one sends textures and pictures, later ones what changed.
+            self._next = now + max(SHORTEST, 0.0 if first else (now - began) / self._share)
+        if self.paused:
+            self._draw(frame())
+            while not self._go.wait(BEAT):
+                pass
+            self._draw_state()
+        return not self.stopped
+
+    def _draw(self, frame: Frame) -> None:
+        with self._drawing:
+            self._frame = frame
+            self._index = min(self._index, max(0, len(frame.cameras) - 1))
+            self._display.draw(frame, self._index, self._losses, self._state())
+
+    def _draw_state(self) -> None:
+        with self._drawing:
+            self._display.say(self._state())
+
+    def _state(self) -> str:
+        what = f"step {self._steps}" + (f", loss {self._losses[-1]:.3e}" if self._losses else "")
+        return f"**paused** at {what}" if self.paused else f"**ended** at {what}" if self._ended else what
+
+    def _label(self) -> None:
+        self._display.label("Resume" if self.paused else "Pause", "Close" if self._ended else "Stop")
+
+    def _toggle(self) -> None:
+        self.resume() if self.paused else self.pause()
+
+    def _look(self, index: int) -> None:
+        """Through another camera, also while paused and after the end."""
+        with self._drawing:
+            self._index = index
+            if self._frame is not None and self._display.url is not None:
+                self._display.draw_panel(self._frame, index)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _loss(fit: object) -> float | None:
+    """Of the last step."""
+    search = getattr(fit, "search", fit)
+    history = getattr(search, "history", None)
+    return getattr(history[-1] if history else fit, "loss", None)
+
+
+def in_notebook() -> bool:
+    """Whether this process is a notebook's kernel."""
+    try:
+        from IPython import get_ipython  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return False
+    return hasattr(get_ipython(), "kernel")
