@@ -85,6 +85,21 @@ def add_descent(parser: argparse.ArgumentParser, result: str) -> None:
     )  # fmt: skip
 
 
+def add_live(parser: argparse.ArgumentParser) -> None:
+    """outputs.live opens it."""
+    parser.add_argument(
+        "--view", type=port, nargs="?", const=8080, metavar="PORT",
+        help="watch, pause and stop the fit in a browser, on this computer's PORT (8080), or the next one that is free; "
+        "the page stays after the result is saved, until Ctrl-C or its Close",
+    )  # fmt: skip
+
+
+def port(text: str) -> int:
+    if (found := number(text)) > 65535:
+        raise argparse.ArgumentTypeError(f"expected a port from 0 to 65535, got {text!r}")
+    return found
+
+
 def shape(text: str) -> tuple[int, int]:
     """(height, width) from 640x480 or 512."""
     numbers = [count(number) for number in text.lower().split("x")]

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from .arguments import add_mesh, add_view, count, number
+from .arguments import add_live, add_mesh, add_view, count, number
 from .inputs import read_background, read_picture, read_scene, read_view
-from .outputs import make_folder, write_outputs
+from .outputs import linger, live, make_folder, write_outputs
 
 
 def add(commands: Any) -> None:
@@ -28,6 +28,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="for camera.json, pose.json, fit.png, loss.png, fit.webp"
     )
+    add_live(parser)
     parser.set_defaults(run=run)
 
 
@@ -48,13 +49,15 @@ def run(args: argparse.Namespace) -> int:
         args.camera, args.fov, args.eye, args.target, args.up = earlier, None, None, None, None
     start = read_view(args, scene, (picture.shape[0], picture.shape[1]), None)
     make_folder(args.out)
-    fit = fit_camera(
-        scene, picture, start, mask=mask, background=read_background(args.background, picture), focal=not args.no_focal,
-        principal=args.principal, distortion=args.distortion, steps=args.steps, seed=args.seed,
-    )  # fmt: skip
-    print(f"loss {fit.loss:.3e} after {fit.search.steps} steps in {fit.search.seconds:.1f} s, {fit.state}")
-    K = fit.camera.K.tolist()
-    print(f"focal length {K[0][0]:.6g} px, principal point {K[0][2]:.6g}, {K[1][2]:.6g} px", flush=True)
-    save_camera(earlier, fit.camera)
-    print(f"wrote {', '.join(['camera.json', *write_outputs(args.out, fit.search)])} in {args.out}")
+    with live(args.view) as view:
+        fit = fit_camera(
+            scene, picture, start, mask=mask, background=read_background(args.background, picture), focal=not args.no_focal,
+            principal=args.principal, distortion=args.distortion, steps=args.steps, seed=args.seed, callback=view,
+        )  # fmt: skip
+        print(f"loss {fit.loss:.3e} after {fit.search.steps} steps in {fit.search.seconds:.1f} s, {fit.state}")
+        K = fit.camera.K.tolist()
+        print(f"focal length {K[0][0]:.6g} px, principal point {K[0][2]:.6g}, {K[1][2]:.6g} px", flush=True)
+        save_camera(earlier, fit.camera)
+        print(f"wrote {', '.join(['camera.json', *write_outputs(args.out, fit.search)])} in {args.out}")
+        linger(view, fit)
     return INTERRUPTED if fit.interrupted else 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
-from .arguments import add_mesh, add_view, count, number
+from .arguments import add_live, add_mesh, add_view, count, number
 from .inputs import check_size, read_background, read_mask, read_picture, read_pose, read_scene, read_view
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="for pose.json, fit.png, loss.png, fit.webp"
     )
+    add_live(parser)
     parser.set_defaults(run=run)
 
 
@@ -66,23 +67,28 @@ def run(args: argparse.Namespace) -> int:
     camera = read_view(args, scene, (picture.shape[0], picture.shape[1]), args.init)
     outputs.make_folder(args.out)
 
-    def save(fit: PoseFit) -> None:
-        # After each step, which takes far longer: whatever ends the process, the best pose so far is on disk.
-        with suppress(OSError):  # the last copy will say what is wrong
-            outputs.write_pose(args.out, fit)
+    with outputs.live(args.view) as view:
 
-    fit = fit_pose(
-        scene, picture, camera, mask, None if init is None else init.matrix,
-        fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=read_background(args.background, picture),
-        weight=weight, max_size=args.size, steps=args.steps, seed=args.seed, callback=save,
-    )  # fmt: skip
-    # Neither a full disk nor a closed terminal may lose the result: it is printed before the files are written, and they
-    # are written also when printing failed.
-    try:
-        _print_fit(fit, args.fit_focal)
-    finally:
-        written = outputs.write_outputs(args.out, fit)
-    print(f"wrote {', '.join(written)} in {args.out}")
+        def after_step(fit: PoseFit) -> None:
+            # A step takes far longer than this: whatever ends the process, the best pose so far is on disk.
+            with suppress(OSError):  # the last copy will say what is wrong
+                outputs.write_pose(args.out, fit)
+            if view is not None:
+                view(fit)
+
+        fit = fit_pose(
+            scene, picture, camera, mask, None if init is None else init.matrix,
+            fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=read_background(args.background, picture),
+            weight=weight, max_size=args.size, steps=args.steps, seed=args.seed, callback=after_step,
+        )  # fmt: skip
+        # Neither a full disk nor a closed terminal may lose the result: it is printed before the files are written, and they
+        # are written also when printing failed.
+        try:
+            _print_fit(fit, args.fit_focal)
+        finally:
+            written = outputs.write_outputs(args.out, fit)
+        print(f"wrote {', '.join(written)} in {args.out}")
+        outputs.linger(view, fit)
     return INTERRUPTED if fit.interrupted else 0
 
 

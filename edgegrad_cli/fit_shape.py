@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from .arguments import add_descent, add_views, count
+from .arguments import add_descent, add_live, add_views, count
 from .inputs import descent, read_mask, read_views
-from .outputs import finish, make_folder
+from .outputs import finish, linger, live, make_folder
 
 
 def add(commands: Any) -> None:
@@ -18,6 +18,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--levels", type=count, default=3, help="from coarse to fine (%(default)s)")
     parser.add_argument("--faces", type=count, help="about so many at the end (four times as many on each level)")
     add_descent(parser, "mesh.ply")
+    add_live(parser)
     parser.set_defaults(run=run)
 
 
@@ -32,5 +33,10 @@ def run(args: argparse.Namespace) -> int:
     # A picture without alpha is a mask itself.
     masks = [read_mask(path) if alpha is None else alpha for path, alpha in zip(args.images, alphas, strict=True)]
     make_folder(args.out)
-    fit = fit_shape(mesh, cameras, masks=masks, levels=args.levels, faces=args.faces, **descent(args))
-    return finish(fit, args.out)
+    with live(args.view) as view:
+        fit = fit_shape(
+            mesh, cameras, masks=masks, levels=args.levels, faces=args.faces, callback=view, **descent(args)
+        )
+        code = finish(fit, args.out)
+        linger(view, fit)
+    return code

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from .arguments import add_descent, add_mesh, add_views, count
+from .arguments import add_descent, add_live, add_mesh, add_views, count
 from .inputs import descent, read_background, read_mesh, read_views
-from .outputs import finish, make_folder
+from .outputs import finish, linger, live, make_folder
 
 
 def add(commands: Any) -> None:
@@ -17,6 +17,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--size", type=count, default=512, help="texels on a side (%(default)s)")
     parser.add_argument("--background", help="#rrggbb, where pictures have no alpha; black when left out")
     add_descent(parser, "texture.png")
+    add_live(parser)
     parser.set_defaults(run=run)
 
 
@@ -35,5 +36,17 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError("--background: expected none with images that have alpha, got both; leave one out")
     background = read_background(args.background, pictures[0])
     make_folder(args.out)
-    fit = fit_texture(mesh, cameras, pictures, args.size, masks=masks or None, background=background, **descent(args))
-    return finish(fit, args.out)
+    with live(args.view) as view:
+        fit = fit_texture(
+            mesh,
+            cameras,
+            pictures,
+            args.size,
+            masks=masks or None,
+            background=background,
+            callback=view,
+            **descent(args),
+        )
+        code = finish(fit, args.out)
+        linger(view, fit)
+    return code

@@ -5,11 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from edgegrad.fit import Fit, PoseFit
+    from edgegrad.fit import CameraFit, Fit, PoseFit
+    from edgegrad.live import Viewer
 
 
 def make_folder(folder: Path) -> None:
@@ -22,6 +25,27 @@ def make_folder(folder: Path) -> None:
         raise OSError(
             f"--out: expected a folder to write to, got {folder} ({error.strerror}); choose another"
         ) from error
+
+
+@contextmanager
+def live(port: int | None) -> Iterator[Viewer | None]:
+    """The live view that --view asks for. Whoever ends the block has saved the result. Raises ImportError without viser."""
+    if port is None:
+        yield None
+        return
+    from edgegrad import viewer
+
+    with viewer(port, server=True) as view:
+        print(f"live view: {view.url}", flush=True)
+        yield view
+
+
+def linger(view: Viewer | None, fit: Fit | PoseFit | CameraFit) -> None:
+    """Shows the result until the user has seen it, unless they ended the fit."""
+    if view is not None and not fit.interrupted:
+        view.show(fit)
+        print(f"live view: {view.url} until Ctrl-C or Close", flush=True)
+        view.wait()
 
 
 def write_pose(folder: Path, fit: PoseFit) -> None:

@@ -24,6 +24,7 @@ THUMBNAIL = 128  # pixels on the longer side of a picture in a frustum
 FRUSTUM = 0.15  # its size as a part of the distance from the camera to the meshes
 WIDEST = 2.0  # radians of a frustum; a camera that has no field of view gets
 NOMINAL = 0.6
+AMBIENT = 1.5
 MOST_POINTS = 500  # of the curve
 GREY = (round(255 * (1.055 * PLAIN ** (1 / 2.4) - 0.055)),) * 3  # sRGB
 PANEL_TITLE = f"target | render | difference × {CONTRAST}"
@@ -37,6 +38,11 @@ class Controls(NamedTuple):
     look: Callable[[int], None]  # through another camera
 
 
+class _Shown(NamedTuple):
+    mesh: Mesh
+    handle: Any  # viser's
+
+
 class Browser:
     """The page. Raises ImportError without viser, OSError where the host has no free port."""
 
@@ -47,8 +53,11 @@ class Browser:
         shown = "localhost" if host in ("127.0.0.1", "0.0.0.0", "") else host
         self.url = f"http://{shown}:{self.server.get_port()}"
         self._rotation = viser.transforms.SO3.from_matrix
-        self._meshes: dict[int, tuple[Mesh, Any]] = {}  # what is shown, and its handle
+        self._meshes: dict[int, _Shown] = {}
         self._frusta: list[tuple[Tensor | None, Any]] = []
+        # Colours that are radiance have their light in them: an even light beside the page's own shows them, and the shape.
+        self.server.scene.configure_default_lights(cast_shadow=False)
+        self.server.scene.add_light_ambient("/light", intensity=AMBIENT)
         gui = self.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False)  # which would open the page to everyone
         gui.main_panel.dock_right()
@@ -107,14 +116,15 @@ class Browser:
             up = mean / np.linalg.norm(mean) if np.linalg.norm(mean) > 0.1 else -poses[0][1, :3]
             offset = frame.cameras[0].eye.detach().double().numpy() - center
             distance = max(float(np.linalg.norm(offset)), 0.5 * size)
-            away = offset / distance + 0.7 * poses[0][0, :3] + 0.35 * up
+            away = 1.1 * offset / distance + 1.2 * poses[0][0, :3] + 0.6 * up
+            center = center + 0.35 * offset
         self.distance = distance
         self.server.scene.set_up_direction(tuple(up))
         start = self.server.initial_camera
         start.near, start.far = 1e-3 * distance, 1e3 * distance
         places = [start, *(client.camera for client in self.server.get_clients().values())]
         for camera in places:  # those who came before there was anything to see look there too
-            camera.position, camera.look_at = center + 1.25 * distance * away, center
+            camera.position, camera.look_at = center + 0.9 * distance * away, center
             camera.fov = 0.8
 
     def _draw_meshes(self, frame: Frame) -> None:
@@ -124,15 +134,16 @@ class Browser:
             scale = float(np.cbrt(np.linalg.det(M[:3, :3])))
             place = {"wxyz": self._rotation(M[:3, :3] / scale).wxyz, "position": M[:3, 3], "scale": scale}
         for i, mesh in enumerate(frame.scene.meshes):
-            old, handle = self._meshes.get(i, (None, None))
-            if old is None or not _alike(old, mesh):
-                if old is not None and _is_plain(mesh) and _is_plain(old) and torch.equal(old.faces, mesh.faces):
+            old = self._meshes.get(i)
+            if old is None or not _alike(old.mesh, mesh):
+                if old and _is_plain(mesh) and _is_plain(old.mesh) and torch.equal(old.mesh.faces, mesh.faces):
+                    handle = old.handle
                     handle.vertices = _floats(mesh.verts)
                 else:
                     handle = self._added(f"/meshes/{i}", mesh)
-                self._meshes[i] = mesh, handle
+                self._meshes[i] = _Shown(mesh, handle)
             for name, value in place.items():
-                setattr(handle, name, value)
+                setattr(self._meshes[i].handle, name, value)
 
     def _added(self, name: str, mesh: Mesh) -> Any:
         """Takes the place of one of that name."""
@@ -187,16 +198,17 @@ class Browser:
         kept = np.isfinite(values)
         if kept.sum() < 2:
             return
-        data = steps[kept], values[kept]
-        scales = {"x": {"time": False}, "y": {"distr": 3 if data[1].min() > 0.0 else 1}}  # 3: logarithmic
+        positive = bool(values[kept].min() > 0.0)
+        data = steps[kept], np.log10(values[kept]) if positive else values[kept]
+        title = "loss, as a power of ten" if positive else "loss"
         if self.curve is None:
             line = {"label": "loss", "stroke": "#2850c8", "width": 2}
-            axes = ({"label": "step"}, {"size": 70})
             self.curve = self.server.gui.add_uplot(
-                data, ({"label": "step"}, line), title="loss", scales=scales, axes=axes, aspect=1.8
-            )
+                data, ({"label": "step"}, line), title=title, scales={"x": {"time": False}}, aspect=2.0,
+                legend={"show": False},
+            )  # fmt: skip
         else:
-            self.curve.data, self.curve.scales = data, scales
+            self.curve.data, self.curve.title = data, title
 
 
 @contextlib.contextmanager
