@@ -88,10 +88,15 @@ def add_descent(parser: argparse.ArgumentParser, result: str) -> None:
 def add_live(parser: argparse.ArgumentParser) -> None:
     """outputs.live opens it."""
     parser.add_argument(
-        "--view", type=port, nargs="?", const=8080, metavar="PORT",
-        help="watch, pause and stop the fit in a browser, on this computer's PORT (8080), or the next one that is free; "
-        "the page stays after the result is saved, until Ctrl-C or its Close",
+        "--view", action="store_true",
+        help="watch, pause and stop the fit in a browser; the page stays after the result is saved, until Ctrl-C or its Close",
     )  # fmt: skip
+    parser.add_argument(
+        "--port",
+        type=port,
+        default=8080,
+        help="of the page, on this computer (%(default)s), or the next one that is free",
+    )
 
 
 def port(text: str) -> int:

@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         args.camera, args.fov, args.eye, args.target, args.up = earlier, None, None, None, None
     start = read_view(args, scene, (picture.shape[0], picture.shape[1]), None)
     make_folder(args.out)
-    with live(args.view) as view:
+    with live(args) as view:
         fit = fit_camera(
             scene, picture, start, mask=mask, background=read_background(args.background, picture), focal=not args.no_focal,
             principal=args.principal, distortion=args.distortion, steps=args.steps, seed=args.seed, callback=view,

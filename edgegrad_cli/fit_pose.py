@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     camera = read_view(args, scene, (picture.shape[0], picture.shape[1]), args.init)
     outputs.make_folder(args.out)
 
-    with outputs.live(args.view) as view:
+    with outputs.live(args) as view:
 
         def after_step(fit: PoseFit) -> None:
             # A step takes far longer than this: whatever ends the process, the best pose so far is on disk.

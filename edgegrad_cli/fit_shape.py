@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     # A picture without alpha is a mask itself.
     masks = [read_mask(path) if alpha is None else alpha for path, alpha in zip(args.images, alphas, strict=True)]
     make_folder(args.out)
-    with live(args.view) as view:
+    with live(args) as view:
         fit = fit_shape(
             mesh, cameras, masks=masks, levels=args.levels, faces=args.faces, callback=view, **descent(args)
         )

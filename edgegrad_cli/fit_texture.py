@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError("--background: expected none with images that have alpha, got both; leave one out")
     background = read_background(args.background, pictures[0])
     make_folder(args.out)
-    with live(args.view) as view:
+    with live(args) as view:
         fit = fit_texture(
             mesh,
             cameras,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import errno
 import os
 import sys
@@ -28,14 +29,14 @@ def make_folder(folder: Path) -> None:
 
 
 @contextmanager
-def live(port: int | None) -> Iterator[Viewer | None]:
+def live(args: argparse.Namespace) -> Iterator[Viewer | None]:
     """The live view that --view asks for. Whoever ends the block has saved the result. Raises ImportError without viser."""
-    if port is None:
+    if not args.view:
         yield None
         return
     from edgegrad import viewer
 
-    with viewer(port, server=True) as view:
+    with viewer(args.port, server=True) as view:
         print(f"live view: {view.url}", flush=True)
         yield view
 

@@ -116,7 +116,7 @@ class Browser:
             up = mean / np.linalg.norm(mean) if np.linalg.norm(mean) > 0.1 else -poses[0][1, :3]
             offset = frame.cameras[0].eye.detach().double().numpy() - center
             distance = max(float(np.linalg.norm(offset)), 0.5 * size)
-            away = 1.1 * offset / distance + 1.2 * poses[0][0, :3] + 0.6 * up
+            away = 1.1 * offset / distance - 1.2 * poses[0][0, :3] + 0.6 * up
             center = center + 0.35 * offset
         self.distance = distance
         self.server.scene.set_up_direction(tuple(up))

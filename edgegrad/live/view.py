@@ -41,7 +41,7 @@ def viewer(port: int = 8080, host: str = "127.0.0.1", *, server: bool | None = N
     host     whose address the page has. Only this computer sees 127.0.0.1; "0.0.0.0" is for all who reach it, without a password
     server   False: a figure that changes in its place in a notebook, with neither meshes nor buttons. None: that figure in a
              notebook without viser, a page everywhere else
-    share    of the time that drawing may take, 0 … 1
+    share    of the time that drawing may take, 0.001 … 1
 
     Raises TypeError or ValueError that names the argument, ImportError without viser (`pip install 'edgegrad[view]'`).
     """
@@ -50,7 +50,7 @@ def viewer(port: int = 8080, host: str = "127.0.0.1", *, server: bool | None = N
         raise TypeError(f"host: expected a str, got {type(host).__name__}")
     if server is not None and not isinstance(server, bool):
         raise TypeError(f"server: expected True, False or None, got {type(server).__name__}")
-    check_positive("share", share, least=0.0, most=1.0)
+    check_positive("share", share, least=1e-3, most=1.0)
     return Viewer(port, host, server, share)
 
 
@@ -195,7 +195,7 @@ class Viewer:
             self._draw(frame())
             now = time.perf_counter()
             # The first one sends textures and pictures, later ones what changed.
-            self._next = now + max(SHORTEST, 0.0 if first else (now - began) / self._share)
+            self._next = now + max(SHORTEST, 0.0 if first else (now - began) * (1.0 / self._share - 1.0))
         if self.paused:
             self._draw(frame())
             while not self._go.wait(BEAT):

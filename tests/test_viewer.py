@@ -1,0 +1,374 @@
+"""The live view without a browser: what its server holds, and how it pauses, stops and keeps out of the way."""
+
+import io
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from test_fit import BACKGROUND, START, bracket, camera, picture
+from test_fit_scene import pictures, views
+
+import edgegrad as eg
+import edgegrad_cli as cli
+from edgegrad.fit import Parameter, fit_camera, fit_pose, fit_scene, fit_shape, fit_texture
+from edgegrad.image import linear_to_srgb, write_image
+from edgegrad.io import save_camera
+from edgegrad.live import frame, view
+from edgegrad.live.browser import Browser
+
+viser = pytest.importorskip("viser", reason="the live view needs edgegrad[view]")
+QUIET = {"progress": False, "spp": 4}
+
+
+@pytest.fixture
+def viewer():
+    with eg.viewer(port=0, share=1.0) as made:
+        yield made
+
+
+def page(viewer) -> Browser:
+    return viewer._display
+
+
+def vertices(handle):
+    """World positions of what the server shows."""
+    if isinstance(handle, viser.MeshHandle):
+        points = handle.vertices
+    else:
+        points = trimesh.load(io.BytesIO(handle.glb_data), file_type="glb", force="mesh").vertices
+    scale = handle.scale
+    return viser.transforms.SO3(handle.wxyz).as_matrix() @ (scale * np.asarray(points, float)).T + np.reshape(
+        handle.position, (3, 1)
+    )
+
+
+def extent(points):
+    return np.concatenate([points.min(1), points.max(1)])
+
+
+# -- what it shows ----------------------------------------------------------------------------------------------------
+
+
+def test_a_pose_moves_the_mesh_and_keeps_the_camera(viewer):
+    at = camera(32)
+    fit = fit_pose(bracket(), picture(at), at, init=START, background=BACKGROUND, callback=viewer, **QUIET)
+    viewer.show(fit)
+    moved = bracket().verts @ fit.matrix[:3, :3].T + fit.matrix[:3, 3]
+    shown = vertices(page(viewer)._meshes[0].handle)
+    np.testing.assert_allclose(extent(shown), extent(moved.T.numpy()), atol=1e-5)
+    (_, frustum) = page(viewer)._frusta[0]
+    np.testing.assert_allclose(frustum.position, at.eye, atol=1e-9)
+    forward = viser.transforms.SO3(frustum.wxyz).as_matrix()[:, 2]
+    np.testing.assert_allclose(forward, at.world_to_camera[2, :3], atol=1e-9)
+    assert np.degrees(frustum.fov) == pytest.approx(float(at.fov_y)) and frustum.aspect == pytest.approx(1.0)
+    assert frustum.image.shape == (32, 32, 3)
+    target, _, apart = np.split(page(viewer).picture.image.astype(int), 3, axis=1)
+    np.testing.assert_array_equal(target, (linear_to_srgb(picture(at).clamp(0, 1)) * 255).round().numpy())
+    assert apart.mean() < 25  # four times the difference
+    assert len(viewer._losses) == fit.steps - 1 and len(page(viewer).curve.data[0]) == fit.steps - 1
+    assert page(viewer).status.content.startswith(f"step {fit.steps - 1}, loss ")
+
+
+def test_a_camera_moves_before_a_scene_at_rest(viewer):
+    at = camera(32)
+    away = at.world_to_camera.clone()
+    away[0, 3] += 0.1
+    fit = fit_camera(bracket(), picture(at), at.replace(world_to_camera=away), focal=False, background=BACKGROUND,
+                     callback=viewer, **QUIET)  # fmt: skip
+    viewer.show(fit)
+    np.testing.assert_allclose(
+        extent(vertices(page(viewer)._meshes[0].handle)), extent(bracket().verts.T.numpy()), atol=1e-6
+    )
+    np.testing.assert_allclose(page(viewer)._frusta[0][1].position, fit.camera.eye, atol=1e-9)
+    assert float((fit.camera.eye - at.eye).norm()) < 0.02
+
+
+def test_shapes_are_shown_as_they_move_also_after_remeshing(viewer, monkeypatch):
+    cameras = views(2)
+    masks = [
+        eg.render_aovs(eg.Mesh(bracket().verts, bracket().faces), one, ["alpha"], spp=16)["alpha"] for one in cameras
+    ]
+    ball = trimesh.creation.icosphere(2, 1.2)
+    ball.vertices += [1.0, 0.75, 0.4]
+    start = eg.Mesh(torch.tensor(ball.vertices).float(), torch.tensor(ball.faces))
+    seen = []
+    monkeypatch.setattr(view, "SHORTEST", 0.0)
+
+    def look(progress):
+        viewer(progress)
+        seen.append((progress.step, len(progress.scene.meshes[0].faces), progress.views[0].camera.size))
+
+    fit = fit_shape(start, cameras, masks=masks, levels=2, steps=4, faces=600, callback=look, **QUIET)
+    viewer.show(fit)
+    handle = page(viewer)._meshes[0].handle
+    np.testing.assert_allclose(handle.vertices, fit.mesh.verts, atol=1e-6)
+    assert seen[0][1] == 320 != seen[-1][1] == len(fit.mesh.faces) == len(handle.faces)
+    assert page(viewer).view.options == ("1", "2") and page(viewer).view.visible
+
+
+def test_textures_and_colours_are_those_of_the_mesh(viewer):
+    square = eg.Mesh(
+        torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2], [0, 2, 3]]),
+        texture=torch.full((4, 4, 3), 0.3), uvs=torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]]),
+        uv_faces=torch.tensor([[0, 1, 2], [0, 2, 3]]),
+    )  # fmt: skip
+    at = eg.Camera.look_at((0.5, 0.5, 2.0), (0.5, 0.5, 0.0), size=(16, 16))
+    fit = fit_texture(square, at, torch.full((16, 16, 3), 0.6), (4, 4), steps=30, callback=viewer, **QUIET)
+    viewer.show(fit)
+    loaded = trimesh.load(io.BytesIO(page(viewer)._meshes[0].handle.glb_data), file_type="glb", force="mesh")
+    texels = np.asarray(loaded.visual.material.baseColorTexture)[..., :3]
+    want = (linear_to_srgb(fit.mesh.texture.clamp(0, 1)) * 255).round().numpy()
+    np.testing.assert_array_equal(texels, want)
+    red = eg.Mesh(square.verts, square.faces, colors=torch.tensor([[0.5, 0.0, 0.0]]).expand(4, 3))
+    viewer._next = 0.0
+    assert viewer.update(red)
+    loaded = trimesh.load(io.BytesIO(page(viewer)._meshes[0].handle.glb_data), file_type="glb", force="mesh")
+    np.testing.assert_array_equal(loaded.visual.vertex_colors[:, :3], [[128, 0, 0]] * 4)  # linear, as in glTF
+
+
+def test_a_loop_of_ones_own(viewer, monkeypatch):
+    monkeypatch.setattr(view, "SHORTEST", 0.0)
+    at = eg.Camera.stack(views(2))
+    mesh = bracket()
+    images = torch.stack(pictures(mesh, list(at)))
+    verts = mesh.verts.clone().requires_grad_()
+    for k in range(3):
+        assert viewer.update(mesh.replace(verts=verts), at, images, loss=torch.tensor(1.0 / (k + 1)))
+    held = vertices(page(viewer)._meshes[0].handle)
+    with torch.no_grad():
+        verts += 1.0  # in place: what is shown stays as it was
+    viewer._look(1)
+    np.testing.assert_allclose(vertices(page(viewer)._meshes[0].handle), held)
+    target, render, _ = np.split(page(viewer).picture.image.astype(int), 3, axis=1)
+    np.testing.assert_array_equal(target, (linear_to_srgb(images[1].clamp(0, 1)) * 255).round().numpy())
+    assert abs(target - render).mean() < 6
+    np.testing.assert_allclose(page(viewer).curve.data, [[1, 2, 3], np.log10([1.0, 1 / 2, 1 / 3])])
+    viewer.update(mesh)  # fewer cameras, no pictures
+    assert not page(viewer)._frusta
+
+
+@pytest.mark.parametrize("kind", ["orthographic", "fisheye", "panorama"])
+def test_cameras_of_all_kinds_are_shown(viewer, kind):
+    at = camera(16)
+    K = at.K.clone() * torch.tensor([[0.4], [0.4], [1.0]])
+    if kind == "panorama":
+        K[:2, :2] = torch.eye(2) * 16 / 6.3
+    assert viewer.update(bracket(), eg.Camera(at.world_to_camera, K, at.size, kind))
+    assert 0.0 < page(viewer)._frusta[0][1].fov <= 2.0
+    assert page(viewer).picture.image.shape == (16, 16, 3)  # the render alone
+
+
+# -- pause, stop, and out of the way ----------------------------------------------------------------------------------
+
+
+def colour_fit(**options):
+    cameras = views(1)
+    return fit_scene(
+        bracket(), cameras, pictures(bracket(), cameras), {"face_colors": Parameter(0.01)}, **{**QUIET, **options}
+    )
+
+
+def test_a_pause_holds_the_fit_and_stop_ends_it_with_its_best(viewer):
+    steps, reached = [], threading.Event()
+
+    def callback(record):
+        steps.append(record.step)
+        if record.step == 3:
+            viewer.pause()
+            reached.set()
+        viewer(record)
+
+    found = []
+    thread = threading.Thread(target=lambda: found.append(colour_fit(steps=10**6, patience=10**6, callback=callback)))
+    thread.start()
+    assert reached.wait(20)
+    time.sleep(0.5)
+    assert steps == [0, 1, 2, 3] and viewer.paused
+    for _ in range(100):
+        if page(viewer).status.content.startswith("**paused** at step 4"):
+            break
+        time.sleep(0.05)
+    else:
+        pytest.fail("the page does not say that it is paused")
+    assert page(viewer).pause.label == "Resume"
+    viewer.resume()
+    while len(steps) < 8:
+        time.sleep(0.01)
+    viewer.pause()
+    viewer.stop()  # also of a fit that is paused
+    thread.join(20)
+    assert not thread.is_alive() and found[0].interrupted and found[0].steps == len(steps)
+    assert not viewer.stopped and not viewer.paused  # ready for the next fit
+    assert colour_fit(steps=2, callback=viewer).steps == 2
+
+
+def test_stop_ends_a_loop_of_ones_own(viewer):
+    assert viewer.update(bracket())
+    viewer.stop()
+    assert not viewer.update(bracket()) and viewer.stopped
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
+def test_ctrl_c_ends_a_pause(viewer):
+    viewer.pause()
+    threading.Timer(0.5, signal.raise_signal, [signal.SIGINT]).start()
+    fit = colour_fit(steps=10**6, callback=viewer)
+    assert fit.interrupted and fit.steps == 1
+
+
+def test_drawing_takes_no_more_than_its_share_of_the_time(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(view.time, "perf_counter", lambda: now[0])
+    drawn = []
+    with eg.viewer(port=0, share=0.05) as viewer:
+
+        def draw(*_):
+            drawn.append(now[0])
+            now[0] += 0.04
+
+        monkeypatch.setattr(viewer._display, "draw", draw)
+        while now[0] < 20.0:
+            now[0] += 0.01
+            viewer.update(bracket())
+    assert drawn[1] - drawn[0] < 0.2  # the first one may take long
+    gaps = np.diff(drawn[1:])
+    assert 0.04 / gaps.max() > 0.04 and 0.04 / gaps.min() < 0.0501
+
+
+def test_scenes_are_made_only_where_they_are_drawn(viewer, monkeypatch):
+    monkeypatch.setattr(view, "SHORTEST", 1e9)
+    made = []
+    monkeypatch.setattr(frame, "frame_of_scene", lambda *a, of=frame.frame_of_scene: made.append(1) or of(*a))
+    for _ in range(5):
+        viewer.update(bracket())
+    assert len(made) == 1 and viewer._steps == 5
+
+
+def test_another_port_where_one_is_taken_and_only_this_computer():
+    with eg.viewer(port=0) as one:
+        port = int(one.url.rsplit(":", 1)[1])
+        with eg.viewer(port) as two:
+            assert two.url != one.url
+        assert page(one).server.get_host() == "127.0.0.1"
+        assert f'<iframe src="{one.url}"' in one._repr_html_()
+    assert "iframe" not in one._repr_html_() and "closed" in repr(one)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", port))  # given back
+    assert one.update(bracket())  # a fit goes on without it
+
+
+# -- a figure in a notebook -------------------------------------------------------------------------------------------
+
+
+def test_a_figure_where_there_is_no_server(monkeypatch):
+    ipython = pytest.importorskip("IPython.display")
+    shown = []
+
+    class Handle:
+        def update(self, image):
+            shown.append(image.data)
+
+    monkeypatch.setattr(view, "in_notebook", lambda: True)
+    monkeypatch.setattr(ipython, "display", lambda image, display_id: shown.append(image.data) or Handle())
+    monkeypatch.setattr(view.importlib.util, "find_spec", lambda name: None)
+    with eg.viewer() as made:
+        assert made.url is None and made._repr_html_() is None
+        made._next = 0.0
+        fit = colour_fit(steps=3, callback=made)
+        made.show(fit)
+        made.wait()  # for nobody
+    titles = [ax.get_title() for ax in made._display.figure.axes]
+    assert titles == ["target", "render", "difference × 4", "loss"]
+    assert len(shown) >= 2 and shown[0] != shown[-1] and all(data.startswith(b"\x89PNG") for data in shown)
+
+
+# -- faults -----------------------------------------------------------------------------------------------------------
+
+
+def test_faults_name_the_argument(viewer):
+    for options, error, text in [
+        ({"port": -1}, ValueError, "port: expected"), ({"port": "x"}, TypeError, "port: expected"),
+        ({"host": 3}, TypeError, "host: expected a str"), ({"server": 1}, TypeError, "server: expected True"),
+        ({"server": False}, ValueError, "server: expected True outside of a notebook"),
+        ({"share": 0.0}, ValueError, "share: expected"), ({"share": 1.5}, ValueError, "share: expected"),
+    ]:  # fmt: skip
+        with pytest.raises(error, match=text):
+            eg.viewer(**{"port": 0, **options})
+    with pytest.raises(TypeError, match="fit: expected what a fit gives its callback"):
+        viewer.show(3)
+    with pytest.raises(TypeError, match="scene: expected a Scene or a Mesh, got int"):
+        viewer.update(3)
+    with pytest.raises(ValueError, match="cameras: expected with images and masks, got None"):
+        viewer.update(bracket(), None, torch.zeros(4, 4, 3))
+
+
+def test_without_viser_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ImportError, match=r"live view needs edgegrad\[view\]; install it with: pip install 'edgegrad"):
+        eg.viewer()
+
+
+def test_importing_edgegrad_imports_no_viser():
+    code = "import sys, edgegrad; sys.exit(any(m in sys.modules for m in ('viser', 'matplotlib', 'IPython')))"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+# -- the command line -------------------------------------------------------------------------------------------------
+
+
+def test_the_command_line_opens_it_and_saves_before_it_waits(tmp_path, monkeypatch, capsys):
+    mesh, at = bracket(), camera(48)
+    colors = (linear_to_srgb(mesh.face_colors) * 255).round().to(torch.uint8).numpy()
+    made = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), face_colors=colors, process=False)
+    made.export(tmp_path / "mesh.ply")
+    save_camera(tmp_path / "camera.json", at)
+    write_image(tmp_path / "target.png", picture(at))
+    out, waited = tmp_path / "out", []
+
+    def wait(viewer):
+        saved = json.loads((out / "pose.json").read_text())["mesh_to_world"]
+        shown = viewer._frame.matrix
+        waited.append(np.allclose(saved, shown) and (out / "fit.png").exists())
+
+    monkeypatch.setattr(view.Viewer, "wait", wait)
+    arguments = ["fit-pose", "mesh.ply", "target.png", "--camera", "camera.json", "--steps", "3", "--size", "32"]
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([*arguments, "--out", "out", "--view", "--port", "0"]) == 0
+    assert waited == [True]
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("live view: http://localhost:")
+    assert lines[-1] == lines[0] + " until Ctrl-C or Close" and "viser" not in "".join(lines)
+
+    # Stop in the page is Ctrl-C in the shell.
+    draw = Browser.draw
+    monkeypatch.setattr(Browser, "draw", lambda self, *given: (draw(self, *given), press(self.stop)))
+    assert cli.main([*arguments, "--out", "out", "--view", "--port", "0"]) == cli.INTERRUPTED
+    assert len(waited) == 1 and "interrupted" in capsys.readouterr().out
+
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert cli.main([*arguments, "--out", "out", "--view"]) == 2
+    assert "needs edgegrad[view]" in capsys.readouterr().err
+
+
+def press(button):
+    """As the server does for a click in the page."""
+    for callback in button._impl.update_cb:
+        callback(None)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
+def test_the_page_stays_until_close_or_ctrl_c(viewer):
+    viewer.update(bracket())
+    threading.Timer(0.3, signal.raise_signal, [signal.SIGINT]).start()
+    viewer.wait()
+    assert page(viewer).stop.label == "Close"
+    threading.Timer(0.3, press, [page(viewer).stop]).start()
+    viewer.wait()
