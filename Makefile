@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := pyproject.toml $(shell find csrc -name '*.cpp' -o -name '*.h' -o -name CMakeLists.txt)
 
-.PHONY: demo test test-slow sanitize sanitize-threads bench lint docs wheel format clean
+.PHONY: demo test test-slow test-browser sanitize sanitize-threads bench lint docs wheel format clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.ready
@@ -19,6 +19,14 @@ test: $(VENV)/.ready
 
 test-slow: $(VENV)/.ready
 	$(BIN)/python -m pytest -m slow $(WORKERS)
+
+# The live view in a real browser. Chromium is the system's; where it is missing, root gets it on Debian, and others are told.
+test-browser: $(VENV)/.ready
+	$(BIN)/uv pip install --quiet --python $(BIN)/python selenium
+	@command -v chromedriver >/dev/null || \
+	  { [ "$$(id -u)" = 0 ] && apt-get update -qq && apt-get install -y -qq chromium chromium-driver; } >/dev/null 2>&1 || \
+	  echo "make test-browser: skipped without Chromium and its chromedriver; on Debian: apt-get install chromium chromium-driver"
+	$(BIN)/python -m pytest tests/test_browser.py
 
 # The tests of the kernel, with a kernel in which AddressSanitizer and UndefinedBehaviorSanitizer watch every access and
 # sum. Python itself is not built with them, so they are loaded before it; what it leaks at its end is not looked at.

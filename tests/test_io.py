@@ -878,7 +878,7 @@ def test_libraries_are_imported_late_and_missed_by_name(tmp_path):
     (tmp_path / "a.obj").write_text(GOOD)
     code = (
         "import sys, edgegrad.io as io\n"
-        "print({'trimesh', 'OpenImageIO', 'PIL', 'roma', 'torch._dynamo'} & set(sys.modules))\n"
+        "print({'trimesh', 'OpenImageIO', 'PIL', 'roma', 'viser', 'matplotlib', 'torch._dynamo'} & set(sys.modules))\n"
         "sys.modules.update({'OpenImageIO': None, 'trimesh': None, 'trimesh.exchange.load': None})\n"
         "for name, read in (('a.png', io.read_image), ('a.obj', io.load_mesh)):\n"
         "    try: read(name)\n"

@@ -21,10 +21,11 @@ from .frame import CONTRAST, Frame, as_bytes, displayed
 
 WIDTH = 480  # pixels of the panel beside the scene
 THUMBNAIL = 128  # pixels on the longer side of a picture in a frustum
-FRUSTUM = 0.15  # its size as a part of the distance from the camera to the meshes
+FRUSTUM = 0.12  # its size as a part of the distance from the cameras to the meshes
 WIDEST = 2.0  # radians of a frustum; a camera that has no field of view gets
 NOMINAL = 0.6
 AMBIENT = 1.5
+FOV, ASIDE = 0.8, 0.9  # radians of the page's own camera, and between it and the cameras shown
 MOST_POINTS = 500  # of the curve
 GREY = (round(255 * (1.055 * PLAIN ** (1 / 2.4) - 0.055)),) * 3  # sRGB
 PANEL_TITLE = f"target | render | difference × {CONTRAST}"
@@ -105,7 +106,7 @@ class Browser:
     # -- the scene --------------------------------------------------------------------------------------------------------
 
     def _look_from_aside(self, frame: Frame) -> None:
-        """Where a page that opens looks from: behind and beside the first camera, so that its frustum is seen too."""
+        """Where a page that opens looks from: beyond the cameras, between them, so that they do not hide the meshes."""
         low, high = _bounds(frame)
         center, size = (low + high) / 2, float(np.linalg.norm(high - low)) or 1.0
         up, away = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.3, 1.0])
@@ -114,18 +115,19 @@ class Browser:
             poses = [camera.world_to_camera.detach().double().numpy() for camera in frame.cameras]
             mean = -np.mean([pose[1, :3] for pose in poses], axis=0)
             up = mean / np.linalg.norm(mean) if np.linalg.norm(mean) > 0.1 else -poses[0][1, :3]
-            offset = frame.cameras[0].eye.detach().double().numpy() - center
-            distance = max(float(np.linalg.norm(offset)), 0.5 * size)
-            away = 1.1 * offset / distance - 1.2 * poses[0][0, :3] + 0.6 * up
-            center = center + 0.35 * offset
+            offsets = np.stack([camera.eye.detach().double().numpy() for camera in frame.cameras]) - center
+            lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
+            distance = max(float(lengths.max()), 0.5 * size)
+            away = 1.4 * _apart(offsets / (lengths + 1e-30), up)
+            center = center + 0.4 * offsets.mean(0)  # to have both in the picture
         self.distance = distance
         self.server.scene.set_up_direction(tuple(up))
         start = self.server.initial_camera
         start.near, start.far = 1e-3 * distance, 1e3 * distance
         places = [start, *(client.camera for client in self.server.get_clients().values())]
         for camera in places:  # those who came before there was anything to see look there too
-            camera.position, camera.look_at = center + 0.9 * distance * away, center
-            camera.fov = 0.8
+            camera.position, camera.look_at = center + distance * away, center
+            camera.fov = FOV
 
     def _draw_meshes(self, frame: Frame) -> None:
         place: dict[str, Any] = {}
@@ -216,6 +218,18 @@ def _quiet() -> Iterator[None]:
     """viser prints a banner."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield
+
+
+def _apart(directions: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """The direction nearest to the first of some that is ASIDE from all, or as far as can be; from above."""
+    e = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    e /= np.linalg.norm(e)
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(0, 360, 5)), np.radians([15, 30, 45, 60]))
+    flat = np.cos(azimuth)[..., None] * e + np.sin(azimuth)[..., None] * np.cross(up, e)
+    candidates = (np.cos(elevation)[..., None] * flat + np.sin(elevation)[..., None] * up).reshape(-1, 3)
+    cosines = candidates @ directions.T
+    nearest = np.maximum(cosines.max(1), np.cos(ASIDE))
+    return candidates[np.argmin(nearest - 1e-3 * cosines[:, 0])]
 
 
 def _is_plain(mesh: Mesh) -> bool:
