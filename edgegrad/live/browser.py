@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -215,9 +214,13 @@ class Browser:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """viser prints a banner."""
-    with contextlib.redirect_stdout(io.StringIO()):
+    """viser prints a banner, through rich, which it brings."""
+    console = require("rich", "edgegrad[view]", "the live view").get_console()
+    before, console.quiet = console.quiet, True
+    try:
         yield
+    finally:
+        console.quiet = before
 
 
 def _apart(directions: np.ndarray, up: np.ndarray) -> np.ndarray:
