@@ -21,6 +21,7 @@ from ..mesh import Mesh
 from ..scene import Scene
 
 if TYPE_CHECKING:
+    from ..fit import CameraFit, Fit, PoseFit
     from .browser import Browser
     from .figure import Notebook
     from .frame import Frame, Shown
@@ -128,7 +129,7 @@ class Viewer:
         number = None if loss is None else float(loss)
         return self._step(number, lambda: frame_of_scene(scene, cameras, images, masks))
 
-    def show(self, fit: Shown) -> None:
+    def show(self, fit: Fit | PoseFit | CameraFit) -> None:
         """Draws at once: what a fit returns, for its last step may not be drawn."""
         from .frame import frame_of
 
