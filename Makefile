@@ -33,7 +33,7 @@ test-browser: $(VENV)/.ready
 SANITIZE := build/sanitize
 # Files, pictures, whole fits and long statistics call the kernel as the other tests do, only for longer; tests of load
 # measure memory and time, of which the sanitizers take more, and fork() takes minutes with them.
-WITHOUT := bad_files browser cli derivatives fit fit_faults io load notebooks oracles report viewer
+WITHOUT := bad_files browser cli derivatives distributed docs fit fit_faults io load notebooks oracles report viewer
 PRELOAD := $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so 2>/dev/null))
 sanitize: $(VENV)/.ready
 ifneq ($(words $(filter /%,$(PRELOAD))),3)

@@ -29,7 +29,7 @@ LIGHT = torch.tensor([[0.30, 0.10, 0.02], [0.05, 0.25, 0.10], [0.12, 0.02, 0.30]
 
 def lit(mesh: eg.Mesh) -> eg.Mesh:
     normals = F.normalize(eg.vertex_normals(mesh.verts, mesh.faces), dim=1)
-    return mesh.replace(colors=EVEN + normals @ LIGHT)
+    return mesh.replace(colors=EVEN + normals @ LIGHT.to(normals))
 
 
 def stone(subdivisions: int = 6) -> eg.Mesh:

@@ -100,6 +100,7 @@ def test_there_is_no_other() -> None:
     assert sorted(path.stem for path in FOLDER.glob("*.py")) == [
         "focal",
         "harmonics",
+        "many_views",
         "mirror",
         "network",
         "objects",
