@@ -40,7 +40,7 @@ fine = trimesh.creation.icosphere(subdivisions=5)
 n = torch.tensor(fine.vertices, dtype=torch.float32)
 waves = torch.tensor([[2.1, 0.3, 1.2], [-0.7, 2.6, 0.4], [0.9, -1.5, 2.3]])
 radius = 1 + 0.12 * torch.sin(1.3 * n @ waves.T).sum(1) + 0.03 * torch.sin(5 * n @ waves).sum(1)
-true = eg.Mesh(radius[:, None] * n, torch.tensor(fine.faces))
+true = eg.Mesh(radius[:, None] * n * torch.tensor([1.25, 0.65, 0.85]), torch.tensor(fine.faces))
 B = torch.tensor([[0.30, 0.10, 0.02], [0.05, 0.25, 0.10], [0.12, 0.02, 0.30]])
 
 
@@ -66,7 +66,8 @@ sphere = eg.Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(
 # %% [markdown]
 # ## The gradient of the vertices
 #
-# Of the mean squared difference of images, over all views. First the check: grow the sphere a little, and compare with finite differences.
+# Of the mean squared difference of images, over all views. First the check: stretch the sphere a
+# little along its axes, and compare with finite differences.
 
 # %%
 batch = eg.Camera.stack(cameras)
@@ -79,18 +80,21 @@ def loss(verts, spp=16, seed=0, **options):
 
 leaf = sphere.verts.clone().requires_grad_()
 loss(leaf).backward()
+h = 0.003  # a tenth of a pixel: the loss is curved
+stretched = (leaf.grad * sphere.verts).sum(0)
 with torch.no_grad():
-    h = 0.01
-    fd = (loss((1 + h) * sphere.verts, 256) - loss((1 - h) * sphere.verts, 256)) / (2 * h)
-grown = (leaf.grad * sphere.verts).sum()
-print(f"growing: gradient {grown:.4f}, finite difference {fd:.4f}")
+    sides = [sphere.verts * (1 + h * axis) for axis in (*torch.eye(3), *-torch.eye(3))]
+    losses = torch.stack([loss(verts, 256) for verts in sides])
+fd = (losses[:3] - losses[3:]) / (2 * h)
+print("by the gradient   ", stretched.numpy().round(4))
+print("finite differences", fd.numpy().round(4))
 
 # %% [markdown]
 # ## Why smooth coordinates
 #
 # The gradient is right, but it is of *this* mesh: vertices on an outline in some view get large values, their neighbours almost none.
 # A step along it pulls thorns out of the sphere. Nicolet, Jacobson and Jakob (*Large Steps in Inverse Rendering of Geometry*, 2021)
-# take the steps in coordinates $u = (I + \lambda L)\,v$ with the mesh's Laplacian $L$; a step of $v$ is then
+# therefore step in coordinates $u = (I + \lambda L)\,v$ with the mesh's Laplacian $L$; a step of $v$ is then
 #
 # $$\Delta v \;\propto\; (I + \lambda L)^{-2}\, \frac{\partial\ell}{\partial v},$$
 #
@@ -107,8 +111,8 @@ for step in steps.values():
 show([*pictures, images[2]], ["sphere", "a step by the gradient", "a smoothed step", "picture"])
 
 # %% [markdown]
-# *What to see:* both steps move the farthest vertex by half a radius. By the plain gradient it is a few vertices; smoothed, the whole body
-# leans towards the picture.
+# *What to see:* both steps move the farthest vertex by half a radius. The plain gradient pulls out thorns and ridges along the
+# outlines of the eight views; smoothed, the whole body leans towards the picture.
 #
 # ## From coarse to fine
 #
@@ -117,7 +121,7 @@ show([*pictures, images[2]], ["sphere", "a step by the gradient", "a smoothed st
 
 # %%
 found = fit_shape(
-    sphere, cameras, images, masks=masks, look=lit, levels=2, steps=60, spp=4, faces=6000, progress=False
+    sphere, cameras, images, masks=masks, look=lit, levels=2, steps=60, lr=0.02, spp=4, faces=6000, progress=False
 )
 print(f"{found.state}; {len(found.mesh.faces)} faces, {found.seconds:.0f} s")
 
@@ -135,8 +139,10 @@ show(
 )
 
 # %% [markdown]
-# *What to see:* from a view that no picture shows, `fit_shape` has the stone and its bumps. Plain Adam has crumpled the surface, and where
-# triangles turned over there is no way back.
+# The fit says `not converged`, for the loss still falls: more steps, or a third level, would sharpen the bumps.
+#
+# *What to see:* from a view that no picture shows, `fit_shape` has the stone and its bumps. Plain Adam comes near too, but left a
+# tangle on top: where triangles have turned over there is no way back.
 
 # %%
 
@@ -154,7 +160,6 @@ def distance(a, b, count=20_000):
 errors = {name: distance(m, true) for name, m in (("start", sphere), ("Adam", by_adam), ("fit_shape", found.mesh))}
 for name, error in errors.items():
     print(f"{name:10} {error:.2f} %")
-found.plot_history();
 
 # %% [markdown]
 # `examples/shape.py` does this with 16 views of any mesh file. Masks alone work too: `fit_shape(sphere, cameras, masks=masks)`.
@@ -162,5 +167,5 @@ found.plot_history();
 # ## Check
 
 # %%
-assert abs(grown / fd - 1) < 0.03, "the gradient is the slope of the loss"
+assert (stretched - fd).norm() < 0.03 * fd.norm(), "the gradient is the slope of the loss"
 assert errors["fit_shape"] < 0.2 * errors["start"] and errors["fit_shape"] < errors["Adam"]

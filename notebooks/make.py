@@ -20,6 +20,7 @@ from PIL import Image
 
 FOLDER = Path(__file__).parent
 COLORS = 256  # of a picture's palette
+WIDTH = 760  # pixels, at most
 
 
 def names() -> list[str]:
@@ -43,6 +44,7 @@ def small(png: str) -> str:
     """The same picture with a palette; PNG in base64, as notebooks hold it."""
     picture = Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB")
     file = io.BytesIO()
+    picture.thumbnail((WIDTH, WIDTH))
     palette = picture.quantize(COLORS, kmeans=1)
     picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(file, "PNG", optimize=True)
     return base64.b64encode(file.getvalue()).decode()
