@@ -1,8 +1,9 @@
 # %% [markdown]
 # # 1. Images and gradients
 #
-# A renderer makes an image from a scene. A *differentiable* renderer also says how the image, or a loss of it, changes with the scene.
-# This notebook shows what such a gradient consists of, on one triangle, and checks it. It takes some seconds.
+# A renderer makes an image from a scene. A *differentiable* renderer also says how the image, or a loss of it, changes
+# with the scene. This notebook shows what such a gradient consists of, on one triangle, and checks it. It takes some
+# seconds.
 
 # %%
 import matplotlib.pyplot as plt
@@ -26,8 +27,8 @@ def show(axis, image, title="", **options):
 # %% [markdown]
 # ## One triangle
 #
-# A mesh is vertices and faces; here with a colour at each vertex, interpolated in between. A camera looks at it. `eg.render` gives
-# linear radiance, a tensor (height, width, channels).
+# A mesh is vertices and faces; here with a colour at each vertex, interpolated in between. A camera looks at it.
+# `eg.render` gives linear radiance, a tensor (height, width, channels).
 
 # %%
 verts = torch.tensor([[-0.8, -0.6, 0.2], [0.9, -0.4, -0.3], [0.1, 0.8, 0.1]])
@@ -42,17 +43,20 @@ print(image.shape, image.dtype)
 # %% [markdown]
 # ## Where an image changes
 #
-# A pixel is the mean of the radiance $L(x)$ over its square. Let a parameter $\theta$ move the scene. Then two things change:
+# A pixel is the mean of the radiance $L(x)$ over its square. Let a parameter $\theta$ move the scene. Then two things
+# change:
 #
-# $$\frac{\partial I}{\partial\theta} = \underbrace{\int_{\text{pixel}} \frac{\partial L}{\partial\theta}\, dx}_{\text{interior: colours slide}}
+# $$\frac{\partial I}{\partial\theta} =
+# \underbrace{\int_{\text{pixel}} \frac{\partial L}{\partial\theta}\, dx}_{\text{interior: colours slide}}
 # \;+\; \underbrace{\int_{\text{edges in the pixel}} \Delta L \; (v \cdot n)\, dl}_{\text{boundary: edges move}}$$
 #
-# Inside a face the colours change smoothly; automatic differentiation of the shading finds that. At an edge the radiance jumps by
-# $\Delta L$, and as the edge moves with velocity $v$ along its normal $n$, the pixel gains what is on one side and loses what is on the other.
-# Automatic differentiation of samples does not see this: no sample's colour changes until the edge passes over it, and then it jumps.
+# Inside a face the colours change smoothly; automatic differentiation of the shading finds that. At an edge the
+# radiance jumps by $\Delta L$, and as the edge moves with velocity $v$ along its normal $n$, the pixel gains what is on
+# one side and loses what is on the other. Automatic differentiation of samples does not see this: no sample's colour
+# changes until the edge passes over it, and then it jumps.
 #
-# edgegrad therefore puts samples *on the edges*. Here are some of them, as the upper vertex moves to the right; the arrows are their
-# velocities across the edge.
+# edgegrad therefore puts samples *on the edges*. Here are some of them, as the upper vertex moves to the right; the
+# arrows are their velocities across the edge.
 
 # %%
 moving = verts.clone().requires_grad_()
@@ -78,12 +82,13 @@ for a, b in ((0, 1), (1, 2), (2, 0)):
 plt.tight_layout()
 
 # %% [markdown]
-# *What to see:* the samples lie on the outline alone. Those near the upper corner move most, those of the lower edge not at all, for neither
-# of its ends moves.
+# *What to see:* the samples lie on the outline alone. Those near the upper corner move most, those of the lower edge
+# not at all, for neither of its ends moves.
 #
 # ## The gradient, three ways
 #
-# A loss that looks at the image: $\ell = \sum_q w_q I_q$ with fixed weights $w$. Its gradient for all nine coordinates of the triangle,
+# A loss that looks at the image: $\ell = \sum_q w_q I_q$ with fixed weights $w$. Its gradient for all nine coordinates
+# of the triangle,
 #
 # - by the interior alone (`visibility=False`), which is what automatic differentiation of a ray caster gives,
 # - by interior and edges (the default),
@@ -108,7 +113,9 @@ def gradient(**options):
 def finite_differences(h=0.02, spp=4096):
     unit = torch.eye(9).reshape(9, 3, 3)
     with torch.no_grad():
-        return torch.stack([(loss(verts + h * u, spp) - loss(verts - h * u, spp)) / (2 * h) for u in unit]).reshape(3, 3)
+        return torch.stack([(loss(verts + h * u, spp) - loss(verts - h * u, spp)) / (2 * h) for u in unit]).reshape(
+            3, 3
+        )
 
 
 interior, whole, differences = gradient(visibility=False), gradient(), finite_differences()
@@ -126,13 +133,14 @@ error_interior = (interior - differences).norm() / differences.norm()
 print(f"off the finite differences: interior alone {error_interior:.0%}, interior + edges {error:.2%}")
 
 # %% [markdown]
-# *What to see:* interior + edges and finite differences agree, bar by bar. The interior alone is another vector altogether: a descent that
-# follows it goes elsewhere. Finite differences need two images a parameter; the gradient costs about one more image for all parameters together.
+# *What to see:* interior + edges and finite differences agree, bar by bar. The interior alone is another vector
+# altogether: a descent that follows it goes elsewhere. Finite differences need two images a parameter; the gradient
+# costs about one more image for all parameters together.
 #
 # ## The derivative of every pixel
 #
-# Reverse mode, above, gives one loss's derivative by all parameters. *Forward mode* gives all pixels' derivatives by one parameter, or by
-# several directions in one pass: a tangent for each tensor that moves.
+# Reverse mode, above, gives one loss's derivative by all parameters. *Forward mode* gives all pixels' derivatives by
+# one parameter, or by several directions in one pass: a tangent for each tensor that moves.
 
 # %%
 shape = trimesh.creation.torus(0.7, 0.3, major_sections=48, minor_sections=24)
@@ -156,11 +164,12 @@ for axis, values, title in zip(axes[1:], derivatives, ["shift to the right", "tu
 plt.tight_layout()
 
 # %% [markdown]
-# *What to see:* red pixels brighten, blue ones darken. Outlines stand out, inner and outer: there background and torus change places. When
-# the torus turns about its axis its outline stays where it is, and only colours slide.
+# *What to see:* red pixels brighten, blue ones darken. Outlines stand out, inner and outer: there background and torus
+# change places. When the torus turns about its axis its outline stays where it is, and only colours slide.
 #
-# Forward and reverse mode are the same matrix $J$, from two sides: $\langle v, J u\rangle = \langle J^T v, u\rangle$ for any image $v$ and
-# direction $u$, up to the noise of their samples. `torch.func.jvp` and `jacfwd` go through `render` likewise.
+# Forward and reverse mode are the same matrix $J$, from two sides: $\langle v, J u\rangle = \langle J^T v, u\rangle$
+# for any image $v$ and direction $u$, up to the noise of their samples. `torch.func.jvp` and `jacfwd` go through
+# `render` likewise.
 
 # %%
 v = torch.sin(torch.arange(96) / 12.0)[None, :, None].expand(96, 96, 3)
@@ -173,7 +182,8 @@ print(f"forward {forward:.1f}, reverse {reverse:.1f}")
 # ## The gradient by place
 #
 # Before any parameter, a loss has a wish for each place of the image: where what is seen there should go.
-# `eg.screen_gradient` gives it, for $\ell = \sum (I - I^*)^2$ with a target $I^*$ in which the torus was turned and shifted.
+# `eg.screen_gradient` gives it, for $\ell = \sum (I - I^*)^2$ with a target $I^*$ in which the torus was turned and
+# shifted.
 
 # %%
 angle = torch.tensor(0.25)
@@ -194,9 +204,9 @@ axes[2].quiver(place, place, arrows[..., 0], arrows[..., 1], angles="xy", color=
 plt.tight_layout()
 
 # %% [markdown]
-# *What to see:* an outline can only be seen to move across itself. On the left the arrows point inward, on the right outward: the torus should
-# go to the right, where the target has it. Chained with how vertices or a camera move each place, they are the gradient that an
-# optimiser follows.
+# *What to see:* an outline can only be seen to move across itself. On the left the arrows point inward, on the right
+# outward: the torus should go to the right, where the target has it. Chained with how vertices or a camera move each
+# place, they are the gradient that an optimiser follows.
 #
 # ## Check
 #

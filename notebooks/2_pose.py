@@ -1,8 +1,9 @@
 # %% [markdown]
 # # 2. A pose from one picture
 #
-# Where is a known object, and how is it turned? Render it where it might be, compare with the picture, and follow the gradient. Here first by
-# hand in a dozen lines, then by `fit_pose`, which starts from further away and lets something stand before the object.
+# Where is a known object, and how is it turned? Render it where it might be, compare with the picture, and follow the
+# gradient. Here first by hand in a dozen lines, then by `fit_pose`, which starts from further away and lets something
+# stand before the object.
 
 # %%
 import math
@@ -55,12 +56,14 @@ with torch.no_grad():
 show(picture=target, start=start, difference=0.5 + target - start)
 
 # %% [markdown]
-# *What to see:* the difference is strongest in a thin rim. There the boundary term works, and much of what tells the pose is there.
+# *What to see:* inside, colours differ; along the rim, stone and background have changed places. There the boundary
+# term works, and much of what tells the pose is there.
 #
 # ## The slope of the loss
 #
-# The loss is the mean squared difference. Along one coordinate, the shift to the right, it can be drawn. Its slope, by the gradient with
-# and without the boundary term, is drawn into it. To see what the outline does alone, the stone is plain white for this.
+# The loss is the mean squared difference. Along one coordinate, the shift to the right, it can be drawn. Its slope, by
+# the gradient with and without the boundary term, is drawn into it. To see what the outline does alone, the stone is
+# plain white for this.
 
 # %%
 white = eg.Mesh(verts, stone.faces, colors=torch.full_like(verts, 0.9))
@@ -104,16 +107,19 @@ plt.xlabel("shift to the right")
 plt.legend(frameon=False)
 plt.tight_layout()
 slope_error = (slopes - differences).norm() / differences.norm()
-print(f"off the finite differences: {slope_error:.2%} with the boundary term, "
-      f"{(slopes_without - differences).norm() / differences.norm():.0%} without")
+print(
+    f"off the finite differences: {slope_error:.2%} with the boundary term, "
+    f"{(slopes_without - differences).norm() / differences.norm():.0%} without"
+)
 
 # %% [markdown]
-# *What to see:* the red slopes are tangents of the loss. The blue ones are flat: inside a face of one colour nothing changes, so without
-# the boundary term there is no gradient at all.
+# *What to see:* the red slopes are tangents of the loss. The blue ones are flat: inside a face of one colour nothing
+# changes, so without the boundary term there is no gradient at all.
 #
 # ## By hand
 #
-# A rotation vector, a translation, and Adam. Each step has a seed of its own, so that the error of few samples averages out.
+# A rotation vector, a translation, and Adam. Each step has a seed of its own, so that the error of few samples averages
+# out.
 
 # %%
 w, t = torch.zeros(3, requires_grad=True), torch.zeros(3, requires_grad=True)
@@ -139,17 +145,20 @@ by_hand = turned[-1]
 print(f"rotation off by {by_hand:.3f}°, translation by {(t.detach() - true_t).norm():.4f}")
 
 # %% [markdown]
-# *What to see:* the loss ends at the noise of four samples a pixel, and goes no lower. The pose goes on improving, for the gradient is right on
-# average.
+# *What to see:* the loss ends at the noise of four samples a pixel, and goes no lower. The pose goes on improving, for
+# the gradient is right on average.
 #
 # ## In one call
 #
-# `fit_pose` does this from coarse to fine, with steps that know the curvature (Gauss–Newton). It says whether it believes what it found.
+# `fit_pose` does this from coarse to fine, with steps that know the curvature (Gauss–Newton). It says whether it
+# believes what it found.
 
 # %%
 fit = fit_pose(stone, target, camera, background=behind, progress=False)
 print(f"{fit.state} after {fit.steps} steps in {fit.seconds:.1f} s")
-print(f"rotation off by {math.degrees(roma.rotmat_geodesic_distance(fit.R.float(), roma.rotvec_to_rotmat(true_w))):.3f}°")
+print(
+    f"rotation off by {math.degrees(roma.rotmat_geodesic_distance(fit.R.float(), roma.rotvec_to_rotmat(true_w))):.3f}°"
+)
 fit.plot()
 
 # %% [markdown]
@@ -157,8 +166,8 @@ fit.plot()
 #
 # ## Something stands before it
 #
-# A striped board covers a part of the stone, and nobody tells the fit. A squared loss would follow the board. `fit_pose` counts a pixel that
-# is far off no more than one that is a tenth of the picture's range off.
+# A striped board covers a part of the stone, and nobody tells the fit. A squared loss would follow the board.
+# `fit_pose` counts a pixel that is far off no more than one that is a tenth of the picture's range off.
 
 # %%
 y, x = torch.meshgrid(torch.arange(96), torch.arange(96), indexing="ij")
@@ -173,11 +182,11 @@ print(f"the picture shows {covered.explained:.0%} of the render's edges")
 show(picture=covered_target, fit=eg.render(stone.transformed(covered.R.float(), covered.t.float()), camera, spp=64))
 
 # %% [markdown]
-# *What to see:* the stone lies where its visible part says. `explained` is the share of the render's edges that the picture shows too: what is
-# behind the board cannot be among them.
+# *What to see:* the stone lies where its visible part says. `explained` is the share of the render's edges that the
+# picture shows too: what is behind the board cannot be among them.
 #
-# From the shell, with your own files: `edgegrad fit-pose model.glb photo.png --fov 40 --out fit/`. `examples/pose.py` counts how many of many
-# random starts succeed.
+# From the shell, with your own files: `edgegrad fit-pose model.glb photo.png --fov 40 --out fit/`. `examples/pose.py`
+# counts how many of many random starts succeed.
 #
 # ## Check
 

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 3. A shape from several views
 #
-# Every vertex is a parameter: a sphere becomes a stone from a few pictures. Why the plain gradient makes thorns, how smooth
-# coordinates help, and how `fit_shape` goes from coarse to fine.
+# Every vertex is a parameter: a sphere becomes a stone from a few pictures. Why the plain gradient makes thorns, how
+# smooth coordinates help, and how `fit_shape` goes from coarse to fine.
 
 # %%
 import math
@@ -32,8 +32,8 @@ def show(images, titles=None, rows=1):
 # %% [markdown]
 # ## The stone, and what is known of it
 #
-# Eight views, with masks. The light is soft, so that a point's colour depends on its normal alone: $L = a + B\,n$. The fit is told this light
-# and the cameras, not the shape.
+# Eight views, with masks. The light is soft, so that a point's colour depends on its normal alone: $L = a + B\,n$. The
+# fit is told this light and the cameras, not the shape.
 
 # %%
 fine = trimesh.creation.icosphere(subdivisions=5)
@@ -66,8 +66,8 @@ sphere = eg.Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(
 # %% [markdown]
 # ## The gradient of the vertices
 #
-# Of the mean squared difference of images, over all views. First the check: stretch the sphere a
-# little along its axes, and compare with finite differences.
+# Of the mean squared difference of images, over all views. First the check: stretch the sphere a little along its axes,
+# and compare with finite differences.
 
 # %%
 batch = eg.Camera.stack(cameras)
@@ -92,9 +92,10 @@ print("finite differences", fd.numpy().round(4))
 # %% [markdown]
 # ## Why smooth coordinates
 #
-# The gradient is right, but it is of *this* mesh: vertices on an outline in some view get large values, their neighbours almost none.
-# A step along it pulls thorns out of the sphere. Nicolet, Jacobson and Jakob (*Large Steps in Inverse Rendering of Geometry*, 2021)
-# therefore step in coordinates $u = (I + \lambda L)\,v$ with the mesh's Laplacian $L$; a step of $v$ is then
+# The gradient is right, but it is of *this* mesh: vertices on an outline in some view get large values, their
+# neighbours almost none. A step along it pulls thorns out of the sphere. Nicolet, Jacobson and Jakob (*Large Steps in
+# Inverse Rendering of Geometry*, 2021) therefore step in coordinates $u = (I + \lambda L)\,v$ with the mesh's Laplacian
+# $L$; a step of $v$ is then
 #
 # $$\Delta v \;\propto\; (I + \lambda L)^{-2}\, \frac{\partial\ell}{\partial v},$$
 #
@@ -111,13 +112,13 @@ for step in steps.values():
 show([*pictures, images[2]], ["sphere", "a step by the gradient", "a smoothed step", "picture"])
 
 # %% [markdown]
-# *What to see:* both steps move the farthest vertex by half a radius. The plain gradient pulls out thorns and ridges along the
-# outlines of the eight views; smoothed, the whole body leans towards the picture.
+# *What to see:* both steps move the farthest vertex by half a radius. The plain gradient pulls out thorns and ridges
+# along the outlines of the eight views; smoothed, the whole body leans towards the picture.
 #
 # ## From coarse to fine
 #
-# `fit_shape` descends in these coordinates, then remeshes to smaller triangles of even size, and goes on. Beside it the same number of steps by
-# plain Adam on the finest mesh.
+# `fit_shape` descends in these coordinates, then remeshes to smaller triangles of even size, and goes on. Beside it the
+# same number of steps by plain Adam on the finest mesh.
 
 # %%
 found = fit_shape(
@@ -141,8 +142,8 @@ show(
 # %% [markdown]
 # The fit says `not converged`, for the loss still falls: more steps, or a third level, would sharpen the bumps.
 #
-# *What to see:* from a view that no picture shows, `fit_shape` has the stone and its bumps. Plain Adam comes near too, but left a
-# tangle on top: where triangles have turned over there is no way back.
+# *What to see:* from a view that no picture shows, `fit_shape` has the stone and its bumps. Plain Adam comes near too,
+# but left a tangle on top: where triangles have turned over there is no way back.
 
 # %%
 
@@ -150,7 +151,9 @@ show(
 def distance(a, b, count=20_000):
     """Chamfer: mean distance of points on one surface to the other, both ways, in percent of the box's diagonal."""
     p, q = (
-        trimesh.sample.sample_surface(trimesh.Trimesh(m.verts.numpy(), m.faces.numpy(), process=False), count, seed=0)[0]
+        trimesh.sample.sample_surface(trimesh.Trimesh(m.verts.numpy(), m.faces.numpy(), process=False), count, seed=0)[
+            0
+        ]
         for m in (a, b)
     )
     low, high = b.verts.aminmax(dim=0)
@@ -162,7 +165,8 @@ for name, error in errors.items():
     print(f"{name:10} {error:.2f} %")
 
 # %% [markdown]
-# `examples/shape.py` does this with 16 views of any mesh file. Masks alone work too: `fit_shape(sphere, cameras, masks=masks)`.
+# `examples/shape.py` does this with 16 views of any mesh file. Masks alone work too: `fit_shape(sphere, cameras,
+# masks=masks)`.
 #
 # ## Check
 

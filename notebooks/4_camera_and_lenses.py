@@ -1,7 +1,8 @@
 # %% [markdown]
 # # 4. Cameras and lenses
 #
-# What kinds of camera there are, how an image changes with the lens, and how focal length, pose and distortion are found from one picture.
+# What kinds of camera there are, how an image changes with the lens, and how focal length, pose and distortion are
+# found from one picture.
 
 # %%
 import math
@@ -80,14 +81,14 @@ with torch.no_grad():
     show({"panorama": eg.render(town, eg.Camera.panorama(inside.world_to_camera, (96, 192)), spp=64)}, 5.2)
 
 # %% [markdown]
-# *What to see:* straight edges stay straight in the perspective, bulge through the distorting lens, and become curves in fisheye and panorama.
-# In the orthographic picture parallel edges stay parallel. Edges are curves in the image where the lens bends them, and edgegrad samples those
-# curves, not their chords.
+# *What to see:* straight edges stay straight in the perspective, bulge through the distorting lens, and become curves
+# in fisheye and panorama. In the orthographic picture parallel edges stay parallel. Edges are curves in the image where
+# the lens bends them, and edgegrad samples those curves, not their chords.
 #
 # ## How an image changes with the lens
 #
-# `eg.jvp` gives every pixel's derivative by the focal length and by the first coefficient of distortion, in one pass; beside them, the same by
-# finite differences.
+# `eg.jvp` gives every pixel's derivative by the focal length and by the first coefficient of distortion, in one pass;
+# beside them, the same by finite differences.
 
 # %%
 lens = views["barrel distortion"]
@@ -114,7 +115,6 @@ signed |= {"by distortion k1": by_bend / 8, "by finite differences ": bend_fd / 
 show({name: values.sum(-1) for name, values in signed.items()}, cmap="RdBu_r", vmin=-1, vmax=1)
 
 
-
 def blocks(image):
     """Sums over 16 × 16 pixels, in which noise averages out."""
     return image.reshape(6, 16, 6, 16, 3).sum((1, 3))
@@ -129,13 +129,13 @@ ratios = ratio(by_focal, focal_fd), ratio(by_bend, bend_fd)
 print(f"gradient over finite difference: focal length {ratios[0]:.3f}, k1 {ratios[1]:.3f}")
 
 # %% [markdown]
-# *What to see:* both change the image most far from the middle; distortion, by $r^3$, almost only there. Edges stand out against faces, whose one
-# colour does not change.
+# *What to see:* both change the image most far from the middle; distortion, by $r^3$, almost only there. Edges stand
+# out against faces, whose one colour does not change.
 #
 # ## Focal length, pose and distortion from one picture
 #
-# Given the town, where was this picture taken, and through which lens? The start has a focal length 10 % off, stands elsewhere, and knows
-# no distortion.
+# Given the town, where was this picture taken, and through which lens? The start has a focal length 10 % off, stands
+# elsewhere, and knows no distortion.
 
 # %%
 taken = eg.Camera.look_at((3.0, -5.2, 4.0), (0.1, 0.1, 0.2), (0.05, 0, 1), 50.0, size).replace(
@@ -159,12 +159,12 @@ focal_true, _, focal = report("true", taken), report("start", first), report("fo
 fit.plot()
 
 # %% [markdown]
-# *What to see:* left to right the picture, the start, the fit, and the difference, brightened: noise
-# at edges is left. The coefficients share the work: a little less $k_1$ and more $k_2$ bend this picture alike. Perspective tells focal
+# *What to see:* left to right the picture, the start, the fit, and the difference, brightened: noise at edges is left.
+# The coefficients share the work: a little less $k_1$ and more $k_2$ bend this picture alike. Perspective tells focal
 # length from distance here, for the town is deep; of a flat or distant object one picture cannot.
 #
-# Cameras of other libraries come in by `Camera.from_opencv`, `from_colmap`, `from_opengl`, `from_pytorch3d`, `from_projection`, and whole
-# reconstructions by `eg.load_cameras`.
+# Cameras of other libraries come in by `Camera.from_opencv`, `from_colmap`, `from_opengl`, `from_pytorch3d`,
+# `from_projection`, and whole reconstructions by `eg.load_cameras`.
 #
 # ## Check
 

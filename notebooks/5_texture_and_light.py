@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 5. Texture, light, and the gradient of a shadow
 #
-# What colours a surface has, how it is lit, and where shadows lie: all of it is found from pictures. The border of a shadow is an
-# edge too, and moves with caster, receiver and light.
+# What colours a surface has, how it is lit, and where shadows lie: all of it is found from pictures. The border of a
+# shadow is an edge too, and moves with caster, receiver and light.
 
 # %%
 import math
@@ -42,13 +42,18 @@ def show(signed=(), vmax=2.0, **images):
 
 # %%
 rings, sides = 48, 24
-u, v = (grid.reshape(-1) for grid in torch.meshgrid(torch.arange(rings + 1.0), torch.arange(sides + 1.0), indexing="ij"))
+u, v = (
+    grid.reshape(-1) for grid in torch.meshgrid(torch.arange(rings + 1.0), torch.arange(sides + 1.0), indexing="ij")
+)
 a, b = u * math.tau / rings, v * math.tau / sides
 verts = torch.stack([(0.7 + 0.3 * b.cos()) * a.cos(), (0.7 + 0.3 * b.cos()) * a.sin(), 0.3 * b.sin()], 1)
 i, j = (grid.reshape(-1) for grid in torch.meshgrid(torch.arange(rings), torch.arange(sides), indexing="ij"))
 corner = i * (sides + 1) + j
 faces = torch.cat(
-    [torch.stack([corner, corner + sides + 1, corner + sides + 2], 1), torch.stack([corner, corner + sides + 2, corner + 1], 1)]
+    [
+        torch.stack([corner, corner + sides + 1, corner + sides + 2], 1),
+        torch.stack([corner, corner + sides + 2, corner + 1], 1),
+    ]
 )
 noise = torch.rand((1, 3, 6, 12), generator=torch.Generator().manual_seed(4))
 texture = F.interpolate(noise, (64, 128), mode="bicubic")[0].movedim(0, -1).clamp(0.05, 0.95)
@@ -69,14 +74,14 @@ show(a_new_view=held_out[0], with_the_texture_found=held_out[1])
 print(f"{fit.seconds:.0f} s; {psnr:.1f} dB in a view that was not among the six")
 
 # %% [markdown]
-# *What to see:* the textures agree but where no camera looked, at the inside of the torus: there the found one is smooth, for it is the sum of
-# an image pyramid, and its coarse levels reach there.
+# *What to see:* no difference. Where no camera looks, texels take the colours of their surroundings, for the texture
+# that is sought is the sum of an image pyramid, whose coarse levels reach there.
 #
 # ## Lights
 #
-# A mesh with a `Material` is lit by the lights of its scene and casts shadows. A point gives hard borders; a panel soft ones; a sky, an
-# image of all directions, hardly any. Of a light with an extent a point is drawn for each point that is shaded: more
-# `light_samples`, less noise.
+# A mesh with a `Material` is lit by the lights of its scene and casts shadows. A point gives hard borders; a panel soft
+# ones; a sky, an image of all directions, hardly any. Of a light with an extent a point is drawn for each point that is
+# shaded: more `light_samples`, less noise.
 
 # %%
 shape = trimesh.creation.torus(0.6, 0.22, major_sections=64, minor_sections=32)
@@ -108,18 +113,18 @@ def picture(material, light, **options):
 show(
     point=picture(matt, lamp),
     point_on_plastic=picture(plastic, lamp),
-    panel=picture(matt, panel, light_samples=2),
+    panel=picture(matt, panel, light_samples=8),
     sky=picture(matt, sky, light_samples=8),
 )
 
 # %% [markdown]
-# *What to see:* the same ring, four times. Plastic has a highlight; under the panel the shadow is sharp where the ring is near the ground and
-# soft where it is far.
+# *What to see:* the same ring, four times. Plastic has a highlight; under the panel the shadow is sharp where the ring
+# is near the ground and soft where it is far.
 #
 # ## The gradient of a shadow
 #
-# How each pixel changes as the lamp moves to the right: `eg.jvp`, beside the same without the boundary term, and a finite difference of two
-# pictures.
+# How each pixel changes as the lamp moves to the right: `eg.jvp`, beside the same without the boundary term, and a
+# finite difference of two pictures.
 
 # %%
 right = torch.tensor([1.0, 0.0, 0.0])
@@ -160,9 +165,9 @@ def ratio(a, b):
 print(f"over the finite difference: {ratio(whole, difference):.3f}, without boundaries {ratio(inside, difference):.3f}")
 
 # %% [markdown]
-# *What to see:* as the lamp goes right, the shadow goes left. On its border it is all or nothing: blue on the left, where shadow comes, red on
-# the right, where light comes. Without the boundary term
-# only the shading's slow change is left.
+# *What to see:* as the lamp goes right, the shadow goes left. On its border it is all or nothing: blue on the left,
+# where shadow comes, red on the right, where light comes. Without the boundary term only the shading's slow change is
+# left.
 #
 # ## Where the lamp is
 #
@@ -189,8 +194,9 @@ show(
 )
 
 # %% [markdown]
-# *What to see:* start and target differ in where the shadow lies and how bright the ground is; what was found looks like the target.
-# `examples/` has longer fits: a sun and a pose, an environment in a mirror, a shape from its shadow alone.
+# *What to see:* start and target differ in where the shadow lies and how bright the ground is; what was found looks
+# like the target. `examples/` has longer fits: a sun and a pose, an environment in a mirror, a shape from its shadow
+# alone.
 #
 # ## Check
 

@@ -1,8 +1,9 @@
 # %% [markdown]
 # # 6. A shader of your own
 #
-# A shader is a function from points on surfaces to radiance, in PyTorch: a formula, a network, a table. Whatever it uses gets its gradient.
-# Silhouettes around it have right gradients without the shader's help, and steps within it too, where it says that they are there.
+# A shader is a function from points on surfaces to radiance, in PyTorch: a formula, a network, a table. Whatever it
+# uses gets its gradient. Silhouettes around it have right gradients without the shader's help, and steps within it too,
+# where it says that they are there.
 
 # %%
 import math
@@ -14,14 +15,14 @@ import trimesh
 import edgegrad as eg
 from edgegrad.image import linear_to_srgb
 
-ring = trimesh.creation.torus(0.7, 1.0, major_sections=48, minor_sections=24)
+ring = trimesh.creation.torus(0.7, 0.1, major_sections=48, minor_sections=24)
 surface = torch.tensor(ring.vertices, dtype=torch.float32)
 middle = torch.nn.functional.pad(torch.nn.functional.normalize(surface[:, :2], dim=1) * 0.7, (0, 1))
 
 
 def torus(tube):
     """With the radius 0.7, and `tube` for that of its tube, a number or a tensor."""
-    return eg.Mesh(middle + tube * (surface - middle), torch.tensor(ring.faces))
+    return eg.Mesh(middle + tube * (surface - middle) / 0.1, torch.tensor(ring.faces))
 
 
 mesh = torus(0.3)
@@ -40,8 +41,8 @@ def show(**images):
 # %% [markdown]
 # ## What a shader sees
 #
-# `hits` holds N points: `position`, `normal`, `shading_normal`, `uv`, `view` (the direction to the eye), `depth`, `face` and more, each made when it is
-# asked for. `hits.visible(light)` casts shadow rays. The shader returns (N, C).
+# `hits` holds N points: `position`, `normal`, `shading_normal`, `uv`, `view` (the direction to the eye), `depth`,
+# `face` and more, each made when it is asked for. `hits.visible(light)` casts shadow rays. The shader returns (N, C).
 
 # %%
 light = torch.tensor([1.5, -0.5, 3.0])
@@ -73,8 +74,9 @@ with torch.no_grad():
 # %% [markdown]
 # ## Silhouettes for nothing
 #
-# How does the image's sum change as the tube grows? The shader knows nothing of silhouettes. The renderer evaluates it on both sides of
-# each edge and adds the boundary term. Beside it: the gradient without that term, and finite differences.
+# How does the image's sum change as the tube grows? The shader knows nothing of silhouettes. The renderer evaluates it
+# on both sides of each edge and adds the boundary term. Beside it: the gradient without that term, and finite
+# differences.
 
 # %%
 
@@ -97,8 +99,8 @@ print(f"gradient {grow:.0f}, finite difference {grow_fd:.0f}, without the bounda
 # %% [markdown]
 # ## Steps within a face
 #
-# Stripes are edges that no mesh has. Where a shader jumps it says so: `hits.where(s, a, b)` is `a` where $s > 0$ and `b` elsewhere, and the
-# border $s = 0$ has a gradient. With `torch.where` the image is the same, and torch finds no gradient in it at all.
+# Stripes are edges that no mesh has. Where a shader jumps it says so: `hits.where(s, a, b)` is `a` where $s > 0$ and
+# `b` elsewhere, and the border $s = 0$ has a gradient. In `torch.where` torch finds no gradient at all.
 
 # %%
 
@@ -130,17 +132,23 @@ def turned(seed, **options):
 with torch.no_grad():
     h = 0.02
     turn_fd = sum((loss(0.1 + h, s, 64) - loss(0.1 - h, s, 64)).item() for s in range(12)) / (24 * h)
-    show(hits_where=eg.render(mesh, camera, 64, shader=painted(0.1)), torch_where=eg.render(mesh, camera, 64, shader=painted(0.1, torch.where)))
+    show(
+        hits_where=eg.render(mesh, camera, 64, shader=painted(0.1)),
+        torch_where=eg.render(mesh, camera, 64, shader=painted(0.1, torch.where)),
+    )
 turn = sum(turned(seed) for seed in range(8)) / 8
-print(f"turning the stripes: gradient {turn:.1f}, finite difference {turn_fd:.1f}, with torch.where {turned(0, where=torch.where):.1f}")
+print(f"turning the stripes: gradient {turn:.1f}, finite difference {turn_fd:.1f}")
+print(f"with torch.where {turned(0, where=torch.where):.1f}")
 
 # %% [markdown]
-# *What to see:* nothing in the pictures; all the difference is in the gradients.
+# *What to see:* with `hits.where` the borders are smooth too, for pixels that they run through are shaded at more
+# points. The gradients tell more: that of `torch.where` is zero.
 #
 # ## A network, and a shape under it
 #
-# A torus whose look and thickness are both unknown, from six pictures of the glossy one. The network takes a point, its normal and the
-# direction to the eye, and gives a colour. Its weights have gradients by torch; the thickness has its own mainly from the silhouettes.
+# A torus whose look and thickness are both unknown, from six pictures of the glossy one. The network takes a point, its
+# normal and the direction to the eye, and gives a colour. Its weights have gradients by torch; the thickness has its
+# own mainly from the silhouettes.
 
 # %%
 torch.manual_seed(0)
@@ -176,8 +184,8 @@ print(f"radius of the tube: 0.22 at the start, {tube.item():.4f} found, 0.3 in t
 #
 # ## Parts to build from
 #
-# `render(…, shader=fn)` is made of public parts. Here it is by hand; `eg.trace` follows any other rays, for reflections or light
-# that bounces.
+# `render(…, shader=fn)` is made of public parts. Here it is by hand; `eg.trace` follows any other rays, for reflections
+# or light that bounces.
 
 # %%
 tube = torch.tensor(0.3, requires_grad=True)

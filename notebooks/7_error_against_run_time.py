@@ -1,9 +1,9 @@
 # %% [markdown]
 # # 7. Error against run time
 #
-# A gradient from samples has an error. More samples, less error, more time. How much of one for how much of the other? First by hand on a
-# triangle, whose exact gradient is known; then a small version of `edgegrad report error-time`, beside finite differences, and Mitsuba 3 where it
-# is installed.
+# A gradient from samples has an error. More samples, less error, more time. How much of one for how much of the other?
+# First by hand on a triangle, whose exact gradient is known; then a small version of `edgegrad report error-time`,
+# beside finite differences, and Mitsuba 3 where it is installed.
 
 # %%
 import contextlib
@@ -22,8 +22,9 @@ from edgegrad.report.exact import exact_image
 # %% [markdown]
 # ## The exact gradient
 #
-# Of a few flat triangles, the image has a formula: what is visible of a face in a pixel is a polygon, and radiance is integrated over it. All in
-# float64, and automatic differentiation of the formula is the exact gradient, boundary term included.
+# Of a few flat triangles, the image has a formula: what is visible of a face in a pixel is a polygon, and radiance is
+# integrated over it. All in float64, and automatic differentiation of the formula is the exact gradient, boundary term
+# included.
 
 # %%
 verts = torch.tensor([[-0.8, -0.6, 0.2], [0.9, -0.4, -0.3], [0.1, 0.8, 0.1]], dtype=torch.float64)
@@ -79,12 +80,14 @@ plt.legend(frameon=False, fontsize=8)
 plt.tight_layout()
 
 # %% [markdown]
-# *What to see:* random samples would follow the dotted line: four times as many for half the error. The samples here are spread evenly
-# (stratified) along edges and over surfaces, and do better: on the edges, which are curves, about four times as many for a quarter.
+# *What to see:* random samples would follow the dotted line: four times as many for half the error. The samples here
+# are spread evenly (stratified) along edges and over surfaces, and do better: on the edges, which are curves, about
+# four times as many for a quarter.
 #
 # ## Is it unbiased?
 #
-# The mean over many seeds must come as near to the exact gradient as its standard error allows. Without the boundary term it does not.
+# The mean over many seeds must come as near to the exact gradient as its standard error allows. Without the boundary
+# term it does not.
 
 # %%
 runs = torch.stack([estimate(500, 500, seed) for seed in range(200)])
@@ -99,12 +102,16 @@ print(f"without the boundary term: {(inside - exact).norm() / exact.norm():.0%} 
 # %% [markdown]
 # ## The report, in small
 #
-# Three scenes, several methods, a few numbers of samples each. The time is that of a whole step: update, image, backward pass. Finite
-# differences give the six numbers of a pose, at twelve images; of all the others the error is that of the same six numbers... and they give
-# every vertex's gradient with it.
+# Three scenes, several methods, a few numbers of samples each. The time is that of a whole step: update, image,
+# backward pass. The error is that of the derivatives by a translation of the whole scene. Finite differences take
+# twelve images for translation and rotation; the other methods give the gradient of every vertex besides.
 
 # %%
-with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+with (
+    tempfile.TemporaryDirectory() as folder,
+    contextlib.redirect_stdout(io.StringIO()),
+    contextlib.redirect_stderr(io.StringIO()),
+):
     document, _ = error_time(Path(folder), ["triangle", "slivers", "sphere"], size=64, seeds=3, quick=True)
 
 names = {
@@ -113,7 +120,7 @@ names = {
     "direct_projective": ("Mitsuba direct_projective", "tab:blue"),
     "prb_projective": ("Mitsuba prb_projective", "tab:cyan"),
 }
-fig, axes = plt.subplots(1, 3, figsize=(9, 3), sharey=True)
+fig, axes = plt.subplots(1, 3, figsize=(8, 3), sharex=True, sharey=True)
 for axis, of in zip(axes, ("triangle", "slivers", "sphere")):
     for name, (label, color) in names.items():
         points = [p for p in document["points"] if (p["scene"], p["method"]) == (of, name)]
@@ -128,12 +135,12 @@ axes[0].legend(frameon=False, fontsize=7)
 plt.tight_layout()
 
 # %% [markdown]
-# *What to see:* lower and more to the left is better. Each method's points go down to the right as it takes more samples. These
-# images are small and runs few; `edgegrad report error-time` does it at 256² for eight scenes, with error bars and a check of its references, and
-# `docs/error-time.md` has a run.
+# *What to see:* lower and more to the left is better. Each method's points go down to the right as it takes more
+# samples. These images are small and runs few; `edgegrad report error-time` does it at 256² for eight scenes, with
+# error bars and a check of its references, and `docs/error-time.md` has a run.
 #
-# In practice: leave the numbers of samples alone, and give each step of an optimiser a seed of its own. Errors of unbiased gradients
-# average out over the steps.
+# In practice: leave the numbers of samples alone, and give each step of an optimiser a seed of its own. Errors of
+# unbiased gradients average out over the steps.
 #
 # ## Check
 

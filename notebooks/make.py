@@ -1,6 +1,6 @@
 """Runs notebooks and writes them with small outputs: N_name.ipynb from N_name.py.
 
-    python notebooks/make.py [NAME ...]     all of them without a name; needs `pip install '.[test]'`
+python notebooks/make.py [NAME ...]     all of them without a name; needs `pip install '.[test]'`
 """
 
 from __future__ import annotations
@@ -34,9 +34,7 @@ def executed(name: str, seconds: int = 300) -> NotebookNode:
         {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"}}
     )
     resources = {"metadata": {"path": FOLDER}}
-    client = NotebookClient(
-        notebook, timeout=seconds, kernel_name="python3", resources=resources, record_timing=False
-    )
+    client = NotebookClient(notebook, timeout=seconds, kernel_name="python3", resources=resources, record_timing=False)
     return client.execute(env={**os.environ, "PYTHONWARNINGS": "ignore::FutureWarning"})  # torch's, of its own code
 
 
