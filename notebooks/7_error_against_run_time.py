@@ -135,9 +135,10 @@ axes[0].legend(frameon=False, fontsize=7)
 plt.tight_layout()
 
 # %% [markdown]
-# *What to see:* lower and more to the left is better. Each method's points go down to the right as it takes more
-# samples. These images are small and runs few; `edgegrad report error-time` does it at 256² for eight scenes, with
-# error bars and a check of its references, and `docs/error-time.md` has a run.
+# *What to see:* lower and more to the left is better. (Where these outputs were made there was no Mitsuba, and other
+# work on the machine.) Each method's points go down to the right as it takes more samples. These images are small and
+# runs few; `edgegrad report error-time` does it at 256² for eight scenes, with error bars and a check of its
+# references, and `docs/error-time.md` has a run.
 #
 # In practice: leave the numbers of samples alone, and give each step of an optimiser a seed of its own. Errors of
 # unbiased gradients average out over the steps.
