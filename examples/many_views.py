@@ -200,7 +200,7 @@ def joined() -> Iterator[None]:
     if not dist.is_torchelastic_launched():
         yield
         return
-    # Since PyTorch 2.4 the processes meet in a store that outlives them: started again, they look for the dead at the
+    # In newer versions of PyTorch processes meet in a store that outlives them: started again, they look for the dead at the
     # addresses left there (github.com/pytorch/pytorch/issues/135712). With the variable each start has a store of its own.
     restarts, kept = (os.environ.get(f"TORCHELASTIC_{name}") for name in ("MAX_RESTARTS", "USE_AGENT_STORE"))
     if restarts != "0" and kept == "True":
