@@ -18,7 +18,7 @@ test: $(VENV)/.ready
 	$(BIN)/python -m pytest -m "not slow" $(WORKERS) --budget $(BUDGET)
 
 test-slow: $(VENV)/.ready
-	$(BIN)/python -m pytest -m slow $(WORKERS)
+	$(BIN)/python -m pytest -m slow --timeout 3600 $(WORKERS)
 
 # The live view in a real browser. Chromium is the system's; where it is missing, root gets it on Debian, and others are told.
 test-browser: $(VENV)/.ready

@@ -27,36 +27,28 @@ import edgegrad as eg
 many_views = example("many_views")
 TASK = many_views.Task(views=6, batch=5, size=24, steps=6, spp=2, subdivisions=2)  # shares of two sizes
 
+pytestmark = pytest.mark.timeout(300)
 forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="workers are forked, so that none imports torch anew")
 
 
 @pytest.fixture(autouse=True)
 def _on_this_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Processes meet on the loopback interface, and a test that hangs ends."""
+    """Processes meet on the loopback interface."""
     monkeypatch.setenv("TORCH_DISABLE_SHARE_RDZV_TCP_STORE", "1")
     if sys.platform == "linux":
         monkeypatch.setenv("GLOO_SOCKET_IFNAME", "lo")
-    with expiring(300):
+    with signals_kept():
         yield
 
 
 @contextmanager
-def expiring(seconds: int) -> Iterator[None]:
+def signals_kept() -> Iterator[None]:
     """With the handlers of signals as they were: those of torchrun stay otherwise."""
-
-    def expire(*_: Any) -> None:
-        raise TimeoutError(f"not done after {seconds} s")
-
-    names = [name for name in ("SIGALRM", "SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT") if hasattr(signal, name)]
+    names = [name for name in ("SIGTERM", "SIGINT", "SIGHUP", "SIGQUIT") if hasattr(signal, name)]
     before = {name: signal.getsignal(getattr(signal, name)) for name in names}
-    if "SIGALRM" in names:
-        signal.signal(signal.SIGALRM, expire)
-        signal.alarm(seconds)
     try:
         yield
     finally:
-        if "SIGALRM" in names:
-            signal.alarm(0)
         for name, handler in before.items():
             signal.signal(getattr(signal, name), handler)
 
