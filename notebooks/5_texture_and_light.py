@@ -114,7 +114,7 @@ show(
     point=picture(matt, lamp),
     point_on_plastic=picture(plastic, lamp),
     panel=picture(matt, panel, light_samples=8),
-    sky=picture(matt, sky, light_samples=8),
+    sky=picture(matt, sky, light_samples=64),
 )
 
 # %% [markdown]
