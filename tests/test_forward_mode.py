@@ -243,18 +243,6 @@ def test_types():
     assert eg.screen_gradient(scene, camera, ADJOINT.float()).dtype == torch.float32
 
 
-def test_forward_over_reverse_is_refused():
-    def loss(verts: Tensor) -> Tensor:
-        return (eg.render(MESH.replace(verts=verts), CAMERA, 4) ** 2).sum()
-
-    for transform in (torch.func.hessian(loss), lambda v: torch.func.jvp(torch.func.grad(loss), (v,), (v,))):
-        with pytest.raises(
-            RuntimeError, match=r"second derivatives of a rendered image are not available.*Gauss-Newton"
-        ):
-            transform(MESH.verts)
-
-
-@pytest.mark.parametrize("call", ["jvp", "screen"])
 def test_same_bits_at_any_number_of_threads(call):
     scene, threads = mixed_scene(), torch.get_num_threads()
     found = []

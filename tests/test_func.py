@@ -38,6 +38,17 @@ def quadratic(verts: Tensor) -> Tensor:
     return triangle(verts).square().sum()
 
 
+def shaded(verts: Tensor) -> Tensor:
+    scene = eg.Scene(MESH.replace(verts=verts), BACKGROUND)
+    return (eg.render(scene, CAMERA, 4, shader=lambda hits: hits.position.square()) * ADJOINT).sum()
+
+
+def lit(verts: Tensor) -> Tensor:
+    mesh = MESH.replace(verts=verts, material=eg.Material())
+    scene = eg.Scene(mesh, BACKGROUND, lights=[eg.PointLight(torch.tensor([1.0, 2.0, 3.0]), 20.0)])
+    return (eg.render(scene, CAMERA, 4) * ADJOINT).sum()
+
+
 def first_order(loss: Callable[[Tensor], Tensor], verts: Tensor) -> Tensor:
     """The gradient as a function of the vertices, in the graph."""
     return torch.autograd.grad(loss(verts), verts, create_graph=True)[0]
@@ -73,11 +84,13 @@ TWICE = {
     ),  # by two backward passes
     "grad(grad)": lambda loss: torch.func.grad(lambda v: torch.func.grad(loss)(v).sum())(MESH.verts),
     "jacrev(grad)": lambda loss: torch.func.jacrev(torch.func.grad(loss))(MESH.verts),
+    "func.hessian": lambda loss: torch.func.hessian(loss)(MESH.verts),
+    "jvp(grad)": lambda loss: torch.func.jvp(torch.func.grad(loss), (MESH.verts,), (MESH.verts,)),
     "jacrev(jacrev)": lambda loss: torch.func.jacrev(torch.func.jacrev(loss))(MESH.verts),
 }
 
 
-@pytest.mark.parametrize("loss", [linear, quadratic])
+@pytest.mark.parametrize("loss", [linear, quadratic, shaded, lit])
 @pytest.mark.parametrize("way", TWICE)
 def test_second_derivatives_are_refused(way, loss):
     """Zeros came, without a word, where the loss is linear in the image, and from some of these for any loss."""
