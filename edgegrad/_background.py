@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ._derivatives import moves
+from ._poses import constant
 from .environment import Environment
 from .samples import Frame
 
@@ -29,7 +30,7 @@ def environments(frame: Frame) -> Tensor | None:
         if moves(frame.intrinsics):
             along = along + rays.along_by_k @ (frame.intrinsics - frame.intrinsics.detach())
         if not frame.view.perspective:
-            along = torch.zeros_like(along) + along.new_tensor([0.0, 0.0, 1.0])
+            along = torch.zeros_like(along) + constant([0.0, 0.0, 1.0], along)
         direction = frame.here(along) @ back.mT
         total = torch.stack([light.towards(direction).expand(-1, scene.channels) for light in shown]).sum(0)
         parts.append(total.reshape(len(pixels), 4, -1).mean(1))

@@ -12,7 +12,16 @@ import torch
 from torch import Tensor
 
 from ._check import as_tensor, check_finite, check_float, check_shape, values_visible
-from ._poses import Vector, check_last_row, check_rotation, image_size, intrinsics, intrinsics_of_view, rigid
+from ._poses import (
+    Vector,
+    check_last_row,
+    check_rotation,
+    constant,
+    image_size,
+    intrinsics,
+    intrinsics_of_view,
+    rigid,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from .camera import Camera
@@ -121,9 +130,9 @@ class Conventions:
         H, W = image_size(size)
         if in_ndc:
             half = 0.5 * min(H, W)
-            focal, middle = half * focal, focal.new_tensor([0.5 * W, 0.5 * H]) - half * middle
+            focal, middle = half * focal, constant([0.5 * W, 0.5 * H], focal) - half * middle
         focal, middle = torch.broadcast_tensors(focal, middle)
-        flip = rotation.new_tensor([-1.0, -1.0, 1.0])  # to +X right, +Y down
+        flip = constant([-1.0, -1.0, 1.0], rotation)  # to +X right, +Y down
         pose = rigid(flip[:, None] * rotation.mT, flip * shift.to(rotation))
         return _camera(pose, intrinsics(*focal.unbind(-1), *middle.unbind(-1)), (H, W))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,16 +23,18 @@ def image_size(size: tuple[int, int]) -> tuple[int, int]:
     return check_positive_int("size", H, most=65536), check_positive_int("size", W, most=65536)
 
 
+def constant(values: Sequence[Any], like: Tensor) -> Tensor:
+    """Numbers as a tensor of this kind and in this place. like.new_tensor() fails under torch.func in torch 2.4."""
+    return torch.tensor(values, dtype=like.dtype, device=like.device)
+
+
 def check_last_row(name: str, matrix: Tensor, expected: list[float], fix: str = "is it transposed?") -> None:
     """`matrix` (…, n, n) is finite and ends with the row `expected`. Raises ValueError."""
     check_finite(name, matrix)
     if not values_visible(matrix):
         return
     last = matrix.detach()[..., -1, :]
-    right = torch.tensor(
-        expected, dtype=last.dtype, device=last.device
-    )  # new_tensor() fails under torch.func in torch 2.4
-    if not torch.equal(last, right.expand_as(last)):
+    if not torch.equal(last, constant(expected, last).expand_as(last)):
         got = last.reshape(-1, len(expected))[0].tolist()
         raise ValueError(f"{name}: expected the last row {expected}, got {got}; {fix}")
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from ._check import as_scalar, as_tensor, check_float, values_visible
-from ._poses import Vector, image_size, intrinsics, intrinsics_of_view, looking_at
+from ._poses import Vector, constant, image_size, intrinsics, intrinsics_of_view, looking_at
 
 if TYPE_CHECKING:
     from .camera import Camera
@@ -71,7 +71,7 @@ class Views:
         check_float("world_to_camera", pose)
         H, W = image_size(size)
         if K is None:
-            K = pose.new_tensor([[W / math.tau, 0.0, 0.5 * W], [0.0, H / math.pi, 0.5 * H], [0.0, 0.0, 1.0]])
+            K = constant([[W / math.tau, 0.0, 0.5 * W], [0.0, H / math.pi, 0.5 * H], [0.0, 0.0, 1.0]], pose)
         return _camera(pose, as_tensor("K", K, like=pose), (H, W), "panorama")
 
 

@@ -33,7 +33,7 @@ from ._check import (
 )
 from ._conventions import Conventions
 from ._lens import COUNTS, TURNS, bend, longitude_latitude
-from ._poses import check_last_row, check_rotation, image_size
+from ._poses import check_last_row, check_rotation, constant, image_size
 from ._views import Views
 
 
@@ -248,7 +248,7 @@ class Camera(Views, Conventions):
     def resized(self, size: tuple[int, int]) -> Camera:
         """The same view with another number of pixels (H, W)."""
         H, W = image_size(size)
-        factor = self.K.new_tensor([[W / self.size[1]], [H / self.size[0]], [1.0]])
+        factor = constant([[W / self.size[1]], [H / self.size[0]], [1.0]], self.K)
         return self.replace(K=self.K * factor, size=(H, W))
 
     def replace(self, **fields: Any) -> Camera:

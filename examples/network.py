@@ -25,10 +25,10 @@ TRUE_TUBE, FIRST_TUBE = 0.30, 0.22
 
 def torus(tube: Tensor) -> eg.Mesh:
     """Around the z axis, with the radius 0.7; `tube` is that of its tube."""
-    made = trimesh.creation.torus(0.7, 1.0, major_sections=48, minor_sections=24)
-    ring = torch.tensor(made.vertices, dtype=torch.float32)
-    around = torch.nn.functional.pad(torch.nn.functional.normalize(ring[:, :2], dim=1) * 0.7, (0, 1))
-    return eg.Mesh(around + tube * (ring - around), torch.tensor(made.faces))
+    made = trimesh.creation.torus(0.7, 0.1, major_sections=48, minor_sections=24)
+    surface = torch.tensor(made.vertices, dtype=torch.float32)
+    middle = torch.nn.functional.pad(torch.nn.functional.normalize(surface[:, :2], dim=1) * 0.7, (0, 1))
+    return eg.Mesh(middle + tube * (surface - middle) / 0.1, torch.tensor(made.faces))
 
 
 def glossy(hits: eg.Hits) -> Tensor:

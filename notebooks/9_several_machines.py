@@ -111,7 +111,8 @@ if __name__ == "__main__":
 # One process for each machine uses all its cores. Here, for a fair comparison, each process has one thread.
 
 # %%
-folder = Path(tempfile.mkdtemp())
+temporary = tempfile.TemporaryDirectory()
+folder = Path(temporary.name)
 (folder / "fit.py").write_text(script)
 
 

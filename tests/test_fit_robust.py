@@ -1,13 +1,14 @@
 """fit_pose and fit_camera where pictures are not as they should be: covered, cluttered, of something else, from several sides."""
 
 import math
+import warnings
 
 import pytest
 import torch
 from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, silhouette
 
 import edgegrad as eg
-from edgegrad.fit import fit_camera, fit_pose
+from edgegrad.fit import fit_camera, fit_pose, fit_scene
 from edgegrad.fit.robust import Comparison
 from edgegrad.fit.task import Lens, PoseTask, is_clutter
 
@@ -45,9 +46,33 @@ def test_what_is_not_in_the_picture_is_not_found(steps):
     """A picture of something else: the fit ends somewhere, and says that the picture does not show it."""
     cells = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
     image = torch.nn.functional.interpolate(cells, (32, 32), mode="bicubic")[0].movedim(0, -1)
-    fit = fit_pose(bracket(), image, camera(32), background=BACKGROUND, steps=steps, progress=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # nor turned over
+        fit = fit_pose(bracket(), image, camera(32), background=BACKGROUND, steps=steps, progress=False)
     assert not fit.converged and fit.explained < 0.5
     assert fit.state.startswith("not converged: the picture shows")
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_picture_from_the_bottom_up_is_named(masked):
+    view = camera(32)
+    target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
+    told = {"mask": mask} if masked else {"background": BACKGROUND}
+    with pytest.warns(UserWarning, match=r"^target: expected the upper row first.*image\.flip\(0\)"):
+        fit = fit_pose(bracket(), target, view, init=START, progress=False, steps=12, **told)
+    assert not fit.converged
+
+
+def test_masks_from_the_bottom_up_are_named():
+    views = [camera(32), camera(32, distance=5.0)]
+    masks = [silhouette(view).flip(0) for view in views]
+    sought = {"verts": 1e-4}
+    options = {"masks": masks, "steps": 2, "spp": 2, "progress": False}
+    with pytest.warns(UserWarning, match=r"^masks: expected the upper row first.*IoU of \d+%, as given at \d+%"):
+        fit_scene(bracket(), views, None, sought, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        fit_scene(bracket(), views, None, sought, **options | {"masks": [mask.flip(0) for mask in masks]})
 
 
 def test_several_pictures_share_the_pose():

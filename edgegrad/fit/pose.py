@@ -22,6 +22,8 @@ from .place import placed
 from .result import Pose, PoseFit, pose_from_matrix
 from .search import Search
 from .task import Lens, PoseTask
+from .upside_down import BETTER, say_upside_down
+from .verdict import ENOUGH
 
 
 @torch.inference_mode(False)
@@ -138,8 +140,20 @@ def search_pose(
     search.after_step = after_step
     try:
         search.run()
+        if search.explained < ENOUGH:
+            _warn_if_upside_down(task, search, init is None, max_size, spp)
     except KeyboardInterrupt:
         interrupted = True
     finally:
         bar.close()
     return result()
+
+
+def _warn_if_upside_down(task: PoseTask, search: Search, place: bool, max_size: int, spp: int) -> None:
+    """Where a fit to the pictures turned over finds in them what it did not find as they are."""
+    turned = task.turned_over()
+    start = placed(turned) if place else search.start
+    again = Search(turned, turned.pyramid(start, max_size, spp), start, search.steps, search.tolerance, search.seed)
+    found = again.first_end()
+    if found >= max(ENOUGH, search.explained + BETTER):
+        say_upside_down("target", f"it shows {found:.0%} of the render's edges, as given {search.explained:.0%}")

@@ -18,6 +18,7 @@ from ..scene import Scene
 from .fitted import Fit
 from .frame import Descent, Options, Parameter, Record, descend, read_checkpoint
 from .losses import loss_of
+from .upside_down import warn_of_masks
 from .verdict import explained
 from .views import Images, View, grouped, views_of
 
@@ -176,7 +177,8 @@ def fit_views(
 ) -> Fit:
     """fit_scene() with everything checked."""
     saved = read_checkpoint(options)
-    start = built(build, {name: p.value for name, p in parameters.items() if p.value is not None})[0]
+    start, cameras = built(build, {name: p.value for name, p in parameters.items() if p.value is not None})
+    warn_of_masks(views, start, cameras)
     objective = objective_of(build, views, options, regularizer)
     loop = None if saved is None else saved["loop"]
     descent = descend(objective, parameters, options, saved=loop, report=reporter(build, views))

@@ -91,6 +91,10 @@ class Search:
                 self._take(best)
         self.history.append(Step(self.levels[-1].size, self.loss, self.best, True))
 
+    def first_end(self) -> float:
+        """The share of the render's edges that the pictures show where the way down from the start alone ends."""
+        return self._judge(*self._down(self.start, self.levels)).explained
+
     def _take(self, end: _End) -> None:
         self.loss, self.explained, self.best, self._answered = end.loss, end.explained, end.pose, True
         self.converged = end.short and end.explained >= ENOUGH

@@ -20,6 +20,7 @@ from .fitted import Fit
 from .frame import Descent, Options, Parameter, Record, descend, read_checkpoint
 from .scene import judged, objective_of, options_of, reporter
 from .smooth import Smooth
+from .upside_down import warn_of_masks
 from .views import Images, View, views_of
 
 SMOOTHNESS = 4.0  # λ of I + λ L
@@ -103,6 +104,8 @@ class _Search:
                 )
             level, mesh = stage["level"], Mesh(stage["verts"], stage["faces"])
             history, seconds = [Record(*record) for record in stage["history"]], stage["seconds"]
+        else:
+            warn_of_masks(self.views, self.scene(mesh), [view.camera for view in self.views])
         while True:
             stage = {
                 "levels": self.levels, "level": level, "verts": mesh.verts, "faces": mesh.faces,

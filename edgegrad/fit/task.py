@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -170,6 +170,18 @@ class PoseTask:
             samples = max(spp, min(MOST_SPP, round(spp * coarseness**2)))
             levels.append(self.level(factor, blur, coarseness, samples, blind if blur else self.free))
         return levels
+
+    def turned_over(self) -> PoseTask:
+        """With the pictures upside down."""
+        shots = [
+            Shot(
+                shot.camera, shot.target.flip(0),
+                shot.background.flip(0) if shot.background is not None and shot.background.dim() == 3 else shot.background,
+                None if shot.weight is None else shot.weight.flip(0),
+            )
+            for shot in self.shots
+        ]  # fmt: skip
+        return replace(self, shots=shots)
 
     def level(self, factor: float, blur: float, coarseness: float, spp: int, free: list[int]) -> Level:
         """The task with the pictures' sides multiplied by `factor`."""

@@ -72,7 +72,7 @@ def unbiased(quick: bool = False, say: Say = lambda text: None) -> dict[str, Any
     tested together by Holm's method, whatever their dependence: with probability ALPHA or less a run without bias has a
     rejection at all.
     """
-    stats = require("scipy.stats", "scipy", "the test of unbiasedness")
+    stats = require("scipy.stats", "edgegrad[report]", "the test of unbiasedness")
     seeds = SEEDS // 4 if quick else SEEDS
     rows, all_p = [], []
     for name, build in (scenes() | LIT).items():
