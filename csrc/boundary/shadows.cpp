@@ -26,13 +26,14 @@ namespace edgegrad {
 namespace {
 
 constexpr int64_t pair_tests = 1 << 22;  // of edges before parts of the light
-constexpr int64_t fewest_intervals = 1 << 10, most_intervals = 1 << 15, samples_of_interval = 8;
+constexpr int64_t fewest_intervals = 1 << 10, most_intervals = 1 << 15, samples_of_interval = 16;
 constexpr int64_t intervals_of_block = 64;
 constexpr double most_of_edge = 64;     // pieces
 constexpr int pilots = 4;               // places of an interval
 constexpr int64_t neighbours = 16;      // of an interval, on either side
 constexpr int64_t mirrored = 2;         // samples of a place before a light with an extent
-constexpr double floor_share = 0.2;     // of the density that pilots do not decide
+constexpr double own_share = 0.3;       // of the mean square that is the interval's own
+constexpr double floor_share = 0.1;     // of the density that pilots do not decide
 constexpr double samples_a_pixel = 24;  // of the border of a point's shadow
 constexpr int64_t fewest_samples = 256, most_samples = 1 << 18;
 
@@ -64,14 +65,20 @@ class Pieces {
         double fraction;  // of it
         double weight;    // that it has, were places drawn evenly: one over its density
     };
-    // The piece of one at a position before it, or −1.
-    Place at(double position, int64_t before) const {
+    // That at a position; `before`: the piece of one at a position before it, or −1.
+    int64_t piece(double position, int64_t before) const {
         const double p = std::min(position * systematic_.total(), std::nextafter(systematic_.total(), 0.0));
-        const int64_t k = before < 0 ? systematic_.primitive(p) : systematic_.primitive(p, before);
+        return before < 0 ? systematic_.primitive(p) : systematic_.primitive(p, before);
+    }
+    Place at(double position, int64_t before) const {
+        const int64_t k = piece(position, before);
         const double measure = systematic_.measure_of(k);
-        return {k, std::clamp((p - systematic_.begin_of(k)) / measure, 0.0, 1.0),
+        return {k, std::clamp((position * systematic_.total() - systematic_.begin_of(k)) / measure, 0.0, 1.0),
                 pieces_[k].share * double(pieces_[k].t1 - pieces_[k].t0) * systematic_.total() / measure};
     }
+    // Where a piece begins and ends.
+    double begin(int64_t k) const { return systematic_.begin_of(k) / systematic_.total(); }
+    double end(int64_t k) const { return begin(k) + systematic_.measure_of(k) / systematic_.total(); }
     const ShadowPiece& operator[](int64_t k) const { return pieces_[k]; }
 
    private:
@@ -244,6 +251,70 @@ class Pilots {
     std::vector<Found>& found_;
 };
 
+// Where the samples lie: n places in proportion to a density that is constant in equal intervals of the pieces'
+// positions. They are equally spaced; but those of a piece that is due at least one are then spread evenly from end to
+// end of it, each somewhere in its share. By how many places the piece has, more or less than it is due, vertices would
+// otherwise differ most. For each number of places the mean over where they lie is right.
+class Places {
+   public:
+    // density  one number for each interval; becomes its running sum
+    // whole    whether pieces get whole numbers of places
+    Places(const Pieces& pieces, Array<double>& density, int64_t n, bool whole, uint64_t seed, Team& team)
+        : pieces_(pieces), intervals_(density.size()), whole_(whole), seed_(seed), systematic_(density, team) {
+        systematic_.draw(n, to_unit(seed));
+        spacing_ = systematic_.total() / double(n);
+    }
+
+    struct Place {
+        double position;  // along the pieces
+        int64_t interval;
+        double weight;  // one over its density
+    };
+
+    // The i-th; places are asked for in ascending order.
+    Place operator()(int64_t i) {
+        const double even = systematic_.position(i);
+        interval_ = interval_ < 0 ? systematic_.primitive(even) : systematic_.primitive(even, interval_);
+        const double position = position_of(even, interval_);
+        if (!whole_) return {position, interval_, weight_of(interval_)};
+        piece_ = pieces_.piece(position, piece_);
+        const double begin = pieces_.begin(piece_), end = pieces_.end(piece_);
+        const double from = sum_before(begin), due = (sum_before(end) - from) / spacing_;
+        const int64_t first = number_from(from), count = number_from(from + due * spacing_) - first;
+        if (!(due >= 1) || i < first || i >= first + count) return {position, interval_, weight_of(interval_)};
+        const double share = (double(i - first) + to_unit(hash(seed_, piece_))) / double(count);
+        const double at = from + share * due * spacing_;
+        const int64_t interval = systematic_.primitive(at, interval_at(begin));
+        return {std::clamp(position_of(at, interval), begin, std::nextafter(end, 0.0)), interval,
+                weight_of(interval) * due / double(count)};
+    }
+
+   private:
+    int64_t interval_at(double position) const {
+        return std::min(int64_t(position * double(intervals_)), intervals_ - 1);
+    }
+    // The density's sum up to a position, and the position from where it is that.
+    double sum_before(double position) const {
+        const int64_t k = interval_at(position);
+        return systematic_.begin_of(k) + (position * double(intervals_) - double(k)) * systematic_.measure_of(k);
+    }
+    double position_of(double sum, int64_t k) const {
+        const double fraction = (sum - systematic_.begin_of(k)) / systematic_.measure_of(k);
+        return (double(k) + std::clamp(fraction, 0.0, 1.0)) / double(intervals_);
+    }
+    // Of the first place that is no less than a sum.
+    int64_t number_from(double sum) const { return int64_t(std::ceil((sum - systematic_.position(0)) / spacing_)); }
+    double weight_of(int64_t interval) const { return systematic_.weight(interval) / double(intervals_); }
+
+    const Pieces& pieces_;
+    const int64_t intervals_;
+    const bool whole_;
+    const uint64_t seed_;
+    Systematic systematic_;
+    double spacing_;
+    int64_t interval_ = -1, piece_ = -1;
+};
+
 // What chunks of samples share.
 template <class T>
 struct ShadowScene {
@@ -269,9 +340,9 @@ class ShadowChunk {
     // fall to the two ends would make most of the noise where there are few on an edge.
     void add(int64_t i, double position, int64_t interval, double weight, int64_t samples) {
         const auto place = scene_.pieces.at(position, piece_);
-        piece_ = place.piece;
-        const ShadowPiece& piece = scene_.pieces[piece_];
-        if (!wedge_.set(piece.edge, piece.part)) return;
+        const ShadowPiece& piece = scene_.pieces[place.piece];
+        if (place.piece != piece_) casts_ = wedge_.set(piece.edge, piece.part), piece_ = place.piece;
+        if (!casts_) return;
         const Vec2 other = sequence_(uint64_t(i));
         // Along the edge before a point, else along the wedge.
         const double t = scene_.light.extended ? other.x : place.fraction;
@@ -297,6 +368,7 @@ class ShadowChunk {
     const ShadowScene<T> scene_;
     const ShiftedSequence sequence_;
     int64_t piece_ = -1;
+    bool casts_ = false;  // whether that one does
     EdgeWedge<T> wedge_;
     ShadowSource<T> source_;
     LightRays<T> light_rays_;
@@ -341,12 +413,13 @@ void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t s
     });
     Array<double> measure(count);
     double known = 0, length = 0;  // of the border, px, a mean over the light
-    // What pilots of one interval miss, those of its neighbours may have met: half of the mean square is theirs.
+    // What pilots of one interval miss, those of its neighbours may have met: most of the mean square is theirs.
     for (int64_t i = 0; i < count; ++i) {
         double window = 0;
         const int64_t low = std::max<int64_t>(i - neighbours, 0), high = std::min(i + neighbours, count - 1);
         for (int64_t k = low; k <= high; ++k) window += of_interval[k].squares / double(high - low + 1);
-        measure[i] = std::sqrt(0.5 * (of_interval[i].squares + window) / pilots), known += measure[i] / double(count);
+        measure[i] = std::sqrt((own_share * of_interval[i].squares + (1 - own_share) * window) / pilots),
+        known += measure[i] / double(count);
         length += of_interval[i].length / double(pilots * count);
     }
     for (int64_t i = 0; i < count; ++i) measure[i] += floor_share * (known > 0 ? known : 1);
@@ -357,19 +430,15 @@ void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t s
     if (view.options.dry || n == 0) return;
     const int64_t samples_of_place = light.extended ? mirrored : 1,
                   places = (n + samples_of_place - 1) / samples_of_place;
-    Systematic systematic(measure, view.team);
-    systematic.draw(places, to_unit(hash(view.options.seed, 11, gradient_stream)));
+    const Places drawn(pieces, measure, places, light.extended, hash(view.options.seed, 11, gradient_stream),
+                       view.team);
     double seconds[2] = {0, 0};
     view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         ShadowChunk chunk(scene, hash(view.options.seed, 9, gradient_stream), on_curves<0>(view, record, grad));
-        int64_t k = -1;
+        Places place(drawn);
         for (int64_t i = first; i < last; ++i) {
-            const double position = systematic.position(i);
-            k = k < 0 ? systematic.primitive(position) : systematic.primitive(position, k);
-            const double fraction =
-                std::clamp((position - systematic.begin_of(k)) / systematic.measure_of(k), 0.0, 1.0);
-            chunk.add(i, (double(k) + fraction) / double(count), k, systematic.weight(k) / double(count),
-                      samples_of_place);
+            const auto [position, interval, weight] = place(i);
+            chunk.add(i, position, interval, weight, samples_of_place);
         }
         chunk.finish(grad);
     });
