@@ -21,13 +21,13 @@ from ._bsdf import Scattering, dot, terminator
 from ._check import check_positive_int, values_visible
 from ._lit_kernel import is_fused
 from ._request import Request
-from ._surfaces import Surfaces, View
+from ._surfaces import Rays, Surfaces, View
 from ._tree import tensors_in
 from ._warnings import warn
 from .camera import Camera
 from .environment import Environment
 from .hits import Hits
-from .lights import Light, LightPoints, SphericalHarmonics
+from .lights import Light, LightPoints, PointLight, SphericalHarmonics, SpotLight
 from .scene import Scene
 from .shader import Effort, render_shaded
 
@@ -63,9 +63,9 @@ class Lighting(NamedTuple):
         # Each point sees another one of a light with an extent.
         extended = any(not light.punctual for light in scene.casting)
         points = max(FEWEST_IN_PENUMBRA, request.image.spp // 4) if extended else 1
-        return render_shaded(
-            scene, camera, self, request, creases, False, Effort(points, scene.blends, is_fused(scene))
-        )
+        fused = is_fused(scene)
+        effort = Effort(points, scene.blends, fused, fused and not scene.blends)
+        return render_shaded(scene, camera, self, request, creases, False, effort)
 
     def __call__(self, hits: Hits) -> Tensor:
         return radiance(hits, *self)
@@ -183,7 +183,8 @@ def _note_jumps(hits: Hits) -> None:
         if mesh.material is None or not (scene.lights or scene.casting):
             continue
         if mesh.normals is None:
-            hits._note(("g", index), _of_scene(surfaces, index, lambda index=index: _face_normals(surfaces, index)))
+            seen_by = hits._view
+            hits._note(("g", index), _of_scene(surfaces, index, lambda i=index, v=seen_by: _of_flat(surfaces, i, v)))
             continue
         if mesh.normal_faces is not None:
             normals, rows = mesh.normals, mesh.normal_faces
@@ -212,6 +213,35 @@ def _faces_of(surfaces: Surfaces, index: int) -> Tensor:
 
 def _face_normals(surfaces: Surfaces, index: int) -> Tensor:
     return surfaces.face_normals(_faces_of(surfaces, index))[:, None].expand(-1, 3, -1)
+
+
+def _of_flat(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
+    """(F, 3, K) of a mesh without normals: what its radiance depends on that may jump, colours apart. That is the normal n on the
+    viewer's side; of points of light alone only where one is in front, and of Lambertian surfaces then E max(0, n·l) of each. It
+    is the same at both ends of an edge only if it is along all of it: as n·l has the sign, and over 1/|l| the size, of a face's
+    distance to the light. The cone of a spot light, which may lie between the ends, is left out."""
+    scene, mesh = surfaces.scene, surfaces.scene.meshes[index]
+    g, material = _face_normals(surfaces, index), mesh.material
+    assert material is not None
+    points_alone = all(light.punctual and not isinstance(light, SphericalHarmonics) for light in scene.lights)
+    points_alone &= all(light.punctual for light in scene.casting) and isinstance(view, View)
+    if not points_alone or material.normal_map is not None:
+        return g
+    position = mesh.verts.detach().to(g)[mesh.faces.long()].reshape(-1, 3)
+    g = g.reshape(-1, 3)
+    n = torch.where(dot(g, view.to_viewer(position).to(g)) < 0, -g, g)
+    found = []
+    for light in scene.casting:
+        everywhere = light
+        if isinstance(light, SpotLight):
+            everywhere = PointLight(light.position, light.intensity, light.color)
+        points = light.draw(position)
+        E = everywhere.arriving(points, position).mean(1, keepdim=True)
+        found.append(E * dot(n, _towards(light, points, position)).clamp(min=0))
+    arriving = torch.cat(found, 1).detach()
+    if material.metallic is not None or material.roughness is not None:
+        arriving = n * (arriving != 0).any(1, keepdim=True)
+    return arriving.reshape(len(mesh.faces), 3, -1)
 
 
 def _sunken(surfaces: Surfaces, index: int, light: Light) -> Tensor:

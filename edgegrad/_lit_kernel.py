@@ -38,8 +38,8 @@ def is_fused(scene: Scene) -> bool:
 
 
 def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
-    """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours. What was
-    found of shadows is noted in the hits."""
+    """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours; or zeros
+    with the same derivatives, for hits of which no more is wanted. What was found of shadows is noted in the hits."""
     surfaces, view = hits._surfaces, hits._view
     assert isinstance(view, View)
     layout, tables = _layout(surfaces, view)
@@ -51,7 +51,7 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
     )
     number = -1 if forced is None else forced.light
     casters = surfaces.casters
-    shading = _Shading(layout, len(tables), number, shadows, samples, casters.cutoffs, casters.spacing)
+    shading = _Shading(layout, len(tables), number, shadows, samples, hits.values, casters.cutoffs, casters.spacing)
     arrays = (part for part in casters if isinstance(part, Tensor))
     found, seen = apply(shading, [hits._exact.cpu(), *points, *tables, *arrays])
     column = 0
@@ -257,14 +257,15 @@ def _rows(index: Tensor) -> np.ndarray:
 
 
 class _Shading(NamedTuple):
-    """csrc/shading/lit/lit.h, of the tensors (b, *points, *tables, *flat): the result is radiance (N, C) float64; beside it which
-    samples of lights are seen, (N, K) int8, −1 where they are below the surface."""
+    """csrc/shading/lit/lit.h, of the tensors (b, *points, *tables, *flat): the result is radiance (N, C) float64, or zeros with its
+    derivatives; beside it which samples of lights are seen, (N, K) int8, −1 where they are below the surface."""
 
     layout: _Layout
     tables: int  # how many
     forced: int  # the light whose shadow is known, −1: none
     shadows: bool
     samples: int
+    values: bool
     cutoffs: list[float]  # of the flat scene, whose other fields are tensors
     spacing: list[float]
 
@@ -298,7 +299,7 @@ class _Shading(NamedTuple):
         }
 
     def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
-        found, seen = kernel_scene(self._flat(tensors)).shade(**self._arguments(tensors))
+        found, seen = kernel_scene(self._flat(tensors)).shade(values=self.values, **self._arguments(tensors))
         return torch.from_numpy(found), torch.from_numpy(seen)
 
     def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:

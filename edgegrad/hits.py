@@ -57,6 +57,7 @@ class Hits:
         forced: Forced | None = None,
     ) -> None:
         self._surfaces, self._view, self._rays_at = surfaces, view, rays_at
+        self.values = True  # whether more than derivatives is wanted of what scenes are lit by (_lit_kernel.py)
         self._seed = torch.arange(len(face), device=face.device) if seed is None else seed
         self._forced = forced
         self._face, self._exact = face, barycentrics

@@ -46,6 +46,7 @@ class Effort(NamedTuple):
     points: int = 1  # of a face in a pixel that are shaded
     blended: bool = False  # whether one may see through surfaces
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
+    gives_derivatives: bool = False  # whether it leaves out values where only derivatives are wanted, see Hits.values
 
     @property
     def at_once(self) -> int:
@@ -159,15 +160,18 @@ class _Image:
         """(H · W, C): Σ k(x − c) L px² over samples inside faces, less its own value."""
         frame = self._frame
         total = frame.fixed.verts.new_zeros((frame.height, frame.width, self._channels or 1))
-        for first in range(0, len(samples), AT_ONCE):
-            some = samples.part(first, first + AT_ONCE)
+        at_once = self._effort.at_once
+        for first in range(0, len(samples), at_once):
+            some = samples.part(first, first + at_once)
 
             def radiance(first: int = first) -> Tensor:
                 # Hits of its own each time, for these keep what was computed from them.
-                return self._shade(samples.part(first, first + AT_ONCE).hits)
+                hits = samples.part(first, first + at_once).hits
+                hits.values = not self._effort.gives_derivatives
+                return self._shade(hits)
 
             # So that memory is that of some points, not of all.
-            many = len(samples) > AT_ONCE and not transformed() and not self._effort.keeps_little
+            many = len(samples) > at_once and not transformed() and not self._effort.keeps_little
             L = checkpoint(radiance, use_reentrant=False) if many else radiance()
             assert isinstance(L, Tensor)
             total = total + some.image(L)

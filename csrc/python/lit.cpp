@@ -253,7 +253,7 @@ nb::object array_of(std::vector<X>&& values, size_t columns) {
 
 template <class T>
 nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points, bool shadows,
-                       int samples, int threads) {
+                       int samples, bool values, int threads) {
     if (arrays.faces.shape(0) == 0 ||
         size_t(lit.scene.meshes.back().first_face + lit.scene.meshes.back().faces) != arrays.faces.shape(0))
         refuse("lit: expected the faces of the scene");
@@ -265,7 +265,8 @@ nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const
     unlocked(threads, [&](Team& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
-        shade(lit.scene, arrays.view(), geometry->caster(), view, options, radiance.data(), seen.data(), team);
+        shade(lit.scene, arrays.view(), geometry->caster(), view, options, values ? radiance.data() : nullptr,
+              seen.data(), team);
     });
     return nb::make_tuple(array_of(std::move(radiance), size_t(lit.scene.channels)), array_of(std::move(seen), lights));
 }
@@ -325,7 +326,7 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, boo
 
 template <class T>
 void bind_scene_lit(nb::class_<SceneArrays<T>>& scene) {
-    scene.def("shade", &shade_points<T>, "lit"_a, "points"_a, "shadows"_a, "samples"_a, "threads"_a);
+    scene.def("shade", &shade_points<T>, "lit"_a, "points"_a, "shadows"_a, "samples"_a, "values"_a, "threads"_a);
 }
 template void bind_scene_lit(nb::class_<SceneArrays<float>>&);
 template void bind_scene_lit(nb::class_<SceneArrays<double>>&);

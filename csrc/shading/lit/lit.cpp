@@ -281,8 +281,16 @@ void radiance(const LitScene& lit, const LitPoints& points, const std::vector<Li
             add_light<S>(lit, lit.lamps[lights[k].lamp], light_point(lit, points, i, lights[k], plain(o.g)),
                          1.0 / lights[k].count, o, total);
 }
+// Whether no light that a point sees, nor anything else, gives it radiance: then it has no derivatives either.
+bool is_unlit(const LitScene& lit, int64_t face, const int8_t* seen, size_t lights) {
+    const LitMesh& mesh = lit.mesh_of(face);
+    if (!mesh.has_material || mesh.emission.exists()) return false;
+    return std::none_of(seen, seen + lights, [](int8_t s) { return s > 0; }) &&
+           std::all_of(lit.lamps.begin(), lit.lamps.end(), [](const Lamp& lamp) { return lamp.casts(); });
+}
 void radiance_vjp(const LitScene& lit, const LitPoints& points, const std::vector<LightSample>& lights, int64_t i,
                   const int8_t* seen, const double* total_bar, double* b_bar, Cotangents& to) {
+    if (is_unlit(lit, points.face[i], seen, lights.size())) return;
     Surface<double> o = surface<double>(lit, points.face[i], points.b + 3 * i);
     if (o.is_black()) return;
     look_up_material(lit, o);
@@ -367,7 +375,7 @@ void shade(const LitScene& lit, const SceneView<T>& scene, const RayCaster& cast
                            }
                        }
                        room.rays.cast(scene, caster, room.found);
-                       for (int64_t j = 0; j < n; ++j) {
+                       for (int64_t j = 0; radiance_out && j < n; ++j) {
                            const int64_t i = first + j;
                            look_up_material(lit, room.surfaces[j]);
                            radiance<double>(lit, points, lights, i, room.surfaces[j], seen + i * K,

@@ -73,7 +73,7 @@ struct LitOptions {
 constexpr int8_t not_asked = -1;
 int light_samples(const LitScene& lit, const LitOptions& options);
 
-// (N, channels) radiance, and (N, light samples) what was found of lights.
+// (N, channels) radiance, null where only derivatives are wanted, and (N, light samples) what was found of lights.
 template <class T>
 void shade(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
            const LitOptions& options, double* radiance, int8_t* seen, Team& team);
