@@ -34,6 +34,9 @@ from .shader import Effort, render_shaded
 FEWEST_IN_PENUMBRA = 4  # points of a face in a pixel that are shaded, at least; else a quarter of its samples
 
 
+EDGE_ON = 1e-3  # cosine, below which it is left open which side of a face is seen
+
+
 class Lighting(NamedTuple):
     """The options of render() for lit scenes."""
 
@@ -64,7 +67,7 @@ class Lighting(NamedTuple):
         extended = any(not light.punctual for light in scene.casting)
         points = max(FEWEST_IN_PENUMBRA, request.image.spp // 4) if extended else 1
         fused = is_fused(scene)
-        effort = Effort(points, scene.blends, fused, fused and not scene.blends)
+        effort = Effort(points, scene.blends, fused, not extended, fused and not scene.blends)
         return render_shaded(scene, camera, self, request, creases, False, effort)
 
     def __call__(self, hits: Hits) -> Tensor:
@@ -227,21 +230,25 @@ def _of_flat(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
     points_alone &= all(light.punctual for light in scene.casting) and isinstance(view, View)
     if not points_alone or material.normal_map is not None:
         return g
-    position = mesh.verts.detach().to(g)[mesh.faces.long()].reshape(-1, 3)
-    g = g.reshape(-1, 3)
-    n = torch.where(dot(g, view.to_viewer(position).to(g)) < 0, -g, g)
+    verts, faces = mesh.verts.detach().to(g), mesh.faces.long()
+    first, g = verts[faces[:, 0]], g[:, 0]
+    towards = dot(g, view.to_viewer(first).to(g))
+    n, edge_on = torch.where(towards < 0, -g, g), towards.abs() < EDGE_ON
     found = []
     for light in scene.casting:
-        everywhere = light
+        everywhere, points = light, light.draw(verts)
         if isinstance(light, SpotLight):
             everywhere = PointLight(light.position, light.intensity, light.color)
-        points = light.draw(position)
-        E = everywhere.arriving(points, position).mean(1, keepdim=True)
-        found.append(E * dot(n, _towards(light, points, position)).clamp(min=0))
-    arriving = torch.cat(found, 1).detach()
+        place, E = light.place(points).detach().to(g), everywhere.arriving(points, verts).detach().mean(1)
+        if light.infinite:
+            distance = dot(n, place[:1])
+        else:
+            distance, E = dot(n, place[:1] - first), E / (place - verts).norm(dim=1).clamp(min=1e-30)
+        found.append(torch.where(edge_on, distance.abs(), distance.clamp(min=0)) * E[faces])
+    arriving = torch.stack(found, -1)
     if material.metallic is not None or material.roughness is not None:
-        arriving = n * (arriving != 0).any(1, keepdim=True)
-    return arriving.reshape(len(mesh.faces), 3, -1)
+        return n[:, None] * (arriving != 0).any(-1, keepdim=True)
+    return arriving
 
 
 def _sunken(surfaces: Surfaces, index: int, light: Light) -> Tensor:

@@ -209,6 +209,20 @@ def test_without_shadows() -> None:
     assert torch.allclose(lit, expected, rtol=1e-12, atol=1e-12)
 
 
+def test_derivatives_without_values() -> None:
+    words = SCENES[-1]
+    found = []
+    for values in (True, False):
+        leaves = {name: value.clone().requires_grad_() for name, value in numbers_of(words).items()}
+        hits = hits_of(scene_of(words, leaves), CAMERAS["perspective"])
+        hits.values = values
+        radiance = _lit_kernel.radiance(hits, True, 1)
+        weights = torch.rand(radiance.shape, dtype=F64, generator=torch.Generator().manual_seed(3))
+        found.append((radiance, torch.autograd.grad((weights * radiance).sum(), list(leaves.values()))))
+    assert float(found[0][0].detach().abs().max()) > 0.1 and not bool(found[1][0].detach().any())
+    assert all(torch.equal(a, b) for a, b in zip(found[0][1], found[1][1], strict=True))
+
+
 def test_the_same_bits_on_any_number_of_threads() -> None:
     words = SCENES[-1]
     leaves = {name: value.clone().requires_grad_() for name, value in numbers_of(words).items()}

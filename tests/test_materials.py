@@ -17,6 +17,7 @@ from torch.nn.functional import normalize
 import edgegrad as eg
 from edgegrad._bsdf import Scattering, ggx, masking, terminator
 from edgegrad._lit import radiance
+from edgegrad.hits import Hits
 
 UP = vector(0, 0, 1)
 
@@ -269,6 +270,42 @@ def test_edges_where_lit_surfaces_jump():
     assert float(by_light[z.abs() > 0.8].max()) < 0.1 * float(by_light[z.abs() < 0.1].max())
     wide = jumping(creases(smooth, eg.Environment([1.0])), smooth)
     assert float(wide.min()) > 1e-3
+
+
+@pytest.mark.parametrize("specular", [False, True])
+def test_edges_where_no_light_jumps(specular: bool):
+    """Points of light: where what is noted at both ends of an edge is the same on its sides, so is the radiance, and dark sides
+    have no creases."""
+    material = eg.Material(roughness=0.5) if specular else eg.Material()
+    ball_ = ball(3, smooth=False, material=material)
+    lights = [
+        eg.DirectionalLight([1.0, 0.3, -0.2]),
+        eg.PointLight([0.0, 3, 1.5], 20.0),
+        eg.SpotLight([0.0, 0.5, -4.0], [0.0, 0, 1.0], 9.0, outer_angle=0.05),
+    ]
+    for lamps in (lights[:1], lights[1:]):
+        hits = eg.primary_hits(eg.Scene([ball_], lights=lamps), from_above()).hits
+        radiance(hits)
+        noted = hits._surfaces.crease_attributes().double()
+        edges: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
+        for face, corners in enumerate(ball_.faces.tolist()):
+            for i in range(3):
+                j = (i + 1) % 3
+                a, b = (i, j) if corners[i] < corners[j] else (j, i)
+                edges.setdefault((corners[a], corners[b]), []).append((face, a, b))
+        sides = torch.tensor(list(edges.values()))  # (E, 2, 3)
+        face, ends = sides[..., 0], sides[..., 1:]
+        at_ends = noted[face[..., None], ends]  # (E, side, end, K)
+        same = (at_ends[:, 0] == at_ends[:, 1]).flatten(1).all(1)
+        found = []
+        for t in (0.5, 0.9):
+            b = torch.zeros(*face.shape, 3, dtype=F64)
+            b.scatter_(2, ends, torch.tensor([1 - t, t], dtype=F64).expand(*ends.shape))
+            points = Hits(hits._surfaces, hits._view, face.reshape(-1), b.reshape(-1, 3))
+            found.append(radiance(points, shadows=False).reshape(*face.shape, -1))
+        jump = torch.stack([(side[:, 0] - side[:, 1]).abs().amax(1) for side in found]).amax(0)
+        assert int(same.sum()) > 0.2 * len(same) and float(jump[same].max()) < 1e-12
+        assert int((jump > 1e-4).sum()) > 0.3 * len(jump)
 
 
 # -- gradients inside faces, and of what moves ------------------------------------------------------------------------------

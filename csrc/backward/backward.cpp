@@ -166,7 +166,7 @@ Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Desti
 template <class T>
 SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions& o, SampleCounts wanted, Team& team) {
     const int64_t pixels = int64_t(input.camera.width) * input.camera.height;
-    const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, team);
+    const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, o.lit ? costs_of_lit : SampleCosts(), team);
     SampleCounts n = budget.share(wanted);
     if (o.surface_samples >= 0) n.surface = wanted.surface;
     if (o.edge_samples >= 0) n.edge = wanted.edge;
@@ -370,8 +370,9 @@ Records record_samples(const BackwardInput<T>& input, GradientOptions o, Team& t
     Destination to;
     to.records = &records;
     BackwardProfile profile;
-    each_view(input, o, terms, team,
-              [&](const BackwardView<T>& view) { add_terms<0>(input, view, terms, Record{o.intrinsics}, to, profile); });
+    each_view(input, o, terms, team, [&](const BackwardView<T>& view) {
+        add_terms<0>(input, view, terms, Record{o.intrinsics}, to, profile);
+    });
     return records;
 }
 
@@ -382,8 +383,9 @@ CurveRecords record_shadows(const BackwardInput<T>& input, const GradientOptions
     Destination to;
     to.records = &records;
     BackwardProfile profile;
-    each_view(input, o, Terms{}, team,
-              [&](const BackwardView<T>& view) { add_shadows(view, light, samples, Record{o.intrinsics}, to, profile); });
+    each_view(input, o, Terms{}, team, [&](const BackwardView<T>& view) {
+        add_shadows(view, light, samples, Record{o.intrinsics}, to, profile);
+    });
     return std::move(records.curves);
 }
 

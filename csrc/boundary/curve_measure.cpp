@@ -297,10 +297,14 @@ class MeasuredEdges {
         return relative(jumps_);
     }
     double relative(const CreaseJumps<N, T>& jumps) const {
-        return std::min(jumps.size(scale_.weights) / scale_.unknown, largest);
+        const double size = jumps.size(scale_.weights) / scale_.unknown;
+        return size > 0 && !visibility_ ? std::clamp(size, least, largest) : std::min(size, largest);
     }
 
     static constexpr double largest = 2;  // so that a bright face among dark ones does not take all samples
+    // Where samples alone find the jump: they look a little aside of the curve (contractions.h), and a texture may
+    // differ there where the faces of a crease are as good as coplanar. Such a sample must not stand for too much.
+    static constexpr double least = 1.0 / 1024;
     const BackwardView<T>& view_;
     const CurveFinder<T>& finder_;
     const JumpScale& scale_;

@@ -34,9 +34,12 @@ class RowBuffer {
     }
     bool is_wanted() const { return !recent_.empty(); }
     void clear() {
-        bool any = false;
-        for (Rows& r : rows_) any |= r.count > 0, r.count = 0;
-        if (any) std::fill(recent_.begin(), recent_.end(), Recent());
+        for (Rows& r : rows_) {
+            if (r.count < n_recent / 4)
+                for (size_t k = 0; k < r.count; ++k) recent_[uint64_t(r.index[k]) % n_recent] = Recent();
+            else std::fill(recent_.begin(), recent_.end(), Recent());
+            r.count = 0;
+        }
     }
     // W: the width at compile time, or 0.
     template <int W = 0>

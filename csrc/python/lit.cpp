@@ -334,8 +334,8 @@ template void bind_scene_lit(nb::class_<SceneArrays<double>>&);
 void bind_lit(nb::module_& m) {
     m.attr("MOST_LIT_CHANNELS") = most_lit_channels;
     nb::class_<SourceArrays>(m, "LitSource")
-        .def(nb::new_(&make_source), "kind"_a, "value"_a = no_table, "factor"_a = no_table,
-             "uvs"_a = no_table, "uv_faces"_a.noconvert() = nb::none(), "height"_a = 0, "width"_a = 0,
+        .def(nb::new_(&make_source), "kind"_a, "value"_a = no_table, "factor"_a = no_table, "uvs"_a = no_table,
+             "uv_faces"_a.noconvert() = nb::none(), "height"_a = 0, "width"_a = 0,
              "sampler"_a = std::vector<int>{0, 0, 0});
     nb::class_<MeshArrays>(m, "LitMesh")
         .def(nb::new_(&make_mesh), nb::kw_only(), "first_face"_a, "faces"_a, "first_vertex"_a, "has_material"_a,

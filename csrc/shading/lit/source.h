@@ -59,6 +59,12 @@ inline Footprint footprint(const Source& source, Vec2 uv) { return footprint(sou
 inline double fraction(double value, double, double) { return value; }
 inline Dual fraction(double value, Dual coordinate, double texels) { return {value, texels * coordinate.dot}; }
 
+template <class S, class Visit>
+void each_texel(const Footprint& f, S a, S b, Visit visit) {
+    visit(f.texel[0], (S(1) - a) * (S(1) - b)), visit(f.texel[1], a * (S(1) - b));
+    visit(f.texel[2], (S(1) - a) * b), visit(f.texel[3], a * b);
+}
+
 // Calls visit(row of the table, its weight) for the rows whose weighted sum the value is.
 template <class S, class Visit>
 void each_row(const std::vector<Table>& tables, const Source& source, const FacePoint<S>& at, Visit visit) {
@@ -78,8 +84,7 @@ void each_row(const std::vector<Table>& tables, const Source& source, const Face
             const bool moves = source.sampler.filter == TextureFilter::linear;
             const S a = fraction(f.a, uv.u, moves ? double(source.width) : 0),
                     b = fraction(f.b, uv.v, moves ? -double(source.height) : 0);
-            visit(f.texel[0], (S(1) - a) * (S(1) - b)), visit(f.texel[1], a * (S(1) - b));
-            visit(f.texel[2], (S(1) - a) * b), visit(f.texel[3], a * b);
+            each_texel(f, a, b, visit);
         }
     }
 }
@@ -120,17 +125,22 @@ inline void value_vjp(const std::vector<Table>& tables, const Source& source, co
         for (int c = 1; c < channels; ++c) own[0] += own[c];
     double row_bar[most_lit_channels], s[4];  // of the texels: bar · texel
     int k = 0;
-    each_row<double>(tables, source, at, [&](int64_t row, double weight) {
+    const auto add = [&](int64_t row, double weight) {
         double sum = 0;
         for (int c = 0; c < n; ++c) row_bar[c] = weight * own[c], sum += own[c] * table.at<double>(row, c);
         to.add(source.value, row, row_bar);
         s[k++] = sum;
-    });
-    if (source.kind == Source::Kind::vertex || source.kind == Source::Kind::corner)
-        for (int i = 0; i < 3; ++i) b_bar[i] += s[i];
-    if (source.kind != Source::Kind::texture || source.sampler.filter != TextureFilter::linear) return;
+    };
+    if (source.kind != Source::Kind::texture) {
+        each_row<double>(tables, source, at, add);
+        if (source.kind == Source::Kind::vertex || source.kind == Source::Kind::corner)
+            for (int i = 0; i < 3; ++i) b_bar[i] += s[i];
+        return;
+    }
     const Uv<double> uv = interpolated_uv(tables, source, at);
     const Footprint f = footprint(source, {uv.u, uv.v});
+    each_texel<double>(f, f.a, f.b, add);
+    if (source.sampler.filter != TextureFilter::linear) return;
     const double u_bar = source.width * ((1 - f.b) * (s[1] - s[0]) + f.b * (s[3] - s[2])),
                  v_bar = -double(source.height) * ((1 - f.a) * (s[2] - s[0]) + f.a * (s[3] - s[1]));
     for (int i = 0; i < 3; ++i) {
