@@ -257,8 +257,8 @@ def _rows(index: Tensor) -> np.ndarray:
 
 
 class _Shading(NamedTuple):
-    """csrc/shading/lit/lit.h, of the tensors (b, *points, *tables, *flat): the result is radiance (N, C) float64, or zeros with its
-    derivatives; beside it which samples of lights are seen, (N, K) int8, −1 where they are below the surface."""
+    """csrc/shading/lit/lit.h, of the tensors (b, *points, *tables, *flat): the result is radiance (N, C) float64, or zeros with
+    its derivatives; beside it which samples of lights are seen, (N, K) int8, −1 where they are below the surface."""
 
     layout: _Layout
     tables: int  # how many

@@ -370,9 +370,8 @@ Records record_samples(const BackwardInput<T>& input, GradientOptions o, Team& t
     Destination to;
     to.records = &records;
     BackwardProfile profile;
-    each_view(input, o, terms, team, [&](const BackwardView<T>& view) {
-        add_terms<0>(input, view, terms, Record{o.intrinsics}, to, profile);
-    });
+    each_view(input, o, terms, team,
+              [&](const BackwardView<T>& view) { add_terms<0>(input, view, terms, Record{o.intrinsics}, to, profile); });
     return records;
 }
 
@@ -383,9 +382,8 @@ CurveRecords record_shadows(const BackwardInput<T>& input, const GradientOptions
     Destination to;
     to.records = &records;
     BackwardProfile profile;
-    each_view(input, o, Terms{}, team, [&](const BackwardView<T>& view) {
-        add_shadows(view, light, samples, Record{o.intrinsics}, to, profile);
-    });
+    each_view(input, o, Terms{}, team,
+              [&](const BackwardView<T>& view) { add_shadows(view, light, samples, Record{o.intrinsics}, to, profile); });
     return std::move(records.curves);
 }
 

@@ -18,8 +18,8 @@ struct GradientOptions {
     uint64_t seed = 0;
     bool interior_geometry = true;  // whether the colours vary over faces, so that moving them shows inside
     bool boundary = true;
-    bool intrinsics = true;  // whether they may move; where boundary does count, the rim of what a lens shows then does
-    bool steps = true;       // whether what moves steps within faces counts
+    bool intrinsics = true;   // whether they may move; where boundary does count, the rim of what a lens shows then does
+    bool steps = true;        // whether what moves steps within faces counts
     double step_spacing = 1;  // px between the lines that find them
     bool lit = false;         // whether lights shade the image and the samples (budget.h)
     bool dry = false;         // only count the samples
