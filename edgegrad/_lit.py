@@ -226,20 +226,20 @@ def _of_flat(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
     scene, mesh = surfaces.scene, surfaces.scene.meshes[index]
     g, material = _face_normals(surfaces, index), mesh.material
     assert material is not None
-    points_alone = all(light.punctual and not isinstance(light, SphericalHarmonics) for light in scene.lights)
-    points_alone &= all(light.punctual for light in scene.casting) and isinstance(view, View)
-    if not points_alone or material.normal_map is not None:
+    harmonics = any(isinstance(light, SphericalHarmonics) for light in scene.lights)
+    points_alone = not harmonics and all(light.punctual for light in scene.casting)
+    if not points_alone or material.normal_map is not None or not isinstance(view, View):
         return g
-    verts, faces = mesh.verts.detach().to(g), mesh.faces.long()
-    first, g = verts[faces[:, 0]], g[:, 0]
-    towards = dot(g, view.to_viewer(first).to(g))
+    verts, faces = mesh.verts.detach().double(), mesh.faces.long()
+    first, g = verts[faces[:, 0]], g[:, 0].double()
+    towards = dot(g, view.to_viewer(first))
     n, edge_on = torch.where(towards < 0, -g, g), towards.abs() < EDGE_ON
     found = []
     for light in scene.casting:
         everywhere, points = light, light.draw(verts)
         if isinstance(light, SpotLight):
             everywhere = PointLight(light.position, light.intensity, light.color)
-        place, E = light.place(points).detach().to(g), everywhere.arriving(points, verts).detach().mean(1)
+        place, E = light.place(points).detach().to(g), everywhere.arriving(points, verts).detach().abs().mean(1)
         if light.infinite:
             distance = dot(n, place[:1])
         else:
@@ -248,7 +248,7 @@ def _of_flat(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
     arriving = torch.stack(found, -1)
     if material.metallic is not None or material.roughness is not None:
         return n[:, None] * (arriving != 0).any(-1, keepdim=True)
-    return arriving
+    return arriving / arriving.max().clamp(min=1e-300)
 
 
 def _sunken(surfaces: Surfaces, index: int, light: Light) -> Tensor:
