@@ -67,7 +67,7 @@ class Lighting(NamedTuple):
         extended = any(not light.punctual for light in scene.casting)
         points = max(FEWEST_IN_PENUMBRA, request.image.spp // 4) if extended else 1
         fused = is_fused(scene)
-        effort = Effort(points, scene.blends, fused, not extended, fused and not scene.blends)
+        effort = Effort(points, scene.blends, fused, fused and not scene.blends)
         return render_shaded(scene, camera, self, request, creases, False, effort)
 
     def __call__(self, hits: Hits) -> Tensor:

@@ -285,13 +285,7 @@ class Sampler:
             yield range(first * width, end * width), PixelRecords(*self._compute(self._request, compute, *places))
 
     def samples(
-        self,
-        request: Request,
-        interior: bool,
-        boundary: bool,
-        intrinsics: bool = False,
-        steps: bool = False,
-        lit: bool = False,
+        self, request: Request, interior: bool, boundary: bool, intrinsics: bool = False, steps: bool = False
     ) -> tuple[SurfaceRecords, CurveRecords]:
         """Of the gradient, after all pixel hits were taken; the scene of `request` has colours that jump where creases are."""
 
@@ -309,7 +303,6 @@ class Sampler:
                     intrinsics=intrinsics,
                     steps=steps,
                     step_spacing=options.step_spacing,
-                    lit=lit,
                 ),
                 threads=torch.get_num_threads(),
                 adjoint=np.ones((*self.coverage.shape, flat.background.shape[-1]), self.coverage.numpy().dtype),

@@ -46,7 +46,6 @@ class Effort(NamedTuple):
     points: int = 1  # of a face in a pixel that are shaded
     blended: bool = False  # whether one may see through surfaces
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
-    lit: bool = False  # whether points of light do it, so that a sample costs more (csrc/backward/budget.h)
     gives_derivatives: bool = False  # whether it leaves out values where only derivatives are wanted, see Hits.values
 
     @property
@@ -96,12 +95,7 @@ class _Image:
         flat = frame.request.scene
         cut = visibility and flat.has_steps and (moving or moves(flat.uvs, flat.alphas))
         surface, curves = frame.sampler.samples(
-            self._with_creases(),
-            interior=True,
-            boundary=moving,
-            intrinsics=moves(frame.intrinsics),
-            steps=cut,
-            lit=self._effort.lit,
+            self._with_creases(), interior=True, boundary=moving, intrinsics=moves(frame.intrinsics), steps=cut
         )
         zero = self._interior(SurfaceSamples(frame, surface))
         if moving or cut:

@@ -166,7 +166,7 @@ Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Desti
 template <class T>
 SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions& o, SampleCounts wanted, Team& team) {
     const int64_t pixels = int64_t(input.camera.width) * input.camera.height;
-    const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, o.lit ? costs_of_lit : SampleCosts(), team);
+    const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, team);
     SampleCounts n = budget.share(wanted);
     if (o.surface_samples >= 0) n.surface = wanted.surface;
     if (o.edge_samples >= 0) n.edge = wanted.edge;
