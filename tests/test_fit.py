@@ -241,6 +241,16 @@ def test_faults_of_pose_json(text, message):
         ({"mesh": "bracket.obj"}, TypeError, "mesh: expected a Mesh or a Scene, got str"),
         ({"target": torch.zeros(32, 64, 3)}, ValueError, "target: expected shape (64, 64, C), got (32, 64, 3)"),
         ({"target": torch.zeros(64, 64, 4)}, ValueError, "target: expected 3 channels"),
+        (
+            {"target": torch.zeros(64, 64, 3)},
+            ValueError,
+            "target: expected a picture of the object, got the same in every",
+        ),
+        (
+            {"mask": torch.ones(64, 64), "target": torch.zeros(64, 64, 3)},
+            ValueError,
+            "mask: expected a picture of the object",
+        ),
         ({"target": torch.full((64, 64, 3), math.nan)}, ValueError, "target: expected finite"),
         ({"camera": np.eye(4)}, TypeError, "camera: expected a Camera, got ndarray"),
         ({"camera": eg.Camera.stack([camera(), camera()])}, ValueError, "camera: expected one camera, got 2"),
@@ -264,7 +274,8 @@ def test_faults_of_pose_json(text, message):
     ],
 )
 def test_errors_name_the_argument(change, error, message):
-    arguments = {"mesh": bracket(), "target": torch.zeros(64, 64, 3), "camera": camera(), **change}
+    something = torch.eye(64)[..., None].expand(-1, -1, 3)
+    arguments = {"mesh": bracket(), "target": something, "camera": camera(), **change}
     with pytest.raises(error) as caught:
         fit_pose(**arguments, progress=False)
     assert message in str(caught.value)

@@ -144,7 +144,13 @@ class PoseTask:
         colours = (
             seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
         )  # a mask's range says nothing of theirs
-        extent = float((colours.amax(0) - colours.amin(0)).norm())
+        # A black object before nothing has no range of colours.
+        extent = next((r for x in (colours, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
+        if extent == 0.0:
+            raise ValueError(
+                f"{'mask' if mask is not None else 'target'}: expected a picture of the object, got the same in every pixel; "
+                "was it read or rendered right?"
+            )
         bare = scene.replace(meshes=double, background=None)
         return PoseTask(bare, aovs, shots, clutter, extent, (low + high) / 2, size, free)
 
