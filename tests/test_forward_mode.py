@@ -243,6 +243,7 @@ def test_types():
     assert eg.screen_gradient(scene, camera, ADJOINT.float()).dtype == torch.float32
 
 
+@pytest.mark.parametrize("call", ["jvp", "screen"])
 def test_same_bits_at_any_number_of_threads(call):
     scene, threads = mixed_scene(), torch.get_num_threads()
     found = []
