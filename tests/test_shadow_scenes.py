@@ -10,7 +10,6 @@ from torch import Tensor
 
 import edgegrad as eg
 
-STEP = 0.01
 FINE = 24  # rays a pixel, each way: all are shaded
 
 
@@ -31,7 +30,9 @@ def loss(case: Case, theta: float, seed: int) -> float:
 
 def finite_difference(case: Case, seeds: int) -> Estimate:
     with torch.no_grad():
-        return estimate([(loss(case, STEP, s) - loss(case, -STEP, s)) / (2 * STEP) for s in range(seeds)])
+        return estimate(
+            [(loss(case, case.step, s) - loss(case, -case.step, s)) / (2 * case.step) for s in range(seeds)]
+        )
 
 
 def gradient(case: Case, seeds: int) -> Estimate:
