@@ -24,7 +24,10 @@ from edgegrad.report.scenes import ReportScene
 from edgegrad.samples import Frame
 from edgegrad.shader import Effort, _Image
 
-COUNTS = tuple(1 << k for k in range(8, 19, 2))  # samples on the borders of shadows
+# Samples on the borders of shadows.
+COUNTS = {
+    lamp: tuple(1 << k for k in range(8, most + 1, 2)) for lamp, most in (("point", 18), ("area", 20), ("sky", 18))
+}
 CONVERGED = 1 << 20
 WANTED = {"point": 3.0, "area": 3.0, "sky": 5.0}  # errors, in percent
 OVER_IMAGE: dict[str, dict[str, float]] = {
@@ -109,7 +112,7 @@ def border_gradient(scene: ReportScene, count: int, seed: int) -> tuple[Tensor, 
     verts = scene.verts.float().requires_grad_()
     moved = scene.moved(verts)
     request = make_request(moved, scene.camera, 16, 0, edge_samples=None if count < 0 else count, grad_seed=seed)
-    image = Borders(Frame(moved, request, 0), Lighting(True, 1), False, False, Effort(keeps_little=True))
+    image = Borders(Frame(moved, request, 0), Lighting(True, 1), False, False, Effort(keeps_little=True, adds_up=True))
     found = image.render()
     begin = time.perf_counter()
     (gradient,) = torch.autograd.grad((found * scene.adjoint).sum(), verts)
@@ -129,10 +132,10 @@ def borders(bench: Bench, lamp: str) -> list[Row]:
             eg.render(scene.scene, scene.camera)
 
     n = bench.repeats(9)
-    image(), border_gradient(scene, COUNTS[0], 0)
+    image(), border_gradient(scene, 256, 0)
     ahead = statistics.median(seconds_of(image) for _ in range(n))
     errors, seconds = [], []
-    counts = COUNTS[:-1] if bench.quick else COUNTS
+    counts = COUNTS[lamp][:-1] if bench.quick else COUNTS[lamp]
     for count in (*counts, -1):
         bench.bar.set_postfix_str(f"{lamp}, {count} samples")
         found = [border_gradient(scene, count, seed) for seed in range(n)]

@@ -67,7 +67,8 @@ class Lighting(NamedTuple):
         extended = any(not light.punctual for light in scene.casting)
         points = max(FEWEST_IN_PENUMBRA, request.image.spp // 4) if extended else 1
         fused = is_fused(scene)
-        effort = Effort(points, scene.blends, fused, fused and not scene.blends)
+        adds_up = not scene.blends
+        effort = Effort(points, scene.blends, fused, fused and adds_up, adds_up)
         return render_shaded(scene, camera, self, request, creases, False, effort)
 
     def __call__(self, hits: Hits) -> Tensor:
@@ -118,7 +119,7 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
     at = OnMesh(mesh, hits._face - surfaces.first_faces[index], hits._barycentrics, hits)
     base, material = at.base_color(), mesh.material
     if material is None:
-        return base
+        return torch.zeros_like(base) if hits.only_light else base
     g, v = surfaces.face_normals(hits._face), hits.view
     front = dot(g.detach(), v.detach()) >= 0
     side = torch.where(front, 1.0, -1.0).to(g)
@@ -131,13 +132,15 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
     flat = mesh.normals is None and material.normal_map is None
     surface = _Surface(hits.position, v, side * g, side * n, Scattering(base, metallic, roughness), flat)
     total = g.new_zeros((len(hits), 1))
-    if material.emission is not None:
+    if material.emission is not None and not hits.only_light:
         total = total + at.value(material.emission)
     for light in scene.lights:
-        if isinstance(light, SphericalHarmonics):
+        if isinstance(light, SphericalHarmonics) and not hits.only_light:
             total = total + surface.scattering.diffuse / math.pi * light.irradiance(surface.n)
     for light in scene.casting:
-        count = 1 if light.punctual else lighting.samples
+        if hits.only_light and not hits.knows_light(light):
+            continue
+        count = 1 if light.punctual or hits.only_light else lighting.samples
         for sample in range(count):
             total = total + _from_light(hits, light, (sample, count), surface, lighting.shadows) / count
     return total if material.two_sided else torch.where(front, total, 0.0)

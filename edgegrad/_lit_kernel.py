@@ -50,12 +50,18 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
         *((None,) * 4 if forced is None else _forced(forced.points, forced.lit)),
     )
     number = -1 if forced is None else forced.light
+    only = number if hits.only_light else -1
+    samples = samples if only < 0 else 1
     casters = surfaces.casters
-    shading = _Shading(layout, len(tables), number, shadows, samples, hits.values, casters.cutoffs, casters.spacing)
+    shading = _Shading(
+        layout, len(tables), number, shadows, samples, only, hits.values, casters.cutoffs, casters.spacing
+    )
     arrays = (part for part in casters if isinstance(part, Tensor))
     found, seen = apply(shading, [hits._exact.cpu(), *points, *tables, *arrays])
     column = 0
     for light, casting in enumerate(surfaces.scene.casting):
+        if only not in (-1, light):
+            continue
         own = seen[:, column]
         if shadows and bool((own >= 0).any()):
             surfaces.shadowing.add(light)
@@ -265,6 +271,7 @@ class _Shading(NamedTuple):
     forced: int  # the light whose shadow is known, −1: none
     shadows: bool
     samples: int
+    only: int  # the light of which alone radiance is wanted, −1: of all
     values: bool
     cutoffs: list[float]  # of the flat scene, whose other fields are tensors
     spacing: list[float]
@@ -293,8 +300,7 @@ class _Shading(NamedTuple):
         return {
             "lit": self.layout.kernel(self._tables(tensors), self._flat(tensors).faces),
             "points": core.LitPoints(b=array(b), forced_lamp=self.forced, **arrays),
-            "shadows": self.shadows,
-            "samples": self.samples,
+            "options": core.LitOptions(shadows=self.shadows, samples=self.samples, only=self.only),
             "threads": torch.get_num_threads(),
         }
 

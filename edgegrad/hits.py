@@ -29,9 +29,10 @@ class Forced(NamedTuple):
     points: LightPoints  # N of them
     lit: Tensor  # (N,) 0 or 1
     some: Tensor  # (N,) bool: at which points; elsewhere light points are drawn, and shadow rays cast
+    only: bool = False  # whether nothing is wanted but what this light adds
 
     def select(self, index: Tensor) -> Forced:
-        return Forced(self.light, self.points.select(index), self.lit[index], self.some[index])
+        return Forced(self.light, self.points.select(index), self.lit[index], self.some[index], self.only)
 
 
 class Hits:
@@ -437,6 +438,11 @@ class Hits:
         whole, rows = self._whole
         known = whole.lit.setdefault(light, lit.new_full((len(whole),), -1))
         known.index_copy_(0, rows, lit)
+
+    @property
+    def only_light(self) -> bool:
+        """Whether nothing is wanted but what one light adds, whose points are given."""
+        return self._forced is not None and self._forced.only
 
     def knows_light(self, light: Light) -> bool:
         """Whether the points of a light are given here, for all the border of one shadow."""

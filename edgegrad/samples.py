@@ -201,14 +201,18 @@ class EdgeSamples:
               that of the place by vertices and camera
     """
 
-    def __init__(self, frame: Frame, records: CurveRecords, light: ShadowLight | None = None) -> None:
+    def __init__(
+        self, frame: Frame, records: CurveRecords, light: ShadowLight | None = None, only: bool = False
+    ) -> None:
+        """Of borders of the shadow of a light; `only`: the hits ask what it adds where it is seen, and are not on both sides."""
         self.frame, self._records = frame, records
         self.x = frame.here(records.x)
         points = None
         if light is not None:
             points, share = light.points(frame.here(records.light), frame.here(records.light_uv))
             records = records._replace(factor=records.factor * share.cpu()[:, None])
-        sample, which = (records.face >= 0).nonzero(as_tuple=True)
+        there = records.face[:, :1] if only else records.face
+        sample, which = (there >= 0).nonzero(as_tuple=True)
         self.sample, self._factor = frame.here(sample), frame.here(records.factor[sample, which])
         # On the border of a face a little inside, so that rounding does not take a step along it for passed: at u = 1 a texture
         # that repeats begins anew.
@@ -219,7 +223,7 @@ class EdgeSamples:
         if light is not None and points is not None:
             lit = frame.here(which == 0).to(frame.dtype)
             some = torch.ones_like(lit, dtype=torch.bool)
-            forced = Forced(light.number, points.select(self.sample), lit, some)
+            forced = Forced(light.number, points.select(self.sample), lit, some, only)
         self.hits = frame.fixed_hits(records.face[sample, which], b, records.x[sample], seed, forced=forced)
         self.to_background = frame.here(torch.where(records.face == -1, records.factor, 0).sum(1))
         flat = frame.request.scene

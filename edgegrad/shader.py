@@ -47,6 +47,9 @@ class Effort(NamedTuple):
     blended: bool = False  # whether one may see through surfaces
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where only derivatives are wanted, see Hits.values
+    adds_up: bool = (
+        False  # whether it is a sum over lights, and gives one of them alone where Hits.only_light asks for it
+    )
 
     @property
     def at_once(self) -> int:
@@ -195,16 +198,19 @@ class _Image:
             moving = moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
             if moving or ShadowLight.moves(light.light):
                 records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics))
-                found = found + self._boundary(EdgeSamples(frame, records, light))
+                found = found + self._boundary(EdgeSamples(frame, records, light, self._effort.adds_up))
         return found
 
     def _boundary(self, samples: EdgeSamples) -> Tensor:
         """(H · W, C): Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
         jump = self._frame.fixed.verts.new_zeros((len(samples), self._channels or 1))
+        at_once = self._effort.at_once
         with torch.no_grad():
-            for first in range(0, len(samples.hits), AT_ONCE):
-                end = min(first + AT_ONCE, len(samples.hits))
-                points = samples.hits.apart(torch.arange(first, end, device=self._frame.device))
+            for first in range(0, len(samples.hits), at_once):
+                end = min(first + at_once, len(samples.hits))
+                points = samples.hits
+                if len(points) > at_once:
+                    points = points.apart(torch.arange(first, end, device=self._frame.device))
                 jump = jump + samples.jump_of(first, end, self._shade(points).detach())
         return boundary(self._frame, samples.x, samples.velocity, jump, samples.to_background, self._background)
 

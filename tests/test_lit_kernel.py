@@ -200,6 +200,43 @@ def test_points_of_a_light_that_are_given() -> None:
         assert torch.allclose(*found, rtol=1e-12, atol=1e-12)
 
 
+def test_what_one_light_adds() -> None:
+    """Values and derivatives are those with the light less those in its shadow."""
+    words = SCENES[-1].replace("microfacets ", "") + " area"
+    for light in (0, 2, 4):
+        of = []
+        for lit, only in ((1, False), (0, False), (1, True)):
+            leaves = {name: value.clone().requires_grad_() for name, value in numbers_of(words).items()}
+            scene = scene_of(words, leaves)
+            hits = hits_of(scene, CAMERAS["perspective"])
+            n = len(hits)
+            points = scene.casting[light].draw(torch.rand(n, 3, dtype=F64, generator=torch.Generator().manual_seed(2)))
+            forced = Forced(light, points, torch.full((n,), lit, dtype=F64), torch.ones(n, dtype=torch.bool), only)
+            place = hits._face, hits._exact, hits._pixel
+            given = [Hits(hits._surfaces, hits._view, *place, seed=hits._seed, forced=forced) for _ in range(2)]
+            L = _lit_kernel.radiance(given[0], True, 2)
+            assert torch.allclose(_lit.reference(given[1], True, 2), L, rtol=1e-12, atol=1e-12)
+            of.append([L, *torch.autograd.grad(L.sum(), list(leaves.values()), materialize_grads=True)])
+        for with_light, without, alone in zip(*of, strict=True):
+            assert torch.allclose(
+                with_light - without, alone, rtol=1e-9, atol=1e-9 * float(with_light.detach().abs().max())
+            )
+        assert float(of[2][0].detach().abs().max()) > 0.01
+
+
+def test_borders_of_shadows_by_what_the_light_adds() -> None:
+    """As by the radiance on both sides, 1e-5 px beside the border, which is what any other shader gives."""
+    leaves = {name: value.clone().requires_grad_() for name, value in numbers_of("normals point area sky base").items()}
+    scene = scene_of("normals point area sky base emission", {**leaves, "emission": torch.ones(3)})
+    camera, found = CAMERAS["perspective"], []
+    weights = torch.rand(24, 24, 3, generator=torch.Generator().manual_seed(1))
+    for shader in (None, lambda hits: _lit.radiance(hits, True, 1)):
+        image = eg.render(scene, camera, spp=4, shader=shader)
+        found.append(torch.autograd.grad((weights * image).sum(), [leaves["verts"], leaves["point"]]))
+    for a, b in zip(*found, strict=True):
+        assert float((a - b).norm()) < 1e-5 * float(a.norm()) > 0
+
+
 def test_without_shadows() -> None:
     words = SCENES[-1]
     scene = scene_of(words, numbers_of(words))

@@ -30,7 +30,7 @@ class LightWedge {
         }
         for (int k = 0; k < 2; ++k) {
             std::vector<Vec2>& polygon = polygon_[k];
-            polygon.clear(), area_[k] = 0;
+            polygon.clear(), area_[k] = 0, sections_[k].clear();
             const double side = k ? -1 : 1;
             if (std::any_of(heights.begin(), heights.end(),
                             [&](Vec3 h) { return std::max({side * h.x, side * h.y, side * h.z}) <= 0; }))
@@ -65,7 +65,8 @@ class LightWedge {
         double area = along * fraction();
         const int k = area_[0] > 0 && (area < area_[0] || !(area_[1] > 0)) ? 0 : 1;
         if (k) area -= area_[0];
-        const Section s = section(polygon_[k], std::clamp(area / area_[k], 0.0, 1.0));
+        if (sections_[k].empty()) find_sections(polygon_[k], sections_[k]);
+        const Section s = section(sections_[k], std::clamp(area / area_[k], 0.0, 1.0));
         const double c = s.low + across * (s.high - s.low);
         const Vec2 uv{s.at * along_.x - c * along_.y, s.at * along_.y + c * along_.x};
         const double u = std::clamp(uv.x, 0.0, 1.0);
@@ -90,16 +91,13 @@ class LightWedge {
         polygon.swap(kept_);
     }
 
-    // Across a convex polygon, with a part of its area before it.
-    Section section(const std::vector<Vec2>& polygon, double part) {
-        sections_.clear();
+    // Across a convex polygon at its corners, ascending.
+    void find_sections(const std::vector<Vec2>& polygon, std::vector<Section>& sections) const {
         const auto forward = [&](Vec2 p) { return p.x * along_.x + p.y * along_.y; };
         const auto aside = [&](Vec2 p) { return p.y * along_.x - p.x * along_.y; };
-        for (const Vec2 p : polygon) sections_.push_back({forward(p), aside(p), aside(p)});
-        std::sort(sections_.begin(), sections_.end(), [](const Section& a, const Section& b) { return a.at < b.at; });
-        double total = 0;
-        for (size_t j = 0; j < sections_.size(); ++j) {
-            Section& s = sections_[j];
+        for (const Vec2 p : polygon) sections.push_back({forward(p), aside(p), aside(p)});
+        std::sort(sections.begin(), sections.end(), [](const Section& a, const Section& b) { return a.at < b.at; });
+        for (Section& s : sections)
             for (size_t i = 0; i < polygon.size(); ++i) {
                 const Vec2 p = polygon[i], q = polygon[(i + 1) % polygon.size()];
                 const double at_p = forward(p), at_q = forward(q);
@@ -108,13 +106,17 @@ class LightWedge {
                              c = aside(p) + f * (aside(q) - aside(p));
                 s.low = std::min(s.low, c), s.high = std::max(s.high, c);
             }
-            if (j) total += between(sections_[j - 1], s);
-        }
+    }
+
+    // With a part of the polygon's area before it.
+    static Section section(const std::vector<Section>& sections, double part) {
+        double total = 0;
+        for (size_t j = 1; j < sections.size(); ++j) total += between(sections[j - 1], sections[j]);
         double area = part * total;
         size_t j = 1;
-        while (j + 1 < sections_.size() && area > between(sections_[j - 1], sections_[j]))
-            area -= between(sections_[j - 1], sections_[j]), ++j;
-        const Section &a = sections_[j - 1], &b = sections_[j];
+        while (j + 1 < sections.size() && area > between(sections[j - 1], sections[j]))
+            area -= between(sections[j - 1], sections[j]), ++j;
+        const Section &a = sections[j - 1], &b = sections[j];
         const double whole = between(a, b), f = whole > 0 ? std::clamp(area / whole, 0.0, 1.0) : 0.5;
         // Of a trapezoid with the widths w₀, w₁ the area up to x is w₀ x + (w₁ − w₀) x² / 2.
         const double w0 = a.high - a.low, w1 = b.high - b.low,
@@ -129,7 +131,7 @@ class LightWedge {
     std::vector<Vec2> polygon_[2], kept_;  // on either side of the edge
     double area_[2] = {0, 0};
     Vec2 along_;
-    std::vector<Section> sections_;
+    std::vector<Section> sections_[2];  // once they were asked for
 };
 
 }  // namespace edgegrad

@@ -30,6 +30,7 @@ struct SurfaceRecords {
     std::vector<double> along_by_k;  // (S, 3, 14) ∂along/∂intrinsics at fixed x
     std::vector<double> weight;      // px² that it stands for
 
+    void clear();
     void add(const SurfaceRecords& o);
 };
 
@@ -66,6 +67,9 @@ struct CurveRecords {
     std::vector<double> by_light;  // (S, 3)
 
     int64_t size() const { return int64_t(x.size()) / 2; }
+    void clear();
+    // Makes room for so many more, with rows of so many vertices each.
+    void reserve(int64_t more, int64_t vertices);
     void add(const CurveRecords& o);
 };
 
@@ -104,9 +108,31 @@ inline void append_ray(const Camera& window, Vec2 n, std::vector<double>& along,
     }
 }
 
+template <class T>
+void reserve_more(std::vector<T>& to, int64_t more) {
+    to.reserve(to.size() + size_t(more));
+}
+
+inline void SurfaceRecords::clear() { face.clear(), x.clear(), along.clear(), along_by_k.clear(), weight.clear(); }
+
 inline void SurfaceRecords::add(const SurfaceRecords& o) {
     append(face, o.face), append(x, o.x), append(along, o.along), append(along_by_k, o.along_by_k),
         append(weight, o.weight);
+}
+
+inline void CurveRecords::clear() {
+    x.clear(), face.clear(), b.clear(), factor.clear(), by_k.clear();
+    row_of.clear(), vertex.clear(), by_q.clear();
+    uv_row_of.clear(), uv.clear(), by_uv.clear();
+    alpha_row_of.clear(), alpha.clear(), by_alpha.clear();
+    light.clear(), light_uv.clear(), by_light.clear();
+}
+
+inline void CurveRecords::reserve(int64_t more, int64_t vertices) {
+    reserve_more(x, 2 * more), reserve_more(face, surfaces * more), reserve_more(b, 2 * surfaces * more);
+    reserve_more(factor, surfaces * more);
+    reserve_more(row_of, vertices * more), reserve_more(vertex, vertices * more),
+        reserve_more(by_q, 3 * vertices * more);
 }
 
 inline void CurveRecords::add(const CurveRecords& o) {

@@ -222,7 +222,7 @@ class Scatter {
             rows.clear();
         }
         g.k = {};
-        if (to.records) g.records = {};
+        g.records.surface.clear(), g.records.curves.clear();
     }
 
     int width_of(const RowSlot& slot, const Destination& to) const {

@@ -252,13 +252,12 @@ nb::object array_of(std::vector<X>&& values, size_t columns) {
 }
 
 template <class T>
-nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points, bool shadows,
-                       int samples, bool values, int threads) {
+nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
+                       const LitOptions& options, bool values, int threads) {
     if (arrays.faces.shape(0) == 0 ||
         size_t(lit.scene.meshes.back().first_face + lit.scene.meshes.back().faces) != arrays.faces.shape(0))
         refuse("lit: expected the faces of the scene");
     const LitPoints view = points.view(lit.scene, int64_t(arrays.faces.shape(0)));
-    const LitOptions options{shadows, samples};
     const size_t lights = size_t(light_samples(lit.scene, options));
     std::vector<double> radiance(size_t(view.size) * size_t(lit.scene.channels));
     std::vector<int8_t> seen(size_t(view.size) * lights);
@@ -278,10 +277,9 @@ void check_seen(const LitArrays& lit, const LitPoints& points, const LitOptions&
 int64_t faces_of(const LitArrays& lit) { return lit.scene.meshes.back().first_face + lit.scene.meshes.back().faces; }
 
 // Cotangents of the tables (None where they are not wanted) and of b.
-nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, bool shadows, int samples,
+nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, const LitOptions& options,
                            In<int8_t, 2> seen, In<double, 2> bar, const std::vector<bool>& wanted, int threads) {
     const LitPoints view = points.view(lit.scene, faces_of(lit));
-    const LitOptions options{shadows, samples};
     check_seen(lit, view, options, seen);
     if (int64_t(bar.shape(0)) != view.size || int(bar.shape(1)) != lit.scene.channels)
         refuse("bar: expected a row a point");
@@ -298,11 +296,10 @@ nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, bool
     return nb::make_tuple(out, array_of(std::move(b_bar), 3));
 }
 
-nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, bool shadows, int samples,
+nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, const LitOptions& options,
                             In<int8_t, 2> seen, const std::vector<std::optional<In<double, 2>>>& tangents,
                             std::optional<In<double, 2>> b_dot, int threads) {
     const LitPoints view = points.view(lit.scene, faces_of(lit));
-    const LitOptions options{shadows, samples};
     check_seen(lit, view, options, seen);
     LitScene moving = lit.scene;
     if (tangents.size() != moving.tables.size()) refuse("tangents: expected one for each table, or None");
@@ -326,7 +323,7 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, boo
 
 template <class T>
 void bind_scene_lit(nb::class_<SceneArrays<T>>& scene) {
-    scene.def("shade", &shade_points<T>, "lit"_a, "points"_a, "shadows"_a, "samples"_a, "values"_a, "threads"_a);
+    scene.def("shade", &shade_points<T>, "lit"_a, "points"_a, "options"_a, "values"_a, "threads"_a);
 }
 template void bind_scene_lit(nb::class_<SceneArrays<float>>&);
 template void bind_scene_lit(nb::class_<SceneArrays<double>>&);
@@ -361,10 +358,13 @@ void bind_lit(nb::module_& m) {
              nb::kw_only(), "face"_a.noconvert(), "b"_a.noconvert(), "seed"_a.noconvert(), "forced_lamp"_a = -1,
              "index"_a.noconvert() = nb::none(), "uv"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(),
              "lit"_a.noconvert() = nb::none());
-    m.def("shade_vjp", &shade_points_vjp, "lit"_a, "points"_a, nb::kw_only(), "shadows"_a, "samples"_a,
-          "seen"_a.noconvert(), "bar"_a.noconvert(), "wanted"_a, "threads"_a);
-    m.def("shade_jvp", &shade_points_jvp, "lit"_a, "points"_a, nb::kw_only(), "shadows"_a, "samples"_a,
-          "seen"_a.noconvert(), "tangents"_a, "b_dot"_a.none(), "threads"_a);
+    nb::class_<LitOptions>(m, "LitOptions")
+        .def(nb::new_([](bool shadows, int samples, int only) { return LitOptions{shadows, samples, only}; }),
+             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a);
+    m.def("shade_vjp", &shade_points_vjp, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "seen"_a.noconvert(),
+          "bar"_a.noconvert(), "wanted"_a, "threads"_a);
+    m.def("shade_jvp", &shade_points_jvp, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "seen"_a.noconvert(),
+          "tangents"_a, "b_dot"_a.none(), "threads"_a);
 }
 
 }  // namespace edgegrad

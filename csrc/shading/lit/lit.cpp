@@ -182,7 +182,7 @@ struct LightSample {
 std::vector<LightSample> samples_of(const LitScene& lit, const LitOptions& options) {
     std::vector<LightSample> out;
     for (int k = 0; k < int(lit.lamps.size()); ++k) {
-        if (!lit.lamps[k].casts()) continue;
+        if (!lit.lamps[k].casts() || !(options.only < 0 || options.only == k)) continue;
         const int count = lit.lamps[k].is_punctual() ? 1 : options.samples;
         for (int s = 0; s < count; ++s) out.push_back({k, s, count});
     }
@@ -271,11 +271,11 @@ void add_unshadowed_vjp(const LitScene& lit, const Surface<double>& o, const dou
 
 // Radiance at a point of which it is known which lights it sees.
 template <class S>
-void radiance(const LitScene& lit, const LitPoints& points, const std::vector<LightSample>& lights, int64_t i,
-              const Surface<S>& o, const int8_t* seen, S* total) {
+void radiance(const LitScene& lit, const LitPoints& points, const LitOptions& options,
+              const std::vector<LightSample>& lights, int64_t i, const Surface<S>& o, const int8_t* seen, S* total) {
     std::fill(total, total + lit.channels, S(0));
     if (o.is_black()) return;
-    add_unshadowed(lit, o, total);
+    if (options.only < 0) add_unshadowed(lit, o, total);
     for (size_t k = 0; k < lights.size(); ++k)
         if (seen[k] > 0)
             add_light<S>(lit, lit.lamps[lights[k].lamp], light_point(lit, points, i, lights[k], plain(o.g)),
@@ -288,14 +288,15 @@ bool is_unlit(const LitScene& lit, int64_t face, const int8_t* seen, size_t ligh
     return std::none_of(seen, seen + lights, [](int8_t s) { return s > 0; }) &&
            std::all_of(lit.lamps.begin(), lit.lamps.end(), [](const Lamp& lamp) { return lamp.casts(); });
 }
-void radiance_vjp(const LitScene& lit, const LitPoints& points, const std::vector<LightSample>& lights, int64_t i,
-                  const int8_t* seen, const double* total_bar, double* b_bar, Cotangents& to) {
+void radiance_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options,
+                  const std::vector<LightSample>& lights, int64_t i, const int8_t* seen, const double* total_bar,
+                  double* b_bar, Cotangents& to) {
     if (is_unlit(lit, points.face[i], seen, lights.size())) return;
     Surface<double> o = surface<double>(lit, points.face[i], points.b + 3 * i);
     if (o.is_black()) return;
     look_up_material(lit, o);
     SurfaceBar bar(lit.channels);
-    add_unshadowed_vjp(lit, o, total_bar, bar, to);
+    if (options.only < 0) add_unshadowed_vjp(lit, o, total_bar, bar, to);
     for (size_t k = 0; k < lights.size(); ++k)
         if (seen[k] > 0)
             add_light_vjp(lit, lit.lamps[lights[k].lamp], light_point(lit, points, i, lights[k], o.g),
@@ -378,7 +379,7 @@ void shade(const LitScene& lit, const SceneView<T>& scene, const RayCaster& cast
                        for (int64_t j = 0; radiance_out && j < n; ++j) {
                            const int64_t i = first + j;
                            look_up_material(lit, room.surfaces[j]);
-                           radiance<double>(lit, points, lights, i, room.surfaces[j], seen + i * K,
+                           radiance<double>(lit, points, options, lights, i, room.surfaces[j], seen + i * K,
                                             radiance_out + i * lit.channels);
                        }
                    });
@@ -393,8 +394,8 @@ void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& o
         team, points.size, chunks, [&](Cotangents& chunk, int owners) { chunk.prepare(lit.tables, to, owners); },
         [&](int64_t first, int64_t last, Cotangents& chunk) {
             for (int64_t i = first; i < last; ++i)
-                radiance_vjp(lit, points, lights, i, seen + i * lights.size(), bar + i * lit.channels, b_bar + 3 * i,
-                             chunk);
+                radiance_vjp(lit, points, options, lights, i, seen + i * lights.size(), bar + i * lit.channels,
+                             b_bar + 3 * i, chunk);
         },
         [&](const Cotangents& chunk, int owner) { chunk.add_to(to, owner); }, [](Cotangents&) {}, seconds);
 }
@@ -408,7 +409,7 @@ void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& o
             for (int k = 0; k < 3; ++k) b[k] = {points.b[3 * i + k], b_dot ? b_dot[3 * i + k] : 0};
             Surface<Dual> o = surface<Dual>(lit, points.face[i], b);
             look_up_material(lit, o);
-            radiance<Dual>(lit, points, lights, i, o, seen + i * lights.size(), total);
+            radiance<Dual>(lit, points, options, lights, i, o, seen + i * lights.size(), total);
             for (int c = 0; c < lit.channels; ++c) radiance_dot[i * lit.channels + c] = total[c].dot;
         }
     });

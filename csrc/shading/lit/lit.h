@@ -67,6 +67,7 @@ struct LitPoints {
 struct LitOptions {
     bool shadows = true;
     int samples = 1;  // points of each light with an extent, for each point that is shaded
+    int only = -1;    // the lamp of which alone radiance is wanted; −1: of all that there is
 };
 
 // Whether points of lights are seen, by points and then by lights and their samples.
