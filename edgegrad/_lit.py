@@ -195,8 +195,8 @@ def _note_jumps(hits: Hits) -> None:
         if mesh.normal_faces is not None:
             normals, rows = mesh.normals, mesh.normal_faces
             hits._note(("n", index), _of_scene(surfaces, index, lambda n=normals, r=rows: n[r.long()]))
-        for k, light in enumerate(scene.casting):
-            hits._note(("lit", index, k), _of_scene(surfaces, index, lambda i=index, o=light: _sunken(surfaces, i, o)))
+        if scene.casting:
+            hits._note(("lit", index), _of_scene(surfaces, index, lambda i=index: _sunken(surfaces, i)))
 
 
 def _of_scene(surfaces: Surfaces, index: int, of_mesh: Callable[[], Tensor]) -> Callable[[], Tensor]:
@@ -254,22 +254,26 @@ def _of_flat(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
     return arriving / arriving.max().clamp(min=1e-300)
 
 
-def _sunken(surfaces: Surfaces, index: int, light: Light) -> Tensor:
-    """(F, 3, 1): n·l at corners with interpolated normals times what terminator() leaves of it. The face's own normal g comes in
-    by that alone, and changes nothing where g·l ≥ (g·n)(n·l): so of a fine mesh only edges near the border of its shaded side are
-    creases. A light with an extent has such a border for each of its points: then the normals of all faces (F, 3, 3)."""
-    if not light.punctual:
-        return _face_normals(surfaces, index)
-    mesh = surfaces.scene.meshes[index]
+def _sunken(surfaces: Surfaces, index: int) -> Tensor:
+    """(F, 3, K): n·l at corners with interpolated normals times what terminator() leaves of it, for each light. The face's own
+    normal g comes in by that alone, and changes nothing where g·l ≥ (g·n)(n·l): so of a fine mesh only edges near the border of
+    its shaded side are creases. A light with an extent has such a border for each of its points: then all faces' normals."""
+    mesh, lights = surfaces.scene.meshes[index], surfaces.scene.casting
     assert mesh.normals is not None
+    of_faces = _face_normals(surfaces, index)
+    found = [] if all(light.punctual for light in lights) else [of_faces]
+    g = of_faces.reshape(-1, 3)
     rows = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
-    g = _face_normals(surfaces, index).reshape(-1, 3)
-    n = normalize(mesh.normals.detach().to(g)[rows.long()].reshape(-1, 3), dim=-1)
+    n = normalize(mesh.normals.detach().to(g), dim=-1)[rows.long()].reshape(-1, 3)
     n = torch.where(dot(n, g) < 0, -n, n)
-    position = mesh.verts.detach().to(g)[mesh.faces.long()].reshape(-1, 3)
-    l = _towards(light, light.draw(position), position).detach()
-    side = torch.where(dot(n, l) < 0, -1.0, 1.0).to(g)
-    return (dot(n, l) * terminator(side * g, side * n, l)).reshape(-1, 3, 1)
+    position = mesh.verts.detach().to(g)
+    for light in lights:
+        if light.punctual:
+            l = _towards(light, light.draw(position), position).detach()
+            l = l.expand(len(position), 3)[mesh.faces.long()].reshape(-1, 3)
+            side = torch.where(dot(n, l) < 0, -1.0, 1.0).to(g)
+            found.append((dot(n, l) * terminator(side * g, side * n, l)).reshape(-1, 3, 1))
+    return torch.cat(found, -1)
 
 
 def check_unlit(function: str, scene: Scene, instead: str) -> None:
