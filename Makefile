@@ -5,6 +5,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := pyproject.toml $(shell find csrc -name '*.cpp' -o -name '*.h' -o -name CMakeLists.txt)
 
+# Tests start Python some hundred times, and each would compile all that it imports where it may not keep it.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-slow test-browser sanitize sanitize-threads bench lint docs wheel format clean
 .DELETE_ON_ERROR:
 
@@ -12,7 +15,7 @@ demo: $(VENV)/.ready
 	$(BIN)/edgegrad demo --out out/demo
 
 # A worker for each processor, of one thread each (tests/conftest.py); a test may take so many seconds of processor time.
-WORKERS := -n logical --maxprocesses 8
+WORKERS := -n logical --maxprocesses 8 --dist worksteal
 BUDGET := 30
 test: $(VENV)/.ready
 	$(BIN)/python -m pytest -m "not slow" $(WORKERS) --budget $(BUDGET)

@@ -18,9 +18,13 @@ pytest.importorskip("viser", reason="the live view needs edgegrad[view]")
 selenium = pytest.importorskip("selenium.webdriver", reason="no selenium; run `make test-browser`")
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 DRIVER = shutil.which("chromedriver")
-pytestmark = pytest.mark.skipif(
-    BROWSER is None or DRIVER is None, reason="no chromium with its chromedriver; run `make test-browser`"
-)
+# `make test-browser` runs them, and so does `make test-slow`.
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        BROWSER is None or DRIVER is None, reason="no chromium with its chromedriver; run `make test-browser`"
+    ),
+]
 # WebGL on the processor; --no-sandbox, for Chromium has none for root, and it opens only the test's own page.
 FLAGS = ("headless=new", "no-sandbox", "use-gl=angle", "use-angle=swiftshader", "enable-unsafe-swiftshader",
          "disable-dev-shm-usage", "window-size=1200,760")  # fmt: skip
