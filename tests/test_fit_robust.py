@@ -10,7 +10,7 @@ from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, p
 import edgegrad as eg
 from edgegrad.fit import fit_camera, fit_pose, fit_scene
 from edgegrad.fit.robust import Comparison
-from edgegrad.fit.task import Lens, PoseTask, is_clutter
+from edgegrad.fit.task import Lens, Names, PoseTask, is_clutter
 
 
 def covered(view, image):
@@ -109,7 +109,7 @@ def test_residuals_have_the_gradient_of_the_loss(clutter):
     image = picture(
         view, background=torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(1)) if clutter else BACKGROUND
     )
-    task = PoseTask.of(bracket(), image, view, None, torch.rand(16, 16), background, Lens(), 1.0)
+    task = PoseTask.of(bracket(), image, view, None, torch.rand(16, 16), background, Lens(), 1.0, Names())
     assert task.clutter == clutter
     level = task.level(1.0, 0.0, 1.0, 4, task.free)
     g = torch.Generator().manual_seed(0)
@@ -173,13 +173,42 @@ def test_a_camera_is_saved(tmp_path):
     torch.testing.assert_close(eg.load_camera(tmp_path / "camera.json").K.double(), view.K.double())
 
 
+def test_a_rig_of_cameras(tmp_path):
+    """Two cameras that keep their places to one another find where they are, and the lens that they share."""
+    left = camera(64, distance=2.6)
+    apart = about_center(rotation(0.0, 0.5, 0.0))
+    true = [left, left.replace(world_to_camera=left.world_to_camera @ apart)]
+    off = torch.linalg.inv(about_center(rotation(0.05, -0.06, 0.04), (0.04, -0.03, 0.05)))
+    wide = torch.diag(torch.tensor([1.05, 1.05, 1.0], dtype=torch.float64))
+    start = [
+        one.replace(world_to_camera=one.world_to_camera @ off, K=(wide @ one.K.double()).to(one.K)) for one in true
+    ]
+    for one, was in zip(start, true, strict=True):
+        one.K[:2, 2] = was.K[:2, 2]
+    fit = fit_camera(bracket(), [picture(one) for one in true], start, background=BACKGROUND, progress=False)
+    assert fit.converged and len(fit.cameras) == 2 and fit.camera is fit.cameras[0]
+    for found, one in zip(fit.cameras, true, strict=True):
+        assert float(found.K[0, 0] / one.K[0, 0]) == pytest.approx(1.0, abs=0.01)
+        assert float((found.eye - one.eye).norm()) < 0.02 * 2.6
+    names = fit.save(tmp_path)
+    assert {"camera-0.json", "camera-1.json"} < set(names) and "camera.json" not in names
+    eye = eg.load_camera(tmp_path / "camera-1.json").eye
+    torch.testing.assert_close(eye.double(), fit.cameras[1].eye.double(), rtol=1e-5, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     "change, message",
     [
         ({"camera": 3}, "camera: expected a Camera"),
+        ({"camera": []}, "camera: expected at least one"),
+        ({"camera": [camera(8), camera(8)]}, "image: expected 2, one for each camera"),
         ({"distortion": 3}, "distortion: expected 0, 4, 5 or 8"),
         ({"focal": 1}, "focal: expected True or False"),
         ({"image": None}, "image: expected a picture, or a mask"),
+        ({"image": torch.zeros(8, 9, 3)}, "image: expected "),
+        ({"image": torch.ones(8, 8, 3)}, "image: expected "),
+        ({"image": None, "mask": torch.zeros(9, 8)}, "mask: expected "),
+        ({"scene": 3}, "scene: expected a Mesh or a Scene"),
     ],
 )
 def test_errors_of_fit_camera(change, message):

@@ -18,7 +18,7 @@ from ..mesh import Mesh
 from ..scene import Scene
 from .pose import _flag, search_pose
 from .result import PoseFit
-from .task import Lens
+from .task import Lens, Names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,10 +28,15 @@ MOST_COEFFICIENTS = 8
 
 @dataclass(frozen=True, eq=False)
 class CameraFit:
-    """What fit_camera found: the camera, and the search for it, in which the scene moved before a camera at rest."""
+    """What fit_camera found: the cameras, and the search for them, in which the scene moved before cameras at rest."""
 
-    camera: Camera
+    cameras: list[Camera]
     search: PoseFit
+
+    @property
+    def camera(self) -> Camera:
+        """Of several the first."""
+        return self.cameras[0]
 
     @property
     def loss(self) -> float:
@@ -59,10 +64,14 @@ class CameraFit:
         return self.search.plot()
 
     def save(self, folder: PathLike) -> list[str]:
-        """Writes camera.json, as load_camera reads it, and what PoseFit.save writes; gives the names. Raises OSError."""
+        """Writes camera.json, as load_camera reads it (of several camera-0.json and so on), and what PoseFit.save writes; gives
+        the names. Raises OSError."""
         names = self.search.save(folder)
-        save_camera(Path(folder) / "camera.json", self.camera)
-        return ["camera.json", *names]
+        several = len(self.cameras) > 1
+        own = [f"camera-{i}.json" if several else "camera.json" for i in range(len(self.cameras))]
+        for name, camera in zip(own, self.cameras, strict=True):
+            save_camera(Path(folder) / name, camera)
+        return [*own, *names]
 
     def _repr_png_(self) -> bytes | None:
         return self.search._repr_png_()
@@ -70,11 +79,11 @@ class CameraFit:
 
 def fit_camera(
     scene: Mesh | Scene,
-    image: Tensor | None,
-    camera: Camera,
+    image: Tensor | Sequence[Tensor] | None,
+    camera: Camera | Sequence[Camera],
     *,
-    mask: Tensor | None = None,
-    weight: Tensor | None = None,
+    mask: Tensor | Sequence[Tensor] | None = None,
+    weight: Tensor | Sequence[Tensor] | None = None,
     background: Tensor | float | None = None,
     focal: bool = True,
     principal: bool = False,
@@ -90,8 +99,9 @@ def fit_camera(
     """Pose and lens of the camera that took a picture of a known scene.
 
     scene       what the picture shows, where it is; unlit, or all colours as they are in the picture
-    image       (H, W, C) linear radiance; None with a mask: that alone is compared
-    camera      of size (H, W), where the fit starts: within about 30° and 15 % of the scene's size
+    image       (H, W, C) linear radiance, or a list of pictures; None with a mask: that alone is compared
+    camera      of size (H, W), where the fit starts: within about 30° and 15 % of the scene's size; or a list of cameras, one
+                for each picture, which keep their places to one another, as those of a rig, and share what is found of the lens
     focal       also find the focal length: one factor for both of K
     principal   also find the principal point
     distortion  also find so many coefficients, in the order in which a Camera has them; those that the camera has beyond stay
@@ -100,29 +110,34 @@ def fit_camera(
     uncertain: focal length against distance where there is hardly any perspective, the principal point against a turn of the
     camera. Raises TypeError or ValueError that names the argument.
     """
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
+    projections = set()
+    for one in camera if isinstance(camera, (list, tuple)) else [camera]:
+        if not isinstance(one, Camera):
+            raise TypeError(f"camera: expected a Camera, got {type(one).__name__}; make one with Camera.look_at(…)")
+        projections.add(one.projection)
     count = check_int("distortion", distortion, 0, MOST_COEFFICIENTS)
-    if count and camera.projection not in ("perspective", "fisheye"):
-        raise ValueError(f"distortion: expected 0 for this projection, {camera.projection}, got {count}")
-    if count and camera.projection == "fisheye" and count != 4:
-        raise ValueError(f"distortion: expected 0 or 4 for a fisheye, got {count}")
-    if count and camera.projection == "perspective" and count not in (4, 5, 8):
-        raise ValueError(f"distortion: expected 0, 4, 5 or 8 for a perspective camera, got {count}")
+    for projection in sorted(projections) if count else []:
+        if projection not in ("perspective", "fisheye"):
+            raise ValueError(f"distortion: expected 0 for this projection, {projection}, got {count}")
+        if projection == "fisheye" and count != 4:
+            raise ValueError(f"distortion: expected 0 or 4 for a fisheye, got {count}")
+        if projection == "perspective" and count not in (4, 5, 8):
+            raise ValueError(f"distortion: expected 0, 4, 5 or 8 for a perspective camera, got {count}")
     lens = Lens(False, _flag("focal", focal), _flag("principal", principal), count)
     if callback is not None and not callable(callback):
         raise TypeError(f"callback: expected a function of a CameraFit, got {type(callback).__name__}")
     target: object = image
+    names = Names("scene", "mask" if image is None else "image", "camera")
     if image is None:
         if mask is None:
             raise ValueError("image: expected a picture, or a mask, to compare with, got neither")
         scene, target = _bare(scene), mask
 
     def result(search: PoseFit) -> CameraFit:
-        seen = search.camera
         # The scene moved by M before the camera W: W M sees the scene at rest alike.
-        moved = camera.world_to_camera.detach().double() @ search.matrix
-        return CameraFit(seen.replace(world_to_camera=moved.to(seen.world_to_camera)), search)
+        moved = [seen.world_to_camera.detach().double() @ search.matrix for seen in search.cameras]
+        found = zip(search.cameras, moved, strict=True)
+        return CameraFit([seen.replace(world_to_camera=M.to(seen.world_to_camera)) for seen, M in found], search)
 
     def step(search: PoseFit) -> None:
         assert callback is not None
@@ -130,7 +145,7 @@ def fit_camera(
 
     start = torch.eye(4, dtype=torch.float64)
     found = search_pose(
-        scene, target, camera, mask, start, lens, background, weight, max_size=max_size, steps=steps, spp=spp,
+        scene, target, camera, mask, start, lens, background, weight, names, max_size=max_size, steps=steps, spp=spp,
         tolerance=tolerance, seed=seed, progress=progress, callback=None if callback is None else step,
     )  # fmt: skip
     return result(found)

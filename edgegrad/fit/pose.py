@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +22,7 @@ from ..scene import Scene
 from .place import placed
 from .result import Pose, PoseFit, pose_from_matrix
 from .search import Search
-from .task import Lens, PoseTask
+from .task import Lens, Names, PoseTask
 from .upside_down import BETTER, say_upside_down
 from .verdict import ENOUGH
 
@@ -82,8 +83,9 @@ def fit_pose(
     lens = Lens(_flag("fit_scale", fit_scale), _flag("fit_focal", fit_focal))
     options = {"max_size": max_size, "steps": steps, "spp": spp, "tolerance": tolerance, "seed": seed}
     return search_pose(
-        mesh, target, camera, mask, init, lens, background, weight, progress=progress, callback=callback, **options
-    )
+        mesh, target, camera, mask, init, lens, background, weight, Names(), progress=progress, callback=callback,
+        **options,
+    )  # fmt: skip
 
 
 def _flag(name: str, flag: object) -> bool:
@@ -96,7 +98,7 @@ def _flag(name: str, flag: object) -> bool:
 @torch.enable_grad()
 def search_pose(
     mesh: Mesh | Scene, target: object, camera: object, mask: object, init: object, lens: Lens,
-    background: Tensor | float | None, weight: object, *, max_size: int, steps: int, spp: int, tolerance: float,
+    background: Tensor | float | None, weight: object, names: Names, *, max_size: int, steps: int, spp: int, tolerance: float,
     seed: int, progress: bool, callback: Callable[[PoseFit], None] | None,
 ) -> PoseFit:  # fmt: skip
     """fit_pose(), with whatever is sought of the lens."""
@@ -111,20 +113,20 @@ def search_pose(
     if callback is not None and not callable(callback):
         raise TypeError(f"callback: expected a function of a PoseFit, got {type(callback).__name__}")
     given = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
-    task = PoseTask.of(mesh, target, camera, mask, weight, background, lens, float(given.scale))
+    task = PoseTask.of(mesh, target, camera, mask, weight, background, lens, float(given.scale), names)
     start = placed(task) if init is None else given
     search = Search(task, task.pyramid(start, max_size, spp), start, steps, tolerance, seed)
     interrupted = False
-    first = camera[0] if isinstance(camera, Sequence) else camera
-    assert isinstance(first, Camera)
+    given_cameras: list[Any] = list(camera) if isinstance(camera, Sequence) else [camera]
 
     def result() -> PoseFit:
         best: Pose = search.best
         seconds = time.perf_counter() - began
         history = list(search.history)
+        cameras = [task.lens(one, best) for one in given_cameras]
         return PoseFit(
-            best.R, best.t, float(best.scale), task.lens(first, best), search.loss, len(history), seconds,
-            search.converged and not interrupted, interrupted, search.explained, history, task,
+            best.R, best.t, float(best.scale), cameras[0], search.loss, len(history), seconds,
+            search.converged and not interrupted, interrupted, search.explained, history, task, cameras,
         )  # fmt: skip
 
     bar = tqdm(total=search.planned, desc="fit", unit="step", disable=not progress, leave=False)
@@ -156,4 +158,6 @@ def _warn_if_upside_down(task: PoseTask, search: Search, place: bool, max_size: 
     again = Search(turned, turned.pyramid(start, max_size, spp), start, search.steps, search.tolerance, search.seed)
     found = again.first_end()
     if found >= max(ENOUGH, search.explained + BETTER):
-        say_upside_down("target", f"it shows {found:.0%} of the render's edges, as given {search.explained:.0%}")
+        say_upside_down(
+            search.task.names.target, f"it shows {found:.0%} of the render's edges, as given {search.explained:.0%}"
+        )

@@ -73,6 +73,9 @@ class PoseFit:
     explained: float = math.nan  # the share of the render's edges that the pictures show too, 0 … 1
     history: list[Step] = field(default_factory=list, repr=False)  # its last `best` step is this pose
     task: PoseTask | None = field(default=None, repr=False)  # what was compared, for pictures; not kept in JSON
+    cameras: list[Camera] = field(
+        default_factory=list, repr=False
+    )  # all that were given, as `camera`; not kept in JSON
 
     @property
     def matrix(self) -> Tensor:

@@ -69,8 +69,8 @@ class Search:
         ends = self._ranked(coarse, starts)
         if not self.history:
             raise ValueError(
-                "init: expected a pose at which the picture changes when the object moves, got one at which it does "
-                "not; is the object out of view, or of the background's colour?"
+                f"{self.task.names.init}: expected a pose at which the picture changes when the object moves, got one at which "
+                "it does not; is the object out of view, or of the background's colour?"
             )
         # The same many samples for all: a fit never ends at a worse pose than its start.
         best = min(self._judge(*self._down(ends[0], finer)), self._judge(self.start, False), key=lambda end: end.loss)

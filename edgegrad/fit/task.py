@@ -68,6 +68,14 @@ class Level(NamedTuple):
         return self.shots[0].camera.size
 
 
+class Names(NamedTuple):
+    """What a function calls its arguments, for errors."""
+
+    mesh: str = "mesh"
+    target: str = "target"
+    init: str = "init"
+
+
 @dataclass(frozen=True)
 class PoseTask:
     """What is compared, and how a pose moves. Geometry is float64."""
@@ -80,16 +88,17 @@ class PoseTask:
     center: Tensor  # (3,) of the bounding box, in the mesh's units
     size: float  # its diagonal at the start, world units
     free: list[int]  # entries of a step that are sought
+    names: Names
 
     @staticmethod
     def of(
         mesh: Mesh | Scene, target: Any, camera: Any, mask: Any, weight: Any, background: Tensor | float | None,
-        lens: Lens, scale: float,
+        lens: Lens, scale: float, names: Names,
     ) -> PoseTask:  # fmt: skip
         """`scale` is the mesh's at the start. Raises TypeError or ValueError."""
         if not isinstance(mesh, Mesh | Scene):
             raise TypeError(
-                f"mesh: expected a Mesh or a Scene, got {type(mesh).__name__}; load one with load_mesh(path)"
+                f"{names.mesh}: expected a Mesh or a Scene, got {type(mesh).__name__}; load one with load_mesh(path)"
             )
         # Copies, for autograd does not keep tensors that were made in torch.inference_mode().
         scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu", copy=True)
@@ -97,12 +106,12 @@ class PoseTask:
         if mask is not None and background is not None:
             raise ValueError("background: expected None with a mask, got both; the mask leaves no background")
         shots, clutter = [], False
-        for name, view, picture, shape, count in _shots(camera, target, mask, weight):
-            image = check_image(f"target{name}", picture, view.size)
+        for name, view, picture, shape, count in _shots(camera, target, mask, weight, names):
+            image = check_image(f"{names.target}{name}", picture, view.size)
             C = image.shape[-1] if plain else scene.channels
             if image.shape[-1] != C:
                 raise ValueError(
-                    f"target{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
+                    f"{names.target}{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
                     "read it with read_image(path, channels=3), or give its alpha as the mask"
                 )
             if count is not None:
@@ -131,7 +140,7 @@ class PoseTask:
         size = float((high - low).norm() * scale)
         if size == 0.0:
             raise ValueError(
-                "mesh: expected vertices apart from one another, got all in one place; check the file's units"
+                f"{names.mesh}: expected vertices apart from one another, got all in one place; check the file's units"
             )
         # One picture tells size from distance only together, and a parallel projection shows no distance at all.
         orthographic = all(shot.camera.projection == "orthographic" for shot in shots)
@@ -148,11 +157,11 @@ class PoseTask:
         extent = next((r for x in (colours, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
         if extent == 0.0:
             raise ValueError(
-                f"{'mask' if mask is not None else 'target'}: expected a picture of the object, got the same in every pixel; "
+                f"{'mask' if mask is not None else names.target}: expected a picture of the object, got the same in every pixel; "
                 "was it read or rendered right?"
             )
         bare = scene.replace(meshes=double, background=None)
-        return PoseTask(bare, aovs, shots, clutter, extent, (low + high) / 2, size, free)
+        return PoseTask(bare, aovs, shots, clutter, extent, (low + high) / 2, size, free, names)
 
     def pyramid(self, start: Pose, max_size: int, spp: int) -> list[Level]:
         """From coarse to fine. Raises ValueError when the object is behind the camera."""
@@ -162,7 +171,9 @@ class PoseTask:
         depth = float(depth_of(camera, start, self.center))
         perspective = camera.projection != "orthographic"
         if perspective and depth <= 0:
-            raise ValueError(f"init: expected the object in front of the camera, got its centre at depth {depth:.3g}")
+            raise ValueError(
+                f"{self.names.init}: expected the object in front of the camera, got its centre at depth {depth:.3g}"
+            )
         across = finest * focal_of(camera) * self.size / (depth if perspective else 1.0)  # pixels
         halvings = round(math.log2(max(1.0, min(across / COARSEST, finest * min(H, W) / SMALLEST))))
         factors = [finest / 2**n for n in range(halvings, -1, -1)]
@@ -272,15 +283,15 @@ class PoseTask:
         ]
 
 
-def _shots(camera: Any, target: Any, mask: Any, weight: Any) -> list[tuple[str, Camera, Any, Any, Any]]:
+def _shots(camera: Any, target: Any, mask: Any, weight: Any, names: Names) -> list[tuple[str, Camera, Any, Any, Any]]:
     """Suffix of the arguments' names, camera, picture, mask and weight of each view. Raises TypeError or ValueError."""
     several = isinstance(camera, Sequence) and not isinstance(camera, str)
     cameras: list[Any] = list(camera) if several else [camera]
     if not cameras:
         raise ValueError("camera: expected at least one, got none")
     columns = []
-    for name, value in (("target", target), ("mask", mask), ("weight", weight)):
-        if value is None and name != "target":
+    for name, value, needed in ((names.target, target, True), ("mask", mask, False), ("weight", weight, False)):
+        if value is None and not needed:
             columns.append([None] * len(cameras))
         elif not several:
             columns.append([value])
@@ -296,8 +307,8 @@ def _shots(camera: Any, target: Any, mask: Any, weight: Any) -> list[tuple[str, 
             raise ValueError(f"camera: expected one camera, got {one.batch}; give a list of cameras, and of pictures")
         if one.world_to_camera.dtype != one.K.dtype:
             cameras[i] = one.to(torch.float64)
-    names = [f"[{i}]" for i in range(len(cameras))] if several else [""]
-    return list(zip(names, cameras, *columns, strict=True))
+    suffixes = [f"[{i}]" for i in range(len(cameras))] if several else [""]
+    return list(zip(suffixes, cameras, *columns, strict=True))
 
 
 def depth_of(camera: Camera, pose: Pose, point: Tensor) -> Tensor:

@@ -50,7 +50,7 @@ Shown = PoseFit | CameraFit | Progress | Fit
 def frame_of(fit: Shown) -> Frame:
     """Of what a fit's callback gets, or a fit returns. Raises TypeError for something else, and for a pose from a file."""
     if isinstance(fit, CameraFit):  # whose search moves the scene before a camera at rest
-        return frame_of(fit.search)._replace(matrix=None, cameras=[fit.camera.detach()])
+        return frame_of(fit.search)._replace(matrix=None, cameras=[camera.detach() for camera in fit.cameras])
     if isinstance(fit, PoseFit) and fit.task is not None and fit.history:
         return _frame_of_pose(fit.task, next(step for step in reversed(fit.history) if step.best))
     if isinstance(fit, Progress | Fit):
