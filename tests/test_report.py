@@ -195,6 +195,12 @@ def test_sweep_stops_where_the_next_point_would_cost_too_much():
     assert module._expected([(1, 2.0), (4, 2.3)], 16) == pytest.approx(3.5)  # mostly a cost that does not grow
 
 
+@pytest.mark.parametrize("part", ["interior", "boundary"])
+def test_terms_of_lit_scenes_are_left_out(part):
+    with pytest.raises(ValueError, match="not timed apart"):
+        Edgegrad(scenes.build("lit-point", 16), part)
+
+
 def test_scan_is_left_out_without_a_mesh(tmp_path, monkeypatch, capsys):
     def nothing(size, path):
         raise ImportError("no pyvista")

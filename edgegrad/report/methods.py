@@ -106,6 +106,10 @@ class Edgegrad:
     compile_seconds = 0.0
 
     def __init__(self, scene: ReportScene, part: str = "whole") -> None:
+        if part != "whole" and scene.scene.is_lit:
+            raise ValueError(
+                "a lit scene's samples are shaded ahead of the backward pass, where its terms are not timed apart"
+            )
         self.name = "edgegrad" if part == "whole" else part
         self.part = part
         self._scene = scene
