@@ -173,6 +173,21 @@ def test_a_camera_is_saved(tmp_path):
     torch.testing.assert_close(eg.load_camera(tmp_path / "camera.json").K.double(), view.K.double())
 
 
+def test_pictures_and_masks_of_bytes_are_named():
+    view = camera(16)
+    image = picture(view)
+    bytes_ = (255 * image / image.max()).round()
+    with pytest.warns(UserWarning, match=r"target: expected linear radiance.*whole numbers up to 255.*srgb_to_linear"):
+        fit_pose(bracket(), bytes_, view, steps=1, progress=False)
+    with pytest.raises(
+        ValueError, match=r"mask: expected numbers from 0 to 1, got 0 to 255; of 8-bit numbers take x / 255"
+    ):
+        fit_pose(bracket(), image, view, 255.0 * torch.eye(16), progress=False)
+    with pytest.raises(ValueError, match=r"masks\[0\]: expected numbers from 0 to 1"):
+        masks = [255.0 * torch.eye(16)]
+        fit_scene(bracket(), [view], None, {"meshes[0].verts": 0.01}, masks=masks, progress=False)
+
+
 def test_a_rig_of_cameras(tmp_path):
     """Two cameras that keep their places to one another find where they are, and the lens that they share."""
     left = camera(64, distance=2.6)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from .._check import as_tensor, check_finite, check_float, check_shape
 from .._tree import map_tensors
+from .._warnings import warn
 from ..camera import Camera
 
 Images = Tensor | Sequence[Tensor]
@@ -127,7 +128,24 @@ def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
     check_float(name, image)
     check_shape(name, image, (*size, "C"), fix="the camera must have the picture's size: camera.resized((H, W))")
     check_finite(name, image)
+    rounding = 1e-3
+    if name.startswith("mask") and bool((image < -rounding).any() | (image > 1.0 + rounding).any()):
+        raise ValueError(
+            f"{name}: expected numbers from 0 to 1, got {float(image.min()):g} to {float(image.max()):g}; of 8-bit numbers take "
+            "x / 255"
+        )
+    if not name.startswith("weight") and _is_of_bytes(image):
+        warn(
+            f"bytes {name}",
+            f"{name}: expected linear radiance, as the scene's colours are, got whole numbers up to {float(image.max()):g}, "
+            "as of a picture of 8 bits; take srgb_to_linear(x / 255), or read it with read_image",
+        )
     return image.float()
+
+
+def _is_of_bytes(image: Tensor) -> bool:
+    """Whether it looks like 8-bit numbers that were made floats."""
+    return image.numel() > 0 and 100.0 < float(image.max()) <= 255.0 and bool((image == image.round()).all())
 
 
 def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:
