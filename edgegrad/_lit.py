@@ -69,7 +69,11 @@ class Lighting(NamedTuple):
         fused = is_fused(scene)
         adds_up = not scene.blends
         effort = Effort(points, scene.blends, fused, fused and adds_up, adds_up)
-        return render_shaded(scene, camera, self, request, creases, False, effort)
+        image = render_shaded(scene, camera, self, request, creases, False, effort)
+        # A graph from all tensors, whatever is in view and whatever is lit.
+        return image + sum(
+            tensor.reshape(-1)[:0].sum().to(image) for tensor in tensors_in((scene, camera)) if tensor.requires_grad
+        )
 
     def __call__(self, hits: Hits) -> Tensor:
         return radiance(hits, *self)

@@ -79,10 +79,8 @@ class Form(NamedTuple):
 
 def velocity(samples: int, forms: Sequence[tuple[Form, Tensor]]) -> Tensor:
     """(samples,) float64, zeros whose derivatives are those of the forms by their tables."""
-    forms = [(form, table) for form, table in forms if len(form.sample)]
-    device = forms[0][1].device if forms else None
-    if not forms:
-        return torch.zeros(samples, dtype=torch.float64, device=device)
+    # One at least, so that an image with nothing in view has a graph too, of zeros.
+    forms = [(form, table) for form, table in forms if len(form.sample)] or list(forms[:1])
     tensors: list[Tensor] = [table for _, table in forms]
     for form, table in forms:
         tensors += (part.to(table.device) for part in form)

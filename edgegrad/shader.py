@@ -164,7 +164,8 @@ class _Image:
         frame = self._frame
         total = frame.fixed.verts.new_zeros((frame.height, frame.width, self._channels or 1))
         at_once = self._effort.at_once
-        for first in range(0, len(samples), at_once):
+        # Once at least, so that an image with nothing in view has a graph too, of zeros.
+        for first in range(0, max(len(samples), 1), at_once):
             some = samples.part(first, first + at_once)
 
             def radiance(first: int = first) -> Tensor:
@@ -319,10 +320,11 @@ class _Image:
     def _shade(self, hits: Hits) -> Tensor:
         """(N, C), checked."""
         radiance = self._checked(self._shader(hits), len(hits))
-        kinds = list(hits._steps.kinds)
-        if self._kinds not in (None, kinds):
-            raise ValueError(UNEQUAL)
-        self._kinds = kinds
+        if not hits.only_light:  # for one light less may be looked up
+            kinds = list(hits._steps.kinds)
+            if self._kinds not in (None, kinds):
+                raise ValueError(UNEQUAL)
+            self._kinds = kinds
         if self._check and len(hits) > 1 and not hits._steps.forced:
             order = torch.randperm(len(hits), generator=torch.Generator().manual_seed(0)).to(radiance.device)
             order = order[: (len(hits) + 1) // 2]

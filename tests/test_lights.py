@@ -469,6 +469,20 @@ def test_gradients_by_lights_are_finite_differences(name: str):
     )
 
 
+@pytest.mark.parametrize("filter", ["linear", "mipmap"])
+def test_nothing_in_view_has_gradients_of_zero(filter: str):
+    """As without lights: a loop goes on where the mesh has left the image, or no light falls on it."""
+    for place, light in ((100, eg.PointLight), (100, eg.SphericalHarmonics), (0, eg.PointLight)):
+        verts, texels = ball(1).verts.clone().requires_grad_(), picture().requires_grad_()
+        uvs, faces = torch.rand(3, 2), torch.arange(3).expand(len(ball(1).faces), 3)
+        lamp = torch.tensor([0, 0, -5], dtype=F64) if light is eg.PointLight else torch.ones((9, 3), dtype=F64)
+        material = eg.Material(eg.Texture(texels, uvs, faces, filter=filter))
+        mesh = ball(1).replace(verts=verts, material=material).transformed(t=vector(place, 0, 0))
+        image = eg.render(eg.Scene([mesh], lights=[light(lamp.requires_grad_())]), from_above(8), spp=4)
+        for own in torch.autograd.grad(image.sum(), [verts, texels, lamp]):
+            assert float(own.abs().max()) == 0
+
+
 # -- what is refused ---------------------------------------------------------------------------------------------------------
 
 MESH = plane(material=WHITE)

@@ -37,6 +37,7 @@ SCENES = [
     "microfacets normals environment",
     "environment",
     "sky",
+    "colors harmonics",
     "area",
     "area one_sided normals microfacets",
     "base emission point",
@@ -233,6 +234,21 @@ def test_borders_of_shadows_by_what_the_light_adds() -> None:
     for shader in (None, lambda hits: _lit.radiance(hits, True, 1)):
         image = eg.render(scene, camera, spp=4, shader=shader)
         found.append(torch.autograd.grad((weights * image).sum(), [leaves["verts"], leaves["point"]]))
+    for a, b in zip(*found, strict=True):
+        assert float((a - b).norm()) < 1e-5 * float(a.norm()) > 0
+
+
+def test_borders_of_shadows_of_what_is_looked_up_nearest() -> None:
+    """What emits is left out of what a light adds, and its nearest texels with it: as one texel, looked up linearly."""
+    found = []
+    for filter in ("nearest", "linear"):
+        leaves = {name: value.clone().requires_grad_() for name, value in numbers_of("normals point").items()}
+        scene = scene_of("normals point", leaves)
+        uvs, faces = torch.eye(3)[:, :2], torch.arange(3).expand(len(scene.meshes[0].faces), 3)
+        glow = eg.Texture(torch.full((1, 1, 3), 0.3, dtype=F64), uvs, faces, filter=filter)
+        glowing = scene.meshes[0].replace(material=eg.Material(emission=glow))
+        image = eg.render(scene.replace(meshes=[glowing, scene.meshes[1]]), CAMERAS["perspective"], spp=4)
+        found.append(torch.autograd.grad(image.sum(), [leaves["verts"], leaves["point"]]))
     for a, b in zip(*found, strict=True):
         assert float((a - b).norm()) < 1e-5 * float(a.norm()) > 0
 

@@ -535,3 +535,15 @@ def test_in_parts_of_bounded_size(monkeypatch: pytest.MonkeyPatch):
     for a, b in zip(gradients(), whole, strict=True):
         assert torch.allclose(a, b, rtol=1e-6, atol=1e-9 * float(b.abs().max()))
     assert max(sizes) <= 1024 < most  # rows of an image are whole
+
+
+def test_nothing_in_view_has_gradients_of_zero():
+    """As without a shader: a loop goes on where the mesh has left the image."""
+    mesh, camera = bumpy(), front_camera(SIZE)
+    net = network(6)
+    verts = (mesh.verts + 100.0).requires_grad_()
+    image = eg.render(
+        mesh.replace(verts=verts), camera, shader=lambda h: net(torch.cat([h.position, h.normal], 1))
+    )  # fmt: skip
+    for gradient in torch.autograd.grad(image.sum(), [verts, *net.parameters()]):
+        assert float(gradient.abs().max()) == 0

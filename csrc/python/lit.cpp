@@ -243,11 +243,12 @@ struct PointArrays {
     }
 };
 
+// Rows of a width that may be zero.
 template <class X>
-nb::object array_of(std::vector<X>&& values, size_t columns) {
+nb::object array_of(std::vector<X>&& values, size_t rows, size_t columns) {
     auto* kept = new std::vector<X>(std::move(values));
     const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<X>*>(p); });
-    const size_t shape[] = {kept->size() / std::max<size_t>(columns, 1), columns};
+    const size_t shape[] = {rows, columns};
     return nb::cast(nb::ndarray<nb::numpy, X>(kept->data(), 2, shape, owner));
 }
 
@@ -267,7 +268,9 @@ nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const
         shade(lit.scene, arrays.view(), geometry->caster(), view, options, values ? radiance.data() : nullptr,
               seen.data(), team);
     });
-    return nb::make_tuple(array_of(std::move(radiance), size_t(lit.scene.channels)), array_of(std::move(seen), lights));
+    const size_t n = size_t(view.size);
+    return nb::make_tuple(array_of(std::move(radiance), n, size_t(lit.scene.channels)),
+                          array_of(std::move(seen), n, lights));
 }
 
 void check_seen(const LitArrays& lit, const LitPoints& points, const LitOptions& options, const In<int8_t, 2>& seen) {
@@ -291,9 +294,10 @@ nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, cons
              [&](Team& team) { shade_vjp(lit.scene, view, options, seen.data(), bar.data(), to, b_bar.data(), team); });
     nb::list out;
     for (size_t i = 0; i < found.size(); ++i)
-        if (wanted[i]) out.append(array_of(std::move(found[i]), size_t(lit.scene.tables[i].width)));
+        if (const Table& table = lit.scene.tables[i]; wanted[i])
+            out.append(array_of(std::move(found[i]), size_t(table.rows), size_t(table.width)));
         else out.append(nb::none());
-    return nb::make_tuple(out, array_of(std::move(b_bar), 3));
+    return nb::make_tuple(out, array_of(std::move(b_bar), size_t(view.size), 3));
 }
 
 nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, const LitOptions& options,
@@ -316,7 +320,7 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
     unlocked(threads, [&](Team& team) {
         shade_jvp(moving, view, options, seen.data(), b_dot ? b_dot->data() : nullptr, out.data(), team);
     });
-    return array_of(std::move(out), size_t(moving.channels));
+    return array_of(std::move(out), size_t(view.size), size_t(moving.channels));
 }
 
 }  // namespace
