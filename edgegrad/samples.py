@@ -46,7 +46,7 @@ from .mesh import Mesh
 from .scene import Scene
 
 ALL_AT_ONCE = 1 << 40
-SAMPLES = ("image", "inside", "edges", "steps", "shadows")  # kinds that draw numbers of their own
+SAMPLES = ("image", "inside", "edges", "steps", "shadows", "image again")  # kinds that draw numbers of their own
 
 
 class Frame:
@@ -74,8 +74,17 @@ class Frame:
     def seeds(self, kind: str, count: int, first: int = 0) -> Tensor:
         """(count,) int64: of the samples of a kind from `first` on."""
         request = self.request
-        seed = camera_seed(request.image.seed, self._index) if kind == "image" else self.sampler.grad_seed
+        seed = camera_seed(request.image.seed, self._index) if kind.startswith("image") else self.sampler.grad_seed
         return self.here(sample_seeds(seed, SAMPLES.index(kind), first, count))
+
+    def seeds_of_pixels(self, kind: str, pixel: Tensor, each: int) -> Tensor:
+        """(N,) int64: of hits in the pixels (N,), in their order, about `each` in one. A pixel has the same ones whatever the
+        others see, so that the images of a scene and of one that is moved a little differ by little."""
+        row = torch.arange(len(pixel))
+        begins = torch.ones(len(pixel), dtype=torch.bool)
+        begins[1:] = pixel[1:] != pixel[:-1]
+        among = row - torch.where(begins, row, 0).cummax(0).values if len(pixel) else row
+        return self.seeds(kind, 1) + self.here(each * pixel + among)
 
     def fixed_hits(
         self,
@@ -132,7 +141,7 @@ class PrimaryHits:
     def __init__(self, scene: Scene, request: Request) -> None:
         self.frame = frame = Frame(scene, request)
         ((_, found),) = frame.sampler.pixel_hits(ALL_AT_ONCE)
-        seed = frame.seeds("image", len(found.face))
+        seed = frame.seeds_of_pixels("image", found.pixel, 1)
         self.hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, seed)
         self.index, self.weight = frame.here(found.pixel), frame.here(found.weight).to(frame.dtype)
         self.coverage = frame.here(frame.sampler.coverage)

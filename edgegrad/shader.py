@@ -117,10 +117,10 @@ class _Image:
         borders = Borders((frame.height, frame.width))
         with torch.no_grad():
             parts: list[Tensor] = []
-            count = 0
-            for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, self._effort.points):
-                sums, hits = self._shaded(found, pixels, count)
-                count += len(found.face)
+            points = self._effort.points
+            for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, points):
+                seeds = frame.seeds_of_pixels("image", found.pixel, points)
+                sums, hits = self._shaded(found, pixels, seeds)
                 parts.append(sums)
                 borders.add(found.pixel, hits)
             image = torch.cat(parts)
@@ -128,15 +128,15 @@ class _Image:
             if again is not None and bool(again.any()):
                 parts = []
                 for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, most, again):
-                    parts.append(self._shaded(found, pixels, count)[0])
-                    count += len(found.face)
+                    seeds = frame.seeds_of_pixels("image again", found.pixel, most)
+                    parts.append(self._shaded(found, pixels, seeds)[0])
                 image = torch.where(frame.here(again).reshape(-1, 1), torch.cat(parts), image)
         return frame.composed(image, self._background)
 
-    def _shaded(self, found: PixelRecords, pixels: range, first: int) -> tuple[Tensor, Hits]:
-        """(pixels, C) what hits add to the image, the `first` of those shaded so far and those after it, and the hits."""
+    def _shaded(self, found: PixelRecords, pixels: range, seeds: Tensor) -> tuple[Tensor, Hits]:
+        """(pixels, C) what hits add to the image, and the hits."""
         frame = self._frame
-        hits = frame.fixed_hits(found.face, found.b, found.x, frame.seeds("image", len(found.face), first))
+        hits = frame.fixed_hits(found.face, found.b, found.x, seeds)
         radiance = self._shade(hits).detach()
         weighted = radiance * frame.here(found.weight).to(radiance.dtype)[:, None]
         return frame.image(found.pixel, weighted, pixels), hits

@@ -469,6 +469,15 @@ def test_gradients_by_lights_are_finite_differences(name: str):
     )
 
 
+def test_random_numbers_of_a_pixel_are_its_own():
+    """So that with a constant seed what changes in one corner leaves the noise of all other pixels as it is."""
+    lamp = eg.AreaLight.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], [3.0, 2.0, 1.0])
+    floor, dot = plane(1.0, material=WHITE), ball(0, material=WHITE).transformed(scale=0.1, t=vector(-0.8, 0.8, 0.1))
+    images = [eg.render(eg.Scene(m, lights=[lamp]), from_above(), shadows=False) for m in ([floor], [floor, dot])]
+    same = (images[0] == images[1]).all(2)
+    assert bool(same[4:].all()) and bool(same[:, 4:].all()) and not bool(same[:4, :4].all())
+
+
 @pytest.mark.parametrize("filter", ["linear", "mipmap"])
 def test_nothing_in_view_has_gradients_of_zero(filter: str):
     """As without lights: a loop goes on where the mesh has left the image, or no light falls on it."""
