@@ -104,7 +104,9 @@ def test_gradients(name: str, projection: str) -> None:
             previous[key] = error
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in ("triangle", "slivers") else name for name in SCENES]
+)
 def test_boundary_error_falls_like_one_over_n(name: str) -> None:
     scene, camera = SCENES[name](), front_camera(SIZE)
 

@@ -288,7 +288,7 @@ def test_beyond_a_fold_there_is_background() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:distortion")
-@pytest.mark.parametrize("what", ["vertices", "pose"])
+@pytest.mark.parametrize("what", ["vertices", pytest.param("pose", marks=pytest.mark.slow)])
 def test_gradient_before_a_fold(what: str) -> None:
     """The sphere passes the fold: what of it lies beyond is not seen, and has no gradient."""
     view = folding_camera()

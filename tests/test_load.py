@@ -365,7 +365,7 @@ os._exit(0)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="fork() as on Linux")
-@pytest.mark.parametrize("forks", [50, pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("forks", [20, pytest.param(500, marks=pytest.mark.slow)])
 def test_forks_wait_for_the_threads_of_a_build(forks, tmp_path):
     """Embree's threads leave a build after it is over, and held locks of their own in 2 % of the children."""
     assert script(FORK_WHILE_BUILDING, forks, timeout=400, folder=tmp_path) == 0
@@ -418,7 +418,7 @@ print(json.dumps({"interrupted": interrupted, "same": before == step(), "gradien
 
 
 @posix
-@pytest.mark.parametrize("kind", ["image", "surface samples", "edge samples"])
+@pytest.mark.parametrize("kind", ["image", pytest.param("surface samples", marks=pytest.mark.slow), "edge samples"])
 def test_ctrl_c_ends_a_long_render(kind, tmp_path):
     """KeyboardInterrupt is there 0.3 s after the signal; 1 s here, for other work may have the machine's cores just then."""
     file = tmp_path / "script.py"

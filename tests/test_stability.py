@@ -265,7 +265,9 @@ def test_painted_areas(name):
     assert float(found.mean()) == pytest.approx(1.0, abs=0.005 + 3.0 * error)
 
 
-@pytest.mark.parametrize("name", list(PAINTED))
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "floor of a shader" else name for name in PAINTED]
+)
 def test_painted_problems(name):
     """Image and gradient against exact integrals."""
     problem = PAINTED[name](front_camera(32))

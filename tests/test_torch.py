@@ -157,6 +157,7 @@ def compiled() -> Iterator[Callable[..., None]]:
     torch._dynamo.reset()
 
 
+@pytest.mark.slow
 def test_compile_mesh_transformed_inside(compiled):
     def function(verts, R, t, scale, world_to_camera):
         scene = eg.Scene(MESH.replace(verts=verts).transformed(R, t, scale), BACKGROUND)
