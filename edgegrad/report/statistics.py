@@ -135,11 +135,13 @@ def lit_components(problem: Problem, seeds: int) -> Components:
         running.squares / (seeds - 1) / seeds,
         squares / (effort.difference_seeds - 1) / effort.difference_seeds,
     )
-    error = (own + other).sqrt()
+    error, off = (own + other).sqrt(), running.mean - wanted
+    varies = error > 0  # not the place of a light that has none
+    assert not bool(off[~varies].any()), "a component without noise is off"
     freedom = (own + other) ** 2 / (own**2 / (seeds - 1) + other**2 / (effort.difference_seeds - 1))
     size = float(wanted.norm())
     return Components(
-        (running.mean - wanted) / error, freedom, float(own.sum().sqrt() * math.sqrt(seeds)) / size,
+        (off / error)[varies], freedom[varies], float(own.sum().sqrt() * math.sqrt(seeds)) / size,
         float(other.sum().sqrt()) / size,
     )  # fmt: skip
 
