@@ -128,10 +128,13 @@ def stage(
     steps = {name: 0.1 * max(level, 1.0) if name == "brightness" else 0.05 for name in parts}
     steps |= {name: 0.005 * value for name, value in (material or {}).items() if value > 0}
     steps |= {name: step[name] if isinstance(step, Mapping) else step for name in moves if name in parts}
-    settings: dict[str, Any] = {"finer": 16, "options": {"light_samples": 4}, "adjoint": adjoint(), **fields}
+    settings: dict[str, Any] = {
+        "finer": 16, "options": {"light_samples": 4}, "adjoint": adjoint(),
+        "image": lambda scene, camera: lit_image(scene, camera, 6, 8), **fields,
+    }  # fmt: skip
     return Problem(
         parts, lambda parts: build(parts, caster), None, "finite differences", steps=steps, equal=alike,
-        image=lambda scene, camera: lit_image(scene, camera, 6, 8), **settings,
+        **settings,
     )  # fmt: skip
 
 
@@ -287,8 +290,10 @@ def bright_sky() -> Problem:
     image = torch.full((8, 16, 1), 1e-3, dtype=F64)
     image[4, 14] = 1e3  # about where the lamp is
     many = {"light_samples": 4, "edge_samples": 50_000, "surface_samples": 50_000}
+    moves = {**ANY, "light": None, "caster": None}  # of the caster nearly all cancels
     return stage(
-        lambda at, level: Environment(level * image, visible=False), moves={**ANY, "light": None}, options=many, step=0.03
+        lambda at, level: Environment(level * image, visible=False), moves=moves, options=many, spp=256, step=0.03,
+        image=lambda scene, camera: lit_image(scene, camera, 4, 24),
     )  # fmt: skip
 
 
