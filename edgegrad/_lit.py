@@ -28,13 +28,11 @@ from .camera import Camera
 from .environment import Environment
 from .hits import Hits
 from .lights import Light, LightPoints, PointLight, SphericalHarmonics, SpotLight
+from .samples import Frame
 from .scene import Scene
 from .shader import Effort, render_shaded
 
 FEWEST_IN_PENUMBRA = 4  # points of a face in a pixel that are shaded, at least; else a quarter of its samples
-
-
-EDGE_ON = 1e-3  # cosine, below which it is left open which side of a face is seen
 
 
 class Lighting(NamedTuple):
@@ -68,7 +66,8 @@ class Lighting(NamedTuple):
         points = max(FEWEST_IN_PENUMBRA, request.image.spp // 4) if extended else 1
         fused = is_fused(scene)
         adds_up = not scene.blends
-        effort = Effort(points, scene.blends, fused, fused and adds_up, adds_up)
+        whole = (lambda frame: _whole(frame, self, points)) if fused and adds_up else None
+        effort = Effort(points, whole, scene.blends, fused, fused and adds_up, adds_up)
         image = render_shaded(scene, camera, self, request, creases, False, effort)
         # A graph from all tensors, whatever is in view and whatever is lit.
         return image + sum(
@@ -77,6 +76,14 @@ class Lighting(NamedTuple):
 
     def __call__(self, hits: Hits) -> Tensor:
         return radiance(hits, *self)
+
+
+def _whole(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:
+    """(H · W, C) what surfaces add to an image, at so many points of a face in a pixel. None where it is not finite: shading
+    points one by one says which."""
+    _note_jumps(frame.no_hits)
+    found = _lit_kernel.image(frame, lighting.shadows, lighting.samples, points)
+    return found if bool(torch.isfinite(found).all()) else None
 
 
 class _Surface(NamedTuple):
@@ -208,6 +215,8 @@ def _of_scene(surfaces: Surfaces, index: int, of_mesh: Callable[[], Tensor]) -> 
 
     def corners() -> Tensor:
         own = of_mesh().detach()
+        if len(own) == len(surfaces.faces):
+            return own
         first = surfaces.first_faces[index]
         after = len(surfaces.faces) - first - len(own)
         before, behind = (own.new_zeros((count, *own.shape[1:])) for count in (first, after))
@@ -231,31 +240,27 @@ def _of_flat(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
     is the same at both ends of an edge only if it is along all of it: as n·l has the sign, and over 1/|l| the size, of a face's
     distance to the light. The cone of a spot light, which may lie between the ends, is left out."""
     scene, mesh = surfaces.scene, surfaces.scene.meshes[index]
-    g, material = _face_normals(surfaces, index), mesh.material
+    material = mesh.material
     assert material is not None
     harmonics = any(isinstance(light, SphericalHarmonics) for light in scene.lights)
     points_alone = not harmonics and all(light.punctual for light in scene.casting)
     if not points_alone or material.normal_map is not None or not isinstance(view, View):
-        return g
-    verts, faces = mesh.verts.detach().double(), mesh.faces.long()
-    first, g = verts[faces[:, 0]], g[:, 0].double()
-    towards = dot(g, view.to_viewer(first))
-    n, edge_on = torch.where(towards < 0, -g, g), towards.abs() < EDGE_ON
-    found = []
+        return _face_normals(surfaces, index)
+    verts = mesh.verts.detach().double()
+    places, arriving = [], []
     for light in scene.casting:
         everywhere, points = light, light.draw(verts)
         if isinstance(light, SpotLight):
             everywhere = PointLight(light.position, light.intensity, light.color)
-        place, E = light.place(points).detach().to(g), everywhere.arriving(points, verts).detach().abs().mean(1)
-        if light.infinite:
-            distance = dot(n, place[:1])
-        else:
-            distance, E = dot(n, place[:1] - first), E / (place - verts).norm(dim=1).clamp(min=1e-30)
-        found.append(torch.where(edge_on, distance.abs(), distance.clamp(min=0)) * E[faces])
-    arriving = torch.stack(found, -1)
-    if material.metallic is not None or material.roughness is not None:
-        return n[:, None] * (arriving != 0).any(-1, keepdim=True)
-    return arriving / arriving.max().clamp(min=1e-300)
+        places.append(light.place(points)[:1].detach().to(verts))
+        arriving.append(everywhere.arriving(points, verts).detach().abs().mean(1))
+    infinite = [light.infinite for light in scene.casting]
+    found = _lit_kernel.light_on_faces(verts, mesh.faces, view, infinite, torch.cat(places), torch.stack(arriving))
+    if material.metallic is None and material.roughness is None:
+        return found
+    g = _face_normals(surfaces, index)
+    away = dot(g[:, 0], view.to_viewer(verts[mesh.faces[:, 0].long()])) < 0
+    return torch.where(away[:, None], -g, g) * (found != 0).any(-1, keepdim=True)
 
 
 def _sunken(surfaces: Surfaces, index: int) -> Tensor:

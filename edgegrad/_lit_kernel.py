@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from ._kernel import core
 from ._mesh_light import MeshLight
-from ._operator import Tensors, apply, array, doubles
+from ._operator import Tensors, apply, array, doubles, without_derivatives
 from ._ops import kernel_scene
 from ._samples import values_of
 from ._seeds import STEPS, mixed_bits
@@ -23,6 +22,7 @@ from .hits import Hits
 from .lights import DirectionalLight, Light, PointLight, SphericalHarmonics, SpotLight
 from .material import WRAPS, Parameter, Texture
 from .mesh import FILTERS, Mesh
+from .samples import Frame
 from .scene import Flat, Scene
 
 _64_BITS = 2**64 - 1
@@ -69,6 +69,45 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
                 hits._noted(light, own)
         column += 1 if casting.punctual else samples
     return found.to(surfaces.verts)
+
+
+def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
+    """(H · W, C) of the scene's surfaces before black, without derivatives, at so many points of a face in a pixel."""
+    layout, tables = _layout(frame.fixed, frame.fixed_view)
+    seed, again = (int(frame.seeds(kind, 1)) & _64_BITS for kind in ("image", "image again"))
+
+    def compute(kernel: Any, faces: Tensor, arguments: dict[str, Any], *tables: Tensor) -> Sequence[Tensor]:
+        found, asked = kernel.lit_image(
+            lit=layout.kernel(tables, faces),
+            options=core.LitOptions(shadows=shadows, samples=samples, only=-1),
+            points=points,
+            seed=seed,
+            again=again,
+            **arguments,
+        )
+        return torch.from_numpy(found), torch.from_numpy(asked)
+
+    found, asked = frame.sampler.lit_image(compute, *tables)
+    if shadows:
+        lights = range(len(frame.surfaces.scene.casting))
+        frame.surfaces.shadowing.update(light for light in lights if asked[light, 0])
+    return frame.here(found)
+
+
+def light_on_faces(
+    verts: Tensor, faces: Tensor, view: View, infinite: list[bool], place: Tensor, arriving: Tensor
+) -> Tensor:
+    """(F, 3, L) by csrc/shading/lit/flat_light.h: E max(0, n·l) at the corners of flat faces, of points of light at places (L, 3)
+    from which E, `arriving` (L, V), comes to the vertices."""
+
+    def compute(*tensors: Tensor) -> Sequence[Tensor]:
+        verts, faces, eye, place, arriving = map(array, tensors)
+        threads = torch.get_num_threads()
+        found = core.light_on_faces(verts, faces, eye, view.perspective, place, infinite, arriving, threads)
+        return (torch.from_numpy(found).reshape(len(faces), 3, -1),)
+
+    tensors = (verts.double(), faces.int(), view.eye.double(), place.double(), arriving.double())
+    return without_derivatives(compute, *tensors)[0].to(verts.device)
 
 
 def _forced(points: Any, lit: Tensor) -> tuple[Tensor, ...]:
@@ -121,9 +160,7 @@ class _Layout(NamedTuple):
     @classmethod
     def of(cls, surfaces: Surfaces, view: View, tables: _Tables) -> _Layout:
         scene = surfaces.scene
-        back = torch.linalg.inv(view.world_to_camera[:3, :3])
-        eye = -back @ view.world_to_camera[:3, 3] if view.perspective else normalize(-back[:, 2], dim=0)
-        verts, seen_from = tables.add(surfaces.bare.verts, 3), tables.add(eye, 3)
+        verts, seen_from = tables.add(surfaces.bare.verts, 3), tables.add(view.eye, 3)
         firsts = np.cumsum([0, *(len(mesh.verts) for mesh in scene.meshes)])
         meshes = [
             _mesh(mesh, first, int(vertex), tables)

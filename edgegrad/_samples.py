@@ -266,23 +266,37 @@ class Sampler:
             def compute(
                 request: Request, camera: Any, *only: Tensor, first: int = first, end: int = end
             ) -> PixelRecords:
-                options = request.image._replace(seed=camera_seed(request.image.seed, self._camera))
-                camera = kernel_camera(request.camera, self._camera)
                 if first == 0 and not only:
                     warn_of_ends([camera])
                 found = kernel_scene(request.scene).pixel_hits(
-                    camera=camera,
-                    options=core.ImageOptions(**options._asdict()),
-                    threads=torch.get_num_threads(),
                     first=first,
                     end=end,
                     most=most,
                     only=only[0].numpy() if only else None,
-                    hits=kernel_hits(self._hits),
+                    **self._image(request, camera),
                 )
                 return _record(PixelRecords, found)
 
             yield range(first * width, end * width), PixelRecords(*self._compute(self._request, compute, *places))
+
+    def _image(self, request: Request, camera: Any) -> dict[str, Any]:
+        """What the kernel is told of the image."""
+        options = request.image._replace(seed=camera_seed(request.image.seed, self._camera))
+        return {
+            "camera": camera,
+            "image": core.ImageOptions(**options._asdict()),
+            "threads": torch.get_num_threads(),
+            "hits": kernel_hits(self._hits),
+        }
+
+    def lit_image(self, compute: Callable[..., Sequence[Tensor]], *tables: Tensor) -> tuple[Tensor, ...]:
+        """compute(scene of the kernel, its faces, what the kernel is told of the image, *tables), instead of pixel hits."""
+
+        def with_request(request: Request, camera: Any, *tables: Tensor) -> Sequence[Tensor]:
+            warn_of_ends([camera])
+            return compute(kernel_scene(request.scene), request.scene.faces, self._image(request, camera), *tables)
+
+        return self._compute(self._request, with_request, *tables)
 
     def samples(
         self, request: Request, interior: bool, boundary: bool, intrinsics: bool = False, steps: bool = False
@@ -352,22 +366,3 @@ class Sampler:
             return _record(RayRecords, found)
 
         return RayRecords(*(part.to(x.device) for part in self._compute(self._request, compute, x)))
-
-
-class Footprints(NamedTuple):
-    """The pixels whose filter reaches points of the image."""
-
-    point: Tensor  # (P,) int64
-    pixel: Tensor  # (P,) int64
-    weight: Tensor  # (P,) float64: the filter there
-
-    @classmethod
-    def of(cls, x: Tensor, request: Request) -> Footprints:
-        """Of points x (S, 2)."""
-        camera = request.camera
-
-        def compute(x: Tensor) -> tuple[Tensor, ...]:
-            parts = core.footprints(x.contiguous().numpy(), request.image.filter, camera.width, camera.height)
-            return tuple(map(torch.from_numpy, parts))
-
-        return cls(*without_derivatives(compute, x))

@@ -176,13 +176,15 @@ class View:
         """(N,) along the axis."""
         return self.in_camera(points)[:, 2]
 
+    @property
+    def eye(self) -> Tensor:
+        """(3,) world coordinates; in an orthographic view, the unit direction towards it. float64."""
+        back = torch.linalg.inv(self.world_to_camera[:3, :3])
+        return -back @ self.world_to_camera[:3, 3] if self.perspective else normalize(-back[:, 2], dim=0)
+
     def to_viewer(self, points: Tensor) -> Tensor:
         """(N, 3) unit directions, float64."""
-        back = torch.linalg.inv(self.world_to_camera[:3, :3])
-        if self.perspective:
-            eye = -back @ self.world_to_camera[:3, 3]
-            return normalize(eye - points.double(), dim=-1)
-        return normalize(-back[:, 2], dim=0).expand(len(points), 3)
+        return normalize(self.eye - points.double(), dim=-1) if self.perspective else self.eye.expand(len(points), 3)
 
 
 class Rays(NamedTuple):

@@ -27,7 +27,6 @@ from ._ops import camera_seed
 from ._request import Request, as_scene, make_request
 from ._samples import (
     CurveRecords,
-    Footprints,
     RayRecords,
     Sampler,
     SurfaceRecords,
@@ -38,6 +37,7 @@ from ._samples import (
 from ._samples import trace as trace_records
 from ._seeds import sample_seeds
 from ._shadows import ShadowLight
+from ._splat import splat
 from ._steps import Steps
 from ._surfaces import Rays, Surfaces, View, every_face
 from .camera import Camera
@@ -99,6 +99,13 @@ class Frame:
         place = self.here(face), self.here(barycentrics(b)), self.here(x)
         return Hits(self.fixed, self.fixed_view, *place, self.sampler.rays_at, steps, seed, forced)
 
+    @property
+    def no_hits(self) -> Hits:
+        none = torch.zeros(0, dtype=torch.int64)
+        return self.fixed_hits(
+            none, torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.float64), none
+        )
+
     def moving_hits(
         self, face: Tensor, rays: RayRecords | SurfaceRecords, x: Tensor, seed: Tensor | None = None
     ) -> Hits:
@@ -113,12 +120,6 @@ class Frame:
         """(H · W, C), or of these pixels: the sums of rows of values (N, C) by pixel."""
         pixels = pixels or range(self.pixels)
         return values.new_zeros((len(pixels), values.shape[1])).index_add(0, self.here(pixel) - pixels.start, values)
-
-    def splat(self, x: Tensor, values: Tensor) -> Tensor:
-        """(H · W, C): Σ k(x − c) · value over points x (S, 2) with values (S, C), for pixels with centres c."""
-        feet = Footprints.of(x, self.request)
-        weight = self.here(feet.weight).to(values.dtype)[:, None]
-        return self.image(feet.pixel, weight * values[self.here(feet.point)])
 
     def composed(self, image: Tensor, background: Tensor | None) -> Tensor:
         """(H, W, C), before a background (C,) or (H, W, C)."""
@@ -195,8 +196,15 @@ class SurfaceSamples:
         faces, for its weights stand for areas of the image and not for shares of a pixel's samples. Raises TypeError or
         ValueError that names the argument."""
         radiance = _rows("radiance", radiance, len(self))
+        return self.frame.composed(self._sums(radiance, zero=False), None)
+
+    def zero(self, radiance: Tensor) -> Tensor:
+        """(H · W, C): the same less its value."""
+        return self._sums(radiance, zero=True)
+
+    def _sums(self, radiance: Tensor, zero: bool) -> Tensor:
         values = self.weight.to(radiance.dtype)[:, None] * radiance
-        return self.frame.composed(self.frame.splat(self._records.x, values), None)
+        return splat(self._records.x, values, self.frame.request, zero)
 
 
 class EdgeSamples:
@@ -405,16 +413,11 @@ def boundary(
     frame: Frame, x: Tensor, velocity: Tensor, jump: Tensor, to_background: Tensor | None, background: Tensor | None
 ) -> Tensor:
     """(H · W, C): Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
-    feet = Footprints.of(x.detach().cpu(), frame.request)
-    point, pixel = frame.here(feet.point), frame.here(feet.pixel)
-    jumps = jump[point]
-    if background is not None and to_background is not None:
-        background = background.detach()
-        behind = background.reshape(frame.pixels, -1)[pixel] if background.dim() == 3 else background
-        jumps = jumps + to_background.to(jump.dtype)[point, None] * behind.to(jump)
-    weight = frame.here(feet.weight).to(jump.dtype)
-    values = (weight * velocity.to(jump.dtype)[point])[:, None] * jumps
-    return frame.image(pixel, values)
+    zero = splat(x.detach(), velocity.to(jump.dtype)[:, None] * jump, frame.request, True)
+    if background is None or to_background is None:
+        return zero
+    share = splat(x.detach(), (velocity * to_background).to(jump.dtype)[:, None], frame.request, True)
+    return zero + share * background.detach().reshape(-1, jump.shape[1]).to(jump)
 
 
 def _within(b: Tensor, least: float) -> Tensor:

@@ -44,6 +44,9 @@ class Effort(NamedTuple):
     """What shading an image takes."""
 
     points: int = 1  # of a face in a pixel that are shaded
+    whole: Callable[[Frame], Tensor | None] | None = (
+        None  # gives the values (H · W, C) of a whole image at once, or None
+    )
     blended: bool = False  # whether one may see through surfaces
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where only derivatives are wanted, see Hits.values
@@ -112,26 +115,35 @@ class _Image:
     # -- the image -----------------------------------------------------------------------------------------------------
 
     def _values(self) -> Tensor:
-        """The image, without a graph."""
+        """The image, without a graph of its surfaces."""
+        frame = self._frame
+        with torch.no_grad():
+            image = None if self._effort.whole is None else self._effort.whole(frame)
+            if image is None:
+                image = self._point_by_point()
+            self._channels = image.shape[1]
+        return frame.composed(image, self._background)
+
+    def _point_by_point(self) -> Tensor:
+        """(H · W, C) what surfaces add to the image."""
         frame = self._frame
         borders = Borders((frame.height, frame.width))
-        with torch.no_grad():
-            parts: list[Tensor] = []
-            points = self._effort.points
-            for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, points):
-                seeds = frame.seeds_of_pixels("image", found.pixel, points)
-                sums, hits = self._shaded(found, pixels, seeds)
-                parts.append(sums)
-                borders.add(found.pixel, hits)
-            image = torch.cat(parts)
-            again, most = borders.found() if frame.request.image.spp > 1 else (None, 1)
-            if again is not None and bool(again.any()):
-                parts = []
-                for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, most, again):
-                    seeds = frame.seeds_of_pixels("image again", found.pixel, most)
-                    parts.append(self._shaded(found, pixels, seeds)[0])
-                image = torch.where(frame.here(again).reshape(-1, 1), torch.cat(parts), image)
-        return frame.composed(image, self._background)
+        parts: list[Tensor] = []
+        points = self._effort.points
+        for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, points):
+            seeds = frame.seeds_of_pixels("image", found.pixel, points)
+            sums, hits = self._shaded(found, pixels, seeds)
+            parts.append(sums)
+            borders.add(found.pixel, hits)
+        image = torch.cat(parts)
+        again, most = borders.found() if frame.request.image.spp > 1 else (None, 1)
+        if again is None or not bool(again.any()):
+            return image
+        parts = []
+        for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, most, again):
+            seeds = frame.seeds_of_pixels("image again", found.pixel, most)
+            parts.append(self._shaded(found, pixels, seeds)[0])
+        return torch.where(frame.here(again).reshape(-1, 1), torch.cat(parts), image)
 
     def _shaded(self, found: PixelRecords, pixels: range, seeds: Tensor) -> tuple[Tensor, Hits]:
         """(pixels, C) what hits add to the image, and the hits."""
@@ -161,8 +173,7 @@ class _Image:
 
     def _interior(self, samples: SurfaceSamples) -> Tensor:
         """(H · W, C): Σ k(x − c) L px² over samples inside faces, less its own value."""
-        frame = self._frame
-        total = frame.fixed.verts.new_zeros((frame.height, frame.width, self._channels or 1))
+        total: Any = 0
         at_once = self._effort.at_once
         # Once at least, so that an image with nothing in view has a graph too, of zeros.
         for first in range(0, max(len(samples), 1), at_once):
@@ -178,9 +189,8 @@ class _Image:
             many = len(samples) > at_once and not transformed() and not self._effort.keeps_little
             L = checkpoint(radiance, use_reentrant=False) if many else radiance()
             assert isinstance(L, Tensor)
-            total = total + some.image(L)
-        total = total.reshape(frame.pixels, -1)
-        return total - total.detach()
+            total = total + some.zero(L)
+        return total
 
     def _shadows(self) -> Any:
         """(H · W, C), or 0: the same over samples on the borders of the shadows that the shader asked for."""
@@ -199,7 +209,8 @@ class _Image:
             moving = moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
             if moving or ShadowLight.moves(light.light):
                 records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics))
-                found = found + self._boundary(EdgeSamples(frame, records, light, self._effort.adds_up))
+                if len(records.x):
+                    found = found + self._boundary(EdgeSamples(frame, records, light, self._effort.adds_up))
         return found
 
     def _boundary(self, samples: EdgeSamples) -> Tensor:

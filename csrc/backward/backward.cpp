@@ -362,40 +362,42 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, Te
 }
 
 template <class T>
-Records record_samples(const BackwardInput<T>& input, GradientOptions o, Team& team) {
-    Records records;
+RecordList record_samples(const BackwardInput<T>& input, GradientOptions o, Team& team) {
+    RecordList records;
     const Terms terms = all_motion(o);
     if (!terms.any()) return records;
     o.controls = false;
     Destination to;
     to.records = &records;
     BackwardProfile profile;
-    each_view(input, o, terms, team,
-              [&](const BackwardView<T>& view) { add_terms<0>(input, view, terms, Record{o.intrinsics}, to, profile); });
+    each_view(input, o, terms, team, [&](const BackwardView<T>& view) {
+        add_terms<0>(input, view, terms, Record{o.intrinsics}, to, profile);
+    });
     return records;
 }
 
 template <class T>
-CurveRecords record_shadows(const BackwardInput<T>& input, const GradientOptions& o, const LightParts& light,
-                            int64_t samples, Team& team) {
-    Records records;
+std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const GradientOptions& o,
+                                         const LightParts& light, int64_t samples, Team& team) {
+    RecordList records;
     Destination to;
     to.records = &records;
     BackwardProfile profile;
-    each_view(input, o, Terms{}, team,
-              [&](const BackwardView<T>& view) { add_shadows(view, light, samples, Record{o.intrinsics}, to, profile); });
+    each_view(input, o, Terms{}, team, [&](const BackwardView<T>& view) {
+        add_shadows(view, light, samples, Record{o.intrinsics}, to, profile);
+    });
     return std::move(records.curves);
 }
 
-#define EDGEGRAD_INSTANTIATE(T)                                                                                       \
-    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,                  \
-                                             const Gradients&);                                                       \
-    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&,      \
-                                  double*);                                                                           \
-    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);                   \
-    template Records record_samples(const BackwardInput<T>&, GradientOptions, Team&);                                 \
-    template CurveRecords record_shadows(const BackwardInput<T>&, const GradientOptions&, const LightParts&, int64_t, \
-                                         Team&);
+#define EDGEGRAD_INSTANTIATE(T)                                                                                  \
+    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,             \
+                                             const Gradients&);                                                  \
+    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&, \
+                                  double*);                                                                      \
+    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);              \
+    template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                         \
+    template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const GradientOptions&,           \
+                                                      const LightParts&, int64_t, Team&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)
 #undef EDGEGRAD_INSTANTIATE

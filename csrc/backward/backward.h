@@ -18,8 +18,8 @@ struct GradientOptions {
     uint64_t seed = 0;
     bool interior_geometry = true;  // whether the colours vary over faces, so that moving them shows inside
     bool boundary = true;
-    bool intrinsics = true;   // whether they may move; where boundary does count, the rim of what a lens shows then does
-    bool steps = true;        // whether what moves steps within faces counts
+    bool intrinsics = true;  // whether they may move; where boundary does count, the rim of what a lens shows then does
+    bool steps = true;       // whether what moves steps within faces counts
     double step_spacing = 1;  // px between the lines that find them
     bool dry = false;         // only count the samples
     bool controls = true;  // whether integrals that are known serve as control variates; they are of one given adjoint
@@ -78,12 +78,12 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions optio
 
 // The samples of both terms, for shaders written in PyTorch. Creases are the edges at which the scene's colours jump.
 template <class T>
-Records record_samples(const BackwardInput<T>& input, GradientOptions options, Team& team);
+RecordList record_samples(const BackwardInput<T>& input, GradientOptions options, Team& team);
 
 // The samples on the borders of shadows, so many or, if −1, by default.
 template <class T>
-CurveRecords record_shadows(const BackwardInput<T>& input, const GradientOptions& options, const LightParts& light,
-                            int64_t samples, Team& team);
+std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const GradientOptions& options,
+                                         const LightParts& light, int64_t samples, Team& team);
 
 // q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a window.
 void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,

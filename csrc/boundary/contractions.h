@@ -138,6 +138,7 @@ class RecordBoundary {
     RecordBoundary(const BackwardView<T>& view, const Record& kept, CurveRecords& records)
         : view_(view), kept_(kept), camera_(view.camera), records_(records) {
         form_.q.prepare(3, 1), form_.uvs.prepare(2, 1), form_.alphas.prepare(1, 1);
+        records_.reserve(scatter_chunk);
     }
 
     bool wants(int, Vec2) const { return true; }

@@ -433,8 +433,6 @@ void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t s
     const Places drawn(pieces, measure, places, light.extended, hash(view.options.seed, 11, gradient_stream),
                        view.team);
     double seconds[2] = {0, 0};
-    constexpr int64_t vertices = 5;  // of the edge and the receiver
-    if (to.records) to.records->curves.reserve(places * samples_of_place, vertices);
     view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         ShadowChunk chunk(scene, hash(view.options.seed, 9, gradient_stream), on_curves<0>(view, record, grad));
         Places place(drawn);

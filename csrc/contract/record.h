@@ -5,11 +5,13 @@
 // velocity of the curve is a linear form in what moves: rows of vertices in camera coordinates, and the intrinsics.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <vector>
 
 #include "camera/camera.h"
 #include "camera/windows.h"
+#include "core/array.h"
 #include "core/math.h"
 
 namespace edgegrad {
@@ -30,8 +32,8 @@ struct SurfaceRecords {
     std::vector<double> along_by_k;  // (S, 3, 14) ∂along/∂intrinsics at fixed x
     std::vector<double> weight;      // px² that it stands for
 
-    void clear();
-    void add(const SurfaceRecords& o);
+    // Makes room for so many.
+    void reserve(int64_t n) { face.reserve(n), x.reserve(2 * n), along.reserve(3 * n), weight.reserve(n); }
 };
 
 // Rays of a camera as functions of where they go and of its intrinsics; see SurfaceRecords.
@@ -67,16 +69,45 @@ struct CurveRecords {
     std::vector<double> by_light;  // (S, 3)
 
     int64_t size() const { return int64_t(x.size()) / 2; }
-    void clear();
-    // Makes room for so many more, with rows of so many vertices each.
-    void reserve(int64_t more, int64_t vertices);
-    void add(const CurveRecords& o);
+    // Makes room for so many, with four vertices each.
+    void reserve(int64_t n) {
+        x.reserve(2 * n), face.reserve(surfaces * n), b.reserve(2 * surfaces * n), factor.reserve(surfaces * n);
+        row_of.reserve(4 * n), vertex.reserve(4 * n), by_q.reserve(12 * n);
+    }
 };
 
 struct Records {
     SurfaceRecords surface;
     CurveRecords curves;
 };
+
+// Those of chunks of samples, in order.
+struct RecordList {
+    std::vector<SurfaceRecords> surface;
+    std::vector<CurveRecords> curves;
+};
+
+// One array of them end to end.
+template <class Part, class X>
+Array<X> joined(const std::vector<Part>& parts, std::vector<X> Part::* field, Team& team) {
+    std::vector<int64_t> first{0};
+    for (const Part& part : parts) first.push_back(first.back() + int64_t((part.*field).size()));
+    Array<X> out(first.back());
+    team.each(int64_t(parts.size()),
+              [&](int64_t k) { std::copy((parts[k].*field).begin(), (parts[k].*field).end(), out.data() + first[k]); });
+    return out;
+}
+// The same of rows that name samples, as they are numbered then.
+inline Array<int64_t> joined_rows(const std::vector<CurveRecords>& parts, std::vector<int64_t> CurveRecords::* field,
+                                  Team& team) {
+    Array<int64_t> out = joined(parts, field, team);
+    int64_t *row = out.begin(), samples = 0;
+    for (const CurveRecords& part : parts) {
+        for (size_t i = 0; i < (part.*field).size(); ++i) *row++ += samples;
+        samples += part.size();
+    }
+    return out;
+}
 
 template <class T>
 void append(std::vector<T>& to, const std::vector<T>& from) {
@@ -106,45 +137,6 @@ inline void append_ray(const Camera& window, Vec2 n, std::vector<double>& along,
         const Vec2 by_x = pixel_vjp(window, n, by_n);
         append(*along_by_x, {by_x.x, by_x.y});
     }
-}
-
-template <class T>
-void reserve_more(std::vector<T>& to, int64_t more) {
-    to.reserve(to.size() + size_t(more));
-}
-
-inline void SurfaceRecords::clear() { face.clear(), x.clear(), along.clear(), along_by_k.clear(), weight.clear(); }
-
-inline void SurfaceRecords::add(const SurfaceRecords& o) {
-    append(face, o.face), append(x, o.x), append(along, o.along), append(along_by_k, o.along_by_k),
-        append(weight, o.weight);
-}
-
-inline void CurveRecords::clear() {
-    x.clear(), face.clear(), b.clear(), factor.clear(), by_k.clear();
-    row_of.clear(), vertex.clear(), by_q.clear();
-    uv_row_of.clear(), uv.clear(), by_uv.clear();
-    alpha_row_of.clear(), alpha.clear(), by_alpha.clear();
-    light.clear(), light_uv.clear(), by_light.clear();
-}
-
-inline void CurveRecords::reserve(int64_t more, int64_t vertices) {
-    reserve_more(x, 2 * more), reserve_more(face, surfaces * more), reserve_more(b, 2 * surfaces * more);
-    reserve_more(factor, surfaces * more);
-    reserve_more(row_of, vertices * more), reserve_more(vertex, vertices * more),
-        reserve_more(by_q, 3 * vertices * more);
-}
-
-inline void CurveRecords::add(const CurveRecords& o) {
-    const int64_t before = size();
-    append(x, o.x), append(face, o.face), append(b, o.b), append(factor, o.factor), append(by_k, o.by_k);
-    const auto append_rows = [&](std::vector<int64_t>& to, const std::vector<int64_t>& from) {
-        for (const int64_t i : from) to.push_back(before + i);
-    };
-    append_rows(row_of, o.row_of), append(vertex, o.vertex), append(by_q, o.by_q);
-    append_rows(uv_row_of, o.uv_row_of), append(uv, o.uv), append(by_uv, o.by_uv);
-    append_rows(alpha_row_of, o.alpha_row_of), append(alpha, o.alpha), append(by_alpha, o.by_alpha);
-    append(light, o.light), append(light_uv, o.light_uv), append(by_light, o.by_light);
 }
 
 }  // namespace edgegrad

@@ -8,6 +8,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 #include "camera/camera.h"
@@ -125,7 +126,7 @@ struct Destination {
     int pixel_width = 0;  // numbers a pixel
     IntrinsicsGrad k = {};
     bool want_k = false;
-    Records* records = nullptr;
+    RecordList* records = nullptr;
 };
 
 // The rows of both, and their width.
@@ -207,7 +208,9 @@ class Scatter {
             },
             [&](ChunkGrad& g) {
                 to.k += g.k;
-                if (to.records) to.records->surface.add(g.records.surface), to.records->curves.add(g.records.curves);
+                if (!to.records) return;
+                to.records->surface.push_back(std::exchange(g.records.surface, {}));
+                to.records->curves.push_back(std::exchange(g.records.curves, {}));
             },
             seconds);
     }
@@ -222,7 +225,6 @@ class Scatter {
             rows.clear();
         }
         g.k = {};
-        g.records.surface.clear(), g.records.curves.clear();
     }
 
     int width_of(const RowSlot& slot, const Destination& to) const {

@@ -81,7 +81,7 @@ class Team {
         each_with(n, [] { return std::make_unique<char>(); }, [&](char&, int64_t i) { body(i); });
     }
 
-    // body(state, i) for i = 0 … n − 1, in no order, with a state for each thread: make() gives a std::unique_ptr.
+    // body(state, i) for i = 0 … n − 1, in no order, with a state for each thread: make() gives a pointer that owns it.
     template <class Make, class Body>
     void each_with(int64_t n, Make make, Body body) {
         check();

@@ -15,13 +15,6 @@ namespace edgegrad {
 
 namespace {
 
-struct PixelHit {
-    int32_t pixel, face;
-    Barycentrics b;
-    Vec2 x;
-    double weight;
-};
-
 // The pixels of one row.
 template <class T>
 class HitRow {
@@ -216,25 +209,54 @@ class HitRow {
     Hash key_{0, 0};            // of its samples
 };
 
+// Keeps them.
+class KeepRows : public RowVisitor {
+   public:
+    KeepRows(std::vector<std::vector<PixelHit>>& rows, int first) : rows_(rows), first_(first) {}
+    void visit(int y, std::vector<PixelHit>& hits) override { rows_[y - first_] = std::move(hits); }
+
+   private:
+    std::vector<std::vector<PixelHit>>& rows_;
+    int first_;
+};
+
 }  // namespace
+
+template <class T>
+void visit_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
+                      const ImageOptions& options, const PixelChoice& choice, Team& team, const HitBuffers<T>& out,
+                      const MakeVisitor& make) {
+    const std::deque<Side> sides = make_sides(scene, camera, caster, options, team);
+    const int width = camera.width, unit = pixels_of_batches(options.spp);
+    const ReachablePixels reachable(sides.front().camera, caster, sides.front().q, options.filter.radius() - 0.5, team);
+    struct State {
+        HitRow<T> row;
+        std::unique_ptr<RowVisitor> visitor;
+        std::vector<PixelHit> hits;
+    };
+    team.each_with(
+        choice.end - choice.first,
+        [&] {
+            return std::unique_ptr<State>(new State{HitRow<T>(scene, sides, options, choice, out, team), make(), {}});
+        },
+        [&](State& state, int64_t k) {
+            const int y = choice.first + int(k);
+            const auto [first, end] = reachable.row(y);
+            const int from = first / unit * unit;
+            state.hits.clear();
+            state.row.find(y, from, std::min(width, from + (std::max(end - from, 0) + unit - 1) / unit * unit),
+                           state.hits);
+            state.visitor->visit(y, state.hits);
+        });
+}
 
 template <class T>
 PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                           const ImageOptions& options, const PixelChoice& choice, Team& team,
                           const HitBuffers<T>& out) {
-    const std::deque<Side> sides = make_sides(scene, camera, caster, options, team);
-    const int width = camera.width, unit = pixels_of_batches(options.spp);
-    const ReachablePixels reachable(sides.front().camera, caster, sides.front().q, options.filter.radius() - 0.5, team);
     std::vector<std::vector<PixelHit>> rows(choice.end - choice.first);
-    team.each_with(
-        choice.end - choice.first,
-        [&] { return std::make_unique<HitRow<T>>(scene, sides, options, choice, out, team); },
-        [&](HitRow<T>& row, int64_t k) {
-            const int y = choice.first + int(k);
-            const auto [first, end] = reachable.row(y);
-            const int from = first / unit * unit;
-            row.find(y, from, std::min(width, from + (std::max(end - from, 0) + unit - 1) / unit * unit), rows[k]);
-        });
+    visit_pixel_hits(scene, camera, caster, options, choice, team, out,
+                     [&] { return std::make_unique<KeepRows>(rows, choice.first); });
     std::vector<int64_t> first_of{0};
     for (const std::vector<PixelHit>& row : rows) first_of.push_back(first_of.back() + int64_t(row.size()));
     PixelHits all(first_of.back());
@@ -249,6 +271,10 @@ PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const
     return all;
 }
 
+template void visit_pixel_hits(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&,
+                               const PixelChoice&, Team&, const HitBuffers<float>&, const MakeVisitor&);
+template void visit_pixel_hits(const SceneView<double>&, const Camera&, const RayCaster&, const ImageOptions&,
+                               const PixelChoice&, Team&, const HitBuffers<double>&, const MakeVisitor&);
 template PixelHits find_pixel_hits(const SceneView<float>&, const Camera&, const RayCaster&, const ImageOptions&,
                                    const PixelChoice&, Team&, const HitBuffers<float>&);
 template PixelHits find_pixel_hits(const SceneView<double>&, const Camera&, const RayCaster&, const ImageOptions&,

@@ -6,20 +6,30 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
+#include <memory>
+#include <vector>
 
 #include "core/array.h"
 #include "forward/forward.h"
+#include "shading/surface.h"
 
 namespace edgegrad {
+
+struct PixelHit {
+    int32_t pixel, face;
+    Barycentrics b;  // where on the face
+    Vec2 x;          // pixel position
+    double weight;   // the share of the pixel's samples
+};
 
 // Arrays side by side, one entry or row for each hit.
 struct PixelHits {
     explicit PixelHits(int64_t size) : pixel(size), face(size), b(2 * size), x(2 * size), weight(size) {}
 
     Array<int32_t> pixel, face;
-    Array<double> b;       // (N, 2) where on the face
-    Array<double> x;       // (N, 2) pixel position
-    Array<double> weight;  // the share of the pixel's samples
+    Array<double> b, x;  // (N, 2)
+    Array<double> weight;
 };
 
 // Which hits, of the rows first … end − 1 of an image.
@@ -29,8 +39,23 @@ struct PixelChoice {
     const uint8_t* only = nullptr;  // (H, W): the pixels; null: all
 };
 
+// Is given the hits of rows, one row after another. Those of one pixel follow one another, but where a lens is looked
+// through side by side they may come in several parts.
+class RowVisitor {
+   public:
+    virtual ~RowVisitor() = default;
+    virtual void visit(int y, std::vector<PixelHit>& hits) = 0;
+};
+using MakeVisitor = std::function<std::unique_ptr<RowVisitor>()>;  // one for each thread
+
 // Of all pixels; writes their rows of `out`, and marks the faces in it. Of some pixels it writes nothing, and which of
 // their samples stand for all is drawn independently of the draw for all pixels.
+template <class T>
+void visit_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
+                      const ImageOptions& options, const PixelChoice& choice, Team& team, const HitBuffers<T>& out,
+                      const MakeVisitor& make);
+
+// The same, as arrays.
 template <class T>
 PixelHits find_pixel_hits(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                           const ImageOptions& options, const PixelChoice& choice, Team& team, const HitBuffers<T>& out);

@@ -186,7 +186,9 @@ template <class T>
 class RecordInterior {
    public:
     RecordInterior(const BackwardView<T>& view, const Record& kept, SurfaceRecords& records)
-        : view_(view), kept_(kept), records_(records) {}
+        : view_(view), kept_(kept), records_(records) {
+        records_.reserve(scatter_chunk);
+    }
 
     bool wants(int, const SurfaceSample&) const { return true; }
 

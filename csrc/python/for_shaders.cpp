@@ -31,6 +31,14 @@ nb::object rows(Values&& values, std::vector<size_t> row = {}) {
     return nb::cast(nb::ndarray<nb::numpy, X>(kept->data(), row.size(), row.data(), owner));
 }
 
+// What work(Team&) gives, without the interpreter's lock.
+template <class Work>
+auto on_team(int threads, Work work) {
+    std::optional<std::invoke_result_t<Work, Team&>> out;
+    unlocked(threads, [&](Team& team) { out.emplace(work(team)); });
+    return *std::move(out);
+}
+
 template <class T>
 nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& options, int threads,
                     int first, int end, int most, std::optional<In<uint8_t, 2>> only, const HitArrays<T>& hits) {
@@ -53,20 +61,21 @@ nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const Im
     return out;
 }
 
-nb::dict arrays_of(CurveRecords&& c) {
+nb::dict arrays_of(const std::vector<CurveRecords>& parts, int threads) {
     nb::dict curves;
-    curves["x"] = rows(std::move(c.x), {2}), curves["face"] = rows(std::move(c.face), {CurveRecords::surfaces});
-    curves["b"] = rows(std::move(c.b), {CurveRecords::surfaces, 2});
-    curves["factor"] = rows(std::move(c.factor), {CurveRecords::surfaces});
-    curves["by_k"] = rows(std::move(c.by_k), {intrinsics_width});
-    curves["row_of"] = rows(std::move(c.row_of)), curves["vertex"] = rows(std::move(c.vertex));
-    curves["by_q"] = rows(std::move(c.by_q), {3});
-    curves["uv_row_of"] = rows(std::move(c.uv_row_of)), curves["uv"] = rows(std::move(c.uv));
-    curves["by_uv"] = rows(std::move(c.by_uv), {2});
-    curves["alpha_row_of"] = rows(std::move(c.alpha_row_of)), curves["alpha"] = rows(std::move(c.alpha));
-    curves["by_alpha"] = rows(std::move(c.by_alpha));
-    curves["light"] = rows(std::move(c.light)), curves["light_uv"] = rows(std::move(c.light_uv), {2});
-    curves["by_light"] = rows(std::move(c.by_light), {3});
+    const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {
+        curves[name] = rows(on_team(threads, [&](Team& team) { return joined(parts, field, team); }), std::move(row));
+    };
+    const auto add_rows = [&](const char* name, auto field) {
+        curves[name] = rows(on_team(threads, [&](Team& team) { return joined_rows(parts, field, team); }));
+    };
+    using C = CurveRecords;
+    add("x", &C::x, {2}), add("face", &C::face, {C::surfaces}), add("b", &C::b, {C::surfaces, 2});
+    add("factor", &C::factor, {C::surfaces}), add("by_k", &C::by_k, {intrinsics_width});
+    add_rows("row_of", &C::row_of), add("vertex", &C::vertex), add("by_q", &C::by_q, {3});
+    add_rows("uv_row_of", &C::uv_row_of), add("uv", &C::uv), add("by_uv", &C::by_uv, {2});
+    add_rows("alpha_row_of", &C::alpha_row_of), add("alpha", &C::alpha), add("by_alpha", &C::by_alpha);
+    add("light", &C::light), add("light_uv", &C::light_uv, {2}), add("by_light", &C::by_light, {3});
     return curves;
 }
 
@@ -77,17 +86,20 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
     check_image("adjoint", adjoint, camera, arrays.background.shape(2));
     hits.check(arrays, camera);
     const SceneView<T> scene = arrays.view();
-    Records found;
+    RecordList found;
     with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
         found = record_samples(BackwardInput<T>{scene, camera, geometry, image, adjoint.data(), hits.view()}, options,
                                team);
     });
-    SurfaceRecords& s = found.surface;
     nb::dict surface;
-    surface["face"] = rows(std::move(s.face)), surface["x"] = rows(std::move(s.x), {2});
-    surface["along"] = rows(std::move(s.along), {3}), surface["weight"] = rows(std::move(s.weight));
-    surface["along_by_k"] = rows(std::move(s.along_by_k), {3, intrinsics_width});
-    return nb::make_tuple(surface, arrays_of(std::move(found.curves)));
+    const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {
+        surface[name] =
+            rows(on_team(threads, [&](Team& team) { return joined(found.surface, field, team); }), std::move(row));
+    };
+    using S = SurfaceRecords;
+    add("face", &S::face), add("x", &S::x, {2}), add("along", &S::along, {3}), add("weight", &S::weight);
+    add("along_by_k", &S::along_by_k, {3, intrinsics_width});
+    return nb::make_tuple(surface, arrays_of(found.curves, threads));
 }
 
 // A light as edges cast shadows of it.
@@ -121,33 +133,51 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const Camera& camera, cons
     check_image("adjoint", adjoint, camera, arrays.background.shape(2));
     hits.check(arrays, camera), light.check(int64_t(arrays.faces.shape(0)));
     const SceneView<T> scene = arrays.view();
-    CurveRecords found;
+    std::vector<CurveRecords> found;
     unlocked(threads, [&](Team& team) {
         GeometryWork done;
         const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
         found = record_shadows(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view()}, options,
                                light.view(), samples, team);
     });
-    return arrays_of(std::move(found));
-}
-
-// The pixels whose filter reaches points of the image: for each pair the point, the pixel, and the filter's weight
-// there.
-nb::tuple footprints(In<double, 2> x, const std::string& filter, int width, int height) {
-    if (x.shape(1) != 2) refuse("x: expected rows of two numbers");
-    const FilteredPixels pixels(make_filter(filter), width, height);
-    std::vector<int64_t> point, pixel;
-    std::vector<double> weight;
-    for (size_t i = 0; i < x.shape(0); ++i)
-        pixels.around({x(i, 0), x(i, 1)}, [&](int64_t p, double w) {
-            point.push_back(int64_t(i)), pixel.push_back(p), weight.push_back(w);
-        });
-    return nb::make_tuple(rows(std::move(point)), rows(std::move(pixel)), rows(std::move(weight)));
+    return arrays_of(found, threads);
 }
 
 Places places_of(const In<double, 2>& x) {
     if (x.shape(1) != 2) refuse("x: expected rows of two numbers");
     return {x.data(), int64_t(x.shape(0))};
+}
+
+// Σ k(x − c) · value over points x (S, 2) with values (S, C), for pixels with centres c: (H · W, C).
+nb::object splat(In<double, 2> x, In<double, 2> values, const std::string& filter, int width, int height) {
+    const size_t n = places_of(x).size, C = values.shape(1);
+    if (values.shape(0) != n) refuse("values: expected a row for each point");
+    const FilteredPixels pixels(make_filter(filter), width, height);
+    std::vector<double> out(size_t(width) * size_t(height) * C, 0.0);
+    for (size_t i = 0; i < n; ++i)
+        pixels.around({x(i, 0), x(i, 1)}, [&](int64_t p, double w) {
+            for (size_t c = 0; c < C; ++c) out[size_t(p) * C + c] += w * values(i, c);
+        });
+    return rows(std::move(out), {C});
+}
+
+// Its adjoint: Σ k(x − c) · image over the pixels (H · W, C), for points x: (S, C).
+template <class T>
+nb::object splat_vjp(In<double, 2> x, In<T, 2> image, const std::string& filter, int width, int height, int threads) {
+    const Places places = places_of(x);
+    const size_t C = image.shape(1);
+    if (image.shape(0) != size_t(width) * size_t(height)) refuse("image: expected a row for each pixel");
+    const FilteredPixels pixels(make_filter(filter), width, height);
+    std::vector<double> out(size_t(places.size) * C);
+    unlocked(threads, [&](Team& team) {
+        team.each_block(places.size, [&](int64_t, int64_t first, int64_t last) {
+            for (int64_t i = first; i < last; ++i)
+                pixels.around(places[i], [&](int64_t p, double w) {
+                    for (size_t c = 0; c < C; ++c) out[size_t(i) * C + c] += w * image.data()[size_t(p) * C + c];
+                });
+        });
+    });
+    return rows(std::move(out), {C});
 }
 
 template <class T>
@@ -219,7 +249,7 @@ nb::object visible_points(const SceneArrays<T>& arrays, In<int32_t, 1> face, In<
 template <class T>
 void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
     scene
-        .def("pixel_hits", &pixel_hits<T>, "camera"_a, "options"_a, "threads"_a, "first"_a, "end"_a, "most"_a,
+        .def("pixel_hits", &pixel_hits<T>, "camera"_a, "image"_a, "threads"_a, "first"_a, "end"_a, "most"_a,
              "only"_a.none(), "hits"_a)
         .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
         .def("shadow_samples", &shadow_samples<T>, "camera"_a, "image"_a, "options"_a, "light"_a, "samples"_a,
@@ -240,7 +270,12 @@ void bind_for_shaders(nb::module_& m) {
                          bool two_sided) { return LightArrays{corner, chance, face, infinite, extended, two_sided}; }),
              "corner"_a.noconvert(), "chance"_a.noconvert(), "face"_a.noconvert(), "infinite"_a, "extended"_a,
              "two_sided"_a);
-    m.def("footprints", &footprints, "x"_a.noconvert(), "filter"_a, "width"_a, "height"_a);
+    m.def("splat", &splat, "x"_a.noconvert(), "values"_a.noconvert(), "filter"_a, "width"_a, "height"_a);
+    const auto bind_vjp = [&](auto function) {
+        m.def("splat_vjp", function, "x"_a.noconvert(), "image"_a.noconvert(), "filter"_a, "width"_a, "height"_a,
+              "threads"_a);
+    };
+    bind_vjp(&splat_vjp<float>), bind_vjp(&splat_vjp<double>);
     m.def("most_shadow_samples", &most_shadow_samples, "width"_a, "height"_a, "spp"_a);
     m.def("rays_at", &rays_of, "camera"_a, "x"_a.noconvert(), "threads"_a);
 }

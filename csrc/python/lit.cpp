@@ -9,8 +9,10 @@
 
 #include <optional>
 
+#include "forward/lit_image.h"
 #include "python/arrays.h"
 #include "python/unlocked.h"
+#include "shading/lit/flat_light.h"
 
 using namespace nanobind::literals;
 
@@ -113,15 +115,6 @@ class LitArrays {
     }
 
     LitScene scene;
-
-    // The cotangents of tables that are wanted, as arrays of zeros.
-    std::vector<std::vector<double>> room(const std::vector<bool>& wanted) const {
-        if (wanted.size() != scene.tables.size()) refuse("wanted: expected a number for each table");
-        std::vector<std::vector<double>> out(wanted.size());
-        for (size_t i = 0; i < wanted.size(); ++i)
-            if (wanted[i]) out[i].assign(size_t(scene.tables[i].rows * scene.tables[i].width), 0.0);
-        return out;
-    }
 
    private:
     const Table& table(int number) const { return scene.tables[size_t(number)]; }
@@ -243,28 +236,36 @@ struct PointArrays {
     }
 };
 
-// Rows of a width that may be zero.
-template <class X>
-nb::object array_of(std::vector<X>&& values, size_t rows, size_t columns) {
-    auto* kept = new std::vector<X>(std::move(values));
-    const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<X>*>(p); });
+// A vector or an Array as rows of a width that may be zero.
+template <class Values>
+nb::object array_of(Values&& values, size_t rows, size_t columns) {
+    static_assert(!std::is_reference_v<Values>);  // it is moved from
+    using X = std::remove_pointer_t<decltype(values.data())>;
+    auto* kept = new Values(std::move(values));
+    const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<Values*>(p); });
     const size_t shape[] = {rows, columns};
     return nb::cast(nb::ndarray<nb::numpy, X>(kept->data(), 2, shape, owner));
 }
 
 template <class T>
-nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
-                       const LitOptions& options, bool values, int threads) {
+void check_faces(const SceneArrays<T>& arrays, const LitArrays& lit) {
     if (arrays.faces.shape(0) == 0 ||
         size_t(lit.scene.meshes.back().first_face + lit.scene.meshes.back().faces) != arrays.faces.shape(0))
         refuse("lit: expected the faces of the scene");
+}
+
+template <class T>
+nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
+                       const LitOptions& options, bool values, int threads) {
+    check_faces(arrays, lit);
     const LitPoints view = points.view(lit.scene, int64_t(arrays.faces.shape(0)));
-    const size_t lights = size_t(light_samples(lit.scene, options));
-    std::vector<double> radiance(size_t(view.size) * size_t(lit.scene.channels));
+    const size_t lights = light_samples(lit.scene, options).size();
+    Array<double> radiance(0);
     std::vector<int8_t> seen(size_t(view.size) * lights);
     unlocked(threads, [&](Team& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
+        radiance = zeros(view.size * lit.scene.channels, team);
         shade(lit.scene, arrays.view(), geometry->caster(), view, options, values ? radiance.data() : nullptr,
               seen.data(), team);
     });
@@ -273,8 +274,47 @@ nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const
                           array_of(std::move(seen), n, lights));
 }
 
+// (F, 3, L); see flat_light.h. Places (L, 3), and what arrives at vertices (L, V).
+nb::object light_on_faces(In<double, 2> verts, Rows faces, In<double, 1> eye, bool perspective, In<double, 2> place,
+                          const std::vector<bool>& infinite, In<double, 2> arriving, int threads) {
+    const size_t L = infinite.size(), V = verts.shape(0), F = faces.shape(0);
+    if (verts.shape(1) != 3 || faces.shape(1) != 3 || eye.size() != 3) refuse("verts, faces, eye: expected 3 columns");
+    if (place.shape(0) != L || place.shape(1) != 3 || arriving.shape(0) != L || arriving.shape(1) != V)
+        refuse("place, arriving: expected a row for each light");
+    check_indices("faces", faces.data(), faces.size(), V, "verts", threads);
+    std::vector<PunctualLight> lights;
+    for (size_t l = 0; l < L; ++l)
+        lights.push_back({{place(l, 0), place(l, 1), place(l, 2)}, infinite[l], arriving.data() + l * V});
+    Array<double> found(0);
+    unlocked(threads, [&](Team& team) {
+        found = light_on_flat_faces(
+            {verts.data(), faces.data(), int64_t(V), int64_t(F), {eye(0), eye(1), eye(2)}, perspective}, lights, team);
+    });
+    return array_of(std::move(found), F, 3 * L);
+}
+
+// The image before what lies behind the surfaces, (H · W, C), and which lamps' shadows were asked for.
+template <class T>
+nb::tuple lit_image(const SceneArrays<T>& arrays, const LitArrays& lit, const Camera& camera, const ImageOptions& image,
+                    const LitOptions& options, int points, uint64_t seed, uint64_t again, int threads,
+                    const HitArrays<T>& hits) {
+    check_faces(arrays, lit), hits.check(arrays, camera);
+    if (points < 1) refuse("points: expected at least 1");
+    LitImage<T> found{Array<T>(0), {}};
+    unlocked(threads, [&](Team& team) {
+        GeometryWork work;
+        const auto geometry = arrays.geometry({}, team, work);
+        found = render_lit(lit.scene, arrays.view(), camera, geometry->caster(), image, options,
+                           LitSampling{points, seed, again}, team, hits.view());
+    });
+    const size_t channels = size_t(lit.scene.channels), pixels = size_t(found.radiance.size()) / channels;
+    const size_t lamps = found.asked.size();
+    return nb::make_tuple(array_of(std::move(found.radiance), pixels, channels),
+                          array_of(std::move(found.asked), lamps, 1));
+}
+
 void check_seen(const LitArrays& lit, const LitPoints& points, const LitOptions& options, const In<int8_t, 2>& seen) {
-    if (int64_t(seen.shape(0)) != points.size || int(seen.shape(1)) != light_samples(lit.scene, options))
+    if (int64_t(seen.shape(0)) != points.size || seen.shape(1) != light_samples(lit.scene, options).size())
         refuse("seen: expected what shade() found");
 }
 int64_t faces_of(const LitArrays& lit) { return lit.scene.meshes.back().first_face + lit.scene.meshes.back().faces; }
@@ -286,12 +326,17 @@ nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, cons
     check_seen(lit, view, options, seen);
     if (int64_t(bar.shape(0)) != view.size || int(bar.shape(1)) != lit.scene.channels)
         refuse("bar: expected a row a point");
-    std::vector<std::vector<double>> found = lit.room(wanted);
-    std::vector<double*> to(found.size());
-    for (size_t i = 0; i < found.size(); ++i) to[i] = wanted[i] ? found[i].data() : nullptr;
-    std::vector<double> b_bar(size_t(3 * view.size));
-    unlocked(threads,
-             [&](Team& team) { shade_vjp(lit.scene, view, options, seen.data(), bar.data(), to, b_bar.data(), team); });
+    if (wanted.size() != lit.scene.tables.size()) refuse("wanted: expected a number for each table");
+    std::vector<Array<double>> found;
+    Array<double> b_bar(3 * view.size);
+    unlocked(threads, [&](Team& team) {
+        std::vector<double*> to;
+        for (size_t i = 0; i < wanted.size(); ++i) {
+            found.push_back(zeros(wanted[i] ? lit.scene.tables[i].rows * lit.scene.tables[i].width : 0, team));
+            to.push_back(wanted[i] ? found[i].data() : nullptr);
+        }
+        shade_vjp(lit.scene, view, options, seen.data(), bar.data(), to, b_bar.data(), team);
+    });
     nb::list out;
     for (size_t i = 0; i < found.size(); ++i)
         if (const Table& table = lit.scene.tables[i]; wanted[i])
@@ -327,7 +372,9 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
 
 template <class T>
 void bind_scene_lit(nb::class_<SceneArrays<T>>& scene) {
-    scene.def("shade", &shade_points<T>, "lit"_a, "points"_a, "options"_a, "values"_a, "threads"_a);
+    scene.def("shade", &shade_points<T>, "lit"_a, "points"_a, "options"_a, "values"_a, "threads"_a)
+        .def("lit_image", &lit_image<T>, "lit"_a, "camera"_a, "image"_a, "options"_a, "points"_a, "seed"_a, "again"_a,
+             "threads"_a, "hits"_a);
 }
 template void bind_scene_lit(nb::class_<SceneArrays<float>>&);
 template void bind_scene_lit(nb::class_<SceneArrays<double>>&);
@@ -367,6 +414,8 @@ void bind_lit(nb::module_& m) {
              nb::kw_only(), "shadows"_a, "samples"_a, "only"_a);
     m.def("shade_vjp", &shade_points_vjp, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "seen"_a.noconvert(),
           "bar"_a.noconvert(), "wanted"_a, "threads"_a);
+    m.def("light_on_faces", &light_on_faces, "verts"_a.noconvert(), "faces"_a.noconvert(), "eye"_a.noconvert(),
+          "perspective"_a, "place"_a.noconvert(), "infinite"_a, "arriving"_a.noconvert(), "threads"_a);
     m.def("shade_jvp", &shade_points_jvp, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "seen"_a.noconvert(),
           "tangents"_a, "b_dot"_a.none(), "threads"_a);
 }

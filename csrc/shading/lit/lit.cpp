@@ -175,20 +175,6 @@ Vec3 place(const LitScene& lit, const Lamp& lamp, const LightPoint& p) {
     }
 }
 
-// One sample of one light.
-struct LightSample {
-    int lamp, sample, count;
-};
-std::vector<LightSample> samples_of(const LitScene& lit, const LitOptions& options) {
-    std::vector<LightSample> out;
-    for (int k = 0; k < int(lit.lamps.size()); ++k) {
-        if (!lit.lamps[k].casts() || !(options.only < 0 || options.only == k)) continue;
-        const int count = lit.lamps[k].is_punctual() ? 1 : options.samples;
-        for (int s = 0; s < count; ++s) out.push_back({k, s, count});
-    }
-    return out;
-}
-
 // The point of a light that point i of a surface with the normal g is lit by.
 LightPoint light_point(const LitScene& lit, const LitPoints& points, int64_t i, const LightSample& which, Vec3 g) {
     const Lamp& lamp = lit.lamps[which.lamp];
@@ -338,61 +324,80 @@ const LitMesh& LitScene::mesh_of(int64_t face) const {
     return meshes[k];
 }
 
-int light_samples(const LitScene& lit, const LitOptions& options) { return int(samples_of(lit, options).size()); }
+std::vector<LightSample> light_samples(const LitScene& lit, const LitOptions& options) {
+    std::vector<LightSample> out;
+    for (int k = 0; k < int(lit.lamps.size()); ++k) {
+        if (!lit.lamps[k].casts() || !(options.only < 0 || options.only == k)) continue;
+        const int count = lit.lamps[k].is_punctual() ? 1 : options.samples;
+        for (int s = 0; s < count; ++s) out.push_back({k, s, count});
+    }
+    return out;
+}
+
+struct ShadeRoom {
+    std::vector<LightSample> lights;
+    std::vector<Surface<double>> surfaces;
+    ShadowRays rays;
+    std::vector<uint8_t> found;
+};
+std::shared_ptr<ShadeRoom> shade_room(const LitScene& lit, const LitOptions& options) {
+    auto room = std::make_shared<ShadeRoom>();
+    room->lights = light_samples(lit, options);
+    return room;
+}
+
+template <class T>
+void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                const LitOptions& options, ShadeRoom& room, double* radiance_out, int8_t* seen) {
+    const std::vector<LightSample>& lights = room.lights;
+    const size_t K = lights.size();
+    room.surfaces.resize(points.size);
+    for (int64_t i = 0; i < points.size; ++i) room.surfaces[i] = surface<double>(lit, points.face[i], points.b + 3 * i);
+    // Light by light, for rays that are cast together are the faster the more alike they are.
+    for (size_t k = 0; k < K; ++k) {
+        const Lamp& lamp = lit.lamps[lights[k].lamp];
+        for (int64_t i = 0; i < points.size; ++i) {
+            const Surface<double>& o = room.surfaces[i];
+            int8_t& found = seen[i * K + k] = not_asked;
+            if (!o.mesh->has_material || o.is_black()) continue;
+            const LightPoint point = light_point(lit, points, i, lights[k], o.g);
+            const Vec3 there = place(lit, lamp, point), l = lamp.is_infinite() ? there : unit(there - o.y);
+            if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
+            found = 1;
+            if (!options.shadows) continue;
+            if (points.forced.lamp == lights[k].lamp) found = int8_t(points.forced.lit[i]);
+            else room.rays.add(lit, lamp, points.face[i], o, there, &found);
+        }
+    }
+    room.rays.cast(scene, caster, room.found);
+    for (int64_t i = 0; radiance_out && i < points.size; ++i) {
+        look_up_material(lit, room.surfaces[i]);
+        radiance<double>(lit, points, options, lights, i, room.surfaces[i], seen + i * K,
+                         radiance_out + i * lit.channels);
+    }
+}
 
 template <class T>
 void shade(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
            const LitOptions& options, double* radiance_out, int8_t* seen, Team& team) {
-    const std::vector<LightSample> lights = samples_of(lit, options);
-    const size_t K = lights.size();
-    struct Room {
-        std::vector<Surface<double>> surfaces;
-        ShadowRays rays;
-        std::vector<uint8_t> found;
-    };
-    constexpr int64_t at_once = 256;
-    team.each_with((points.size + at_once - 1) / at_once, [] { return std::make_unique<Room>(); },
-                   [&](Room& room, int64_t block) {
-                       const int64_t first = block * at_once, n = std::min(at_once, points.size - first);
-                       room.surfaces.resize(n);
-                       for (int64_t j = 0; j < n; ++j)
-                           room.surfaces[j] = surface<double>(lit, points.face[first + j], points.b + 3 * (first + j));
-                       // Light by light, for rays that are cast together are the faster the more alike they are.
-                       for (size_t k = 0; k < K; ++k) {
-                           const Lamp& lamp = lit.lamps[lights[k].lamp];
-                           for (int64_t j = 0; j < n; ++j) {
-                               const int64_t i = first + j;
-                               const Surface<double>& o = room.surfaces[j];
-                               int8_t& found = seen[i * K + k] = not_asked;
-                               if (!o.mesh->has_material || o.is_black()) continue;
-                               const LightPoint point = light_point(lit, points, i, lights[k], o.g);
-                               const Vec3 there = place(lit, lamp, point),
-                                          l = lamp.is_infinite() ? there : unit(there - o.y);
-                               if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
-                               found = 1;
-                               if (!options.shadows) continue;
-                               if (points.forced.lamp == lights[k].lamp) found = int8_t(points.forced.lit[i]);
-                               else room.rays.add(lit, lamp, points.face[i], o, there, &found);
-                           }
-                       }
-                       room.rays.cast(scene, caster, room.found);
-                       for (int64_t j = 0; radiance_out && j < n; ++j) {
-                           const int64_t i = first + j;
-                           look_up_material(lit, room.surfaces[j]);
-                           radiance<double>(lit, points, options, lights, i, room.surfaces[j], seen + i * K,
-                                            radiance_out + i * lit.channels);
-                       }
+    const size_t K = light_samples(lit, options).size();
+    team.each_with((points.size + shaded_at_once - 1) / shaded_at_once, [&] { return shade_room(lit, options); },
+                   [&](ShadeRoom& room, int64_t block) {
+                       const int64_t first = block * shaded_at_once;
+                       shade_some(lit, scene, caster, points.part(first, shaded_at_once), options, room,
+                                  radiance_out ? radiance_out + first * lit.channels : nullptr, seen + first * K);
                    });
 }
 
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
                const double* bar, const std::vector<double*>& to, double* b_bar, Team& team) {
-    const std::vector<LightSample> lights = samples_of(lit, options);
+    const std::vector<LightSample> lights = light_samples(lit, options);
     std::vector<Cotangents> chunks;
     double seconds[2] = {};
     scatter_in_waves(
         team, points.size, chunks, [&](Cotangents& chunk, int owners) { chunk.prepare(lit.tables, to, owners); },
         [&](int64_t first, int64_t last, Cotangents& chunk) {
+            std::fill(b_bar + 3 * first, b_bar + 3 * last, 0.0);
             for (int64_t i = first; i < last; ++i)
                 radiance_vjp(lit, points, options, lights, i, seen + i * lights.size(), bar + i * lit.channels,
                              b_bar + 3 * i, chunk);
@@ -402,7 +407,7 @@ void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& o
 
 void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
                const double* b_dot, double* radiance_dot, Team& team) {
-    const std::vector<LightSample> lights = samples_of(lit, options);
+    const std::vector<LightSample> lights = light_samples(lit, options);
     team.each_block(points.size, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) {
             Dual b[3], total[most_lit_channels];
@@ -415,6 +420,10 @@ void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& o
     });
 }
 
+template void shade_some(const LitScene&, const SceneView<float>&, const RayCaster&, const LitPoints&,
+                         const LitOptions&, ShadeRoom&, double*, int8_t*);
+template void shade_some(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&,
+                         const LitOptions&, ShadeRoom&, double*, int8_t*);
 template void shade(const LitScene&, const SceneView<float>&, const RayCaster&, const LitPoints&, const LitOptions&,
                     double*, int8_t*, Team&);
 template void shade(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&, const LitOptions&,

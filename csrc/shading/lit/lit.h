@@ -6,7 +6,9 @@
 // where this does not, and as its reference.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
+#include <memory>
 #include <vector>
 
 #include "core/parallel.h"
@@ -62,6 +64,15 @@ struct LitPoints {
     const double* b = nullptr;      // (N, 3) barycentrics
     const int64_t* seed = nullptr;  // (N,) of random numbers
     ForcedLight forced;
+
+    // So many from `first` on, or those that there are.
+    LitPoints part(int64_t first, int64_t count) const {
+        LitPoints o{std::min(count, size - first), face + first, b + 3 * first, seed + first, forced};
+        if (forced.lamp >= 0)
+            o.forced = {forced.lamp, forced.index + first, forced.uv + 2 * first, forced.density + first,
+                        forced.lit + first};
+        return o;
+    }
 };
 
 struct LitOptions {
@@ -72,12 +83,22 @@ struct LitOptions {
 
 // Whether points of lights are seen, by points and then by lights and their samples.
 constexpr int8_t not_asked = -1;
-int light_samples(const LitScene& lit, const LitOptions& options);
+struct LightSample {
+    int lamp, sample, count;  // one of so many of a lamp
+};
+std::vector<LightSample> light_samples(const LitScene& lit, const LitOptions& options);
 
 // (N, channels) radiance, null where only derivatives are wanted, and (N, light samples) what was found of lights.
 template <class T>
 void shade(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
            const LitOptions& options, double* radiance, int8_t* seen, Team& team);
+// The same of few points, about so many, on one thread, which keeps what it needs from one call to the next.
+constexpr int64_t shaded_at_once = 256;
+struct ShadeRoom;
+std::shared_ptr<ShadeRoom> shade_room(const LitScene& lit, const LitOptions& options);
+template <class T>
+void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                const LitOptions& options, ShadeRoom& room, double* radiance, int8_t* seen);
 // From what shade() found. Adds to the cotangents of the tables, null where none is wanted, and writes those of b (N,
 // 3).
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,

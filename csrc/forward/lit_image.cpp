@@ -1,0 +1,170 @@
+#include "forward/lit_image.h"
+
+#include <algorithm>
+#include <atomic>
+#include <memory>
+
+#include "forward/pixel_hits.h"
+
+namespace edgegrad {
+
+namespace {
+
+constexpr int most_again = 8;   // points of a face in a pixel that is shaded again
+constexpr int share_again = 4;  // so many times the points of the first look, in all
+
+// What is seen of punctual lamps in the pixels of an image, and how many points were shaded there.
+class Sights {
+   public:
+    Sights(int width, int height, const std::vector<LightSample>& lights, const LitScene& lit)
+        : width_(width), height_(height), points_(int64_t(width) * height, 0) {
+        for (size_t k = 0; k < lights.size(); ++k)
+            if (lit.lamps[lights[k].lamp].is_punctual()) columns_.push_back(k);
+        seen_.assign(size_t(width + 2) * (height + 2) * columns_.size(), 0);
+    }
+
+    // Of one point.
+    void add(int x, int y, const int8_t* seen) {
+        ++points_[int64_t(y) * width_ + x];
+        uint8_t* here = &seen_[at(x, y)];
+        for (size_t l = 0; l < columns_.size(); ++l)
+            if (const int8_t s = seen[columns_[l]]; s != not_asked) here[l] |= s ? visible : hidden;
+    }
+
+    // Pixels that borders run through, and how many points of each face in them are to be shaded.
+    int borders(std::vector<uint8_t>& pixels, Team& team) const {
+        pixels.assign(points_.size(), 0);
+        if (columns_.empty()) return 0;
+        team.each(height_, [&](int64_t y) { mark(int(y), &pixels[y * width_]); });
+        int64_t first = 0, there = 0;
+        for (size_t i = 0; i < pixels.size(); ++i) first += points_[i], there += pixels[i] ? points_[i] : 0;
+        if (std::none_of(pixels.begin(), pixels.end(), [](uint8_t p) { return p != 0; })) return 0;
+        return int(std::clamp<int64_t>(share_again * first / std::max<int64_t>(there, 1), 2, most_again));
+    }
+
+   private:
+    enum : uint8_t { hidden = 1, visible = 2 };
+
+    // With a pixel around the image, of which nothing is known.
+    size_t at(int x, int y) const { return (size_t(y + 1) * (width_ + 2) + x + 1) * columns_.size(); }
+    void mark(int y, uint8_t* pixels) const {
+        const size_t L = columns_.size(), n = L * width_;
+        const uint8_t *above = &seen_[at(0, y - 1)], *row = &seen_[at(0, y)], *below = &seen_[at(0, y + 1)];
+        std::vector<uint8_t> both(n);
+        for (size_t e = 0; e < n; ++e)
+            both[e] = (above + e)[-ptrdiff_t(L)] | above[e] | above[e + L] | (row + e)[-ptrdiff_t(L)] | row[e + L] |
+                      (below + e)[-ptrdiff_t(L)] | below[e] | below[e + L];
+        for (size_t e = 0; e < n; ++e)
+            if (both[e] == (hidden | visible)) pixels[e / L] = 1;
+    }
+
+    int width_, height_;
+    std::vector<int32_t> points_;
+    std::vector<size_t> columns_;  // of light samples, those of punctual lamps
+    std::vector<uint8_t> seen_;    // (H + 2, W + 2, those)
+};
+
+// What rows have in common.
+template <class T>
+struct Look {
+    const LitScene& lit;
+    const SceneView<T>& scene;
+    const RayCaster& caster;
+    const LitOptions& options;
+    int width, points;
+    uint64_t seed;
+    const uint8_t* only;  // pixels, null: all
+    LitImage<T>& to;
+    Sights* sights;  // null: not wanted
+};
+
+template <class T>
+class LitRow : public RowVisitor {
+   public:
+    explicit LitRow(const Look<T>& look)
+        : look_(look),
+          lights_(light_samples(look.lit, look.options)),
+          room_(shade_room(look.lit, look.options)),
+          sums_(int64_t(look.width) * look.lit.channels) {}
+
+    void visit(int y, std::vector<PixelHit>& hits) override {
+        std::fill(sums_.begin(), sums_.end(), 0.0);
+        among_ = 0;
+        for (size_t first = 0; first < hits.size(); first += shaded_at_once)
+            shade(hits, first, std::min(hits.size() - first, size_t(shaded_at_once)));
+        const int C = look_.lit.channels;
+        for (int x = 0; x < look_.width; ++x) {
+            const int64_t pixel = int64_t(y) * look_.width + x;
+            if (look_.only && !look_.only[pixel]) continue;
+            for (int c = 0; c < C; ++c) look_.to.radiance[pixel * C + c] = T(sums_[int64_t(x) * C + c]);
+        }
+    }
+
+   private:
+    void shade(const std::vector<PixelHit>& hits, size_t first, size_t n) {
+        const int C = look_.lit.channels;
+        const size_t K = lights_.size();
+        face_.clear(), b_.clear(), seed_.clear(), radiance_.resize(n * C), seen_.resize(n * K);
+        for (size_t i = first; i < first + n; ++i) {
+            const PixelHit& hit = hits[i];
+            among_ = i > 0 && hits[i - 1].pixel == hit.pixel ? among_ + 1 : 0;
+            face_.push_back(hit.face), b_.insert(b_.end(), {1 - (hit.b.u + hit.b.v), hit.b.u, hit.b.v});
+            seed_.push_back(int64_t(look_.seed + uint64_t(look_.points) * uint64_t(hit.pixel) + among_));
+        }
+        shade_some(look_.lit, look_.scene, look_.caster, {int64_t(n), face_.data(), b_.data(), seed_.data(), {}},
+                   look_.options, *room_, radiance_.data(), seen_.data());
+        for (size_t i = 0; i < n; ++i) {
+            const PixelHit& hit = hits[first + i];
+            double* sum = &sums_[int64_t(hit.pixel % look_.width) * C];
+            for (int c = 0; c < C; ++c) sum[c] += hit.weight * radiance_[i * C + c];
+            const int8_t* seen = seen_.data() + i * K;
+            if (look_.sights) look_.sights->add(hit.pixel % look_.width, hit.pixel / look_.width, seen);
+            for (size_t k = 0; k < K; ++k)
+                if (seen[k] != not_asked)
+                    std::atomic_ref(look_.to.asked[lights_[k].lamp]).store(1, std::memory_order_relaxed);
+        }
+    }
+
+    const Look<T>& look_;
+    std::vector<LightSample> lights_;
+    std::shared_ptr<ShadeRoom> room_;
+    std::vector<double> sums_;  // of the row
+    uint64_t among_ = 0;        // the hits of one pixel, which this is
+    std::vector<int64_t> face_, seed_;
+    std::vector<double> b_, radiance_;
+    std::vector<int8_t> seen_;
+};
+
+}  // namespace
+
+template <class T>
+LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
+                       const ImageOptions& image, const LitOptions& options, const LitSampling& sampling, Team& team,
+                       const HitBuffers<T>& hits) {
+    LitImage<T> out{Array<T>(int64_t(camera.width) * camera.height * lit.channels),
+                    std::vector<uint8_t>(lit.lamps.size(), 0)};
+    const bool looks_again = options.shadows && image.spp > 1;
+    std::unique_ptr<Sights> sights;
+    if (looks_again) sights = std::make_unique<Sights>(camera.width, camera.height, light_samples(lit, options), lit);
+    const auto look = [&](const PixelChoice& choice, uint64_t seed) {
+        const Look<T> rows{lit,         scene, caster,      options, camera.width,
+                           choice.most, seed,  choice.only, out,     choice.only ? nullptr : sights.get()};
+        visit_pixel_hits(scene, camera, caster, image, choice, team, hits,
+                         [&] { return std::make_unique<LitRow<T>>(rows); });
+    };
+    look({0, camera.height, sampling.points}, sampling.seed);
+    if (!looks_again) return out;
+    std::vector<uint8_t> borders;
+    if (const int points = sights->borders(borders, team))
+        look({0, camera.height, points, borders.data()}, sampling.again);
+    return out;
+}
+
+template LitImage<float> render_lit(const LitScene&, const SceneView<float>&, const Camera&, const RayCaster&,
+                                    const ImageOptions&, const LitOptions&, const LitSampling&, Team&,
+                                    const HitBuffers<float>&);
+template LitImage<double> render_lit(const LitScene&, const SceneView<double>&, const Camera&, const RayCaster&,
+                                     const ImageOptions&, const LitOptions&, const LitSampling&, Team&,
+                                     const HitBuffers<double>&);
+
+}  // namespace edgegrad
