@@ -11,7 +11,7 @@ from scenes import icosphere
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad import _lit, _lit_kernel
+from edgegrad import _borders, _lit, _lit_kernel
 from edgegrad._derivatives import transformed
 from edgegrad._request import make_request
 from edgegrad.hits import Forced, Hits
@@ -251,6 +251,82 @@ def test_borders_of_shadows_of_what_is_looked_up_nearest() -> None:
         found.append(torch.autograd.grad(image.sum(), [leaves["verts"], leaves["point"]]))
     for a, b in zip(*found, strict=True):
         assert float((a - b).norm()) < 1e-5 * float(a.norm()) > 0
+
+
+AROUND = {
+    **CAMERAS,
+    "panorama": eg.Camera.panorama(CAMERAS["perspective"].world_to_camera.double(), (48, 24)),
+}
+
+
+@pytest.mark.parametrize("view", AROUND)
+@pytest.mark.parametrize(
+    "words", ["colors directional point spot", "normals area point", "environment", "base emission harmonics"]
+)
+def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As from hits that are shaded one by one, with the pixels that borders of shadows run through shaded again."""
+    leaves = numbers_of(words)
+    camera = AROUND[view].replace(world_to_camera=AROUND[view].world_to_camera.double())
+    scenes = [scene_of(words, leaves), scene_of(words, leaves).replace(background=torch.rand(*camera.size, 3).double())]
+    again, borders = [], _borders.Borders.found
+    for options in ({"spp": 7, "seed": 5}, {"spp": 1}, {"light_samples": 3, "filter": "tent"}, {"shadows": False}):
+        for scene in scenes:
+            found = []
+            for whole in (True, False):
+                with monkeypatch.context() as patch:
+                    if not whole:
+                        patch.setattr(_lit, "_whole", lambda *arguments: None)
+                        keep = lambda self: (again.append(found := borders(self)), found)[1]  # noqa: E731
+                        patch.setattr(_borders.Borders, "found", keep)
+                    found.append(eg.render(scene, camera, **options))
+            assert float(found[0].max()) > 0.1
+            assert float((found[0] - found[1]).abs().max()) <= 1e-12 * float(found[0].abs().max())
+    assert ("point" not in words) or any(int(pixels.sum()) > 10 for pixels, _ in again)
+
+
+def test_the_same_whole_image_on_any_number_of_threads() -> None:
+    scene, before, found = scene_of(SCENES[-1], numbers_of(SCENES[-1])), torch.get_num_threads(), []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            found.append(eg.render(scene, CAMERAS["perspective"].resized((64, 64)), spp=4))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*found)
+
+
+def test_radiance_that_is_not_finite_is_named() -> None:
+    light = eg.PointLight(torch.tensor([0.0, 0.0, 3.0]), 1e25, torch.full((3,), 1e25))
+    ball = icosphere(2)
+    scene = eg.Scene([eg.Mesh(ball.verts.float(), ball.faces, material=eg.Material())], lights=[light])
+    with pytest.raises(ValueError, match=r"expected finite numbers, got .*inf"):
+        eg.render(scene, CAMERAS["perspective"])
+
+
+@pytest.mark.parametrize("view", CAMERAS)
+def test_light_on_flat_faces(view: str) -> None:
+    """E max(0, n·l) at corners, with the normal on the viewer's side; over the greatest."""
+    leaves = numbers_of("point directional")
+    scene = scene_of("point directional", leaves).replace(meshes=scene_of("point", leaves).meshes[:1])
+    frame = Frame(scene, make_request(scene, CAMERAS[view], 2, 0))
+    found = _lit._of_flat(frame.fixed, 0, frame.fixed_view)
+    (mesh,) = scene.meshes
+    corner = mesh.verts[mesh.faces.long()]
+    n = torch.nn.functional.normalize(
+        torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=1
+    )
+    towards = (n * frame.fixed_view.to_viewer(corner[:, 0])).sum(1, keepdim=True)
+    n, told = torch.where(towards < 0, -n, n)[:, None], towards[:, 0].abs() > 1e-3  # of others the side is left open
+    to_point = leaves["point"] - corner
+    distance = to_point.norm(dim=-1)
+    power = leaves["point_power"] * leaves["point_color"].mean()
+    sun = -torch.nn.functional.normalize(leaves["sun"], dim=0)
+    expected = torch.stack(
+        [power / distance**3 * (n * to_point).sum(-1), leaves["sun_power"] * (n @ sun).expand(-1, 3)], -1
+    ).clamp(min=0)
+    assert found.shape == expected.shape
+    assert int(told.sum()) > 250
+    assert float((found - expected / expected.max())[told].abs().max()) < 1e-12
 
 
 def test_without_shadows() -> None:

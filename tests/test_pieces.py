@@ -663,3 +663,18 @@ def test_vertices_inside_a_closed_surface_do_not_weld():
     verts = torch.cat([CUBE.verts, CUBE.verts + torch.tensor([1.2, 0.0, 0.0])])
     faces = torch.cat([CUBE.faces, CUBE.faces + 8])
     assert faces_at(edges_of(verts, faces)) == [2] * 36
+
+
+@pytest.mark.parametrize("filter", ["box", "tent", "gaussian"])
+def test_splats_and_their_adjoint(filter: str) -> None:
+    """⟨bar, splat(values)⟩ = ⟨splat_vjp(bar), values⟩, and what is spread sums to the filter's weights in the image."""
+    x, values, bar = 12 * random(200, 2) + 6, random(200, 3, seed=2), random(12 * 9, 3, seed=3)
+    found = core.splat(x, values, filter, 12, 9)
+    back = core.splat_vjp(x, bar, filter, 12, 9, 2)
+    assert np.sum(bar * found) == pytest.approx(np.sum(back * values), rel=1e-12)
+    inside = (np.abs(x - [6, 4.5]) < [4, 2.5]).all(1)
+    weights = core.splat(x[inside], values[inside], filter, 12, 9).sum(0)
+    spread = {"box": 0, "tent": 1e-12, "gaussian": 0.05}[filter]  # pixel centres do not sum a Gaussian exactly
+    np.testing.assert_allclose(weights, values[inside].sum(0), atol=spread * np.abs(values[inside]).sum() + 1e-12)
+    single = core.splat_vjp(x, bar.astype(np.float32), filter, 12, 9, 1)
+    np.testing.assert_allclose(single, back, atol=1e-6)
