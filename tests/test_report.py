@@ -195,10 +195,14 @@ def test_sweep_stops_where_the_next_point_would_cost_too_much():
     assert module._expected([(1, 2.0), (4, 2.3)], 16) == pytest.approx(3.5)  # mostly a cost that does not grow
 
 
-@pytest.mark.parametrize("part", ["interior", "boundary"])
-def test_terms_of_lit_scenes_are_left_out(part):
-    with pytest.raises(ValueError, match="not timed apart"):
-        Edgegrad(scenes.build("lit-point", 16), part)
+@pytest.mark.parametrize("scene", scenes.LIT)
+def test_lit_scenes(scene, tmp_path):
+    """From a reference that is computed anew. Their terms are not timed alone."""
+    document, _ = error_time(tmp_path, [scene], ["edgegrad", "boundary"], size=16, seeds=2, limit=5.0, quick=True)
+    of_scene = document["scenes"][scene]
+    assert "not timed apart" in of_scene["left_out"]["boundary"]
+    assert 0 < of_scene["reference"]["error"]["boundary"]["translation"] < 0.5
+    assert [point["method"] for point in document["points"]] == ["edgegrad"] * 3
 
 
 def test_scan_is_left_out_without_a_mesh(tmp_path, monkeypatch, capsys):

@@ -106,10 +106,6 @@ class Edgegrad:
     compile_seconds = 0.0
 
     def __init__(self, scene: ReportScene, part: str = "whole") -> None:
-        if part != "whole" and scene.scene.is_lit:
-            raise ValueError(
-                "a lit scene's samples are shaded ahead of the backward pass, where its terms are not timed apart"
-            )
         self.name = "edgegrad" if part == "whole" else part
         self.part = part
         self._scene = scene
@@ -237,10 +233,21 @@ def pixels_per_unit(scene: ReportScene) -> float:
 
 PEERS = ("direct_projective", "prb_projective")
 GUIDED = "-guided"
+
+
+def _term(scene: ReportScene, part: str) -> list[Edgegrad]:
+    """Raises ValueError."""
+    if scene.scene.is_lit:
+        raise ValueError(
+            "a lit scene's samples are shaded ahead of the backward pass, where its terms are not timed apart"
+        )
+    return [Edgegrad(scene, part)]
+
+
 METHODS: dict[str, Callable[[ReportScene], Sequence[Method]]] = {
     "edgegrad": lambda scene: [Edgegrad(scene)],
-    "interior": lambda scene: [Edgegrad(scene, "interior")],
-    "boundary": lambda scene: [Edgegrad(scene, "boundary")],
+    "interior": lambda scene: _term(scene, "interior"),
+    "boundary": lambda scene: _term(scene, "boundary"),
     # 6 V images are too many but for a single triangle.
     "finite-differences": lambda scene: [
         FiniteDifferences(scene, of_vertices) for of_vertices in ((False, True) if len(scene.verts) <= 3 else (False,))
