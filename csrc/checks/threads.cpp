@@ -6,6 +6,7 @@
 // Each image and gradient must have the bits that it has alone. With `race`, the threads of a loop add to one number,
 // which must be reported.
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdio>
@@ -17,6 +18,7 @@
 #include <vector>
 
 #include "backward/backward.h"
+#include "forward/lit_image.h"
 
 using namespace edgegrad;
 
@@ -110,6 +112,26 @@ Camera camera(bool perspective) {
 
 thread_local bool stop = false;
 
+// The scene, of one material, before a point of light.
+template <class T>
+struct Lit {
+    double eye[3], position[3] = {1, 0.5, -2.5}, intensity = 7;
+    LitScene scene;
+
+    Lit(const SceneView<T>& view, const Camera& camera) : eye{0, 0, camera.perspective ? -3. : -1.} {
+        scene.tables = {
+            {view.verts, true, view.n_verts, 3}, {eye, true, 1, 3}, {position, true, 1, 3}, {&intensity, true, 1, 1}};
+        LitMesh mesh;
+        mesh.faces = view.n_faces, mesh.has_material = true;
+        scene.meshes = {mesh};
+        Lamp lamp;
+        lamp.kind = Lamp::Kind::point, lamp.position = 2, lamp.intensity = 3, lamp.eps = 1e-7;
+        scene.lamps = {lamp};
+        scene.faces = view.faces, scene.verts = 0, scene.eye = 1, scene.perspective = camera.perspective;
+        scene.channels = channels, scene.radius = 4;
+    }
+};
+
 // The image and all gradients, one after the other.
 template <class T>
 std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKind filter, int spp) {
@@ -119,12 +141,17 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
     std::vector<float> depth(width * height);
     std::vector<int32_t> hit(2 * width * height);
     std::vector<uint8_t> seen(view.n_faces);
+    std::vector<double> all;
     GeometryWork work;
     const HitBuffers<T> hits{coverage.data(), depth.data(), hit.data(), seen.data()};
     const ImageOptions options{spp, Filter(filter), 1};
     {
         const auto geometry =
             acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, spacing, {}, team, work);
+        const Lit<T> lit(view, camera);
+        const LitImage<T> lit_image = render_lit(lit.scene, view, camera, geometry->caster(), options, LitOptions(),
+                                                 LitSampling{1, 3, 4}, team, hits);
+        all.assign(lit_image.radiance.begin(), lit_image.radiance.end());
         render_forward(view, camera, geometry->caster(), options, team, image.data(), hits);
     }
     std::vector<double> verts(scene.verts.size()), colors(scene.colors.size()), uvs(scene.uvs.size()),
@@ -139,7 +166,8 @@ std::vector<double> render(const Scene<T>& scene, const Camera& camera, FilterKi
     const auto geometry = acquire_geometry(view.faces, view.n_faces, view.verts, view.n_verts, spacing,
                                            geometry_for(true, true), team, work);
     render_backward(BackwardInput<T>{view, camera, *geometry, options, image.data(), hits}, {.seed = 2}, team, grad);
-    std::vector<double> all(image.begin(), image.end());
+    if (!(*std::max_element(all.begin(), all.end()) > 0)) std::puts("the lit image is black"), std::exit(1);
+    all.insert(all.end(), image.begin(), image.end());
     for (const auto* values : {&verts, &colors, &uvs, &texels, &background, &pose, &K}) {
         const double size = std::inner_product(values->begin(), values->end(), values->begin(), 0.0);
         if (!(size > 0) || !std::isfinite(size)) std::puts("a gradient is zero or not finite"), std::exit(1);
