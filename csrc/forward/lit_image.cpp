@@ -26,7 +26,7 @@ class Sights {
     // Of one point.
     void add(int x, int y, const int8_t* seen) {
         ++points_[int64_t(y) * width_ + x];
-        uint8_t* here = &seen_[at(x, y)];
+        uint8_t* here = seen_.data() + at(x, y);
         for (size_t l = 0; l < columns_.size(); ++l)
             if (const int8_t s = seen[columns_[l]]; s != not_asked) here[l] |= s ? visible : hidden;
     }
@@ -49,7 +49,8 @@ class Sights {
     size_t at(int x, int y) const { return (size_t(y + 1) * (width_ + 2) + x + 1) * columns_.size(); }
     void mark(int y, uint8_t* pixels) const {
         const size_t L = columns_.size(), n = L * width_;
-        const uint8_t *above = &seen_[at(0, y - 1)], *row = &seen_[at(0, y)], *below = &seen_[at(0, y + 1)];
+        const uint8_t *above = seen_.data() + at(0, y - 1), *row = seen_.data() + at(0, y),
+                      *below = seen_.data() + at(0, y + 1);
         std::vector<uint8_t> both(n);
         for (size_t e = 0; e < n; ++e)
             both[e] = (above + e)[-ptrdiff_t(L)] | above[e] | above[e + L] | (row + e)[-ptrdiff_t(L)] | row[e + L] |
