@@ -104,7 +104,7 @@ def light_on_faces(
         verts, faces, eye, place, arriving = map(array, tensors)
         threads = torch.get_num_threads()
         found = core.light_on_faces(verts, faces, eye, view.perspective, place, infinite, arriving, threads)
-        return (torch.from_numpy(found).reshape(len(faces), 3, -1),)
+        return (torch.from_numpy(found),)
 
     tensors = (verts.double(), faces.int(), view.eye.double(), place.double(), arriving.double())
     return without_derivatives(compute, *tensors)[0].to(verts.device)

@@ -108,10 +108,12 @@ class _Velocity(NamedTuple):
         grads = []
         for want, form, table in zip(wanted, self._forms(tensors), tensors, strict=False):
             assert table is not None
-            grad = table.new_zeros(table.shape, dtype=torch.float64)
-            if want:
-                grad = grad.index_add(0, form.row, form.by * bar.index_select(0, form.sample)[:, None])
-            grads.append(grad.to(table.dtype))
+            if not want:
+                grads.append(table.new_zeros(0))
+                continue
+            parts = (array(form.sample), array(form.row), doubles(form.by), doubles(bar))
+            grad = torch.from_numpy(core.form_vjp(*parts, len(table), torch.get_num_threads()))
+            grads.append(grad.to(table))
         return grads
 
     def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:

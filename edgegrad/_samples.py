@@ -43,9 +43,14 @@ class CurveRecords(NamedTuple):
     """Samples on curves where the image may jump."""
 
     x: Tensor  # (S, 2) float64, pixel positions
-    face: Tensor  # (S, 3) int64 of the surfaces there; -1: the background, -2: none
-    b: Tensor  # (S, 3, 2) float64, the last two barycentrics on them
-    factor: Tensor  # (S, 3) float64: the jump, times what the sample stands for, is the sum of factor · radiance
+    # N points of surfaces there, at most three a sample. The jump, times what a sample stands for, is Σ factor · radiance.
+    hit_sample: Tensor  # (N,) int64, whose each is
+    hit_face: Tensor  # (N,) int64
+    hit_side: Tensor  # (N,) int64, which of the sample's it is
+    hit_b: Tensor  # (N, 3) float64, barycentrics
+    hit_x: Tensor  # (N, 2) float64, pixel position
+    hit_factor: Tensor  # (N,) float64
+    to_background: Tensor  # (S,) float64, the factor of what lies behind all surfaces
     by_k: Tensor  # (S, 14) float64, the curve's velocity by K in rows and the distortion; empty where these stay
     row_of: Tensor  # (R,) int64, the sample of a row
     vertex: Tensor  # (R,) int64
@@ -221,8 +226,10 @@ def visible(flat: Flat, face: Tensor, b: Tensor, to: Tensor, contact: Tensor) ->
 class Sampler:
     """The samples of one camera of a request."""
 
-    def __init__(self, request: Request, camera: int) -> None:
-        self._request, self._camera = request, camera
+    def __init__(self, request: Request, camera: int, least: float) -> None:
+        """`least`: barycentrics of points on curves are no less."""
+        self._request, self._camera, self._least = request, camera, least
+        self._kept: tuple[list[Any], Flat, Any] | None = None
         height, width, faces = request.camera.height, request.camera.width, len(request.scene.faces)
         dtype = request.scene.colors.dtype
         self._hits = ImageHits(
@@ -240,6 +247,13 @@ class Sampler:
     @property
     def grad_seed(self) -> int:
         return camera_seed(self._request.gradient.grad_seed, self._camera)
+
+    def _scene(self, flat: Flat) -> Any:
+        """The kernel's, checked once: most calls are given the same arrays."""
+        key = [part.data_ptr() if isinstance(part, Tensor) else part for part in flat]
+        if self._kept is None or self._kept[0] != key:
+            self._kept = key, flat, kernel_scene(flat)  # with the tensors, so that no other ones come to lie there
+        return self._kept[2]
 
     def _compute(self, request: Request, compute: Callable[..., Sequence[Tensor]], *more: Tensor) -> tuple[Tensor, ...]:
         """compute(request, camera of the kernel, *more) of values."""
@@ -268,7 +282,7 @@ class Sampler:
             ) -> PixelRecords:
                 if first == 0 and not only:
                     warn_of_ends([camera])
-                found = kernel_scene(request.scene).pixel_hits(
+                found = self._scene(request.scene).pixel_hits(
                     first=first,
                     end=end,
                     most=most,
@@ -294,7 +308,7 @@ class Sampler:
 
         def with_request(request: Request, camera: Any, *tables: Tensor) -> Sequence[Tensor]:
             warn_of_ends([camera])
-            return compute(kernel_scene(request.scene), request.scene.faces, self._image(request, camera), *tables)
+            return compute(self._scene(request.scene), request.scene.faces, self._image(request, camera), *tables)
 
         return self._compute(self._request, with_request, *tables)
 
@@ -305,7 +319,7 @@ class Sampler:
 
         def compute(request: Request, camera: Any) -> Sequence[Tensor]:
             flat, options = request.scene, request.gradient
-            surface, curves = kernel_scene(flat).samples(
+            surface, curves = self._scene(flat).samples(
                 camera=camera,
                 image=core.ImageOptions(**request.image._asdict()),
                 options=core.GradientOptions(
@@ -318,6 +332,7 @@ class Sampler:
                     steps=steps,
                     step_spacing=options.step_spacing,
                 ),
+                least=self._least,
                 threads=torch.get_num_threads(),
                 adjoint=np.ones((*self.coverage.shape, flat.background.shape[-1]), self.coverage.numpy().dtype),
                 hits=kernel_hits(self._hits),
@@ -328,17 +343,22 @@ class Sampler:
         count = len(SurfaceRecords._fields)
         return SurfaceRecords(*parts[:count]), CurveRecords(*parts[count:])
 
-    def shadow_samples(self, light: LightParts, seed: int, samples: int, intrinsics: bool) -> CurveRecords:
-        """On the borders of a light's shadows, after all pixel hits were taken; so many, or by default."""
+    def shadow_samples(
+        self, light: LightParts, seed: int, samples: int, intrinsics: bool, one: bool = False
+    ) -> CurveRecords:
+        """On the borders of a light's shadows, after all pixel hits were taken; so many, or by default. `one`: with the point in
+        the light alone."""
 
         def compute(request: Request, camera: Any, *rows: Tensor) -> CurveRecords:
             arrays = (tensor.cpu().contiguous().numpy() for tensor in rows)
-            found = kernel_scene(request.scene).shadow_samples(
+            found = self._scene(request.scene).shadow_samples(
                 camera=camera,
                 image=core.ImageOptions(**request.image._asdict()),
                 options=core.GradientOptions(seed=seed, intrinsics=intrinsics),
                 light=core.LightParts(*arrays, *light[3:]),
                 samples=samples,
+                least=self._least,
+                one=one,
                 threads=torch.get_num_threads(),
                 adjoint=np.ones(
                     (*self.coverage.shape, request.scene.background.shape[-1]), self.coverage.numpy().dtype
@@ -353,7 +373,7 @@ class Sampler:
         """What is seen at places (N, 2) in the image."""
 
         def compute(request: Request, camera: Any, x: Tensor) -> PlaceRecords:
-            found = kernel_scene(request.scene).hits_at(camera=camera, x=_array(x), threads=torch.get_num_threads())
+            found = self._scene(request.scene).hits_at(camera=camera, x=_array(x), threads=torch.get_num_threads())
             return _record(PlaceRecords, found)
 
         return PlaceRecords(*self._compute(self._request, compute, x))

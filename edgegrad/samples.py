@@ -55,9 +55,9 @@ class Frame:
     def __init__(self, scene: Scene, request: Request, index: int = 0) -> None:
         packed = request.camera
         self.request, self._index = request._replace(scene=without_colors(request.scene)), index
-        self.sampler = Sampler(self.request, index)
         self.surfaces = Surfaces(scene)
         self.device, self.dtype = self.surfaces.verts.device, self.surfaces.verts.dtype
+        self.sampler = Sampler(self.request, index, torch.finfo(self.dtype).eps ** (2 / 3))
         self.view = View(packed.world_to_camera[index].to(self.device, torch.float64), packed.perspective)
         self.fixed, self.fixed_view = self.surfaces.detach(), self.view.detach()
         self.intrinsics = torch.cat([packed.K[index, :2].reshape(6), packed.distortion[index]])
@@ -95,8 +95,8 @@ class Frame:
         steps: Steps | None = None,
         forced: Forced | None = None,
     ) -> Hits:
-        """Without derivatives; b (N, 2)."""
-        place = self.here(face), self.here(barycentrics(b)), self.here(x)
+        """Without derivatives; b (N, 3), or the last two barycentrics."""
+        place = self.here(face), self.here(b if b.shape[1] == 3 else barycentrics(b)), self.here(x)
         return Hits(self.fixed, self.fixed_view, *place, self.sampler.rays_at, steps, seed, forced)
 
     @property
@@ -221,28 +221,24 @@ class EdgeSamples:
     def __init__(
         self, frame: Frame, records: CurveRecords, light: ShadowLight | None = None, only: bool = False
     ) -> None:
-        """Of borders of the shadow of a light; `only`: the hits ask what it adds where it is seen, and are not on both sides."""
+        """Of borders of the shadow of a light; `only`: the hits, those in the light alone, ask what it adds."""
         self.frame, self._records = frame, records
         self.x = frame.here(records.x)
+        self._in_order = only and len(records.hit_sample) == len(records.x)  # whether the i-th hit is the i-th sample's
+        self.sample, self._factor = frame.here(records.hit_sample), frame.here(records.hit_factor)
+        self.to_background = frame.here(records.to_background)
         points = None
         if light is not None:
             points, share = light.points(frame.here(records.light), frame.here(records.light_uv))
-            records = records._replace(factor=records.factor * share.cpu()[:, None])
-        there = records.face[:, :1] if only else records.face
-        sample, which = (there >= 0).nonzero(as_tuple=True)
-        self.sample, self._factor = frame.here(sample), frame.here(records.factor[sample, which])
-        # On the border of a face a little inside, so that rounding does not take a step along it for passed: at u = 1 a texture
-        # that repeats begins anew.
-        b = _within(records.b[sample, which], torch.finfo(frame.dtype).eps ** (2 / 3))
+            self._factor, self.to_background = self._factor * share[self.sample], self.to_background * share
         # All sides of a sample see the same points of lights.
         seed = frame.seeds("edges" if light is None else "shadows", len(self))[self.sample]
         forced = None
         if light is not None and points is not None:
-            lit = frame.here(which == 0).to(frame.dtype)
+            lit = frame.here(records.hit_side == 0).to(frame.dtype)
             some = torch.ones_like(lit, dtype=torch.bool)
             forced = Forced(light.number, points.select(self.sample), lit, some, only)
-        self.hits = frame.fixed_hits(records.face[sample, which], b, records.x[sample], seed, forced=forced)
-        self.to_background = frame.here(torch.where(records.face == -1, records.factor, 0).sum(1))
+        self.hits = frame.fixed_hits(records.hit_face, records.hit_b, records.hit_x, seed, forced=forced)
         flat = frame.request.scene
         forms = [
             (Form(records.row_of, records.vertex, records.by_q), frame.view.in_camera(frame.surfaces.verts)),
@@ -267,16 +263,14 @@ class EdgeSamples:
     def jump(self, radiance: Tensor) -> Tensor:
         """(S, C) how the image jumps at each sample, from the radiance (N, C) of the hits; a background comes in by
         attach_boundary(). Raises TypeError or ValueError that names the argument."""
-        radiance = _rows("radiance", radiance, len(self.hits))
-        return self.sum(self.sample, self._factor, radiance)
+        return self.sum(_rows("radiance", radiance, len(self.hits)))
 
-    def jump_of(self, first: int, end: int, radiance: Tensor) -> Tensor:
-        """What some of the hits add to it."""
-        return self.sum(self.sample[first:end], self._factor[first:end], radiance)
-
-    def sum(self, sample: Tensor, factor: Tensor, radiance: Tensor) -> Tensor:
-        weighted = factor.to(radiance.dtype)[:, None] * radiance
-        return radiance.new_zeros((len(self), radiance.shape[1])).index_add(0, sample, weighted)
+    def sum(self, radiance: Tensor) -> Tensor:
+        """(S, C) from the radiance (N, C)."""
+        weighted = self._factor.to(radiance.dtype)[:, None] * radiance
+        if self._in_order:
+            return weighted
+        return radiance.new_zeros((len(self), radiance.shape[1])).index_add(0, self.sample, weighted)
 
 
 # -- what users call ----------------------------------------------------------------------------------------------------
@@ -418,12 +412,6 @@ def boundary(
         return zero
     share = splat(x.detach(), (velocity * to_background).to(jump.dtype)[:, None], frame.request, True)
     return zero + share * background.detach().reshape(-1, jump.shape[1]).to(jump)
-
-
-def _within(b: Tensor, least: float) -> Tensor:
-    """Barycentrics (N, 2), those of corners no less than that."""
-    b = barycentrics(b).clamp(min=least)
-    return (b / b.sum(1, keepdim=True))[:, 1:]
 
 
 def _request_of(primary: PrimaryHits, name: str, count: int | None) -> Request:

@@ -208,22 +208,24 @@ class _Image:
             light = ShadowLight.of(frame.surfaces, index, seed)
             moving = moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
             if moving or ShadowLight.moves(light.light):
-                records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics))
+                one = self._effort.adds_up
+                records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics), one)
                 if len(records.x):
-                    found = found + self._boundary(EdgeSamples(frame, records, light, self._effort.adds_up))
+                    found = found + self._boundary(EdgeSamples(frame, records, light, one))
         return found
 
     def _boundary(self, samples: EdgeSamples) -> Tensor:
         """(H · W, C): Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
-        jump = self._frame.fixed.verts.new_zeros((len(samples), self._channels or 1))
         at_once = self._effort.at_once
+        parts = [self._frame.fixed.verts.new_zeros((0, self._channels or 1))]
         with torch.no_grad():
             for first in range(0, len(samples.hits), at_once):
-                end = min(first + at_once, len(samples.hits))
                 points = samples.hits
                 if len(points) > at_once:
+                    end = min(first + at_once, len(points))
                     points = points.apart(torch.arange(first, end, device=self._frame.device))
-                jump = jump + samples.jump_of(first, end, self._shade(points).detach())
+                parts.append(self._shade(points).detach())
+            jump = samples.sum(torch.cat(parts[1:] or parts))
         return boundary(self._frame, samples.x, samples.velocity, jump, samples.to_background, self._background)
 
     def _steps(self) -> Tensor:

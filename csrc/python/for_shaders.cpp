@@ -6,10 +6,12 @@
 
 #include "backward/backward.h"
 #include "boundary/shadows.h"
+#include "contract/curve_hits.h"
 #include "forward/pixel_hits.h"
 #include "forward/places.h"
 #include "forward/trace.h"
 #include "python/arrays.h"
+#include "python/shaped.h"
 #include "python/unlocked.h"
 
 using namespace nanobind::literals;
@@ -17,19 +19,6 @@ using namespace nanobind::literals;
 namespace edgegrad {
 
 namespace {
-
-// A vector or an Array as an array of rows of this shape, without a copy.
-template <class Values>
-nb::object rows(Values&& values, std::vector<size_t> row = {}) {
-    static_assert(!std::is_reference_v<Values>);  // it is moved from
-    using X = std::remove_pointer_t<decltype(values.data())>;
-    size_t width = 1;
-    for (const size_t n : row) width *= n;
-    auto* kept = new Values(std::move(values));
-    const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<Values*>(p); });
-    row.insert(row.begin(), size_t(kept->size()) / width);
-    return nb::cast(nb::ndarray<nb::numpy, X>(kept->data(), row.size(), row.data(), owner));
-}
 
 // What work(Team&) gives, without the interpreter's lock.
 template <class Work>
@@ -61,8 +50,13 @@ nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const Im
     return out;
 }
 
-nb::dict arrays_of(const std::vector<CurveRecords>& parts, int threads) {
+nb::dict arrays_of(const std::vector<CurveRecords>& parts, double least, bool one, int threads) {
     nb::dict curves;
+    CurveHits hits = on_team(threads, [&](Team& team) { return curve_hits(parts, least, one, team); });
+    curves["hit_sample"] = rows(std::move(hits.sample)), curves["hit_face"] = rows(std::move(hits.face));
+    curves["hit_side"] = rows(std::move(hits.side)), curves["hit_b"] = rows(std::move(hits.b), {3});
+    curves["hit_x"] = rows(std::move(hits.x), {2}), curves["hit_factor"] = rows(std::move(hits.factor));
+    curves["to_background"] = rows(std::move(hits.to_background));
     const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {
         curves[name] = rows(on_team(threads, [&](Team& team) { return joined(parts, field, team); }), std::move(row));
     };
@@ -70,8 +64,7 @@ nb::dict arrays_of(const std::vector<CurveRecords>& parts, int threads) {
         curves[name] = rows(on_team(threads, [&](Team& team) { return joined_rows(parts, field, team); }));
     };
     using C = CurveRecords;
-    add("x", &C::x, {2}), add("face", &C::face, {C::surfaces}), add("b", &C::b, {C::surfaces, 2});
-    add("factor", &C::factor, {C::surfaces}), add("by_k", &C::by_k, {intrinsics_width});
+    add("x", &C::x, {2}), add("by_k", &C::by_k, {intrinsics_width});
     add_rows("row_of", &C::row_of), add("vertex", &C::vertex), add("by_q", &C::by_q, {3});
     add_rows("uv_row_of", &C::uv_row_of), add("uv", &C::uv), add("by_uv", &C::by_uv, {2});
     add_rows("alpha_row_of", &C::alpha_row_of), add("alpha", &C::alpha), add("by_alpha", &C::by_alpha);
@@ -82,7 +75,8 @@ nb::dict arrays_of(const std::vector<CurveRecords>& parts, int threads) {
 // The samples of the terms inside faces and on curves, as records of arrays.
 template <class T>
 nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
-                  const GradientOptions& options, int threads, Out<T, 3> adjoint, const HitArrays<T>& hits) {
+                  const GradientOptions& options, double least, int threads, Out<T, 3> adjoint,
+                  const HitArrays<T>& hits) {
     check_image("adjoint", adjoint, camera, arrays.background.shape(2));
     hits.check(arrays, camera);
     const SceneView<T> scene = arrays.view();
@@ -99,7 +93,7 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
     using S = SurfaceRecords;
     add("face", &S::face), add("x", &S::x, {2}), add("along", &S::along, {3}), add("weight", &S::weight);
     add("along_by_k", &S::along_by_k, {3, intrinsics_width});
-    return nb::make_tuple(surface, arrays_of(found.curves, threads));
+    return nb::make_tuple(surface, arrays_of(found.curves, least, false, threads));
 }
 
 // A light as edges cast shadows of it.
@@ -128,8 +122,8 @@ struct LightArrays {
 // The samples on the borders of shadows.
 template <class T>
 nb::dict shadow_samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
-                        const GradientOptions& options, const LightArrays& light, int64_t samples, int threads,
-                        Out<T, 3> adjoint, const HitArrays<T>& hits) {
+                        const GradientOptions& options, const LightArrays& light, int64_t samples, double least,
+                        bool one, int threads, Out<T, 3> adjoint, const HitArrays<T>& hits) {
     check_image("adjoint", adjoint, camera, arrays.background.shape(2));
     hits.check(arrays, camera), light.check(int64_t(arrays.faces.shape(0)));
     const SceneView<T> scene = arrays.view();
@@ -140,7 +134,7 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const Camera& camera, cons
         found = record_shadows(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view()}, options,
                                light.view(), samples, team);
     });
-    return arrays_of(found, threads);
+    return arrays_of(found, least, one, threads);
 }
 
 Places places_of(const In<double, 2>& x) {
@@ -251,9 +245,10 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
     scene
         .def("pixel_hits", &pixel_hits<T>, "camera"_a, "image"_a, "threads"_a, "first"_a, "end"_a, "most"_a,
              "only"_a.none(), "hits"_a)
-        .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
+        .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "least"_a, "threads"_a,
+             "adjoint"_a.noconvert(), "hits"_a)
         .def("shadow_samples", &shadow_samples<T>, "camera"_a, "image"_a, "options"_a, "light"_a, "samples"_a,
-             "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
+             "least"_a, "one"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)
         .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(),
              "ignored"_a.noconvert().none(), "threads"_a)

@@ -11,6 +11,7 @@
 
 #include "forward/lit_image.h"
 #include "python/arrays.h"
+#include "python/shaped.h"
 #include "python/unlocked.h"
 #include "shading/lit/flat_light.h"
 
@@ -236,17 +237,6 @@ struct PointArrays {
     }
 };
 
-// A vector or an Array as rows of a width that may be zero.
-template <class Values>
-nb::object array_of(Values&& values, size_t rows, size_t columns) {
-    static_assert(!std::is_reference_v<Values>);  // it is moved from
-    using X = std::remove_pointer_t<decltype(values.data())>;
-    auto* kept = new Values(std::move(values));
-    const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<Values*>(p); });
-    const size_t shape[] = {rows, columns};
-    return nb::cast(nb::ndarray<nb::numpy, X>(kept->data(), 2, shape, owner));
-}
-
 template <class T>
 void check_faces(const SceneArrays<T>& arrays, const LitArrays& lit) {
     if (arrays.faces.shape(0) == 0 ||
@@ -270,8 +260,8 @@ nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const
               seen.data(), team);
     });
     const size_t n = size_t(view.size);
-    return nb::make_tuple(array_of(std::move(radiance), n, size_t(lit.scene.channels)),
-                          array_of(std::move(seen), n, lights));
+    return nb::make_tuple(shaped(std::move(radiance), {n, size_t(lit.scene.channels)}),
+                          shaped(std::move(seen), {n, lights}));
 }
 
 // (F, 3, L); see flat_light.h. Places (L, 3), and what arrives at vertices (L, V).
@@ -290,7 +280,7 @@ nb::object light_on_faces(In<double, 2> verts, Rows faces, In<double, 1> eye, bo
         found = light_on_flat_faces(
             {verts.data(), faces.data(), int64_t(V), int64_t(F), {eye(0), eye(1), eye(2)}, perspective}, lights, team);
     });
-    return array_of(std::move(found), F, 3 * L);
+    return shaped(std::move(found), {F, 3, L});
 }
 
 // The image before what lies behind the surfaces, (H · W, C), and which lamps' shadows were asked for.
@@ -309,8 +299,8 @@ nb::tuple lit_image(const SceneArrays<T>& arrays, const LitArrays& lit, const Ca
     });
     const size_t channels = size_t(lit.scene.channels), pixels = size_t(found.radiance.size()) / channels;
     const size_t lamps = found.asked.size();
-    return nb::make_tuple(array_of(std::move(found.radiance), pixels, channels),
-                          array_of(std::move(found.asked), lamps, 1));
+    return nb::make_tuple(shaped(std::move(found.radiance), {pixels, channels}),
+                          shaped(std::move(found.asked), {lamps, 1}));
 }
 
 void check_seen(const LitArrays& lit, const LitPoints& points, const LitOptions& options, const In<int8_t, 2>& seen) {
@@ -340,9 +330,9 @@ nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, cons
     nb::list out;
     for (size_t i = 0; i < found.size(); ++i)
         if (const Table& table = lit.scene.tables[i]; wanted[i])
-            out.append(array_of(std::move(found[i]), size_t(table.rows), size_t(table.width)));
+            out.append(shaped(std::move(found[i]), {size_t(table.rows), size_t(table.width)}));
         else out.append(nb::none());
-    return nb::make_tuple(out, array_of(std::move(b_bar), size_t(view.size), 3));
+    return nb::make_tuple(out, shaped(std::move(b_bar), {size_t(view.size), 3}));
 }
 
 nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, const LitOptions& options,
@@ -365,7 +355,7 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
     unlocked(threads, [&](Team& team) {
         shade_jvp(moving, view, options, seen.data(), b_dot ? b_dot->data() : nullptr, out.data(), team);
     });
-    return array_of(std::move(out), size_t(view.size), size_t(moving.channels));
+    return shaped(std::move(out), {size_t(view.size), size_t(moving.channels)});
 }
 
 }  // namespace

@@ -6,7 +6,9 @@
 
 #include <optional>
 
+#include "core/array.h"
 #include "python/checks.h"
+#include "python/shaped.h"
 #include "python/unlocked.h"
 
 using namespace nanobind::literals;
@@ -38,20 +40,13 @@ void check(const HitFaces& hits, const Doubles& verts, const Doubles& world_to_c
     if (along.shape(0) != hits.face.size() || along.shape(1) != 3) refuse("along: expected a row a hit");
 }
 
-nb::object array_of(std::vector<double>&& values, size_t columns) {
-    auto* kept = new std::vector<double>(std::move(values));
-    const nb::capsule owner(kept, [](void* p) noexcept { delete static_cast<std::vector<double>*>(p); });
-    const size_t shape[] = {kept->size() / columns, columns};
-    return nb::cast(nb::ndarray<nb::numpy, double>(kept->data(), 2, shape, owner));
-}
-
 nb::object meet(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along, int threads) {
     check(hits, verts, world_to_camera, along);
     std::vector<double> b(3 * hits.face.size());
     unlocked(threads, [&](Team& team) {
         meet_faces(hits.view(), {verts.data(), world_to_camera.data(), along.data()}, b.data(), team);
     });
-    return array_of(std::move(b), 3);
+    return rows(std::move(b), {3});
 }
 
 // Cotangents of verts, world_to_camera and along.
@@ -64,8 +59,8 @@ nb::tuple meet_vjp(const HitFaces& hits, Doubles verts, Doubles world_to_camera,
         meet_faces_vjp(hits.view(), {verts.data(), world_to_camera.data(), along.data()}, bar.data(),
                        {verts_bar.data(), pose_bar.data(), along_bar.data()}, team);
     });
-    return nb::make_tuple(array_of(std::move(verts_bar), 3), array_of(std::move(pose_bar), 4),
-                          array_of(std::move(along_bar), 3));
+    return nb::make_tuple(rows(std::move(verts_bar), {3}), rows(std::move(pose_bar), {4}),
+                          rows(std::move(along_bar), {3}));
 }
 
 nb::object meet_jvp(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along,
@@ -85,7 +80,32 @@ nb::object meet_jvp(const HitFaces& hits, Doubles verts, Doubles world_to_camera
     unlocked(threads, [&](Team& team) {
         meet_faces_jvp(hits.view(), {verts.data(), world_to_camera.data(), along.data()}, tangents, b_dot.data(), team);
     });
-    return array_of(std::move(b_dot), 3);
+    return rows(std::move(b_dot), {3});
+}
+
+// Σ by · bar[sample] of the rows of a linear form, by rows of the table that it is of: (R, K).
+nb::object form_vjp(In<int64_t, 1> sample, In<int64_t, 1> row, Doubles by, In<double, 1> bar, int64_t table,
+                    int threads) {
+    const size_t n = row.size(), K = by.shape(1);
+    if (sample.size() != n || by.shape(0) != n) refuse("form: expected as many samples, rows and derivatives");
+    for (size_t i = 0; i < n; ++i)
+        if (sample(i) < 0 || sample(i) >= int64_t(bar.size()) || row(i) < 0 || row(i) >= table)
+            refuse("form: expected samples and rows that there are");
+    Array<double> out(0);
+    unlocked(threads, [&](Team& team) {
+        out = zeros(table * int64_t(K), team);
+        // Each thread owns some rows, runs of them, and adds to them in order.
+        constexpr int64_t run = 64;
+        const int owners = team.threads();
+        team.each(owners, [&](int64_t owner) {
+            for (size_t i = 0; i < n; ++i) {
+                if ((row(i) / run) % owners != owner) continue;
+                const double weight = bar(sample(i));
+                for (size_t k = 0; k < K; ++k) out[row(i) * int64_t(K) + int64_t(k)] += by(i, k) * weight;
+            }
+        });
+    });
+    return shaped(std::move(out), {size_t(table), K});
 }
 
 }  // namespace
@@ -97,6 +117,8 @@ void bind_moving_hits(nb::module_& m) {
           "threads"_a);
     m.def("meet_vjp", &meet_vjp, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(),
           "along"_a.noconvert(), "bar"_a.noconvert(), "threads"_a);
+    m.def("form_vjp", &form_vjp, "sample"_a.noconvert(), "row"_a.noconvert(), "by"_a.noconvert(), "bar"_a.noconvert(),
+          "table"_a, "threads"_a);
     m.def("meet_jvp", &meet_jvp, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(),
           "along"_a.noconvert(), "verts_dot"_a.none(), "pose_dot"_a.none(), "along_dot"_a.none(), "threads"_a);
 }
