@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ._formats.part import Fault, Part
-from .mesh import Mesh
+from .mesh import LARGEST_UV, Mesh
 
 
 def _look_of(part: Part) -> tuple[object, ...]:
@@ -54,12 +54,15 @@ def to_mesh(part: Part) -> Mesh:
     verts, faces = _weld(part.verts, part.faces)
     images: dict[str, Any] = {**_material(part), "name": part.name or None}
     shared = part.material is not None and set(part.material.textures) - set(part.material_uvs)
-    if part.texture is not None or part.alpha is not None or shared:
-        if part.uvs is None:
-            raise Fault(f"part {part.name!r}: expected texture coordinates for its texture, got none; unwrap the mesh")
-        uvs, uv_faces = _weld(part.uvs, part.faces)
+    textured = part.texture is not None or part.alpha is not None or bool(shared)
+    if textured and part.uvs is None:
+        raise Fault(f"part {part.name!r}: expected texture coordinates for its texture, got none; unwrap the mesh")
+    # Those that nothing of the file needs are for textures to come, and for shaders.
+    if part.uvs is not None and (textured or bool((np.abs(part.uvs) <= LARGEST_UV).all())):
+        images["uvs"], images["uv_faces"] = _weld(part.uvs, part.faces)
+    if textured:
         wrap = part.wrap[0] if part.wrap[0] == part.wrap[1] else part.wrap
-        images |= {"uvs": uvs, "uv_faces": uv_faces, "texture": part.texture, "wrap": wrap, "filter": part.filter}
+        images |= {"texture": part.texture, "wrap": wrap, "filter": part.filter}
     if part.alpha is not None:
         images |= {"alpha": part.alpha, "alpha_cutoff": part.cutoff}
     if part.normals is not None:

@@ -37,11 +37,12 @@ def from_trimesh(given: Any) -> Mesh:
         elif visual.kind == "face":
             look["face_colors"] = linear_colors("face", visual.face_colors, srgb=True)
         elif visual.kind == "texture" and visual.uv is not None:
+            look["uvs"] = np.asarray(visual.uv, np.float32)
             material = visual.material
             image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
             if image is not None:
                 image.format = image.format or "PNG"  # one that was made, not read
-                look |= {"texture": Textures().get("texture", image), "uvs": np.asarray(visual.uv, np.float32)}
+                look["texture"] = Textures().get("texture", image)
         return to_mesh(Part("", np.asarray(given.vertices, np.float32), np.asarray(given.faces, np.int64), **look))
     except Fault as fault:
         raise ValueError(f"mesh: {fault}") from fault.__cause__
@@ -83,7 +84,8 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     """Writes a mesh: PLY, OBJ, GLB, STL or OFF by the name's ending. Missing folders are made.
 
     Colours become 8-bit (sRGB; in a GLB those of vertices linear, as the format wants), clipped to 0 … 1; an OBJ's texture lies
-    beside it with its .mtl. STL holds the shape alone. Materials, normals and alpha are left out.
+    beside it with its .mtl. STL holds the shape alone. Materials, normals and alpha are left out, and texture
+    coordinates without a texture.
 
     Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
     """

@@ -62,8 +62,9 @@ def load_mesh(
 
     Vertices that the file repeats (at texture seams, for normals, in triangle soups) are welded where their float32
     positions are equal; unused ones are left out; polygons become fans of triangles. Texture coordinates are indexed
-    apart, v running up. Where welded vertices had different colours, they become `corner_colors`. OFF and 3MF give
-    the shape only. What colours mean stands at the top of this module. Parts that look alike (all plain, all with
+    apart, v running up; an OBJ's and a glTF's are there without a texture too. Where welded vertices had different
+    colours, they become `corner_colors`. OFF and 3MF give the shape only. What colours mean stands at the top of this
+    module. Parts that look alike (all plain, all with
     vertex colours, all with face colours, all on one texture; lit, all with one material) become one Mesh. Files that the
     file names are read from its folder and below, and from nowhere else.
 

@@ -4,6 +4,7 @@ import io
 import json
 import logging
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -182,6 +183,23 @@ def test_vertices_stay_welded_at_a_texture_seam_and_a_crease(tmp_path):
     assert mesh.faces[0, 0] == mesh.faces[1, 0] and mesh.uv_faces[0, 0] != mesh.uv_faces[1, 0]
     np.testing.assert_allclose(mesh.uvs[mesh.uv_faces[1]].numpy(), [[0.5, 0], [0.5, 1], [0, 1]])
     np.testing.assert_allclose(mesh.verts[mesh.faces[1]].numpy(), np.array(SQUARE)[[0, 2, 3]])
+
+
+@pytest.mark.parametrize("bad", [None, "nan", "1e10"])
+def test_texture_coordinates_without_a_texture(tmp_path, bad):
+    """For a texture to come; and those that no texture can have are no fault of a file without one."""
+    path = write_obj(tmp_path)
+    plain = path.read_text().replace("mtllib quad.mtl\n", "").replace("usemtl skin\n", "")
+    path.write_text(plain if bad is None else re.sub(r"(?m)^vt \S+", f"vt {bad}", plain, count=1))
+    mesh = load_mesh(path)
+    assert mesh.texture is None and mesh.channels is None and mesh.verts.tolist() == SQUARE
+    if bad is not None:
+        assert mesh.uvs is None
+        return
+    given = load_mesh(path, texture=tmp_path / "skin.png")
+    textured = mesh.replace(texture=given.texture)
+    for face, corner in np.ndindex(2, 3):
+        np.testing.assert_array_equal(texel_at(textured, face, corner), texel_at(given, face, corner))
 
 
 def test_obj_texture_given_by_hand(tmp_path):

@@ -84,7 +84,7 @@ def test_factors(tmp_path):
     assert (float(material.metallic), float(material.roughness)) == (0.25, 0.75)
     np.testing.assert_allclose(material.emission, [0.5, 0.25, 1.0])
     assert material.two_sided and material.alpha_mode == "OPAQUE" and mesh.channels == 3
-    assert material.textures == {} and mesh.uvs is None and mesh.face_colors is None
+    assert material.textures == {} and mesh.texture is None and mesh.face_colors is None
     strength = {"KHR_materials_emissive_strength": {"emissiveStrength": 8.0}}
     material = loaded(tmp_path, {**given, "extensions": strength}).material
     np.testing.assert_allclose(material.emission, [4.0, 2.0, 8.0])
