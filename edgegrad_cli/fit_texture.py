@@ -16,7 +16,7 @@ def add(commands: Any) -> None:
     add_views(parser, "the pictures; an alpha channel is taken as the mask")
     parser.add_argument("--size", type=count, default=512, help="texels on a side (%(default)s)")
     parser.add_argument("--background", help="#rrggbb, where pictures have no alpha; black when left out")
-    add_descent(parser, "texture.png")
+    add_descent(parser, "texture.png, mesh.glb")
     add_live(parser)
     parser.set_defaults(run=run)
 

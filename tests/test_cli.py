@@ -282,6 +282,8 @@ def test_fit_texture(sphere, capsys):
     uv = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]]).numpy()
     square.visual = trimesh.visual.TextureVisuals(uv=uv)
     square.export(sphere / "square.obj")
+    text = (sphere / "square.obj").read_text()  # as many have them: texture coordinates, and no material
+    (sphere / "square.obj").write_text("".join(line for line in text.splitlines(True) if "mtl" not in line))
     view = eg.Camera.look_at((0.3, 0.2, 3.0), (0, 0, 0), size=(32, 32))
     save_camera(sphere / "c.json", view)
     plain = eg.Mesh(torch.tensor(square.vertices), torch.tensor(square.faces))
@@ -292,6 +294,8 @@ def test_fit_texture(sphere, capsys):
     torch.testing.assert_close(
         texture.flatten(0, 1).median(0).values, 0.7 * torch.tensor([1.0, 0.5, 0.2]), atol=0.05, rtol=0
     )
+    saved = eg.load_mesh(sphere / "out" / "mesh.glb")
+    torch.testing.assert_close(saved.texture, texture, atol=1e-6, rtol=0)
     assert (
         run("fit-texture", sphere / "square.obj", sphere / "p.png", "--camera", *2 * [sphere / "c.json"], *options) == 2
     )

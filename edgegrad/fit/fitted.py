@@ -6,6 +6,7 @@ import io
 import json
 import math
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -106,7 +107,8 @@ class Fit:
         fit.json      loss, state, cameras, and values of up to 64 numbers
         values.pt     all values, for torch.load
         history.json  loss, gradient norms and small values of each step
-        mesh*.ply     the shapes that moved, texture*.png their textures, as sRGB
+        mesh*.ply     the shapes that moved
+        texture*.png  textures of 1 or 3 channels, as sRGB; mesh*.glb: the meshes with them, where pillow is installed
         camera*.json  the cameras, as load_camera reads them
         fit.png       plot(), loss.png: plot_history(); not with figures=False
 
@@ -134,6 +136,9 @@ class Fit:
             if mesh.texture is not None and mesh.texture.shape[-1] in (1, 3):
                 write_image(out / f"texture{number}.png", mesh.texture.clamp(0.0, 1.0))
                 written.append(f"texture{number}.png")
+                if find_spec("PIL"):
+                    save_mesh(out / f"mesh{number}.glb", mesh)
+                    written.append(f"mesh{number}.glb")
         for i, camera in enumerate(self.cameras):
             name = f"camera{'' if len(self.cameras) == 1 else i}.json"
             save_camera(out / name, camera)
