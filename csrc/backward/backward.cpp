@@ -262,7 +262,6 @@ BackwardProfile& BackwardProfile::operator+=(const BackwardProfile& o) {
     silhouettes += o.silhouettes, creases += o.creases, intersections += o.intersections, rim += o.rim;
     measure += o.measure, curves += o.curves, view += o.view, world += o.world;
     step_lines += o.step_lines, shadow_samples += o.shadow_samples;
-    for (int i = 0; i < 3; ++i) shadow[i] += o.shadow[i];
     for (int i = 0; i < 2; ++i) surface[i] += o.surface[i], edge[i] += o.edge[i], step[i] += o.step[i];
     return *this;
 }

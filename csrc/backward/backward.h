@@ -37,7 +37,6 @@ struct BackwardProfile {
     double view = 0;                 // vertices in camera coordinates, where the loss looks
     double measure = 0, curves = 0;  // triangles and curves laid end to end
     double surface[2] = {0, 0}, edge[2] = {0, 0}, step[2] = {0, 0};  // samples with their rays; adding what they found
-    double shadow[3] = {0, 0, 0};                                    // edges before lights; pilots; samples
     double world = 0;                                                // from camera coordinates to the user's arrays
 
     // Of another window of the camera.

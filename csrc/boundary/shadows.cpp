@@ -16,7 +16,6 @@
 #include "boundary/shadow_edges.h"
 #include "boundary/shadow_source.h"
 #include "core/sampler.h"
-#include "core/stopwatch.h"
 #include "core/systematic.h"
 #include "rays/meeting.h"
 #include "shading/cut_outs.h"
@@ -384,7 +383,6 @@ int64_t most_shadow_samples(int64_t width, int64_t height, int spp) {
 template <class T>
 void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t samples, const Record& record,
                  Destination& to, BackwardProfile& profile) {
-    Stopwatch watch;
     // No more rays than an eighth of the image's, for each is one of a light and one of the camera, alone; and so many
     // where the light has an extent, for each of its points casts a shadow of its own.
     const int64_t most = most_shadow_samples(view.camera.width, view.camera.height, view.image.spp);
@@ -394,7 +392,6 @@ void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t s
     std::vector<ShadowPiece> found = ShadowEdgeFinder<T>(view, light, faces).find(pair_tests);
     if (light.extended) found = cut(found, double(count));
     const Pieces pieces(std::move(found), view.team);
-    profile.shadow[0] += watch.lap();
     if (pieces.empty()) return;
 
     const ShadowScene<T> scene{view, light, faces, pieces};
@@ -423,7 +420,6 @@ void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t s
         length += of_interval[i].length / double(pilots * count);
     }
     for (int64_t i = 0; i < count; ++i) measure[i] += floor_share * (known > 0 ? known : 1);
-    profile.shadow[1] += watch.lap();
     const int64_t wanted = light.extended ? most : int64_t(std::min(samples_a_pixel * length, 1e15));
     const int64_t n = samples >= 0 ? samples : std::clamp(wanted, fewest_samples, most);
     profile.shadow_samples += n;
@@ -432,7 +428,7 @@ void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t s
                   places = (n + samples_of_place - 1) / samples_of_place;
     const Places drawn(pieces, measure, places, light.extended, hash(view.options.seed, 11, gradient_stream),
                        view.team);
-    double seconds[2] = {0, 0};
+    double seconds[2] = {};
     view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         ShadowChunk chunk(scene, hash(view.options.seed, 9, gradient_stream), on_curves<0>(view, record, grad));
         Places place(drawn);
@@ -442,7 +438,6 @@ void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t s
         }
         chunk.finish(grad);
     });
-    profile.shadow[2] += seconds[0] + seconds[1];
 }
 
 template void add_shadows(const BackwardView<float>&, const LightParts&, int64_t, const Record&, Destination&,
