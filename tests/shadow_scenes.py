@@ -160,9 +160,9 @@ def alone(mesh: eg.Mesh, smooth: bool) -> Parts:
 
 
 def warped(mesh: eg.Mesh, smooth: bool) -> Parts:
-    """A field of shifts, of which some turn faces."""
+    """A field of shifts, of which some turn faces; it grows and rises, so that little cancels."""
     x, y, z = mesh.verts.unbind(1)
-    field = 0.3 * torch.stack([(3 * y + 1).sin(), (2 * z + x).cos(), (2 * x).sin()], 1)
+    field = 0.3 * torch.stack([(3 * y + 1).sin() + 2 * x, (2 * z + x).cos() + 2 * y, (2 * x).sin() + 1.5], 1)
     return lambda m: [ground(m), lit(mesh.replace(verts=mesh.verts + m.by(CASTER, field)), smooth)]
 
 
@@ -272,13 +272,22 @@ CASES = {
     },
     **{
         f"lamp shade, {moves} moves": Case(
-            above(lamp_shade().transformed(t=vector(0, 0, 1.1))), lambda m: point(m, vector(0.03, 0.02, 1.1)), moves
+            above(lamp_shade().transformed(t=vector(0, 0, 1.1))),
+            lambda m: point(m, vector(0.03, 0.02, 1.1)),
+            moves,
+            step=0.003 if moves == LIGHT else 0.01,
         )
         for moves in (CASTER, LIGHT)
     },
+    # It moves along the plane: across it, the border of the shadow has another speed on either side.
     "light nearly in a face's plane": Case(
-        above(box(vector(0.1, 0, 1.0), 0.6, 0.6, 0.5)), lambda m: point(m, vector(0.4 + 1e-7, -0.1, 2.4)), LIGHT
+        above(box(vector(0.1, 0, 1.0), 0.6, 0.6, 0.5)),
+        lambda m: eg.PointLight(vector(0.4 + 1e-7, -0.1, 2.4) + m.by(LIGHT, vector(0, 1.0, 0.2)), 10.0),
+        LIGHT,
     ),
-    **{f"thin strip, {moves} moves": Case(grazing, point, moves) for moves in (CASTER, RECEIVER)},
+    **{
+        f"thin strip, {moves} moves": Case(grazing, point, moves, step=0.06 if moves == CASTER else 0.01)
+        for moves in (CASTER, RECEIVER)
+    },
     "far crop": Case(above(sphere(3, 0.4, vector(0, 0, 1.0))), point, CASTER, crop=True),
 }
