@@ -344,10 +344,16 @@ class Sampler:
         return SurfaceRecords(*parts[:count]), CurveRecords(*parts[count:])
 
     def shadow_samples(
-        self, light: LightParts, seed: int, samples: int, intrinsics: bool, one: bool = False
+        self,
+        light: LightParts,
+        seed: int,
+        samples: int,
+        intrinsics: bool,
+        one: bool = False,
+        casters: Flat | None = None,
     ) -> CurveRecords:
         """On the borders of a light's shadows, after all pixel hits were taken; so many, or by default. `one`: with the point in
-        the light alone."""
+        the light alone. `casters`: the same faces as shadow rays meet them, where these meet less than the camera's."""
 
         def compute(request: Request, camera: Any, *rows: Tensor) -> CurveRecords:
             arrays = (tensor.cpu().contiguous().numpy() for tensor in rows)
@@ -367,7 +373,8 @@ class Sampler:
             )
             return _record(CurveRecords, found)
 
-        return CurveRecords(*self._compute(self._request, compute, *light[:3]))
+        request = self._request if casters is None else self._request._replace(scene=casters)
+        return CurveRecords(*self._compute(request, compute, *light[:3]))
 
     def hits_at(self, x: Tensor) -> PlaceRecords:
         """What is seen at places (N, 2) in the image."""

@@ -209,7 +209,8 @@ class _Image:
             moving = moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
             if moving or ShadowLight.moves(light.light):
                 one = self._effort.adds_up
-                records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics), one)
+                casters = frame.fixed.casters if frame.surfaces.scene.blends else None
+                records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics), one, casters)
                 if len(records.x):
                     found = found + self._boundary(EdgeSamples(frame, records, light, one))
         return found

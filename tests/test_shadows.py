@@ -190,3 +190,28 @@ def test_triangles_of_directions() -> None:
     assert angle.sum().item() == pytest.approx(4 * torch.pi)
     assert chance.max() < 1.5 / 12
     assert angle[chance > 0.02].min() < 0.01
+
+
+@pytest.mark.parametrize("mode", ["MASK", "BLEND"])
+@pytest.mark.parametrize("alpha", [0.4, 0.9])
+def test_what_is_cut_out_casts_no_shadow_whose_border_moves(mode, alpha):
+    """Shadow rays pass where alpha is below ½: the gradient is then that without shadows; above, it is another."""
+    square = torch.tensor([[-0.8, -0.3, 1.0], [0.8, -0.3, 1.0], [0.8, 0.9, 1.0], [-0.8, 0.9, 1.0]])
+    faces, uvs = torch.tensor([[0, 1, 2], [0, 2, 3]]), torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    below = torch.tensor([[-3.0, -1, -3], [-3, -1, 3], [3, -1, 3], [3, -1, -3]])
+    floor = eg.Mesh(below, faces, material=eg.Material(0.6))
+    camera = eg.Camera.look_at((0, 2.5, 4), (0, -0.3, 0), fov_y=45, size=(32, 32))
+    found = []
+    for shadows in (True, False):
+        verts = square.clone().requires_grad_()
+        look = {"alpha": torch.full((2, 2), alpha), "material": eg.Material(0.5, alpha_mode=mode)}
+        pane = eg.Mesh(verts, faces, uvs=uvs, uv_faces=faces, **look)
+        scene = eg.Scene([pane, floor], lights=[eg.PointLight(torch.tensor([1.2, 2.5, 2.5]), 15.0)])
+        image = eg.render(scene, camera, spp=16, shadows=shadows)
+        (image * torch.linspace(-1, 1, 32)[:, None, None]).sum().backward()
+        found.append(verts.grad)
+    with_shadows, without = found
+    if alpha < 0.5:
+        torch.testing.assert_close(with_shadows, without, rtol=1e-4, atol=1e-4)
+    else:
+        assert float((with_shadows - without).norm()) > 0.2 * float(without.norm())

@@ -98,6 +98,7 @@ class LightRays {
 
     // The place t of an edge before a point of the light, for whoever knows the segment by this number.
     void add(const ShadowPiece& piece, LightWedge::Point from, int64_t segment, double t, double weight) {
+        if (!casts(piece.edge, t)) return;
         const HalfEdge& h = view_.geometry.topology().half_edges(piece.edge)[0];
         const SceneView<T>& scene = view_.scene;
         const auto vertex_of = [&](int c) { return scene.faces[3 * int64_t(h.face) + c]; };
@@ -163,6 +164,16 @@ class LightRays {
         Ray ray;
         double before;  // where the edge lies on the ray, in lengths of its direction
     };
+
+    // Whether a face beside the edge is there at that place of it: where all are cut out, light passes on both sides.
+    bool casts(int64_t edge, double t) const {
+        for (const HalfEdge& h : view_.geometry.topology().half_edges(edge)) {
+            double b[3] = {};
+            b[h.first()] = 1 - t, b[h.second()] = t;
+            if (shows(view_.scene, h.face, {b[1], b[2]})) return true;
+        }
+        return false;
+    }
 
     bool accept(const Waiting& w, int32_t face, Meeting& m) const {
         m = meet(view_.scene, face, w.ray);
