@@ -293,6 +293,11 @@ def test_saves_everything_and_draws_itself(tmp_path):
         ({"parameters": {}}, TypeError, "parameters: expected a mapping"),
         ({"parameters": {"background": "fast"}}, TypeError, "background: lr: expected a number"),
         ({"parameters": {"background": Parameter(0.1, torch.zeros(4))}}, ValueError, "background: expected shape (3,)"),
+        (
+            {"parameters": {"background": Parameter(0.1, low=1.0, high=0.0)}},
+            ValueError,
+            "background: expected low ≤ high",
+        ),
         ({"images": torch.zeros(8, 8, 3)}, ValueError, "images: expected 2, one for each camera, got 8"),
         ({"images": None}, ValueError, "images: expected pictures or masks"),
         ({"weights": -torch.ones(2, 32, 32)}, ValueError, "weights: expected numbers from 0 up"),

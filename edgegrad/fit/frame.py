@@ -52,6 +52,10 @@ class Parameter:
         value = as_tensor(name, self.value, floating=True).detach().cpu().clone()
         check_float(name, value)
         check_finite(name, value)
+        if self.low is not None and self.high is not None:
+            low, high = torch.as_tensor(self.low), torch.as_tensor(self.high)
+            if bool((low > high).any()):
+                raise ValueError(f"{name}: expected low ≤ high, got {self.low} and {self.high}")
         return replace(self, value=value)
 
     def within(self, value: Tensor) -> Tensor:
