@@ -97,8 +97,8 @@ def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
 def light_on_faces(
     verts: Tensor, faces: Tensor, view: View, infinite: list[bool], place: Tensor, arriving: Tensor
 ) -> Tensor:
-    """(F, 3, L) by csrc/shading/lit/flat_light.h: E max(0, n·l) at the corners of flat faces, of points of light at places (L, 3)
-    from which E, `arriving` (L, V), comes to the vertices."""
+    """(F, 3, L) float64 by csrc/shading/lit/flat_light.h: E max(0, n·l) at the corners of flat faces, over the greatest of them,
+    of points of light at places (L, 3) from which E, `arriving` (L, V), comes to the vertices."""
 
     def compute(*tensors: Tensor) -> Sequence[Tensor]:
         verts, faces, eye, place, arriving = map(array, tensors)

@@ -101,6 +101,7 @@ class Frame:
 
     @property
     def no_hits(self) -> Hits:
+        """None of them: for what a shader notes of the scene, such as where it jumps."""
         none = torch.zeros(0, dtype=torch.int64)
         return self.fixed_hits(
             none, torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.float64), none

@@ -44,9 +44,8 @@ class Effort(NamedTuple):
     """What shading an image takes."""
 
     points: int = 1  # of a face in a pixel that are shaded
-    whole: Callable[[Frame], Tensor | None] | None = (
-        None  # gives the values (H · W, C) of a whole image at once, or None
-    )
+    # The values (H · W, C) of a whole image at once, or None where points are to be shaded one by one.
+    whole: Callable[[Frame], Tensor | None] | None = None
     blended: bool = False  # whether one may see through surfaces
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where only derivatives are wanted, see Hits.values

@@ -136,7 +136,7 @@ class Fit:
             if mesh.texture is not None and mesh.texture.shape[-1] in (1, 3):
                 write_image(out / f"texture{number}.png", mesh.texture.clamp(0.0, 1.0))
                 written.append(f"texture{number}.png")
-                if find_spec("PIL"):
+                if find_spec("PIL") and mesh.channels in (1, 3):  # its material may have more than the texture
                     save_mesh(out / f"mesh{number}.glb", mesh)
                     written.append(f"mesh{number}.glb")
         for i, camera in enumerate(self.cameras):
