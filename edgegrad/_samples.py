@@ -354,10 +354,15 @@ class Sampler:
     ) -> CurveRecords:
         """On the borders of a light's shadows, after all pixel hits were taken; so many, or by default. `one`: with the point in
         the light alone. `casters`: the same faces as shadow rays meet them, where these meet less than the camera's."""
+        parts, count = [part for part in casters or () if isinstance(part, Tensor)], len(light[:3])
 
-        def compute(request: Request, camera: Any, *rows: Tensor) -> CurveRecords:
-            arrays = (tensor.cpu().contiguous().numpy() for tensor in rows)
-            found = self._scene(request.scene).shadow_samples(
+        def compute(request: Request, camera: Any, *tensors: Tensor) -> CurveRecords:
+            arrays, values = (t.cpu().contiguous().numpy() for t in tensors[:count]), iter(tensors[count:])
+            scene = self._scene(request.scene)
+            found = scene.shadow_samples(
+                casters=scene
+                if casters is None
+                else kernel_scene(Flat(*(next(values) if isinstance(part, Tensor) else part for part in casters))),
                 camera=camera,
                 image=core.ImageOptions(**request.image._asdict()),
                 options=core.GradientOptions(seed=seed, intrinsics=intrinsics),
@@ -373,8 +378,7 @@ class Sampler:
             )
             return _record(CurveRecords, found)
 
-        request = self._request if casters is None else self._request._replace(scene=casters)
-        return CurveRecords(*self._compute(request, compute, *light[:3]))
+        return CurveRecords(*self._compute(self._request, compute, *light[:3], *parts))
 
     def hits_at(self, x: Tensor) -> PlaceRecords:
         """What is seen at places (N, 2) in the image."""

@@ -195,7 +195,7 @@ class _Image:
         """(H · W, C), or 0: the same over samples on the borders of the shadows that the shader asked for."""
         frame = self._frame
         found: Any = 0
-        count, flat = frame.request.gradient.edge_samples, frame.request.scene
+        count, flat = frame.request.gradient.edge_samples, frame.surfaces.casters
         if frame.surfaces.shadowing and len(flat.cut_outs) and moves(frame.surfaces.verts, flat.alphas, flat.uvs):
             warn(
                 "shadows of cut-outs",

@@ -215,3 +215,37 @@ def test_what_is_cut_out_casts_no_shadow_whose_border_moves(mode, alpha):
         torch.testing.assert_close(with_shadows, without, rtol=1e-4, atol=1e-4)
     else:
         assert float((with_shadows - without).norm()) > 0.2 * float(without.norm())
+
+
+def test_shadows_fall_on_each_of_the_panes_that_let_light_through():
+    """Panes of alpha 0.4, one behind the other as seen from the light, side by side as seen from the camera, before black: the
+    image and its gradient are 0.4 of those of each as if it were opaque and the other were not there."""
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    uvs = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]], dtype=DOUBLE)
+    camera = eg.Camera.look_at((0.8, 0, 5), (0.8, 0, 0), up=(0.37, 1, 0), fov_y=50, size=(48, 48))
+    weights = (
+        torch.linspace(-1, 1.5, 48, dtype=DOUBLE)[:, None, None] * torch.linspace(0.2, 1, 48, dtype=DOUBLE)[:, None]
+    )
+
+    def upright(x0: float, x1: float, y0: float, y1: float, z: float) -> Tensor:
+        return torch.tensor([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]], dtype=DOUBLE)
+
+    near, far = upright(-1.5, 0.3, -1, 1, 0), upright(0.5, 3, -1.4, 1.4, -1.5)
+
+    def gradient(alpha: float | None, *panes: Tensor) -> Tensor:
+        caster, light = upright(-1.9, -1.4, -0.4, 0.3, 1.2).requires_grad_(), vector(-3.5, 0.3, 3.4).requires_grad_()
+        look = {"material": eg.Material(0.8)}
+        if alpha is not None:
+            look = {"material": eg.Material(0.8, alpha_mode="BLEND"), "alpha": torch.full((2, 2), alpha, dtype=DOUBLE)}
+        meshes = [eg.Mesh(pane, faces, uvs=uvs, uv_faces=faces, **look) for pane in panes]
+        scene = eg.Scene(
+            [*meshes, eg.Mesh(caster, faces, material=eg.Material(0.3))], lights=[eg.PointLight(light, 30.0)]
+        )
+        image = eg.render(scene, camera, spp=16, edge_samples=1 << 14)
+        (image * weights).sum().backward()
+        assert caster.grad is not None and light.grad is not None
+        return torch.cat([caster.grad, light.grad[None]])
+
+    both, first, second = gradient(0.4, near, far), gradient(None, near), gradient(None, far)
+    assert second.norm() > 0.1 * first.norm()  # that of each is told from none
+    torch.testing.assert_close(both, 0.4 * (first + second), rtol=0, atol=0.01 * float(both.norm()))

@@ -376,14 +376,15 @@ RecordList record_samples(const BackwardInput<T>& input, GradientOptions o, Team
 }
 
 template <class T>
-std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const GradientOptions& o,
-                                         const LightParts& light, int64_t samples, Team& team) {
+std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                         const GradientOptions& o, const LightParts& light, int64_t samples,
+                                         Team& team) {
     RecordList records;
     Destination to;
     to.records = &records;
     BackwardProfile profile;
     each_view(input, o, Terms{}, team, [&](const BackwardView<T>& view) {
-        add_shadows(view, light, samples, Record{o.intrinsics}, to, profile);
+        add_shadows(view, casters, light, samples, Record{o.intrinsics}, to, profile);
     });
     return std::move(records.curves);
 }
@@ -395,8 +396,8 @@ std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const Gr
                                   double*);                                                                      \
     template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);              \
     template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                         \
-    template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const GradientOptions&,           \
-                                                      const LightParts&, int64_t, Team&);
+    template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,              \
+                                                      const GradientOptions&, const LightParts&, int64_t, Team&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)
 #undef EDGEGRAD_INSTANTIATE

@@ -79,10 +79,11 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions optio
 template <class T>
 RecordList record_samples(const BackwardInput<T>& input, GradientOptions options, Team& team);
 
-// The samples on the borders of shadows, so many or, if −1, by default.
+// The samples on the borders of the shadows of `casters`, the scene as light meets it; so many or, if −1, by default.
 template <class T>
-std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const GradientOptions& options,
-                                         const LightParts& light, int64_t samples, Team& team);
+std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                         const GradientOptions& options, const LightParts& light, int64_t samples,
+                                         Team& team);
 
 // q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a window.
 void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,

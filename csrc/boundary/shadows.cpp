@@ -94,7 +94,8 @@ class Pieces {
 template <class T>
 class LightRays {
    public:
-    LightRays(const BackwardView<T>& view, const LightParts& light) : view_(view), light_(light) {}
+    LightRays(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light)
+        : view_(view), casters_(casters), light_(light) {}
 
     // The place t of an edge before a point of the light, for whoever knows the segment by this number.
     void add(const ShadowPiece& piece, LightWedge::Point from, int64_t segment, double t, double weight) {
@@ -135,24 +136,29 @@ class LightRays {
 
     bool is_full() const { return count_ == RayBatch::size; }
 
-    // Calls body(ShadowPoint, weight) for those past which light goes on to a face.
+    // Calls body(ShadowPoint, weight) for each face to which light goes on past them: the first that casts a shadow,
+    // and those before it that let light through.
     template <class Body>
     void cast(Body body) {
-        int32_t face[RayBatch::size];
-        Meeting met[RayBatch::size];
-        cast_each(
-            view_.geometry.caster(), count_, face, without_, [&](int i) { return waiting_[i].ray; },
-            [&](int i, int32_t f) { return accept(waiting_[i], f, met[i]); });
-        for (int i = 0; i < count_; ++i) {
-            Waiting& w = waiting_[i];
-            // What it meets first lies before the edge, or touches it: then the shadow begins there, along a curve that
-            // the camera sees as an edge.
-            if (face[i] < 0 || met[i].t <= w.before + touching(w, face[i])) continue;
-            w.point.face = face[i], w.point.on = inside({met[i].u, met[i].v});
-            w.point.along = light_.infinite ? met[i].t - w.before : met[i].t;
-            body(w.point, w.weight);
+        while (count_ > 0) {
+            int32_t face[RayBatch::size];
+            Meeting met[RayBatch::size];
+            cast_each(
+                view_.geometry.caster(), count_, face, without_, [&](int i) { return waiting_[i].ray; },
+                [&](int i, int32_t f) { return accept(waiting_[i], f, met[i]); });
+            int going_on = 0;
+            for (int i = 0; i < count_; ++i) {
+                if (face[i] < 0) continue;
+                Waiting& w = waiting_[i];
+                w.point.face = face[i], w.point.on = inside({met[i].u, met[i].v});
+                w.point.along = light_.infinite ? met[i].t - w.before : met[i].t;
+                // What lies before the edge, or touches it, bears no border: the shadow begins there, along a curve
+                // that the camera sees as an edge.
+                if (met[i].t > w.before + touching(w, face[i])) body(w.point, w.weight);
+                if (casters_.cut_outs.on(face[i]) && !shows(casters_, face[i], w.point.on)) go_on(going_on++, i);
+            }
+            count_ = going_on;
         }
-        count_ = 0;
     }
 
    private:
@@ -165,12 +171,22 @@ class LightRays {
         double before;  // where the edge lies on the ray, in lengths of its direction
     };
 
-    // Whether a face beside the edge is there at that place of it: where all are cut out, light passes on both sides.
+    // The i-th ray goes on behind the face that it met, as the k-th.
+    void go_on(int k, int i) {
+        std::vector<int32_t>& without = without_[i];
+        without.insert(std::upper_bound(without.begin(), without.end(), waiting_[i].point.face),
+                       waiting_[i].point.face);
+        if (k == i) return;
+        waiting_[k] = waiting_[i];
+        without_[k].swap(without);
+    }
+
+    // Whether a face beside the edge casts a shadow from that place of it: where none does, light passes on both sides.
     bool casts(int64_t edge, double t) const {
         for (const HalfEdge& h : view_.geometry.topology().half_edges(edge)) {
             double b[3] = {};
             b[h.first()] = 1 - t, b[h.second()] = t;
-            if (shows(view_.scene, h.face, {b[1], b[2]})) return true;
+            if (shows(casters_, h.face, {b[1], b[2]})) return true;
         }
         return false;
     }
@@ -210,6 +226,7 @@ class LightRays {
     }
 
     const BackwardView<T>& view_;
+    const SceneView<T>& casters_;
     const LightParts& light_;
     Waiting waiting_[RayBatch::size];
     std::vector<int32_t> without_[RayBatch::size];
@@ -329,6 +346,7 @@ class Places {
 template <class T>
 struct ShadowScene {
     const BackwardView<T>& view;
+    const SceneView<T>& casters;
     const LightParts& light;
     const FacesBeforeLight<T>& faces;
     const Pieces& pieces;
@@ -343,7 +361,7 @@ class ShadowChunk {
           sequence_(seed),
           wedge_(scene.view, scene.faces),
           source_(scene.view, scene.light.infinite),
-          light_rays_(scene.view, scene.light),
+          light_rays_(scene.view, scene.casters, scene.light),
           samples_(scene.view, source_, std::move(contraction)) {}
 
     // The i-th of places that ascend, with so many samples: a second one mirrors the first on the edge. How samples
@@ -392,8 +410,8 @@ int64_t most_shadow_samples(int64_t width, int64_t height, int spp) {
 }
 
 template <class T>
-void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t samples, const Record& record,
-                 Destination& to, BackwardProfile& profile) {
+void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light, int64_t samples,
+                 const Record& record, Destination& to, BackwardProfile& profile) {
     // No more rays than an eighth of the image's, for each is one of a light and one of the camera, alone; and so many
     // where the light has an extent, for each of its points casts a shadow of its own.
     const int64_t most = most_shadow_samples(view.camera.width, view.camera.height, view.image.spp);
@@ -405,7 +423,7 @@ void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t s
     const Pieces pieces(std::move(found), view.team);
     if (pieces.empty()) return;
 
-    const ShadowScene<T> scene{view, light, faces, pieces};
+    const ShadowScene<T> scene{view, casters, light, faces, pieces};
     std::vector<Found> of_interval(count);
     const uint64_t pilot_seed = hash(view.options.seed, 10, gradient_stream);
     view.team.each((count + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {
@@ -451,9 +469,9 @@ void add_shadows(const BackwardView<T>& view, const LightParts& light, int64_t s
     });
 }
 
-template void add_shadows(const BackwardView<float>&, const LightParts&, int64_t, const Record&, Destination&,
-                          BackwardProfile&);
-template void add_shadows(const BackwardView<double>&, const LightParts&, int64_t, const Record&, Destination&,
-                          BackwardProfile&);
+template void add_shadows(const BackwardView<float>&, const SceneView<float>&, const LightParts&, int64_t,
+                          const Record&, Destination&, BackwardProfile&);
+template void add_shadows(const BackwardView<double>&, const SceneView<double>&, const LightParts&, int64_t,
+                          const Record&, Destination&, BackwardProfile&);
 
 }  // namespace edgegrad

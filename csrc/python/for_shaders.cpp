@@ -119,20 +119,22 @@ struct LightArrays {
     }
 };
 
-// The samples on the borders of shadows.
+// The samples on the borders of shadows of `casters`: the same faces as light meets them.
 template <class T>
-nb::dict shadow_samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
-                        const GradientOptions& options, const LightArrays& light, int64_t samples, double least,
-                        bool one, int threads, Out<T, 3> adjoint, const HitArrays<T>& hits) {
+nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const Camera& camera,
+                        const ImageOptions& image, const GradientOptions& options, const LightArrays& light,
+                        int64_t samples, double least, bool one, int threads, Out<T, 3> adjoint,
+                        const HitArrays<T>& hits) {
     check_image("adjoint", adjoint, camera, arrays.background.shape(2));
     hits.check(arrays, camera), light.check(int64_t(arrays.faces.shape(0)));
-    const SceneView<T> scene = arrays.view();
+    if (casters.faces.shape(0) != arrays.faces.shape(0)) refuse("casters: expected the faces of the scene");
+    const SceneView<T> scene = arrays.view(), casting = casters.view();
     std::vector<CurveRecords> found;
     unlocked(threads, [&](Team& team) {
         GeometryWork done;
         const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
-        found = record_shadows(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view()}, options,
-                               light.view(), samples, team);
+        found = record_shadows(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view()}, casting,
+                               options, light.view(), samples, team);
     });
     return arrays_of(found, least, one, threads);
 }
@@ -247,8 +249,8 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
              "only"_a.none(), "hits"_a)
         .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "least"_a, "threads"_a,
              "adjoint"_a.noconvert(), "hits"_a)
-        .def("shadow_samples", &shadow_samples<T>, "camera"_a, "image"_a, "options"_a, "light"_a, "samples"_a,
-             "least"_a, "one"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
+        .def("shadow_samples", &shadow_samples<T>, "casters"_a, "camera"_a, "image"_a, "options"_a, "light"_a,
+             "samples"_a, "least"_a, "one"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)
         .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(),
              "ignored"_a.noconvert().none(), "threads"_a)
