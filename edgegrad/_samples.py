@@ -356,13 +356,15 @@ class Sampler:
         the light alone. `casters`: the same faces as shadow rays meet them, where these meet less than the camera's."""
         parts, count = [part for part in casters or () if isinstance(part, Tensor)], len(light[:3])
 
+        def with_values(values: Iterator[Tensor]) -> Any:
+            found: list[Any] = [next(values) if isinstance(part, Tensor) else part for part in casters or ()]
+            return kernel_scene(Flat(*found))
+
         def compute(request: Request, camera: Any, *tensors: Tensor) -> CurveRecords:
-            arrays, values = (t.cpu().contiguous().numpy() for t in tensors[:count]), iter(tensors[count:])
+            arrays = (tensor.cpu().contiguous().numpy() for tensor in tensors[:count])
             scene = self._scene(request.scene)
             found = scene.shadow_samples(
-                casters=scene
-                if casters is None
-                else kernel_scene(Flat(*(next(values) if isinstance(part, Tensor) else part for part in casters))),
+                casters=scene if casters is None else with_values(iter(tensors[count:])),
                 camera=camera,
                 image=core.ImageOptions(**request.image._asdict()),
                 options=core.GradientOptions(seed=seed, intrinsics=intrinsics),

@@ -31,7 +31,7 @@ from ._warnings import warn
 from .camera import Camera
 from .hits import Hits
 from .samples import EdgeSamples, Frame, SurfaceSamples, boundary
-from .scene import Scene
+from .scene import Flat, Scene
 
 Shader = Callable[[Hits], Tensor]
 
@@ -196,7 +196,7 @@ class _Image:
         frame = self._frame
         found: Any = 0
         count, flat = frame.request.gradient.edge_samples, frame.surfaces.casters
-        if frame.surfaces.shadowing and len(flat.cut_outs) and moves(frame.surfaces.verts, flat.alphas, flat.uvs):
+        if frame.surfaces.shadowing and _has_rims(flat) and moves(frame.surfaces.verts, flat.alphas, flat.uvs):
             warn(
                 "shadows of cut-outs",
                 "alpha: the rims of what alpha cuts out cast shadows whose borders have no gradient yet, so gradients by alpha, "
@@ -376,3 +376,10 @@ class _Image:
 
 def _parts(found: Crossings) -> list[slice]:
     return [slice(first, first + AT_ONCE) for first in range(0, max(len(found.x), 1), AT_ONCE)]
+
+
+def _has_rims(flat: Flat) -> bool:
+    """Whether alpha cuts out some of a mesh, not all or nothing."""
+    rows = zip(flat.cut_outs.tolist(), flat.cutoffs, strict=True)
+    there = ((flat.alphas[first : first + h * w] >= cutoff).detach() for (first, h, w, *_), cutoff in rows)
+    return any(bool(texels.any()) and not bool(texels.all()) for texels in there)

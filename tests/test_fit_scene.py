@@ -239,8 +239,18 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path):
     target = pictures(bracket(), cameras)
     file = tmp_path / "fit.ckpt"
     colour_fit(cameras, target, steps=1, checkpoint=file)
-    with pytest.raises(ValueError, match="resume: expected a checkpoint of"):
+    with pytest.raises(ValueError, match=r"resume: expected .* made with another scene, parameters;"):
         fit_scene(bracket(), cameras, target, {"verts": 1e-3}, steps=1, checkpoint=file, resume=True, **QUIET)
+    for name, given in {
+        "images": (cameras, [picture + 0.1 for picture in target], {}),
+        "cameras": ([eg.Camera.look_at((0, 0, 7), (0, 0, 0), size=view.size) for view in cameras], target, {}),
+        "masks": (cameras, target, {"masks": [torch.ones(picture.shape[:2]) for picture in target]}),
+        "seed": (cameras, target, {"seed": 1}),
+        "render": (cameras, target, {"render": {"filter": "gaussian"}}),
+    }.items():
+        with pytest.raises(ValueError, match=rf"fit\.ckpt to be a checkpoint of this fit.* another {name};"):
+            colour_fit(*given[:2], steps=2, checkpoint=file, resume=True, **given[2])
+    assert colour_fit(cameras, target, steps=2, checkpoint=file, resume=True).steps == 2  # of the same fit
     file.write_bytes(file.read_bytes()[:200])
     with pytest.raises(ValueError, match="expected a checkpoint of a fit"):
         colour_fit(cameras, target, steps=1, checkpoint=file, resume=True)

@@ -18,13 +18,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import as_tensor, check_finite, check_float, check_int, check_positive, check_positive_int
-from .._files import PathLike, replacing
+from .._files import PathLike
 from .losses import Loss, loss_of
 
 CUT, CUTS = 0.3, 3  # learning rates fall by this factor when the loss is flat; so often before the fit ends
 SMOOTH = 0.9  # the best values are those of the least loss, averaged over some ten steps for its noise
 SMALL = 64  # values of up to so many numbers are kept for each step
-FORMAT = 1  # of checkpoints
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,8 @@ class Options:
                       from it ends the fit
     checkpoint        a file that holds the fit's state, written every `checkpoint_every` steps and at the end, and never in part
     checkpoint_every  steps
-    resume            go on from the checkpoint, if there is one: the fit ends as if it had never stopped
+    resume            go on from the checkpoint, if there is one: the fit ends as if it had never stopped. One of a fit that was
+                      given something else is refused
     render            further arguments of render(), such as light_samples
     """
 
@@ -144,7 +144,7 @@ def descend(
     objective: Callable[[dict[str, Tensor], int], Tensor],
     parameters: Mapping[str, Parameter],
     options: Options,
-    stage: dict[str, Any] | None = None,
+    save: Callable[[dict[str, Any]], None],
     saved: dict[str, Any] | None = None,
     title: str = "fit",
     report: Callable[[Record, dict[str, Tensor]], Record] = lambda record, values: record,
@@ -152,7 +152,7 @@ def descend(
     """Follows the gradient of `objective(values, step)`. Ctrl-C ends it with the best values so far. The callback gets what
     `report` makes of a step's record and the values after it.
 
-    `stage` is kept in the checkpoint beside the loop's own state, for fits of several loops; `saved` is a state to go on from.
+    `save` is given the loop's state now and then, and at the end; `saved` is such a state to go on from.
     """
     began = time.perf_counter()
     loop = _Loop(parameters, options)
@@ -161,10 +161,9 @@ def descend(
     earlier = loop.seconds
     interrupted = False
 
-    def save() -> None:
-        if options.checkpoint is not None:
-            loop.seconds = earlier + time.perf_counter() - began
-            write_checkpoint(options.checkpoint, {"stage": stage or {}, "loop": loop.state()})
+    def keep() -> None:
+        loop.seconds = earlier + time.perf_counter() - began
+        save(loop.state())
 
     bar = tqdm(
         total=options.steps, initial=loop.step, desc=title, unit="step", disable=not options.progress, leave=False
@@ -178,12 +177,12 @@ def descend(
             if options.callback is not None:
                 options.callback(report(record, loop.values))
             if loop.step % options.checkpoint_every == 0:
-                save()
+                keep()
     except KeyboardInterrupt:
         interrupted = True
     finally:
         bar.close()
-    save()
+    keep()
     seconds = earlier + time.perf_counter() - began
     return Descent(loop.best, loop.history, seconds, loop.flat, interrupted)
 
@@ -260,13 +259,6 @@ class _Loop:
         return {**plain, "values": values, "history": history, "optimizer": self.optimizer.state_dict()}
 
     def load(self, saved: dict[str, Any]) -> None:
-        """Raises ValueError for the state of other parameters."""
-        shapes = {name: tuple(value.shape) for name, value in self.values.items()}
-        found = {name: tuple(value.shape) for name, value in saved["values"].items()}
-        if shapes != found:
-            raise ValueError(
-                f"resume: expected a checkpoint of {shapes}, got one of {found}; give the arguments that it was made with"
-            )
         for name in _PLAIN:
             setattr(self, name, saved[name])
         self.history = [Record(*record) for record in saved["history"]]
@@ -301,24 +293,3 @@ class Adam(torch.optim.Optimizer):
                 # Relative to the largest, for losses have any units.
                 floor = 1e-8 * float(size.max()) + 1e-30
                 p.sub_(group["lr"] / (1.0 - b1 ** state["step"]) * state["mean"] / (size + floor))
-
-
-def write_checkpoint(path: PathLike, state: dict[str, Any]) -> None:
-    with replacing(path) as temporary:
-        torch.save({"format": FORMAT, **state}, temporary)
-
-
-def read_checkpoint(options: Options) -> dict[str, Any] | None:
-    """The state to go on from, or None to begin. Raises ValueError for a file that is no checkpoint."""
-    if not options.resume or options.checkpoint is None or not Path(options.checkpoint).exists():
-        return None
-    try:
-        state = torch.load(options.checkpoint, weights_only=True)
-    except Exception as error:  # whatever torch says of a damaged file
-        raise ValueError(
-            f"{options.checkpoint}: expected a checkpoint of a fit, got something else ({type(error).__name__}); "
-            "remove it, or leave out resume"
-        ) from error
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
-        raise ValueError(f"{options.checkpoint}: expected a checkpoint of format {FORMAT}; remove it to begin anew")
-    return state

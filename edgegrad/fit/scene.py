@@ -15,8 +15,9 @@ from ..aovs import render_aovs
 from ..camera import Camera
 from ..mesh import Mesh
 from ..scene import Scene
+from .checkpoints import Checkpoint
 from .fitted import Fit
-from .frame import Descent, Options, Parameter, Record, descend, read_checkpoint
+from .frame import Descent, Options, Parameter, Record, descend
 from .losses import loss_of
 from .upside_down import warn_of_masks
 from .verdict import explained
@@ -92,7 +93,7 @@ def fit_scene(
     views = views_of(cameras, images, masks, weights)
     build, known = builder(scene, [view.camera for view in views], drop_background=masks is not None)
     wanted = checked_parameters(parameters, known)
-    return fit_views(build, views, wanted, opts, regularizer)
+    return fit_views(build, views, wanted, opts, {"scene": scene, "parameters": wanted}, regularizer)
 
 
 def options_of(options: Mapping[str, Any]) -> Options:
@@ -173,15 +174,16 @@ def fit_views(
     views: list[View],
     parameters: Mapping[str, Parameter],
     options: Options,
+    given: Mapping[str, Any],
     regularizer: Callable[[Scene], Tensor] | None = None,
 ) -> Fit:
-    """fit_scene() with everything checked."""
-    saved = read_checkpoint(options)
+    """fit_scene() with everything checked; `given` are the arguments of which views and options do not tell."""
+    checkpoint = Checkpoint(options, views, given)
+    saved = checkpoint.read()
     start, cameras = built(build, {name: p.value for name, p in parameters.items() if p.value is not None})
     warn_of_masks(views, start, cameras)
     objective = objective_of(build, views, options, regularizer)
-    loop = None if saved is None else saved["loop"]
-    descent = descend(objective, parameters, options, saved=loop, report=reporter(build, views))
+    descent = descend(objective, parameters, options, checkpoint.write, saved, report=reporter(build, views))
     return judged(build, views, options, descent, start)
 
 

@@ -16,8 +16,9 @@ from .._files import require
 from ..camera import Camera
 from ..mesh import Mesh
 from ..scene import Scene
+from .checkpoints import Checkpoint
 from .fitted import Fit
-from .frame import Descent, Options, Parameter, Record, descend, read_checkpoint
+from .frame import Descent, Options, Parameter, Record, descend
 from .scene import judged, objective_of, options_of, reporter
 from .smooth import Smooth
 from .upside_down import warn_of_masks
@@ -94,24 +95,31 @@ class _Search:
     @torch.enable_grad()
     def run(self, mesh: Mesh) -> Fit:
         start, level, history, seconds = mesh, 0, [], 0.0
-        saved = read_checkpoint(self.options)
+        checkpoint = Checkpoint(
+            self.options,
+            self.views,
+            {
+                "mesh": mesh, "levels": self.levels, "faces": self.faces, "lr": self.lr, "smoothness": self.smoothness,
+                "background": self.background,
+            },
+        )  # fmt: skip
+        saved = checkpoint.read()
         last = self.faces or len(mesh.faces) * 4 ** (self.levels - 1)
         if saved is not None:
-            stage = saved["stage"]
-            if stage.get("levels") != self.levels:
-                raise ValueError(
-                    "resume: expected a checkpoint of as many levels; give the arguments that it was made with"
-                )
-            level, mesh = stage["level"], Mesh(stage["verts"], stage["faces"])
-            history, seconds = [Record(*record) for record in stage["history"]], stage["seconds"]
+            level, mesh = saved["level"], Mesh(saved["verts"], saved["faces"])
+            history, seconds = [Record(*record) for record in saved["history"]], saved["seconds"]
         else:
             warn_of_masks(self.views, self.scene(mesh), [view.camera for view in self.views])
         while True:
             stage = {
-                "levels": self.levels, "level": level, "verts": mesh.verts, "faces": mesh.faces,
+                "level": level, "verts": mesh.verts, "faces": mesh.faces,
                 "history": [tuple(record) for record in history], "seconds": seconds,
             }  # fmt: skip
-            found = self.descend(mesh, level, stage, None if saved is None else saved["loop"])
+
+            def save(loop: dict[str, Any], stage: dict[str, Any] = stage) -> None:
+                checkpoint.write({**stage, "loop": loop})
+
+            found = self.descend(mesh, level, save, None if saved is None else saved["loop"])
             saved, mesh = None, mesh.replace(verts=found.values["verts"])
             history += [record._replace(step=len(history) + k) for k, record in enumerate(found.history)]
             seconds += found.seconds
@@ -126,7 +134,9 @@ class _Search:
 
         return judged(build, self.views, self.options, whole, self.scene(start))
 
-    def descend(self, mesh: Mesh, level: int, stage: dict[str, Any], saved: dict[str, Any] | None) -> Descent:
+    def descend(
+        self, mesh: Mesh, level: int, save: Callable[[dict[str, Any]], None], saved: dict[str, Any] | None
+    ) -> Descent:
         """One level, from `mesh`; the best vertices are in its values."""
         smooth = Smooth(mesh.faces, len(mesh.verts), self.smoothness)
         smallest = min(min(view.camera.size) for view in self.views)
@@ -141,7 +151,7 @@ class _Search:
         objective = objective_of(build, views, self.options, self.regularizer)
         parameters = {"verts": Parameter(rate, smooth.times(mesh.verts), uniform=True)}
         title = f"level {level + 1} of {self.levels}"
-        found = descend(objective, parameters, self.options, stage, saved, title, reporter(build, views))
+        found = descend(objective, parameters, self.options, save, saved, title, reporter(build, views))
         return found._replace(values={"verts": smooth(found.values["verts"])})
 
     def scene(self, mesh: Mesh) -> Scene:

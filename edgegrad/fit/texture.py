@@ -75,7 +75,8 @@ def fit_texture(
     while min(sizes[-1]) > COARSEST:
         sizes.append((max(1, sizes[-1][0] // 2), max(1, sizes[-1][1] // 2)))
     levels = {f"level{k}": Parameter(lr / len(sizes), torch.zeros(*s, C)) for k, s in enumerate(sizes)}
-    return fit_views(build, views, levels, opts, regularizer)
+    given = {"mesh": shape, "size": (h, w), "lr": lr, "background": behind}
+    return fit_views(build, views, levels, opts, given, regularizer)
 
 
 def resampled(image: Tensor, size: tuple[int, int]) -> Tensor:

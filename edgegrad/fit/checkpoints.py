@@ -1,0 +1,92 @@
+"""Checkpoints of fits by gradient descent: whole files or none, and refused by another fit than the one that wrote them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .._files import PathLike, replacing
+from .._tree import named_tensors
+from .frame import Options, Parameter
+from .views import View
+
+FORMAT = 2
+SAME = ("loss", "mask_loss", "views_per_step", "spp", "seed", "patience", "tolerance")  # options that steps depend on
+
+
+class Checkpoint:
+    """The file of one fit, and what that fit was given.
+
+    `given` is told by the names of the arguments: tensors, dataclasses of them, numbers; functions are taken as the same.
+    """
+
+    def __init__(self, options: Options, views: Sequence[View], given: Mapping[str, Any]) -> None:
+        self.path: PathLike | None = options.checkpoint
+        self._resumes = options.resume
+        self._given: dict[str, str] = {}
+        if self.path is None:
+            return
+        of_views = {
+            "cameras": [(view.camera, view.camera.size, view.camera.projection, view.camera.lens) for view in views],
+            "images": [view.image for view in views],
+            "masks": [view.mask for view in views],
+            "weights": [view.weight for view in views],
+        }
+        of_options = {name: getattr(options, name) for name in SAME} | {"render": options.render}
+        self._given = {name: _digest(value) for name, value in {**given, **of_views, **of_options}.items()}
+
+    def read(self) -> dict[str, Any] | None:
+        """The state to go on from, or None to begin. Raises ValueError for a file that is no checkpoint, or another fit's."""
+        if not self._resumes or self.path is None or not Path(self.path).exists():
+            return None
+        try:
+            state = torch.load(self.path, weights_only=True)
+        except Exception as error:  # whatever torch says of a damaged file
+            raise ValueError(
+                f"{self.path}: expected a checkpoint of a fit, got something else ({type(error).__name__}); "
+                "remove it, or leave out resume"
+            ) from error
+        if not isinstance(state, dict) or state.get("format") != FORMAT:
+            raise ValueError(f"{self.path}: expected a checkpoint of format {FORMAT}; remove it to begin anew")
+        found = state["given"]
+        if other := [name for name in {**self._given, **found} if self._given.get(name) != found.get(name)]:
+            raise ValueError(
+                f"resume: expected {self.path} to be a checkpoint of this fit, got one that was made with another "
+                f"{', '.join(other)}; give what it was made with, or remove it to begin anew"
+            )
+        return state["state"]
+
+    def write(self, state: dict[str, Any]) -> None:
+        if self.path is not None:
+            with replacing(self.path) as temporary:
+                torch.save({"format": FORMAT, "given": self._given, "state": state}, temporary)
+
+
+def _digest(value: Any) -> str:
+    """Of the tensors and plain values in it."""
+    digest = hashlib.sha256()
+    for part in _parts(value):
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def _parts(value: Any) -> Any:
+    if isinstance(value, (str, int, float, type(None))):
+        yield repr(value).encode()
+    elif isinstance(value, Mapping):
+        for name in sorted(value):
+            yield name.encode()
+            yield from _parts(value[name])
+    elif isinstance(value, Parameter):
+        yield from _parts((value.lr, value.value, value.low, value.high, value.uniform))
+    elif isinstance(value, (tuple, list)):
+        for part in value:
+            yield from _parts(part)
+    else:
+        for name, tensor in named_tensors(value):
+            yield f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode()
+            yield tensor.detach().cpu().contiguous().numpy().tobytes()
