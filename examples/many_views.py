@@ -30,8 +30,8 @@ from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
 import edgegrad as eg
-from edgegrad.fit import Options
-from edgegrad.fit.frame import Adam, read_checkpoint, write_checkpoint
+from edgegrad.fit.checkpoints import Checkpoint
+from edgegrad.fit.frame import Adam
 from edgegrad.fit.smooth import Smooth
 
 
@@ -123,11 +123,9 @@ def fit(
     loss = DistributedDataParallel(module) if dist.is_initialized() else module
     optimizer = Adam([{"params": [module.coordinates], "lr": task.rate, "uniform": True}])
     first, (rank, processes) = 0, _place()
-    saved = _shared(lambda: read_checkpoint(Options(checkpoint=checkpoint, resume=True)))
+    file = Checkpoint(checkpoint, True, task._asdict())
+    saved = _shared(file.read)
     if saved is not None:
-        if saved["task"] != task._asdict():
-            before = Task(**saved["task"])
-            raise ValueError(f"checkpoint: expected one of {task}, {checkpoint} is of {before}; remove it")
         first = saved["step"]
         module.load_state_dict(saved["module"])
         optimizer.load_state_dict(saved["optimizer"])
@@ -142,7 +140,7 @@ def fit(
         optimizer.step()
         if rank == 0 and (step + 1) % every == 0:
             state = {"step": step + 1, "module": module.state_dict(), "optimizer": optimizer.state_dict()}
-            write_checkpoint(checkpoint, {"task": task._asdict(), **state})
+            file.write(state)
         if callback is not None:
             callback(step, number)
     wall, work = time.perf_counter() - wall, time.process_time() - work
@@ -157,10 +155,17 @@ def _place() -> tuple[int, int]:
 
 
 def _shared(read: Callable[[], Any]) -> Any:
-    """What the first process reads, for all: so they agree, wherever the file is."""
-    box = [read() if _place()[0] == 0 else None]
+    """What the first process reads, or why it cannot, for all: so they agree, wherever the file is."""
+    box: list[Any] = [None]
+    if _place()[0] == 0:
+        try:
+            box = [read()]
+        except ValueError as error:
+            box = [error]
     if dist.is_initialized():
         dist.broadcast_object_list(box, src=0)
+    if isinstance(box[0], ValueError):
+        raise box[0]
     return box[0]
 
 

@@ -15,29 +15,37 @@ from .frame import Options, Parameter
 from .views import View
 
 FORMAT = 2
-SAME = ("loss", "mask_loss", "views_per_step", "spp", "seed", "patience", "tolerance")  # options that steps depend on
+SAME = (
+    "loss",
+    "mask_loss",
+    "views_per_step",
+    "spp",
+    "seed",
+    "patience",
+    "tolerance",
+    "render",
+)  # options that steps depend on
 
 
 class Checkpoint:
-    """The file of one fit, and what that fit was given.
+    """The file of one fit, which goes on from it if it `resumes`, and what it was given, by the names of arguments: tensors,
+    dataclasses of them, numbers; functions are taken as the same."""
 
-    `given` is told by the names of the arguments: tensors, dataclasses of them, numbers; functions are taken as the same.
-    """
+    def __init__(self, path: PathLike | None, resumes: bool, given: Mapping[str, Any]) -> None:
+        self.path, self._resumes = path, resumes
+        self._given = {} if path is None else {name: _digest(value) for name, value in given.items()}
 
-    def __init__(self, options: Options, views: Sequence[View], given: Mapping[str, Any]) -> None:
-        self.path: PathLike | None = options.checkpoint
-        self._resumes = options.resume
-        self._given: dict[str, str] = {}
-        if self.path is None:
-            return
+    @staticmethod
+    def of(options: Options, views: Sequence[View], given: Mapping[str, Any]) -> Checkpoint:
+        """That of the options; `given` are the arguments of which views and options do not tell."""
         of_views = {
             "cameras": [(view.camera, view.camera.size, view.camera.projection, view.camera.lens) for view in views],
             "images": [view.image for view in views],
             "masks": [view.mask for view in views],
             "weights": [view.weight for view in views],
         }
-        of_options = {name: getattr(options, name) for name in SAME} | {"render": options.render}
-        self._given = {name: _digest(value) for name, value in {**given, **of_views, **of_options}.items()}
+        of_options = {name: getattr(options, name) for name in SAME}
+        return Checkpoint(options.checkpoint, options.resume, {**given, **of_views, **of_options})
 
     def read(self) -> dict[str, Any] | None:
         """The state to go on from, or None to begin. Raises ValueError for a file that is no checkpoint, or another fit's."""

@@ -178,7 +178,7 @@ def fit_views(
     regularizer: Callable[[Scene], Tensor] | None = None,
 ) -> Fit:
     """fit_scene() with everything checked; `given` are the arguments of which views and options do not tell."""
-    checkpoint = Checkpoint(options, views, given)
+    checkpoint = Checkpoint.of(options, views, given)
     saved = checkpoint.read()
     start, cameras = built(build, {name: p.value for name, p in parameters.items() if p.value is not None})
     warn_of_masks(views, start, cameras)

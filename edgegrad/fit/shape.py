@@ -95,7 +95,7 @@ class _Search:
     @torch.enable_grad()
     def run(self, mesh: Mesh) -> Fit:
         start, level, history, seconds = mesh, 0, [], 0.0
-        checkpoint = Checkpoint(
+        checkpoint = Checkpoint.of(
             self.options,
             self.views,
             {
