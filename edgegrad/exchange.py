@@ -15,6 +15,7 @@ from torch import Tensor
 from ._files import PathLike, check_suffix, replacing, require
 from ._formats.part import Fault, Part
 from ._formats.source import Textures, linear_colors
+from ._warnings import warn
 from ._welding import to_mesh
 from .image import linear_to_srgb
 from .mesh import Mesh
@@ -48,8 +49,9 @@ def from_trimesh(given: Any) -> Mesh:
         raise ValueError(f"mesh: {fault}") from fault.__cause__
 
 
-def to_trimesh(mesh: Mesh, linear: bool = False) -> Any:
-    """See Mesh.to_trimesh. linear: colours of vertices are, as in glTF."""
+def to_trimesh(mesh: Mesh, linear: bool = False, faces_colored: bool = True) -> Any:
+    """See Mesh.to_trimesh. linear: colours of vertices are, as in glTF. faces_colored: False where faces have none of their own,
+    which those of their vertices then hold."""
     trimesh = require("trimesh", "trimesh", "Mesh.to_trimesh")
     if mesh.channels not in (None, 1, 3):
         raise ValueError(f"mesh: expected 1 or 3 channels, got {mesh.channels}; pick some")
@@ -67,7 +69,7 @@ def to_trimesh(mesh: Mesh, linear: bool = False) -> Any:
         visual = trimesh.visual.TextureVisuals(uv=_array(mesh.uvs)[pairs[:, 1]], material=material)
         faces = index.reshape(-1, 3)
         return trimesh.Trimesh(verts[pairs[:, 0]], faces, visual=visual, process=False)
-    if mesh.corner_colors is not None or (mesh.face_colors is not None and linear):
+    if mesh.corner_colors is not None or (mesh.face_colors is not None and not faces_colored):
         given = mesh.corner_colors if mesh.face_colors is None else mesh.face_colors[:, None].expand(-1, 3, -1)
         assert given is not None
         verts, faces = verts[faces.reshape(-1)], np.arange(faces.size).reshape(-1, 3)
@@ -84,8 +86,8 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     """Writes a mesh: PLY, OBJ, GLB, STL or OFF by the name's ending. Missing folders are made.
 
     Colours become 8-bit (sRGB; in a GLB those of vertices linear, as the format wants), clipped to 0 … 1; an OBJ's texture lies
-    beside it with its .mtl. STL holds the shape alone. Materials, normals and alpha are left out, and texture
-    coordinates without a texture.
+    beside it with its .mtl. STL and OFF hold the shape alone. Materials, normals and alpha are left out, and texture
+    coordinates without a texture; a warning names what is.
 
     Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
     """
@@ -93,7 +95,12 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; save the meshes of a scene one by one")
     kind = file.suffix.lower()[1:]
-    made, beside = to_trimesh(mesh, linear=kind == "glb"), {}
+    made, beside = to_trimesh(mesh, linear=kind == "glb", faces_colored=kind not in ("obj", "glb")), {}
+    if lost := _left_out(mesh, kind):
+        warn(
+            f"left out of {kind}",
+            f"save_mesh: {file.name} holds no {', no '.join(lost)}; torch.save(mesh, path) keeps all of a Mesh",
+        )
     if kind == "obj":
         export = require("trimesh.exchange.obj", "trimesh", "saving meshes").export_obj
         content, beside = export(made, return_texture=True, mtl_name=f"{file.stem}.mtl")
@@ -102,6 +109,23 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     for name, data in {**beside, file.name: content}.items():
         with replacing(file.parent / Path(name).name) as temporary:
             temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def _left_out(mesh: Mesh, kind: str) -> list[str]:
+    """What of a mesh a file of this kind does not hold."""
+    look = {"colors": mesh.colors, "face_colors": mesh.face_colors, "corner_colors": mesh.corner_colors}
+    look["texture"] = mesh.texture
+    never = {"material": mesh.material, "normals": mesh.normals, "alpha": mesh.alpha}
+    never["uvs"] = mesh.uvs if mesh.texture is None or kind not in ("obj", "glb") else None
+    found = [name for name, value in never.items() if value is not None]
+    for name, value in look.items():
+        if value is None:
+            continue
+        if kind in ("stl", "off") or (name == "texture" and kind not in ("obj", "glb")):
+            found.append(name)
+        elif bool((value < 0).any() | (value > 1).any()):
+            found.append(f"{name} beyond 0 … 1")
+    return found
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -75,7 +75,7 @@ def add_views(parser: argparse.ArgumentParser, images: str) -> None:
 
 def add_descent(parser: argparse.ArgumentParser, result: str) -> None:
     """What fits by descent have in common; inputs.descent reads it."""
-    parser.add_argument("--steps", type=count, default=150, help="most steps, on each level (%(default)s)")
+    parser.add_argument("--steps", type=count, default=150, help="most steps; of fit-shape on each level (%(default)s)")
     parser.add_argument("--spp", type=count, default=4, help="samples a pixel (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
     parser.add_argument("--resume", action="store_true", help=f"go on from DIR/{CHECKPOINT}, if it is there")

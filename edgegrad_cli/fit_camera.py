@@ -33,7 +33,7 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Finds pose and focal length of the camera that took a picture of a mesh, from a start within about 20° and 15 % of the
+    """Finds pose and focal length of the camera that took a picture of a mesh, from a start within about 30° and 15 % of the
     mesh's size. Ctrl-C keeps the best so far."""
     from edgegrad import save_camera
     from edgegrad.fit import fit_camera

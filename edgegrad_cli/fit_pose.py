@@ -44,7 +44,7 @@ def add(commands: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Finds rotation and translation of a mesh in a picture, from a start within about 20° and 15 % of the mesh's size.
+    """Finds rotation and translation of a mesh in a picture, from a start within about 30° and 15 % of the mesh's size.
     Ctrl-C keeps the best pose so far."""
     from edgegrad.fit import fit_pose
 

@@ -319,6 +319,17 @@ def test_saves_everything_and_draws_itself(tmp_path):
         ({"steps": 0}, ValueError, "steps: expected an int from 1"),
         ({"resume": True}, ValueError, "resume: expected a checkpoint"),
         ({"checkpoint": "/nowhere/at/all"}, FileNotFoundError, "checkpoint: expected the folder"),
+        ({"render": {"spps": 3}}, ValueError, "render: expected arguments of render() among surface_samples"),
+        ({"render": {"spp": 3}}, ValueError, "got 'spp'; it is an option of its own"),
+        (
+            {"loss": lambda image, target: image.mean()},
+            TypeError,
+            "loss: expected a function of image, target and weight",
+        ),
+        ({"loss": lambda image, target, weight: image - target}, ValueError, "gives a tensor of one number, got shape"),
+        ({"weights": torch.zeros(2, 32, 32)}, ValueError, "weights: expected numbers above 0 somewhere"),
+        ({"masks": torch.zeros(2, 32, 32)}, ValueError, "masks: expected numbers above 0 somewhere"),
+        ({"parameters": {"background": Parameter(0.1, high=0.01)}}, ValueError, "background: expected a start within"),
     ],
 )
 def test_errors_name_the_argument(change, error, message):
@@ -400,6 +411,17 @@ def test_finds_a_shape_from_masks():
     assert float(off.mean()) < 0.04, float(off.mean())
     assert 400 < len(fit.mesh.faces) < 900 and fit.steps <= 80
     assert [record.step for record in fit.history] == list(range(fit.steps))
+
+
+def test_a_shape_that_cannot_be_remeshed_is_refused_before_the_first_level():
+    pytest.importorskip("gpytoolbox")
+    cameras, masks = egg_views()
+    mesh = ball(1)
+    fin = torch.cat([mesh.faces[0, :2], torch.tensor([len(mesh.verts)])])[None]
+    finned = eg.Mesh(torch.cat([mesh.verts, mesh.verts[:1] * 2]), torch.cat([mesh.faces, fin]))
+    with pytest.raises(ValueError, match=r"mesh: expected no more than two triangles at each edge, .* got 1 edges"):
+        fit_shape(finned, cameras, masks=masks, levels=2, steps=2, **QUIET)
+    assert fit_shape(finned, cameras, masks=masks, levels=1, steps=2, **QUIET).steps == 2
 
 
 def test_a_shape_resumes_on_a_later_level(tmp_path):

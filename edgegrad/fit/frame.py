@@ -6,6 +6,7 @@ The loop knows nothing of what is fitted: an objective gives the loss of the par
 
 from __future__ import annotations
 
+import inspect
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -19,10 +20,12 @@ from tqdm import tqdm
 
 from .._check import as_tensor, check_finite, check_float, check_int, check_positive, check_positive_int
 from .._files import PathLike
+from ..aovs import render_aovs
 from .losses import Loss, loss_of
 
 CUT, CUTS = 0.3, 3  # learning rates fall by this factor when the loss is flat; so often before the fit ends
 SMOOTH = 0.9  # the best values are those of the least loss, averaged over some ten steps for its noise
+RENDER = tuple(inspect.signature(render_aovs).parameters)[3:]
 SMALL = 64  # values of up to so many numbers are kept for each step
 
 
@@ -55,6 +58,11 @@ class Parameter:
             low, high = torch.as_tensor(self.low), torch.as_tensor(self.high)
             if bool((low > high).any()):
                 raise ValueError(f"{name}: expected low ≤ high, got {self.low} and {self.high}")
+        if not torch.equal(self.within(value), value):
+            raise ValueError(
+                f"{name}: expected a start within low and high, {self.low} and {self.high}, got {float(value.min()):g} to "
+                f"{float(value.max()):g}; clamp it first"
+            )
         return replace(self, value=value)
 
     def within(self, value: Tensor) -> Tensor:
@@ -124,6 +132,11 @@ class Options:
             loss_of(name, getattr(self, name))
         if self.callback is not None and not callable(self.callback):
             raise TypeError(f"callback: expected a function of a Record, got {type(self.callback).__name__}")
+        own = ("spp", "seed")
+        if unknown := [name for name in self.render if name not in RENDER or name in own]:
+            fix = "; it is an option of its own" if unknown[0] in own else ""
+            known = ", ".join(name for name in RENDER if name not in own)
+            raise ValueError(f"render: expected arguments of render() among {known}, got {unknown[0]!r}{fix}")
         if self.resume and self.checkpoint is None:
             raise ValueError("resume: expected a checkpoint to go on from, got none; give checkpoint=path")
         if self.checkpoint is not None and not (folder := Path(self.checkpoint).absolute().parent).is_dir():

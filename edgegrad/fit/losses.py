@@ -9,6 +9,7 @@ with any number of samples; losses that are not quadratic are so in the limit of
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 
 import torch
@@ -111,11 +112,29 @@ LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "huber": huber, "robust": robust,
 
 
 def loss_of(name: str, loss: str | Loss) -> Loss:
-    """By name, or itself. Raises TypeError or ValueError."""
+    """By name, or itself, which then raises TypeError or ValueError if it gives no number. Raises TypeError or ValueError."""
     if callable(loss):
-        return loss
+        return _checked(name, loss)
     if not isinstance(loss, str):
         raise TypeError(f"{name}: expected a name or a function of image, target and weight, got {type(loss).__name__}")
     if loss not in LOSSES:
         raise ValueError(f"{name}: expected one of {', '.join(LOSSES)}, or a function, got {loss!r}")
     return LOSSES[loss]
+
+
+def _checked(name: str, loss: Loss) -> Loss:
+    try:
+        inspect.signature(loss).bind(None, None, None)
+    except TypeError as error:
+        raise TypeError(f"{name}: expected a function of image, target and weight, got one with {error}") from None
+    except ValueError:  # it does not tell
+        pass
+
+    def checked(image: Tensor, target: Tensor, weight: Tensor | None) -> Tensor:
+        found = loss(image, target, weight)
+        if not isinstance(found, Tensor) or found.numel() != 1:
+            got = f"shape {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
+            raise ValueError(f"{name}: expected a function that gives a tensor of one number, got {got}; take its mean")
+        return found.reshape(())
+
+    return checked

@@ -69,8 +69,12 @@ def fit_shape(
         check_positive(name, value, least=0.0, most=1e9)
     if faces is not None:
         check_positive_int("faces", faces)
-    if levels > 1:
-        _gpytoolbox()  # before the first level rather than after it
+    # Before the first level rather than after it.
+    if levels > 1 and (count := len(_gpytoolbox().non_manifold_edges(mesh.faces.cpu().numpy().astype(np.int32)))):
+        raise ValueError(
+            f"mesh: expected no more than two triangles at each edge, as remeshing needs, got {count} edges with more; "
+            "give levels=1, or a sphere around the object"
+        )
     views = views_of(cameras, images, masks, weights)
     behind = None if masks is not None else background
     bare = Mesh(mesh.verts.detach().cpu().float().clone(), mesh.faces.detach().cpu().clone())

@@ -79,6 +79,12 @@ def views_of(
         if image is not None and mask is not None:
             image = image * mask
         views.append(View(camera, image, mask, weight))
+    for name, values in (("masks", shapes), ("weights", counts)):
+        given = [value for value in values if value is not None]
+        if given and not any(bool((value > 0).any()) for value in given):
+            raise ValueError(
+                f"{name}: expected numbers above 0 somewhere, got zero in every pixel; there is nothing to fit"
+            )
     return views
 
 

@@ -151,7 +151,7 @@ class Browser:
         if _is_plain(mesh):
             faces = mesh.faces.numpy().astype(np.uint32)
             return self.server.scene.add_mesh_simple(name, _floats(mesh.verts), faces, color=GREY, side="double")
-        made = to_trimesh(mesh, linear=True)
+        made = to_trimesh(mesh, linear=True, faces_colored=False)
         _ = made.vertex_normals  # written only if they are there
         return self.server.scene.add_glb(name, made.export(file_type="glb"))
 
