@@ -82,8 +82,8 @@ def fit_scene(
     parameters   by name, a learning rate or a Parameter. Names are those of the fields: "verts" or "texture" of a Mesh,
                  "meshes.0.verts", "lights.1.direction", "background" of a Scene, "cameras.0.K" of a camera; for a function they
                  are its own, each with a Parameter that has a value
-    masks        (H, W) each, 1 on the object, 0 elsewhere: then pictures are multiplied by them and compared over black, and alpha
-                 is compared with the mask
+    masks        (H, W) each, 1 on the object, 0 elsewhere: then pictures are multiplied by them and compared over black, and
+                 alpha is compared with the mask
     weights      (H, W) each, from 0: how much a pixel counts
     regularizer  of the scene, added to the loss
     options      see edgegrad.fit.Options: loss, steps, spp, seed, callback, checkpoint, …
