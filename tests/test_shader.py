@@ -298,7 +298,8 @@ def check(name: str, of: str, seeds: int) -> None:
     own, stepped = name.startswith("its own"), name in ("checkerboard", "disc", "nearest texture", "its own step")
     step = STEPS["pose" if own else of]
     if stepped and of == "shape":  # borders move much: the second-order error is larger still
-        step, seeds = step / 4, 4 * seeds
+        # Of nearest texels less so, and noise is more.
+        step, seeds = step / (2 if name == "nearest texture" else 4), 4 * seeds
     at = case(name, of)
     right_ratio(differences(at, step, seeds), derivative(at, 24 if stepped else 6))
 

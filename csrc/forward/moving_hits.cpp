@@ -156,4 +156,18 @@ void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at
     });
 }
 
+void form_vjp(const LinearForm& form, const double* bar, double* table_bar, Team& team) {
+    // Each thread owns some rows, runs of them, and adds to them in order: so the sums are the same for any number.
+    constexpr int64_t run = 64;
+    const int owners = team.threads();
+    team.each(owners, [&](int64_t owner) {
+        for (int64_t i = 0; i < form.size; ++i) {
+            if ((form.row[i] / run) % owners != owner) continue;
+            const double weight = bar[form.sample[i]];
+            double* to = table_bar + form.row[i] * form.width;
+            for (int64_t k = 0; k < form.width; ++k) to[k] += form.by[i * form.width + k] * weight;
+        }
+    });
+}
+
 }  // namespace edgegrad

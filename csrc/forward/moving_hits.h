@@ -32,4 +32,14 @@ void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at
 void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at,
                     const MovingArrays<const double>& tangents, double* b_dot, Team& team);
 
+// How numbers of samples move with rows of a table: each is the sum over its rows of by · moved row.
+struct LinearForm {
+    const int64_t *sample, *row;  // (N,)
+    const double* by;             // (N, width)
+    int64_t size, width;
+};
+
+// Adds Σ bar[sample] · by to the rows of the table's cotangent.
+void form_vjp(const LinearForm& form, const double* bar, double* table_bar, Team& team);
+
 }  // namespace edgegrad

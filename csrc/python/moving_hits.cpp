@@ -83,9 +83,9 @@ nb::object meet_jvp(const HitFaces& hits, Doubles verts, Doubles world_to_camera
     return rows(std::move(b_dot), {3});
 }
 
-// Σ by · bar[sample] of the rows of a linear form, by rows of the table that it is of: (R, K).
-nb::object form_vjp(In<int64_t, 1> sample, In<int64_t, 1> row, Doubles by, In<double, 1> bar, int64_t table,
-                    int threads) {
+// Of the rows of the table that the form is of, (R, K).
+nb::object form_vjp_by_rows(In<int64_t, 1> sample, In<int64_t, 1> row, Doubles by, In<double, 1> bar, int64_t table,
+                            int threads) {
     const size_t n = row.size(), K = by.shape(1);
     if (sample.size() != n || by.shape(0) != n) refuse("form: expected as many samples, rows and derivatives");
     for (size_t i = 0; i < n; ++i)
@@ -94,16 +94,7 @@ nb::object form_vjp(In<int64_t, 1> sample, In<int64_t, 1> row, Doubles by, In<do
     Array<double> out(0);
     unlocked(threads, [&](Team& team) {
         out = zeros(table * int64_t(K), team);
-        // Each thread owns some rows, runs of them, and adds to them in order.
-        constexpr int64_t run = 64;
-        const int owners = team.threads();
-        team.each(owners, [&](int64_t owner) {
-            for (size_t i = 0; i < n; ++i) {
-                if ((row(i) / run) % owners != owner) continue;
-                const double weight = bar(sample(i));
-                for (size_t k = 0; k < K; ++k) out[row(i) * int64_t(K) + int64_t(k)] += by(i, k) * weight;
-            }
-        });
+        form_vjp({sample.data(), row.data(), by.data(), int64_t(n), int64_t(K)}, bar.data(), out.data(), team);
     });
     return shaped(std::move(out), {size_t(table), K});
 }
@@ -117,8 +108,8 @@ void bind_moving_hits(nb::module_& m) {
           "threads"_a);
     m.def("meet_vjp", &meet_vjp, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(),
           "along"_a.noconvert(), "bar"_a.noconvert(), "threads"_a);
-    m.def("form_vjp", &form_vjp, "sample"_a.noconvert(), "row"_a.noconvert(), "by"_a.noconvert(), "bar"_a.noconvert(),
-          "table"_a, "threads"_a);
+    m.def("form_vjp", &form_vjp_by_rows, "sample"_a.noconvert(), "row"_a.noconvert(), "by"_a.noconvert(),
+          "bar"_a.noconvert(), "table"_a, "threads"_a);
     m.def("meet_jvp", &meet_jvp, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(),
           "along"_a.noconvert(), "verts_dot"_a.none(), "pose_dot"_a.none(), "along_dot"_a.none(), "threads"_a);
 }
