@@ -13,12 +13,11 @@
 #include <vector>
 
 #include "boundary/curve_samples.h"
+#include "boundary/light_rays.h"
 #include "boundary/shadow_edges.h"
 #include "boundary/shadow_source.h"
 #include "core/sampler.h"
 #include "core/systematic.h"
-#include "rays/meeting.h"
-#include "shading/cut_outs.h"
 
 namespace edgegrad {
 
@@ -88,149 +87,6 @@ class Pieces {
     std::vector<ShadowPiece> pieces_;
     Array<double> measure_;
     Systematic systematic_;
-};
-
-// Rays from points of a light past edges, in batches, and what they meet behind.
-template <class T>
-class LightRays {
-   public:
-    LightRays(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light)
-        : view_(view), casters_(casters), light_(light) {}
-
-    // The place t of an edge before a point of the light, for whoever knows the segment by this number.
-    void add(const ShadowPiece& piece, LightWedge::Point from, int64_t segment, double t, double weight) {
-        if (!casts(piece.edge, t)) return;
-        const HalfEdge& h = view_.geometry.topology().half_edges(piece.edge)[0];
-        const SceneView<T>& scene = view_.scene;
-        const auto vertex_of = [&](int c) { return scene.faces[3 * int64_t(h.face) + c]; };
-        const Vec3 a = corner(scene, h.face, h.first()), b = corner(scene, h.face, h.second());
-        const Vec3 light = light_.at(piece.part, from.uv);
-        Waiting& w = waiting_[count_];
-        w.point = {.a = vertex_of(h.first()),
-                   .b = vertex_of(h.second()),
-                   .part = piece.part,
-                   .uv = from.uv,
-                   .light = light,
-                   .side = from.side,
-                   .segment = segment,
-                   .t = t};
-        w.weight = weight;
-        w.edge = piece.edge;
-        w.p = (1 - t) * a + t * b;
-        if (light_.infinite) {
-            // From outside of the scene.
-            const RayFrame& frame = view_.geometry.caster().frame();
-            w.before = (4 * frame.radius * frame.unit + length(w.p - frame.centre)) / length(light);
-            w.ray = {w.p + w.before * light, -light};
-        } else {
-            w.before = 1;
-            w.ray = {light, w.p - light};
-        }
-        auto& without = without_[count_];
-        const auto beside = view_.geometry.topology().faces(piece.edge);
-        without.assign(beside.begin(), beside.end());
-        if (const int32_t own = light_.face[piece.part]; own >= 0) without.push_back(own);
-        std::sort(without.begin(), without.end());
-        ++count_;
-    }
-
-    bool is_full() const { return count_ == RayBatch::size; }
-
-    // Calls body(ShadowPoint, weight) for each face to which light goes on past them: the first that casts a shadow,
-    // and those before it that let light through.
-    template <class Body>
-    void cast(Body body) {
-        while (count_ > 0) {
-            int32_t face[RayBatch::size];
-            Meeting met[RayBatch::size];
-            cast_each(
-                view_.geometry.caster(), count_, face, without_, [&](int i) { return waiting_[i].ray; },
-                [&](int i, int32_t f) { return accept(waiting_[i], f, met[i]); });
-            int going_on = 0;
-            for (int i = 0; i < count_; ++i) {
-                if (face[i] < 0) continue;
-                Waiting& w = waiting_[i];
-                w.point.face = face[i], w.point.on = inside({met[i].u, met[i].v});
-                w.point.along = light_.infinite ? met[i].t - w.before : met[i].t;
-                // What lies before the edge, or touches it, bears no border: the shadow begins there, along a curve
-                // that the camera sees as an edge.
-                if (met[i].t > w.before + touching(w, face[i])) body(w.point, w.weight);
-                if (casters_.cut_outs.on(face[i]) && !shows(casters_, face[i], w.point.on)) go_on(going_on++, i);
-            }
-            count_ = going_on;
-        }
-    }
-
-   private:
-    struct Waiting {
-        ShadowPoint point;
-        double weight;
-        int64_t edge;
-        Vec3 p;  // of the edge, world coordinates
-        Ray ray;
-        double before;  // where the edge lies on the ray, in lengths of its direction
-    };
-
-    // The i-th ray goes on behind the face that it met, as the k-th.
-    void go_on(int k, int i) {
-        std::vector<int32_t>& without = without_[i];
-        without.insert(std::upper_bound(without.begin(), without.end(), waiting_[i].point.face),
-                       waiting_[i].point.face);
-        if (k == i) return;
-        waiting_[k] = waiting_[i];
-        without_[k].swap(without);
-    }
-
-    // Whether a face beside the edge casts a shadow from that place of it: where none does, light passes on both sides.
-    bool casts(int64_t edge, double t) const {
-        for (const HalfEdge& h : view_.geometry.topology().half_edges(edge)) {
-            double b[3] = {};
-            b[h.first()] = 1 - t, b[h.second()] = t;
-            if (shows(casters_, h.face, {b[1], b[2]})) return true;
-        }
-        return false;
-    }
-
-    bool accept(const Waiting& w, int32_t face, Meeting& m) const {
-        m = meet(view_.scene, face, w.ray);
-        if (!m.exists() || m.t <= 0 || m.margin() < -Meeting::rounding) return false;
-        // On the border of a face, as that of a box in whose side the light lies, it goes by or not as it would had the
-        // light moved a little (FacesBeforeLight).
-        if (m.margin() <= Meeting::rounding) {
-            constexpr double little = 1e-7;
-            const Vec3 moved = (little * length(w.ray.direction)) * FacesBeforeLight<T>::aside;
-            const Vec3 origin = w.ray.origin + (light_.infinite ? w.before : 1) * moved;
-            const Meeting beside = meet(view_.scene, face, {origin, w.p - origin});
-            if (!beside.exists() || beside.margin() < 0) return false;
-        }
-        // The light itself, of which the point lies on this face or one beside it.
-        if (light_.face[w.point.part] >= 0 && m.t <= touching(w, face)) return false;
-        return shows(view_.scene, face, inside({m.u, m.v}));
-    }
-
-    // How far along its ray an edge may lie from a face that it touches, up to the rounding of the input.
-    double touching(const Waiting& w, int32_t face) const {
-        const SceneView<T>& scene = view_.scene;
-        for (const int32_t beside : view_.geometry.topology().faces(w.edge))
-            if (share_vertex(scene, face, beside)) return Meeting::rounding * w.before;
-        const int32_t* v = scene.faces + 3 * int64_t(face);
-        double size = 0;
-        for (int i = 0; i < 3; ++i)
-            for (int axis = 0; axis < 3; ++axis)
-                size = std::max(size, std::fabs(scene.verts[3 * int64_t(v[i]) + axis]));
-        const Vec3 q = corner(scene, face, 0);
-        const Vec3 m = cross(corner(scene, face, 1) - q, corner(scene, face, 2) - q);
-        const double spacing = std::max(scene.spacing->of(v[0]), scene.spacing->of(w.point.a));
-        // Across the face, so along the ray it is more the more this grazes it.
-        return contact(spacing, size, size) * length(m) / std::fabs(dot(m, w.ray.direction));
-    }
-
-    const BackwardView<T>& view_;
-    const SceneView<T>& casters_;
-    const LightParts& light_;
-    Waiting waiting_[RayBatch::size];
-    std::vector<int32_t> without_[RayBatch::size];
-    int count_ = 0;
 };
 
 // Whether the filter of a pixel reaches x, and what is there belongs to this window.
