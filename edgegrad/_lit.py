@@ -67,7 +67,7 @@ class Lighting(NamedTuple):
         fused = is_fused(scene)
         adds_up = not scene.blends
         whole = (lambda frame: _whole(frame, self, points)) if fused and adds_up else None
-        effort = Effort(points, whole, scene.blends, fused, fused and adds_up, adds_up)
+        effort = Effort(points, whole, scene.blends, True, fused, fused and adds_up, adds_up)
         image = render_shaded(scene, camera, self, request, creases, False, effort)
         # A graph from all tensors, whatever is in view and whatever is lit.
         return image + sum(

@@ -121,9 +121,16 @@ def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
 
 
 def backward_kernel(
-    adjoint: Tensor, hits: Hits, request: Request, wanted: Collection[str], *, dry: bool = False
+    adjoint: Tensor,
+    hits: Hits,
+    request: Request,
+    wanted: Collection[str],
+    *,
+    dry: bool = False,
+    detailed: Tensor | None = None,
 ) -> tuple[dict[str, Tensor], list[Profile]]:
-    """The gradients of the slots that are wanted, float64, and what the kernel did for each camera. `dry` only counts samples.
+    """The gradients of the slots that are wanted, float64, and what the kernel did for each camera. `dry` only counts samples;
+    `detailed` (F,) uint8 says which faces look as textures say that the request does not hold.
 
     `adjoint` is (B, H, W, C), or (H, W, C) for a single camera. Raises MemoryError.
     """
@@ -145,6 +152,7 @@ def backward_kernel(
                     hits=kernel_hits(hits, b),
                     # Each camera has a gradient of its own.
                     gradients={n: g[b] if n in PER_CAMERA else g for n, g in grads.items()},
+                    detailed=None if detailed is None else detailed.numpy(),
                 )
                 for b in range(request.cameras)
             ]

@@ -107,15 +107,16 @@ class TraceRecords(NamedTuple):
 SURFACE_BYTES, CURVE_BYTES = 8 * (1 + 2 + 3 + 3 * 14 + 1), 8 * (2 + 3 + 6 + 3 + 14 + 4 * (1 + 1 + 3))
 
 
-def shaded_room(request: Request, gradient: bool | None = None) -> AbstractContextManager[None]:
+def shaded_room(request: Request, gradient: bool | None = None, textures: bool = False) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the image of a shader does not fit, and if an allocation in it fails; what the
     shader itself takes is not known before. With the samples of the `gradient`, by default where gradients are enabled."""
     size, options = pass_size(request), request.gradient
     pixels = request.camera.height * request.camera.width
     needs = core.image_bytes(size, request.cameras)
     if torch.is_grad_enabled() if gradient is None else gradient:
-        # By default about half a sample a pixel of surface, and some at edges.
-        surface = options.surface_samples if options.surface_samples >= 0 else pixels // 2
+        # By default about half a sample a pixel of surface, four where textures tell how it looks, and some at edges.
+        default = 4 * pixels if textures else pixels // 2
+        surface = options.surface_samples if options.surface_samples >= 0 else default
         edge = options.edge_samples if options.edge_samples >= 0 else pixels // 8
         needs["samples"] = request.cameras * (SURFACE_BYTES * surface + CURVE_BYTES * edge)
     return memory.room("render with a shader", needs, lambda: lower(request) + ", or what the shader keeps of a point")
@@ -313,9 +314,16 @@ class Sampler:
         return self._compute(self._request, with_request, *tables)
 
     def samples(
-        self, request: Request, interior: bool, boundary: bool, intrinsics: bool = False, steps: bool = False
+        self,
+        request: Request,
+        interior: bool,
+        boundary: bool,
+        intrinsics: bool = False,
+        steps: bool = False,
+        detailed: Tensor | None = None,
     ) -> tuple[SurfaceRecords, CurveRecords]:
-        """Of the gradient, after all pixel hits were taken; the scene of `request` has colours that jump where creases are."""
+        """Of the gradient, after all pixel hits were taken; the scene of `request` has colours that jump where creases are, and
+        `detailed` (F,) uint8 says which faces have textures."""
 
         def compute(request: Request, camera: Any) -> Sequence[Tensor]:
             flat, options = request.scene, request.gradient
@@ -336,6 +344,7 @@ class Sampler:
                 threads=torch.get_num_threads(),
                 adjoint=np.ones((*self.coverage.shape, flat.background.shape[-1]), self.coverage.numpy().dtype),
                 hits=kernel_hits(self._hits),
+                detailed=None if detailed is None else detailed.numpy(),
             )
             return (*_record(SurfaceRecords, surface), *_record(CurveRecords, curves))
 

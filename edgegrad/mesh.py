@@ -23,7 +23,7 @@ from ._check import (
 )
 from ._kernel import core
 from ._tree import map_tensors, moved
-from .material import LARGEST_UV, WRAPS, Material
+from .material import LARGEST_UV, WRAPS, Material, Texture
 
 PLAIN = 0.7  # radiance, or base colour, of a mesh without colours, in every channel
 FILTERS: tuple[str, ...] = core.TEXTURE_FILTERS  # linear, nearest
@@ -188,6 +188,13 @@ class Mesh:
             )
         if self.filter not in FILTERS:
             raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {self.filter!r}")
+
+    @property
+    def has_textures(self) -> bool:
+        """Whether its colours, or numbers of its material, are textures."""
+        material = self.material
+        values = () if material is None else (getattr(material, field.name) for field in dataclasses.fields(material))
+        return self.texture is not None or any(isinstance(value, Texture) for value in values)
 
     @property
     def blends(self) -> bool:

@@ -53,10 +53,10 @@ def render(
                      get samples of their own. With a constant seed, each step of an optimisation repeats the samples of
                      image and gradient, and their error does not average out: pass seed=step
     surface_samples  samples of the gradient inside faces, for each camera: an int in all, or None for ½ a unit of surface,
-                     (area + longest side · 1 px) summed over the triangles in view; 4 where they are textured and unlit; up to
-                     5 times as many where the loss is as rough as noise, down to 1/16 where triangles are small and it
-                     changes little over them, ⅛ to 1/64 where they are most likely occluded. Large textured triangles, and
-                     large ones under a rough loss, take whole samples a pixel, at least one
+                     (area + longest side · 1 px) summed over the triangles in view; 4 where they are textured; up to 5 times
+                     as many where the loss is as rough as noise, down to 1/16 where triangles are small and it changes
+                     little over them (both of unlit scenes), ⅛ to 1/64 where they are most likely occluded. Large textured
+                     triangles, and large ones under a rough loss, take whole samples a pixel, at least one, where unlit
     edge_samples     samples of the gradient at edges and where faces pass through each other, for each camera: an int in all,
                      and as many on the borders of the shadows of each light; or None for 24 a pixel of curve, 1/16 where it is
                      most likely occluded; creases by the size of their jump, and few where all of one is visible. Default

@@ -130,6 +130,11 @@ class Scene:
         return bool(self.lights) or any(mesh.material is not None for mesh in self.meshes)
 
     @property
+    def has_textures(self) -> bool:
+        """Whether colours or materials of a mesh are textures."""
+        return any(mesh.has_textures for mesh in self.meshes)
+
+    @property
     def blends(self) -> bool:
         """Whether one sees through a mesh."""
         return any(mesh.blends for mesh in self.meshes)

@@ -26,7 +26,7 @@ from ._request import Request, derived_seed
 from ._samples import PixelRecords, RayRecords, shaded_room, without_colors
 from ._shadows import ShadowLight
 from ._steps import UNEQUAL, Crossings, Points, Steps, find_crossings
-from ._surfaces import every_face
+from ._surfaces import every_face, textured_faces
 from ._warnings import warn
 from .camera import Camera
 from .hits import Hits
@@ -47,6 +47,7 @@ class Effort(NamedTuple):
     # The values (H · W, C) of a whole image at once, or None where points are to be shaded one by one.
     whole: Callable[[Frame], Tensor | None] | None = None
     blended: bool = False  # whether one may see through surfaces
+    textures: bool = False  # whether surfaces look as the textures of their meshes and materials say
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where only derivatives are wanted, see Hits.values
     adds_up: bool = (
@@ -73,10 +74,10 @@ def render_shaded(
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
-    with shaded_room(request):
+    effort = effort or Effort()
+    with shaded_room(request, textures=effort.textures and scene.has_textures):
         images = [
-            _Image(Frame(scene, request, k), shader, creases, check, effort or Effort()).render()
-            for k in range(request.cameras)
+            _Image(Frame(scene, request, k), shader, creases, check, effort).render() for k in range(request.cameras)
         ]
     return images[0] if camera.batch is None else torch.stack(images)
 
@@ -100,7 +101,12 @@ class _Image:
         flat = frame.request.scene
         cut = visibility and flat.has_steps and (moving or moves(flat.uvs, flat.alphas))
         surface, curves = frame.sampler.samples(
-            self._with_creases(), interior=True, boundary=moving, intrinsics=moves(frame.intrinsics), steps=cut
+            self._with_creases(),
+            interior=True,
+            boundary=moving,
+            intrinsics=moves(frame.intrinsics),
+            steps=cut,
+            detailed=textured_faces(frame.surfaces.scene) if self._effort.textures else None,
         )
         zero = self._interior(SurfaceSamples(frame, surface))
         if moving or cut:

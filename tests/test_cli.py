@@ -70,16 +70,15 @@ def test_fit_pose(files, capsys):
     assert float(((again - picture(camera(48))).abs() * covered).mean()) < 0.01
 
 
-def test_fit_pose_with_mask_background_and_alpha(files):
-    assert fit(files, "--init", files / "init.json", "--mask", files / "mask.png", "--out", files / "a") == 0
-    colour = "#" + bytes((linear_to_srgb(BACKGROUND) * 255).round().to(torch.uint8).tolist()).hex()
-    assert fit(files, "--init", files / "init.json", "--background", colour, "--out", files / "b") == 0
+@pytest.mark.parametrize("what", ["mask", *(pytest.param(w, marks=pytest.mark.slow) for w in ("background", "alpha"))])
+def test_fit_pose_with(what, files):
     view = camera(48)
-    write_image(files / "target.png", torch.cat([picture(view), silhouette(view)], -1))
-    assert fit(files, "--init", files / "init.json", "--out", files / "c") == 0
-    for folder in "abc":
-        found = PoseFit.from_json((files / folder / "pose.json").read_text())
-        assert max(errors(found)) < 2.0
+    colour = "#" + bytes((linear_to_srgb(BACKGROUND) * 255).round().to(torch.uint8).tolist()).hex()
+    more = {"mask": ["--mask", files / "mask.png"], "background": ["--background", colour], "alpha": []}[what]
+    if what == "alpha":
+        write_image(files / "target.png", torch.cat([picture(view), silhouette(view)], -1))
+    assert fit(files, "--init", files / "init.json", *more, "--out", files / "out") == 0
+    assert max(errors(PoseFit.from_json((files / "out" / "pose.json").read_text()))) < 2.0
 
 
 def test_an_interrupted_fit_is_written(files, capsys, monkeypatch):

@@ -909,7 +909,14 @@ def test_libraries_are_imported_late_and_missed_by_name(tmp_path):
     assert "pip install OpenImageIO" in image and "pip install trimesh" in mesh
 
 
-@pytest.mark.parametrize("missing, names", [("PIL", ["a.glb", "a.obj"]), ("lxml", ["a.3mf"]), ("networkx", ["a.3mf"])])
+@pytest.mark.parametrize(
+    "missing, names",
+    [
+        ("PIL", ["a.glb", "a.obj"]),
+        pytest.param("lxml", ["a.3mf"], marks=pytest.mark.slow),
+        pytest.param("networkx", ["a.3mf"], marks=pytest.mark.slow),
+    ],
+)
 def test_missing_libraries_are_asked_for_by_their_extra(tmp_path, missing, names):
     for name in names:
         box = trimesh.creation.box()

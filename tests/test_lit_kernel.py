@@ -227,8 +227,10 @@ def test_what_one_light_adds() -> None:
 
 def test_borders_of_shadows_by_what_the_light_adds() -> None:
     """As by the radiance on both sides, 1e-5 px beside the border, which is what any other shader gives."""
-    leaves = {name: value.clone().requires_grad_() for name, value in numbers_of("normals point area sky base").items()}
-    scene = scene_of("normals point area sky base emission", {**leaves, "emission": torch.ones(3)})
+    leaves = {
+        name: value.clone().requires_grad_() for name, value in numbers_of("normals point area sky colors").items()
+    }
+    scene = scene_of("normals point area sky colors emission", {**leaves, "emission": torch.ones(3)})
     camera, found = CAMERAS["perspective"], []
     weights = torch.rand(24, 24, 3, generator=torch.Generator().manual_seed(1))
     for shader in (None, lambda hits: _lit.radiance(hits, True, 1)):
@@ -396,3 +398,26 @@ def test_extremes_are_finite(dtype: torch.dtype) -> None:
         image = eg.render(scene, eg.Camera.look_at((0.3, 0.2, 3.0), (0.0, 0.0, 0.0), size=(16, 16)), spp=4)
         grads = torch.autograd.grad(image.sum(), [verts, roughness, position])
         assert bool(torch.isfinite(image).all()) and all(bool(torch.isfinite(g).all()) for g in grads)
+
+
+def test_textured_surfaces_take_more_samples() -> None:
+    """Eight times those of interpolated colours, as unlit: the error of a gradient falls with them."""
+    camera = CAMERAS["perspective"].resized((96, 96))
+    weights = torch.randn(96, 96, 3, dtype=F64, generator=torch.Generator().manual_seed(2))
+
+    def spread(**options: int) -> float:
+        found = []
+        for seed in range(8):
+            leaves = {name: value.clone().requires_grad_() for name, value in numbers_of("point texture").items()}
+            image = eg.render(scene_of("point texture", leaves), camera, spp=16, seed=seed, **options)
+            found.append(torch.autograd.grad((weights * image).sum(), leaves["texture"])[0])
+        return float(torch.stack(found).std(0).norm())
+
+    planned = [
+        eg.plan(scene_of(words, {k: v.requires_grad_() for k, v in numbers_of(words).items()}), camera, spp=16)[
+            "interior"
+        ].samples
+        for words in ("point texture", "point colors")
+    ]
+    assert planned[0] > 4 * planned[1] > 0
+    assert spread() < 0.6 * spread(surface_samples=planned[1])

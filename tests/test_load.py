@@ -181,12 +181,13 @@ time.sleep(0.3)
 """
 
 
-def test_a_process_ends_while_daemon_threads_render(tmp_path):
+@pytest.mark.parametrize("rounds", [1, pytest.param(10, marks=pytest.mark.slow)])
+def test_a_process_ends_while_daemon_threads_render(rounds, tmp_path):
     """Python then ends each thread that asks for its lock, which aborts the process where C++ frames are in the way."""
     file = tmp_path / "script.py"
     file.write_text(COMMON + ENDING)
     environment = {**psutil.Process().environ(), "PYTHONPATH": f"{TESTS}:{TESTS.parent}"}
-    for _ in range(2):
+    for _ in range(rounds):
         run = subprocess.run([sys.executable, str(file)], env=environment, capture_output=True, text=True, timeout=120)
         assert (run.returncode, run.stderr) == (0, "")
 
@@ -418,7 +419,14 @@ print(json.dumps({"interrupted": interrupted, "same": before == step(), "gradien
 
 
 @posix
-@pytest.mark.parametrize("kind", ["image", pytest.param("surface samples", marks=pytest.mark.slow), "edge samples"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param("image", marks=pytest.mark.slow),
+        pytest.param("surface samples", marks=pytest.mark.slow),
+        "edge samples",
+    ],
+)
 def test_ctrl_c_ends_a_long_render(kind, tmp_path):
     """KeyboardInterrupt is there 0.3 s after the signal; 1 s here, for other work may have the machine's cores just then."""
     file = tmp_path / "script.py"

@@ -16,8 +16,6 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad._kernel import core
 
-OPTIONS = ("max_isa=avx2", "max_isa=sse4.2")
-
 
 @cache
 def results() -> dict[str, Tensor]:
@@ -40,7 +38,7 @@ def results() -> dict[str, Tensor]:
     return found
 
 
-@pytest.mark.parametrize("options", OPTIONS)
+@pytest.mark.parametrize("options", [pytest.param("max_isa=avx2", marks=pytest.mark.slow), "max_isa=sse4.2"])
 def test_narrow_packets(options: str, tmp_path: Path) -> None:
     file = tmp_path / "results.pt"
     environment = {**os.environ, "EDGEGRAD_EMBREE": options, "PYTHONPATH": str(Path(__file__).parent)}

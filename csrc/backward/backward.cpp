@@ -94,7 +94,7 @@ struct InImage {
 template <class T, class Body>
 void with_view(const BackwardInput<T>& input, const Camera& camera, const InImage<T>& in_image,
                const GradientOptions& o, const Terms& terms, Team& team, Body body) {
-    const auto& [scene, whole, geometry, image, adjoint, hit_buffers] = input;
+    const auto& [scene, whole, geometry, image, adjoint, hit_buffers, detailed] = input;
     const auto& [filtered, importance, occlusion] = in_image;
     const ViewVolume volume(camera, InImage<T>::margin_of(image));
     const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, team);
@@ -126,6 +126,7 @@ void with_view(const BackwardInput<T>& input, const Camera& camera, const InImag
                          .cut_outs = through,
                          .occlusion = occlusion,
                          .hits = hits ? &*hits : nullptr,
+                         .detailed = detailed,
                          .seen = hit_buffers.seen,
                          .hit = hit_buffers.hit,
                          .vertex_adjoint = vertex_adjoint});
@@ -166,7 +167,7 @@ Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Desti
 template <class T>
 SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions& o, SampleCounts wanted, Team& team) {
     const int64_t pixels = int64_t(input.camera.width) * input.camera.height;
-    const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, team);
+    const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, input.detailed, team);
     SampleCounts n = budget.share(wanted);
     if (o.surface_samples >= 0) n.surface = wanted.surface;
     if (o.edge_samples >= 0) n.edge = wanted.edge;
@@ -298,7 +299,7 @@ void add_world(const Camera& window, const double* verts, const Array<double>& q
 template <class T>
 BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOptions& o, Team& team,
                                 const Gradients& grad) {
-    const auto& [scene, camera, geometry, image, adjoint, hits] = input;
+    const auto& [scene, camera, geometry, image, adjoint, hits, detailed] = input;
     BackwardProfile profile;
     Stopwatch watch;
     if (grad.background)

@@ -52,6 +52,8 @@ struct BackwardInput {
     const ImageOptions& image;  // of the image that was made
     const T* adjoint;           // ∂loss/∂image (H, W, C)
     HitBuffers<T> hits;         // of that image
+    // (F,): faces that look as a texture says, which the scene's own colours need not; null: none.
+    const uint8_t* detailed = nullptr;
 };
 
 // The geometry that the terms of a derivative need.

@@ -32,6 +32,7 @@ struct BackwardView {
     const SeenThrough* cut_outs;  // null: there are none
     const OcclusionHint& occlusion;
     const ImageHits* hits;           // null where neither term asks
+    const uint8_t* detailed;         // (F,), null: see BackwardInput
     const uint8_t* seen;             // (F,): 0, or the side from which the forward pass hit the face
     const int32_t* hit;              // (H, W, 2): the first and the last of the faces hit in each pixel
     const Array<T>& vertex_adjoint;  // (V, C): Ã at the vertices of faces that were hit (vertex_image.h)

@@ -17,7 +17,7 @@ namespace edgegrad {
 struct Direction {
     Tangents tangents;
     Array<Vec3> q{0};  // (V,) camera coordinates; empty: nothing moves
-    IntrinsicsGrad intrinsics;
+    IntrinsicsGrad intrinsics{};
 
     bool moves() const { return !q.empty(); }
 };

@@ -35,8 +35,8 @@ double more_if_rough(double rough, double longest) {
 }
 
 // From this area in the image on, px², a triangle with a texture, or under a rough adjoint, is left to samples of the
-// pixels. Each triangle's
-// integral is estimated in exactly one way, chosen before any sample is drawn, so the sum stays unbiased.
+// pixels. Each triangle's integral is estimated in exactly one way, chosen before any sample is drawn, so the sum stays
+// unbiased.
 constexpr double large = 256;
 
 // A face with a control is sampled the less the better that is likely to be: the adjoint changes little, and the face
@@ -151,7 +151,6 @@ class MeasuredChunk {
         if (!count) return;
         l.bound(view_.occlusion, rounding_);
         int8_t* facing = facing_.data();
-        const double default_factor = colored * hidden_by_all_around_;
         for (int i = 0; i < count; ++i) {
             const int64_t f = l.face[i];
             if (!(l.side[i] <= small)) {
@@ -166,8 +165,7 @@ class MeasuredChunk {
             }
             const double importance = importance_around_[l.tile[i]];
             if (!(importance > 0)) continue;
-            const double m =
-                l.extent[i] * (is_textured(view_.scene, f) ? textured * hidden_by_all_around_ : default_factor);
+            const double m = l.extent[i] * rate(f) * hidden_by_all_around_;
             out_.of_face[f] = m * importance;
             total_ += m;
         }
@@ -207,6 +205,11 @@ class MeasuredChunk {
         facing_[f] = int8_t(view_.camera.facing(q[0], q[1], q[2]));
     }
 
+    // Samples a unit of a face.
+    double rate(int64_t f) const {
+        return is_textured(view_.scene, f) || (view_.detailed && view_.detailed[f]) ? textured : colored;
+    }
+
     // What the measure of a face is multiplied by if it lies behind what was hit in so many pixels.
     double hidden(int64_t pixels) const { return view_.occlusion.factor(occluded, pixels, view_.image.spp); }
 
@@ -220,7 +223,7 @@ class MeasuredChunk {
     // `side()` says from which side the face would be visible.
     template <class Side>
     double default_samples(int64_t f, const Extent& e, ImageHits::Face hits, Side side) const {
-        const double m = (e.area + e.longest) * (is_textured(view_.scene, f) ? textured : colored);
+        const double m = (e.area + e.longest) * rate(f);
         const int64_t hiding = view_.seen[f] ? 0 : view_.occlusion.hiding_pixels(e.low, e.high, e.nearest);
         if (hits.partly) return hiding ? m * OcclusionHint::factor(occluded_beside_hits, view_.image.spp) : m;
         if (hiding) return m * hidden(hiding);

@@ -238,6 +238,14 @@ void check_image(const char* name, const Out<T, 3>& image, const Camera& camera,
         refuse(std::string(name) + ": expected an image of the camera's size and the scene's channels");
 }
 
+// See BackwardInput::detailed.
+template <class T>
+const uint8_t* detailed_faces(const SceneArrays<T>& scene, const std::optional<In<uint8_t, 1>>& detailed) {
+    if (!detailed) return nullptr;
+    if (detailed->size() != scene.faces.shape(0)) refuse("detailed: expected one number a face");
+    return detailed->data();
+}
+
 // Geometry as the terms of a derivative want it.
 template <class T, class Work>
 void with_geometry(const SceneArrays<T>& arrays, bool boundary, int threads, Work work) {

@@ -76,14 +76,15 @@ nb::dict arrays_of(const std::vector<CurveRecords>& parts, double least, bool on
 template <class T>
 nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
                   const GradientOptions& options, double least, int threads, Out<T, 3> adjoint,
-                  const HitArrays<T>& hits) {
+                  const HitArrays<T>& hits, const std::optional<In<uint8_t, 1>>& detailed) {
     check_image("adjoint", adjoint, camera, arrays.background.shape(2));
     hits.check(arrays, camera);
     const SceneView<T> scene = arrays.view();
     RecordList found;
     with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
-        found = record_samples(BackwardInput<T>{scene, camera, geometry, image, adjoint.data(), hits.view()}, options,
-                               team);
+        found = record_samples(BackwardInput<T>{scene, camera, geometry, image, adjoint.data(), hits.view(),
+                                                detailed_faces(arrays, detailed)},
+                               options, team);
     });
     nb::dict surface;
     const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {
@@ -248,7 +249,7 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
         .def("pixel_hits", &pixel_hits<T>, "camera"_a, "image"_a, "threads"_a, "first"_a, "end"_a, "most"_a,
              "only"_a.none(), "hits"_a)
         .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "least"_a, "threads"_a,
-             "adjoint"_a.noconvert(), "hits"_a)
+             "adjoint"_a.noconvert(), "hits"_a, "detailed"_a.none())
         .def("shadow_samples", &shadow_samples<T>, "casters"_a, "camera"_a, "image"_a, "options"_a, "light"_a,
              "samples"_a, "least"_a, "one"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)

@@ -94,7 +94,8 @@ Gradients make_gradients(const GradientArrays& arrays, const SceneView<T>& scene
 template <class T>
 Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const ChannelArrays& channels,
                  const ImageOptions& image, const GradientOptions& options, int threads, Out<T, 3> adjoint,
-                 const HitArrays<T>& hits, const GradientArrays& gradients) {
+                 const HitArrays<T>& hits, const GradientArrays& gradients,
+                 const std::optional<In<uint8_t, 1>>& detailed) {
     check_background(arrays, camera);
     check_image("adjoint", adjoint, camera, arrays.background.shape(2));
     hits.check(arrays, camera);
@@ -109,8 +110,9 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Chann
         const bool interior = (grad.geometry() && options.interior_geometry) || grad.appearance();
         const auto geometry = arrays.geometry(geometry_for(interior, boundary), team, work);
         update = watch.lap();
-        return render_backward(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view()}, options,
-                               team, grad);
+        return render_backward(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view(),
+                                                detailed_faces(arrays, detailed)},
+                               options, team, grad);
     });
     return {{"surface_samples", double(p.surface_samples)},
             {"edge_samples", double(p.edge_samples)},
@@ -197,7 +199,7 @@ void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
              "hits"_a)
         .def("faces_at_centers", &find_faces<T>, "camera"_a, "channels"_a, "threads"_a, "face"_a.noconvert())
         .def("backward", &backward<T>, "camera"_a, "channels"_a, "image"_a, "options"_a, "threads"_a,
-             "adjoint"_a.noconvert(), "hits"_a, "gradients"_a)
+             "adjoint"_a.noconvert(), "hits"_a, "gradients"_a, "detailed"_a.none() = nb::none())
         .def("jvp", &jvp<T>, "camera"_a, "channels"_a, "image"_a, "options"_a, "threads"_a, "adjoint"_a.noconvert(),
              "hits"_a, "tangents"_a, "image_dot"_a.noconvert())
         .def("screen_gradient", &screen_gradient<T>, "camera"_a, "channels"_a, "image"_a, "options"_a, "threads"_a,
