@@ -25,7 +25,7 @@ from ._request import (
     label,
 )
 from ._warnings import warn
-from .scene import Flat
+from .scene import Flat, Scene
 
 Profile = dict[str, float]
 
@@ -127,10 +127,10 @@ def backward_kernel(
     wanted: Collection[str],
     *,
     dry: bool = False,
-    detailed: Tensor | None = None,
+    lit: Scene | None = None,
 ) -> tuple[dict[str, Tensor], list[Profile]]:
-    """The gradients of the slots that are wanted, float64, and what the kernel did for each camera. `dry` only counts samples;
-    `detailed` (F,) uint8 says which faces look as textures say that the request does not hold.
+    """The gradients of the slots that are wanted, float64, and what the kernel did for each camera. `dry` only counts samples,
+    as for a scene that is `lit`, whose textures the request does not hold.
 
     `adjoint` is (B, H, W, C), or (H, W, C) for a single camera. Raises MemoryError.
     """
@@ -146,13 +146,13 @@ def backward_kernel(
                     camera=kernel_camera(request.camera, b),
                     channels=kernel_channels(request, b),
                     image=image,
-                    options=_gradient_options(request, wanted, b, dry),
+                    options=_gradient_options(request, wanted, b, dry, lit is not None),
                     threads=torch.get_num_threads(),
                     adjoint=images[b].numpy(),
                     hits=kernel_hits(hits, b),
                     # Each camera has a gradient of its own.
                     gradients={n: g[b] if n in PER_CAMERA else g for n, g in grads.items()},
-                    detailed=None if detailed is None else detailed.numpy(),
+                    detailed=faces_with_textures(lit),
                 )
                 for b in range(request.cameras)
             ]
@@ -219,7 +219,9 @@ def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Ten
         return torch.from_numpy(out).to(adjoint.dtype)
 
 
-def _gradient_options(request: Request, wanted: Collection[str], camera: int, dry: bool = False) -> Any:
+def _gradient_options(
+    request: Request, wanted: Collection[str], camera: int, dry: bool = False, lit: bool = False
+) -> Any:
     options, work = request.gradient, Work.of(request, wanted)
     return core.GradientOptions(
         seed=camera_seed(options.grad_seed, camera),
@@ -229,8 +231,15 @@ def _gradient_options(request: Request, wanted: Collection[str], camera: int, dr
         boundary=work.boundary,
         steps=work.steps,
         step_spacing=options.step_spacing,
+        lit=lit,
         dry=dry,
     )
+
+
+def faces_with_textures(lit: Scene | None) -> np.ndarray | None:
+    """(F,) uint8, if there are some in a scene that is lit."""
+    textured = None if lit is None else lit.textured_faces
+    return None if textured is None else textured.numpy()
 
 
 def camera_seed(seed: int, camera: int) -> int:

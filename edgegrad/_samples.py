@@ -14,7 +14,16 @@ from . import _memory as memory
 from ._kernel import core
 from ._operator import without_derivatives
 from ._ops import Hits as ImageHits
-from ._ops import camera_seed, kernel_camera, kernel_hits, kernel_scene, lower, pass_size, warn_of_ends
+from ._ops import (
+    camera_seed,
+    faces_with_textures,
+    kernel_camera,
+    kernel_hits,
+    kernel_scene,
+    lower,
+    pass_size,
+    warn_of_ends,
+)
 from ._request import Request
 from .scene import Flat, Scene, flatten
 
@@ -107,15 +116,15 @@ class TraceRecords(NamedTuple):
 SURFACE_BYTES, CURVE_BYTES = 8 * (1 + 2 + 3 + 3 * 14 + 1), 8 * (2 + 3 + 6 + 3 + 14 + 4 * (1 + 1 + 3))
 
 
-def shaded_room(request: Request, gradient: bool | None = None, textures: bool = False) -> AbstractContextManager[None]:
+def shaded_room(request: Request, gradient: bool | None = None, textured: bool = False) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the image of a shader does not fit, and if an allocation in it fails; what the
     shader itself takes is not known before. With the samples of the `gradient`, by default where gradients are enabled."""
     size, options = pass_size(request), request.gradient
     pixels = request.camera.height * request.camera.width
     needs = core.image_bytes(size, request.cameras)
     if torch.is_grad_enabled() if gradient is None else gradient:
-        # By default about half a sample a pixel of surface, four where textures tell how it looks, and some at edges.
-        default = 4 * pixels if textures else pixels // 2
+        # By default about half a sample a pixel of surface, one where it is lit and has a texture, and some at edges.
+        default = pixels if textured else pixels // 2
         surface = options.surface_samples if options.surface_samples >= 0 else default
         edge = options.edge_samples if options.edge_samples >= 0 else pixels // 8
         needs["samples"] = request.cameras * (SURFACE_BYTES * surface + CURVE_BYTES * edge)
@@ -320,10 +329,10 @@ class Sampler:
         boundary: bool,
         intrinsics: bool = False,
         steps: bool = False,
-        detailed: Tensor | None = None,
+        lit: Scene | None = None,
     ) -> tuple[SurfaceRecords, CurveRecords]:
-        """Of the gradient, after all pixel hits were taken; the scene of `request` has colours that jump where creases are, and
-        `detailed` (F,) uint8 says which faces have textures."""
+        """Of the gradient, after all pixel hits were taken; the scene of `request` has colours that jump where creases are.
+        `lit`: the scene whose lights shade them."""
 
         def compute(request: Request, camera: Any) -> Sequence[Tensor]:
             flat, options = request.scene, request.gradient
@@ -339,12 +348,13 @@ class Sampler:
                     intrinsics=intrinsics,
                     steps=steps,
                     step_spacing=options.step_spacing,
+                    lit=lit is not None,
                 ),
                 least=self._least,
                 threads=torch.get_num_threads(),
                 adjoint=np.ones((*self.coverage.shape, flat.background.shape[-1]), self.coverage.numpy().dtype),
                 hits=kernel_hits(self._hits),
-                detailed=None if detailed is None else detailed.numpy(),
+                detailed=faces_with_textures(lit),
             )
             return (*_record(SurfaceRecords, surface), *_record(CurveRecords, curves))
 

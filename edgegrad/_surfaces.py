@@ -16,13 +16,6 @@ from ._samples import bare
 from .scene import Flat, Scene
 
 
-def textured_faces(scene: Scene) -> Tensor | None:
-    """(F,) uint8 on the CPU: the faces whose colours or materials have textures; None: none have."""
-    if not scene.has_textures:
-        return None
-    return torch.cat([torch.full((len(m.faces),), m.has_textures, dtype=torch.uint8) for m in scene.meshes])
-
-
 class Surfaces:
     """Meshes laid end to end.
 

@@ -21,7 +21,7 @@ from ._ops import Hits, backward_kernel, forward_kernel, image_room, pass_size
 from ._request import MOVING, SLOTS, Request, Work, as_scene, label, make_request, required
 from ._samples import CURVE_BYTES, SURFACE_BYTES, without_colors
 from ._shadows import ShadowLight
-from ._surfaces import every_face, textured_faces
+from ._surfaces import every_face
 from .camera import Camera
 from .mesh import Mesh
 from .render import SHADING, render
@@ -103,14 +103,14 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
     return Plan({**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted)})
 
 
-def _shaded_terms(scene: Scene, request: Request, creases: object, detailed: Tensor | None = None) -> dict[str, Term]:
+def _shaded_terms(scene: Scene, request: Request, creases: object, lit: Scene | None = None) -> dict[str, Term]:
     """With a shader, of which nothing is asked before it runs: neither what it needs nor at which edges it may jump."""
     attributes = every_face(len(request.scene.faces)) if creases is True else None
     request = request._replace(scene=without_colors(request.scene, attributes))
     moving = [name for name in required(request) if name in MOVING]
     # Whether a tensor of the shader's own requires a gradient is not known either.
     wanted = [*moving, "colors"] if torch.is_grad_enabled() else []
-    terms = {**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted, detailed)}
+    terms = {**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted, lit)}
     rows = CURVE_BYTES * terms["boundary"].samples + SURFACE_BYTES * terms["interior"].samples
     terms["textures"] = Term(False, "the shader looks up its own")
     terms["shader"] = Term(
@@ -129,7 +129,7 @@ def _shaded_terms(scene: Scene, request: Request, creases: object, detailed: Ten
 
 def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighting) -> dict[str, Term]:
     """Materials and lights are shaded in PyTorch, as by a shader."""
-    terms = _shaded_terms(scene, request, creases, textured_faces(scene))
+    terms = _shaded_terms(scene, request, creases, scene)
     lights = sum(1 if light.punctual else lighting.samples for light in scene.casting)
     shaded = terms["interior"].samples + terms["boundary"].samples
     terms["textures"] = Term(False, "looked up where they are lit")
@@ -198,7 +198,7 @@ def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str
     }
 
 
-def _gradient_terms(request: Request, wanted: Collection[str], detailed: Tensor | None = None) -> dict[str, Term]:
+def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None = None) -> dict[str, Term]:
     flat, camera, B = request.scene, request.camera, request.cameras
     work = Work.of(request, wanted)
     moves = any(name in wanted for name in MOVING)
@@ -212,7 +212,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], detailed: Tensor 
         flat.faces.new_zeros((*ones.shape[:-1], 2), dtype=torch.int32),
         flat.faces.new_ones((B, len(flat.faces)), dtype=torch.uint8),
     )
-    _, profiles = backward_kernel(ones, hits, request, wanted, dry=True, detailed=detailed)
+    _, profiles = backward_kernel(ones, hits, request, wanted, dry=True, lit=lit)
     counts = {name: int(sum(profile[name] for profile in profiles)) for name in _COUNTS}
     surface, edge, silhouettes, creases, intersections, rim = (
         counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections", "rim")

@@ -55,10 +55,12 @@ def render(
     surface_samples  samples of the gradient inside faces, for each camera: an int in all, or None for ½ a unit of surface,
                      (area + longest side · 1 px) summed over the triangles in view; 4 where they are textured; up to 5 times
                      as many where the loss is as rough as noise, down to 1/16 where triangles are small and it changes
-                     little over them (both of unlit scenes), ⅛ to 1/64 where they are most likely occluded. Large textured
-                     triangles, and large ones under a rough loss, take whole samples a pixel, at least one, where unlit
+                     little over them, ⅛ to 1/64 where they are most likely occluded. Large textured triangles, and large
+                     ones under a rough loss, take whole samples a pixel, at least one. In lit scenes ½ a unit, and one a pixel
+                     of textured triangles that are no slivers
     edge_samples     samples of the gradient at edges and where faces pass through each other, for each camera: an int in all,
-                     and as many on the borders of the shadows of each light; or None for 24 a pixel of curve, 1/16 where it is
+                     and as many on the borders of the shadows of each light; or None for 24 a pixel of curve, 6 in lit
+                     scenes, 1/16 where it is
                      most likely occluded; creases by the size of their jump, and few where all of one is visible. Default
                      samples of both kinds together take about as long as the image at most: plan() says where that bound
     visibility       False leaves out what moves at silhouettes and other jumps; the gradient is then that of the shading alone

@@ -130,9 +130,11 @@ class Scene:
         return bool(self.lights) or any(mesh.material is not None for mesh in self.meshes)
 
     @property
-    def has_textures(self) -> bool:
-        """Whether colours or materials of a mesh are textures."""
-        return any(mesh.has_textures for mesh in self.meshes)
+    def textured_faces(self) -> Tensor | None:
+        """(F,) uint8 on the CPU: the faces whose colours or materials have textures; None: none have."""
+        if not any(mesh.has_textures for mesh in self.meshes):
+            return None
+        return torch.cat([torch.full((len(m.faces),), m.has_textures, dtype=torch.uint8) for m in self.meshes])
 
     @property
     def blends(self) -> bool:

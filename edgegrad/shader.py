@@ -26,7 +26,7 @@ from ._request import Request, derived_seed
 from ._samples import PixelRecords, RayRecords, shaded_room, without_colors
 from ._shadows import ShadowLight
 from ._steps import UNEQUAL, Crossings, Points, Steps, find_crossings
-from ._surfaces import every_face, textured_faces
+from ._surfaces import every_face
 from ._warnings import warn
 from .camera import Camera
 from .hits import Hits
@@ -47,7 +47,7 @@ class Effort(NamedTuple):
     # The values (H · W, C) of a whole image at once, or None where points are to be shaded one by one.
     whole: Callable[[Frame], Tensor | None] | None = None
     blended: bool = False  # whether one may see through surfaces
-    textures: bool = False  # whether surfaces look as the textures of their meshes and materials say
+    lit: bool = False  # whether the scene's materials and lights shade them
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where only derivatives are wanted, see Hits.values
     adds_up: bool = (
@@ -75,7 +75,7 @@ def render_shaded(
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
     effort = effort or Effort()
-    with shaded_room(request, textures=effort.textures and scene.has_textures):
+    with shaded_room(request, textured=effort.lit and scene.textured_faces is not None):
         images = [
             _Image(Frame(scene, request, k), shader, creases, check, effort).render() for k in range(request.cameras)
         ]
@@ -106,7 +106,7 @@ class _Image:
             boundary=moving,
             intrinsics=moves(frame.intrinsics),
             steps=cut,
-            detailed=textured_faces(frame.surfaces.scene) if self._effort.textures else None,
+            lit=frame.surfaces.scene if self._effort.lit else None,
         )
         zero = self._interior(SurfaceSamples(frame, surface))
         if moving or cut:

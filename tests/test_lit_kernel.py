@@ -234,7 +234,7 @@ def test_borders_of_shadows_by_what_the_light_adds() -> None:
     camera, found = CAMERAS["perspective"], []
     weights = torch.rand(24, 24, 3, generator=torch.Generator().manual_seed(1))
     for shader in (None, lambda hits: _lit.radiance(hits, True, 1)):
-        image = eg.render(scene, camera, spp=4, shader=shader)
+        image = eg.render(scene, camera, spp=4, shader=shader, edge_samples=4000)
         found.append(torch.autograd.grad((weights * image).sum(), [leaves["verts"], leaves["point"]]))
     for a, b in zip(*found, strict=True):
         assert float((a - b).norm()) < 1e-5 * float(a.norm()) > 0
@@ -400,8 +400,50 @@ def test_extremes_are_finite(dtype: torch.dtype) -> None:
         assert bool(torch.isfinite(image).all()) and all(bool(torch.isfinite(g).all()) for g in grads)
 
 
-def test_textured_surfaces_take_more_samples() -> None:
-    """Eight times those of interpolated colours, as unlit: the error of a gradient falls with them."""
+def pyramid(texture: Tensor) -> eg.Scene:
+    """Larger than its image, lit from both sides."""
+    verts = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 0.8]])
+    faces = torch.tensor([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    uvs = (verts[:, :2] + 1) / 2
+    lights = [eg.PointLight(torch.tensor([0.5, -0.4, z]), power) for z, power in ((3.0, 30.0), (-3.0, 5.0))]
+    return eg.Scene(
+        [eg.Mesh(verts, faces, texture=texture, uvs=uvs, uv_faces=faces, material=eg.Material())], lights=lights
+    )
+
+
+NEAR = eg.Camera.look_at((0.3, -0.9, 1.6), (0.2, 0.0, 0.0), size=(24, 24))
+AROUND_PYRAMID = {
+    "pinhole": NEAR,
+    "distorted": NEAR.replace(distortion=torch.tensor([-0.1, 0.02, 0.001, -0.001])),
+    "panorama": eg.Camera.panorama(NEAR.world_to_camera, (24, 48)),
+}
+
+
+@pytest.mark.parametrize("filter", ["box", "tent", "gaussian"])
+@pytest.mark.parametrize("view", AROUND_PYRAMID)
+@pytest.mark.parametrize("samples", [None, 150])
+def test_textured_faces_by_samples_of_pixels(samples: int | None, view: str, filter: str) -> None:
+    """An image is linear in the base colour: the derivative along the texture is the image."""
+    generator = torch.Generator().manual_seed(3)
+    texture, camera = torch.rand(16, 16, 3, generator=generator), AROUND_PYRAMID[view]
+    weights, found = torch.rand(*camera.size, 3, generator=generator), []
+    for seed in range(24 if samples is None else 96):
+        texture = texture.detach().requires_grad_()
+        image = eg.render(
+            pyramid(texture), camera, spp=64, seed=seed, filter=filter, surface_samples=samples, visibility=False
+        )
+        (gradient,) = torch.autograd.grad((weights * image).sum(), texture)
+        found.append([float((gradient * texture).sum().detach()), float((weights * image).sum().detach())])
+    (along, image), error = (
+        torch.tensor(found).double().mean(0),
+        torch.tensor(found).double().std(0) / len(found) ** 0.5,
+    )
+    assert float(error.norm()) < 0.01 * float(image)
+    assert abs(float(along - image)) < 4 * float(error.norm())
+
+
+def test_textured_faces_take_a_sample_a_pixel() -> None:
+    """Fewer where fewer are asked for, and the error of a gradient grows."""
     camera = CAMERAS["perspective"].resized((96, 96))
     weights = torch.randn(96, 96, 3, dtype=F64, generator=torch.Generator().manual_seed(2))
 
@@ -413,11 +455,8 @@ def test_textured_surfaces_take_more_samples() -> None:
             found.append(torch.autograd.grad((weights * image).sum(), leaves["texture"])[0])
         return float(torch.stack(found).std(0).norm())
 
-    planned = [
-        eg.plan(scene_of(words, {k: v.requires_grad_() for k, v in numbers_of(words).items()}), camera, spp=16)[
-            "interior"
-        ].samples
-        for words in ("point texture", "point colors")
-    ]
-    assert planned[0] > 4 * planned[1] > 0
-    assert spread() < 0.6 * spread(surface_samples=planned[1])
+    moving = scene_of("point texture", {k: v.requires_grad_() for k, v in numbers_of("point texture").items()})
+    covered = float(eg.render_aovs(moving, camera, ["alpha"], 16)["alpha"].sum().detach())
+    planned = eg.plan(moving, camera, spp=16)["interior"].samples
+    assert covered < planned < 4 * covered
+    assert spread() < 0.6 * spread(surface_samples=planned // 8)

@@ -155,7 +155,7 @@ Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Desti
     if (terms.boundary) {
         if (!terms.interior()) facing = facing_of_faces(view);
         const Curves<T>& curves = out.curves.emplace(measure_curves<N>(view, std::move(facing), terms.rim));
-        out.wanted.edge = profile.edge_wanted = curves.wanted(o.edge_samples);
+        out.wanted.edge = profile.edge_wanted = curves.wanted(o);
         profile.silhouettes = curves.silhouettes, profile.creases = curves.creases;
         profile.intersections = curves.intersections, profile.rim = curves.rim;
         profile.curves = watch.lap();
@@ -167,7 +167,7 @@ Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Desti
 template <class T>
 SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions& o, SampleCounts wanted, Team& team) {
     const int64_t pixels = int64_t(input.camera.width) * input.camera.height;
-    const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, input.detailed, team);
+    const SampleBudget budget(input.hits.coverage, pixels, input.image.spp, o.lit, team);
     SampleCounts n = budget.share(wanted);
     if (o.surface_samples >= 0) n.surface = wanted.surface;
     if (o.edge_samples >= 0) n.edge = wanted.edge;

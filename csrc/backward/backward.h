@@ -21,6 +21,7 @@ struct GradientOptions {
     bool intrinsics = true;  // whether they may move; where boundary does count, the rim of what a lens shows then does
     bool steps = true;       // whether what moves steps within faces counts
     double step_spacing = 1;  // px between the lines that find them
+    bool lit = false;         // whether samples are shaded by lights, at several times the cost
     bool dry = false;         // only count the samples
     bool controls = true;  // whether integrals that are known serve as control variates; they are of one given adjoint
     int pixel_spp = 0;     // if not zero, all of the interior term from so many samples a pixel, for the benchmarks

@@ -14,8 +14,10 @@ namespace edgegrad {
 
 namespace {
 
-// Default samples a pixel of curve; see surface_measure.cpp.
-constexpr double samples_per_pixel = 24;
+// Default samples a pixel of curve; see surface_measure.cpp. Of lit scenes, where a sample costs three times as much
+// and most of the error is that of faces: with a quarter of the samples it grows by a tenth at most
+// (docs/performance.md).
+double samples_per_pixel(bool lit) { return lit ? 6 : 24; }
 
 // The error of a gradient is seen relative to all of it. What controls know has none, so the more of it that is, the
 // fewer samples do for the rest: their error falls as one over their number, and the rest of the gradient, a vector by
@@ -440,11 +442,11 @@ Curves<T>::Curves(const BackwardView<T>& view, Array<int8_t> facing)
                   view.team)) {}
 
 template <class T>
-int64_t Curves<T>::wanted(int64_t given) const {
+int64_t Curves<T>::wanted(const GradientOptions& o) const {
     if (!(pixels > 0)) return 0;
-    if (given >= 0) return given;
+    if (o.edge_samples >= 0) return o.edge_samples;
     const double rest = squares > 0 ? std::clamp(std::sqrt(unknown / squares), least_rest, 1.0) : 1;
-    const double all = samples_per_pixel * pixels;
+    const double all = samples_per_pixel(o.lit) * pixels;
     return int64_t(std::ceil(std::max(rest * all, std::min(all, least_samples))));
 }
 

@@ -58,7 +58,7 @@ struct Curves : CurvesFound {
     int64_t arcs() const { return rim_curve ? int64_t(rim_curve->arcs.size()) : 0; }
 
     // Samples: so many as are given, if not −1, or the defaults.
-    int64_t wanted(int64_t given) const;
+    int64_t wanted(const GradientOptions& o) const;
 
     // Adds the segments of those clear creases in whose pixels any other curve lies; or of all creases.
     void add_segments(const BackwardView<T>& view, bool all);

@@ -2,6 +2,7 @@
 // forward mode a derivative of the pixels around it, or the gradient by its place in the image.
 #pragma once
 
+#include <algorithm>
 #include <vector>
 
 #include "contract/forward.h"
@@ -20,8 +21,8 @@ struct SurfaceSample {
 };
 
 // Each offers: wants(i, sample), false if nothing could come of it; add(i, sample, n, visible) for those that it
-// wanted, where i tells the samples of a batch apart; and begin_pixel(pixel, spp), add_in_pixel(face, n) for samples
-// that were drawn in a pixel.
+// wanted, where i tells the samples of a batch apart; and begin_pixel(pixel, weight), false if nothing could come of
+// it, add_in_pixel(face, n, x) for samples that were drawn in a pixel, with that weight each.
 
 template <int N, class T>
 class ReverseInterior {
@@ -47,14 +48,14 @@ class ReverseInterior {
         if (s.controlled) run_.control().subtract(s.lambda, s.share);
     }
 
-    bool begin_pixel(int64_t pixel, int spp) {
+    bool begin_pixel(int64_t pixel, double weight) {
         const T* A = view_.adjoint.of(pixel);
-        for (int c = 0; c < C_; ++c) in_pixel_[c] = double(A[c]) / spp;
+        for (int c = 0; c < C_; ++c) in_pixel_[c] = weight * double(A[c]);
         return std::any_of(A, A + C_, [](T a) { return a != 0; });
     }
 
     // Faces in a pixel take turns and come again in the next one: some runs are kept open.
-    void add_in_pixel(int32_t face, Vec2 n) {
+    void add_in_pixel(int32_t face, Vec2 n, Vec2) {
         if (open_.empty()) open_ = std::vector<FaceGrad<N, T>>(32, run_);
         FaceGrad<N, T>& run = open_[unsigned(face) % open_.size()];
         if (run.face() != face) run.flush(), run.start(face);
@@ -93,12 +94,12 @@ class ForwardInterior {
         splat_.add(s.x, values_);
     }
 
-    bool begin_pixel(int64_t pixel, int spp) {
-        pixel_ = pixel, spp_ = spp;
+    bool begin_pixel(int64_t pixel, double weight) {
+        pixel_ = pixel, weight_ = weight;
         return true;
     }
-    void add_in_pixel(int32_t face, Vec2 n) {
-        if (differentiate(face, n)) splat_.add(pixel_, 1.0 / spp_, values_);
+    void add_in_pixel(int32_t face, Vec2 n, Vec2) {
+        if (differentiate(face, n)) splat_.add(pixel_, weight_, values_);
     }
 
     void finish() {}
@@ -130,7 +131,7 @@ class ForwardInterior {
     Splat splat_;
     std::vector<double> values_;  // (D, C)
     int64_t pixel_ = 0;
-    int spp_ = 1;
+    double weight_ = 1;
 };
 
 // −Ã · ∂L/∂x: how the loss changes as what is seen at x moves in the image.
@@ -150,13 +151,13 @@ class ScreenInterior {
         if (visible) add(view_.pixel(s.x), s.face, n, adjoint_.data() + i * in_pixel_.size());
     }
 
-    bool begin_pixel(int64_t pixel, int spp) {
+    bool begin_pixel(int64_t pixel, double weight) {
         const T* A = view_.adjoint.of(pixel);
         pixel_ = pixel;
-        for (size_t c = 0; c < in_pixel_.size(); ++c) in_pixel_[c] = double(A[c]) / spp;
+        for (size_t c = 0; c < in_pixel_.size(); ++c) in_pixel_[c] = weight * double(A[c]);
         return std::any_of(in_pixel_.begin(), in_pixel_.end(), [](double a) { return a != 0; });
     }
-    void add_in_pixel(int32_t face, Vec2 n) { add(pixel_, face, n, in_pixel_.data()); }
+    void add_in_pixel(int32_t face, Vec2 n, Vec2) { add(pixel_, face, n, in_pixel_.data()); }
 
     void finish() {}
 
@@ -196,14 +197,26 @@ class RecordInterior {
         if (visible) add(s.face, s.x, n, s.weight);
     }
 
-    // A sample of a pixel was drawn in proportion to its filter k; as one of the plane it has the weight 1 / (spp k).
-    // Only textured faces, and large ones under a loss as rough as noise, are sampled so; here there are neither.
-    bool begin_pixel(int64_t, int) const { return false; }
-    void add_in_pixel(int32_t, Vec2) const {}
+    bool begin_pixel(int64_t, double weight) {
+        weight_ = weight;
+        return true;
+    }
+    void add_in_pixel(int32_t face, Vec2 n, Vec2 x) { in_pixels_.push_back({face, x, n, weight_}); }
 
-    void finish() {}
+    // Face by face, for what samples of one face share is then read, and added to, once.
+    void finish() {
+        std::stable_sort(in_pixels_.begin(), in_pixels_.end(),
+                         [](const InPixel& a, const InPixel& b) { return a.face < b.face; });
+        for (const InPixel& s : in_pixels_) add(s.face, s.x, s.n, s.weight);
+    }
 
    private:
+    struct InPixel {
+        int32_t face;
+        Vec2 x, n;
+        double weight;
+    };
+
     void add(int32_t face, Vec2 x, Vec2 n, double weight) {
         records_.face.push_back(face);
         append(records_.x, {x.x, x.y});
@@ -214,6 +227,8 @@ class RecordInterior {
     const BackwardView<T>& view_;
     const Record kept_;
     SurfaceRecords& records_;
+    double weight_ = 0;
+    std::vector<InPixel> in_pixels_;
 };
 
 }  // namespace edgegrad

@@ -16,6 +16,7 @@
 #include "core/sampler.h"
 #include "core/sobol.h"
 #include "core/systematic.h"
+#include "film/film.h"
 #include "interior/contractions.h"
 #include "interior/surface_measure.h"
 
@@ -150,31 +151,47 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
 template <int N, class Contraction, class T>
 void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Contraction& contraction,
                        Destination& to, double (&seconds)[2]) {
-    const auto& [pixels, spp, seed, faces] = samples;
-    const int width = view.camera.width;
+    const auto& [pixels, spp, seed, faces, share, beyond] = samples;
+    const int margin = beyond.value_or(0), stride = view.camera.width + 2 * margin;
+    const Filter filter = beyond ? Filter(FilterKind::box) : view.image.filter;
+    const double weight = 1 / (spp * share);
     const ScrambledSobol sobol(seed);
     view.scatter.add(int64_t(pixels.size()), to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         auto chunk = contract<N>(view, contraction, to, grad);
         CameraRays rays(view.frame);
+        struct {
+            int64_t pixel;
+            Vec2 x;  // of the plane
+        } drawn[RayBatch::size];
+        const auto cast = [&] {
+            rays.prepare();
+            view.frame.cast(rays);
+            int64_t pixel = -1;
+            for (int i = 0; i < rays.count; ++i) {
+                const int32_t face = rays.face[i];
+                if (face < 0 || (faces && !faces[face])) continue;
+                if (drawn[i].pixel != pixel) chunk.begin_pixel(pixel = drawn[i].pixel, weight);
+                chunk.add_in_pixel(face, rays.n(i), drawn[i].x);
+            }
+            rays.count = 0;
+        };
         for (int64_t p = first; p < last; ++p) {
             const int64_t pixel = pixels[p];
-            if (!chunk.begin_pixel(pixel, spp)) continue;
+            if (!chunk.begin_pixel(pixel, weight)) continue;
             view.team.check();
-            const int x = int(pixel % width), y = int(pixel / width);
-            const uint64_t place = z_order(x, y) * spp;
-            for (int done = 0; done < spp; done += RayBatch::size) {
-                rays.count = std::min(spp - done, RayBatch::size);
-                sobol.fill(place + done, rays.count, rays.n_x, rays.n_y);
-                place_in_pixel(view.camera, view.image.filter, x, y, rays.count, rays.n_x, rays.n_y);
-                rays.prepare();
-                view.frame.cast(rays);
-                for (int i = 0; i < rays.count; ++i) {
-                    const int32_t face = rays.face[i];
-                    if (face < 0 || (faces && !faces[face])) continue;
-                    chunk.add_in_pixel(face, rays.n(i));
-                }
+            const int column = int(pixel % stride), row = int(pixel / stride), x = column - margin, y = row - margin;
+            const uint64_t place = z_order(column, row) * spp;
+            for (int done = 0; done < spp;) {
+                const int n = std::min(spp - done, RayBatch::size - rays.count);
+                double *n_x = rays.n_x + rays.count, *n_y = rays.n_y + rays.count;
+                sobol.fill(place + done, n, n_x, n_y);
+                for (int i = 0; i < n; ++i) drawn[rays.count + i] = {pixel, {x + n_x[i], y + n_y[i]}};
+                place_in_pixel(view.camera, filter, x, y, n, n_x, n_y);
+                rays.count += n, done += n;
+                if (rays.count == RayBatch::size) cast();
             }
         }
+        cast();
         chunk.finish();
     });
 }
@@ -186,8 +203,9 @@ void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64
     profile.surface_samples = surface.pixel_samples() + n;
     if (o.dry) return;
     if (surface.pixel_samples() > 0) {
-        const PixelSamples samples{surface.pixels, surface.pixel_spp, hash(o.seed, 4, gradient_stream),
-                                   surface.is_large.data()};
+        PixelSamples samples{surface.pixels, surface.pixel_spp, hash(o.seed, 4, gradient_stream),
+                             surface.by_pixels.data(), surface.pixel_share};
+        if (view.detailed) samples.beyond = surface.beyond;
         add_pixel_samples<N>(view, samples, contraction, to, profile.surface);
     }
     if (n == 0) return;

@@ -1,6 +1,7 @@
 // The interior term ∫ Ã · ∂L/∂Φ dx: what changes inside the faces.
 #pragma once
 
+#include <optional>
 #include <vector>
 
 #include "backward/view.h"
@@ -23,6 +24,10 @@ struct PixelSamples {
     int spp;
     uint64_t seed;
     const uint8_t* faces;
+    double share = 1;  // of the pixels of which these are some
+    // If there are some, the pixels are those of the plane, row by row, so many beyond each side of the image included,
+    // and samples are uniform in them; else these are drawn in proportion to the filter of their pixel.
+    std::optional<int> beyond = {};
 };
 template <int N, class Contraction, class T>
 void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Contraction& contraction,

@@ -8,6 +8,7 @@
 #include "backward/vertex_image.h"
 #include "camera/polygon.h"
 #include "core/channels.h"
+#include "core/sampler.h"
 #include "interior/control.h"
 #include "interior/face_lanes.h"
 #include "shading/shade.h"
@@ -26,6 +27,11 @@ constexpr double occluded_beside_hits = 1.0 / 8;
 // from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
 // (docs/performance.md).
 constexpr double colored = 0.5, textured = 4;
+
+// Shaded by lights a sample costs several times as much, so textures get no more samples there than colours do; but of
+// faces that are no slivers they are better placed in the image's pixels, one in each, for neighbours' samples
+// complement one another (sobol.h). A sliver is hit there by chance, and weighs the more.
+constexpr double lit_pixel = 1, least_lit_area = 2, sliver = 0.1;  // samples, px², of the longest side's square
 
 // Where the adjoint is as rough as noise it changes from pixel to pixel within a face: up to so many times more samples
 // are taken, on faces that are several pixels long.
@@ -51,15 +57,18 @@ static_assert(small < 2 * OcclusionHint::tile);
 // The pixels that large triangles may touch, by tiles.
 class PixelMask {
    public:
-    PixelMask(const Camera& camera, double radius)
-        : width_(camera.width),
-          height_(camera.height),
+    // Of the image and so many pixels beyond each of its sides.
+    PixelMask(const Camera& camera, double radius, int beyond)
+        : width_(camera.width + 2 * beyond),
+          height_(camera.height + 2 * beyond),
           radius_(radius),
-          columns_((camera.width + tile - 1) / tile),
-          marked_(size_t(columns_) * ((camera.height + tile - 1) / tile), 0) {}
+          beyond_(beyond),
+          columns_((width_ + tile - 1) / tile),
+          marked_(size_t(columns_) * ((height_ + tile - 1) / tile), 0) {}
 
     // A box in the image.
     void mark(Vec2 low, Vec2 high) {
+        low += Vec2{double(beyond_), double(beyond_)}, high += Vec2{double(beyond_), double(beyond_)};
         const auto index = [](double x, int most) {
             return int(std::clamp(std::floor(x), 0.0, double(most - 1))) / tile;
         };
@@ -84,7 +93,7 @@ class PixelMask {
     static constexpr int tile = 16;
     int width_, height_;
     double radius_;
-    int columns_;
+    int beyond_, columns_;
     std::vector<uint8_t> marked_;
 };
 
@@ -109,7 +118,7 @@ class MeasuredChunk {
           want_values_(to.colors || to.vertex_attributes || to.face_attributes) {}
 
     double total() const { return total_; }
-    double of_large() const { return of_large_; }
+    double of_pixels() const { return of_pixels_; }
 
     void add(int64_t first, int64_t last) {
         for (int64_t g = first; g < last; g += FaceLanes::size) {
@@ -206,9 +215,9 @@ class MeasuredChunk {
     }
 
     // Samples a unit of a face.
-    double rate(int64_t f) const {
-        return is_textured(view_.scene, f) || (view_.detailed && view_.detailed[f]) ? textured : colored;
-    }
+    double rate(int64_t f) const { return is_textured(view_.scene, f) ? textured : colored; }
+    // Whether lights shade it and it has a texture.
+    bool is_detailed(int64_t f) const { return view_.detailed && view_.detailed[f]; }
 
     // What the measure of a face is multiplied by if it lies behind what was hit in so many pixels.
     double hidden(int64_t pixels) const { return view_.occlusion.factor(occluded, pixels, view_.image.spp); }
@@ -235,10 +244,12 @@ class MeasuredChunk {
         if (!std::isfinite(m)) return;  // coordinates beyond 1e150 cannot be sampled
         const bool textured = is_textured(view_.scene, f);
         if (!textured) m *= more_if_rough(rough_, e.longest);
-        if ((textured || rough_ > 1) && e.area >= large) {
-            out_.is_large[f] = 1;
+        const bool by_pixels = is_detailed(f) ? e.area >= least_lit_area && e.area >= sliver * e.longest * e.longest
+                                              : (textured || rough_ > 1) && e.area >= large;
+        if (by_pixels) {
+            out_.by_pixels[f] = 1;
             mask_.mark(e.low, e.high);
-            of_large_ += m;
+            of_pixels_ += m;
         } else {
             out_.of_face[f] = m * importance;
             total_ += m;
@@ -357,7 +368,7 @@ class MeasuredChunk {
     const int C_;
     const double rough_;                                                 // of faces without a control
     const double rounding_ = 16 * view_.camera.rounding_of_positions();  // of a wedge, over the longer side
-    double total_ = 0, of_large_ = 0;
+    double total_ = 0, of_pixels_ = 0;
     VisiblePolygon polygon_;
     std::optional<FaceLanes> lanes_;  // none before there is a face for them
     HiddenFaces hidden_;
@@ -372,19 +383,36 @@ class MeasuredChunk {
 
 }  // namespace
 
+namespace {
+
+// Keeps so many of the pixels, evenly spread: each as likely as any other.
+void thin_out(std::vector<int64_t>& pixels, double share, double offset) {
+    if (share >= 1) return;
+    size_t kept = 0;
+    for (size_t i = 0; i < pixels.size(); ++i)
+        if (std::floor(double(i + 1) * share + offset) > std::floor(double(i) * share + offset))
+            pixels[kept++] = pixels[i];
+    pixels.resize(kept);
+}
+
+}  // namespace
+
 template <int N, class T>
 SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Array<int8_t>& facing, Destination& to) {
     const GradientOptions& o = view.options;
     const int64_t F = view.scene.n_faces, chunks = (F + scatter_chunk - 1) / scatter_chunk;
     SurfaceMeasure<T> out{Array<double>(F), Array<uint8_t>(F), {}, {}};
-    if (view.scene.face_texture || 2 * std::pow(view.importance.roughness(), 2) > 1) out.is_large.assign(F, 0);
-    PixelMask mask(view.camera, view.image.filter.radius() - 0.5);
+    if (view.detailed || view.scene.face_texture || 2 * std::pow(view.importance.roughness(), 2) > 1)
+        out.by_pixels.assign(F, 0);
+    const double margin = view.image.filter.radius() - 0.5;
+    if (view.detailed) out.beyond = int(std::ceil(margin));
+    PixelMask mask(view.camera, margin, out.beyond);
     // What the controls are of all of their faces, summed by the places of vertices in the image.
     Array<double> x_bar = zeros(geometry ? 2 * view.scene.n_verts : 0, view.team);
     Destination whole;
     whole.x = geometry ? x_bar.data() : nullptr, whole.colors = to.colors;
     whole.vertex_attributes = to.vertex_attributes, whole.face_attributes = to.face_attributes;
-    std::vector<double> total(chunks), of_large(chunks);
+    std::vector<double> total(chunks), of_pixels(chunks);
     const int columns = view.occlusion.columns(), rows = view.occlusion.rows();
     std::vector<double> importance_around(size_t(columns) * rows);
     view.team.each(rows, [&](int64_t j) {
@@ -397,14 +425,18 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
     view.scatter.add(F, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         MeasuredChunk<N, T> chunk(view, importance_around, geometry, to, facing, out, mask, grad);
         chunk.add(first, last);
-        total[first / scatter_chunk] = chunk.total(), of_large[first / scatter_chunk] = chunk.of_large();
+        total[first / scatter_chunk] = chunk.total(), of_pixels[first / scatter_chunk] = chunk.of_pixels();
     });
     if (geometry) add_places(view, x_bar, to);
-    for (int64_t k = 0; k < chunks; ++k) out.total += total[k], out.of_large += of_large[k];
-    if (out.of_large > 0) out.pixels = mask.pixels();
-    if (!out.pixels.empty())
+    for (int64_t k = 0; k < chunks; ++k) out.total += total[k], out.of_pixels += of_pixels[k];
+    if (out.of_pixels > 0) out.pixels = mask.pixels();
+    if (view.detailed) {
+        const double each = out.scale(o.surface_samples) * lit_pixel;
+        out.pixel_spp = int(std::clamp(std::round(each), 1.0, 0x1p20)), out.pixel_share = std::min(each, 1.0);
+        thin_out(out.pixels, out.pixel_share, to_unit(hash(o.seed, 5, gradient_stream)));
+    } else if (!out.pixels.empty())
         out.pixel_spp = int(std::clamp(
-            std::round(out.scale(o.surface_samples) * out.of_large / double(out.pixels.size())), 1.0, 0x1p20));
+            std::round(out.scale(o.surface_samples) * out.of_pixels / double(out.pixels.size())), 1.0, 0x1p20));
     return out;
 }
 

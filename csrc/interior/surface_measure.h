@@ -15,15 +15,17 @@ namespace edgegrad {
 // control (control.h) says nearly all.
 template <class T>
 struct SurfaceMeasure {
-    Array<double> of_face;           // (F,) m
-    Array<uint8_t> is_controlled;    // (F,)
-    std::vector<uint8_t> is_large;   // (F,) faces left to samples of the pixels; empty without textures
-    std::vector<int64_t> pixels;     // which those may touch
-    int pixel_spp = 0;               // samples in each of them
-    double total = 0, of_large = 0;  // default samples: of the faces laid out, of the large ones
+    Array<double> of_face;            // (F,) m
+    Array<uint8_t> is_controlled;     // (F,)
+    std::vector<uint8_t> by_pixels;   // (F,) faces left to samples of the pixels; empty if there are none
+    std::vector<int64_t> pixels;      // which those may touch, or some of these
+    double pixel_share = 1;           // how many of them
+    int pixel_spp = 0;                // samples in each
+    int beyond = 0;                   // so many pixels beyond each side of the image count, see PixelSamples
+    double total = 0, of_pixels = 0;  // default samples: of the faces laid out, of those left to the pixels
 
     // How often each is sampled: as the defaults, or in proportion to them if a number is given.
-    double scale(int64_t given) const { return given >= 0 ? double(given) / (total + of_large) : 1; }
+    double scale(int64_t given) const { return given >= 0 ? double(given) / (total + of_pixels) : 1; }
     // Samples on the faces that are laid out.
     int64_t wanted(int64_t given) const {
         if (!(total > 0)) return 0;
