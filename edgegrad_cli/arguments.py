@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-CHECKPOINT = "checkpoint.pt"  # of fits by descent
+CHECKPOINT = "checkpoint.pt"  # of fits
 
 
 class Parser(argparse.ArgumentParser):
@@ -78,11 +78,15 @@ def add_descent(parser: argparse.ArgumentParser, result: str) -> None:
     parser.add_argument("--steps", type=count, default=150, help="most steps; of fit-shape on each level (%(default)s)")
     parser.add_argument("--spp", type=count, default=4, help="samples a pixel (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
-    parser.add_argument("--resume", action="store_true", help=f"go on from DIR/{CHECKPOINT}, if it is there")
+    add_resume(parser)
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR",
         help=f"for {result}, values.pt, fit.json, history.json, fit.png, loss.png, cameras, {CHECKPOINT}",
     )  # fmt: skip
+
+
+def add_resume(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--resume", action="store_true", help=f"go on from DIR/{CHECKPOINT}, if it is there")
 
 
 def add_live(parser: argparse.ArgumentParser) -> None:

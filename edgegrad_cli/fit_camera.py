@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from .arguments import add_live, add_mesh, add_view, count, number
+from .arguments import CHECKPOINT, add_live, add_mesh, add_resume, add_view, count, number
 from .inputs import read_background, read_picture, read_scene, read_view
 from .outputs import linger, live, make_folder, write_outputs
 
@@ -24,17 +24,18 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--steps", type=count, default=60, help="most steps on each level of resolution (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
-    parser.add_argument("--resume", action="store_true", help="start from DIR/camera.json, if it is there")
+    add_resume(parser)
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="for camera.json, pose.json, fit.png, loss.png, fit.webp"
-    )
+        "--out", type=Path, required=True, metavar="DIR",
+        help=f"for camera.json, pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}",
+    )  # fmt: skip
     add_live(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Finds pose and focal length of the camera that took a picture of a mesh, from a start within about 30° and 15 % of the
-    mesh's size. Ctrl-C keeps the best so far."""
+    mesh's size. Ctrl-C keeps the best so far, and --resume goes on from there."""
     from edgegrad import save_camera
     from edgegrad.fit import fit_camera
 
@@ -44,20 +45,18 @@ def run(args: argparse.Namespace) -> int:
     picture, mask = read_picture(args.image)
     if mask is not None and args.background is not None:
         raise ValueError("--background: expected none with an image that has alpha, got both; leave one out")
-    earlier = args.out / "camera.json"
-    if args.resume and earlier.exists():
-        args.camera, args.fov, args.eye, args.target, args.up = earlier, None, None, None, None
     start = read_view(args, scene, (picture.shape[0], picture.shape[1]), None)
     make_folder(args.out)
     with live(args) as view:
         fit = fit_camera(
             scene, picture, start, mask=mask, background=read_background(args.background, picture), focal=not args.no_focal,
             principal=args.principal, distortion=args.distortion, steps=args.steps, seed=args.seed, callback=view,
+            checkpoint=args.out / CHECKPOINT, resume=args.resume,
         )  # fmt: skip
         print(f"loss {fit.loss:.3e} after {fit.search.steps} steps in {fit.search.seconds:.1f} s, {fit.state}")
         K = fit.camera.K.tolist()
         print(f"focal length {K[0][0]:.6g} px, principal point {K[0][2]:.6g}, {K[1][2]:.6g} px", flush=True)
-        save_camera(earlier, fit.camera)
+        save_camera(args.out / "camera.json", fit.camera)
         print(f"wrote {', '.join(['camera.json', *write_outputs(args.out, fit.search)])} in {args.out}")
         linger(view, fit)
     return INTERRUPTED if fit.interrupted else 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
-from .arguments import add_live, add_mesh, add_view, count, number
+from .arguments import CHECKPOINT, add_live, add_mesh, add_resume, add_view, count, number
 from .inputs import check_size, read_background, read_mask, read_picture, read_pose, read_scene, read_view
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--init", type=Path, metavar="POSE.json", help="pose to start from; as in the mesh file when left out"
     )
-    parser.add_argument("--resume", action="store_true", help="start from DIR/pose.json, if it is there")
+    add_resume(parser)
     parser.add_argument(
         "--weight", type=Path, help="image of the picture's size: how much a pixel counts, black not at all"
     )
@@ -37,7 +37,11 @@ def add(commands: Any) -> None:
     parser.add_argument("--steps", type=count, default=40, help="most steps on each level of resolution (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="for pose.json, fit.png, loss.png, fit.webp"
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help=f"for pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}",
     )
     add_live(parser)
     parser.set_defaults(run=run)
@@ -45,7 +49,7 @@ def add(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Finds rotation and translation of a mesh in a picture, from a start within about 30° and 15 % of the mesh's size.
-    Ctrl-C keeps the best pose so far."""
+    Ctrl-C keeps the best pose so far, and --resume goes on from there."""
     from edgegrad.fit import fit_pose
 
     from . import INTERRUPTED
@@ -61,8 +65,6 @@ def run(args: argparse.Namespace) -> int:
         check_size(weight, picture, args.weight, args.image)
     if mask is not None and args.background is not None:
         raise ValueError("--background: expected none with a mask (or an image with alpha), got both; leave one out")
-    if args.resume and (args.out / "pose.json").exists():
-        args.init = args.out / "pose.json"
     init = None if args.init is None else read_pose(args.init)
     camera = read_view(args, scene, (picture.shape[0], picture.shape[1]), args.init)
     outputs.make_folder(args.out)
@@ -80,6 +82,7 @@ def run(args: argparse.Namespace) -> int:
             scene, picture, camera, mask, None if init is None else init.matrix,
             fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=read_background(args.background, picture),
             weight=weight, max_size=args.size, steps=args.steps, seed=args.seed, callback=after_step,
+            checkpoint=args.out / CHECKPOINT, resume=args.resume,
         )  # fmt: skip
         # Neither a full disk nor a closed terminal may lose the result: it is printed before the files are written, and they
         # are written also when printing failed.

@@ -54,7 +54,9 @@ def test_fit_pose(files, capsys):
         and "pose.json, fit.png, loss.png, fit.webp" in said.out
     )
     assert "loss" in said.err  # the progress bar
-    assert sorted(p.name for p in out.iterdir()) == ["fit.png", "fit.webp", "loss.png", "pose.json"]
+    assert sorted(p.name for p in out.iterdir()) == [
+        "checkpoint.pt", "fit.png", "fit.webp", "loss.png", "pose.json"
+    ]  # fmt: skip
 
     sheet = Image.open(out / "fit.png")
     assert sheet.width > 3 * sheet.height
@@ -305,16 +307,35 @@ def test_fit_camera(files, capsys):
     out = files / "out"
     said = ["fit-camera", files / "mesh.ply", files / "target.png", "--camera", files / "camera.json", "--steps", 4]
     assert run(*said, "--no-focal", "--out", out) == 0
-    assert run(*said, "--no-focal", "--out", out, "--resume") == 0
     found, true = eg.load_camera(out / "camera.json"), camera(48)
     torch.testing.assert_close(found.world_to_camera.double(), true.world_to_camera, atol=0.05, rtol=0)
     assert "focal length" in capsys.readouterr().out
+    assert run(*said, "--no-focal", "--out", out, "--resume") == 0  # nothing left to do
+    assert torch.equal(eg.load_camera(out / "camera.json").world_to_camera, found.world_to_camera)
+    assert run(*said, "--principal", "--out", out, "--resume") == 2
+    assert "made with another focal, principal; give what it was made with" in capsys.readouterr().err
 
 
-def test_fit_pose_resumes(files):
-    out = files / "out"
-    assert fit(files, "--init", files / "init.json", "--steps", 5, "--out", out) == 0
-    first = PoseFit.from_json((out / "pose.json").read_text())
-    assert fit(files, "--resume", "--steps", 5, "--out", out) == 0
-    again = PoseFit.from_json((out / "pose.json").read_text())
-    assert sum(errors(again)) <= sum(errors(first)) + 0.5
+def test_fit_pose_resumes(files, monkeypatch):
+    """As if it had never been interrupted, to the last bit."""
+
+    def found(folder):
+        kept = json.loads((files / folder / "pose.json").read_text())
+        return {name: value for name, value in kept.items() if name != "seconds"}
+
+    def write_pose(folder, fit):
+        write(folder, fit)
+        if fit.steps == 30:
+            raise KeyboardInterrupt
+
+    said = ["--init", files / "init.json", "--steps", 8]
+    assert fit(files, *said, "--out", files / "whole") == 0
+    write = outputs.write_pose
+    monkeypatch.setattr(outputs, "write_pose", write_pose)
+    assert fit(files, *said, "--resume", "--out", files / "half") == cli.INTERRUPTED
+    monkeypatch.undo()
+    assert found("half")["steps"] == 30
+    assert fit(files, *said, "--resume", "--out", files / "half") == 0
+    assert found("half") == found("whole") and found("whole")["steps"] > 40
+    for name in ("fit.png", "loss.png"):
+        assert (files / "half" / name).read_bytes() == (files / "whole" / name).read_bytes()

@@ -106,6 +106,103 @@ def test_where_gradients_are_off(mode):
     assert expected.loss < 0.3 * expected.history[0].loss
 
 
+def small_fit(**options):
+    view = camera(size=options["target"].shape[0] if "target" in options else 96)
+    given = {"mesh": bracket(), "target": picture(view), "camera": view, "init": START, "steps": 6} | options
+    return fit_pose(**given, progress=False)
+
+
+def same(fit, other):
+    """To the last bit."""
+    assert torch.equal(fit.matrix, other.matrix) and torch.equal(fit.camera.K, other.camera.K)
+    assert (fit.loss, fit.explained, fit.converged) == (other.loss, other.explained, other.converged)
+    assert [(s.size, s.loss, s.best) for s in fit.history] == [(s.size, s.loss, s.best) for s in other.history]
+    for a, b in zip(fit.history, other.history, strict=True):
+        assert all(torch.equal(x, y) for x, y in zip(a.pose, b.pose, strict=True))
+
+
+SECOND_OPINION = {"target": picture(camera(32)).flip(1), "steps": 21, "fit_focal": True, "seed": 3}
+
+
+@pytest.mark.parametrize(
+    ("options", "stops"),
+    [
+        # In the first of the starts, in another, between the levels, within and at the end of the last.
+        ({}, (1, 13, 30, 31, 37, 42)),
+        # Among other starts, on their ways to finer levels, on that of the best.
+        pytest.param(SECOND_OPINION, (100, 210, 330), marks=pytest.mark.slow, id="second opinions"),
+    ],
+)
+def test_a_resumed_fit_ends_as_if_it_had_never_stopped(options, stops, tmp_path):
+    whole = small_fit(**options)
+    if not options:
+        sizes = [step.size[0] for step in whole.history]
+        assert [sizes.count(n) for n in (24, 48, 96)] == [30, 6, 7]  # the last step is the final comparison
+    for stop in stops:
+
+        def after_step(fit, stop=stop):
+            if fit.steps == stop:
+                raise KeyboardInterrupt
+
+        options = {**options, "checkpoint": tmp_path / "fit.ckpt"}
+        half = small_fit(**options, callback=after_step)
+        assert half.interrupted and half.steps == stop
+        again = small_fit(**options, resume=True)
+        assert again.seconds > half.seconds
+        same(again, whole)
+    same(small_fit(**options, resume=True), whole)  # nothing left to do
+    assert [path.name for path in tmp_path.iterdir()] == ["fit.ckpt"]  # nothing half done stays behind
+
+
+def test_a_fit_that_was_killed_goes_on_from_its_last_checkpoint(tmp_path):
+    def die(fit):
+        if fit.steps == 20:
+            raise MemoryError
+
+    steps = []
+    with pytest.raises(MemoryError):
+        small_fit(checkpoint=tmp_path / "fit.ckpt", checkpoint_every=8, callback=die)
+    again = small_fit(checkpoint=tmp_path / "fit.ckpt", resume=True, callback=lambda fit: steps.append(fit.steps))
+    assert steps[0] == 17
+    same(again, small_fit())
+
+
+def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
+    file = tmp_path / "fit.ckpt"
+    small_fit(steps=1, checkpoint=file)
+    view = camera(size=96)
+    for name, value in {
+        "mesh": bracket().transformed(scale=1.01),
+        "target": picture(view) + 0.01,
+        "camera": camera(size=96, distance=4.6),
+        "mask": silhouette(view),
+        "weight": torch.ones(96, 96).numpy(),
+        "init": torch.eye(4),
+        "background": BACKGROUND,
+        "fit_scale": True,
+        "spp": 4,
+        "steps": 2,
+    }.items():
+        with pytest.raises(ValueError, match=rf"resume: expected .* with another {name}; give what it was made with"):
+            small_fit(**{"steps": 1, name: value}, checkpoint=file, resume=True)
+    with pytest.raises(ValueError, match="resume: expected a checkpoint to go on from, got none"):
+        small_fit(resume=True)
+    with pytest.raises(TypeError, match="resume: expected True or False, got str"):
+        small_fit(resume="yes", checkpoint=file)
+    with pytest.raises(FileNotFoundError, match="checkpoint: expected the folder"):
+        small_fit(checkpoint=tmp_path / "none" / "fit.ckpt")
+
+
+def test_a_checkpoint_that_cannot_be_written_ends_no_fit(tmp_path, monkeypatch):
+    def replace(source, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.replace", replace)
+    with pytest.warns(UserWarning, match=r"checkpoint: expected to write .*fit\.ckpt, got: No space left on device;"):
+        fit = small_fit(checkpoint=tmp_path / "fit.ckpt", checkpoint_every=1)
+    assert fit.steps > 20 and list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("plain", [pytest.param(False, marks=pytest.mark.slow), True], ids=["coloured", "plain"])
 def test_finds_the_pose_with_a_mask(plain):
     view = camera()

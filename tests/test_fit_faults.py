@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import random
+import shutil
 import signal
 import sys
 import time
@@ -146,7 +147,8 @@ def test_a_fit_that_cannot_be_written_is_printed(files, code, monkeypatch, capsy
         raise OSError(code, os.strerror(code), source, None, target)
 
     monkeypatch.setattr(os, "replace", replace)
-    assert cli.main(arguments(files)) == 2
+    with pytest.warns(UserWarning, match=rf"checkpoint\.pt, got: {os.strerror(code)}; the fit goes on without"):
+        assert cli.main(arguments(files)) == 2
     said = capsys.readouterr()
     assert is_a_result(said.out)
     last = said.err.splitlines()[-1]
@@ -157,9 +159,13 @@ def test_a_fit_that_cannot_be_written_is_printed(files, code, monkeypatch, capsy
 def test_a_folder_that_vanishes_during_the_fit(files, monkeypatch, capsys):
     search = edgegrad.fit.fit_pose
 
-    def vanishing(*args, **options):
-        (files / "out").rmdir()
-        return search(*args, **options)
+    def vanishing(*args, callback, **options):
+        def after_step(fit):
+            callback(fit)
+            if fit.steps == 3:
+                shutil.rmtree(files / "out")
+
+        return search(*args, callback=after_step, **options)
 
     monkeypatch.setattr(edgegrad.fit, "fit_pose", vanishing)
     assert cli.main(arguments(files)) == 0  # it is made again
@@ -183,6 +189,7 @@ def test_a_folder_without_permission_is_named_before_the_fit(files, monkeypatch,
 
 
 @linux
+@pytest.mark.filterwarnings("ignore:checkpoint. expected to write")  # of files larger than the limits
 @pytest.mark.parametrize(("limit", "file"), [(100, "pose.json"), (4096, "fit.png")])
 def test_a_file_that_cannot_grow(files, limit, file):
     def fit():

@@ -16,7 +16,7 @@ from ..camera import Camera
 from ..io import save_camera
 from ..mesh import Mesh
 from ..scene import Scene
-from .pose import _flag, search_pose
+from .pose import check_flag, search_pose
 from .result import PoseFit
 from .task import Lens, Names
 
@@ -95,6 +95,9 @@ def fit_camera(
     seed: int = 0,
     progress: bool = True,
     callback: Callable[[CameraFit], None] | None = None,
+    checkpoint: PathLike | None = None,
+    checkpoint_every: int = 25,
+    resume: bool = False,
 ) -> CameraFit:
     """Pose and lens of the camera that took a picture of a known scene.
 
@@ -107,9 +110,9 @@ def fit_camera(
     distortion  also find so many coefficients, the first of those of OpenCV's model (k1, k2, p1, p2, k3, …) or a fisheye's, as a
                 Camera has them; those that the camera has beyond stay
 
-    mask, weight, background and the rest are as for fit_pose(), whose search this is. What a picture does not show stays
-    uncertain: focal length against distance where there is hardly any perspective, the principal point against a turn of the
-    camera. Raises TypeError or ValueError that names the argument.
+    mask, weight, background, checkpoint, resume and the rest are as for fit_pose(), whose search this is. What a
+    picture does not show stays uncertain: focal length against distance where there is hardly any perspective, the
+    principal point against a turn of the camera. Raises TypeError or ValueError that names the argument.
     """
     projections = set()
     for one in camera if isinstance(camera, (list, tuple)) else [camera]:
@@ -124,11 +127,13 @@ def fit_camera(
             raise ValueError(f"distortion: expected 0 or 4 for a fisheye, got {count}")
         if projection == "perspective" and count not in (4, 5, 8):
             raise ValueError(f"distortion: expected 0, 4, 5 or 8 for a perspective camera, got {count}")
-    lens = Lens(False, _flag("focal", focal), _flag("principal", principal), count)
+    lens = Lens(False, check_flag("focal", focal), check_flag("principal", principal), count)
     if callback is not None and not callable(callback):
         raise TypeError(f"callback: expected a function of a CameraFit, got {type(callback).__name__}")
     target: object = image
-    names = Names("scene", "mask" if image is None else "image", "camera")
+    names = Names(
+        "scene", "mask" if image is None else "image", "camera", ("fit_scale", "focal", "principal", "distortion")
+    )
     if image is None:
         if mask is None:
             raise ValueError("image: expected a picture, or a mask, to compare with, got neither")
@@ -148,6 +153,7 @@ def fit_camera(
     found = search_pose(
         scene, target, camera, mask, start, lens, background, weight, names, max_size=max_size, steps=steps, spp=spp,
         tolerance=tolerance, seed=seed, progress=progress, callback=None if callback is None else step,
+        checkpoint=checkpoint, checkpoint_every=checkpoint_every, resume=resume,
     )  # fmt: skip
     return result(found)
 

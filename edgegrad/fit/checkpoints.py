@@ -1,16 +1,20 @@
-"""Checkpoints of fits by gradient descent: whole files or none, and refused by another fit than the one that wrote them."""
+"""Checkpoints of fits: whole files or none, and refused by another fit than the one that wrote them."""
 
 from __future__ import annotations
 
 import hashlib
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from .._files import PathLike, replacing
 from .._tree import named_tensors
+from .._warnings import warn
+from ..camera import Camera
 from .frame import Options, Parameter
 from .views import View
 
@@ -37,9 +41,9 @@ class Checkpoint:
 
     @staticmethod
     def of(options: Options, views: Sequence[View], given: Mapping[str, Any]) -> Checkpoint:
-        """That of the options; `given` are the arguments of which views and options do not tell."""
+        """That of a descent; `given` are the arguments of which views and options do not tell."""
         of_views = {
-            "cameras": [(view.camera, view.camera.size, view.camera.projection, view.camera.lens) for view in views],
+            "cameras": [traits(view.camera) for view in views],
             "images": [view.image for view in views],
             "masks": [view.mask for view in views],
             "weights": [view.weight for view in views],
@@ -69,9 +73,24 @@ class Checkpoint:
         return state["state"]
 
     def write(self, state: dict[str, Any]) -> None:
-        if self.path is not None:
+        """Where that fails, as on a full disk, the fit goes on, and a warning says so."""
+        if self.path is None:
+            return
+        content = io.BytesIO()  # torch's own errors of writing do not say why
+        torch.save({"format": FORMAT, "given": self._given, "state": state}, content)
+        try:
             with replacing(self.path) as temporary:
-                torch.save({"format": FORMAT, "given": self._given, "state": state}, temporary)
+                temporary.write_bytes(content.getbuffer())
+        except OSError as error:
+            warn(
+                f"checkpoint {self.path}",
+                f"checkpoint: expected to write {self.path}, got: {error.strerror or error}; the fit goes on without",
+            )
+
+
+def traits(camera: Camera) -> tuple[Any, ...]:
+    """All that a camera is, for Checkpoint."""
+    return camera, camera.size, camera.projection, camera.lens
 
 
 def _digest(value: Any) -> str:
@@ -94,6 +113,9 @@ def _parts(value: Any) -> Any:
     elif isinstance(value, (tuple, list)):
         for part in value:
             yield from _parts(part)
+    elif isinstance(value, np.ndarray):
+        yield f"{value.dtype} {value.shape}".encode()
+        yield value.tobytes()
     else:
         for name, tensor in named_tensors(value):
             yield f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode()

@@ -122,7 +122,7 @@ class Options:
     render: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("steps", "spp", "patience", "checkpoint_every"):
+        for name in ("steps", "spp", "patience"):
             check_positive_int(name, getattr(self, name))
         if self.views_per_step is not None:
             check_positive_int("views_per_step", self.views_per_step)
@@ -137,10 +137,16 @@ class Options:
             fix = "; it is an option of its own" if unknown[0] in own else ""
             known = ", ".join(name for name in RENDER if name not in own)
             raise ValueError(f"render: expected arguments of render() among {known}, got {unknown[0]!r}{fix}")
-        if self.resume and self.checkpoint is None:
-            raise ValueError("resume: expected a checkpoint to go on from, got none; give checkpoint=path")
-        if self.checkpoint is not None and not (folder := Path(self.checkpoint).absolute().parent).is_dir():
-            raise FileNotFoundError(f"checkpoint: expected the folder {folder} to exist; make it first with Path.mkdir")
+        check_checkpoint(self.checkpoint, self.checkpoint_every, self.resume)
+
+
+def check_checkpoint(checkpoint: PathLike | None, every: int, resume: bool) -> None:
+    """Raises TypeError, ValueError or FileNotFoundError."""
+    check_positive_int("checkpoint_every", every)
+    if resume and checkpoint is None:
+        raise ValueError("resume: expected a checkpoint to go on from, got none; give checkpoint=path")
+    if checkpoint is not None and not (folder := Path(checkpoint).absolute().parent).is_dir():
+        raise FileNotFoundError(f"checkpoint: expected the folder {folder} to exist; make it first with Path.mkdir")
 
 
 class Descent(NamedTuple):

@@ -12,7 +12,8 @@ Where every render has a seed of its own, Jᵀr is unbiased, and steps that shri
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,6 +24,7 @@ FIRST_DAMPING, LEAST_DAMPING = 0.1, 0.005  # relative to the diagonal of JᵀJ
 LONGEST = 0.07  # of any entry of a step: JᵀJ says little about poses further away
 FULL_STEPS, DECAY = 4, 0.5  # so many steps at full length once the loss hardly falls, then 1 / (1 + DECAY k)
 NOISE = 1.03  # a loss that rises by a smaller factor may have risen by the noise of its samples
+_STATE = ("loss", "seen", "accepted", "_settled", "damping", "_gradient", "_curvature")
 
 
 class GaussNewton:
@@ -90,6 +92,14 @@ class GaussNewton:
         step = -torch.linalg.solve(damped, self._gradient)
         shrink = min(1.0, LONGEST / float(step.abs().max().clamp(min=1e-30)))
         return step * shrink / (1.0 + DECAY * max(0, self._settled - FULL_STEPS))
+
+    def state(self) -> dict[str, Any]:
+        """What it keeps between steps, beside the generator."""
+        return {name: getattr(self, name) for name in _STATE}
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        for name in _STATE:
+            setattr(self, name, state[name])
 
 
 def _pulled_back(residual: Tensor, p: Tensor, image: Tensor) -> Tensor:

@@ -16,9 +16,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from .._check import check_int, check_positive_int
+from .._files import PathLike
 from ..camera import Camera
 from ..mesh import Mesh
 from ..scene import Scene
+from .checkpoints import Checkpoint, traits
+from .frame import check_checkpoint
+from .journal import Journal
 from .place import placed
 from .result import Pose, PoseFit, pose_from_matrix
 from .search import Search
@@ -47,6 +51,9 @@ def fit_pose(
     seed: int = 0,
     progress: bool = True,
     callback: Callable[[PoseFit], None] | None = None,
+    checkpoint: PathLike | None = None,
+    checkpoint_every: int = 25,
+    resume: bool = False,
 ) -> PoseFit:
     """Rotation and translation (and scale, and focal length) of a known mesh in a picture, or in several.
 
@@ -74,6 +81,9 @@ def fit_pose(
     seed        the same seed gives the same fit
     progress    show a bar with the loss on standard error
     callback    called after each step with the best fit so far
+    checkpoint  a file that holds the fit's state, written every `checkpoint_every` steps and at the end, never in part
+    resume      go on from the checkpoint, if there is one: the fit ends as if it had never stopped. One of a fit that
+                was given something else is refused
 
     About a quarter of the object may be covered. The fit is `converged` when its last step was short and the pictures show at
     least 60 % of the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few
@@ -81,15 +91,15 @@ def fit_pose(
     Works in torch.no_grad() and torch.inference_mode() too. Raises TypeError or ValueError that names the argument, also when
     the object leaves no trace in the picture at the start.
     """
-    lens = Lens(_flag("fit_scale", fit_scale), _flag("fit_focal", fit_focal))
-    options = {"max_size": max_size, "steps": steps, "spp": spp, "tolerance": tolerance, "seed": seed}
+    lens = Lens(check_flag("fit_scale", fit_scale), check_flag("fit_focal", fit_focal))
     return search_pose(
-        mesh, target, camera, mask, init, lens, background, weight, Names(), progress=progress, callback=callback,
-        **options,
+        mesh, target, camera, mask, init, lens, background, weight, Names(), max_size=max_size, steps=steps, spp=spp,
+        tolerance=tolerance, seed=seed, progress=progress, callback=callback, checkpoint=checkpoint,
+        checkpoint_every=checkpoint_every, resume=resume,
     )  # fmt: skip
 
 
-def _flag(name: str, flag: object) -> bool:
+def check_flag(name: str, flag: object) -> bool:
     if not isinstance(flag, bool):
         raise TypeError(f"{name}: expected True or False, got {type(flag).__name__} ({flag!r})")
     return flag
@@ -100,7 +110,8 @@ def _flag(name: str, flag: object) -> bool:
 def search_pose(
     mesh: Mesh | Scene, target: object, camera: object, mask: object, init: object, lens: Lens,
     background: Tensor | float | None, weight: object, names: Names, *, max_size: int, steps: int, spp: int, tolerance: float,
-    seed: int, progress: bool, callback: Callable[[PoseFit], None] | None,
+    seed: int, progress: bool, callback: Callable[[PoseFit], None] | None, checkpoint: PathLike | None,
+    checkpoint_every: int, resume: bool,
 ) -> PoseFit:  # fmt: skip
     """fit_pose(), with whatever is sought of the lens."""
     began = time.perf_counter()
@@ -113,24 +124,40 @@ def search_pose(
         raise ValueError(f"tolerance: expected a number above 0, got {tolerance:g}")
     if callback is not None and not callable(callback):
         raise TypeError(f"callback: expected a function of a PoseFit, got {type(callback).__name__}")
+    check_checkpoint(checkpoint, checkpoint_every, check_flag("resume", resume))
     given = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
     task = PoseTask.of(mesh, target, camera, mask, weight, background, lens, float(given.scale), names)
     start = placed(task) if init is None else given
-    search = Search(task, task.pyramid(start, max_size, spp), start, steps, tolerance, seed)
-    interrupted = False
     given_cameras: list[Any] = list(camera) if isinstance(camera, Sequence) else [camera]
+    file = Checkpoint(checkpoint, resume, {
+        names.init: None if init is None else given.matrix, names.mesh: mesh, names.target: target, "mask": mask,
+        "weight": weight, "camera": [traits(one) for one in given_cameras], "background": background,
+        **dict(zip(names.lens, lens, strict=False)), "max_size": max_size, "steps": steps, "spp": spp,
+        "tolerance": tolerance, "seed": seed,
+    })  # fmt: skip
+    saved = file.read()
+    journal, earlier = (Journal(), 0.0) if saved is None else (Journal(saved["journal"]), saved["seconds"])
+    search = Search(task, task.pyramid(start, max_size, spp), start, steps, tolerance, seed, journal)
+    interrupted = False
+
+    def seconds() -> float:
+        return earlier + time.perf_counter() - began
+
+    def keep() -> None:
+        if checkpoint is not None:
+            file.write({"journal": journal.state(), "seconds": seconds()})
 
     def result() -> PoseFit:
         best: Pose = search.best
-        seconds = time.perf_counter() - began
         history = list(search.history)
         cameras = [task.lens(one, best) for one in given_cameras]
         return PoseFit(
-            best.R, best.t, float(best.scale), cameras[0], search.loss, len(history), seconds,
+            best.R, best.t, float(best.scale), cameras[0], search.loss, len(history), seconds(),
             search.converged and not interrupted, interrupted, search.explained, history, task, cameras,
         )  # fmt: skip
 
-    bar = tqdm(total=search.planned, desc="fit", unit="step", disable=not progress, leave=False)
+    total = max(search.planned, journal.steps)
+    bar = tqdm(total=total, initial=journal.steps, desc="fit", unit="step", disable=not progress, leave=False)
 
     def after_step() -> None:
         last = search.history[-1]
@@ -139,6 +166,8 @@ def search_pose(
         bar.update()
         if callback is not None:
             callback(result())
+        if journal.steps % checkpoint_every == 0:
+            keep()
 
     search.after_step = after_step
     try:
@@ -149,6 +178,7 @@ def search_pose(
         interrupted = True
     finally:
         bar.close()
+    keep()
     return result()
 
 

@@ -41,6 +41,17 @@ class Pose(NamedTuple):
         last = self.t.new_tensor([[0.0, 0.0, 0.0, 1.0]])
         return torch.cat([torch.cat([self.scale * self.R, self.t[:, None]], 1), last])
 
+    @property
+    def numbers(self) -> list[float]:
+        """All of them, one after the other."""
+        return [number for field in self for number in field.flatten().tolist()]
+
+    @staticmethod
+    def of(numbers: list[float]) -> Pose:
+        """From `numbers`."""
+        R, t, scale, focal, principal, distortion = torch.tensor(numbers, dtype=torch.float64).split([9, 3, 1, 1, 2, 8])
+        return Pose(R.reshape(3, 3), t, scale[0], focal[0], principal, distortion)
+
 
 class Step(NamedTuple):
     """One render of the fit."""

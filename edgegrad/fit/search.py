@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .gauss_newton import GaussNewton
+from .journal import Journal, Way
 from .result import Pose, Step
 from .robust import NARROWEST, NOISE, Comparison
 from .task import GROW, SHIFT, TURN, Level, PoseTask
@@ -43,16 +44,19 @@ class _End(NamedTuple):
 
 
 class Search:
-    """The state of a search. `best`, `loss` and `history` may be read after each step."""
+    """The state of a search. `best`, `loss` and `history` may be read after each step, and `journal` at any time: a
+    search that is given it goes on from there."""
 
     def __init__(
-        self, task: PoseTask, levels: list[Level], start: Pose, steps: int, tolerance: float, seed: int
-    ) -> None:
+        self, task: PoseTask, levels: list[Level], start: Pose, steps: int, tolerance: float, seed: int,
+        journal: Journal | None = None,
+    ) -> None:  # fmt: skip
         self.task, self.levels, self.start = task, levels, start
         self.steps, self.tolerance, self.seed = steps, tolerance, seed
         self.generator = torch.Generator().manual_seed(seed)
         self.best, self.loss, self.converged, self.explained = start, math.nan, False, math.nan
         self.history: list[Step] = []
+        self.journal = journal or Journal()
         self.after_step: Callable[[], Any] = lambda: None
         self._answered = False  # later passes do not show until they win
 
@@ -107,8 +111,7 @@ class Search:
             ends.append(end)
             lowest = min(lowest, loss)
         # Each followed a loss of its own width: here all have one.
-        losses = [self._compare(level, end, level.spp, self.seed).loss(COMMON * self.task.extent)[0] for end in ends]
-        return [ends[k] for k in sorted(range(len(ends)), key=losses.__getitem__)]
+        return self._sorted(level, ends, level.spp)
 
     def _down(self, pose: Pose, levels: list[Level]) -> tuple[Pose, bool]:
         """Through the levels; the pose, and whether the last step was short."""
@@ -120,34 +123,45 @@ class Search:
     def _follow(self, level: Level, origin: Pose, most: int, lowest: float) -> tuple[Pose, float, bool]:
         """Steps on one level; the pose, its loss, and whether the last step was short."""
         task, search = self.task, GaussNewton(self.generator)
-        pose = here = origin
-        c, converged = math.inf, False
-        while search.seen < most:
+        if (way := self.journal.entered()) is None:
+            way = Way(origin, origin, lowest)
+        else:
+            search.load(way.search)
+            self.generator.set_state(way.random)
+            for step in way.steps:
+                self._note(step)
+        while not way.done:
             p = torch.zeros(len(level.free), dtype=torch.float64, requires_grad=True)
             seed = (self.seed + len(self.history)) % 2**32
-            compared = Comparison(task, level, task.images(level, task.moved(pose, level.free, p), level.spp, seed))
-            if c == math.inf:
-                c = compared.scale()
+            compared = Comparison(task, level, task.images(level, task.moved(way.pose, level.free, p), level.spp, seed))
+            c = compared.scale() if way.c == math.inf else way.c
             loss, slack = compared.loss(c)
             if taken := search.observe(p, compared.residuals(c), loss, slack):
-                here = pose
+                way = way._replace(here=way.pose)
                 c = min(c, compared.scale())
                 search.loss = loss = compared.loss(c)[0]
+            way = way._replace(c=c, search=search.state(), random=self.generator.get_state())
             if search.blind:
+                self.journal.keep(way := way._replace(done=True))
                 break
-            step = search.step()
-            converged = float(step.abs().max()) < self.tolerance * level.coarseness
-            good = taken and loss <= lowest + NOISE * abs(lowest)
-            if good:
-                lowest = loss
-            if not self._answered and good:
-                self.best, self.loss = pose, loss
-            self.history.append(Step(level.size, loss, pose, good))
+            move = search.step()
+            short = float(move.abs().max()) < self.tolerance * level.coarseness
+            settled = search.settled and level is not self.levels[-1]
+            good = taken and loss <= way.lowest + NOISE * abs(way.lowest)
+            step = Step(level.size, loss, way.pose, good)
+            way = way._replace(
+                pose=task.moved(way.here, level.free, move), lowest=loss if good else way.lowest, short=short,
+                done=short or settled or search.seen >= most, steps=(*way.steps, step),
+            )  # fmt: skip
+            self.journal.keep(way)
+            self._note(step)
             self.after_step()
-            if converged or (search.settled and level is not self.levels[-1]):
-                break
-            pose = task.moved(here, level.free, step)
-        return here, search.loss, converged
+        return way.here, search.loss, way.short
+
+    def _note(self, step: Step) -> None:
+        if step.best and not self._answered:
+            self.best, self.loss = step.pose, step.loss
+        self.history.append(step)
 
     def _compare(self, level: Level, pose: Pose, spp: int, seed: int) -> Comparison:
         with torch.no_grad():
@@ -155,6 +169,11 @@ class Search:
 
     def _judge(self, pose: Pose, short: bool) -> _End:
         """With many samples on the finest level."""
+        loss, share = self.journal.numbers(lambda: self._judged(pose))
+        return _End(loss, share, pose, short)
+
+    def _judged(self, pose: Pose) -> list[float]:
+        """The loss, and the share of the render's edges."""
         final = self.levels[-1]
         first, second = (self._compare(final, pose, FINAL_SPP, (self.seed + k) % 2**32) for k in (0, 1))
         pairs = []
@@ -166,20 +185,24 @@ class Search:
                 weight = inside if weight is None else weight * inside
                 a, b = a[..., :-1], b[..., :-1]
             pairs.append((a, b, shot.target, weight))
-        return _End(first.loss(NARROWEST * self.task.extent)[0], explained(pairs), pose, short)
+        return [first.loss(NARROWEST * self.task.extent)[0], explained(pairs)]
 
     def _others(self, best: Pose) -> list[Pose]:
         """The few best of many poses around the start and the best one, by their loss on the coarsest level."""
         level, drawn = self.levels[0], []
-        c = COMMON * self.task.extent
         entries = [entry for entry in range(TURN, GROW) if entry in self.task.free]
         for k in range(LOOKS):
             p = torch.zeros(GROW, dtype=torch.float64)
             p[TURN:SHIFT] = FARTHEST * self._ball()
             p[SHIFT:GROW] = FARTHEST_SHIFT * self._ball()
-            pose = self.task.moved(self.start if k % 2 else best, entries, p[entries])
-            drawn.append((self._compare(level, pose, max(4, level.spp // 16), self.seed).loss(c)[0], k, pose))
-        return _distinct([pose for _, _, pose in sorted(drawn, key=lambda entry: entry[:2])], KEPT)
+            drawn.append(self.task.moved(self.start if k % 2 else best, entries, p[entries]))
+        return _distinct(self._sorted(level, drawn, max(4, level.spp // 16)), KEPT)
+
+    def _sorted(self, level: Level, poses: list[Pose], spp: int) -> list[Pose]:
+        """By their loss, the least first."""
+        c = COMMON * self.task.extent
+        losses = self.journal.numbers(lambda: [self._compare(level, pose, spp, self.seed).loss(c)[0] for pose in poses])
+        return [poses[k] for k in sorted(range(len(poses)), key=losses.__getitem__)]
 
     def _ball(self) -> Tensor:
         """(3,) even in a ball of radius 1."""

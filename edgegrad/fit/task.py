@@ -74,6 +74,7 @@ class Names(NamedTuple):
     mesh: str = "mesh"
     target: str = "target"
     init: str = "init"
+    lens: tuple[str, ...] = ("fit_scale", "fit_focal")  # of the entries of a Lens
 
 
 @dataclass(frozen=True)
