@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from ._files import PathLike, check_suffix, replacing, require
+from ._formats.gltf_write import to_glb
 from ._formats.part import Fault, Part
 from ._formats.source import Textures, linear_colors
 from ._warnings import warn
 from ._welding import to_mesh
-from .image import linear_to_srgb
+from .image import to_bytes
 from .mesh import Mesh
 
 WRITTEN = (".ply", ".obj", ".glb", ".stl", ".off")
@@ -53,8 +53,7 @@ def to_trimesh(mesh: Mesh, linear: bool = False, faces_colored: bool = True) -> 
     """See Mesh.to_trimesh. linear: colours of vertices are, as in glTF. faces_colored: False where faces have none of their own,
     which those of their vertices then hold."""
     trimesh = require("trimesh", "trimesh", "Mesh.to_trimesh")
-    if mesh.channels not in (None, 1, 3):
-        raise ValueError(f"mesh: expected 1 or 3 channels, got {mesh.channels}; pick some")
+    _check_channels(mesh)
     faces = _array(mesh.faces)
     verts, colors = _array(mesh.verts), mesh.colors
     if mesh.texture is not None:
@@ -64,7 +63,7 @@ def to_trimesh(mesh: Mesh, linear: bool = False, faces_colored: bool = True) -> 
         )
         pillow = require("PIL.Image", "edgegrad[files]", "saving textures")
         material = trimesh.visual.material.PBRMaterial(
-            baseColorTexture=pillow.fromarray(_bytes(mesh.texture)), metallicFactor=0.0, roughnessFactor=1.0
+            baseColorTexture=pillow.fromarray(to_bytes(mesh.texture)), metallicFactor=0.0, roughnessFactor=1.0
         )
         visual = trimesh.visual.TextureVisuals(uv=_array(mesh.uvs)[pairs[:, 1]], material=material)
         faces = index.reshape(-1, 3)
@@ -76,52 +75,66 @@ def to_trimesh(mesh: Mesh, linear: bool = False, faces_colored: bool = True) -> 
         colors = given.reshape(-1, given.shape[-1])
     look = {}
     if colors is not None:
-        look["vertex_colors"] = _bytes(colors, linear)
+        look["vertex_colors"] = to_bytes(colors, linear)
     elif mesh.face_colors is not None:
-        look["face_colors"] = _bytes(mesh.face_colors)
+        look["face_colors"] = to_bytes(mesh.face_colors)
     return trimesh.Trimesh(verts, faces, process=False, **look)
 
 
 def save_mesh(path: PathLike, mesh: Mesh) -> None:
     """Writes a mesh: PLY, OBJ, GLB, STL or OFF by the name's ending. Missing folders are made.
 
-    Colours become 8-bit (sRGB; in a GLB those of vertices linear, as the format wants), clipped to 0 … 1; an OBJ's texture lies
-    beside it with its .mtl. STL and OFF hold the shape alone. Materials, normals and alpha are left out, and texture
-    coordinates without a texture; a warning names what is.
+    A GLB holds material, normals, alpha and textures with their coordinates, wraps and filters, as
+    `load_scene(path, lit=True)` reads them: factors and colours of vertices in full, textures in 8 bit (sRGB those of
+    colour), clipped to 0 … 1. Metallic, roughness and emission of vertices become their mean, for glTF has none. A
+    Lambertian material is one without a highlight (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an
+    OBJ also a texture, which lies beside it with its .mtl; STL and OFF the shape alone. A warning names what is left out
+    or clipped.
 
     Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
     """
     file = check_suffix(path, WRITTEN)
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; save the meshes of a scene one by one")
+    _check_channels(mesh)
     kind = file.suffix.lower()[1:]
-    made, beside = to_trimesh(mesh, linear=kind == "glb", faces_colored=kind not in ("obj", "glb")), {}
-    if lost := _left_out(mesh, kind):
+    beside = {}
+    if kind == "glb":
+        content, lost = to_glb(mesh)
+    else:
+        made, lost = to_trimesh(mesh, faces_colored=kind != "obj"), _left_out(mesh, kind)
+        if kind == "obj":
+            export = require("trimesh.exchange.obj", "trimesh", "saving meshes").export_obj
+            content, beside = export(made, return_texture=True, mtl_name=f"{file.stem}.mtl")
+        else:
+            content = made.export(file_type=kind)
+    if lost:
         warn(
             f"left out of {kind}",
             f"save_mesh: {file.name} holds no {', no '.join(lost)}; torch.save(mesh, path) keeps all of a Mesh",
         )
-    if kind == "obj":
-        export = require("trimesh.exchange.obj", "trimesh", "saving meshes").export_obj
-        content, beside = export(made, return_texture=True, mtl_name=f"{file.stem}.mtl")
-    else:
-        content = made.export(file_type=kind)
     for name, data in {**beside, file.name: content}.items():
         with replacing(file.parent / Path(name).name) as temporary:
             temporary.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
+def _check_channels(mesh: Mesh) -> None:
+    """Raises ValueError."""
+    if mesh.channels not in (None, 1, 3):
+        raise ValueError(f"mesh: expected 1 or 3 channels, got {mesh.channels}; pick some")
+
+
 def _left_out(mesh: Mesh, kind: str) -> list[str]:
-    """What of a mesh a file of this kind does not hold."""
+    """What of a mesh a file of this kind, other than GLB, does not hold."""
     look = {"colors": mesh.colors, "face_colors": mesh.face_colors, "corner_colors": mesh.corner_colors}
     look["texture"] = mesh.texture
     never = {"material": mesh.material, "normals": mesh.normals, "alpha": mesh.alpha}
-    never["uvs"] = mesh.uvs if mesh.texture is None or kind not in ("obj", "glb") else None
+    never["uvs"] = mesh.uvs if mesh.texture is None or kind != "obj" else None
     found = [name for name, value in never.items() if value is not None]
     for name, value in look.items():
         if value is None:
             continue
-        if kind in ("stl", "off") or (name == "texture" and kind not in ("obj", "glb")):
+        if kind in ("stl", "off") or (name == "texture" and kind != "obj"):
             found.append(name)
         elif bool((value < 0).any() | (value > 1).any()):
             found.append(f"{name} beyond 0 … 1")
@@ -130,10 +143,3 @@ def _left_out(mesh: Mesh, kind: str) -> list[str]:
 
 def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().cpu().numpy()
-
-
-def _bytes(values: Tensor, linear: bool = False) -> np.ndarray:
-    """(…, 3) uint8, sRGB unless told otherwise."""
-    values = values.detach().cpu().double().clamp(0.0, 1.0)
-    values = values.expand(*values.shape[:-1], 3)
-    return ((values if linear else linear_to_srgb(values)) * 255.0).round().to(torch.uint8).contiguous().numpy()

@@ -152,6 +152,13 @@ def write_image(path: PathLike, img: Tensor) -> None:
             raise OSError(f"{path}: cannot write the image ({reason})")
 
 
+def to_bytes(values: Tensor, linear: bool = False) -> np.ndarray:
+    """(…, 3) uint8 from (…, 1) or (…, 3), clipped to 0 … 1; sRGB unless told otherwise."""
+    values = values.detach().cpu().double().clamp(0.0, 1.0)
+    values = values.expand(*values.shape[:-1], 3)
+    return ((values if linear else linear_to_srgb(values)) * 255.0).round().to(torch.uint8).contiguous().numpy()
+
+
 def _reason(source: object) -> str:
     """The last error of an OpenImageIO object, on one line."""
     try:

@@ -15,6 +15,7 @@ lit=True takes them for base colours:
 
 - glTF: metallic-roughness materials with all five textures, each on its own set of texture coordinates with its own
   KHR_texture_transform, wraps and filter (mipmaps, but where the sampler says otherwise); KHR_materials_emissive_strength;
+  KHR_materials_specular where its factor, and metallic, are 0: Lambertian;
   doubleSided, without which the back of faces is black; alphaMode MASK and BLEND (see Material). A material with
   KHR_materials_unlit is none, and its colours are radiance. Normals, in the world, where the file has them; else faces are
   flat. Point, spot and directional lights of KHR_lights_punctual, whose range is without end. Units are glTF's: candela, lux

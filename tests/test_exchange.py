@@ -99,8 +99,9 @@ def test_save_shapes_and_faults(tmp_path: Path) -> None:
 
 def test_what_a_file_does_not_hold_is_said(tmp_path: Path) -> None:
     look = {"colors": torch.full((8, 3), 2.0), "material": eg.Material(0.5), "normals": torch.ones(8, 3)}
-    with pytest.warns(UserWarning, match=r"a\.glb holds no material, no normals, no colors beyond 0 … 1;"):
-        eg.save_mesh(tmp_path / "a.glb", eg.Mesh(VERTS, FACES, **look))
+    for ending in ("ply", "obj"):
+        with pytest.warns(UserWarning, match=rf"a\.{ending} holds no material, no normals, no colors beyond 0 … 1;"):
+            eg.save_mesh(tmp_path / f"a.{ending}", eg.Mesh(VERTS, FACES, **look))
     with pytest.warns(UserWarning, match=r"a\.stl holds no colors;"):
         eg.save_mesh(tmp_path / "a.stl", eg.Mesh(VERTS, FACES, colors=torch.rand(8, 3)))
 

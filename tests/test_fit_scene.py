@@ -296,6 +296,18 @@ def test_saves_everything_and_draws_itself(tmp_path):
     assert fit._repr_png_()[:4] == b"\x89PNG"
 
 
+def test_saves_the_materials_it_found(tmp_path):
+    cameras = views(1)
+    mesh = bracket().replace(material=eg.Material(roughness=0.4, emission=torch.tensor([0.2, 3.0, 0.1])))
+    target = pictures(mesh.replace(material=mesh.material.replace(emission=torch.tensor([0.4, 2.0, 0.3]))), cameras)
+    fit = fit_scene(mesh, cameras, target, {"material.emission": 0.05}, steps=5, **QUIET)
+    assert "mesh.glb" in fit.save(tmp_path, figures=False)
+    (found,) = eg.load_scene(tmp_path / "mesh.glb", lit=True).meshes
+    assert float(fit.values["material.emission"][1]) < 2.95
+    torch.testing.assert_close(found.material.emission, fit.values["material.emission"])
+    assert float(found.material.roughness) == pytest.approx(0.4)
+
+
 @pytest.mark.parametrize(
     "change, error, message",
     [

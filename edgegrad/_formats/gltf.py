@@ -12,6 +12,7 @@ from .source import Source
 
 MOST_ZEROS = 1 << 24  # rows that a glTF may ask for without holding them
 GLOSS = "KHR_materials_pbrSpecularGlossiness"
+MATT = "KHR_materials_specular"  # with a factor of 0: what is not metal has no highlight
 NEEDLESS = re.compile(r"KHR_materials_(?!pbrSpecularGlossiness)|KHR_lights|KHR_texture_transform|EXT_texture_webp")
 # Extensions that are read, or that change no picture.
 READ = {
@@ -109,7 +110,7 @@ def primitives(tree: dict[str, Any], geometry: dict[str, Any]) -> dict[str, dict
 def note_unsupported(tree: dict[str, Any], source: Source) -> None:
     """Of the file as a whole: of its shape, and of a lit one all extensions."""
     used = set(tree.get("extensionsUsed", [])) | set(tree.get("extensions", {}))
-    for name in sorted(used - READ if source.wanted.lit else used & set(SHAPING)):
+    for name in sorted(used - READ - {MATT} if source.wanted.lit else used & set(SHAPING)):
         source.unsupported.note(name, SHAPING.get(name, "left out"))
     for name, instead in {"animations": "shown at rest", "skins": "shown in the pose of their binding"}.items():
         if tree.get(name):

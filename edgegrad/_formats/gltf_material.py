@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..material import Material, Texture
-from .gltf import GLOSS, READ
+from .gltf import GLOSS, MATT, READ
 from .gltf_texture import Lookup, Place, coordinates
 from .part import Fault
 from .source import Source, linear_colors
@@ -167,7 +167,8 @@ def _material(primitive: Primitive) -> tuple[Material, dict[str, Place]]:
     """And how its textures lie."""
     given, base, source = primitive.material, primitive.base, primitive.source
     extensions = given.get("extensions", {})
-    for name in sorted(set(extensions) - READ):
+    matt = extensions.get(MATT, {}).get("specularFactor") == 0 and base.get("metallicFactor") == 0
+    for name in sorted(set(extensions) - READ - ({MATT} if matt else set())):
         source.unsupported.note(name)
     places: dict[str, Place] = {}
 
@@ -187,7 +188,7 @@ def _material(primitive: Primitive) -> tuple[Material, dict[str, Place]]:
         "base_color", torch.tensor(primitive.factor), primitive.lookup("baseColorTexture", base)
     )
     both = primitive.lookup("metallicRoughnessTexture", base)
-    for name, channel in (("roughness", slice(1, 2)), ("metallic", slice(2, 3))):
+    for name, channel in () if matt else (("roughness", slice(1, 2)), ("metallic", slice(2, 3))):
         fields[name] = factor = float(base.get(f"{name}Factor", 1.0))
         if both is not None and factor != 0.0:
             fields[name] = textured(name, both, source.textures.data(both.name, both.image, channel), factor)

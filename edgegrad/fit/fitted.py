@@ -108,7 +108,8 @@ class Fit:
         values.pt     all values, for torch.load
         history.json  loss, gradient norms and small values of each step
         mesh*.ply     the shapes that moved
-        texture*.png  textures of 1 or 3 channels, as sRGB; mesh*.glb: the meshes with them, where pillow is installed
+        texture*.png  textures of 1 or 3 channels, as sRGB
+        mesh*.glb     the meshes with textures and materials, as save_mesh() writes them, where pillow is installed
         camera*.json  the cameras, as load_camera reads them
         fit.png       plot(), loss.png: plot_history(); not with figures=False
 
@@ -136,9 +137,10 @@ class Fit:
             if mesh.texture is not None and mesh.texture.shape[-1] in (1, 3):
                 write_image(out / f"texture{number}.png", mesh.texture.clamp(0.0, 1.0))
                 written.append(f"texture{number}.png")
-                if find_spec("PIL") and mesh.channels in (1, 3):  # its material may have more than the texture
-                    save_mesh(out / f"mesh{number}.glb", mesh)
-                    written.append(f"mesh{number}.glb")
+            looks = mesh.texture is not None or mesh.material is not None
+            if looks and mesh.channels in (None, 1, 3) and (find_spec("PIL") or not mesh.has_textures):
+                save_mesh(out / f"mesh{number}.glb", mesh)
+                written.append(f"mesh{number}.glb")
         for i, camera in enumerate(self.cameras):
             name = f"camera{'' if len(self.cameras) == 1 else i}.json"
             save_camera(out / name, camera)
