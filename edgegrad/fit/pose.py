@@ -62,8 +62,9 @@ def fit_pose(
     camera      the camera of the picture, of size (H, W), or a list of them; with fit_focal, its focal length is where the fit
                 starts
     mask        (H, W) or (H, W, 1), 1 on the object and 0 elsewhere. Then the colours inside the mask and the mask itself
-                are compared; a plain mesh, which has no colours to compare, is fitted to the mask alone. The picture is
-                multiplied by the mask: of one before black, as renders are, give background=0 instead
+                are compared; a plain mesh, which has no colours to compare, is fitted to the mask alone. At the border of
+                a soft mask the colour beside it counts, times the mask: what the picture has there, before black, a
+                photograph's background or straight alpha, makes no difference
     init        the pose to start from, within about 30° and 15 % of the object's size of the true one: an earlier fit, or
                 mesh to world as a matrix (4, 4) for column vectors. When None, where the mesh file puts the object, if the
                 camera sees it there (and the mask agrees); else in the middle of the mask, or of the picture

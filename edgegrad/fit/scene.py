@@ -82,8 +82,8 @@ def fit_scene(
     parameters   by name, a learning rate or a Parameter. Names are those of the fields: "verts" or "texture" of a Mesh,
                  "meshes.0.verts", "lights.1.direction", "background" of a Scene, "cameras.0.K" of a camera; for a function they
                  are its own, each with a Parameter that has a value
-    masks        (H, W) each, 1 on the object, 0 elsewhere: then pictures are multiplied by them and compared over black, and
-                 alpha is compared with the mask
+    masks        (H, W) each, 1 on the object, 0 elsewhere: then pictures are multiplied by them and compared over black,
+                 and alpha is compared with the mask; where a soft mask is between, alpha alone
     weights      (H, W) each, from 0: how much a pixel counts
     regularizer  of the scene, added to the loss
     options      see edgegrad.fit.Options: loss, steps, spp, seed, callback, checkpoint, …
@@ -200,10 +200,10 @@ def objective_of(
         picks = _picks(len(views), options, step)
         total = torch.zeros((), dtype=torch.float64)
         for group, renders in _renders(scene, cameras, views, picks, options, options.spp, seed):
-            first = views[group[0]]
-            weight = None if first.weight is None else _stacked([views[i].weight for i in group])
             for name, render in renders.items():
                 target = _stacked([views[i].wanted[name] for i in group])
+                weights = [views[i].weights[name] for i in group]
+                weight = None if weights[0] is None else _stacked(weights)
                 by = loss if name == "image" else mask_loss
                 total = total + len(group) * by(render, target, weight).double()
         total = total / len(picks)
@@ -258,7 +258,7 @@ def judged(build: Build, views: list[View], options: Options, descent: Descent, 
             ]
             for name, target in view.wanted.items():
                 first, second = (found[name][0] for found in renders)
-                loss += float(loss_functions[name](0.5 * (first + second), target, view.weight)) / len(views)
+                loss += float(loss_functions[name](0.5 * (first + second), target, view.weights[name])) / len(views)
                 pairs.append((first, second, target, view.weight))
     return Fit(
         values=descent.values, scene=scene, cameras=cameras, views=views, loss=loss, explained=explained(pairs),

@@ -17,7 +17,7 @@ from ..camera import Camera
 from ..mesh import Mesh
 from ..scene import Scene
 from .result import Pose
-from .views import area_mean, check_image
+from .views import area_mean, before_black, check_image
 
 COARSEST = 24  # pixels across the object where the fit begins: 15 % of its size is then a few pixels
 SMALLEST = 12  # pixels on the shorter side of the coarsest level
@@ -124,7 +124,7 @@ class PoseTask:
             if mask is not None:
                 shape = check_image(f"mask{name}", shape, view.size)
                 check_shape(f"mask{name}", shape, (*view.size, 1))
-                image = shape if plain else torch.cat([image * shape, shape], -1)
+                image = shape if plain else torch.cat([before_black(image, shape)[0], shape], -1)
             else:
                 behind = background if background is not None else scene.background
                 if behind is None:

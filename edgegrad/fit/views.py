@@ -16,6 +16,8 @@ from .._warnings import warn
 from ..camera import Camera
 
 Images = Tensor | Sequence[Tensor]
+FULL = 0.98  # a mask of more covers the whole pixel
+REACH = 8  # pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +28,7 @@ class View:
     image: Tensor | None  # (H, W, C) linear radiance
     mask: Tensor | None  # (H, W, 1), the share of each pixel that the object covers
     weight: Tensor | None  # (H, W, 1), zero where the picture says nothing
+    sure: Tensor | None = None  # (H, W, 1), zero where its colour is not sure, for the mask is neither full nor empty
 
     @property
     def aovs(self) -> list[str]:
@@ -38,16 +41,23 @@ class View:
         both = {"image": self.image, "alpha": self.mask}
         return {name: value for name, value in both.items() if value is not None}
 
+    @property
+    def weights(self) -> dict[str, Tensor | None]:
+        """How much the pixels of each channel count."""
+        of_image = self.weight if self.sure is None else self.sure if self.weight is None else self.sure * self.weight
+        return {"image": of_image, "alpha": self.weight}
+
     def resized(self, factor: float) -> View:
         """With the sides multiplied by `factor`; pixels are means over the area of the old ones."""
         H, W = self.camera.size
         size = max(1, round(H * factor)), max(1, round(W * factor))
         if size == (H, W):
             return self
-        image, mask, weight = (
-            None if value is None else area_mean(value, size) for value in (self.image, self.mask, self.weight)
+        image, mask, weight, sure = (
+            None if value is None else area_mean(value, size)
+            for value in (self.image, self.mask, self.weight, self.sure)
         )
-        return View(self.camera.resized(size), image, mask, weight)
+        return View(self.camera.resized(size), image, mask, weight, sure)
 
 
 def views_of(
@@ -76,9 +86,10 @@ def views_of(
             raise ValueError(f"weights: expected numbers from 0 up, got {float(weight.min()):g}")
         if image is None and mask is None:
             raise ValueError("images: expected pictures or masks to compare with, got neither")
+        sure = None
         if image is not None and mask is not None:
-            image = image * mask
-        views.append(View(camera, image, mask, weight))
+            image, sure = before_black(image, mask)
+        views.append(View(camera, image, mask, weight, sure))
     for name, values in (("masks", shapes), ("weights", counts)):
         given = [value for value in values if value is not None]
         if given and not any(bool((value > 0).any()) for value in given):
@@ -154,6 +165,34 @@ def _is_of_bytes(image: Tensor) -> bool:
     return image.numel() > 0 and 100.0 < float(image.max()) <= 255.0 and bool((image == image.round()).all())
 
 
+def before_black(image: Tensor, mask: Tensor) -> tuple[Tensor, Tensor | None]:
+    """(H, W, C): the object alone, as a render before black shows it, from a picture of it before anything; and (H, W, 1)
+    where this is sure, or None where it is so everywhere.
+
+    Where the mask is full, the picture shows the object. A pixel that it covers in part may hold its colour as it is
+    (straight alpha), times the mask (before black), or mixed with what lies behind (a photograph), and does not tell
+    which. So it gets the mask times the colour beside it, grown from where the mask is full by up to REACH pixels, and
+    what is farther from there the mask times its own. That is not sure."""
+    colors, known = image, mask > FULL
+    partial = (mask > 0.0) & ~known
+    if not bool(known.any()) or not bool(partial.any()):
+        return image * mask, None
+    left = partial
+    for _ in range(REACH):
+        share = _around(known.to(image))
+        fresh = left & (share > 0.01)  # a ninth, or rounding
+        if not bool(fresh.any()):
+            break
+        colors = torch.where(fresh, _around(colors * known) / share.clamp(min=0.01), colors)
+        known, left = known | fresh, left & ~fresh
+    return colors * mask, (~partial).to(image)
+
+
+def _around(image: Tensor) -> Tensor:
+    """Means over 3 × 3 pixels, of zeros beyond the rim."""
+    return F.avg_pool2d(image.movedim(-1, 0)[None], 3, stride=1, padding=1)[0].movedim(0, -1)
+
+
 def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:
     """Means over the new pixels' areas, which is what a render of that size with the box filter estimates."""
     return F.interpolate(image.movedim(-1, 0)[None], size=size, mode="area")[0].movedim(0, -1)
@@ -166,6 +205,7 @@ def grouped(views: Sequence[View]) -> list[list[int]]:
         camera = view.camera
         lens = None if camera.distortion is None else camera.distortion.shape
         shape = None if view.image is None else view.image.shape[-1]
-        key = camera.size, camera.projection, lens, camera.K.dtype, shape, view.mask is None, view.weight is None
+        key = camera.size, camera.projection, lens, camera.K.dtype, shape, view.mask is None
+        key = *key, view.weight is None, view.sure is None
         groups.setdefault(key, []).append(i)
     return list(groups.values())
