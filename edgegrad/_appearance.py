@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ._rows import scaled
 from ._textures import look_up
 from .material import Parameter, Texture
 from .mesh import PLAIN, Mesh
@@ -139,5 +140,5 @@ def jumps(mesh: Mesh) -> Tensor:
         tangent, hand = tangents(mesh.verts[mesh.faces.long()], uvs.to(mesh.verts)[uv_faces.long()])
         found.append((hand * normalize(tangent, dim=-1))[:, None].expand(-1, 3, -1))
     parts = [part.detach().to(mesh.verts) for part in found]
-    parts = [part / part.abs().max().clamp(min=1e-30) for part in parts]
+    parts = [scaled(part) for part in parts]
     return torch.cat([mesh.verts.detach().new_zeros((len(mesh.faces), 3, 0)), *parts], -1)

@@ -16,6 +16,11 @@ def transformed() -> bool:
     return functorch.peek_interpreter_stack() is not None
 
 
+def plain() -> bool:
+    """Whether tensors are what they seem: neither a transform of torch.func, nor forward mode, nor torch.compile is under way."""
+    return not (transformed() or torch.autograd.forward_ad._current_level >= 0 or torch.compiler.is_compiling())
+
+
 def differentiates() -> bool:
     return torch.is_grad_enabled() or transformed() or torch.autograd.forward_ad._current_level >= 0
 

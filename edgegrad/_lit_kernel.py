@@ -53,11 +53,15 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
     only = number if hits.only_light else -1
     samples = samples if only < 0 else 1
     casters = surfaces.casters
-    shading = _Shading(
-        layout, len(tables), number, shadows, samples, only, hits.values, casters.cutoffs, casters.spacing
-    )
+    # Of the derivatives alone nothing is computed ahead of them, once it is known of which lights shadows are asked.
+    known = not shadows or len(surfaces.shadowing) == len(surfaces.scene.casting)
+    values = hits.values or not known
+    shading = _Shading(layout, len(tables), number, shadows, samples, only, values, casters.cutoffs, casters.spacing)
     arrays = (part for part in casters if isinstance(part, Tensor))
-    found, seen = apply(shading, [hits._exact.cpu(), *points, *tables, *arrays])
+    found, *kept = apply(shading, [hits._exact.cpu(), *points, *tables, *arrays])
+    if not values:
+        return found.to(surfaces.verts)
+    (seen,) = kept
     column = 0
     for light, casting in enumerate(surfaces.scene.casting):
         if only not in (-1, light):
@@ -300,8 +304,8 @@ def _rows(index: Tensor) -> np.ndarray:
 
 
 class _Shading(NamedTuple):
-    """csrc/shading/lit/lit.h, of the tensors (b, *points, *tables, *flat): the result is radiance (N, C) float64, or zeros with
-    its derivatives; beside it which samples of lights are seen, (N, K) int8, −1 where they are below the surface."""
+    """csrc/shading/lit/lit.h, of the tensors (b, *points, *tables, *flat): the result is radiance (N, C) float64, and beside it
+    which samples of lights are seen, (N, K) int8, −1 where they are below the surface; or zeros with its derivatives alone."""
 
     layout: _Layout
     tables: int  # how many
@@ -341,22 +345,31 @@ class _Shading(NamedTuple):
             "threads": torch.get_num_threads(),
         }
 
-    def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
+    def _shade(self, tensors: Tensors) -> tuple[Tensor, Tensor]:
         found, seen = kernel_scene(self._flat(tensors)).shade(values=self.values, **self._arguments(tensors))
         return torch.from_numpy(found), torch.from_numpy(seen)
 
+    def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
+        if self.values:
+            return self._shade(tensors)
+        b = tensors[0]
+        assert b is not None
+        return (torch.zeros((len(b), self.layout.channels), dtype=torch.float64),)
+
     def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
-        (seen,) = kept
-        assert seen is not None
-        found, b_bar = core.shade_vjp(
-            seen=array(seen), bar=doubles(bar), wanted=list(wanted[1:]), **self._arguments(tensors)
-        )
+        arguments = {"bar": doubles(bar), "wanted": list(wanted[1:]), **self._arguments(tensors)}
+        if kept:
+            (seen,) = kept
+            assert seen is not None
+            found, b_bar = core.shade_vjp(seen=array(seen), **arguments)
+        else:
+            found, b_bar = kernel_scene(self._flat(tensors)).look_and_shade_vjp(**arguments)
         none = bar.new_zeros(0)
         tables = zip(found, self._tables(tensors), strict=True)
         return [torch.from_numpy(b_bar), *(none if g is None else torch.from_numpy(g).to(t.dtype) for g, t in tables)]
 
     def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
-        (seen,) = kept
+        seen = kept[0] if kept else self._shade(tensors)[1]
         assert seen is not None
         b_dot, *rest = (doubles(tangent) for tangent in tangents)
         return torch.from_numpy(

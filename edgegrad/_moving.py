@@ -61,7 +61,8 @@ class _Meeting(NamedTuple):
         return (torch.from_numpy(core.meet(**self._arguments(tensors))),)
 
     def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
-        return [torch.from_numpy(g) for g in core.meet_vjp(bar=array(bar), **self._arguments(tensors))]
+        found = core.meet_vjp(bar=array(bar), wanted=list(wanted), **self._arguments(tensors))
+        return [torch.from_numpy(g) for g in found]
 
     def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
         names = ("verts_dot", "pose_dot", "along_dot")

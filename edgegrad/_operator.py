@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ._autograd import FIRST_ORDER, _one_by_one
+from ._derivatives import plain
 
 Tensors = Sequence[Tensor | None]
 
@@ -42,6 +43,9 @@ def apply(operation: Operation, tensors: Tensors) -> tuple[Tensor, ...]:
 
 def without_derivatives(compute: Callable[..., Sequence[Tensor]], *tensors: Tensor) -> tuple[Tensor, ...]:
     """What `compute` makes of the values of tensors, whatever transforms of torch.func are under way."""
+    if plain():
+        with torch.no_grad():
+            return tuple(compute(*(tensor.detach() for tensor in tensors)))
     return _Values.apply(compute, *tensors)  # pyright: ignore[reportReturnType]
 
 

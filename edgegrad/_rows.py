@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 
@@ -18,3 +19,9 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 def interpolated(b: Tensor, corners: Tensor) -> Tensor:
     """(N, K) from barycentrics (N, 3) and values at corners (N, 3, K). A matrix product would lose digits under autocast."""
     return b[:, :1] * corners[:, 0] + b[:, 1:2] * corners[:, 1] + b[:, 2:] * corners[:, 2]
+
+
+def scaled(values: Tensor) -> Tensor:
+    """By its largest number, to a size of 1."""
+    low, high = torch.aminmax(values)
+    return values / torch.maximum(-low, high).clamp(min=1e-30)

@@ -352,7 +352,6 @@ class Sampler:
                 ),
                 least=self._least,
                 threads=torch.get_num_threads(),
-                adjoint=np.ones((*self.coverage.shape, flat.background.shape[-1]), self.coverage.numpy().dtype),
                 hits=kernel_hits(self._hits),
                 detailed=faces_with_textures(lit),
             )
@@ -392,9 +391,6 @@ class Sampler:
                 least=self._least,
                 one=one,
                 threads=torch.get_num_threads(),
-                adjoint=np.ones(
-                    (*self.coverage.shape, request.scene.background.shape[-1]), self.coverage.numpy().dtype
-                ),
                 hits=kernel_hits(self._hits),
             )
             return _record(CurveRecords, found)

@@ -35,10 +35,9 @@ class ShadowLight(NamedTuple):
                 mesh = next(i for i, mesh in enumerate(surfaces.scene.meshes) if mesh is light.mesh)
                 parts, faces = _of_mesh(light, surfaces.first_faces[mesh], seed)
             else:
-                place = light.place(light.draw(_even(DIRECTIONS, seed).to(surfaces.verts.device))).double().cpu()
-                corner, chance = (
-                    triangles_of(place) if not light.punctual else (place[:1].expand(1, 3, 3), torch.ones(1))
-                )
+                u = _even(1 if light.punctual else DIRECTIONS, seed).to(surfaces.verts.device)
+                place = light.place(light.draw(u)).double().cpu()
+                corner, chance = (place.expand(1, 3, 3), torch.ones(1)) if light.punctual else triangles_of(place)
                 faces = torch.full((len(corner),), -1)
                 parts = LightParts(corner, chance.double(), faces.int(), light.infinite, not light.punctual, True)
         return cls(index, light, parts, faces)

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ._derivatives import transformed
 from ._moving import barycentrics, barycentrics_by
-from ._rows import dot, rows_of
+from ._rows import dot, rows_of, scaled
 from ._samples import bare
 from .scene import Flat, Scene
 
@@ -22,7 +23,8 @@ class Surfaces:
     It also notes which properties that may jump at an edge a shader asks for, and which shadows: there it may jump too.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, bare: Flat | None = None) -> None:
+        """`bare`: as bare() makes it, if that is there."""
         meshes = scene.meshes
         first = [sum(len(m.verts) for m in meshes[:k]) for k in range(len(meshes))]
         dtype = max((m.verts.dtype for m in meshes), key=lambda t: torch.finfo(t).bits)
@@ -31,9 +33,11 @@ class Surfaces:
         counts = torch.tensor([len(m.faces) for m in meshes])
         self.mesh_of_face = torch.repeat_interleave(torch.arange(len(meshes)), counts).to(self.verts.device)
         self.scene = scene
+        self._bare = bare
         self.jumping: dict[Any, Callable[[], Tensor]] = {}  # (F, 3, K) at corners, of what may jump
         self.shadowing: set[int] = set()  # lights, in scene.casting, of which a shader asks for shadows
         self.pyramids: dict[int, tuple[Tensor, list[Tensor]]] = {}  # of textures, by their ids
+        self._moving: Surfaces | None = None  # of which these are the values
         self.layout: Any = None  # as the kernel shades them, kept where nothing has derivatives (_lit_kernel.py)
         self.has_derivatives = True
 
@@ -43,8 +47,11 @@ class Surfaces:
         other.__dict__.update(self.__dict__)
         for name in ("bare", "casters", "corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
             other.__dict__.pop(name, None)
+        if self._bare is not None:
+            parts = self._bare._asdict().items()
+            other._bare = self._bare._replace(**{k: v.detach() for k, v in parts if isinstance(v, Tensor)})
         other.verts, other.scene, other.pyramids = self.verts.detach(), self.scene.detach(), {}
-        other.layout, other.has_derivatives = None, False
+        other.layout, other.has_derivatives, other._moving = None, False, self
         return other
 
     @cached_property
@@ -55,7 +62,7 @@ class Surfaces:
     @cached_property
     def bare(self) -> Flat:
         """As the kernel reads them, without colours."""
-        return bare(self.scene)
+        return bare(self.scene) if self._bare is None else self._bare
 
     @cached_property
     def casters(self) -> Flat:
@@ -65,6 +72,8 @@ class Surfaces:
     @cached_property
     def ball(self) -> tuple[Tensor, float]:
         """A centre (3,) and a radius of a ball around all vertices, float64."""
+        if self._moving is not None:
+            return self._moving.ball
         verts = self.verts.detach().double()
         low, high = verts.amin(0), verts.amax(0)
         return (low + high) / 2, float((high - low).norm()) / 2
@@ -101,8 +110,11 @@ class Surfaces:
     def crease_attributes(self) -> Tensor:
         """(F, 3, K) of all that was asked for and may jump, each scaled to its largest number."""
         parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
-        parts = [p / p.abs().max().clamp(min=1e-30) for p in parts if p.shape[-1]]
-        return _Beside.apply(torch.cat(parts, -1)) if parts else self.verts.new_zeros((len(self.faces), 3, 0))
+        parts = [scaled(part) for part in parts if part.shape[-1]]
+        if not parts:
+            return self.verts.new_zeros((len(self.faces), 3, 0))
+        attributes = torch.cat(parts, -1)
+        return _Beside.apply(attributes) if transformed() else attributes
 
 
 class _Beside(torch.autograd.Function):

@@ -55,7 +55,7 @@ class Frame:
     def __init__(self, scene: Scene, request: Request, index: int = 0) -> None:
         packed = request.camera
         self.request, self._index = request._replace(scene=without_colors(request.scene)), index
-        self.surfaces = Surfaces(scene)
+        self.surfaces = Surfaces(scene, self.request.scene)
         self.device, self.dtype = self.surfaces.verts.device, self.surfaces.verts.dtype
         self.sampler = Sampler(self.request, index, torch.finfo(self.dtype).eps ** (2 / 3))
         self.view = View(packed.world_to_camera[index].to(self.device, torch.float64), packed.perspective)

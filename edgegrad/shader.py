@@ -338,7 +338,7 @@ class _Image:
 
     def _shade(self, hits: Hits) -> Tensor:
         """(N, C), checked."""
-        radiance = self._checked(self._shader(hits), len(hits))
+        radiance = self._checked(self._shader(hits), hits)
         if not hits.only_light:  # for one light less may be looked up
             kinds = list(hits._steps.kinds)
             if self._kinds not in (None, kinds):
@@ -358,7 +358,8 @@ class _Image:
                 )
         return radiance
 
-    def _checked(self, radiance: object, count: int) -> Tensor:
+    def _checked(self, radiance: object, hits: Hits) -> Tensor:
+        count = len(hits)
         if not isinstance(radiance, Tensor):
             raise TypeError(f"shader: expected a tensor ({count}, C), got {type(radiance).__name__}")
         if radiance.dim() != 2 or radiance.shape[0] != count or radiance.shape[1] < 1:
@@ -371,7 +372,7 @@ class _Image:
         if self._channels not in (None, radiance.shape[1]):
             raise ValueError(f"shader: expected {self._channels} channels as before, got {radiance.shape[1]}")
         self._channels = radiance.shape[1]
-        if values_visible(radiance) and not bool(torch.isfinite(radiance.detach()).all()):
+        if hits.values and values_visible(radiance) and not bool(torch.isfinite(radiance.detach()).all()):
             row = int((~torch.isfinite(radiance.detach())).any(1).nonzero()[0])
             raise ValueError(
                 f"shader: expected finite numbers, got {radiance.detach()[row].tolist()} at one of {count} hits; look for "

@@ -51,7 +51,7 @@ struct BackwardInput {
     const Camera& camera;
     const Geometry& geometry;
     const ImageOptions& image;  // of the image that was made
-    const T* adjoint;           // ∂loss/∂image (H, W, C)
+    const T* adjoint;           // ∂loss/∂image (H, W, C); null for records, which are drawn before it is known
     HitBuffers<T> hits;         // of that image
     // (F,): faces that look as a texture says, which the scene's own colours need not; null: none.
     const uint8_t* detailed = nullptr;

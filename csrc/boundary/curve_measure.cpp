@@ -466,6 +466,7 @@ void Curves<T>::add_segments(const BackwardView<T>& view, bool all) {
         });
         segments.insert(segments.end(), std::make_move_iterator(hidden.begin()), std::make_move_iterator(hidden.end()));
     }
+    if (std::all_of(clear.begin(), clear.end(), [](const auto& part) { return part.empty(); })) return;
     CellMarks marks(view.camera.width, view.camera.height);
     if (!all)
         view.team.each(n, [&](int64_t part) {

@@ -18,9 +18,11 @@ namespace edgegrad {
 // one being the defensive floor that bounds the weight of what is small but not zero.
 class Importance {
    public:
+    // Without an adjoint all pixels count the same, and there is no table.
     template <class T>
     Importance(const T* adjoint, int width, int height, int channels, double radius, Team& team)
-        : width_(width), height_(height), radius_(radius), table_(int64_t(width + 1) * (height + 1)) {
+        : width_(width), height_(height), radius_(radius), table_(adjoint ? int64_t(width + 1) * (height + 1) : 0) {
+        if (!adjoint) return;
         const auto size = [&](int64_t pixel) {
             double a = 0;
             for (int c = 0; c < channels; ++c) a += std::fabs(double(adjoint[pixel * channels + c]));
@@ -70,11 +72,13 @@ class Importance {
     // Mean over the pixels i0 … i1 − 1, j0 … j1 − 1 of an image; 0 if no adjoint is there.
     double mean(int i0, int i1, int j0, int j1) const {
         if (i0 >= i1 || j0 >= j1) return 0;
+        if (table_.empty()) return of(1);
         const int64_t *above = &table_[index(0, j0)], *to = &table_[index(0, j1)];
         return double(to[i1] - to[i0] - above[i1] + above[i0]) / (double(unit) * (double(i1 - i0) * double(j1 - j0)));
     }
     // Asks for what that will read.
     void prefetch(int i0, int i1, int j0, int j1) const {
+        if (table_.empty()) return;
         for (const int j : {j0, j1})
             for (const int i : {i0, i1}) edgegrad::prefetch(&table_[index(i, j)]);
     }
@@ -105,7 +109,7 @@ class Importance {
     size_t index(int i, int j) const { return size_t(j) * (width_ + 1) + i; }
 
     int width_, height_;
-    double radius_, per_adjoint_ = 0, roughness_ = 0;
+    double radius_, per_adjoint_ = 8, roughness_ = 0;
     Array<int64_t> table_;
 };
 

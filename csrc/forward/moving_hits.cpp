@@ -119,7 +119,7 @@ void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at
                 for (int k = 0; k < 3; ++k) {
                     const double bar[3] = {corner_bar[k].x, corner_bar[k].y, corner_bar[k].z};
                     const double p[3] = {world[k].x, world[k].y, world[k].z};
-                    for (int r = 0; r < 3; ++r) {
+                    for (int r = 0; to.world_to_camera && r < 3; ++r) {
                         for (int s = 0; s < 3; ++s) chunk.pose[3 * r + s] += bar[r] * p[s];
                         chunk.pose[9 + r] += bar[r];
                     }

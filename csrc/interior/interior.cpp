@@ -164,6 +164,7 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
             Vec2 x;  // of the plane
         } drawn[RayBatch::size];
         const auto cast = [&] {
+            view.team.check();
             rays.prepare();
             view.frame.cast(rays);
             int64_t pixel = -1;
@@ -178,7 +179,6 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
         for (int64_t p = first; p < last; ++p) {
             const int64_t pixel = pixels[p];
             if (!chunk.begin_pixel(pixel, weight)) continue;
-            view.team.check();
             const int column = int(pixel % stride), row = int(pixel / stride), x = column - margin, y = row - margin;
             const uint64_t place = z_order(column, row) * spp;
             for (int done = 0; done < spp;) {

@@ -79,18 +79,24 @@ class PixelMask {
                 std::atomic_ref(marked_[size_t(j) * columns_ + i]).store(1, std::memory_order_relaxed);
     }
 
+    // Square by square, for rays that are cast together are the faster the nearer they are.
     std::vector<int64_t> pixels() const {
         std::vector<int64_t> out;
-        for (size_t t = 0; t < marked_.size(); ++t)
-            if (marked_[t])
-                for (int y = int(t) / columns_ * tile; y < std::min((int(t) / columns_ + 1) * tile, height_); ++y)
-                    for (int x = int(t) % columns_ * tile; x < std::min((int(t) % columns_ + 1) * tile, width_); ++x)
-                        out.push_back(int64_t(y) * width_ + x);
+        for (size_t t = 0; t < marked_.size(); ++t) {
+            if (!marked_[t]) continue;
+            const int left = int(t) % columns_ * tile, top = int(t) / columns_ * tile;
+            for (int k = 0; k < tile * tile; ++k) {
+                const int square = k / (near * near), i = k % (near * near);
+                const int x = left + square % (tile / near) * near + i % near;
+                const int y = top + square / (tile / near) * near + i / near;
+                if (x < width_ && y < height_) out.push_back(int64_t(y) * width_ + x);
+            }
+        }
         return out;
     }
 
    private:
-    static constexpr int tile = 16;
+    static constexpr int tile = 16, near = 4;  // px
     int width_, height_;
     double radius_;
     int beyond_, columns_;

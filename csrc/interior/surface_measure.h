@@ -24,8 +24,8 @@ struct SurfaceMeasure {
     int beyond = 0;                   // so many pixels beyond each side of the image count, see PixelSamples
     double total = 0, of_pixels = 0;  // default samples: of the faces laid out, of those left to the pixels
 
-    // How often each is sampled: as the defaults, or in proportion to them if a number is given. A side of a panorama may
-    // see no face at all.
+    // How often each is sampled: as the defaults, or in proportion to them if a number is given. A side of a panorama
+    // may see no face at all.
     double scale(int64_t given) const {
         const double all = total + of_pixels;
         return given >= 0 && all > 0 ? double(given) / all : 1;

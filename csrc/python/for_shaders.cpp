@@ -75,16 +75,15 @@ nb::dict arrays_of(const std::vector<CurveRecords>& parts, double least, bool on
 // The samples of the terms inside faces and on curves, as records of arrays.
 template <class T>
 nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
-                  const GradientOptions& options, double least, int threads, Out<T, 3> adjoint,
-                  const HitArrays<T>& hits, const std::optional<In<uint8_t, 1>>& detailed) {
-    check_image("adjoint", adjoint, camera, arrays.background.shape(2));
+                  const GradientOptions& options, double least, int threads, const HitArrays<T>& hits,
+                  const std::optional<In<uint8_t, 1>>& detailed) {
     hits.check(arrays, camera);
     const SceneView<T> scene = arrays.view();
     RecordList found;
     with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
-        found = record_samples(BackwardInput<T>{scene, camera, geometry, image, adjoint.data(), hits.view(),
-                                                detailed_faces(arrays, detailed)},
-                               options, team);
+        found = record_samples(
+            BackwardInput<T>{scene, camera, geometry, image, nullptr, hits.view(), detailed_faces(arrays, detailed)},
+            options, team);
     });
     nb::dict surface;
     const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {
@@ -124,9 +123,7 @@ struct LightArrays {
 template <class T>
 nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const Camera& camera,
                         const ImageOptions& image, const GradientOptions& options, const LightArrays& light,
-                        int64_t samples, double least, bool one, int threads, Out<T, 3> adjoint,
-                        const HitArrays<T>& hits) {
-    check_image("adjoint", adjoint, camera, arrays.background.shape(2));
+                        int64_t samples, double least, bool one, int threads, const HitArrays<T>& hits) {
     hits.check(arrays, camera), light.check(int64_t(arrays.faces.shape(0)));
     if (casters.faces.shape(0) != arrays.faces.shape(0)) refuse("casters: expected the faces of the scene");
     const SceneView<T> scene = arrays.view(), casting = casters.view();
@@ -134,7 +131,7 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& cast
     unlocked(threads, [&](Team& team) {
         GeometryWork done;
         const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
-        found = record_shadows(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view()}, casting,
+        found = record_shadows(BackwardInput<T>{scene, camera, *geometry, image, nullptr, hits.view()}, casting,
                                options, light.view(), samples, team);
     });
     return arrays_of(found, least, one, threads);
@@ -248,10 +245,10 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
     scene
         .def("pixel_hits", &pixel_hits<T>, "camera"_a, "image"_a, "threads"_a, "first"_a, "end"_a, "most"_a,
              "only"_a.none(), "hits"_a)
-        .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "least"_a, "threads"_a,
-             "adjoint"_a.noconvert(), "hits"_a, "detailed"_a.none())
+        .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "least"_a, "threads"_a, "hits"_a,
+             "detailed"_a.none())
         .def("shadow_samples", &shadow_samples<T>, "casters"_a, "camera"_a, "image"_a, "options"_a, "light"_a,
-             "samples"_a, "least"_a, "one"_a, "threads"_a, "adjoint"_a.noconvert(), "hits"_a)
+             "samples"_a, "least"_a, "one"_a, "threads"_a, "hits"_a)
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)
         .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(),
              "ignored"_a.noconvert().none(), "threads"_a)

@@ -309,30 +309,51 @@ void check_seen(const LitArrays& lit, const LitPoints& points, const LitOptions&
 }
 int64_t faces_of(const LitArrays& lit) { return lit.scene.meshes.back().first_face + lit.scene.meshes.back().faces; }
 
-// Cotangents of the tables (None where they are not wanted) and of b.
-nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, const LitOptions& options,
-                           In<int8_t, 2> seen, In<double, 2> bar, const std::vector<bool>& wanted, int threads) {
-    const LitPoints view = points.view(lit.scene, faces_of(lit));
-    check_seen(lit, view, options, seen);
-    if (int64_t(bar.shape(0)) != view.size || int(bar.shape(1)) != lit.scene.channels)
+// Cotangents of the tables (None where they are not wanted) and of b: compute(to, b_bar, team) adds and writes them.
+template <class Compute>
+nb::tuple cotangents(const LitArrays& lit, const LitPoints& points, const In<double, 2>& bar,
+                     const std::vector<bool>& wanted, int threads, Compute compute) {
+    if (int64_t(bar.shape(0)) != points.size || int(bar.shape(1)) != lit.scene.channels)
         refuse("bar: expected a row a point");
     if (wanted.size() != lit.scene.tables.size()) refuse("wanted: expected a number for each table");
     std::vector<Array<double>> found;
-    Array<double> b_bar(3 * view.size);
+    Array<double> b_bar(3 * points.size);
     unlocked(threads, [&](Team& team) {
         std::vector<double*> to;
         for (size_t i = 0; i < wanted.size(); ++i) {
             found.push_back(zeros(wanted[i] ? lit.scene.tables[i].rows * lit.scene.tables[i].width : 0, team));
             to.push_back(wanted[i] ? found[i].data() : nullptr);
         }
-        shade_vjp(lit.scene, view, options, seen.data(), bar.data(), to, b_bar.data(), team);
+        compute(to, b_bar.data(), team);
     });
     nb::list out;
     for (size_t i = 0; i < found.size(); ++i)
         if (const Table& table = lit.scene.tables[i]; wanted[i])
             out.append(shaped(std::move(found[i]), {size_t(table.rows), size_t(table.width)}));
         else out.append(nb::none());
-    return nb::make_tuple(out, shaped(std::move(b_bar), {size_t(view.size), 3}));
+    return nb::make_tuple(out, shaped(std::move(b_bar), {size_t(points.size), 3}));
+}
+
+nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, const LitOptions& options,
+                           In<int8_t, 2> seen, In<double, 2> bar, const std::vector<bool>& wanted, int threads) {
+    const LitPoints view = points.view(lit.scene, faces_of(lit));
+    check_seen(lit, view, options, seen);
+    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, double* b_bar, Team& team) {
+        shade_vjp(lit.scene, view, options, seen.data(), bar.data(), to, b_bar, team);
+    });
+}
+
+template <class T>
+nb::tuple look_and_shade_points_vjp(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
+                                    const LitOptions& options, In<double, 2> bar, const std::vector<bool>& wanted,
+                                    int threads) {
+    check_faces(arrays, lit);
+    const LitPoints view = points.view(lit.scene, faces_of(lit));
+    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, double* b_bar, Team& team) {
+        GeometryWork work;
+        const auto geometry = arrays.geometry({}, team, work);
+        look_and_shade_vjp(lit.scene, arrays.view(), geometry->caster(), view, options, bar.data(), to, b_bar, team);
+    });
 }
 
 nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, const LitOptions& options,
@@ -363,6 +384,8 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
 template <class T>
 void bind_scene_lit(nb::class_<SceneArrays<T>>& scene) {
     scene.def("shade", &shade_points<T>, "lit"_a, "points"_a, "options"_a, "values"_a, "threads"_a)
+        .def("look_and_shade_vjp", &look_and_shade_points_vjp<T>, "lit"_a, "points"_a, nb::kw_only(), "options"_a,
+             "bar"_a.noconvert(), "wanted"_a, "threads"_a)
         .def("lit_image", &lit_image<T>, "lit"_a, "camera"_a, "image"_a, "options"_a, "points"_a, "seed"_a, "again"_a,
              "threads"_a, "hits"_a);
 }

@@ -2,8 +2,10 @@
 
 #include "forward/moving_hits.h"
 
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 
+#include <array>
 #include <optional>
 
 #include "core/array.h"
@@ -49,15 +51,18 @@ nb::object meet(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Do
     return rows(std::move(b), {3});
 }
 
-// Cotangents of verts, world_to_camera and along.
+// Cotangents of those of verts, world_to_camera and along that are wanted; of the others nothing.
 nb::tuple meet_vjp(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along, Doubles bar,
-                   int threads) {
+                   std::array<bool, 3> wanted, int threads) {
     check(hits, verts, world_to_camera, along);
     if (bar.shape(0) != hits.face.size() || bar.shape(1) != 3) refuse("bar: expected a row a hit");
-    std::vector<double> verts_bar(verts.size()), pose_bar(16), along_bar(along.size());
+    const auto [of_verts, of_pose, of_along] = wanted;
+    std::vector<double> verts_bar(of_verts ? verts.size() : 0), pose_bar(of_pose ? 16 : 0),
+        along_bar(of_along ? along.size() : 0);
+    const auto to = [](std::vector<double>& bar) { return bar.empty() ? nullptr : bar.data(); };
     unlocked(threads, [&](Team& team) {
         meet_faces_vjp(hits.view(), {verts.data(), world_to_camera.data(), along.data()}, bar.data(),
-                       {verts_bar.data(), pose_bar.data(), along_bar.data()}, team);
+                       {to(verts_bar), to(pose_bar), to(along_bar)}, team);
     });
     return nb::make_tuple(rows(std::move(verts_bar), {3}), rows(std::move(pose_bar), {4}),
                           rows(std::move(along_bar), {3}));
@@ -107,7 +112,7 @@ void bind_moving_hits(nb::module_& m) {
     m.def("meet", &meet, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(), "along"_a.noconvert(),
           "threads"_a);
     m.def("meet_vjp", &meet_vjp, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(),
-          "along"_a.noconvert(), "bar"_a.noconvert(), "threads"_a);
+          "along"_a.noconvert(), "bar"_a.noconvert(), "wanted"_a, "threads"_a);
     m.def("form_vjp", &form_vjp_by_rows, "sample"_a.noconvert(), "row"_a.noconvert(), "by"_a.noconvert(),
           "bar"_a.noconvert(), "table"_a, "threads"_a);
     m.def("meet_jvp", &meet_jvp, "hits"_a, "verts"_a.noconvert(), "world_to_camera"_a.noconvert(),

@@ -111,7 +111,9 @@ void surface_vjp(const LitScene& lit, const Surface<double>& o, SurfaceBar& bar,
     if (o.mesh->normal.is_flat()) bar.g += bar.n;
     else shading_normal_vjp(tables, o.mesh->normal, o.at, o.frame, o.side * bar.n, bar.frame, bar.b, to);
     bar.frame.g += o.side * bar.g;
-    if (lit.perspective) {
+    if (o.scattering.lambertian) {
+        // Looks the same from everywhere.
+    } else if (lit.perspective) {
         const Vec3 towards_bar = unit_vjp(tables[lit.eye].vector_at<double>(0) - o.y, bar.v);
         to.add(lit.eye, 0, towards_bar), bar.y -= towards_bar;
     } else {
@@ -275,11 +277,9 @@ bool is_unlit(const LitScene& lit, int64_t face, const int8_t* seen, size_t ligh
            std::all_of(lit.lamps.begin(), lit.lamps.end(), [](const Lamp& lamp) { return lamp.casts(); });
 }
 void radiance_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options,
-                  const std::vector<LightSample>& lights, int64_t i, const int8_t* seen, const double* total_bar,
-                  double* b_bar, Cotangents& to) {
-    if (is_unlit(lit, points.face[i], seen, lights.size())) return;
-    Surface<double> o = surface<double>(lit, points.face[i], points.b + 3 * i);
-    if (o.is_black()) return;
+                  const std::vector<LightSample>& lights, int64_t i, Surface<double>& o, const int8_t* seen,
+                  const double* total_bar, double* b_bar, Cotangents& to) {
+    if (o.is_black() || is_unlit(lit, points.face[i], seen, lights.size())) return;
     look_up_material(lit, o);
     SurfaceBar bar(lit.channels);
     if (options.only < 0) add_unshadowed_vjp(lit, o, total_bar, bar, to);
@@ -346,9 +346,12 @@ std::shared_ptr<ShadeRoom> shade_room(const LitScene& lit, const LitOptions& opt
     return room;
 }
 
+namespace {
+
+// Finds the surfaces at points, and which lights they see.
 template <class T>
-void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-                const LitOptions& options, ShadeRoom& room, double* radiance_out, int8_t* seen) {
+void look(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+          const LitOptions& options, ShadeRoom& room, int8_t* seen) {
     const std::vector<LightSample>& lights = room.lights;
     const size_t K = lights.size();
     room.surfaces.resize(points.size);
@@ -356,12 +359,14 @@ void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster&
     // Light by light, for rays that are cast together are the faster the more alike they are.
     for (size_t k = 0; k < K; ++k) {
         const Lamp& lamp = lit.lamps[lights[k].lamp];
+        const Vec3 only_place = lamp.is_punctual() ? place(lit, lamp, {}) : Vec3();
         for (int64_t i = 0; i < points.size; ++i) {
             const Surface<double>& o = room.surfaces[i];
             int8_t& found = seen[i * K + k] = not_asked;
             if (!o.mesh->has_material || o.is_black()) continue;
-            const LightPoint point = light_point(lit, points, i, lights[k], o.g);
-            const Vec3 there = place(lit, lamp, point), l = lamp.is_infinite() ? there : unit(there - o.y);
+            const Vec3 there =
+                lamp.is_punctual() ? only_place : place(lit, lamp, light_point(lit, points, i, lights[k], o.g));
+            const Vec3 l = lamp.is_infinite() ? there : unit(there - o.y);
             if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
             found = 1;
             if (!options.shadows) continue;
@@ -370,9 +375,17 @@ void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster&
         }
     }
     room.rays.cast(scene, caster, room.found);
+}
+
+}  // namespace
+
+template <class T>
+void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                const LitOptions& options, ShadeRoom& room, double* radiance_out, int8_t* seen) {
+    look(lit, scene, caster, points, options, room, seen);
     for (int64_t i = 0; radiance_out && i < points.size; ++i) {
         look_up_material(lit, room.surfaces[i]);
-        radiance<double>(lit, points, options, lights, i, room.surfaces[i], seen + i * K,
+        radiance<double>(lit, points, options, room.lights, i, room.surfaces[i], seen + i * room.lights.size(),
                          radiance_out + i * lit.channels);
     }
 }
@@ -389,20 +402,50 @@ void shade(const LitScene& lit, const SceneView<T>& scene, const RayCaster& cast
                    });
 }
 
-void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               const double* bar, const std::vector<double*>& to, double* b_bar, Team& team) {
-    const std::vector<LightSample> lights = light_samples(lit, options);
+namespace {
+
+// Calls body(first, last, cotangents) for chunks of points, and adds these up.
+template <class Body>
+void add_cotangents(const LitScene& lit, int64_t points, const std::vector<double*>& to, Team& team, Body body) {
     std::vector<Cotangents> chunks;
     double seconds[2] = {};
     scatter_in_waves(
-        team, points.size, chunks, [&](Cotangents& chunk, int owners) { chunk.prepare(lit.tables, to, owners); },
-        [&](int64_t first, int64_t last, Cotangents& chunk) {
-            std::fill(b_bar + 3 * first, b_bar + 3 * last, 0.0);
-            for (int64_t i = first; i < last; ++i)
-                radiance_vjp(lit, points, options, lights, i, seen + i * lights.size(), bar + i * lit.channels,
-                             b_bar + 3 * i, chunk);
-        },
+        team, points, chunks, [&](Cotangents& chunk, int owners) { chunk.prepare(lit.tables, to, owners); }, body,
         [&](const Cotangents& chunk, int owner) { chunk.add_to(to, owner); }, [](Cotangents&) {}, seconds);
+}
+
+}  // namespace
+
+void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
+               const double* bar, const std::vector<double*>& to, double* b_bar, Team& team) {
+    const std::vector<LightSample> lights = light_samples(lit, options);
+    std::fill(b_bar, b_bar + 3 * points.size, 0.0);
+    add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
+        for (int64_t i = first; i < last; ++i) {
+            Surface<double> o = surface<double>(lit, points.face[i], points.b + 3 * i);
+            radiance_vjp(lit, points, options, lights, i, o, seen + i * lights.size(), bar + i * lit.channels,
+                         b_bar + 3 * i, chunk);
+        }
+    });
+}
+
+template <class T>
+void look_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster,
+                        const LitPoints& points, const LitOptions& options, const double* bar,
+                        const std::vector<double*>& to, double* b_bar, Team& team) {
+    std::fill(b_bar, b_bar + 3 * points.size, 0.0);
+    add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
+        const auto room = shade_room(lit, options);
+        const size_t K = room->lights.size();
+        std::vector<int8_t> seen(shaded_at_once * K);
+        for (; first < last; first += shaded_at_once) {
+            const LitPoints some = points.part(first, std::min(shaded_at_once, last - first));
+            look(lit, scene, caster, some, options, *room, seen.data());
+            for (int64_t i = 0; i < some.size; ++i)
+                radiance_vjp(lit, some, options, room->lights, i, room->surfaces[i], seen.data() + i * K,
+                             bar + (first + i) * lit.channels, b_bar + 3 * (first + i), chunk);
+        }
+    });
 }
 
 void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
@@ -428,5 +471,9 @@ template void shade(const LitScene&, const SceneView<float>&, const RayCaster&, 
                     double*, int8_t*, Team&);
 template void shade(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&, const LitOptions&,
                     double*, int8_t*, Team&);
+template void look_and_shade_vjp(const LitScene&, const SceneView<float>&, const RayCaster&, const LitPoints&,
+                                 const LitOptions&, const double*, const std::vector<double*>&, double*, Team&);
+template void look_and_shade_vjp(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&,
+                                 const LitOptions&, const double*, const std::vector<double*>&, double*, Team&);
 
 }  // namespace edgegrad

@@ -14,7 +14,7 @@ Arriving<S> from_direction(const std::vector<Table>& tables, const Lamp& lamp, i
 }
 inline void from_direction_vjp(const std::vector<Table>& tables, const Lamp& lamp, int channels,
                                const Arriving<double>& bar, Cotangents& to) {
-    direction_vjp(tables, lamp, -unit_vjp(direction_of<double>(tables, lamp), bar.l), to);
+    if (to.wants(lamp.direction)) direction_vjp(tables, lamp, -unit_vjp(direction_of<double>(tables, lamp), bar.l), to);
     power_vjp(tables, lamp, channels, bar.E, to);
 }
 
