@@ -1,6 +1,6 @@
 """What shaders written in PyTorch cost, in time, memory and noise: one table.
 
-Run:  python benchmarks/shaders.py [--only time memory noise]
+Run:  python benchmarks/shaders.py [--only time memory noise mipmaps]
 
 Times are medians of steps, image and backward pass, on a sphere of 81,920 faces at 256² and 16 samples a pixel; ratios are of
 steps that alternate in one run.
@@ -23,6 +23,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import edgegrad as eg
+from edgegrad.report import build
 from edgegrad.report.scenes import front_camera, smooth_adjoint
 from edgegrad.report.scenes import sphere as icosphere
 
@@ -147,7 +148,31 @@ def noise(seeds: int = 64) -> None:
         print(f"| {name} | {rms[0]:.4f} | {rms[1]:.4f} |")
 
 
-PARTS = {"time": times, "memory": memory, "noise": noise}
+def mipmaps(seeds: int = 16, converged: int = 32) -> None:
+    """The gradient of a texture much finer than the pixels, at default samples, against a converged one of the same filter."""
+    scene = build("quad", 24)
+    (quad,) = scene.scene.meshes
+    print("| error of the gradient at 24 px of 256² texels | vertices | texels |\n|---|---|---|")
+    for filter in ("linear", "mipmap"):
+
+        def gradient(seed: int, filter: str = filter, **samples: int) -> tuple[Tensor, ...]:
+            assert quad.texture is not None
+            verts, texture = quad.verts.clone().requires_grad_(), quad.texture.clone().requires_grad_()
+            mesh = quad.replace(verts=verts, texture=texture, filter=filter)
+            image = eg.render(mesh, scene.camera, seed=seed, **samples)
+            return torch.autograd.grad(image, [verts, texture], scene.adjoint.to(image))
+
+        many = zip(*(gradient(1000 + seed, surface_samples=200_000) for seed in range(converged)), strict=True)
+        some = zip(*(gradient(seed) for seed in range(seeds)), strict=True)
+        errors = []
+        for correct, found in zip(many, some, strict=True):
+            mean = torch.stack(correct).mean(0)
+            squares = [float((g - mean).norm() / mean.norm()) ** 2 for g in found]
+            errors.append(f"{100 * math.sqrt(statistics.fmean(squares)):.0f} %")
+        print(f"| {filter} | {' | '.join(errors)} |")
+
+
+PARTS = {"time": times, "memory": memory, "noise": noise, "mipmaps": mipmaps}
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

@@ -55,7 +55,7 @@ class Lighting(NamedTuple):
                 "render: expected tensors with values where a scene is lit, got those of torch.vmap or torch.compile; render a "
                 "batch one by one, and leave render() out of what is compiled"
             )
-        if not (scene.lights or scene.casting):
+        if scene.is_lit and not (scene.lights or scene.casting):
             warn(
                 "no light",
                 "scene: no light falls on its materials, so they are black; give it lights=[…], such as "
@@ -289,3 +289,8 @@ def check_unlit(function: str, scene: Scene, instead: str) -> None:
     """Raises ValueError."""
     if scene.is_lit:
         raise ValueError(f"{function}: expected a scene without materials and lights, got one that has them; {instead}")
+    if scene.is_shaded:
+        raise ValueError(
+            f'{function}: expected textures with filter "linear" or "nearest", got "mipmap", of which the kernel knows nothing; '
+            'replace(filter="linear")'
+        )

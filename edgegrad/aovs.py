@@ -77,7 +77,7 @@ def render_aovs(
     }  # fmt: skip
     batched, device = camera.batch is not None, scene.meshes[0].verts.device
     found: dict[str, Tensor] = {}
-    shaded = scene.is_lit and "image" in names
+    shaded = scene.is_shaded and "image" in names
     if shaded:
         request = make_request(scene, camera, spp, seed, **options)
         found["image"] = lighting.image(scene, camera, request)

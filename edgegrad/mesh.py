@@ -23,7 +23,7 @@ from ._check import (
 )
 from ._kernel import core
 from ._tree import map_tensors, moved
-from .material import LARGEST_UV, WRAPS, Material, Texture
+from .material import LARGEST_UV, LOOKUPS, WRAPS, Material, Texture
 
 PLAIN = 0.7  # radiance, or base colour, of a mesh without colours, in every channel
 FILTERS: tuple[str, ...] = core.TEXTURE_FILTERS  # linear, nearest
@@ -49,7 +49,9 @@ class Mesh:
     alpha_cutoff   number         this, faces are cut out, and rays pass through; needs uvs
     wrap           what lies beyond the rim of both images: "repeat", "clamp" (the texels at the rim go on) or "mirror"; or
                    a pair of these, for u and v
-    filter         "linear" between the centres of texels, or "nearest", the texel that the point lies in
+    filter         "linear" between the centres of texels; "nearest", the texel that the point lies in; "mipmap", for a texture
+                   finer than the pixels: its means over squares of 2, 4, 8 … texels, as of eg.Texture (shaded in PyTorch, so
+                   slower; alpha is then looked up as "linear")
     material       how it scatters light, and what it emits: then the colours above are base colours. None: it is not lit, and
                    colours are radiance
     normals        (N, 3) float   normals, of any length, interpolated over the faces where a material is lit; without, faces
@@ -186,8 +188,8 @@ class Mesh:
             raise ValueError(
                 f"wrap: expected one of {', '.join(WRAPS)}, or a pair of them for u and v, got {self.wrap!r}"
             )
-        if self.filter not in FILTERS:
-            raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {self.filter!r}")
+        if self.filter not in LOOKUPS:
+            raise ValueError(f"filter: expected one of {', '.join(LOOKUPS)}, got {self.filter!r}")
 
     @property
     def has_textures(self) -> bool:

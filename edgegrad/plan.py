@@ -97,7 +97,7 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
     if shading.get("shader") is not None:
         return Plan(_shaded_terms(scene, request, shading.get("creases", "auto")))
     lighting = Lighting.of(shading.get("shadows", True), shading.get("light_samples", 1))
-    if scene.is_lit:
+    if scene.is_shaded:
         return Plan(_lit_terms(scene, request, shading.get("creases", "auto"), lighting))
     wanted = required(request)
     return Plan({**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted)})

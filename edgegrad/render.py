@@ -98,7 +98,7 @@ def render(
         filter=filter, grad_seed=grad_seed, step_spacing=step_spacing,
     )  # fmt: skip
     lighting = Lighting.of(shadows, light_samples)
-    if shader is None and as_scene(scene).is_lit:
+    if shader is None and as_scene(scene).is_shaded:
         return lighting.image(as_scene(scene), camera, request, creases)
     if shader is not None:
         return render_shaded(as_scene(scene), camera, shader, request, creases, check_shader)

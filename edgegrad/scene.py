@@ -130,6 +130,11 @@ class Scene:
         return bool(self.lights) or any(mesh.material is not None for mesh in self.meshes)
 
     @property
+    def is_shaded(self) -> bool:
+        """Whether more than the kernel's own colours is to be seen: light, or mipmaps."""
+        return self.is_lit or any(mesh.texture is not None and mesh.filter == "mipmap" for mesh in self.meshes)
+
+    @property
     def textured_faces(self) -> Tensor | None:
         """(F,) uint8 on the CPU: the faces whose colours or materials have textures; None: none have."""
         if not any(mesh.has_textures for mesh in self.meshes):
@@ -256,9 +261,11 @@ def image_dtype(scene: Scene) -> torch.dtype:
 
 
 def _sampler(mesh: Mesh) -> list[int]:
-    """How the images of a mesh are looked up: the wrap of u and of v, and the filter, as the kernel counts them."""
+    """How the images of a mesh are looked up: the wrap of u and of v, and the filter, as the kernel counts them. It knows no
+    mipmaps: their levels are of the texture, which it is not given where there are some."""
     u, v = mesh.wraps
-    return [WRAPS.index(u), WRAPS.index(v), FILTERS.index(mesh.filter)]
+    filter = "linear" if mesh.filter == "mipmap" else mesh.filter
+    return [WRAPS.index(u), WRAPS.index(v), FILTERS.index(filter)]
 
 
 def flatten(scene: Scene, all_uvs: bool = False, blended: bool = True) -> Flat:

@@ -163,7 +163,7 @@ MESH = {
     "filter of a texture": (
         lambda: textured(filter="cubic"),
         V,
-        "filter: expected one of linear, nearest, got 'cubic'",
+        "filter: expected one of linear, nearest, mipmap, got 'cubic'",
     ),
     "uvs in 3-D": (lambda: textured(uvs=VERTS), V, "uvs: expected shape (T, 2), got (8, 3)"),
     "uvs of integers": (lambda: textured(uvs=FACES[:, :2]), T, "uvs: expected float32 or float64, got torch.int64"),

@@ -388,3 +388,50 @@ def test_beyond_the_rim(wrap: str, expected: list[int]):
     assert torch.allclose(
         hits.sample(texture, uv=far, wrap=wrap), torch.tensor(2.0 if wrap == "clamp" else 1.0).double()
     )
+
+
+def test_meshes_with_mipmaps_are_shaded_by_them():
+    texture = torch.rand((32, 64, 3), generator=torch.Generator().manual_seed(0), dtype=F64)
+    mesh, camera = facing(texture, 0.3)
+    found = []
+    for shader in (None, lambda hits: hits.sample(texture, mipmap=True)):
+        looked_up = mesh.replace(filter="linear" if shader else "mipmap")
+        image = eg.render(looked_up, camera, spp=4, seed=3, shader=shader)
+        found.append(image.detach())
+    assert torch.allclose(*found, rtol=1e-9, atol=1e-12)
+    fine = mesh.replace(filter="mipmap")
+    assert torch.allclose(eg.render_aovs(fine, camera, ["image"], 4, 3)["image"], found[0], atol=1e-12)
+    assert eg.plan(fine, camera)["textures"].why == "looked up where they are lit"
+    with pytest.raises(ValueError, match='screen_gradient: expected textures with filter "linear" or "nearest"'):
+        eg.screen_gradient(fine, camera, found[0])
+
+
+def test_meshes_with_mipmaps_have_gradients():
+    """Along the texture it is the image; along a shift across the image, which changes no level, finite differences."""
+    generator = torch.Generator().manual_seed(2)
+    mesh, camera = facing(torch.rand((48, 48, 2), generator=generator, dtype=F64), 0.4)
+    K = camera.K + torch.tensor([[0, 0, 3], [0, 0, 3], [0, 0, 0]], dtype=F64)  # so that the rim is in the image
+    camera = camera.replace(K=K, size=(25, 25))
+    weights = torch.arange(25, dtype=F64)[None, :, None].expand(25, 25, 2)
+    shift = torch.tensor([1.0, 0.5, 0.0], dtype=F64)
+
+    def loss(mesh: eg.Mesh, seed: int) -> Tensor:
+        return (weights * eg.render(mesh, camera, spp=256, seed=seed, surface_samples=4000)).sum()
+
+    rows = []
+    for seed in range(24):
+        texture, t = mesh.texture.clone().requires_grad_(), torch.zeros((), dtype=F64, requires_grad=True)  # pyright: ignore
+        moved = mesh.replace(verts=mesh.verts + t * shift, texture=texture, filter="mipmap")
+        value = loss(moved, seed)
+        by_texture, by_t = torch.autograd.grad(value, [texture, t])
+        value, along = value.detach(), (by_texture * texture.detach()).sum()
+        h = 2.0
+        ahead, back = (
+            loss(mesh.replace(verts=mesh.verts + s * h * shift, filter="mipmap"), seed).detach() for s in (1, -1)
+        )
+        rows.append([float(along - value), float(value), float(by_t), float(ahead - back) / (2 * h)])
+    along, value, by_shift, difference = torch.tensor(rows, dtype=F64).T
+    error = (by_shift - difference).std() / len(rows) ** 0.5
+    assert abs(float(along.mean())) < 4 * float(along.std()) / len(rows) ** 0.5 < 0.01 * float(value.mean())
+    assert abs(float((by_shift - difference).mean())) < 4 * float(error)
+    assert float(error) < 0.0125 * abs(float(difference.mean()))
