@@ -29,7 +29,7 @@ from .environment import Environment
 from .hits import Hits
 from .lights import Light, LightPoints, PointLight, SphericalHarmonics, SpotLight
 from .samples import Frame
-from .scene import Scene
+from .scene import Scene, image_dtype
 from .shader import Effort, render_shaded
 
 FEWEST_IN_PENUMBRA = 4  # points of a face in a pixel that are shaded, at least; else a quarter of its samples
@@ -52,8 +52,8 @@ class Lighting(NamedTuple):
         """(H, W, C), or (B, H, W, C) for a batch of cameras. Raises RuntimeError for a batch of torch.vmap."""
         if not torch.compiler.is_compiling() and not values_visible(*tensors_in(scene)):
             raise RuntimeError(
-                "render: expected tensors with values where a scene is lit, got those of torch.vmap or torch.compile; render a "
-                "batch one by one, and leave render() out of what is compiled"
+                "render: expected tensors with values where a scene is lit or has mipmaps, got those of torch.vmap or "
+                "torch.compile; render a batch one by one, and leave render() out of what is compiled"
             )
         if scene.is_lit and not (scene.lights or scene.casting):
             warn(
@@ -69,6 +69,8 @@ class Lighting(NamedTuple):
         whole = (lambda frame: _whole(frame, self, points)) if fused and adds_up else None
         effort = Effort(points, whole, scene.blends, True, fused, fused and adds_up, adds_up)
         image = render_shaded(scene, camera, self, request, creases, False, effort)
+        if not scene.is_lit:  # as the kernel has it where there are no mipmaps
+            image = image.to(image_dtype(scene))
         # A graph from all tensors, whatever is in view and whatever is lit.
         return image + sum(
             tensor.reshape(-1)[:0].sum().to(image) for tensor in tensors_in((scene, camera)) if tensor.requires_grad

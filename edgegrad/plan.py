@@ -132,7 +132,8 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     terms = _shaded_terms(scene, request, creases, scene)
     lights = sum(1 if light.punctual else lighting.samples for light in scene.casting)
     shaded = terms["interior"].samples + terms["boundary"].samples
-    terms["textures"] = Term(False, "looked up where they are lit")
+    where = "lit" if scene.is_lit else "seen, with mipmaps, in PyTorch"
+    terms["textures"] = Term(False, f"looked up where they are {where}")
     del terms["shader"]
     terms["lights"] = Term(
         lights > 0, f"{lights} points of lights for each point; at most {AT_ONCE:,} points at a time"

@@ -115,7 +115,7 @@ class _Image:
             zero = zero + self._steps()
         if visibility:
             zero = zero + self._shadows()
-        return image + once(zero.reshape(image.shape))
+        return once(image + zero.reshape(image.shape))  # also of the background's part: how coverage moves is not in it
 
     # -- the image -----------------------------------------------------------------------------------------------------
 
@@ -374,9 +374,14 @@ class _Image:
         self._channels = radiance.shape[1]
         if hits.values and values_visible(radiance) and not bool(torch.isfinite(radiance.detach()).all()):
             row = int((~torch.isfinite(radiance.detach())).any(1).nonzero()[0])
+            name, hint = "shader", "divisions by zero and powers of negative numbers"
+            if self._effort.lit:
+                name, hint = (
+                    "radiance",
+                    "numbers of textures, colours, materials or lights that are too large for its dtype",
+                )
             raise ValueError(
-                f"shader: expected finite numbers, got {radiance.detach()[row].tolist()} at one of {count} hits; look for "
-                "divisions by zero and powers of negative numbers"
+                f"{name}: expected finite numbers, got {radiance.detach()[row].tolist()} at one of {count} hits; look for {hint}"
             )
         return radiance.to(self._frame.dtype)
 

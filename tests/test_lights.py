@@ -469,6 +469,26 @@ def test_gradients_by_lights_are_finite_differences(name: str):
     )
 
 
+@pytest.mark.parametrize("kind", ["lit", "mipmap", "shader"])
+def test_second_derivatives_raise_before_a_background(kind: str) -> None:
+    """Of the part through coverage, too, which the image's own graph does not have."""
+    uvs = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    texture = torch.rand(8, 8, 3, dtype=F64)
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    verts, background = QUAD.clone().requires_grad_(), torch.rand(3, dtype=F64, requires_grad=True)
+    mesh = eg.Mesh(
+        verts, faces, texture=texture, uvs=uvs, uv_faces=faces, filter="mipmap" if kind == "mipmap" else "linear"
+    )
+    mesh = mesh.replace(material=WHITE) if kind == "lit" else mesh
+    lights = [eg.PointLight(torch.zeros(3, dtype=F64), 3.0)] if kind == "lit" else []
+    camera = eg.Camera.look_at((0.0, 0, -2), (0.0, 0, 1), size=(16, 16))
+    shader = (lambda hits: hits.sample(texture)) if kind == "shader" else None
+    image = eg.render(eg.Scene([mesh], background, lights), camera, spp=4, shader=shader)
+    (gradient,) = torch.autograd.grad(image.pow(3).sum(), background, create_graph=True)
+    with pytest.raises(RuntimeError, match="second derivatives"):
+        torch.autograd.grad(gradient.sum(), verts)
+
+
 def test_random_numbers_of_a_pixel_are_its_own():
     """So that with a constant seed what changes in one corner leaves the noise of all other pixels as it is."""
     lamp = eg.AreaLight.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], [3.0, 2.0, 1.0])

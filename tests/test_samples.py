@@ -401,7 +401,7 @@ def test_meshes_with_mipmaps_are_shaded_by_them():
     assert torch.allclose(*found, rtol=1e-9, atol=1e-12)
     fine = mesh.replace(filter="mipmap")
     assert torch.allclose(eg.render_aovs(fine, camera, ["image"], 4, 3)["image"], found[0], atol=1e-12)
-    assert eg.plan(fine, camera)["textures"].why == "looked up where they are lit"
+    assert "with mipmaps" in eg.plan(fine, camera)["textures"].why
     with pytest.raises(ValueError, match='screen_gradient: expected textures with filter "linear" or "nearest"'):
         eg.screen_gradient(fine, camera, found[0])
 
