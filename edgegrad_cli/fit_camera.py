@@ -18,7 +18,9 @@ def add(commands: Any) -> None:
     add_view(parser)
     parser.add_argument("--no-focal", action="store_true", help="keep the focal length")
     parser.add_argument("--principal", action="store_true", help="also find the principal point")
-    parser.add_argument("--distortion", type=number, default=0, metavar="N", help="also find so many coefficients")
+    parser.add_argument(
+        "--distortion", type=number, default=0, metavar="N", help="also find so many coefficients (4, 5 or 8)"
+    )
     parser.add_argument(
         "--background", help="#rrggbb or an image; without it the median colour of the picture's border"
     )

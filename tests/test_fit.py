@@ -8,6 +8,7 @@ import torch
 
 import edgegrad as eg
 from edgegrad.fit import PoseFit, fit_pose
+from edgegrad.fit.checkpoints import FORMAT
 from edgegrad.fit.gauss_newton import GaussNewton
 from edgegrad.fit.result import pose_from_json
 
@@ -185,6 +186,16 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     }.items():
         with pytest.raises(ValueError, match=rf"resume: expected .* with another {name}; give what it was made with"):
             small_fit(**{"steps": 1, name: value}, checkpoint=file, resume=True)
+    for other in ({"filter": "nearest"}, {"alpha_cutoff": 0.9}, {"wrap": "clamp"}):  # of no tensors
+        with pytest.raises(ValueError, match="with another mesh; give what it was made with"):
+            small_fit(steps=1, mesh=bracket().replace(**other), checkpoint=file, resume=True)
+    same(small_fit(steps=1, mesh=bracket().replace(name="it"), checkpoint=file, resume=True), small_fit(steps=1))
+    for damaged in ({"format": 2}, {"format": FORMAT}, {"format": FORMAT, "given": 3, "state": {}}):
+        torch.save(damaged, tmp_path / "damaged.ckpt")
+        with pytest.raises(ValueError, match=r"damaged\.ckpt: expected a checkpoint of format"):
+            small_fit(checkpoint=tmp_path / "damaged.ckpt", resume=True)
+    with pytest.raises(TypeError, match=r"checkpoint: expected a path, got int \(3\)"):
+        small_fit(checkpoint=3)
     with pytest.raises(ValueError, match="resume: expected a checkpoint to go on from, got none"):
         small_fit(resume=True)
     with pytest.raises(TypeError, match="resume: expected True or False, got str"):
@@ -351,7 +362,7 @@ def test_faults_of_pose_json(text, message):
         ({"target": torch.full((64, 64, 3), math.nan)}, ValueError, "target: expected finite"),
         ({"camera": np.eye(4)}, TypeError, "camera: expected a Camera, got ndarray"),
         ({"camera": eg.Camera.stack([camera(), camera()])}, ValueError, "camera: expected one camera, got 2"),
-        ({"mask": torch.ones(8, 8)}, ValueError, "mask: expected shape (64, 64, C), got (8, 8, 1)"),
+        ({"mask": torch.ones(8, 8)}, ValueError, "mask: expected shape (64, 64) or (64, 64, 1), got (8, 8)"),
         ({"mask": torch.ones(64, 64), "background": 0.0}, ValueError, "background: expected None with a mask"),
         ({"background": torch.ones(2)}, ValueError, "background: expected shape (3,) or (64, 64, 3), got (2,)"),
         ({"init": torch.eye(3)}, ValueError, "init: expected shape (4, 4), got (3, 3)"),

@@ -323,7 +323,7 @@ def test_saves_the_materials_it_found(tmp_path):
         ({"images": torch.zeros(8, 8, 3)}, ValueError, "images: expected 2, one for each camera, got 8"),
         ({"images": None}, ValueError, "images: expected pictures or masks"),
         ({"weights": -torch.ones(2, 32, 32)}, ValueError, "weights: expected numbers from 0 up"),
-        ({"masks": torch.ones(2, 32, 32, 3)}, ValueError, "masks: expected shape (32, 32, 1)"),
+        ({"masks": torch.ones(2, 32, 32, 3)}, ValueError, "masks[0]: expected shape (32, 32) or (32, 32, 1)"),
         ({"cameras": "here"}, TypeError, "cameras[0]: expected a Camera"),
         ({"scene": 3}, TypeError, "scene: expected a Scene, a Mesh, or a function"),
         ({"loss": "l3"}, ValueError, "loss: expected one of l1, l2"),

@@ -107,8 +107,8 @@ def fit_camera(
                 for each picture, which keep their places to one another, as those of a rig, and share what is found of the lens
     focal       also find the focal length: one factor for both of K
     principal   also find the principal point
-    distortion  also find so many coefficients, the first of those of OpenCV's model (k1, k2, p1, p2, k3, …) or a fisheye's, as a
-                Camera has them; those that the camera has beyond stay
+    distortion  also find so many coefficients (0, 4, 5 or 8; of a fisheye 4), the first of those of OpenCV's model (k1, k2, p1,
+                p2, k3, …) or a fisheye's, as a Camera has them; those that the camera has beyond stay
 
     mask, weight, background, checkpoint, resume and the rest are as for fit_pose(), whose search this is. What a
     picture does not show stays uncertain: focal length against distance where there is hardly any perspective, the

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import io
 from collections.abc import Mapping, Sequence
@@ -12,13 +13,12 @@ import numpy as np
 import torch
 
 from .._files import PathLike, replacing
-from .._tree import named_tensors
 from .._warnings import warn
 from ..camera import Camera
 from .frame import Options, Parameter
 from .views import View
 
-FORMAT = 2
+FORMAT = 3
 SAME = (
     "loss",
     "mask_loss",
@@ -62,9 +62,9 @@ class Checkpoint:
                 f"{self.path}: expected a checkpoint of a fit, got something else ({type(error).__name__}); "
                 "remove it, or leave out resume"
             ) from error
-        if not isinstance(state, dict) or state.get("format") != FORMAT:
+        found = state.get("given") if isinstance(state, dict) and state.get("format") == FORMAT else None
+        if not isinstance(found, dict) or "state" not in state:
             raise ValueError(f"{self.path}: expected a checkpoint of format {FORMAT}; remove it to begin anew")
-        found = state["given"]
         if other := [name for name in {**self._given, **found} if self._given.get(name) != found.get(name)]:
             raise ValueError(
                 f"resume: expected {self.path} to be a checkpoint of this fit, got one that was made with another "
@@ -102,6 +102,8 @@ def _digest(value: Any) -> str:
 
 
 def _parts(value: Any) -> Any:
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)  # 0 and 0.0 are the same
     if isinstance(value, (str, int, float, type(None))):
         yield repr(value).encode()
     elif isinstance(value, Mapping):
@@ -116,7 +118,12 @@ def _parts(value: Any) -> Any:
     elif isinstance(value, np.ndarray):
         yield f"{value.dtype} {value.shape}".encode()
         yield value.tobytes()
-    else:
-        for name, tensor in named_tensors(value):
-            yield f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode()
-            yield tensor.detach().cpu().contiguous().numpy().tobytes()
+    elif isinstance(value, torch.Tensor):
+        yield f"{value.dtype} {tuple(value.shape)}".encode()
+        yield value.detach().cpu().contiguous().numpy().tobytes()
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        yield type(value).__name__.encode()
+        for field in dataclasses.fields(value):
+            if field.name != "name":  # what a mesh is called changes nothing
+                yield field.name.encode()
+                yield from _parts(getattr(value, field.name))

@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 import torch
@@ -145,6 +145,8 @@ def check_checkpoint(checkpoint: PathLike | None, every: int, resume: bool) -> N
     check_positive_int("checkpoint_every", every)
     if resume and checkpoint is None:
         raise ValueError("resume: expected a checkpoint to go on from, got none; give checkpoint=path")
+    if checkpoint is not None and not isinstance(checkpoint, (str, PurePath)):
+        raise TypeError(f"checkpoint: expected a path, got {type(checkpoint).__name__} ({checkpoint!r})")
     if checkpoint is not None and not (folder := Path(checkpoint).absolute().parent).is_dir():
         raise FileNotFoundError(f"checkpoint: expected the folder {folder} to exist; make it first with Path.mkdir")
 

@@ -127,6 +127,8 @@ def _images(name: str, value: object, cameras: list[Camera]) -> list[Tensor | No
     """(H, W, c) float32 on the CPU, one for each camera. Raises TypeError or ValueError."""
     if value is None:
         return [None] * len(cameras)
+    if len(cameras) == 1 and isinstance(value, (list, tuple)) and len(value) > 1 and hasattr(value[0], "ndim"):
+        raise ValueError(f"{name}: expected one for each camera, got {len(value)} and one camera; give as many cameras")
     single = len(cameras) == 1 and not isinstance(value, (list, tuple)) and getattr(value, "ndim", 0) < 4
     given: Any = [value] if single else value
     if len(given) != len(cameras):
@@ -140,10 +142,18 @@ def _images(name: str, value: object, cameras: list[Camera]) -> list[Tensor | No
 def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
     """(H, W, C) float32 on the CPU. Raises TypeError or ValueError."""
     image = as_tensor(name, value).detach().cpu()
-    image = image[..., None] if image.dim() == 2 else image
     image = image.float() if image.dtype == torch.bool else image
-    check_float(name, image)
-    check_shape(name, image, (*size, "C"), fix="the camera must have the picture's size: camera.resized((H, W))")
+    fix = "the camera must have the picture's size: camera.resized((H, W))"
+    if name.startswith(("mask", "weight")):
+        if not image.is_floating_point():
+            raise TypeError(
+                f"{name}: expected floating-point numbers, got {image.dtype}; of 8-bit numbers take x / 255"
+            )
+        check_shape(name, image, size, (*size, 1), fix=fix)
+    else:
+        check_float(name, image)
+    image = image[..., None] if image.dim() == 2 else image
+    check_shape(name, image, (*size, "C"), fix=fix)
     check_finite(name, image)
     rounding = 1e-3
     if name.startswith("mask") and bool((image < -rounding).any() | (image > 1.0 + rounding).any()):
