@@ -6,8 +6,12 @@ faults of arguments are said before. Each command imports what it uses when it r
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from . import demo, doctor, fit_camera, fit_pose, fit_shape, fit_texture, render, report
 from .arguments import Parser
@@ -19,6 +23,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs a command; the exit code is 0, 2 after an error, 130 after Ctrl-C."""
     try:
         args = parser().parse(argv)
+        with _ended_by_ctrl_c():
+            import edgegrad  # noqa: F401  which each command uses
         return args.run(args)
     except KeyboardInterrupt:
         print("edgegrad: interrupted", file=sys.stderr)
@@ -26,6 +32,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (OSError, ValueError, TypeError, ImportError, MemoryError) as error:
         print(f"edgegrad: error: {_one_line(error)}", file=sys.stderr)
         return 2
+
+
+@contextmanager
+def _ended_by_ctrl_c() -> Iterator[None]:
+    """Ctrl-C ends the process at once. As an exception it may be lost while modules are imported, in code that lets none out."""
+    usual = signal.getsignal(signal.SIGINT)
+    if usual is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(*_: object) -> None:
+        os.write(sys.stderr.fileno(), b"edgegrad: interrupted\n")
+        os._exit(INTERRUPTED)
+
+    signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
 
 
 def _one_line(error: Exception) -> str:

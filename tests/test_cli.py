@@ -339,3 +339,16 @@ def test_fit_pose_resumes(files, monkeypatch):
     assert found("half") == found("whole") and found("whole")["steps"] > 40
     for name in ("fit.png", "loss.png"):
         assert (files / "half" / name).read_bytes() == (files / "whole" / name).read_bytes()
+
+
+def test_ctrl_c_while_modules_are_imported_is_not_lost():
+    code = (
+        "import os, signal, time, edgegrad_cli\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "with edgegrad_cli._ended_by_ctrl_c():\n"
+        "    try:\n        os.kill(os.getpid(), signal.SIGINT)\n        time.sleep(1)\n"
+        "    except BaseException:\n        pass\n"
+        "print('went on')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (cli.INTERRUPTED, "", "edgegrad: interrupted\n")
