@@ -139,7 +139,7 @@ def test_residuals_have_the_gradient_of_the_loss(clutter):
             "mask[0]: expected",
         ),
         ({"weight": -torch.ones(8, 8)}, ValueError, "weight: expected numbers from 0 up"),
-        ({"weight": torch.ones(8, 8, 3)}, ValueError, "weight: expected shape (8, 8, 1)"),
+        ({"weight": torch.ones(8, 8, 3)}, ValueError, "weight: expected shape (8, 8) or (8, 8, 1)"),
     ],
 )
 def test_errors_name_the_argument(change, error, message):
