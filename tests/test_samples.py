@@ -402,6 +402,8 @@ def test_meshes_with_mipmaps_are_shaded_by_them():
     fine = mesh.replace(filter="mipmap")
     assert torch.allclose(eg.render_aovs(fine, camera, ["image"], 4, 3)["image"], found[0], atol=1e-12)
     assert "with mipmaps" in eg.plan(fine, camera)["textures"].why
+    single = fine.replace(texture=texture.float())  # the image has the type of the colours, as without mipmaps
+    assert eg.render(single, camera, spp=1).dtype == torch.float32
     with pytest.raises(ValueError, match='screen_gradient: expected textures with filter "linear" or "nearest"'):
         eg.screen_gradient(fine, camera, found[0])
 

@@ -97,6 +97,7 @@ def _digest(value: Any) -> str:
     """Of the tensors and plain values in it."""
     digest = hashlib.sha256()
     for part in _parts(value):
+        digest.update(f"{len(part)}:".encode())  # so that 1, 23 and 12, 3 differ
         digest.update(part)
     return digest.hexdigest()
 
