@@ -29,7 +29,7 @@ def add(commands: Any) -> None:
     add_resume(parser)
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR",
-        help=f"for camera.json, pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}",
+        help=f"for camera.json, history.json, pose.json, fit.png, loss.png, fit.webp, {CHECKPOINT}",
     )  # fmt: skip
     add_live(parser)
     parser.set_defaults(run=run)
@@ -55,10 +55,11 @@ def run(args: argparse.Namespace) -> int:
             principal=args.principal, distortion=args.distortion, steps=args.steps, seed=args.seed, callback=view,
             checkpoint=args.out / CHECKPOINT, resume=args.resume,
         )  # fmt: skip
-        print(f"loss {fit.loss:.3e} after {fit.search.steps} steps in {fit.search.seconds:.1f} s, {fit.state}")
+        print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.state}")
         K = fit.camera.K.tolist()
         print(f"focal length {K[0][0]:.6g} px, principal point {K[0][2]:.6g}, {K[1][2]:.6g} px", flush=True)
         save_camera(args.out / "camera.json", fit.camera)
-        print(f"wrote {', '.join(['camera.json', *write_outputs(args.out, fit.search)])} in {args.out}")
+        names = ["camera.json", fit.write_history(args.out), *write_outputs(args.out, fit.search)]
+        print(f"wrote {', '.join(names)} in {args.out}")
         linger(view, fit)
     return INTERRUPTED if fit.interrupted else 0

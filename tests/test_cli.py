@@ -310,6 +310,8 @@ def test_fit_camera(files, capsys):
     found, true = eg.load_camera(out / "camera.json"), camera(48)
     torch.testing.assert_close(found.world_to_camera.double(), true.world_to_camera, atol=0.05, rtol=0)
     assert "focal length" in capsys.readouterr().out
+    losses = [record["loss"] for record in json.loads((out / "history.json").read_text())]
+    assert losses[-1] == json.loads((out / "pose.json").read_text())["loss"]
     assert run(*said, "--no-focal", "--out", out, "--resume") == 0  # nothing left to do
     assert torch.equal(eg.load_camera(out / "camera.json").world_to_camera, found.world_to_camera)
     assert run(*said, "--principal", "--out", out, "--resume") == 2

@@ -1,5 +1,6 @@
 """fit_pose and fit_camera where pictures are not as they should be: covered, cluttered, of something else, from several sides."""
 
+import json
 import math
 import warnings
 
@@ -10,7 +11,7 @@ from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, p
 import edgegrad as eg
 from edgegrad.fit import fit_camera, fit_pose, fit_scene, fit_texture
 from edgegrad.fit.robust import Comparison
-from edgegrad.fit.task import Lens, Names, PoseTask, is_clutter
+from edgegrad.fit.task import PARTS, Lens, Names, PoseTask, is_clutter
 from edgegrad.fit.views import before_black
 
 
@@ -124,6 +125,7 @@ def test_residuals_have_the_gradient_of_the_loss(clutter):
     (found,) = torch.autograd.grad(sum(0.5 * f.square().sum() for f in at(x).residuals(c)), x)
     weight = level.shots[0].weight
     count = float(weight.sum()) * 3
+    assert at(x).count == pytest.approx(count)
     expected = 0.5 * count * (at(h).loss(c)[0] - at(-h).loss(c)[0]) / (2 * h)
     assert float(found) == pytest.approx(expected, rel=1e-3)
 
@@ -167,10 +169,79 @@ def test_a_camera_and_its_focal_length():
     assert math.degrees(math.acos(min(1.0, (float(turned.trace()) - 1.0) / 2.0))) < 1.0
 
 
+def started_aside(true, zoom=1.0):
+    """A camera some degrees and some percent off."""
+    off = torch.linalg.inv(about_center(rotation(0.05, -0.06, 0.04), (0.04, -0.03, 0.05)))
+    K = true.K.clone()
+    K[:2, :2] *= zoom
+    return true.replace(world_to_camera=true.world_to_camera @ off, K=K)
+
+
+def test_the_history_of_a_camera(tmp_path):
+    """Loss, gradient and cameras of each step; that of a fit that goes on is the same to the last bit."""
+    true = camera(48)
+    start = started_aside(true, 1.05)
+
+    def fit(**options):
+        told = {"background": BACKGROUND, "steps": 4, "progress": False, **options}
+        return fit_camera(bracket(), picture(true), start, **told)
+
+    whole = fit()
+    history = whole.history
+    assert whole.steps == len(history) == len(whole.search.history) and whole.seconds == whole.search.seconds > 0
+    assert [record.step for record in history] == list(range(whole.steps))
+    assert set(history[0].values) == {"cameras.0.world_to_camera", "cameras.0.K"}
+    for record, one in ((history[0], start), (history[-1], whole.camera)):
+        torch.testing.assert_close(record.values["cameras.0.K"], one.K.double())
+        torch.testing.assert_close(record.values["cameras.0.world_to_camera"], one.world_to_camera.double())
+    assert history[-1].loss == whole.loss < history[0].loss
+    # The focal length is not sought on blurred levels, and the last record is no step.
+    assert set(history[0].gradient) == {"world_to_camera"} and not history[-1].gradient
+    assert any(set(record.gradient) == {"world_to_camera", "K"} for record in history)
+
+    def after_step(fit):
+        if fit.steps == 21:
+            raise KeyboardInterrupt
+
+    kept = {"checkpoint": tmp_path / "fit.ckpt"}
+    assert len(fit(**kept, callback=after_step).history) == 21
+    for record, again in zip(history, fit(**kept, resume=True).history, strict=True):
+        assert (record.step, record.loss, record.gradient) == (again.step, again.loss, again.gradient)
+        assert all(torch.equal(value, again.values[name]) for name, value in record.values.items())
+
+
+@pytest.mark.parametrize("part", ["rotation", "shift"])
+def test_the_gradient_in_the_history(part):
+    """That of the loss, by finite differences of renders with the same samples, which leave some percent."""
+    true = camera(48)
+    fit = fit_camera(
+        bracket(), picture(true), started_aside(true), background=BACKGROUND, focal=False, steps=1, spp=64, progress=False
+    )  # fmt: skip
+    task, first, h = fit.search.task, fit.search.history[0], 2e-3
+    assert task is not None
+    level = task.pyramid(first.pose, 512, 64)[0]
+    assert level.size == first.size
+
+    def loss(entry, step, c=None):
+        moved = task.moved(first.pose, [entry], torch.tensor([step], dtype=torch.float64))
+        compared = Comparison(task, level, task.images(level, moved, 4096, 0))
+        return compared.loss(c or compared.scale())[0], compared.scale()
+
+    c = loss(0, 0.0)[1]
+    slopes = [(loss(entry, h, c)[0] - loss(entry, -h, c)[0]) / (2 * h) for entry in PARTS[part]]
+    assert first.gradient[part] == pytest.approx(math.hypot(*slopes), rel=0.05)
+
+
 def test_a_camera_is_saved(tmp_path):
     view = camera(32)
     fit = fit_camera(bracket(), picture(view), view, background=BACKGROUND, focal=False, steps=2, progress=False)
-    assert "camera.json" in fit.save(tmp_path) and torch.equal(fit.camera.K, view.K)
+    names = fit.save(tmp_path)
+    assert names == ["camera.json", "history.json", "pose.json", "fit.png", "loss.png", "fit.webp"]
+    assert {path.name for path in tmp_path.iterdir()} == set(names) and torch.equal(fit.camera.K, view.K)
+    history = json.loads((tmp_path / "history.json").read_text())
+    assert [record["loss"] for record in history] == [record.loss for record in fit.history]
+    assert history[0]["values"] == {"cameras.0.world_to_camera": view.world_to_camera.tolist()}
+    assert {axes.get_ylabel() for axes in fit.plot_history().axes} == {"mean squared difference", "|gradient|"}
     torch.testing.assert_close(eg.load_camera(tmp_path / "camera.json").K.double(), view.K.double())
 
 

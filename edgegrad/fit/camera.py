@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,24 +13,38 @@ import torch
 from torch import Tensor
 
 from .._check import check_int
-from .._files import PathLike
+from .._files import PathLike, replacing
 from ..camera import Camera
 from ..io import save_camera
 from ..mesh import Mesh
 from ..scene import Scene
+from .fitted import plain_history
+from .frame import Record
 from .pose import check_flag, search_pose
-from .result import PoseFit
-from .task import Lens, Names
+from .result import PoseFit, Step
+from .task import PARTS, Lens, Names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_COEFFICIENTS = 8
+# Which tensor of a camera each part of a step moves.
+PARTS_OF = {
+    "rotation": "world_to_camera", "shift": "world_to_camera", "focal": "K", "principal": "K", "distortion": "distortion",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFit:
-    """What fit_camera found: the cameras, and the search for them, in which the scene moved before cameras at rest."""
+    """What fit_camera found: the cameras, and the search for them, in which the scene moved before cameras at rest.
+
+    `history` has a Record of each step: the loss, which is comparable within one level of the image pyramid; what the cameras
+    were, float64, by the names that fit_scene() has for them ("cameras.0.world_to_camera", and "cameras.0.K" and
+    "cameras.0.distortion" where they are sought); and norms of the gradient by "world_to_camera" (in radians and sizes of the
+    scene), "K" (logarithm of the focal length, widths of the image) and "distortion", which all cameras share: of those that are
+    sought on the level, and none where the loss rose and the step was taken back. The last record is the final comparison.
+    `search.history` has the size of the level and which steps were the best so far.
+    """
 
     cameras: list[Camera]
     search: PoseFit
@@ -41,6 +57,18 @@ class CameraFit:
     @property
     def loss(self) -> float:
         return self.search.loss
+
+    @property
+    def history(self) -> list[Record]:
+        return [self._record(number, step) for number, step in enumerate(self.search.history)]
+
+    @property
+    def steps(self) -> int:
+        return self.search.steps
+
+    @property
+    def seconds(self) -> float:
+        return self.search.seconds
 
     @property
     def explained(self) -> float:
@@ -63,15 +91,39 @@ class CameraFit:
         """target | start | fit | difference."""
         return self.search.plot()
 
+    def plot_history(self) -> Figure:
+        """The loss and the norm of each gradient, step by step."""
+        return self.search.plot_history()
+
     def save(self, folder: PathLike) -> list[str]:
-        """Writes camera.json, as load_camera reads it (of several camera-0.json and so on), and what PoseFit.save writes; gives
-        the names. Raises OSError."""
-        names = self.search.save(folder)
+        """Writes history.json, camera.json, as load_camera reads it (of several camera-0.json and so on), and what PoseFit.save
+        writes; gives the names. Raises OSError, or ImportError at last when matplotlib or pillow is missing."""
+        Path(folder).mkdir(parents=True, exist_ok=True)
         several = len(self.cameras) > 1
         own = [f"camera-{i}.json" if several else "camera.json" for i in range(len(self.cameras))]
         for name, camera in zip(own, self.cameras, strict=True):
             save_camera(Path(folder) / name, camera)
-        return [*own, *names]
+        own.append(self.write_history(folder))
+        return [*own, *self.search.save(folder)]
+
+    def write_history(self, folder: PathLike) -> str:
+        """history.json alone, with loss, gradient norms and cameras of each step; gives its name. Raises OSError."""
+        with replacing(Path(folder) / "history.json") as temporary:
+            temporary.write_text(json.dumps(plain_history(self.history), indent=2) + "\n", encoding="utf-8")
+        return "history.json"
+
+    def _record(self, number: int, step: Step) -> Record:
+        task = self.search.task
+        assert task is not None
+        sought = [PARTS_OF[name] for name, entries in PARTS.items() if any(entry in task.free for entry in entries)]
+        values = {}
+        for i, shot in enumerate(task.shots):
+            camera = moved(task.lens(shot.camera, step.pose), step.pose.matrix)
+            values |= {f"cameras.{i}.{name}": getattr(camera, name).clone() for name in dict.fromkeys(sought)}
+        squares: dict[str, float] = {}
+        for part, norm in step.gradient.items():
+            squares[PARTS_OF[part]] = squares.get(PARTS_OF[part], 0.0) + norm**2
+        return Record(number, step.loss, {name: math.sqrt(square) for name, square in squares.items()}, values)
 
     def _repr_png_(self) -> bytes | None:
         return self.search._repr_png_()
@@ -140,10 +192,7 @@ def fit_camera(
         scene, target = _bare(scene), mask
 
     def result(search: PoseFit) -> CameraFit:
-        # The scene moved by M before the camera W: W M sees the scene at rest alike.
-        moved = [seen.world_to_camera.detach().double() @ search.matrix for seen in search.cameras]
-        found = zip(search.cameras, moved, strict=True)
-        return CameraFit([seen.replace(world_to_camera=M.to(seen.world_to_camera)) for seen, M in found], search)
+        return CameraFit([moved(seen, search.matrix) for seen in search.cameras], search)
 
     def step(search: PoseFit) -> None:
         assert callback is not None
@@ -156,6 +205,12 @@ def fit_camera(
         checkpoint=checkpoint, checkpoint_every=checkpoint_every, resume=resume,
     )  # fmt: skip
     return result(found)
+
+
+def moved(camera: Camera, matrix: Tensor) -> Camera:
+    """The camera that sees a scene at rest as this one W sees it moved by the matrix M (4, 4): W M."""
+    W = camera.world_to_camera
+    return camera.replace(world_to_camera=(W.detach().double() @ matrix).to(W))
 
 
 def _bare(scene: Mesh | Scene) -> Scene:

@@ -18,7 +18,7 @@ from ..camera import Camera
 from .frame import Options, Parameter
 from .views import View
 
-FORMAT = 3
+FORMAT = 4
 SAME = (
     "loss",
     "mask_loss",

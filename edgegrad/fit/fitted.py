@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -128,7 +129,7 @@ class Fit:
         with replacing(out / "values.pt") as temporary:
             torch.save(self.values, temporary)
         written.append("values.pt")
-        text("history.json", [_plain(record) for record in self.history])
+        text("history.json", plain_history(self.history))
         for i, mesh in enumerate(self.scene.meshes):
             number = "" if len(self.scene.meshes) == 1 else str(i)
             if any(name.endswith("verts") for name in self.values):
@@ -173,6 +174,11 @@ def _render(scene: Scene, camera: Camera, view: View, spp: int, seed: int) -> Te
 
 def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def plain_history(history: Sequence[Record]) -> list[dict[str, Any]]:
+    """As history.json has it."""
+    return [_plain(record) for record in history]
 
 
 def _plain(record: Record) -> dict[str, Any]:

@@ -80,7 +80,7 @@ class Record(NamedTuple):
     loss: float  # of this step's views and samples, regularizer included
     gradient: dict[str, float]  # norm, by parameter
     values: dict[str, Tensor]  # of parameters of up to 64 numbers, before the step
-    rate: float  # factor of the learning rates
+    rate: float = 1.0  # factor of the learning rates; 1 where there are none
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,11 @@ class GaussNewton:
         return True
 
     @property
+    def gradient(self) -> Tensor:
+        """Jᵀr (n,) at the last accepted point."""
+        return self._gradient
+
+    @property
     def blind(self) -> bool:
         """Whether nothing in the image depends on p."""
         return not bool(self._curvature.diagonal().sum() > 0)

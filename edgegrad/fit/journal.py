@@ -66,10 +66,10 @@ class Journal:
 
 
 def _packed(way: Way) -> dict[str, Any]:
-    steps = [(step.size, step.loss, step.pose.numbers, step.best) for step in way.steps]
+    steps = [(step.size, step.loss, step.pose.numbers, step.best, dict(step.gradient)) for step in way.steps]
     return {**way._asdict(), "pose": way.pose.numbers, "here": way.here.numbers, "steps": steps}
 
 
 def _unpacked(packed: dict[str, Any]) -> Way:
-    steps = tuple(Step(size, loss, Pose.of(pose), best) for size, loss, pose, best in packed["steps"])
+    steps = tuple(Step(size, loss, Pose.of(pose), *rest) for size, loss, pose, *rest in packed["steps"])
     return Way(**{**packed, "pose": Pose.of(packed["pose"]), "here": Pose.of(packed["here"]), "steps": steps})

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -42,15 +44,22 @@ def curves(history: Sequence[Record]) -> Figure:
     steps = [record.step + 1 for record in history]
     above.plot(steps, [record.loss for record in history], color=INK, linewidth=1)
     above.set_ylabel("loss")
-    for name in history[0].gradient:
-        below.plot(steps, [record.gradient[name] for record in history], linewidth=1, label=name)
-    below.set_ylabel("|gradient|")
-    below.set_xlabel("step")
-    below.legend(frameon=False, fontsize=8)
-    for ax in (above, below):
-        ax.set_yscale("log")
-        ax.spines[["top", "right"]].set_visible(False)
+    draw_gradients(below, [record.gradient for record in history])
+    above.set_yscale("log")
+    above.spines[["top", "right"]].set_visible(False)
     return figure
+
+
+def draw_gradients(axes: Axes, gradients: Sequence[Mapping[str, float]]) -> None:
+    """The norm of each, from step 1 on; with gaps where a step has none of that name."""
+    for name in dict.fromkeys(name for gradient in gradients for name in gradient):
+        norms = [gradient.get(name, math.nan) for gradient in gradients]
+        axes.plot(range(1, len(norms) + 1), norms, linewidth=1, label=name)
+    axes.set_yscale("log")
+    axes.set_ylabel("|gradient|")
+    axes.set_xlabel("step")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8)
 
 
 def displayed(image: Tensor) -> np.ndarray:

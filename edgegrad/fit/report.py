@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from .._files import PathLike, replacing
-from .plots import comparison, displayed
+from .plots import comparison, displayed, draw_gradients
 from .result import PoseFit, Step
 from .task import Level, PoseTask
 
@@ -38,18 +38,26 @@ def sheet(fit: PoseFit) -> Figure:
 
 
 def draw_loss(path: PathLike, fit: PoseFit) -> None:
-    """Writes the loss of every step: one colour for each level of the image pyramid, grey where a search came to nothing.
+    """Writes what curves_of() draws. Raises ValueError, or OSError when the file cannot be written."""
+    figure = curves_of(fit)
+    with replacing(path) as temporary:
+        figure.savefig(temporary)
 
-    Raises ValueError for a fit that did not take a step or came from JSON, OSError when the file cannot be written.
+
+def curves_of(fit: PoseFit) -> Figure:
+    """The loss of every step, one colour for each level of the image pyramid, grey where a search came to nothing; and the norms
+    of the gradient.
+
+    Raises ValueError for a fit that did not take a step or came from JSON.
     """
     _task(fit)
     # The last entry of a whole fit is no step but the final comparison, which has less noise.
     history = fit.history[:-1] if len(fit.history) > 1 and not fit.interrupted else fit.history
     begins = [k for k, step in enumerate(history) if k == 0 or step.size != history[k - 1].size]
     sizes = sorted({step.size for step in history})
-    figure = Figure(figsize=(6.4, 3.2), dpi=200, layout="constrained")
-    axes = figure.subplots()
-    axes.plot(range(1, len(history) + 1), [step.loss for step in history], ".", color=FAINT, markersize=4)
+    figure = Figure(figsize=(6.4, 4.8), dpi=200, layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    above.plot(range(1, len(history) + 1), [step.loss for step in history], ".", color=FAINT, markersize=4)
     labelled = set()
     for begin, end in zip(begins, [*begins[1:], len(history)], strict=True):
         best = [k for k in range(begin, end) if history[k].best]
@@ -57,14 +65,13 @@ def draw_loss(path: PathLike, fit: PoseFit) -> None:
         color = colormaps["viridis"](0.85 * sizes.index((h, w)) / max(1, len(sizes) - 1))
         label = None if (h, w) in labelled else f"{w} × {h} px"  # later ones are of second opinions
         labelled.add((h, w))
-        axes.plot([k + 1 for k in best], [history[k].loss for k in best], ".-", color=color, label=label)
-    axes.set_yscale("log")
-    axes.set_xlabel("step")
-    axes.set_ylabel("mean squared difference")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8, title="best so far", title_fontsize=8)
-    with replacing(path) as temporary:
-        figure.savefig(temporary)
+        above.plot([k + 1 for k in best], [history[k].loss for k in best], ".-", color=color, label=label)
+    above.set_yscale("log")
+    above.set_ylabel("mean squared difference")
+    above.spines[["top", "right"]].set_visible(False)
+    above.legend(frameon=False, fontsize=8, title="best so far", title_fontsize=8)
+    draw_gradients(below, [step.gradient for step in history])
+    return figure
 
 
 def draw_animation(path: PathLike, fit: PoseFit) -> None:

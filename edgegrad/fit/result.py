@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -60,6 +62,9 @@ class Step(NamedTuple):
     loss: float  # mean squared difference, blurred alike; comparable within one level
     pose: Pose
     best: bool  # whether it was the best so far
+    # Norms of the loss's gradient by rotation (radians), shift (object sizes), scale and focal (logarithms), principal (widths of
+    # the image) and distortion, of those that are sought on the level; empty where the loss rose and the step was taken back.
+    gradient: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +117,14 @@ class PoseFit:
         """target | start | fit | difference, a row for each picture; with a mask all over black, as they were compared."""
         return require("edgegrad.fit.report", *DRAWING).sheet(self)
 
+    def plot_history(self) -> Figure:
+        """The loss and the norm of each gradient, step by step."""
+        return require("edgegrad.fit.report", *DRAWING).curves_of(self)
+
     def save(self, folder: PathLike) -> list[str]:
-        """Writes pose.json, fit.png, loss.png and fit.webp to a folder, which is made where it is missing, each whole or not
-        at all, and gives their names; of a fit that took no step, pose.json alone. Raises OSError, or ImportError once
-        pose.json is written when matplotlib or pillow is missing."""
+        """Writes pose.json, fit.png, loss.png (plot_history()) and fit.webp to a folder, which is made where it is missing, each
+        whole or not at all, and gives their names; of a fit that took no step, pose.json alone. Raises OSError, or ImportError
+        once pose.json is written when matplotlib or pillow is missing."""
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
         with replacing(out / "pose.json") as temporary:

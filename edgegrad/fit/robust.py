@@ -44,6 +44,15 @@ class Comparison:
     def channels(self) -> int:
         return self.differences[0].shape[-1]
 
+    @property
+    def count(self) -> float:
+        """Of numbers that are compared, weighted."""
+        weights = (
+            r.numel() // self.channels if shot.weight is None else float(shot.weight.sum())
+            for r, shot in zip(self.differences, self.level.shots, strict=True)
+        )  # fmt: skip
+        return max(self.channels * sum(weights), 1e-30)
+
     def scale(self) -> float:
         """c that the median difference suggests."""
         sizes, counts = [], []
@@ -61,7 +70,7 @@ class Comparison:
 
     def loss(self, c: float) -> tuple[float, float]:
         """The mean over pixels and channels, and by how much that of another render may be higher by its noise."""
-        total = near = paid = count = 0.0
+        total = near = paid = 0.0
         for k, r in enumerate(self.differences):
             square = r.detach().square().sum(-1, keepdim=True)
             weight = self.level.shots[k].weight
@@ -70,9 +79,7 @@ class Comparison:
             near += float((w * square / (1.0 + square / c**2).square()).sum())  # what is far off is so in any samples
             if self.open:
                 paid += float((w * (1.0 - self.open[k].detach().square())).sum()) * PAYS * c**2
-            count += float(w.sum()) * self.channels
-        count = max(count, 1e-30)
-        return (total - paid) / count, NOISE * (near + FAINT * paid) / count
+        return (total - paid) / self.count, NOISE * (near + FAINT * paid) / self.count
 
     def residuals(self, c: float) -> list[Tensor]:
         """Whose squares sum up to the loss's approximation for one step."""

@@ -19,7 +19,7 @@ from .gauss_newton import GaussNewton
 from .journal import Journal, Way
 from .result import Pose, Step
 from .robust import NARROWEST, NOISE, Comparison
-from .task import GROW, SHIFT, TURN, Level, PoseTask
+from .task import GROW, PARTS, SHIFT, TURN, Level, PoseTask
 from .verdict import ENOUGH, explained
 
 ASIDE, ASIDE_STEPS = 0.2, 20  # radians between the starts on the coarsest level, and steps from each
@@ -136,8 +136,10 @@ class Search:
             compared = Comparison(task, level, task.images(level, task.moved(way.pose, level.free, p), level.spp, seed))
             c = compared.scale() if way.c == math.inf else way.c
             loss, slack = compared.loss(c)
+            norms = {}
             if taken := search.observe(p, compared.residuals(c), loss, slack):
                 way = way._replace(here=way.pose)
+                norms = _norms(level.free, 2.0 / compared.count * search.gradient)
                 c = min(c, compared.scale())
                 search.loss = loss = compared.loss(c)[0]
             way = way._replace(c=c, search=search.state(), random=self.generator.get_state())
@@ -148,7 +150,7 @@ class Search:
             short = float(move.abs().max()) < self.tolerance * level.coarseness
             settled = search.settled and level is not self.levels[-1]
             good = taken and loss <= way.lowest + NOISE * abs(way.lowest)
-            step = Step(level.size, loss, way.pose, good)
+            step = Step(level.size, loss, way.pose, good, norms)
             way = way._replace(
                 pose=task.moved(way.here, level.free, move), lowest=loss if good else way.lowest, short=short,
                 done=short or settled or search.seen >= most, steps=(*way.steps, step),
@@ -209,6 +211,13 @@ class Search:
         direction = torch.randn(3, generator=self.generator, dtype=torch.float64)
         radius = torch.rand((), generator=self.generator, dtype=torch.float64) ** (1 / 3)
         return radius * direction / direction.norm()
+
+
+def _norms(free: list[int], gradient: Tensor) -> dict[str, float]:
+    """Of each part of a step whose entries are `free`."""
+    squares = dict(zip(free, gradient.square().tolist(), strict=True))
+    sums = {name: [squares[entry] for entry in entries if entry in squares] for name, entries in PARTS.items()}
+    return {name: math.sqrt(sum(part)) for name, part in sums.items() if part}
 
 
 def _distinct(poses: list[Pose], most: int) -> list[Pose]:

@@ -33,6 +33,10 @@ EVEN = (
 # of scale and focal length, the principal point in widths of the image, and the lens's distortion. The first of each:
 TURN, SHIFT, GROW, ZOOM, PRINCIPAL, BEND = 0, 3, 6, 7, 8, 10
 ENTRIES = 18
+PARTS = {  # of a step, by name
+    "rotation": range(TURN, SHIFT), "shift": range(SHIFT, GROW), "scale": range(GROW, ZOOM), "focal": range(ZOOM, PRINCIPAL),
+    "principal": range(PRINCIPAL, BEND), "distortion": range(BEND, ENTRIES),
+}  # fmt: skip
 
 
 class Lens(NamedTuple):
