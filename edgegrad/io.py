@@ -3,7 +3,8 @@
 What colours mean: vertex and face colours of OBJ and PLY files and the texels of textures of colour are sRGB on disk and
 become linear; factors of materials (glTF baseColorFactor, emissiveFactor, OBJ Kd, Ke), vertex colours of glTF and textures of
 data (normals, metallic, roughness) are linear already. All become float32. A glTF multiplies the texture, the factor and the
-vertex colours. Elsewhere, where a file gives several looks, the first of these is taken: texture, vertex colours, face
+vertex colours; those that differ from vertex to vertex beside a texture need lit=True, for a mesh that is not lit has one kind of
+colour. Elsewhere, where a file gives several looks, the first of these is taken: texture, vertex colours, face
 colours, the material's colour.
 
 lit=False, the default, takes these colours for radiance. Lights are dropped, as are normals and everything of a material but its

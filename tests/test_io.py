@@ -650,7 +650,10 @@ def test_a_link_out_of_the_folder_is_not_followed(tmp_path):
     ("change", "fault"),
     [
         ({"images": [{"bufferView": 0, "name": "bark"}]}, "image in the texture 'bark'"),
-        ({"colors": np.full((4, 4), 128, np.uint8)}, "vertex colours, got both"),
+        (
+            {"colors": np.eye(4, dtype="<f4")},
+            r"vertex colours that differ, got both.*load it with lit=True, which multiplies them, or materials=False",
+        ),
         ({"uv": False}, "expected texture coordinates"),
         ({"reference": {"index": 0, "texCoord": 1}}, "expected texture coordinates TEXCOORD_1"),
         ({"images": [{"uri": "gone.png"}]}, "names 'gone.png'"),
@@ -664,6 +667,31 @@ def test_gltf_texture_faults(tmp_path, change, fault):
     (tmp_path / "t.glb").write_bytes(square_glb({"pbrMetallicRoughness": base}, **options))
     with pytest.raises((ValueError, FileNotFoundError), match=rf"t\.glb.*{fault}"):
         load_mesh(tmp_path / "t.glb")
+
+
+def test_gltf_vertex_colours_beside_a_texture(tmp_path):
+    """Multiplied where they are all one. Others need a lit mesh, or the texture left out."""
+    base = {"baseColorTexture": {"index": 0}, "baseColorFactor": [0.5, 1.0, 0.2, 1.0]}
+    given = dict(uv=True, extra=[png_bytes()], textures=[{"source": 0}], images=[{"bufferView": 4}])
+    file, colors = tmp_path / "t.glb", np.array([[0.5, 0.25, 1.0, 1.0]] * 4, "<f4")
+
+    def save(colors, **material):
+        file.write_bytes(square_glb({"pbrMetallicRoughness": base, **material}, colors=colors, **given))
+
+    save(colors)
+    mesh = load_mesh(file)
+    expected = srgb_to_linear(torch.from_numpy(TEXELS) / 255.0) * torch.tensor([0.25, 0.25, 0.2])
+    torch.testing.assert_close(mesh.texture, expected, check_dtype=False)
+    assert mesh.colors is None
+    colors[0, 0] = 0.75
+    save(colors)
+    torch.testing.assert_close(load_mesh(file, materials=False).colors, torch.from_numpy(colors[:, :3]))
+    lit = load_mesh(file, lit=True)
+    torch.testing.assert_close(lit.colors, torch.from_numpy(colors[:, :3]))
+    assert lit.material.base_color.image.shape == (2, 2, 3)
+    save(colors, extensions={"KHR_materials_unlit": {}})
+    with pytest.raises(ValueError, match=r"got both.*; load it with materials=False"):
+        load_mesh(file, lit=True)
 
 
 # -- images -----------------------------------------------------------------------------------------------------------

@@ -141,8 +141,14 @@ def _unlit(primitive: Primitive, texture: Lookup | None, colors: Tensor | None) 
         if colors is not None:
             return {"colors": colors * colors.new_tensor(factor)}
         return {"face_colors": torch.tensor(factor, dtype=torch.float32).repeat(len(primitive.raw["faces"]), 1)}
-    if colors is not None and not bool((colors == 1.0).all()):
-        raise Fault(f"expected the texture {texture.name!r} or vertex colours, got both; bake one into the other")
+    if colors is not None:
+        if not bool((colors == colors[0]).all()):
+            lit = "" if primitive.source.wanted.lit else "lit=True, which multiplies them, or "
+            raise Fault(
+                f"expected the texture {texture.name!r} or vertex colours that differ, got both, of which an unlit mesh has one; "
+                f"load it with {lit}materials=False, which leaves out the texture, or bake one into the other"
+            )
+        factor = tuple((colors[0] * colors.new_tensor(factor)).tolist())
     return {"colors": None, "texture": primitive.source.textures.get(texture.name, texture.image, factor)}
 
 
