@@ -35,7 +35,8 @@ class LightPoints(NamedTuple):
 
 
 class Light:
-    """What all lights have in common."""
+    """What all lights have in common. Negative radiances, intensities and colours are not refused, for an optimisation may pass
+    there: they take light away, and images stay linear in them."""
 
     casts = True  # whether it casts shadows
     infinite = False  # whether it is a direction

@@ -110,6 +110,32 @@ def test_points_of_an_environment_have_their_density():
     torch.testing.assert_close(seen[:, 0], vector(1, 2, 3, 0))
 
 
+@pytest.mark.parametrize("kind", ["constant", "image", "image of both signs", "point", "directional", "emission"])
+def test_negative_light_takes_away_what_it_would_give(kind: str):
+    """An optimisation may pass there: images are linear in radiance and intensity, also below zero."""
+    rows = picture() - (0.7 if kind == "image of both signs" else 0.0)
+    make: dict[str, Callable[[Tensor], Any]] = {
+        "constant": lambda scale: eg.Environment(scale * rows[0, 0]),
+        "point": lambda scale: eg.PointLight(vector(1, 2, 3), 5 * scale),
+        "directional": lambda scale: eg.DirectionalLight(vector(0, -1, -1), 5 * scale),
+        "emission": lambda scale: eg.AreaLight.rectangle(
+            vector(0, 0, 3), vector(1, 0, 0), vector(0, 1, 0), scale * rows[0, 0]
+        ),
+    }
+    light = make.get(kind, lambda scale: eg.Environment(scale * rows))
+
+    def image(sign: float) -> tuple[Tensor, Tensor]:
+        scale = torch.tensor(sign, dtype=F64, requires_grad=True)
+        mesh = ball(1).replace(material=eg.Material(0.8, metallic=0.5, roughness=0.6))
+        made = eg.render(eg.Scene([mesh], torch.zeros(3), lights=[light(scale)]), from_above(8), spp=4)
+        return made.detach(), torch.autograd.grad(made.sum(), scale)[0]
+
+    (above, slope), (below, same) = image(1.0), image(-1.0)
+    assert float(above.abs().max()) > 0.05
+    torch.testing.assert_close(below, -above)
+    torch.testing.assert_close(same, slope)
+
+
 def test_dark_texels_and_dark_faces_are_drawn_too():
     image = torch.zeros(2, 4, 1, dtype=F64)
     image[0, 0] = 1e6
