@@ -27,7 +27,9 @@ class Texture:
     uv_faces  (F, 3) int        indices into uvs; given with uvs
     wrap      what lies beyond the rim: "repeat", "clamp" or "mirror", or a pair of these for u and v
     filter    "linear" between texel centres; "nearest", the texel that the point lies in; "mipmap", means over squares of 2, 4,
-              8 … texels, so that neighbouring pixels are about a texel apart, linear between two such levels (Williams 1983)
+              8 … texels, so that neighbouring pixels are about a texel apart, linear between two such levels (Williams 1983).
+              Beyond the rim "clamp" goes on with the rim of such means, as GPUs do: where many texels fall on a pixel, with a
+              mean of the border and of what lies within, at last of the whole image
     factor    a number or (K,)  what the image is multiplied by, as glTF has it
 
     Raises TypeError or ValueError that names the argument.
