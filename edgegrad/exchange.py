@@ -49,9 +49,8 @@ def from_trimesh(given: Any) -> Mesh:
         raise ValueError(f"mesh: {fault}") from fault.__cause__
 
 
-def to_trimesh(mesh: Mesh, linear: bool = False, faces_colored: bool = True) -> Any:
-    """See Mesh.to_trimesh. linear: colours of vertices are, as in glTF. faces_colored: False where faces have none of their own,
-    which those of their vertices then hold."""
+def to_trimesh(mesh: Mesh, faces_colored: bool = True) -> Any:
+    """See Mesh.to_trimesh. faces_colored: False where faces have none of their own, which those of their vertices then hold."""
     trimesh = require("trimesh", "trimesh", "Mesh.to_trimesh")
     _check_channels(mesh)
     faces = _array(mesh.faces)
@@ -75,7 +74,7 @@ def to_trimesh(mesh: Mesh, linear: bool = False, faces_colored: bool = True) -> 
         colors = given.reshape(-1, given.shape[-1])
     look = {}
     if colors is not None:
-        look["vertex_colors"] = to_bytes(colors, linear)
+        look["vertex_colors"] = to_bytes(colors)
     elif mesh.face_colors is not None:
         look["face_colors"] = to_bytes(mesh.face_colors)
     return trimesh.Trimesh(verts, faces, process=False, **look)

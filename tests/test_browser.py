@@ -117,6 +117,25 @@ def test_the_page_pauses_goes_on_and_stops_a_running_fit(browser):
     assert found[0].loss < found[0].history[0].loss
 
 
+def test_the_page_shows_materials(browser):
+    """A purple texture that a factor makes blue, on a metal, is seen as blue."""
+    verts = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    texels = torch.tensor([0.9, 0.0, 0.9]).expand(4, 4, 3)
+    material = eg.Material(eg.Texture(texels, factor=torch.tensor([0.0, 1.0, 1.0])), metallic=0.5, roughness=0.5)
+    square = eg.Mesh(verts, faces, uvs=verts[:, :2], uv_faces=faces, material=material)
+    with eg.viewer(port=0) as viewer:
+        viewer.update(square)
+        client = opened(browser, viewer)
+        place = {"wxyz": (0.0, 1.0, 0.0, 0.0), "position": (0.0, 0.0, 3.0), "fov": 0.3}
+
+        def is_blue():
+            red, green, blue = client.get_render(16, 16, **place, transport_format="png")[8, 8, :3].astype(int)
+            return blue > 60 + max(red, green)
+
+        wait_for(is_blue, "the colour of texture and factor")
+
+
 def test_the_page_shows_the_meshes_where_the_camera_sees_them(browser):
     """The same camera sees the same outline in the page, drawn by three.js, as render() does."""
     at = camera(96)

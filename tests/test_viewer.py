@@ -113,7 +113,7 @@ def test_shapes_are_shown_as_they_move_also_after_remeshing(viewer, monkeypatch)
     assert page(viewer).view.options == ("1", "2") and page(viewer).view.visible
 
 
-def test_textures_and_colours_are_those_of_the_mesh(viewer):
+def test_textures_and_colours_are_those_of_the_mesh(viewer, tmp_path):
     square = eg.Mesh(
         torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2], [0, 2, 3]]),
         texture=torch.full((4, 4, 3), 0.3), uvs=torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]]),
@@ -129,8 +129,61 @@ def test_textures_and_colours_are_those_of_the_mesh(viewer):
     red = eg.Mesh(square.verts, square.faces, colors=torch.tensor([[0.5, 0.0, 0.0]]).expand(4, 3))
     viewer._next = 0.0
     assert viewer.update(red)
-    loaded = trimesh.load(io.BytesIO(page(viewer)._meshes[0].handle.glb_data), file_type="glb", force="mesh")
-    np.testing.assert_array_equal(loaded.visual.vertex_colors[:, :3], [[128, 0, 0]] * 4)  # linear, as in glTF
+    assert torch.equal(shown(viewer, tmp_path).colors, red.colors)  # linear, as in glTF
+    faces = red.replace(face_colors=torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.25, 1.0]]))
+    viewer._next = 0.0
+    assert viewer.update(faces)
+    found = shown(viewer, tmp_path)
+    assert torch.equal(found.corner_colors, faces.face_colors[:, None].expand(-1, 3, -1))
+    assert found.material.two_sided and float(found.material.base_color.mean()) == 1.0 and found.normals is not None
+
+
+def test_materials_are_those_of_the_mesh(viewer, tmp_path, monkeypatch):
+    """Shown as a GLB, which holds all of them; one matt colour as a mesh whose vertices may move."""
+    monkeypatch.setattr(view, "SHORTEST", 0.0)
+    viewer._next = 0.0
+    verts, faces = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
+    square = eg.Mesh(verts, faces, uvs=verts[:, :2], uv_faces=faces)
+    base = torch.arange(12).reshape(2, 2, 3) / 12.0
+    material = eg.Material(
+        eg.Texture(base, factor=torch.tensor([1.0, 0.5, 0.25]), wrap="clamp", filter="nearest"), metallic=0.75, roughness=0.25,
+        emission=torch.tensor([0.0, 2.0, 0.0]), two_sided=False,
+    )  # fmt: skip
+
+    def update(mesh):
+        viewer._next = 0.0
+        assert viewer.update(mesh)
+        return page(viewer)._meshes[0].handle
+
+    update(square.replace(material=material))
+    found = shown(viewer, tmp_path).material
+    torch.testing.assert_close(found.base_color.image, base, atol=4e-3, rtol=0)
+    torch.testing.assert_close(found.base_color.factor, material.base_color.factor)
+    assert (found.base_color.wraps, found.base_color.filter) == (("clamp", "clamp"), "nearest")
+    assert (float(found.metallic), float(found.roughness), found.two_sided) == (0.75, 0.25, False)
+    assert found.emission.tolist() == [0, 2, 0]
+    colors = torch.rand(4, 3)
+    update(square.replace(colors=colors, material=eg.Material(torch.tensor([0.2, 1.0, 0.2]))))
+    torch.testing.assert_close(shown(viewer, tmp_path).colors, colors)
+    torch.testing.assert_close(shown(viewer, tmp_path).material.base_color, torch.tensor([0.2, 1.0, 0.2]))
+    # What is no tensor counts as well.
+    cut = square.replace(alpha=torch.tensor([[0.0, 1.0]]))
+    update(cut)
+    update(cut.replace(alpha_cutoff=0.25))
+    assert shown(viewer, tmp_path).alpha_cutoff == 0.25
+
+    matt = square.replace(material=eg.Material(torch.tensor([1.0, 0.0, 0.2158605]), two_sided=False))
+    handle = update(matt)
+    assert isinstance(handle, viser.MeshHandle) and tuple(handle.color) == (255, 0, 128)
+    assert (handle.side, handle.flat_shading) == ("front", True)
+    assert update(matt.replace(verts=2 * verts)) is handle and handle.vertices.max() == 2.0
+    assert update(matt.replace(material=eg.Material(0.5))) is not handle
+
+
+def shown(viewer, folder):
+    """The GLB that the page has, as load_mesh reads it."""
+    (folder / "shown.glb").write_bytes(page(viewer)._meshes[0].handle.glb_data)
+    return eg.load_mesh(folder / "shown.glb", lit=True)
 
 
 def test_a_loop_of_ones_own(viewer, monkeypatch):

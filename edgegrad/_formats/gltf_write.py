@@ -288,8 +288,11 @@ def _split(look: _Look) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         given["_COLOR_0"] = look.colors
     rows = {name: values.detach().cpu().float().numpy() for name, (values, _) in given.items()}
     index = np.stack([faces.cpu().long().numpy().reshape(-1) for _, faces in given.values()], 1)
+    corners = np.arange(len(index))
     if bool((index == index[:, :1]).all()):  # one already
         kept, faces = np.arange(len(mesh.verts))[:, None].repeat(index.shape[1], 1), index[:, 0]
+    elif bool((index == corners[:, None]).all(0).any()):  # no two corners are alike
+        kept, faces = index, corners
     else:
         kept, faces = np.unique(index, axis=0, return_inverse=True)
     found = {name: values[kept[:, k]] for k, (name, values) in enumerate(rows.items())}

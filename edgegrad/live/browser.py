@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from .._files import require
+from .._formats.gltf_write import to_glb
 from .._tree import named_tensors
 from ..camera import Camera
-from ..exchange import to_trimesh
+from ..material import Material, vertex_normals
 from ..mesh import PLAIN, Mesh
 from .frame import CONTRAST, Frame, as_bytes, displayed
 
@@ -137,7 +138,9 @@ class Browser:
         for i, mesh in enumerate(frame.scene.meshes):
             old = self._meshes.get(i)
             if old is None or not _alike(old.mesh, mesh):
-                if old and _is_plain(mesh) and _is_plain(old.mesh) and torch.equal(old.mesh.faces, mesh.faces):
+                simple = _Simple.of(mesh)
+                same = old is not None and simple is not None and simple == _Simple.of(old.mesh)
+                if old and same and torch.equal(old.mesh.faces, mesh.faces):
                     handle = old.handle
                     handle.vertices = _floats(mesh.verts)
                 else:
@@ -148,12 +151,15 @@ class Browser:
 
     def _added(self, name: str, mesh: Mesh) -> Any:
         """Takes the place of one of that name."""
-        if _is_plain(mesh):
+        if (simple := _Simple.of(mesh)) is not None:
             faces = mesh.faces.numpy().astype(np.uint32)
-            return self.server.scene.add_mesh_simple(name, _floats(mesh.verts), faces, color=GREY, side="double")
-        made = to_trimesh(mesh, linear=True, faces_colored=False)
-        _ = made.vertex_normals  # written only if they are there
-        return self.server.scene.add_glb(name, made.export(file_type="glb"))
+            return self.server.scene.add_mesh_simple(name, _floats(mesh.verts), faces, **simple._asdict())
+        mesh = mesh.detach()
+        if mesh.face_colors is not None:  # of corners they are written faster
+            mesh = mesh.replace(corner_colors=mesh.face_colors[:, None].expand(-1, 3, -1))
+        if mesh.material is None:  # matt and smooth
+            mesh = mesh.replace(material=Material(), normals=vertex_normals(mesh.verts, mesh.faces), normal_faces=None)
+        return self.server.scene.add_glb(name, to_glb(mesh)[0])
 
     def _draw_cameras(self, frame: Frame) -> None:
         if len(frame.cameras) != len(self._frusta):
@@ -235,15 +241,56 @@ def _apart(directions: np.ndarray, up: np.ndarray) -> np.ndarray:
     return candidates[np.argmin(nearest - 1e-3 * cosines[:, 0])]
 
 
-def _is_plain(mesh: Mesh) -> bool:
-    return mesh.channels not in (1, 3)
+class _Simple(NamedTuple):
+    """How a mesh of one matt colour looks. Where it moves, its vertices alone are sent."""
+
+    color: tuple[int, ...]  # sRGB
+    side: str
+    flat_shading: bool
+
+    @staticmethod
+    def of(mesh: Mesh) -> _Simple | None:
+        """None of a mesh that needs more than that. Colours of other than 1 or 3 channels cannot be shown."""
+        material = mesh.material
+        if mesh.channels not in (None, 1, 3):
+            return _Simple(GREY, "double", False)
+        if (
+            mesh.alpha is not None
+            or mesh.has_textures
+            or not (mesh.colors is mesh.face_colors is mesh.corner_colors is None)
+        ):
+            return None
+        if material is None:
+            return _Simple(GREY, "double", False)
+        base, others = material.base_color, (material.metallic, material.roughness, material.emission)
+        if any(value is not None for value in others) or (isinstance(base, Tensor) and base.dim() == 2):
+            return None
+        color = GREY
+        if isinstance(base, Tensor):
+            color = tuple(as_bytes(displayed(base.detach().float().reshape(1, 1, -1)))[0, 0].tolist())
+        return _Simple(color, "double" if material.two_sided else "front", mesh.normals is None)
 
 
 def _alike(a: Mesh, b: Mesh) -> bool:
-    return a is b or all(
-        x == y and s.shape == t.shape and torch.equal(s, t)
-        for (x, s), (y, t) in zip(named_tensors(a), named_tensors(b), strict=False)
+    """Whether both look the same."""
+    if a is b:
+        return True
+    these, others = dict(named_tensors(a)), dict(named_tensors(b))
+    return (
+        _settings(a) == _settings(b)
+        and these.keys() == others.keys()
+        and all(torch.equal(tensor, others[name]) for name, tensor in these.items())
     )
+
+
+def _settings(mesh: Mesh) -> tuple[Any, ...]:
+    """What is no tensor."""
+    material = mesh.material
+    own = mesh.wraps, mesh.filter, mesh.alpha_cutoff
+    if material is None:
+        return own
+    textures = {name: (texture.wraps, texture.filter) for name, texture in material.textures.items()}
+    return *own, material.two_sided, material.alpha_mode, textures
 
 
 def _bounds(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
