@@ -8,7 +8,7 @@ import torch
 from test_fit import BACKGROUND, bracket, camera
 
 import edgegrad as eg
-from edgegrad.fit import Parameter, fit_scene, fit_shape, fit_texture, losses, regularizers
+from edgegrad.fit import Parameter, fit_scene, fit_shape, fit_texture, losses, regularizers, verdict
 from edgegrad.fit.frame import Adam
 from edgegrad.fit.smooth import Smooth
 from edgegrad.fit.verdict import explained, picture_noise
@@ -379,6 +379,19 @@ def test_explained_falls_with_misplacement(noise):
 
     shares = [share(pixels) for pixels in (0.0, 0.5, 2.0, 8.0)]
     assert shares[0] > 0.95 and shares == sorted(shares, reverse=True) and shares[1] > 0.6 and shares[2] < 0.5, shares
+
+
+def test_a_channel_of_which_the_picture_shows_little_counts_by_what_the_render_has():
+    """As where the one blue thing is covered: that edge is missing, and the others are not."""
+    render = torch.zeros(32, 32, 3)
+    render[8:24, 8:24, :2] = 1.0
+    render[12:14, 12:14, 2] = 1.0
+    picture = render.clone()
+    picture[10:16, 10:16] = torch.tensor([1.0, 1.0, 0.0])
+    picture[0, 0, 2] = 1e-3  # that nothing else of the channel is there does not make it larger
+    share = explained([(render, render, picture, None)])
+    edges = [float(verdict._gradient(render[..., k : k + 1]).norm(dim=0).sum()) for k in range(3)]
+    assert share == pytest.approx((edges[0] + edges[1]) / sum(edges), abs=1e-3) and share > 0.8
 
 
 # -- texture and shape ------------------------------------------------------------------------------------------------

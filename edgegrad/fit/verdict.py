@@ -45,7 +45,8 @@ def explained(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> floa
         picture = picture.to(render)
         mean = 0.5 * (render + again)
         samples = 0.5 * (render - again).square().mean((0, 1))
-        extent = (picture.amax((0, 1)) - picture.amin((0, 1))).clamp(min=1e-30)
+        both = torch.stack([picture, mean])  # what is covered may be all that a channel shows
+        extent = (both.amax((0, 1, 2)) - both.amin((0, 1, 2))).clamp(min=1e-30)
         least = DEVIATIONS * samples.sqrt() + DISPLAY * extent
         gradient = _gradient(mean)
         size = gradient.norm(dim=0)
