@@ -9,7 +9,8 @@ import torch
 from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, silhouette
 
 import edgegrad as eg
-from edgegrad.fit import fit_camera, fit_pose, fit_scene, fit_texture
+from edgegrad.fit import fit_camera, fit_pose, fit_scene, fit_texture, search
+from edgegrad.fit.result import pose_from_matrix
 from edgegrad.fit.robust import Comparison
 from edgegrad.fit.task import PARTS, Lens, Names, PoseTask, is_clutter
 from edgegrad.fit.views import before_black
@@ -35,6 +36,38 @@ def test_a_quarter_covered(how):
     degrees, percent = errors(fit)
     assert degrees < 1.0 and percent < 1.0, (degrees, percent)
     assert fit.converged and fit.explained > 0.5
+
+
+@pytest.mark.parametrize("looks", [True, False])
+def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
+    """Where noise does not explain the loss left, as with a board cut out of the mask, turned poses are looked at."""
+    view = camera(64)
+    image, free = covered(view, picture(view))
+    down, aside = search.Search._down, []
+
+    def ends_aside(self, pose, levels):
+        if aside:
+            return down(self, pose, levels)
+        aside.append(self.task.moved(pose_from_matrix("", torch.eye(4)), [0], torch.tensor([0.12]).double()))
+        return aside[0], True
+
+    monkeypatch.setattr(search.Search, "_down", ends_aside)
+    monkeypatch.setattr(search, "ENOUGH", 0.0)  # all ends are taken for right
+    if not looks:
+        monkeypatch.setattr(search, "FAR_ABOVE", math.inf)
+    fit = fit_pose(bracket(), image, view, silhouette(view) * free, START, progress=False)
+    assert (errors(fit)[0] < 1.0) == looks and fit.converged
+    assert torch.equal([step for step in fit.history if step.best][-1].pose.matrix, fit.matrix)
+
+
+def test_noise_explains_the_loss_of_a_pose_that_is_right():
+    """Of what is seen whole: no other poses are looked at."""
+    view = camera(64)
+    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, progress=False)
+    pose = pose_from_matrix("", fit.matrix)
+    assert fit.task is not None
+    _, _, noise = search.Search(fit.task, fit.task.pyramid(pose, 64, 16), pose, 40, 3e-4, 0)._judged(pose)
+    assert 0.0 < fit.loss < search.FAR_ABOVE * noise < 1e-2
 
 
 def test_a_border_of_many_colours_is_clutter():

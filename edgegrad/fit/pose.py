@@ -88,7 +88,8 @@ def fit_pose(
 
     About a quarter of the object may be covered. The fit is `converged` when its last step was short and the pictures show at
     least 60 % of the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few
-    times as long. KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set.
+    times as long; where they do, but noise does not explain the loss, as when something covers the object, nearby, in about the
+    same time again. KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set.
     Works in torch.no_grad() and torch.inference_mode() too. Raises TypeError or ValueError that names the argument, also when
     the object leaves no trace in the picture at the start.
     """

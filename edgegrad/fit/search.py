@@ -20,11 +20,12 @@ from .journal import Journal, Way
 from .result import Pose, Step
 from .robust import NARROWEST, NOISE, Comparison
 from .task import GROW, PARTS, SHIFT, TURN, Level, PoseTask
-from .verdict import ENOUGH, explained
+from .verdict import ENOUGH, explained, noise_of
 
 ASIDE, ASIDE_STEPS = 0.2, 20  # radians between the starts on the coarsest level, and steps from each
 FINAL_SPP = 64  # samples a pixel when ends are compared
 ROUNDS = 2  # of second opinions at most
+FAR_ABOVE = 4.0  # the noise: a loss that this does not explain, beside what is covered, may be that of a place nearby
 LOOKS, KEPT, FOLLOWED = (
     150,
     4,
@@ -39,6 +40,7 @@ class _End(NamedTuple):
 
     loss: float  # on the finest level, with many samples
     explained: float  # the share of the render's edges that the pictures show
+    noise: float  # the loss that the noise of pictures and samples explains
     pose: Pose
     short: bool  # the last step
 
@@ -67,10 +69,8 @@ class Search:
 
     def run(self) -> None:
         """Raises ValueError when nothing in the pictures depends on the pose."""
-        tilts = ASIDE * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=torch.float64)
-        starts = [self.start, *(self.task.moved(self.start, [TURN, TURN + 1], tilt) for tilt in tilts)]
         coarse, *finer = self.levels
-        ends = self._ranked(coarse, starts)
+        ends = self._ranked(coarse, self._tilted(self.start))
         if not self.history:
             raise ValueError(
                 f"{self.task.names.init}: expected a pose at which the picture changes when the object moves, got one at which "
@@ -86,18 +86,33 @@ class Search:
             ends = _distinct(self._ranked(coarse, [*self._others(best.pose), *ends[1:]]), FOLLOWED)
             ends = self._ranked(finer[0], ends)
             found = self._judge(*self._down(ends[0], finer))
-            # The way to the answer is what `best` marks in the history.
-            won = found.loss < best.loss
-            lost = slice(0, begins) if won else slice(begins, None)
-            self.history[lost] = [step._replace(best=False) for step in self.history[lost]]
-            if won:
-                best = found
-                self._take(best)
+            best = self._better(best, found, found.loss < best.loss, begins)
+        if self.steps > ASIDE_STEPS and best.explained >= ENOUGH and best.loss > FAR_ABOVE * best.noise:
+            # Something covers the object, or a place nearby looks alike. Where much is covered, a wrong place may have a lower
+            # loss: a better one has more of its edges in the pictures as well.
+            begins = len(self.history)
+            near = self._ranked(finer[0], self._tilted(best.pose))
+            found = self._judge(*self._down(near[0], finer[1:]))
+            won = found.loss < best.loss and found.explained > best.explained
+            best = self._better(best, found, won, begins)
         self.history.append(Step(self.levels[-1].size, self.loss, self.best, True))
 
     def first_end(self) -> float:
         """The share of the render's edges that the pictures show where the way down from the start alone ends."""
         return self._judge(*self._down(self.start, self.levels)).explained
+
+    def _tilted(self, pose: Pose) -> list[Pose]:
+        """The pose, and others turned aside from it."""
+        tilts = ASIDE * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=torch.float64)
+        return [pose, *(self.task.moved(pose, [TURN, TURN + 1], tilt) for tilt in tilts)]
+
+    def _better(self, best: _End, found: _End, won: bool, begins: int) -> _End:
+        """Which of both is the answer. `best` marks the way to it in the history, where that to `found` begins at `begins`."""
+        lost = slice(0, begins) if won else slice(begins, None)
+        self.history[lost] = [step._replace(best=False) for step in self.history[lost]]
+        if won:
+            self._take(found)
+        return found if won else best
 
     def _take(self, end: _End) -> None:
         self.loss, self.explained, self.best, self._answered = end.loss, end.explained, end.pose, True
@@ -171,11 +186,11 @@ class Search:
 
     def _judge(self, pose: Pose, short: bool) -> _End:
         """With many samples on the finest level."""
-        loss, share = self.journal.numbers(lambda: self._judged(pose))
-        return _End(loss, share, pose, short)
+        loss, share, noise = self.journal.numbers(lambda: self._judged(pose))
+        return _End(loss, share, noise, pose, short)
 
     def _judged(self, pose: Pose) -> list[float]:
-        """The loss, and the share of the render's edges."""
+        """The loss, the share of the render's edges, and the loss that noise explains."""
         final = self.levels[-1]
         first, second = (self._compare(final, pose, FINAL_SPP, (self.seed + k) % 2**32) for k in (0, 1))
         pairs = []
@@ -187,7 +202,7 @@ class Search:
                 weight = inside if weight is None else weight * inside
                 a, b = a[..., :-1], b[..., :-1]
             pairs.append((a, b, shot.target, weight))
-        return [first.loss(NARROWEST * self.task.extent)[0], explained(pairs)]
+        return [first.loss(NARROWEST * self.task.extent)[0], explained(pairs), noise_of(pairs)]
 
     def _others(self, best: Pose) -> list[Pose]:
         """The few best of many poses around the start and the best one, by their loss on the coarsest level."""

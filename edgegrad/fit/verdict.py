@@ -60,6 +60,20 @@ def explained(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> floa
     return max(0.0, min(1.0, alike / edges)) if edges > 1e-4 * pixels else same / max(pixels, 1e-30)
 
 
+def noise_of(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> float:
+    """The mean squared difference of renders to pictures, as explained() takes them, that noise explains: that of the renders'
+    samples, that of the pictures, and what eight bits leave."""
+    total = count = 0.0
+    for render, again, picture, weight in pairs:
+        picture = picture.to(render)
+        w = torch.ones_like(render[..., :1]) if weight is None else weight
+        rounding = DISPLAY / DEVIATIONS * (picture.amax((0, 1)) - picture.amin((0, 1)))
+        even = picture_noise(picture).square() + rounding.square()
+        total += float((w * (0.5 * (render - again).square() + even)).sum())
+        count += float(w.sum()) * render.shape[-1]
+    return total / max(count, 1e-30)
+
+
 def _gradient(image: Tensor) -> Tensor:
     """(2, H, W, C), central differences."""
     padded = F.pad(image.movedim(-1, 0)[None], (1, 1, 1, 1), mode="replicate")[0].movedim(0, -1)
