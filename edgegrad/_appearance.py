@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ._rows import scaled
+from ._rows import columns, rows_of, scaled
 from ._textures import look_up
 from .material import Parameter, Texture
 from .mesh import PLAIN, Mesh
@@ -132,13 +132,11 @@ def jumps(mesh: Mesh) -> Tensor:
     textures = [] if mesh.material is None else list(mesh.material.textures.values())
     for texture in [*([None] if mesh.texture is not None else []), *textures]:
         uvs, uv_faces = coordinates(mesh, texture)
-        found.append(uvs[uv_faces.long()])
+        found.append(rows_of(uvs, uv_faces.long()))
     material = mesh.material
     if material is not None and material.normal_map is not None:
         # Frames of tangents are of each face: on curved meshes they jump at every edge.
         uvs, uv_faces = coordinates(mesh, material.normal_map)
         tangent, hand = tangents(mesh.verts[mesh.faces.long()], uvs.to(mesh.verts)[uv_faces.long()])
         found.append((hand * normalize(tangent, dim=-1))[:, None].expand(-1, 3, -1))
-    parts = [part.detach().to(mesh.verts) for part in found]
-    parts = [scaled(part) for part in parts]
-    return torch.cat([mesh.verts.detach().new_zeros((len(mesh.faces), 3, 0)), *parts], -1)
+    return columns([scaled(part.detach().to(mesh.verts)) for part in found], len(mesh.faces), mesh.verts)

@@ -150,6 +150,10 @@ def all_below(index: Tensor, count: int) -> bool:
     return low >= 0 and high < count
 
 
+def all_finite(tensor: Tensor) -> bool:
+    return _ask_kernel(core.all_finite, tensor) or bool(torch.isfinite(tensor).all())
+
+
 def check_storage(name: str, tensor: Tensor) -> None:
     """Torch would read the numbers of a tensor whose memory was given back, and end the process. Raises ValueError."""
     try:

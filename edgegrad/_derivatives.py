@@ -1,4 +1,4 @@
-"""Whether derivatives may be asked for, in any of torch's ways, and values of which only first ones can be taken."""
+"""Whether derivatives may be asked for, in any of torch's ways."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-
-from ._autograd import FIRST_ORDER
 
 
 def transformed() -> bool:
@@ -33,57 +31,3 @@ def moves(*tensors: Tensor) -> bool:
         return True
     dual = torch.autograd.forward_ad
     return dual._current_level >= 0 and any(dual.unpack_dual(t).tangent is not None for t in tensors)
-
-
-def once(value: Tensor) -> Tensor:
-    """The same, of which only first derivatives can be taken."""
-    return _FirstOrder.apply(value)
-
-
-class _FirstOrder(torch.autograd.Function):
-    """The identity, whose derivative has none: that of the samples' places and of their visibility is not known."""
-
-    @staticmethod
-    def forward(value: Tensor) -> Tensor:
-        return value.clone()
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        # With the value, so that a derivative of the gradient by what the image depends on comes by here.
-        return _Last.apply(*grad_outputs, *ctx.saved_tensors)
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, Any]:
-        return _FirstOrder.apply(*args), in_dims[0]
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        return tangents[0].clone()
-
-
-class _Last(torch.autograd.Function):
-    """The first of its arguments, which has no derivative."""
-
-    @staticmethod
-    def forward(grad: Tensor, value: Tensor) -> Tensor:
-        return grad.clone()
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, Any]:
-        return _Last.apply(*args), in_dims[0]
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *grad_outputs: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)
-
-    @staticmethod
-    def jvp(ctx: Any, *tangents: Any) -> Any:
-        raise RuntimeError(FIRST_ORDER)

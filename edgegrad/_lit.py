@@ -18,8 +18,9 @@ from torch.nn.functional import normalize
 from . import _lit_kernel
 from ._appearance import OnMesh, jumps
 from ._bsdf import Scattering, dot, terminator
-from ._check import check_positive_int, values_visible
+from ._check import all_finite, check_positive_int, values_visible
 from ._lit_kernel import is_fused
+from ._operator import unreached
 from ._request import Request
 from ._surfaces import Rays, Surfaces, View
 from ._tree import tensors_in
@@ -27,7 +28,7 @@ from ._warnings import warn
 from .camera import Camera
 from .environment import Environment
 from .hits import Hits
-from .lights import Light, LightPoints, PointLight, SphericalHarmonics, SpotLight
+from .lights import Light, LightPoints, SphericalHarmonics
 from .samples import Frame
 from .scene import Scene, image_dtype
 from .shader import Effort, render_shaded
@@ -72,9 +73,9 @@ class Lighting(NamedTuple):
         if not scene.is_lit:  # as the kernel has it where there are no mipmaps
             image = image.to(image_dtype(scene))
         # A graph from all tensors, whatever is in view and whatever is lit.
-        return image + sum(
-            tensor.reshape(-1)[:0].sum().to(image) for tensor in tensors_in((scene, camera)) if tensor.requires_grad
-        )
+        for tensor in unreached(image, tensors_in((scene, camera))):
+            image = image + tensor.reshape(-1)[:0].sum().to(image)
+        return image
 
     def __call__(self, hits: Hits) -> Tensor:
         return radiance(hits, *self)
@@ -85,7 +86,7 @@ def _whole(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:
     points one by one says which."""
     _note_jumps(frame.no_hits)
     found = _lit_kernel.image(frame, lighting.shadows, lighting.samples, points)
-    return found if bool(torch.isfinite(found).all()) else None
+    return found if all_finite(found) else None
 
 
 class _Surface(NamedTuple):
@@ -249,15 +250,10 @@ def _of_flat(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
     if not points_alone or material.normal_map is not None or not isinstance(view, View):
         return _face_normals(surfaces, index)
     verts = mesh.verts.detach().double()
-    places, arriving = [], []
-    for light in scene.casting:
-        everywhere, points = light, light.draw(verts)
-        if isinstance(light, SpotLight):
-            everywhere = PointLight(light.position, light.intensity, light.color)
-        places.append(light.place(points)[:1].detach().to(verts))
-        arriving.append(everywhere.arriving(points, verts).detach().abs().mean(1))
+    places = [light.place(light.draw(verts[:1])).detach().to(verts) for light in scene.casting]
+    power = [light._power(verts).detach().abs().mean() for light in scene.casting]
     infinite = [light.infinite for light in scene.casting]
-    found = _lit_kernel.light_on_faces(verts, mesh.faces, view, infinite, torch.cat(places), torch.stack(arriving))
+    found = _lit_kernel.light_on_faces(verts, mesh.faces, view, infinite, torch.cat(places), torch.stack(power))
     if material.metallic is None and material.roughness is None:
         return found
     g = _face_normals(surfaces, index)

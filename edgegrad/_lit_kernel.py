@@ -56,7 +56,18 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
     # Of the derivatives alone nothing is computed ahead of them, once it is known of which lights shadows are asked.
     known = not shadows or len(surfaces.shadowing) == len(surfaces.scene.casting)
     values = hits.values or not known
-    shading = _Shading(layout, len(tables), number, shadows, samples, only, values, casters.cutoffs, casters.spacing)
+    shading = _Shading(
+        layout,
+        len(tables),
+        number,
+        shadows,
+        samples,
+        only,
+        values,
+        surfaces.verts.dtype,
+        casters.cutoffs,
+        casters.spacing,
+    )
     arrays = (part for part in casters if isinstance(part, Tensor))
     found, *kept = apply(shading, [hits._exact.cpu(), *points, *tables, *arrays])
     if not values:
@@ -99,18 +110,18 @@ def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
 
 
 def light_on_faces(
-    verts: Tensor, faces: Tensor, view: View, infinite: list[bool], place: Tensor, arriving: Tensor
+    verts: Tensor, faces: Tensor, view: View, infinite: list[bool], place: Tensor, power: Tensor
 ) -> Tensor:
     """(F, 3, L) float64 by csrc/shading/lit/flat_light.h: E max(0, n·l) at the corners of flat faces, over the greatest of them,
-    of points of light at places (L, 3) from which E, `arriving` (L, V), comes to the vertices."""
+    of points of light at places (L, 3), with power (L,) in W/sr, or W/m² of what is infinitely far away."""
 
     def compute(*tensors: Tensor) -> Sequence[Tensor]:
-        verts, faces, eye, place, arriving = map(array, tensors)
+        verts, faces, eye, place, power = map(array, tensors)
         threads = torch.get_num_threads()
-        found = core.light_on_faces(verts, faces, eye, view.perspective, place, infinite, arriving, threads)
+        found = core.light_on_faces(verts, faces, eye, view.perspective, place, infinite, power.tolist(), threads)
         return (torch.from_numpy(found),)
 
-    tensors = (verts.double(), faces.int(), view.eye.double(), place.double(), arriving.double())
+    tensors = (verts.double(), faces.int(), view.eye.double(), place.double(), power.double())
     return without_derivatives(compute, *tensors)[0].to(verts.device)
 
 
@@ -314,6 +325,7 @@ class _Shading(NamedTuple):
     samples: int
     only: int  # the light of which alone radiance is wanted, −1: of all
     values: bool
+    dtype: torch.dtype  # of the zeros
     cutoffs: list[float]  # of the flat scene, whose other fields are tensors
     spacing: list[float]
 
@@ -354,7 +366,7 @@ class _Shading(NamedTuple):
             return self._shade(tensors)
         b = tensors[0]
         assert b is not None
-        return (torch.zeros((len(b), self.layout.channels), dtype=torch.float64),)
+        return (torch.zeros((len(b), self.layout.channels), dtype=self.dtype),)
 
     def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
         arguments = {"bar": doubles(bar), "wanted": list(wanted[1:]), **self._arguments(tensors)}
@@ -365,8 +377,7 @@ class _Shading(NamedTuple):
         else:
             found, b_bar = kernel_scene(self._flat(tensors)).look_and_shade_vjp(**arguments)
         none = bar.new_zeros(0)
-        tables = zip(found, self._tables(tensors), strict=True)
-        return [torch.from_numpy(b_bar), *(none if g is None else torch.from_numpy(g).to(t.dtype) for g, t in tables)]
+        return [torch.from_numpy(b_bar), *(none if g is None else torch.from_numpy(g) for g in found)]
 
     def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
         seen = kept[0] if kept else self._shade(tensors)[1]

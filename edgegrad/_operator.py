@@ -3,14 +3,15 @@ transforms of torch.func."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
+from torch.autograd.graph import get_gradient_edge
 
 from ._autograd import FIRST_ORDER, _one_by_one
-from ._derivatives import plain
+from ._derivatives import plain, transformed
 
 Tensors = Sequence[Tensor | None]
 
@@ -47,6 +48,23 @@ def without_derivatives(compute: Callable[..., Sequence[Tensor]], *tensors: Tens
         with torch.no_grad():
             return tuple(compute(*(tensor.detach() for tensor in tensors)))
     return _Values.apply(compute, *tensors)  # pyright: ignore[reportReturnType]
+
+
+def unreached(result: Tensor, tensors: Iterable[Tensor]) -> list[Tensor]:
+    """Those that require a gradient and get none from the result, not even of zeros."""
+    wanting = [tensor for tensor in tensors if tensor.requires_grad]
+    if transformed() or not result.requires_grad:
+        return wanting
+    edges: set[Any] = set()
+    waiting: list[Any] = [get_gradient_edge(result)[:2]]
+    while waiting:
+        edge = node, _ = waiting.pop()
+        if node is None or edge in edges:
+            continue
+        edges.add(edge)
+        inputs = node.next_functions
+        waiting += inputs if not hasattr(node, "of_moving") else [inputs[k] for k in node.of_moving]
+    return [tensor for tensor in wanting if get_gradient_edge(tensor)[:2] not in edges]
 
 
 class _Values(torch.autograd.Function):
@@ -93,6 +111,9 @@ class _Value(torch.autograd.Function):
         ctx.save_for_backward(*kept, *tensors)
         ctx.save_for_forward(*kept, *tensors)
         ctx.operation, ctx.count, ctx.outputs = operation, len(kept), len(output)
+        # Which of the node's edges to inputs are those of moving tensors; what is no tensor has none.
+        there = [i for i, tensor in enumerate(tensors) if tensor is not None]
+        ctx.of_moving = [k for k, i in enumerate(there) if i in operation.moving]
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -19,6 +21,13 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 def interpolated(b: Tensor, corners: Tensor) -> Tensor:
     """(N, K) from barycentrics (N, 3) and values at corners (N, 3, K). A matrix product would lose digits under autocast."""
     return b[:, :1] * corners[:, 0] + b[:, 1:2] * corners[:, 1] + b[:, 2:] * corners[:, 2]
+
+
+def columns(parts: Sequence[Tensor], count: int, like: Tensor) -> Tensor:
+    """(count, 3, K) side by side, of the dtype of `like`: what is at the corners of faces."""
+    if len(parts) == 1:
+        return parts[0]
+    return torch.cat([like.detach().new_zeros((count, 3, 0)), *parts], -1)
 
 
 def scaled(values: Tensor) -> Tensor:

@@ -13,18 +13,47 @@ from ._operator import Tensors, apply, array, doubles
 from ._request import Request
 
 
-def splat(x: Tensor, values: Tensor, request: Request, zero: bool) -> Tensor:
-    """(H · W, C): Σ k(x − c) · value over points x (S, 2) with values (S, C), for pixels with centres c; `zero`: zeros with the
-    same derivatives by the values."""
-    camera = request.camera
-    return apply(_Splat(request.image.filter, camera.width, camera.height, zero), [values, x])[0]
+class Term(NamedTuple):
+    """Σ k(x − c) · value over points of an image, or that times what is behind; its derivatives alone."""
+
+    x: Tensor  # (S, 2)
+    values: Tensor  # (S, C), or (S, 1) if anything is behind
+    behind: Tensor | None = None  # (H · W, C) or (1, C)
 
 
-class _Splat(NamedTuple):
+def splat(x: Tensor, values: Tensor, request: Request) -> Tensor:
+    """(H · W, C): Σ k(x − c) · value over points x (S, 2) with values (S, C), for pixels with centres c."""
+    return apply(_Splat(Film.of(request)), [values, x])[0]
+
+
+def attached(image: Tensor, terms: Sequence[Term], request: Request) -> Tensor:
+    """The image (H · W, C), with the derivatives of terms by their values; these have none of their own, for how samples'
+    places and their visibility change is not known."""
+    columns = zip(*terms, strict=True) if terms else ((), (), ())
+    x, values, behind = map(list, columns)
+    return apply(_Attached(Film.of(request), len(terms)), [image, *values, *x, *behind])[0]
+
+
+class Film(NamedTuple):
     filter: str
     width: int
     height: int
-    zero: bool
+
+    @classmethod
+    def of(cls, request: Request) -> Film:
+        return cls(request.image.filter, request.camera.width, request.camera.height)
+
+    def sum(self, x: Tensor | None, values: Tensor) -> Tensor:
+        """(H · W, C)"""
+        return torch.from_numpy(core.splat(doubles(x), doubles(values), *self)).to(values)
+
+    def adjoint(self, x: Tensor | None, bar: Tensor) -> Tensor:
+        """(S, C)"""
+        return torch.from_numpy(core.splat_vjp(doubles(x), array(bar), *self, torch.get_num_threads())).to(bar)
+
+
+class _Splat(NamedTuple):
+    film: Film
 
     @property
     def moving(self) -> Sequence[int]:
@@ -33,21 +62,51 @@ class _Splat(NamedTuple):
     def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
         values, x = tensors
         assert values is not None
-        if self.zero:
-            return (values.new_zeros((self.height * self.width, values.shape[1])),)
-        return (self._sum(values, x),)
-
-    def _sum(self, values: Tensor, x: Tensor | None) -> Tensor:
-        found = core.splat(doubles(x), doubles(values), self.filter, self.width, self.height)
-        return torch.from_numpy(found).to(values)
+        return (self.film.sum(x, values),)
 
     def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
-        found = core.splat_vjp(
-            doubles(tensors[1]), array(bar), self.filter, self.width, self.height, torch.get_num_threads()
-        )
-        return [torch.from_numpy(found).to(bar)]
+        return [self.film.adjoint(tensors[1], bar)]
 
     def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
         (tangent,) = tangents
         assert tangent is not None
-        return self._sum(tangent, tensors[1])
+        return self.film.sum(tensors[1], tangent)
+
+
+class _Attached(NamedTuple):
+    """Of the tensors (image, *values, *x, *behind) of so many terms."""
+
+    film: Film
+    terms: int
+
+    @property
+    def moving(self) -> Sequence[int]:
+        return range(1 + self.terms)
+
+    def _places(self, tensors: Tensors) -> list[tuple[Tensor | None, Tensor | None]]:
+        """x and what is behind."""
+        x, behind = tensors[1 + self.terms : 1 + 2 * self.terms], tensors[1 + 2 * self.terms :]
+        return list(zip(x, behind, strict=True))
+
+    def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
+        image = tensors[0]
+        assert image is not None
+        return (image.clone(),)
+
+    def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
+        none = bar.new_zeros(0)
+        found = [bar.clone() if wanted[0] else none]
+        for want, (x, behind) in zip(wanted[1:], self._places(tensors), strict=True):
+            seen = bar if behind is None or not want else (bar * behind).sum(1, keepdim=True)
+            found.append(self.film.adjoint(x, seen) if want else none)
+        return found
+
+    def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
+        image = tensors[0]
+        assert image is not None
+        total = torch.zeros_like(image) if tangents[0] is None else tangents[0].clone()
+        for tangent, (x, behind) in zip(tangents[1:], self._places(tensors), strict=True):
+            if tangent is not None:
+                moved = self.film.sum(x, tangent)
+                total = total + (moved if behind is None else moved * behind)
+        return total

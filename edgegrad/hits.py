@@ -31,7 +31,7 @@ class Forced(NamedTuple):
     some: Tensor  # (N,) bool: at which points; elsewhere light points are drawn, and shadow rays cast
     only: bool = False  # whether nothing is wanted but what this light adds
 
-    def select(self, index: Tensor) -> Forced:
+    def select(self, index: Tensor | slice) -> Forced:
         return Forced(self.light, self.points.select(index), self.lit[index], self.some[index], self.only)
 
 
@@ -91,7 +91,7 @@ class Hits:
             raise ValueError(f"index: expected numbers from {-count} to {count - 1}, got {int(index[wrong][0])}")
         return self.apart(index, StepsOfSome(self._steps, index % max(count, 1), count))
 
-    def apart(self, index: Tensor, steps: Steps | None = None) -> Hits:
+    def apart(self, index: Tensor | slice, steps: Steps | None = None) -> Hits:
         """Some of the points, as hits that know nothing of the whole."""
         view = self._view.select(index) if isinstance(self._view, Rays) else self._view
         pixel = None if self._pixel is None else self._pixel[index]
@@ -99,7 +99,8 @@ class Hits:
         place = self._face[index], self._exact[index], pixel
         some = Hits(self._surfaces, view, *place, self._rays_at, steps, self._seed[index], forced)
         if self._whole is None:
-            some._whole = self, index
+            rows = torch.arange(len(self), device=self._face.device)[index] if isinstance(index, slice) else index
+            some._whole = self, rows
         else:
             some._whole = self._whole[0], self._whole[1][index]
         return some

@@ -29,7 +29,7 @@ class LightPoints(NamedTuple):
     uv: Tensor
     density: Tensor
 
-    def select(self, rows: Tensor) -> LightPoints:
+    def select(self, rows: Tensor | slice) -> LightPoints:
         """Some of them."""
         return LightPoints(self.index[rows], self.uv[rows], self.density[rows])
 

@@ -17,11 +17,13 @@ Or with less: the image of primary_hits with a graph has the gradient inside fac
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
-from ._derivatives import moves, once
+from ._derivatives import moves
 from ._moving import Form, velocity
 from ._ops import camera_seed
 from ._request import Request, as_scene, make_request
@@ -37,7 +39,7 @@ from ._samples import (
 from ._samples import trace as trace_records
 from ._seeds import sample_seeds
 from ._shadows import ShadowLight
-from ._splat import splat
+from ._splat import Term, attached, splat
 from ._steps import Steps
 from ._surfaces import Rays, Surfaces, View, every_face
 from .camera import Camera
@@ -122,6 +124,10 @@ class Frame:
         pixels = pixels or range(self.pixels)
         return values.new_zeros((len(pixels), values.shape[1])).index_add(0, self.here(pixel) - pixels.start, values)
 
+    def attached(self, image: Tensor, terms: Sequence[Term]) -> Tensor:
+        """The image, and of terms (H · W, C) their derivatives."""
+        return attached(image.reshape(self.pixels, -1), terms, self.request).reshape(image.shape)
+
     def composed(self, image: Tensor, background: Tensor | None) -> Tensor:
         """(H, W, C), before a background (C,) or (H, W, C)."""
         image = image.reshape(self.height, self.width, -1)
@@ -197,15 +203,12 @@ class SurfaceSamples:
         faces, for its weights stand for areas of the image and not for shares of a pixel's samples. Raises TypeError or
         ValueError that names the argument."""
         radiance = _rows("radiance", radiance, len(self))
-        return self.frame.composed(self._sums(radiance, zero=False), None)
+        term = self.term(radiance)
+        return self.frame.composed(splat(term.x, term.values, self.frame.request), None)
 
-    def zero(self, radiance: Tensor) -> Tensor:
-        """(H · W, C): the same less its value."""
-        return self._sums(radiance, zero=True)
-
-    def _sums(self, radiance: Tensor, zero: bool) -> Tensor:
-        values = self.weight.to(radiance.dtype)[:, None] * radiance
-        return splat(self._records.x, values, self.frame.request, zero)
+    def term(self, radiance: Tensor) -> Term:
+        """The same, for attached()."""
+        return Term(self._records.x, self.weight.to(radiance.dtype)[:, None] * radiance)
 
 
 class EdgeSamples:
@@ -227,18 +230,19 @@ class EdgeSamples:
         self.x = frame.here(records.x)
         self._in_order = only and len(records.hit_sample) == len(records.x)  # whether the i-th hit is the i-th sample's
         self.sample, self._factor = frame.here(records.hit_sample), frame.here(records.hit_factor)
+        of_hits = slice(None) if self._in_order else self.sample
         self.to_background = frame.here(records.to_background)
         points = None
         if light is not None:
             points, share = light.points(frame.here(records.light), frame.here(records.light_uv))
-            self._factor, self.to_background = self._factor * share[self.sample], self.to_background * share
+            self._factor, self.to_background = self._factor * share[of_hits], self.to_background * share
         # All sides of a sample see the same points of lights.
-        seed = frame.seeds("edges" if light is None else "shadows", len(self))[self.sample]
+        seed = frame.seeds("edges" if light is None else "shadows", len(self))[of_hits]
         forced = None
         if light is not None and points is not None:
             lit = frame.here(records.hit_side == 0).to(frame.dtype)
             some = torch.ones_like(lit, dtype=torch.bool)
-            forced = Forced(light.number, points.select(self.sample), lit, some, only)
+            forced = Forced(light.number, points.select(of_hits), lit, some, only)
         self.hits = frame.fixed_hits(records.hit_face, records.hit_b, records.hit_x, seed, forced=forced)
         flat = frame.request.scene
         forms = [
@@ -397,22 +401,23 @@ def attach_boundary(image: Tensor, samples: EdgeSamples, jump: Tensor, backgroun
     check_float("image", image)
     check_shape("image", image, (frame.height, frame.width, jump.shape[1]))
     background = _background(background, jump, frame)
-    zero = boundary(frame, samples.x, samples.velocity, jump, samples.to_background, background)
-    return image + once(zero.reshape(image.shape).to(image))
+    terms = boundary(samples.x, samples.velocity, jump, samples.to_background, background)
+    return image + frame.attached(torch.zeros_like(image, requires_grad=False), terms)
 
 
 # -- shared with shader.py ------------------------------------------------------------------------------------------------
 
 
 def boundary(
-    frame: Frame, x: Tensor, velocity: Tensor, jump: Tensor, to_background: Tensor | None, background: Tensor | None
-) -> Tensor:
-    """(H · W, C): Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
-    zero = splat(x.detach(), velocity.to(jump.dtype)[:, None] * jump, frame.request, True)
-    if background is None or to_background is None:
-        return zero
-    share = splat(x.detach(), (velocity * to_background).to(jump.dtype)[:, None], frame.request, True)
-    return zero + share * background.detach().reshape(-1, jump.shape[1]).to(jump)
+    x: Tensor, velocity: Tensor, jump: Tensor, to_background: Tensor | None, background: Tensor | None
+) -> list[Term]:
+    """Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
+    x, velocity = x.detach(), velocity.to(jump.dtype)[:, None]
+    terms = [Term(x, velocity * jump)]
+    if background is not None and to_background is not None:
+        behind = background.detach().reshape(-1, jump.shape[1]).to(jump)
+        terms.append(Term(x, velocity * to_background.to(jump.dtype)[:, None], behind))
+    return terms
 
 
 def _request_of(primary: PrimaryHits, name: str, count: int | None) -> Request:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,11 +20,12 @@ from torch.utils.checkpoint import checkpoint
 from ._background import environments
 from ._blend import Blended
 from ._borders import Borders
-from ._check import values_visible
-from ._derivatives import differentiates, moves, once, transformed
+from ._check import all_finite, values_visible
+from ._derivatives import differentiates, moves, transformed
 from ._request import Request, derived_seed
 from ._samples import PixelRecords, RayRecords, shaded_room, without_colors
 from ._shadows import ShadowLight
+from ._splat import Term
 from ._steps import UNEQUAL, Crossings, Points, Steps, find_crossings
 from ._surfaces import every_face
 from ._warnings import warn
@@ -108,14 +109,14 @@ class _Image:
             steps=cut,
             lit=frame.surfaces.scene if self._effort.lit else None,
         )
-        zero = self._interior(SurfaceSamples(frame, surface))
+        terms = self._interior(SurfaceSamples(frame, surface))
         if moving or cut:
-            zero = zero + self._boundary(EdgeSamples(frame, curves))
+            terms += self._boundary(EdgeSamples(frame, curves))
         if visibility and self._kinds:
-            zero = zero + self._steps()
+            terms += self._steps()
         if visibility:
-            zero = zero + self._shadows()
-        return once(image + zero.reshape(image.shape))  # also of the background's part: how coverage moves is not in it
+            terms += self._shadows()
+        return frame.attached(image, terms)
 
     # -- the image -----------------------------------------------------------------------------------------------------
 
@@ -174,11 +175,11 @@ class _Image:
             )
         return None if background is None else background.to(self._frame.dtype)
 
-    # -- what is added to it, of the value zero -----------------------------------------------------------------------
+    # -- what its derivatives are those of ----------------------------------------------------------------------------
 
-    def _interior(self, samples: SurfaceSamples) -> Tensor:
-        """(H · W, C): Σ k(x − c) L px² over samples inside faces, less its own value."""
-        total: Any = 0
+    def _interior(self, samples: SurfaceSamples) -> list[Term]:
+        """Σ k(x − c) L px² over samples inside faces."""
+        terms: list[Term] = []
         at_once = self._effort.at_once
         # Once at least, so that an image with nothing in view has a graph too, of zeros.
         for first in range(0, max(len(samples), 1), at_once):
@@ -194,13 +195,13 @@ class _Image:
             many = len(samples) > at_once and not transformed() and not self._effort.keeps_little
             L = checkpoint(radiance, use_reentrant=False) if many else radiance()
             assert isinstance(L, Tensor)
-            total = total + some.zero(L)
-        return total
+            terms.append(some.term(L))
+        return terms
 
-    def _shadows(self) -> Any:
-        """(H · W, C), or 0: the same over samples on the borders of the shadows that the shader asked for."""
+    def _shadows(self) -> list[Term]:
+        """The same over samples on the borders of the shadows that the shader asked for."""
         frame = self._frame
-        found: Any = 0
+        terms: list[Term] = []
         count, flat = frame.request.gradient.edge_samples, frame.surfaces.casters
         if frame.surfaces.shadowing and _has_rims(flat) and moves(frame.surfaces.verts, flat.alphas, flat.uvs):
             warn(
@@ -217,25 +218,24 @@ class _Image:
                 casters = frame.fixed.casters if frame.surfaces.scene.blends else None
                 records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics), one, casters)
                 if len(records.x):
-                    found = found + self._boundary(EdgeSamples(frame, records, light, one))
-        return found
+                    terms += self._boundary(EdgeSamples(frame, records, light, one))
+        return terms
 
-    def _boundary(self, samples: EdgeSamples) -> Tensor:
-        """(H · W, C): Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
+    def _boundary(self, samples: EdgeSamples) -> list[Term]:
+        """Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
         at_once = self._effort.at_once
         parts = [self._frame.fixed.verts.new_zeros((0, self._channels or 1))]
         with torch.no_grad():
             for first in range(0, len(samples.hits), at_once):
                 points = samples.hits
                 if len(points) > at_once:
-                    end = min(first + at_once, len(points))
-                    points = points.apart(torch.arange(first, end, device=self._frame.device))
+                    points = points.apart(slice(first, first + at_once))
                 parts.append(self._shade(points).detach())
             jump = samples.sum(torch.cat(parts[1:] or parts))
-        return boundary(self._frame, samples.x, samples.velocity, jump, samples.to_background, self._background)
+        return boundary(samples.x, samples.velocity, jump, samples.to_background, self._background)
 
-    def _steps(self) -> Tensor:
-        """(H · W, C): Σ k(x − c) [L₊ − L₋] δs / |∇ₓs| · weight over where lines cross steps s = 0 of the shader."""
+    def _steps(self) -> list[Term]:
+        """Σ k(x − c) [L₊ − L₋] δs / |∇ₓs| · weight over where lines cross steps s = 0 of the shader."""
         frame = self._frame
         found = self._crossings()
         rays = frame.sampler.rays_at(found.x)
@@ -273,7 +273,7 @@ class _Image:
             assert isinstance(s, Tensor)
             values.append(s)
         s = torch.cat(values)
-        return boundary(frame, found.x, weight * (s - s.detach()), jump, None, None)
+        return boundary(found.x, weight * (s - s.detach()), jump, None, None)
 
     def _crossings(self) -> Crossings:
         frame, options = self._frame, self._frame.request.gradient
@@ -372,7 +372,7 @@ class _Image:
         if self._channels not in (None, radiance.shape[1]):
             raise ValueError(f"shader: expected {self._channels} channels as before, got {radiance.shape[1]}")
         self._channels = radiance.shape[1]
-        if hits.values and values_visible(radiance) and not bool(torch.isfinite(radiance.detach()).all()):
+        if hits.values and values_visible(radiance) and not all_finite(radiance.detach()):
             row = int((~torch.isfinite(radiance.detach())).any(1).nonzero()[0])
             name, hint = "shader", "divisions by zero and powers of negative numbers"
             if self._effort.lit:

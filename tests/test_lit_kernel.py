@@ -13,6 +13,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad import _borders, _lit, _lit_kernel
 from edgegrad._derivatives import transformed
+from edgegrad._operator import unreached
 from edgegrad._request import make_request
 from edgegrad.hits import Forced, Hits
 from edgegrad.lights import LightPoints
@@ -303,6 +304,33 @@ def test_radiance_that_is_not_finite_is_named() -> None:
     scene = eg.Scene([eg.Mesh(ball.verts.float(), ball.faces, material=eg.Material())], lights=[light])
     with pytest.raises(ValueError, match=r"expected finite numbers, got .*inf"):
         eg.render(scene, CAMERAS["perspective"])
+
+
+def test_tensors_from_which_no_graph_leads_to_a_result() -> None:
+    """Of two outputs of one operation it may be the other that does."""
+    leaf, other = (torch.ones(4, 2, requires_grad=True) for _ in range(2))
+    used, unused = (2 * leaf).unbind(1)
+    left = unreached(3 * used, [used, unused, leaf, other, torch.ones(2)])
+    assert [id(tensor) for tensor in left] == [id(unused), id(other)]
+
+
+def test_all_tensors_get_gradients_though_the_image_depends_on_few() -> None:
+    """Zeros of those that it does not depend on: alpha that cuts nothing out, a light that is behind, the lens."""
+    ball = icosphere(1)
+    alpha = torch.ones(2, 2, requires_grad=True)
+    lamp = eg.SpotLight(*(torch.tensor(v, requires_grad=True) for v in ([0.0, 0.0, 9.0], [0.0, 0.0, 1.0])), 3.0)
+    distortion = torch.zeros(8, requires_grad=True)
+    mesh = eg.Mesh(
+        ball.verts.float().requires_grad_(), ball.faces, uvs=torch.rand(len(ball.verts), 2), uv_faces=ball.faces,
+        material=eg.Material(), alpha=alpha,
+    )  # fmt: skip
+    camera = CAMERAS["perspective"].replace(distortion=distortion)
+    sun = eg.DirectionalLight(torch.tensor([-0.2, -0.5, -1.0]), 2.0)
+    image = eg.render(eg.Scene([mesh], lights=[sun, lamp]), camera, 4)
+    leaves = [mesh.verts, alpha, lamp.position, lamp.direction, distortion]
+    found = torch.autograd.grad(image.sum(), leaves)
+    assert all(bool(torch.isfinite(g).all()) for g in found)
+    assert [bool((g != 0).any()) for g in found] == [True, False, False, False, True]
 
 
 @pytest.mark.parametrize("view", CAMERAS)

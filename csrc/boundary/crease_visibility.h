@@ -57,6 +57,8 @@ class CreaseVisibility {
         if (relation == Relation::across) return Expected{hits(c.minus).whole && hits(c.plus).whole, missed};
         // On the side of a closed mesh that is turned away.
         if (missed < ImageHits::missed) return Expected{false, relation == Relation::apart ? missed / 16 : missed};
+        // Rays may slip past an own face that is seen edge-on, whose other sides are silhouettes then.
+        if (is_thin(c, c.minus) || is_thin(c, c.plus)) return Expected{false, missed};
         if (fewest(c, relation) != few || !(view_.seen[c.minus.face] || view_.seen[c.plus.face])) return std::nullopt;
         return Expected{true, by_evidence(few)};
     }
@@ -125,6 +127,15 @@ class CreaseVisibility {
             }
         if (!hits(c.minus).clear || !hits(c.plus).clear) return beside_missed;
         return meeting_.in(low, high) ? beside_parts : crossings_.in(low, high, farthest) ? beside_silhouettes : few;
+    }
+
+    // Whether an own face is no wider in the image than rays err, which are placed in float.
+    bool is_thin(const Curve& c, const HalfEdge& h) const {
+        const int32_t opposite = vertex(view_.scene, h, (h.corner + 2) % 3);
+        if (view_.vertices.outcode[opposite]) return false;
+        const double error =
+            4 * std::numeric_limits<float>::epsilon() * std::max(view_.camera.width, view_.camera.height);
+        return std::fabs(wedge(c.tangent(), view_.vertices.x[opposite] - c.x0)) < error * c.length;
     }
 
     // What a ray says of the point s of a crease. Of what is nearer by less than a part of a pixel it does not tell:

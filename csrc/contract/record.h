@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <initializer_list>
 #include <vector>
 
 #include "camera/camera.h"
@@ -69,10 +70,12 @@ struct CurveRecords {
     std::vector<double> by_light;  // (S, 3)
 
     int64_t size() const { return int64_t(x.size()) / 2; }
-    // Makes room for so many, with four vertices each.
+    // Makes room for so many, with the vertices of an edge and of a face each.
     void reserve(int64_t n) {
+        constexpr int rows = 5;
         x.reserve(2 * n), face.reserve(surfaces * n), b.reserve(2 * surfaces * n), factor.reserve(surfaces * n);
-        row_of.reserve(4 * n), vertex.reserve(4 * n), by_q.reserve(12 * n);
+        row_of.reserve(rows * n), vertex.reserve(rows * n), by_q.reserve(3 * rows * n);
+        light.reserve(n), light_uv.reserve(2 * n), by_light.reserve(3 * n);
     }
 };
 
@@ -110,8 +113,8 @@ inline Array<int64_t> joined_rows(const std::vector<CurveRecords>& parts, std::v
 }
 
 template <class T>
-void append(std::vector<T>& to, const std::vector<T>& from) {
-    to.insert(to.end(), from.begin(), from.end());
+void append(std::vector<T>& to, std::initializer_list<T> from) {
+    for (const T& value : from) to.push_back(value);
 }
 
 // A cotangent of a window's intrinsics as one of the camera's.

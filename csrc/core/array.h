@@ -61,4 +61,12 @@ inline Array<double> zeros(int64_t n, Team& team) {
     return a;
 }
 
+inline Array<float> to_float(const Array<double>& values, Team& team) {
+    Array<float> a(values.size());
+    team.each_block(a.size(), [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i) a[i] = float(values[i]);
+    });
+    return a;
+}
+
 }  // namespace edgegrad

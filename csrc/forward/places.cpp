@@ -84,8 +84,8 @@ RayRecords rays_at(const Camera& camera, const Places& places, Team& team) {
     });
     RayRecords all;
     for (const RayRecords& block : blocks)
-        append(all.along, block.along), append(all.along_by_x, block.along_by_x),
-            append(all.along_by_k, block.along_by_k);
+        for (const auto field : {&RayRecords::along, &RayRecords::along_by_x, &RayRecords::along_by_k})
+            (all.*field).insert((all.*field).end(), (block.*field).begin(), (block.*field).end());
     return all;
 }
 

@@ -264,17 +264,16 @@ nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const
                           shaped(std::move(seen), {n, lights}));
 }
 
-// (F, 3, L); see flat_light.h. Places (L, 3), and what arrives at vertices (L, V).
+// (F, 3, L); see flat_light.h. Places (L, 3) of lights of so much power.
 nb::object light_on_faces(In<double, 2> verts, Rows faces, In<double, 1> eye, bool perspective, In<double, 2> place,
-                          const std::vector<bool>& infinite, In<double, 2> arriving, int threads) {
+                          const std::vector<bool>& infinite, const std::vector<double>& power, int threads) {
     const size_t L = infinite.size(), V = verts.shape(0), F = faces.shape(0);
     if (verts.shape(1) != 3 || faces.shape(1) != 3 || eye.size() != 3) refuse("verts, faces, eye: expected 3 columns");
-    if (place.shape(0) != L || place.shape(1) != 3 || arriving.shape(0) != L || arriving.shape(1) != V)
-        refuse("place, arriving: expected a row for each light");
+    if (place.shape(0) != L || place.shape(1) != 3 || power.size() != L)
+        refuse("place, power: expected a row for each light");
     check_indices("faces", faces.data(), faces.size(), V, "verts", threads);
     std::vector<PunctualLight> lights;
-    for (size_t l = 0; l < L; ++l)
-        lights.push_back({{place(l, 0), place(l, 1), place(l, 2)}, infinite[l], arriving.data() + l * V});
+    for (size_t l = 0; l < L; ++l) lights.push_back({{place(l, 0), place(l, 1), place(l, 2)}, infinite[l], power[l]});
     Array<double> found(0);
     unlocked(threads, [&](Team& team) {
         found = light_on_flat_faces(
@@ -317,6 +316,7 @@ nb::tuple cotangents(const LitArrays& lit, const LitPoints& points, const In<dou
         refuse("bar: expected a row a point");
     if (wanted.size() != lit.scene.tables.size()) refuse("wanted: expected a number for each table");
     std::vector<Array<double>> found;
+    std::vector<Array<float>> narrow;  // of tables in float
     Array<double> b_bar(3 * points.size);
     unlocked(threads, [&](Team& team) {
         std::vector<double*> to;
@@ -325,12 +325,16 @@ nb::tuple cotangents(const LitArrays& lit, const LitPoints& points, const In<dou
             to.push_back(wanted[i] ? found[i].data() : nullptr);
         }
         compute(to, b_bar.data(), team);
+        for (size_t i = 0; i < wanted.size(); ++i)
+            narrow.push_back(lit.scene.tables[i].wide ? Array<float>(0) : to_float(found[i], team));
     });
     nb::list out;
-    for (size_t i = 0; i < found.size(); ++i)
-        if (const Table& table = lit.scene.tables[i]; wanted[i])
-            out.append(shaped(std::move(found[i]), {size_t(table.rows), size_t(table.width)}));
-        else out.append(nb::none());
+    for (size_t i = 0; i < found.size(); ++i) {
+        const Table& table = lit.scene.tables[i];
+        const std::vector<size_t> shape{size_t(table.rows), size_t(table.width)};
+        if (!wanted[i]) out.append(nb::none());
+        else out.append(table.wide ? shaped(std::move(found[i]), shape) : shaped(std::move(narrow[i]), shape));
+    }
     return nb::make_tuple(out, shaped(std::move(b_bar), {size_t(points.size), 3}));
 }
 
@@ -428,7 +432,7 @@ void bind_lit(nb::module_& m) {
     m.def("shade_vjp", &shade_points_vjp, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "seen"_a.noconvert(),
           "bar"_a.noconvert(), "wanted"_a, "threads"_a);
     m.def("light_on_faces", &light_on_faces, "verts"_a.noconvert(), "faces"_a.noconvert(), "eye"_a.noconvert(),
-          "perspective"_a, "place"_a.noconvert(), "infinite"_a, "arriving"_a.noconvert(), "threads"_a);
+          "perspective"_a, "place"_a.noconvert(), "infinite"_a, "power"_a, "threads"_a);
     m.def("shade_jvp", &shade_points_jvp, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "seen"_a.noconvert(),
           "tangents"_a, "b_dot"_a.none(), "threads"_a);
 }

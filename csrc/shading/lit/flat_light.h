@@ -24,7 +24,14 @@ struct FlatFaces {
 struct PunctualLight {
     Vec3 place;  // at infinity, the unit direction towards it
     bool infinite;
-    const double* E;  // (V,) what arrives at vertices
+    double power;  // W/sr, or at infinity W/m²
+
+    // The irradiance at normal incidence, over the distance |l|.
+    double arriving_over_distance(Vec3 at) const {
+        if (infinite) return power;
+        const double squared = dot(place - at, place - at);
+        return squared > 0 ? power / (squared * std::sqrt(squared)) : 0;
+    }
 };
 
 // Cosine, below which it is left open which side of a face is seen.
@@ -55,10 +62,9 @@ inline Array<double> light_on_flat_faces(const FlatFaces& of, const std::vector<
                 const double d = dot(n, light.infinite ? light.place : light.place - corner[0]);
                 const double distance = std::fabs(towards) < edge_on ? std::fabs(d) : std::max(d, 0.0);
                 for (int i = 0; i < 3; ++i) {
-                    double E = light.E[v[i]];
-                    if (!light.infinite) E /= std::max(length(light.place - corner[i]), 1e-30);
-                    out[(3 * f + i) * L + l] = distance * E;
-                    greatest[k] = std::max(greatest[k], distance * E);
+                    const double E = distance * light.arriving_over_distance(corner[i]);
+                    out[(3 * f + i) * L + l] = E;
+                    greatest[k] = std::max(greatest[k], E);
                 }
             }
         }

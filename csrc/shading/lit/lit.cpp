@@ -348,19 +348,21 @@ std::shared_ptr<ShadeRoom> shade_room(const LitScene& lit, const LitOptions& opt
 
 namespace {
 
-// Finds the surfaces at points, and which lights they see.
-template <class T>
+// Finds the surfaces at points, and which lights they see; of points that are `wanted`.
+template <class T, class Wanted>
 void look(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-          const LitOptions& options, ShadeRoom& room, int8_t* seen) {
+          const LitOptions& options, ShadeRoom& room, int8_t* seen, Wanted wanted) {
     const std::vector<LightSample>& lights = room.lights;
     const size_t K = lights.size();
     room.surfaces.resize(points.size);
-    for (int64_t i = 0; i < points.size; ++i) room.surfaces[i] = surface<double>(lit, points.face[i], points.b + 3 * i);
+    for (int64_t i = 0; i < points.size; ++i)
+        if (wanted(i)) room.surfaces[i] = surface<double>(lit, points.face[i], points.b + 3 * i);
     // Light by light, for rays that are cast together are the faster the more alike they are.
     for (size_t k = 0; k < K; ++k) {
         const Lamp& lamp = lit.lamps[lights[k].lamp];
         const Vec3 only_place = lamp.is_punctual() ? place(lit, lamp, {}) : Vec3();
         for (int64_t i = 0; i < points.size; ++i) {
+            if (!wanted(i)) continue;
             const Surface<double>& o = room.surfaces[i];
             int8_t& found = seen[i * K + k] = not_asked;
             if (!o.mesh->has_material || o.is_black()) continue;
@@ -382,7 +384,7 @@ void look(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caste
 template <class T>
 void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                 const LitOptions& options, ShadeRoom& room, double* radiance_out, int8_t* seen) {
-    look(lit, scene, caster, points, options, room, seen);
+    look(lit, scene, caster, points, options, room, seen, [](int64_t) { return true; });
     for (int64_t i = 0; radiance_out && i < points.size; ++i) {
         look_up_material(lit, room.surfaces[i]);
         radiance<double>(lit, points, options, room.lights, i, room.surfaces[i], seen + i * room.lights.size(),
@@ -440,10 +442,16 @@ void look_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const Ra
         std::vector<int8_t> seen(shaded_at_once * K);
         for (; first < last; first += shaded_at_once) {
             const LitPoints some = points.part(first, std::min(shaded_at_once, last - first));
-            look(lit, scene, caster, some, options, *room, seen.data());
+            // What the loss ignores needs no look, for its derivatives are zero.
+            const auto wanted = [&](int64_t i) {
+                const double* of_point = bar + (first + i) * lit.channels;
+                return std::any_of(of_point, of_point + lit.channels, [](double x) { return x != 0; });
+            };
+            look(lit, scene, caster, some, options, *room, seen.data(), wanted);
             for (int64_t i = 0; i < some.size; ++i)
-                radiance_vjp(lit, some, options, room->lights, i, room->surfaces[i], seen.data() + i * K,
-                             bar + (first + i) * lit.channels, b_bar + 3 * (first + i), chunk);
+                if (wanted(i))
+                    radiance_vjp(lit, some, options, room->lights, i, room->surfaces[i], seen.data() + i * K,
+                                 bar + (first + i) * lit.channels, b_bar + 3 * (first + i), chunk);
         }
     });
 }
