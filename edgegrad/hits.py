@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ._check import as_tensor, check_finite, check_float, check_shape, values_visible
+from ._derivatives import moves
 from ._rows import interpolated, rows_of
 from ._samples import RayRecords, visible
 from ._seeds import STEPS, mixed_bits, signed
@@ -235,7 +236,7 @@ class Hits:
         wrap     beyond the rim: "repeat", "clamp" or "mirror", or two of these, for u and for v
         filter   "linear" between the centres of texels; "nearest", the texel itself, whose borders are steps: see where()
         mipmap   True: texels are averaged over squares of 2, 4, 8 … so that neighbouring pixels are about a texel apart, linear
-                 between two such levels (Williams 1983). The level itself has no derivative. Only for hits of a camera
+                 between two such levels (Williams 1983). Only for hits of a camera
 
         Raises TypeError or ValueError that names the argument.
         """
@@ -291,22 +292,31 @@ class Hits:
         return kept[id(texture)][1]
 
     def _level(self, texture: Tensor, corner_uvs: Tensor) -> Tensor:
-        """(N,) the logarithm of how many texels neighbouring pixels are apart, at most; without derivatives."""
+        """(N,) the logarithm of how many texels neighbouring pixels are apart, at most."""
         if self._rays_at is None or self._pixel is None or isinstance(self._view, Rays):
             raise ValueError("mipmap: expected hits of a camera, for rays of trace() have no neighbours; leave it out")
-        with torch.no_grad():
-            corners = corner_uvs.detach().double()
-            size = torch.tensor([texture.shape[1], texture.shape[0]], dtype=torch.float64, device=corners.device)
-            rays, surfaces, view = self._rays_at(self._pixel), self._surfaces.detach(), self._view.detach()
-            step = 1 / 64  # px, within which the face's plane is as good as straight
+        rays_at, view, pixel, corners = self._rays_at, self._view, self._pixel, corner_uvs.double()
+        size = torch.tensor([texture.shape[1], texture.shape[0]], dtype=torch.float64, device=corners.device)
+        step = 1 / 64  # px, within which the face's plane is as good as straight
+        rays = rays_at(pixel)
 
-            def apart(axis: int) -> Tensor:
-                moved = step * rays.along_by_x[:, :, axis]
-                b = [view.barycentrics(surfaces, self._face, rays.along + sign * moved) for sign in (1, -1)]
-                return (interpolated(b[0] - b[1], corners) * size).norm(dim=1) / (2 * step)
+        def beside(axis: int, aside: float) -> Tensor:
+            if not moves(rays.along):
+                return rays.along + aside * rays.along_by_x[:, :, axis]
+            # As functions of the intrinsics; where the lens shows nothing there, as if all were the same.
+            offset = torch.zeros(2, dtype=pixel.dtype, device=pixel.device)
+            offset[axis] = aside
+            along = rays_at(pixel + offset).along
+            return torch.where(torch.isfinite(along), along, rays.along)
 
-            most = torch.maximum(apart(0), apart(1))
-            return torch.nan_to_num(most, nan=1.0, posinf=1e9).clamp(1, 1e9).log2()
+        def squared(axis: int) -> Tensor:
+            """How many texels a pixel is along an axis, squared."""
+            b = [view.barycentrics(self._surfaces, self._face, beside(axis, aside)) for aside in (step, -step)]
+            texels = interpolated(b[0] - b[1], corners) * size / (2 * step)
+            return (texels * texels).sum(1)
+
+        most = torch.nan_to_num(torch.maximum(squared(0), squared(1)), nan=1.0, posinf=1e18).clamp(1, 1e18)
+        return 0.5 * most.log2()
 
     # -- steps ---------------------------------------------------------------------------------------------------------
 

@@ -18,6 +18,7 @@ Or with less: the image of primary_hits with a graph has the gradient inside fac
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -113,11 +114,18 @@ class Frame:
         self, face: Tensor, rays: RayRecords | SurfaceRecords, x: Tensor, seed: Tensor | None = None
     ) -> Hits:
         """Functions of vertices and camera, at fixed places in the image."""
-        face, along = self.here(face), rays.along
-        if moves(self.intrinsics):
-            along = along + rays.along_by_k @ (self.intrinsics - self.intrinsics.detach())
-        b = self.view.barycentrics(self.surfaces, face, self.here(along))
-        return Hits(self.surfaces, self.view, face, b, self.here(x), self.sampler.rays_at, seed=seed)
+        face = self.here(face)
+        b = self.view.barycentrics(self.surfaces, face, self.here(self._moving(rays).along))
+        return Hits(
+            self.surfaces, self.view, face, b, self.here(x), lambda x: self._moving(self.sampler.rays_at(x)), seed=seed
+        )
+
+    def _moving(self, rays: Any) -> Any:
+        """The rays as functions of the intrinsics, at fixed places in the image."""
+        if not moves(self.intrinsics):
+            return rays
+        moved = rays.along_by_k @ (self.intrinsics - self.intrinsics.detach()).to(rays.along_by_k.device)
+        return rays._replace(along=rays.along + moved)
 
     def image(self, pixel: Tensor, values: Tensor, pixels: range | None = None) -> Tensor:
         """(H · W, C), or of these pixels: the sums of rows of values (N, C) by pixel."""

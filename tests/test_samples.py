@@ -355,6 +355,34 @@ def test_texels_get_gradients_through_mipmaps():
     assert torch.autograd.gradcheck(value, texture.requires_grad_())
 
 
+@pytest.mark.parametrize("view", ["perspective", "orthographic"])
+def test_levels_of_mipmaps_have_derivatives(view: str):
+    """By what is seen and by the camera, at fixed places in the image; of a square that is turned away from it, so that the level
+    differs from place to place."""
+    texture = torch.rand((64, 64, 2), generator=torch.Generator().manual_seed(0), dtype=F64)
+    mesh, camera = facing(texture, 1.0)
+    R = torch.tensor([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]], dtype=F64)
+    mesh = mesh.transformed(R, torch.tensor([-26.0, -32, 120], dtype=F64))
+    if view == "perspective":
+        camera = eg.Camera.look_at((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), fov_y=25.0, size=(8, 8))
+    else:
+        camera = eg.Camera.orthographic((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), height=50.0, size=(8, 8))
+    camera = camera.replace(world_to_camera=camera.world_to_camera.double(), K=camera.K.double())
+
+    def value(verts: Tensor, uvs: Tensor, t: Tensor, focal: Tensor, texture: Tensor = texture) -> Tensor:
+        moved = mesh.replace(verts=verts, uvs=uvs)
+        W, K = camera.world_to_camera, camera.K
+        W = torch.cat([torch.cat([W[:3, :3], W[:3, 3:] + t[:, None]], 1), W[3:]])
+        K = torch.cat([torch.cat([focal * K[:2, :2], K[:2, 2:]], 1), K[2:]])
+        return eg.primary_hits(moved, camera.replace(world_to_camera=W, K=K), spp=1).hits.sample(texture, mipmap=True)
+
+    assert mesh.uvs is not None
+    leaves = [mesh.verts, mesh.uvs, torch.zeros(3, dtype=F64), torch.ones((), dtype=F64)]
+    leaves = [leaf.detach().clone().requires_grad_() for leaf in leaves]
+    assert len(value(*leaves)) > 40
+    assert torch.autograd.gradcheck(value, leaves, eps=1e-7, atol=1e-4, rtol=1e-3)
+
+
 def test_mipmaps_need_neighbours():
     texture = torch.rand((8, 8, 1), dtype=F64)
     mesh, camera = facing(texture, 0.5)
