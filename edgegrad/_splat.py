@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ._check import check_finite
 from ._kernel import core
 from ._operator import Tensors, apply, array, doubles
 from ._request import Request
@@ -94,6 +95,7 @@ class _Attached(NamedTuple):
         return (image.clone(),)
 
     def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
+        check_finite("the gradient of the image", bar.reshape(self.film.height, self.film.width, -1))
         none = bar.new_zeros(0)
         found = [bar.clone() if wanted[0] else none]
         for want, (x, behind) in zip(wanted[1:], self._places(tensors), strict=True):
@@ -108,5 +110,5 @@ class _Attached(NamedTuple):
         for tangent, (x, behind) in zip(tangents[1:], self._places(tensors), strict=True):
             if tangent is not None:
                 moved = self.film.sum(x, tangent)
-                total = total + (moved if behind is None else moved * behind)
+                total = total + (moved if behind is None else moved * behind).to(total)
         return total

@@ -82,7 +82,7 @@ class Light:
         if shape == ():
             if value.numel() != 1:
                 raise ValueError(f"{name}: expected one number, got shape {tuple(value.shape)}")
-            value = value.reshape(())
+            value = value if value.dim() == 0 else value.reshape(())  # a leaf stays one
         else:
             check_shape(name, value, shape)
         if unit and values_visible(value) and not bool((value.detach() != 0).any()):

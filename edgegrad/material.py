@@ -157,7 +157,7 @@ class Material:
             check_shape("normal_map", self.normal_map.image, ("h", "w", 3))
         scale = numbers("normal_scale", self.normal_scale)
         check_shape("normal_scale", scale, (), (1,))
-        object.__setattr__(self, "normal_scale", scale.reshape(()))
+        object.__setattr__(self, "normal_scale", scale if scale.dim() == 0 else scale.reshape(()))
         if not isinstance(self.two_sided, bool):
             raise TypeError(f"two_sided: expected True or False, got {type(self.two_sided).__name__}")
         if self.alpha_mode not in ALPHA_MODES:

@@ -48,7 +48,9 @@ def render(
 ) -> Tensor:
     """The image (H, W, C) of a scene, or (B, H, W, C) for a batch of cameras: linear radiance, row 0 on top.
 
-    spp              samples a pixel of the image
+    spp              samples a pixel of the image. In lit scenes and around shaders they find what covers a pixel; a face in it is
+                     shaded at one of them, under lights with an extent at up to a quarter of them, where a border runs
+                     through at up to 8: for less noise of shading render a larger image, and average
     seed             the same seed gives the same bits, image and gradient, at any number of threads; cameras of a batch
                      get samples of their own. With a constant seed, each step of an optimisation repeats the samples of
                      image and gradient, and their error does not average out: pass seed=step

@@ -410,7 +410,7 @@ def attach_boundary(image: Tensor, samples: EdgeSamples, jump: Tensor, backgroun
     check_shape("image", image, (frame.height, frame.width, jump.shape[1]))
     background = _background(background, jump, frame)
     terms = boundary(samples.x, samples.velocity, jump, samples.to_background, background)
-    return image + frame.attached(torch.zeros_like(image, requires_grad=False), terms)
+    return frame.attached(image, terms)
 
 
 # -- shared with shader.py ------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """fit_pose on a small coloured bracket: poses come back, errors are told, an interruption keeps the best."""
 
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -85,6 +86,15 @@ def test_finds_the_pose(background, capsys):
     torch.testing.assert_close(fit.history[0].pose.matrix, START, rtol=0, atol=1e-12)
     assert torch.equal([s for s in fit.history if s.best][-1].pose.matrix, fit.matrix)
     assert capsys.readouterr() == ("", "")
+    again = pickle.loads(pickle.dumps(fit))
+    assert again.loss == fit.loss and [step.loss for step in again.history] == [step.loss for step in fit.history]
+
+
+def test_a_start_that_is_the_answer_is_converged():
+    """More steps would not find a better one."""
+    target = picture(camera())
+    fit = fit_pose(bracket(), target, camera(), background=BACKGROUND, progress=False)
+    assert fit.converged and errors(fit)[0] < 0.2
 
 
 @pytest.mark.parametrize("mode", [pytest.param(torch.no_grad, marks=pytest.mark.slow), torch.inference_mode])
@@ -193,7 +203,12 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     same(small_fit(steps=1, mesh=bracket().replace(name="it"), checkpoint=file, resume=True), small_fit(steps=1))
     for damaged in ({"format": 2}, {"format": FORMAT}, {"format": FORMAT, "given": 3, "state": {}}):
         torch.save(damaged, tmp_path / "damaged.ckpt")
-        with pytest.raises(ValueError, match=r"damaged\.ckpt: expected a checkpoint of format"):
+        expected = (
+            rf"of format {FORMAT}, got 2, which another version"
+            if damaged["format"] == 2
+            else "of a fit, got something else"
+        )
+        with pytest.raises(ValueError, match=rf"damaged\.ckpt: expected a checkpoint {expected}"):
             small_fit(checkpoint=tmp_path / "damaged.ckpt", resume=True)
     with pytest.raises(TypeError, match=r"checkpoint: expected a path, got int \(3\)"):
         small_fit(checkpoint=3)

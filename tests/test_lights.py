@@ -515,6 +515,24 @@ def test_second_derivatives_raise_before_a_background(kind: str) -> None:
         torch.autograd.grad(gradient.sum(), verts)
 
 
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_gradient_of_the_image_that_is_not_finite_is_named(bad: float) -> None:
+    """As without lights, whether or not a sample looks there."""
+    verts = QUAD.clone().requires_grad_()
+    mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=WHITE)
+    camera = eg.Camera.look_at((0.0, 0, -2), (0.0, 0, 1), size=(16, 16))
+    image = eg.render(eg.Scene([mesh], lights=[eg.PointLight(torch.zeros(3, dtype=F64), 3.0)]), camera, spp=4)
+    adjoint = torch.zeros_like(image)
+    adjoint[1, 14, 2] = bad
+    with pytest.raises(ValueError, match=r"the gradient of the image: expected finite numbers, got .* at \[1, 14, 2\]"):
+        image.backward(adjoint)
+
+
+def test_leaves_of_lights_stay_leaves() -> None:
+    power = torch.tensor(3.0, dtype=F64, requires_grad=True)
+    assert eg.PointLight(torch.zeros(3, dtype=F64), power).intensity is power
+
+
 def test_random_numbers_of_a_pixel_are_its_own():
     """So that with a constant seed what changes in one corner leaves the noise of all other pixels as it is."""
     lamp = eg.AreaLight.rectangle([0.0, -0.5, 1.5], [0.2, 0.0, 0.1], [0.0, -0.2, 0.0], [3.0, 2.0, 1.0])

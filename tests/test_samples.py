@@ -285,6 +285,29 @@ def test_jumps_at_edges_alone_move_a_silhouette():
         torch.autograd.grad(first.sum(), verts)
 
 
+def test_attached_edges_keep_the_type_and_have_no_second_derivatives():
+    """Nor by what the image depends on: how coverage moves is not in its graph."""
+    verts, color = ball().verts.clone().requires_grad_(), torch.rand(3, dtype=F64, requires_grad=True)
+    primary = eg.primary_hits(ball().replace(verts=verts), front_camera(SIZE))
+    edges = eg.edge_samples(primary, 200)
+    jump = edges.jump(torch.ones((len(edges.hits), 3), dtype=F64))
+    image = primary.image(torch.ones((len(primary.hits), 3), dtype=F64), color)
+    (by_verts,) = torch.autograd.grad(
+        eg.attach_boundary(image, edges, jump, color).pow(2).sum(), verts, create_graph=True
+    )
+    with pytest.raises(RuntimeError, match="second derivatives"):
+        torch.autograd.grad(by_verts.sum(), color)
+
+    def single(verts: Tensor) -> Tensor:
+        edges = eg.edge_samples(eg.primary_hits(ball().replace(verts=verts), front_camera(SIZE)), 200)
+        return eg.attach_boundary(
+            torch.zeros(SIZE, SIZE, 3), edges, edges.jump(torch.ones((len(edges.hits), 3), dtype=F64))
+        )
+
+    found = torch.func.jvp(single, (ball().verts,), (ball().verts,))
+    assert [part.dtype for part in found] == [torch.float32] * 2 and float(found[1].abs().sum()) > 0
+
+
 def test_what_parts_are_given_is_checked():
     primary = eg.primary_hits(ball(), front_camera(SIZE))
     edges = eg.edge_samples(primary, 100)

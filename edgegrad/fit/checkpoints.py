@@ -62,9 +62,17 @@ class Checkpoint:
                 f"{self.path}: expected a checkpoint of a fit, got something else ({type(error).__name__}); "
                 "remove it, or leave out resume"
             ) from error
-        found = state.get("given") if isinstance(state, dict) and state.get("format") == FORMAT else None
+        made = state.get("format") if isinstance(state, dict) else None
+        if isinstance(made, int) and made != FORMAT:
+            raise ValueError(
+                f"{self.path}: expected a checkpoint of format {FORMAT}, got {made}, which another version of edgegrad wrote; go "
+                "on with that version, or remove it to begin anew"
+            )
+        found = state.get("given") if made == FORMAT else None
         if not isinstance(found, dict) or "state" not in state:
-            raise ValueError(f"{self.path}: expected a checkpoint of format {FORMAT}; remove it to begin anew")
+            raise ValueError(
+                f"{self.path}: expected a checkpoint of a fit, got something else; remove it, or leave out resume"
+            )
         if other := [name for name in {**self._given, **found} if self._given.get(name) != found.get(name)]:
             raise ValueError(
                 f"resume: expected {self.path} to be a checkpoint of this fit, got one that was made with another "

@@ -8,7 +8,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -64,7 +63,7 @@ class Step(NamedTuple):
     best: bool  # whether it was the best so far
     # Norms of the loss's gradient by rotation (radians), shift (object sizes), scale and focal (logarithms), principal (widths of
     # the image) and distortion, of those that are sought on the level; empty where the loss rose and the step was taken back.
-    gradient: Mapping[str, float] = MappingProxyType({})
+    gradient: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)

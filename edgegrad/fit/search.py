@@ -77,7 +77,9 @@ class Search:
                 "it does not; is the object out of view, or of the background's colour?"
             )
         # The same many samples for all: a fit never ends at a worse pose than its start.
-        best = min(self._judge(*self._down(ends[0], finer)), self._judge(self.start, False), key=lambda end: end.loss)
+        found = self._judge(*self._down(ends[0], finer))
+        stays = found.short and len(_distinct([found.pose, self.start], 2)) == 1  # the start was the answer already
+        best = min(found, self._judge(self.start, stays), key=lambda end: end.loss)
         self._take(best)
         for _ in range(ROUNDS if self.steps > ASIDE_STEPS else 0):
             if best.explained >= ENOUGH:
@@ -95,7 +97,7 @@ class Search:
             found = self._judge(*self._down(near[0], finer[1:]))
             won = found.loss < best.loss and found.explained > best.explained
             best = self._better(best, found, won, begins)
-        self.history.append(Step(self.levels[-1].size, self.loss, self.best, True))
+        self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
 
     def first_end(self) -> float:
         """The share of the render's edges that the pictures show where the way down from the start alone ends."""
