@@ -211,10 +211,10 @@ class SurfaceSamples:
         faces, for its weights stand for areas of the image and not for shares of a pixel's samples. Raises TypeError or
         ValueError that names the argument."""
         radiance = _rows("radiance", radiance, len(self))
-        term = self.term(radiance)
+        term = self._term(radiance)
         return self.frame.composed(splat(term.x, term.values, self.frame.request), None)
 
-    def term(self, radiance: Tensor) -> Term:
+    def _term(self, radiance: Tensor) -> Term:
         """The same, for attached()."""
         return Term(self._records.x, self.weight.to(radiance.dtype)[:, None] * radiance)
 

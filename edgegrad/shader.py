@@ -195,7 +195,7 @@ class _Image:
             many = len(samples) > at_once and not transformed() and not self._effort.keeps_little
             L = checkpoint(radiance, use_reentrant=False) if many else radiance()
             assert isinstance(L, Tensor)
-            terms.append(some.term(L))
+            terms.append(some._term(L))
         return terms
 
     def _shadows(self) -> list[Term]:
