@@ -77,7 +77,7 @@ bench: $(VENV)/.ready
 
 lint: $(VENV)/.ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[dev,demo,test]"
-	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
+	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/clang-format --dry-run --Werror $(filter-out %.txt %.toml,$(SOURCES))
 
 # Warnings are errors; build/docs/index.html is the site.
