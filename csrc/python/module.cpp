@@ -245,8 +245,17 @@ NB_MODULE(_core, m) {
     nb::class_<GradientOptions>(m, "GradientOptions")
         .def(nb::new_([](uint64_t seed, int64_t surface_samples, int64_t edge_samples, bool interior_geometry,
                          bool boundary, bool intrinsics, bool steps, double step_spacing, bool lit, bool dry) {
-                 return GradientOptions{surface_samples, edge_samples, seed, interior_geometry, boundary, intrinsics, steps,
-                                        step_spacing,    lit,          dry,  !dry};
+                 return GradientOptions{surface_samples,
+                                        edge_samples,
+                                        seed,
+                                        interior_geometry,
+                                        boundary,
+                                        intrinsics,
+                                        steps,
+                                        step_spacing,
+                                        lit,
+                                        dry,
+                                        !dry};
              }),
              "seed"_a, nb::kw_only(), "surface_samples"_a = -1, "edge_samples"_a = -1, "interior_geometry"_a = true,
              "boundary"_a = true, "intrinsics"_a = true, "steps"_a = true, "step_spacing"_a = 1.0, "lit"_a = false,
