@@ -54,7 +54,8 @@ def draw_gradients(axes: Axes, gradients: Sequence[Mapping[str, float]]) -> None
     """The norm of each, from step 1 on; with gaps where a step has none of that name."""
     for name in dict.fromkeys(name for gradient in gradients for name in gradient):
         norms = [gradient.get(name, math.nan) for gradient in gradients]
-        axes.plot(range(1, len(norms) + 1), norms, linewidth=1, label=name)
+        # With points, for a step between gaps has no line.
+        axes.plot(range(1, len(norms) + 1), norms, ".-", markersize=3, linewidth=1, label=name)
     axes.set_yscale("log")
     axes.set_ylabel("|gradient|")
     axes.set_xlabel("step")
