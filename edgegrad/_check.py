@@ -151,6 +151,7 @@ def all_below(index: Tensor, count: int) -> bool:
 
 
 def all_finite(tensor: Tensor) -> bool:
+    """Whether no number is NaN or infinite."""
     return _ask_kernel(core.all_finite, tensor) or bool(torch.isfinite(tensor).all())
 
 

@@ -57,17 +57,9 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
     known = not shadows or len(surfaces.shadowing) == len(surfaces.scene.casting)
     values = hits.values or not known
     shading = _Shading(
-        layout,
-        len(tables),
-        number,
-        shadows,
-        samples,
-        only,
-        values,
-        surfaces.verts.dtype,
-        casters.cutoffs,
-        casters.spacing,
-    )
+        layout=layout, tables=len(tables), forced=number, shadows=shadows, samples=samples, only=only, values=values,
+        dtype=surfaces.verts.dtype, cutoffs=casters.cutoffs, spacing=casters.spacing,
+    )  # fmt: skip
     arrays = (part for part in casters if isinstance(part, Tensor))
     found, *kept = apply(shading, [hits._exact.cpu(), *points, *tables, *arrays])
     if not values:

@@ -18,7 +18,7 @@ Or with less: the image of primary_hits with a graph has the gradient inside fac
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -49,6 +49,7 @@ from .mesh import Mesh
 from .scene import Scene
 
 ALL_AT_ONCE = 1 << 40
+_Rays = TypeVar("_Rays", bound=RayRecords | SurfaceRecords)
 SAMPLES = ("image", "inside", "edges", "steps", "shadows", "image again")  # kinds that draw numbers of their own
 
 
@@ -120,7 +121,7 @@ class Frame:
             self.surfaces, self.view, face, b, self.here(x), lambda x: self._moving(self.sampler.rays_at(x)), seed=seed
         )
 
-    def _moving(self, rays: Any) -> Any:
+    def _moving(self, rays: _Rays) -> _Rays:
         """The rays as functions of the intrinsics, at fixed places in the image."""
         if not moves(self.intrinsics):
             return rays

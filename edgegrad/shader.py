@@ -2,7 +2,8 @@
 
 The value of the image and its gradient come from different samples. Those of the image are shaded without a graph, several of a
 face where borders of steps run through a pixel. To it
-terms are added whose value is exactly zero: samples inside faces, shaded with a graph at points that move with the scene while
+terms are attached of which only the derivatives count (_splat.py):
+samples inside faces, shaded with a graph at points that move with the scene while
 their pixel stays; samples on curves, shaded without one on both sides, whose jump multiplies the curve's velocity; and, where
 the shader declares steps, samples on these. All of it is PyTorch, so whatever the shader uses gets its gradient by itself.
 """

@@ -129,7 +129,8 @@ class CreaseVisibility {
         return meeting_.in(low, high) ? beside_parts : crossings_.in(low, high, farthest) ? beside_silhouettes : few;
     }
 
-    // Whether an own face is no wider in the image than rays err, which are placed in float.
+    // Whether an own face is no wider in the image than rays err: their places are rounded to floats of the image's
+    // size, and again as they are turned and cast.
     bool is_thin(const Curve& c, const HalfEdge& h) const {
         const int32_t opposite = vertex(view_.scene, h, (h.corner + 2) % 3);
         if (view_.vertices.outcode[opposite]) return false;
