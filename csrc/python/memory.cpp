@@ -107,7 +107,7 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         bytes["edge samples"] = rows(w.edge_samples < 0 ? many : w.edge_samples,
                                      w.curves < 0 ? s.edges() : w.curves + w.intersections, 6, 3, s.verts);
         bytes["topology"] = Topology::bytes(s.faces, s.edges()) + FaceTree::bytes(s.faces);
-        bytes["intersections"] = Intersections::bytes(w.intersections < 0 ? s.faces / 4 : w.intersections);
+        bytes["intersections"] = Intersections::bytes(w.intersections < 0 ? s.faces / 4 : w.intersections, s.faces);
     }
     return bytes;
 }

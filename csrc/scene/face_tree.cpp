@@ -7,6 +7,7 @@
 #include <tuple>
 
 #include "core/math.h"
+#include "scene/contact.h"
 
 namespace edgegrad {
 
@@ -168,8 +169,11 @@ FaceBox BoxGroup::box(int lane) const {
 unsigned BoxGroup::overlapping(const FaceBox& box) const { return overlapping_lanes(*this, box); }
 unsigned BoxGroup::overlapping(const AskewBox& box) const { return overlapping_lanes(*this, box); }
 
-unsigned CornerGroup::may_cross(const FacePlane& plane) const {
+unsigned CornerGroup::may_cross(const FacePlane& plane, double spacing) const {
     const Vec3 N = plane.normal;
+    const double own = std::max({std::fabs(origin.x), std::fabs(origin.y), std::fabs(origin.z)}) + reach;
+    const double coordinate = std::max(plane.coordinate, own);
+    const double touching = contact(spacing, coordinate, coordinate) * plane.normal_length;
     const double offset = dot(N, origin - plane.origin);
     const double size = (std::fabs(N.x) + std::fabs(N.y) + std::fabs(N.z)) * reach + std::fabs(offset);
     return crossing_lanes(*this, {.x = float(N.x),
@@ -178,7 +182,7 @@ unsigned CornerGroup::may_cross(const FacePlane& plane) const {
                                   .offset = float(offset),
                                   // Four products and sums of rounded numbers, each to half a spacing; twice that. What
                                   // floats cannot hold tells nothing.
-                                  .error = float(0x1p-20 * size + plane.slack) + std::numeric_limits<float>::min(),
+                                  .error = float(0x1p-20 * size + touching) + std::numeric_limits<float>::min(),
                                   .vertex = {plane.vertex[0], plane.vertex[1], plane.vertex[2]}});
 }
 
@@ -206,15 +210,14 @@ FaceTree::FaceTree(const int32_t* faces, int64_t n_faces, const double* verts, c
         }
         return m;
     };
-    std::vector<std::array<Vec3, 2>> parts(Team::blocks(n_faces));
-    team.each_block(n_faces, [&](int64_t k, int64_t first, int64_t last) {
+    const auto parts = team.of_blocks(n_faces, [&](int64_t first, int64_t last) {
         Vec3 low = middle(first), high = low;
         for (int64_t f = first; f < last; ++f) {
             const Vec3 m = middle(f);
             low = {std::min(low.x, m.x), std::min(low.y, m.y), std::min(low.z, m.z)};
             high = {std::max(high.x, m.x), std::max(high.y, m.y), std::max(high.z, m.z)};
         }
-        parts[k] = {low, high};
+        return std::array{low, high};
     });
     Vec3 low = parts[0][0], high = parts[0][1];
     for (const auto& [l, h] : parts) {

@@ -57,7 +57,8 @@ struct BoxGroup {
 struct FacePlane {
     const int32_t* vertex;  // 3, of the face
     Vec3 origin, normal;
-    double slack;  // what doubles leave of normal · (p − origin)
+    double normal_length;
+    double coordinate;  // the largest of the face's coordinates
 };
 
 // The corners of eight faces, relative to one of them, so that floats hold them well.
@@ -69,8 +70,9 @@ struct CornerGroup {
     int32_t vertex[3][size];  // −1: there is no face
 
     // Bit i: face i shares at most one vertex with a face, and its others lie neither all before the plane of that face
-    // nor all behind it, as far as floats tell. Of most neighbours this says all.
-    unsigned may_cross(const FacePlane& plane) const;
+    // nor all behind it, as far as floats tell, and by more than what touches may lie apart (contact.h) where no mesh
+    // is coarser than `spacing`. Of most neighbours this says all.
+    unsigned may_cross(const FacePlane& plane, double spacing) const;
 };
 
 class FaceTree {

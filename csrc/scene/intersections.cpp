@@ -1,6 +1,7 @@
 #include "scene/intersections.h"
 
 #include <algorithm>
+#include <atomic>
 #include <bit>
 #include <tuple>
 #include <utility>
@@ -35,14 +36,19 @@ struct Found {
 // A tangle of noise, or a soup of large triangles, has so many intersections that finding them all would take longer
 // than all else, and most of them are hidden. So from one for each face on, some are drawn, by pairs of leaves. How
 // many there are is estimated from so many leaves; where there are not much more of these, all are searched.
-constexpr int64_t enough_intersections = 1 << 15, leaves_in_pilot = 128, most_in_pilot = 128;
+constexpr int64_t enough_intersections = 1 << 15, leaves_in_pilot = 128, most_in_pilot = 32;
 constexpr int64_t leaves_in_block = 16;
 
 class PairFinder {
    public:
     PairFinder(const FaceTree& tree, const HeightFields& fields, const int32_t* faces, const double* verts,
                const Spacing& spacing)
-        : tree_(tree), fields_(fields), faces_(faces), verts_(verts), spacing_(spacing) {}
+        : tree_(tree),
+          fields_(fields),
+          faces_(faces),
+          verts_(verts),
+          spacing_(spacing),
+          coarsest_(spacing.coarsest()) {}
 
     // Calls found(other) for the leaves from this one on that overlap it, where faces may pass through each other.
     template <class Found>
@@ -57,18 +63,27 @@ class PairFinder {
     // Adds the pairs with a face of either leaf.
     void add(int64_t leaf, int64_t other, Found& out) {
         if (leaf != leaf_) place(leaf);
-        unsigned placed = 0;  // faces of the other leaf that are
         const BoxGroup &own = tree_.leaf(leaf), &others = tree_.leaf(other);
+        unsigned any = 0, met_by[FaceTree::leaf_size];  // of the other leaf, each with those of this one
         for (unsigned hits = own.overlapping(tree_.bounds(other)); hits; hits &= hits - 1) {
             const int i = std::countr_zero(hits);
             unsigned met = others.overlapping(own.box(i));
             if (leaf == other) met &= ~0u << (i + 1);
-            if (met) met &= tree_.corners(other).may_cross(plane_[i]);
+            if (met) met &= tree_.corners(other).may_cross(plane_[i], coarsest_);
             for (; met; met &= met - 1) {
                 const int j = std::countr_zero(met);
-                const int32_t face = tree_.face(other, j);
-                if (!(placed >> j & 1)) place(other_[j], face), placed |= 1u << j;
-                add_pair(placed_[i], tree_.face(leaf, i), other_[j], face, out);
+                met_by[j] = (any >> j & 1 ? met_by[j] : 0) | 1u << i, any |= 1u << j;
+            }
+        }
+        PlacedFace placed;
+        for (; any; any &= any - 1) {
+            const int j = std::countr_zero(any);
+            const int32_t face = tree_.face(other, j);
+            place(placed, face);
+            unsigned met = met_by[j] & tree_.corners(leaf).may_cross(plane_of(placed), coarsest_);
+            for (; met; met &= met - 1) {
+                const int i = std::countr_zero(met);
+                add_pair(placed_[i], tree_.face(leaf, i), placed, face, out);
             }
         }
     }
@@ -77,15 +92,14 @@ class PairFinder {
     void place(int64_t leaf) {
         leaf_ = leaf;
         for (int i = 0; i < FaceTree::leaf_size; ++i)
-            if (const int32_t f = tree_.face(leaf, i); f >= 0) {
-                PlacedFace& p = placed_[i];
-                place(p, f);
-                plane_[i] = {p.vertex, p.p[0], p.normal, rounding_of_doubles * p.coordinate * p.normal_length};
-            }
+            if (const int32_t f = tree_.face(leaf, i); f >= 0) place(placed_[i], f), plane_[i] = plane_of(placed_[i]);
     }
     void place(PlacedFace& placed, int32_t face) const {
         const int32_t* v = faces_ + 3 * int64_t(face);
         placed.set(verts_, v, spacing_.of(v[0]));
+    }
+    static FacePlane plane_of(const PlacedFace& f) {
+        return {f.vertex, f.p[0], f.normal, f.normal_length, f.coordinate};
     }
 
     void add_pair(const PlacedFace& f, int32_t face, const PlacedFace& g, int32_t other, Found& out) {
@@ -107,9 +121,9 @@ class PairFinder {
     const int32_t* const faces_;
     const double* const verts_;
     const Spacing& spacing_;
+    const double coarsest_;
     int64_t leaf_ = -1;
     PlacedFace placed_[FaceTree::leaf_size];  // its faces
-    PlacedFace other_[FaceTree::leaf_size];   // those of another one that were asked
     FacePlane plane_[FaceTree::leaf_size];    // theirs
 };
 
@@ -140,7 +154,7 @@ void add_along(std::vector<AlongEdge>& along, std::vector<Intersection>& out) {
 }
 
 // Divides what copies of faces have in common among them.
-void share_among_copies(std::vector<Intersection>& all, const int32_t* faces, const double* verts, Team& team) {
+void share_among_copies(Array<Intersection>& all, const int32_t* faces, const double* verts, Team& team) {
     // Of where both faces lie, whatever the order of their corners.
     const auto place = [&](int32_t face) {
         uint64_t bits = 0;
@@ -151,7 +165,7 @@ void share_among_copies(std::vector<Intersection>& all, const int32_t* faces, co
         }
         return hash(bits, 0);
     };
-    const auto n = int64_t(all.size());
+    const int64_t n = all.size();
     Array<uint64_t> key(n);
     team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) key[i] = place(all[i].face[0]) + place(all[i].face[1]);
@@ -174,17 +188,30 @@ void share_among_copies(std::vector<Intersection>& all, const int32_t* faces, co
     }
 }
 
-// By ascending faces; of two between the same faces the first found comes first.
-void sort_by_faces(std::vector<Intersection>& all, Team& team) {
-    const auto n = int64_t(all.size());
-    std::vector<std::pair<uint64_t, int64_t>> order(n);
-    for (int64_t i = 0; i < n; ++i) order[i] = {uint64_t(all[i].face[0]) << 32 | uint64_t(all[i].face[1]), i};
-    std::sort(order.begin(), order.end());
-    std::vector<Intersection> sorted(n);
-    team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t i = first; i < last; ++i) sorted[i] = all[order[i].second];
+// All parts by ascending faces: those of each lower face side by side, and these, which are few, in order.
+Array<Intersection> sorted(const std::vector<std::vector<Intersection>>& parts, int64_t n_faces, Team& team) {
+    size_t n = 0;
+    for (const auto& part : parts) n += part.size();
+    Array<Intersection> all{int64_t(n)};
+    if (n == 0) return all;
+    std::vector<uint32_t> end(n_faces, 0);  // of each face, in `all`
+    const auto each = [&](auto body) {
+        team.each(int64_t(parts.size()), [&](int64_t k) {
+            for (const Intersection& i : parts[k]) body(std::atomic_ref(end[i.face[0]]), i);
+        });
+    };
+    each([](auto count, const Intersection&) { count.fetch_add(1, std::memory_order_relaxed); });
+    uint32_t sum = 0;
+    for (uint32_t& e : end) sum += std::exchange(e, sum);
+    each([&](auto at, const Intersection& i) { all[at.fetch_add(1, std::memory_order_relaxed)] = i; });
+    team.each_block(n_faces, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t f = first; f < last; ++f)
+            std::sort(all.begin() + (f ? end[f - 1] : 0), all.begin() + end[f],
+                      [](const Intersection& a, const Intersection& b) {
+                          return std::tie(a.face[1], a.next, a.beside) < std::tie(b.face[1], b.next, b.beside);
+                      });
     });
-    all = std::move(sorted);
+    return all;
 }
 
 }  // namespace
@@ -231,26 +258,26 @@ Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double
     const int64_t blocks = (leaves + leaves_in_block - 1) / leaves_in_block;
     std::vector<Found> found(blocks);
     team.each_with(blocks, finder, [&](PairFinder& pairs, int64_t block) {
+        Found part;
         for (int64_t leaf = block * leaves_in_block; leaf < std::min(leaves, (block + 1) * leaves_in_block); ++leaf)
             pairs.each_overlapping(leaf, [&](int64_t other) {
                 if (share == 1 || to_unit(hash(seed, uint64_t(leaf), uint64_t(other))) < share)
-                    pairs.add(leaf, other, found[block]);
+                    pairs.add(leaf, other, part);
             });
+        found[block] = std::move(part);
     });
-    size_t n = 0;
-    for (const Found& part : found) n += part.through.size();
-    all_.reserve(n);
+    std::vector<std::vector<Intersection>> parts(1);
     std::vector<AlongEdge> along;
-    for (const Found& part : found) {
-        all_.insert(all_.end(), part.through.begin(), part.through.end());
+    for (Found& part : found) {
+        parts.push_back(std::move(part.through));
         along.insert(along.end(), part.along.begin(), part.along.end());
     }
-    found = {};
-    add_along(along, all_);
+    add_along(along, parts[0]);
     team.check();
-    sort_by_faces(all_, team);
+    all_ = sorted(parts, n_faces, team);
     team.check();
     share_among_copies(all_, faces, verts, team);
+    if (share < 1) order = {};  // there will be as many the next time, and then it may not be kept either
 }
 
 }  // namespace edgegrad

@@ -2,8 +2,8 @@
 #pragma once
 
 #include <cstdint>
-#include <vector>
 
+#include "core/array.h"
 #include "core/parallel.h"
 #include "scene/face_tree.h"
 #include "scene/scene.h"
@@ -29,16 +29,19 @@ class Intersections {
                   const Topology& topology, FaceOrder& order, Team& team);
 
     // By ascending faces.
-    const std::vector<Intersection>& all() const { return all_; }
+    const Array<Intersection>& all() const { return all_; }
 
     // For how many each of them stands: more than 1 where there would be too many, and some are drawn.
     double each_stands_for() const { return stands_for_; }
 
-    // Of so many that are found, before and after they are sorted, with what they are sorted by.
-    static int64_t bytes(int64_t found) { return found * int64_t(2 * sizeof(Intersection) + 2 * sizeof(int64_t)); }
+    // Of so many that are found among so many faces, before and after they are sorted, and what they are sorted by.
+    // Lists double as they grow.
+    static int64_t bytes(int64_t found, int64_t faces) {
+        return found * int64_t(3 * sizeof(Intersection) + sizeof(uint64_t)) + faces * int64_t(sizeof(uint32_t));
+    }
 
    private:
-    std::vector<Intersection> all_;
+    Array<Intersection> all_{0};
     double stands_for_ = 1;
 };
 

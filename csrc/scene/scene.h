@@ -20,6 +20,8 @@ struct Spacing {
         return value[std::upper_bound(first.begin(), first.end(), vertex) - first.begin() - 1];
     }
 
+    double coarsest() const { return *std::max_element(value.begin(), value.end()); }
+
     bool operator==(const Spacing&) const = default;
 };
 
