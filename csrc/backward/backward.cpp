@@ -33,13 +33,14 @@ void add_background(const SceneView<T>& scene, int64_t pixels, const T* adjoint,
         });
         return;
     }
-    std::vector<double> sum(Team::blocks(pixels) * C, 0.0);
-    team.each_block(pixels, [&](int64_t k, int64_t first, int64_t last) {
+    const auto parts = team.of_blocks(pixels, [&](int64_t first, int64_t last) {
+        std::vector<double> sum(C, 0.0);
         for (int64_t p = first; p < last; ++p)
-            for (int c = 0; c < C; ++c) sum[k * C + c] += (1 - double(coverage[p])) * adjoint[p * C + c];
+            for (int c = 0; c < C; ++c) sum[c] += (1 - double(coverage[p])) * adjoint[p * C + c];
+        return sum;
     });
-    for (int64_t k = 0; k < Team::blocks(pixels); ++k)
-        for (int c = 0; c < C; ++c) grad[c] += sum[k * C + c];
+    for (const std::vector<double>& sum : parts)
+        for (int c = 0; c < C; ++c) grad[c] += sum[c];
 }
 
 // Which terms are asked for.
@@ -269,9 +270,8 @@ BackwardProfile& BackwardProfile::operator+=(const BackwardProfile& o) {
 
 void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,
                const Gradients& grad) {
-    const int64_t V = q_bar.size() / 3, blocks = Team::blocks(V);
-    std::vector<double> sum(grad.world_to_camera ? 12 * blocks : 0, 0.0);
-    team.each_block(V, [&](int64_t k, int64_t first, int64_t last) {
+    const auto parts = team.of_blocks(q_bar.size() / 3, [&](int64_t first, int64_t last) {
+        std::array<double, 12> sum{};
         for (int64_t v = first; v < last; ++v) {
             const double *q = q_bar.data() + 3 * v, *p = verts + 3 * v;
             if (q[0] == 0 && q[1] == 0 && q[2] == 0) continue;
@@ -281,15 +281,16 @@ void add_world(const Camera& window, const double* verts, const Array<double>& q
             }
             if (grad.world_to_camera)
                 for (int i = 0; i < 3; ++i) {
-                    for (int j = 0; j < 3; ++j) sum[12 * k + 4 * i + j] += q[i] * p[j];
-                    sum[12 * k + 4 * i + 3] += q[i];
+                    for (int j = 0; j < 3; ++j) sum[4 * i + j] += q[i] * p[j];
+                    sum[4 * i + 3] += q[i];
                 }
         }
+        return sum;
     });
     if (grad.world_to_camera)
-        for (int64_t k = 0; k < blocks; ++k)
+        for (const auto& sum : parts)
             for (int j = 0; j < 4; ++j) {
-                const double* column = sum.data() + 12 * k + j;
+                const double* column = sum.data() + j;
                 const Vec3 m = transposed_times(window.turn, {column[0], column[4], column[8]});
                 double* to = grad.world_to_camera + j;
                 to[0] += m.x, to[4] += m.y, to[8] += m.z;

@@ -21,11 +21,10 @@ class SampleBudget {
     // `coverage` (H · W): of the image, which cast `spp` rays in each pixel. Rays that hit nothing cost little.
     template <class T>
     SampleBudget(const T* coverage, int64_t pixels, int spp, bool lit, Team& team) : cost_(lit ? shaded : plain) {
-        std::vector<int64_t> covered(Team::blocks(pixels), 0);
-        team.each_block(pixels, [&](int64_t k, int64_t first, int64_t last) {
-            covered[k] = std::count_if(coverage + first, coverage + last, [](T c) { return c > 0; });
+        const auto covered = team.of_blocks(pixels, [&](int64_t first, int64_t last) {
+            return std::count_if(coverage + first, coverage + last, [](T c) { return c > 0; });
         });
-        for (const int64_t c : covered) rays_ += share_of_image * double(c) * spp;
+        for (const auto c : covered) rays_ += share_of_image * double(c) * spp;
     }
 
     // As many as are wanted, if they cost no more than the rays of the image; else these are shared in proportion to

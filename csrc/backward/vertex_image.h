@@ -32,16 +32,16 @@ Array<T> adjoint_at_vertices(const FilteredAdjoint<T>& filtered, const VertexVie
 // Adds cotangents of places in the image (V, 2) to those of camera coordinates and of K.
 template <class T>
 void add_places(const BackwardView<T>& view, const Array<double>& x_bar, Destination& to) {
-    const int64_t V = view.scene.n_verts, blocks = Team::blocks(V);
-    std::vector<IntrinsicsGrad> intrinsics(blocks);
-    view.team.each_block(V, [&](int64_t k, int64_t first, int64_t last) {
+    const auto intrinsics = view.team.of_blocks(view.scene.n_verts, [&](int64_t first, int64_t last) {
+        IntrinsicsGrad sum;
         for (int64_t v = first; v < last; ++v) {
             const Vec2 x{x_bar[2 * v], x_bar[2 * v + 1]};
             if (x.x == 0 && x.y == 0) continue;
             Vec3 q;
-            project_vjp(view.camera, view.vertices.q[v], x, q, intrinsics[k]);
+            project_vjp(view.camera, view.vertices.q[v], x, q, sum);
             to.q[3 * v] += q.x, to.q[3 * v + 1] += q.y, to.q[3 * v + 2] += q.z;
         }
+        return sum;
     });
     for (const IntrinsicsGrad& g : intrinsics) to.k += g;
 }

@@ -174,7 +174,6 @@ void CoincidentCurves::fill(Team& team) {
 // Buckets are shared by what follows end to end along a line, too. Where one holds many, all of them are kept unasked.
 void CoincidentCurves::find_companions(const Systematic& samples, Team& team) {
     constexpr uint32_t many = 64;
-    std::vector<std::vector<Companion>> parts(Team::blocks(segments_.size()));
     const auto any_beside = [&](const ImageSegment& s, const LineBuckets::Line& l) {
         uint64_t keys[4];
         LineBuckets::keys_around(l, keys);
@@ -193,14 +192,16 @@ void CoincidentCurves::find_companions(const Systematic& samples, Team& team) {
         }
         return false;
     };
-    team.each_block(segments_.size(), [&](int64_t k, int64_t first, int64_t last) {
+    const auto parts = team.of_blocks(segments_.size(), [&](int64_t first, int64_t last) {
+        std::vector<Companion> part;
         for (int64_t i = first; i < last; ++i) {
             if (!samples.may_draw(segments_[i].curve)) continue;
             bool found = false;
             lines_.each_cell(segments_[i],
                              [&](const LineBuckets::Line& l) { found = found || any_beside(segments_[i], l); });
-            if (found) parts[k].push_back({segments_[i].edge, uint32_t(i)});
+            if (found) part.push_back({segments_[i].edge, uint32_t(i)});
         }
+        return part;
     });
     for (const auto& part : parts) companions_.insert(companions_.end(), part.begin(), part.end());
     std::sort(companions_.begin(), companions_.end(),

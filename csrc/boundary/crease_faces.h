@@ -109,20 +109,18 @@ class CreaseFaces {
 
     // Bounds for all faces, of what else would be asked of each edge: how large coordinates and how coarse they are.
     void set_largest() {
-        const int64_t V = view_.scene.n_verts;
-        std::vector<Vec3> parts(Team::blocks(V));
-        view_.team.each_block(V, [&](int64_t k, int64_t first, int64_t last) {
+        const auto parts = view_.team.of_blocks(view_.scene.n_verts, [&](int64_t first, int64_t last) {
             double most[3] = {};
             for (int64_t v = first; v < last; ++v)
                 for (int i = 0; i < 3; ++i) most[i] = std::max(most[i], std::fabs(view_.scene.verts[3 * v + i]));
-            parts[k] = {most[0], most[1], most[2]};
+            return Vec3{most[0], most[1], most[2]};
         });
         for (const Vec3& m : parts) {
             const double of_part[3] = {m.x, m.y, m.z};
             for (int i = 0; i < 3; ++i) by_axis_[i] = std::max(by_axis_[i], of_part[i]);
         }
         largest_ = std::max({by_axis_[0], by_axis_[1], by_axis_[2]});
-        spacing_ = *std::max_element(view_.scene.spacing->value.begin(), view_.scene.spacing->value.end());
+        spacing_ = view_.scene.spacing->coarsest();
         const double margin = 2 * (view_.importance.radius() + 1);
         pixels_ = 2 * (view_.camera.width + view_.camera.height + 2 * margin);
     }

@@ -55,13 +55,14 @@ struct JumpScale {
 template <class Number>
 double mean_size(const Number* values, int64_t rows, const double* weights, int width, Team& team) {
     if (rows == 0 || width == 0) return 0;
-    std::vector<double> sum(Team::blocks(rows), 0.0);
-    team.each_block(rows, [&](int64_t k, int64_t first, int64_t last) {
+    const std::vector<double> parts = team.of_blocks(rows, [&](int64_t first, int64_t last) {
+        double sum = 0;
         for (int64_t i = first; i < last; ++i)
-            for (int c = 0; c < width; ++c) sum[k] += weights[c] * std::fabs(values[i * width + c]);
+            for (int c = 0; c < width; ++c) sum += weights[c] * std::fabs(values[i * width + c]);
+        return sum;
     });
     double all = 0;
-    for (const double s : sum) all += s;
+    for (const double part : parts) all += part;
     return all / double(rows);
 }
 
@@ -74,13 +75,15 @@ JumpScale jump_scale(const BackwardView<T>& view) {
     JumpScale out{std::vector<double>(C, 1.0)};
     if (C > R) {
         const int64_t pixels = int64_t(view.camera.width) * view.camera.height;
-        std::vector<double> sum(Team::blocks(pixels) * C, 0.0);
-        view.team.each_block(pixels, [&](int64_t k, int64_t first, int64_t last) {
+        const auto parts = view.team.of_blocks(pixels, [&](int64_t first, int64_t last) {
+            std::vector<double> sum(C, 0.0);
             for (int64_t p = first; p < last; ++p)
-                for (int c = 0; c < C; ++c) sum[k * C + c] += std::fabs(view.adjoint.of(p)[c]);
+                for (int c = 0; c < C; ++c) sum[c] += std::fabs(view.adjoint.of(p)[c]);
+            return sum;
         });
         std::fill(out.weights.begin(), out.weights.end(), 0.0);
-        for (size_t i = 0; i < sum.size(); ++i) out.weights[i % C] += sum[i] / double(pixels);
+        for (const std::vector<double>& sum : parts)
+            for (int c = 0; c < C; ++c) out.weights[c] += sum[c] / double(pixels);
     }
     const double* weights = out.weights.data();
     out.unknown = mean_size(scene.colors, scene.n_colors, weights, R, view.team);
@@ -374,15 +377,18 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
     const int64_t n = int64_t(all.size());
     if (n == 0) return;
     const JumpScale scale = jump_scale(view);
-    std::vector<CurvesFound> found(Team::blocks(n));
-    std::vector<std::vector<MeasuredIntersection>> parts(found.size());
-    std::vector<double> sized(found.size(), 0.0);  // Σ pixels · size
-    view.team.each_block(n, [&](int64_t k, int64_t first, int64_t last) {
+    struct Part {
+        std::vector<MeasuredIntersection> lines;
+        int64_t found = 0;
+        double pixels = 0, sized = 0, squares = 0;  // Σ pixels, Σ pixels · size, Σ measure²
+    };
+    const std::vector<Part> parts = view.team.of_blocks(n, [&](int64_t first, int64_t last) {
+        Part part;
         IntersectionSize<N, T> size_of(view, scale);
         for (int64_t i = first; i < last; ++i) {
             IntersectionCurve c;
             if (!find_intersection(view, out.finder.facing(), all[i], c)) continue;
-            ++found[k].intersections;
+            ++part.found;
             const auto [low, high] = view.camera.image_box(c.low(), c.high());
             const double importance = view.importance.mean(low, high);
             if (!(importance > 0)) continue;
@@ -390,19 +396,20 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
             const double pixels = c.length * view.camera.stretch(c.low(), c.high()) *
                                   (hiding ? view.occlusion.factor(occluded, hiding, view.image.spp) : 1);
             const double size = size_of(c);
-            found[k].pixels += pixels, sized[k] += pixels * size;
-            found[k].unknown += std::pow(pixels * size * importance, 2);
-            parts[k].push_back({pixels * size * importance, int32_t(i)});
+            part.pixels += pixels, part.sized += pixels * size;
+            part.squares += std::pow(pixels * size * importance, 2);
+            part.lines.push_back({pixels * size * importance, int32_t(i)});
         }
+        return part;
     });
-    double pixels = 0, all_sized = 0;
-    for (size_t k = 0; k < parts.size(); ++k) pixels += found[k].pixels, all_sized += sized[k];
+    double pixels = 0, sized = 0;
+    for (const Part& part : parts) pixels += part.pixels, sized += part.sized;
     const double share = share_of_length * std::sqrt(view.geometry.intersections().each_stands_for()),
-                 scaled = all_sized > 0 ? share * pixels / all_sized : 0;
-    for (size_t k = 0; k < parts.size(); ++k) {
-        out.pixels += found[k].pixels, out.intersections += found[k].intersections;
-        out.squares += scaled * scaled * found[k].unknown, out.unknown += scaled * scaled * found[k].unknown;
-        for (const MeasuredIntersection& i : parts[k]) out.intersection.push_back({scaled * i.measure, i.index});
+                 scaled = sized > 0 ? share * pixels / sized : 0;
+    for (const Part& part : parts) {
+        out.pixels += part.pixels, out.intersections += part.found;
+        out.squares += scaled * scaled * part.squares, out.unknown += scaled * scaled * part.squares;
+        for (const MeasuredIntersection& i : part.lines) out.intersection.push_back({scaled * i.measure, i.index});
     }
 }
 
@@ -419,16 +426,15 @@ void measure_rim(const BackwardView<T>& view, Curves<T>& out) {
 // Silhouettes and borders.
 template <class T>
 std::vector<std::vector<ImageSegment>> silhouettes(const BackwardView<T>& view, const CurveFinder<T>& finder) {
-    const int64_t E = view.geometry.topology().n_edges();
-    std::vector<std::vector<ImageSegment>> parts(Team::blocks(E));
-    view.team.each_block(E, [&](int64_t k, int64_t first, int64_t last) {
+    return view.team.of_blocks(view.geometry.topology().n_edges(), [&](int64_t first, int64_t last) {
+        std::vector<ImageSegment> part;
         finder.each(first, last, typename CurveFinder<T>::NoCreases(), [&](int64_t e) {
             Curve c;
             if (finder.find(e, c) && !c.is_crease() && std::isfinite(c.length))
-                parts[k].push_back(image_segment(view, c, 0));
+                part.push_back(image_segment(view, c, 0));
         });
+        return part;
     });
-    return parts;
 }
 
 }  // namespace
@@ -459,10 +465,11 @@ void Curves<T>::add_segments(const BackwardView<T>& view, bool all) {
         return image_segment(view, c, k);
     };
     if (all) {
-        std::vector<std::vector<ImageSegment>> hidden(Team::blocks(int64_t(curve.size())));
-        view.team.each_block(int64_t(curve.size()), [&](int64_t part, int64_t first, int64_t last) {
+        auto hidden = view.team.of_blocks(int64_t(curve.size()), [&](int64_t first, int64_t last) {
+            std::vector<ImageSegment> part;
             for (int64_t k = first; k < last; ++k)
-                if (curve[k].hidden) hidden[part].push_back(segment(k));
+                if (curve[k].hidden) part.push_back(segment(k));
+            return part;
         });
         segments.insert(segments.end(), std::make_move_iterator(hidden.begin()), std::make_move_iterator(hidden.end()));
     }
@@ -473,8 +480,10 @@ void Curves<T>::add_segments(const BackwardView<T>& view, bool all) {
             for (const ImageSegment& s : segments[part]) marks.mark(s.a, s.b, s.reach);
         });
     view.team.each(int64_t(clear.size()), [&](int64_t part) {
+        std::vector<ImageSegment> near;
         for (const ClearCrease& c : clear[part])
-            if (all || marks.any(c.cells)) segments[part].push_back(segment(c.curve));
+            if (all || marks.any(c.cells)) near.push_back(segment(c.curve));
+        segments[part].insert(segments[part].end(), near.begin(), near.end());
     });
 }
 
@@ -513,22 +522,23 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool
     for (const CurvesFound& f : found)
         out.pixels += f.pixels, out.silhouettes += f.silhouettes, out.creases += f.creases, out.squares += f.squares,
             out.unknown += f.unknown;
-    int64_t n = 0;
-    for (const auto& part : curves) n += int64_t(part.size());
+    std::vector<int64_t> first{0};  // of each part, in all
+    for (const auto& part : curves) first.push_back(first.back() + int64_t(part.size()));
+    const int64_t n = first.back();
     measure_intersections<N>(view, out);
     if (rim) measure_rim(view, out);
-    out.curve.reserve(n), out.measure = Array<double>(n + int64_t(out.intersection.size()) + out.arcs());
+    out.curve = Array<MeasuredCurve>(n), out.measure = Array<double>(n + int64_t(out.intersection.size()) + out.arcs());
     int64_t next = n;
     for (const MeasuredIntersection& i : out.intersection) out.measure[next++] = i.measure;
     if (out.rim_curve)
         for (const RimArc& arc : out.rim_curve->arcs) out.measure[next++] = arc.measure;
-    for (size_t k = 0; k < curves.size(); ++k) {
-        for (ImageSegment& s : out.segments[k]) s.curve += int32_t(out.curve.size());
-        for (ClearCrease& c : out.clear[k]) c.curve += int32_t(out.curve.size());
-        out.any_hidden |= any_hidden[k];
-        for (const MeasuredCurve& c : curves[k])
-            out.measure[int64_t(out.curve.size())] = c.measure, out.curve.push_back(c);
-    }
+    view.team.each(int64_t(curves.size()), [&](int64_t k) {
+        for (ImageSegment& s : out.segments[k]) s.curve += int32_t(first[k]);
+        for (ClearCrease& c : out.clear[k]) c.curve += int32_t(first[k]);
+        std::copy(curves[k].begin(), curves[k].end(), out.curve.begin() + first[k]);
+        for (size_t i = 0; i < curves[k].size(); ++i) out.measure[first[k] + int64_t(i)] = curves[k][i].measure;
+    });
+    out.any_hidden = std::find(any_hidden.begin(), any_hidden.end(), 1) != any_hidden.end();
     return out;
 }
 

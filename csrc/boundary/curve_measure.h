@@ -44,7 +44,7 @@ constexpr int64_t bytes_per_curve() {
 template <class T>
 struct Curves : CurvesFound {
     CurveFinder<T> finder;
-    std::vector<MeasuredCurve> curve;                // those where the loss looks, by ascending edges
+    Array<MeasuredCurve> curve{0};                   // those where the loss looks, by ascending edges
     std::vector<MeasuredIntersection> intersection;  // after them, those of faces that pass through each other
     std::optional<RimCurve> rim_curve;               // and after these the rim of what a lens shows, if it is asked for
     Array<double> measure{0};                        // of all

@@ -138,10 +138,11 @@ class ShadowEdgeFinder {
 
     std::vector<ShadowPiece> find(int64_t tests) const {
         const int64_t edges = view_.geometry.topology().n_edges();
-        std::vector<std::vector<int64_t>> may(Team::blocks(edges));
-        view_.team.each_block(edges, [&](int64_t k, int64_t begin, int64_t end) {
+        const auto may = view_.team.of_blocks(edges, [&](int64_t begin, int64_t end) {
+            std::vector<int64_t> part;
             for (int64_t e = begin; e < end; ++e)
-                if (may_cast(e)) may[k].push_back(e);
+                if (may_cast(e)) part.push_back(e);
+            return part;
         });
         int64_t asking = 0;
         for (const auto& part : may) asking += int64_t(part.size());
@@ -149,7 +150,9 @@ class ShadowEdgeFinder {
         std::vector<std::vector<ShadowPiece>> parts(may.size());
         view_.team.each(int64_t(may.size()), [&](int64_t k) {
             EdgeWedge<T> wedge(view_, faces_);
-            for (const int64_t e : may[k]) add(e, asked, wedge, parts[k]);
+            std::vector<ShadowPiece> part;
+            for (const int64_t e : may[k]) add(e, asked, wedge, part);
+            parts[k] = std::move(part);
         });
         int64_t edges_found = 0;
         for (const auto& block : parts)

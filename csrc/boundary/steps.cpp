@@ -55,13 +55,14 @@ class StepLines {
           shift_{to_unit(hash(view.options.seed, 5, gradient_stream)),
                  to_unit(hash(view.options.seed, 6, gradient_stream))} {
         const SceneView<T>& scene = view.scene;
-        std::vector<std::vector<LinedFace>> parts(Team::blocks(scene.n_faces));
-        view.team.each_block(scene.n_faces, [&](int64_t k, int64_t first, int64_t last) {
+        const auto parts = view.team.of_blocks(scene.n_faces, [&](int64_t first, int64_t last) {
+            std::vector<LinedFace> part;
             VisiblePolygon polygon;
             for (int64_t f = first; f < last; ++f)
                 if (StepFinder<T>::may_step(scene, f) &&
                     polygon.set(view.camera, view.volume, view.vertices, scene.faces + 3 * f))
-                    add(int32_t(f), polygon, parts[k]);
+                    add(int32_t(f), polygon, part);
+            return part;
         });
         for (const auto& part : parts)
             for (LinedFace face : part) {

@@ -54,10 +54,11 @@ class Array {
     int64_t size_;
 };
 
-inline Array<double> zeros(int64_t n, Team& team) {
-    Array<double> a(n);
+template <class T = double>
+Array<T> zeros(int64_t n, Team& team) {
+    Array<T> a(n);
     team.each_block(
-        n, [&](int64_t, int64_t first, int64_t last) { std::fill(&a[first], &a[first] + (last - first), 0.0); });
+        n, [&](int64_t, int64_t first, int64_t last) { std::fill(a.begin() + first, a.begin() + last, T(0)); });
     return a;
 }
 

@@ -108,6 +108,14 @@ class Team {
     void each_block(int64_t n, Body body) {
         each(blocks(n), [&](int64_t k) { body(k, k * block, std::min(n, (k + 1) * block)); });
     }
+    // What body(first, last) returns for each block, in their order. Each is made on the thread's own stack: threads
+    // that write beside one another in an array wait for each other's caches.
+    template <class Body>
+    auto of_blocks(int64_t n, Body body) {
+        std::vector<decltype(body(n, n))> out(blocks(n));
+        each_block(n, [&](int64_t k, int64_t first, int64_t last) { out[k] = body(first, last); });
+        return out;
+    }
 
    private:
     const int threads_;

@@ -8,8 +8,7 @@ namespace edgegrad {
 ReachablePixels::ReachablePixels(const Camera& camera, const RayCaster& caster, const Array<Vec3>& q, double radius,
                                  Team& team)
     : width_(camera.width), margin_(radius + 1) {
-    std::vector<Bounds> of_block(Team::blocks(q.size()));
-    team.each_block(q.size(), [&](int64_t k, int64_t first, int64_t last) {
+    const auto of_block = team.of_blocks(q.size(), [&](int64_t first, int64_t last) {
         Bounds b;
         for (int64_t v = first; v < last; ++v) {
             if (!caster.uses(v)) continue;
@@ -24,7 +23,7 @@ ReachablePixels::ReachablePixels(const Camera& camera, const RayCaster& caster, 
             if (far < 1e5) b.add(2, x.x + x.y), b.add(3, x.x - x.y);
             else b.low[2] = b.low[3] = -infinite, b.high[2] = b.high[3] = infinite;
         }
-        of_block[k] = b;
+        return b;
     });
     for (const Bounds& b : of_block)
         for (int k = 0; k < 4; ++k) bounds_.add(k, b.low[k]), bounds_.add(k, b.high[k]);

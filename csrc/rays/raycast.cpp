@@ -215,8 +215,7 @@ void RayCaster::set_frame(const double* verts, Team& team) {
         double weight = 0;
         int64_t faces = 0, powers = 0;  // those that have a side; log₂ of its square, summed
     };
-    std::vector<Block> of_faces(Team::blocks(n_faces_));
-    team.each_block(n_faces_, [&](int64_t k, int64_t first, int64_t last) {
+    const auto of_faces = team.of_blocks(n_faces_, [&](int64_t first, int64_t last) {
         Block block;
         for (int64_t f = first; f < last; ++f) {
             if (constexpr int ahead = 16; f + ahead < last)
@@ -230,7 +229,7 @@ void RayCaster::set_frame(const double* verts, Team& team) {
             block.sum += w * (a - base + (b - base) + (c - base));
         }
         block.sum = (1.0 / 3) * block.sum;
-        of_faces[k] = block;
+        return block;
     });
     Block all;
     for (const Block& b : of_faces)
@@ -239,13 +238,15 @@ void RayCaster::set_frame(const double* verts, Team& team) {
     centre = base + (1 / all.weight) * all.sum;
     if (!std::isfinite(centre.x + centre.y + centre.z)) centre = base;
 
-    std::vector<double> farthest(Team::blocks(n_verts_), 0.0);
-    team.each_block(n_verts_, [&](int64_t k, int64_t first, int64_t last) {
+    const Vec3 from = centre;
+    const std::vector<double> farthest = team.of_blocks(n_verts_, [&](int64_t first, int64_t last) {
+        double most = 0;
         for (int64_t v = first; v < last; ++v) {
             if (!uses(v)) continue;
-            const Vec3 p = vertex(v) - centre;
-            farthest[k] = std::max(farthest[k], dot(p, p));
+            const Vec3 p = vertex(v) - from;
+            most = std::max(most, dot(p, p));
         }
+        return most;
     });
     unit = std::sqrt(*std::max_element(farthest.begin(), farthest.end())), radius = 1;
     if (!(unit > 0)) unit = 1;  // a single point

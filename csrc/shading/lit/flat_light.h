@@ -47,8 +47,8 @@ inline Array<double> light_on_flat_faces(const FlatFaces& of, const std::vector<
     };
     const int64_t L = int64_t(lights.size());
     Array<double> out(3 * of.n_faces * L);
-    std::vector<double> greatest(Team::blocks(of.n_faces), 0.0);
-    team.each_block(of.n_faces, [&](int64_t k, int64_t first, int64_t last) {
+    const std::vector<double> greatest = team.of_blocks(of.n_faces, [&](int64_t first, int64_t last) {
+        double most = 0;
         for (int64_t f = first; f < last; ++f) {
             const int32_t* v = of.faces + 3 * f;
             const Vec3 corner[3] = {at(v[0]), at(v[1]), at(v[2])};
@@ -62,12 +62,13 @@ inline Array<double> light_on_flat_faces(const FlatFaces& of, const std::vector<
                 const double d = dot(n, light.infinite ? light.place : light.place - corner[0]);
                 const double distance = std::fabs(towards) < edge_on ? std::fabs(d) : std::max(d, 0.0);
                 for (int i = 0; i < 3; ++i) {
-                    const double E = distance * light.arriving_over_distance(corner[i]);
-                    out[(3 * f + i) * L + l] = E;
-                    greatest[k] = std::max(greatest[k], E);
+                    const double irradiance = distance * light.arriving_over_distance(corner[i]);
+                    out[(3 * f + i) * L + l] = irradiance;
+                    most = std::max(most, irradiance);
                 }
             }
         }
+        return most;
     });
     const double scale = 1 / std::max(*std::max_element(greatest.begin(), greatest.end()), 1e-300);
     team.each_block(out.size(), [&](int64_t, int64_t first, int64_t last) {
