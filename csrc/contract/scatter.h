@@ -71,10 +71,11 @@ class RowBuffer {
         for (const Rows& r : rows_)
             for (size_t k = 0; k < r.count; ++k) visit(r.index[k], r.value.data() + k * width_);
     }
-    void add_to(double* destination, int owner) const {
-        if (width_ == 2) add_to<2>(destination, rows_[owner]);
-        else if (width_ == 3) add_to<3>(destination, rows_[owner]);
-        else add_to<0>(destination, rows_[owner]);
+    template <class Number>
+    void add_to(Number* destination, int owner) const {
+        if (width_ == 2) add_rows<2>(destination, rows_[owner]);
+        else if (width_ == 3) add_rows<3>(destination, rows_[owner]);
+        else add_rows<0>(destination, rows_[owner]);
     }
 
    private:
@@ -87,11 +88,11 @@ class RowBuffer {
         int64_t index = -1;
         uint32_t owner = 0, row = 0;
     };
-    template <int W>
-    void add_to(double* destination, const Rows& r) const {
+    template <int W, class Number>
+    void add_rows(Number* destination, const Rows& r) const {
         const int width = W ? W : width_;
         for (size_t k = 0; k < r.count; ++k)
-            for (int c = 0; c < width; ++c) destination[r.index[k] * width + c] += r.value[k * width + c];
+            for (int c = 0; c < width; ++c) destination[r.index[k] * width + c] += Number(r.value[k * width + c]);
     }
     static constexpr int n_recent = 256;
     static constexpr size_t fewest_rows = 16;  // that a buffer has room for as soon as there is one

@@ -308,6 +308,32 @@ void check_seen(const LitArrays& lit, const LitPoints& points, const LitOptions&
 }
 int64_t faces_of(const LitArrays& lit) { return lit.scene.meshes.back().first_face + lit.scene.meshes.back().faces; }
 
+// The cotangent of a table, in its type. Of a table in float the sums are floats too if it is large, for then few
+// samples go to each row, and the doubles of a texture would take longer to come to memory than to be added to.
+class Cotangent {
+   public:
+    Cotangent(const Table& table, bool wanted, Team& team) : table_(table) {
+        if (!wanted) return;
+        const int64_t n = table.rows * table.width;
+        if (table.wide || n < large) wide_ = zeros(n, team);
+        else narrow_ = zeros<float>(n, team);
+    }
+    TableBar bar() { return {wide_.empty() ? nullptr : wide_.data(), narrow_.empty() ? nullptr : narrow_.data()}; }
+    void finish(Team& team) {
+        if (!table_.wide && !wide_.empty()) narrow_ = to_float(wide_, team);
+    }
+    nb::object take() {
+        const std::vector<size_t> shape{size_t(table_.rows), size_t(table_.width)};
+        return table_.wide ? shaped(std::move(wide_), shape) : shaped(std::move(narrow_), shape);
+    }
+
+   private:
+    static constexpr int64_t large = 1 << 16;
+    const Table& table_;
+    Array<double> wide_{0};
+    Array<float> narrow_{0};
+};
+
 // Cotangents of the tables (None where they are not wanted) and of b: compute(to, b_bar, team) adds and writes them.
 template <class Compute>
 nb::tuple cotangents(const LitArrays& lit, const LitPoints& points, const In<double, 2>& bar,
@@ -315,26 +341,19 @@ nb::tuple cotangents(const LitArrays& lit, const LitPoints& points, const In<dou
     if (int64_t(bar.shape(0)) != points.size || int(bar.shape(1)) != lit.scene.channels)
         refuse("bar: expected a row a point");
     if (wanted.size() != lit.scene.tables.size()) refuse("wanted: expected a number for each table");
-    std::vector<Array<double>> found;
-    std::vector<Array<float>> narrow;  // of tables in float
+    std::vector<Cotangent> found;
     Array<double> b_bar(3 * points.size);
     unlocked(threads, [&](Team& team) {
-        std::vector<double*> to;
+        std::vector<TableBar> to;
         for (size_t i = 0; i < wanted.size(); ++i) {
-            found.push_back(zeros(wanted[i] ? lit.scene.tables[i].rows * lit.scene.tables[i].width : 0, team));
-            to.push_back(wanted[i] ? found[i].data() : nullptr);
+            found.emplace_back(lit.scene.tables[i], wanted[i], team);
+            to.push_back(found[i].bar());
         }
         compute(to, b_bar.data(), team);
-        for (size_t i = 0; i < wanted.size(); ++i)
-            narrow.push_back(lit.scene.tables[i].wide ? Array<float>(0) : to_float(found[i], team));
+        for (Cotangent& cotangent : found) cotangent.finish(team);
     });
     nb::list out;
-    for (size_t i = 0; i < found.size(); ++i) {
-        const Table& table = lit.scene.tables[i];
-        const std::vector<size_t> shape{size_t(table.rows), size_t(table.width)};
-        if (!wanted[i]) out.append(nb::none());
-        else out.append(table.wide ? shaped(std::move(found[i]), shape) : shaped(std::move(narrow[i]), shape));
-    }
+    for (size_t i = 0; i < found.size(); ++i) out.append(wanted[i] ? found[i].take() : nb::none());
     return nb::make_tuple(out, shaped(std::move(b_bar), {size_t(points.size), 3}));
 }
 

@@ -408,7 +408,7 @@ namespace {
 
 // Calls body(first, last, cotangents) for chunks of points, and adds these up.
 template <class Body>
-void add_cotangents(const LitScene& lit, int64_t points, const std::vector<double*>& to, Team& team, Body body) {
+void add_cotangents(const LitScene& lit, int64_t points, const std::vector<TableBar>& to, Team& team, Body body) {
     std::vector<Cotangents> chunks;
     double seconds[2] = {};
     scatter_in_waves(
@@ -419,7 +419,7 @@ void add_cotangents(const LitScene& lit, int64_t points, const std::vector<doubl
 }  // namespace
 
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               const double* bar, const std::vector<double*>& to, double* b_bar, Team& team) {
+               const double* bar, const std::vector<TableBar>& to, double* b_bar, Team& team) {
     const std::vector<LightSample> lights = light_samples(lit, options);
     std::fill(b_bar, b_bar + 3 * points.size, 0.0);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
@@ -434,7 +434,7 @@ void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& o
 template <class T>
 void look_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster,
                         const LitPoints& points, const LitOptions& options, const double* bar,
-                        const std::vector<double*>& to, double* b_bar, Team& team) {
+                        const std::vector<TableBar>& to, double* b_bar, Team& team) {
     std::fill(b_bar, b_bar + 3 * points.size, 0.0);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
         const auto room = shade_room(lit, options);
@@ -480,8 +480,8 @@ template void shade(const LitScene&, const SceneView<float>&, const RayCaster&, 
 template void shade(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&, const LitOptions&,
                     double*, int8_t*, Team&);
 template void look_and_shade_vjp(const LitScene&, const SceneView<float>&, const RayCaster&, const LitPoints&,
-                                 const LitOptions&, const double*, const std::vector<double*>&, double*, Team&);
+                                 const LitOptions&, const double*, const std::vector<TableBar>&, double*, Team&);
 template void look_and_shade_vjp(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&,
-                                 const LitOptions&, const double*, const std::vector<double*>&, double*, Team&);
+                                 const LitOptions&, const double*, const std::vector<TableBar>&, double*, Team&);
 
 }  // namespace edgegrad

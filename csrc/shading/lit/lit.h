@@ -99,15 +99,15 @@ std::shared_ptr<ShadeRoom> shade_room(const LitScene& lit, const LitOptions& opt
 template <class T>
 void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                 const LitOptions& options, ShadeRoom& room, double* radiance, int8_t* seen);
-// From what shade() found. Adds to the cotangents of the tables, null where none is wanted, and writes those of b (N,
+// From what shade() found. Adds to the cotangents of the tables, and writes those of b (N,
 // 3).
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               const double* bar, const std::vector<double*>& to, double* b_bar, Team& team);
+               const double* bar, const std::vector<TableBar>& to, double* b_bar, Team& team);
 // The same at once, of points of which only derivatives are wanted: what each sees is found here.
 template <class T>
 void look_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster,
                         const LitPoints& points, const LitOptions& options, const double* bar,
-                        const std::vector<double*>& to, double* b_bar, Team& team);
+                        const std::vector<TableBar>& to, double* b_bar, Team& team);
 // For the tangents of the tables, and of b (N, 3).
 void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
                const double* b_dot, double* radiance_dot, Team& team);

@@ -41,13 +41,21 @@ struct Table {
     }
 };
 
+// Where the cotangents of a table are added up, in double or in float; neither where none are wanted.
+struct TableBar {
+    double* wide = nullptr;
+    float* narrow = nullptr;
+
+    bool is_wanted() const { return wide || narrow; }
+};
+
 // What the points of one chunk give, a buffer for each table; those of tables that are not wanted take nothing.
 class Cotangents {
    public:
-    void prepare(const std::vector<Table>& tables, const std::vector<double*>& to, int owners) {
+    void prepare(const std::vector<Table>& tables, const std::vector<TableBar>& to, int owners) {
         of_.resize(tables.size());
         for (size_t i = 0; i < tables.size(); ++i) {
-            if (to[i]) of_[i].prepare(tables[i].width, owners);
+            if (to[i].is_wanted()) of_[i].prepare(tables[i].width, owners);
             of_[i].clear();
         }
     }
@@ -67,9 +75,11 @@ class Cotangents {
         for (int c = 0; c < channels; ++c) sum += bar[c];
         of_[table].add(row, &sum);
     }
-    void add_to(const std::vector<double*>& to, int owner) const {
-        for (size_t i = 0; i < to.size(); ++i)
-            if (to[i]) of_[i].add_to(to[i], owner);
+    void add_to(const std::vector<TableBar>& to, int owner) const {
+        for (size_t i = 0; i < to.size(); ++i) {
+            if (to[i].wide) of_[i].add_to(to[i].wide, owner);
+            if (to[i].narrow) of_[i].add_to(to[i].narrow, owner);
+        }
     }
 
    private:
