@@ -15,10 +15,11 @@ from ._request import Request
 
 
 class Term(NamedTuple):
-    """Σ k(x − c) · value over points of an image, or that times what is behind; its derivatives alone."""
+    """Σ k(x − c) · weight · value over points of an image, or that times what is behind; its derivatives alone."""
 
     x: Tensor  # (S, 2)
     values: Tensor  # (S, C), or (S, 1) if anything is behind
+    weight: Tensor | None = None  # (S,) float64, or else 1
     behind: Tensor | None = None  # (H · W, C) or (1, C)
 
 
@@ -30,9 +31,9 @@ def splat(x: Tensor, values: Tensor, request: Request) -> Tensor:
 def attached(image: Tensor, terms: Sequence[Term], request: Request) -> Tensor:
     """The image (H · W, C), with the derivatives of terms by their values; these have none of their own, for how samples'
     places and their visibility change is not known."""
-    columns = zip(*terms, strict=True) if terms else ((), (), ())
-    x, values, behind = map(list, columns)
-    return apply(_Attached(Film.of(request), len(terms)), [image, *values, *x, *behind])[0]
+    values = (term.values for term in terms)
+    fixed = (part for term in terms for part in (term.x, term.weight, term.behind))
+    return apply(_Attached(Film.of(request), len(terms)), [image, *values, *fixed])[0]
 
 
 class Film(NamedTuple):
@@ -48,9 +49,10 @@ class Film(NamedTuple):
         """(H · W, C)"""
         return torch.from_numpy(core.splat(doubles(x), doubles(values), *self)).to(values)
 
-    def adjoint(self, x: Tensor | None, bar: Tensor) -> Tensor:
+    def adjoint(self, x: Tensor | None, bar: Tensor, weight: Tensor | None = None) -> Tensor:
         """(S, C)"""
-        return torch.from_numpy(core.splat_vjp(doubles(x), array(bar), *self, torch.get_num_threads())).to(bar)
+        found = core.splat_vjp(doubles(x), array(bar), *self, torch.get_num_threads(), doubles(weight))
+        return torch.from_numpy(found).to(bar.device)
 
 
 class _Splat(NamedTuple):
@@ -75,7 +77,7 @@ class _Splat(NamedTuple):
 
 
 class _Attached(NamedTuple):
-    """Of the tensors (image, *values, *x, *behind) of so many terms."""
+    """Of the tensors (image, *values, and x, weight and what is behind of each) of so many terms."""
 
     film: Film
     terms: int
@@ -84,10 +86,10 @@ class _Attached(NamedTuple):
     def moving(self) -> Sequence[int]:
         return range(1 + self.terms)
 
-    def _places(self, tensors: Tensors) -> list[tuple[Tensor | None, Tensor | None]]:
-        """x and what is behind."""
-        x, behind = tensors[1 + self.terms : 1 + 2 * self.terms], tensors[1 + 2 * self.terms :]
-        return list(zip(x, behind, strict=True))
+    def _fixed(self, tensors: Tensors) -> list[tuple[Tensor | None, ...]]:
+        """x, the weight and what is behind."""
+        rest = tensors[1 + self.terms :]
+        return list(zip(rest[::3], rest[1::3], rest[2::3], strict=True))
 
     def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
         image = tensors[0]
@@ -98,17 +100,17 @@ class _Attached(NamedTuple):
         check_finite("the gradient of the image", bar.reshape(self.film.height, self.film.width, -1))
         none = bar.new_zeros(0)
         found = [bar.clone() if wanted[0] else none]
-        for want, (x, behind) in zip(wanted[1:], self._places(tensors), strict=True):
+        for want, (x, weight, behind) in zip(wanted[1:], self._fixed(tensors), strict=True):
             seen = bar if behind is None or not want else (bar * behind).sum(1, keepdim=True)
-            found.append(self.film.adjoint(x, seen) if want else none)
+            found.append(self.film.adjoint(x, seen, weight) if want else none)
         return found
 
     def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
         image = tensors[0]
         assert image is not None
         total = torch.zeros_like(image) if tangents[0] is None else tangents[0].clone()
-        for tangent, (x, behind) in zip(tangents[1:], self._places(tensors), strict=True):
+        for tangent, (x, weight, behind) in zip(tangents[1:], self._fixed(tensors), strict=True):
             if tangent is not None:
-                moved = self.film.sum(x, tangent)
+                moved = self.film.sum(x, tangent if weight is None else weight[:, None] * tangent)
                 total = total + (moved if behind is None else moved * behind).to(total)
         return total

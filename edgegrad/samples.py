@@ -212,12 +212,12 @@ class SurfaceSamples:
         faces, for its weights stand for areas of the image and not for shares of a pixel's samples. Raises TypeError or
         ValueError that names the argument."""
         radiance = _rows("radiance", radiance, len(self))
-        term = self._term(radiance)
-        return self.frame.composed(splat(term.x, term.values, self.frame.request), None)
+        weighted = self.weight.to(radiance.dtype)[:, None] * radiance
+        return self.frame.composed(splat(self._records.x, weighted, self.frame.request), None)
 
     def _term(self, radiance: Tensor) -> Term:
         """The same, for attached()."""
-        return Term(self._records.x, self.weight.to(radiance.dtype)[:, None] * radiance)
+        return Term(self._records.x, radiance, self._records.weight)
 
 
 class EdgeSamples:
@@ -425,7 +425,7 @@ def boundary(
     terms = [Term(x, velocity * jump)]
     if background is not None and to_background is not None:
         behind = background.detach().reshape(-1, jump.shape[1]).to(jump)
-        terms.append(Term(x, velocity * to_background.to(jump.dtype)[:, None], behind))
+        terms.append(Term(x, velocity * to_background.to(jump.dtype)[:, None], behind=behind))
     return terms
 
 

@@ -155,23 +155,31 @@ nb::object splat(In<double, 2> x, In<double, 2> values, const std::string& filte
     return rows(std::move(out), {C});
 }
 
-// Its adjoint: Σ k(x − c) · image over the pixels (H · W, C), for points x: (S, C).
+// Its adjoint: Σ k(x − c) · image over the pixels (H · W, C), for points x, times their weights (S,) if there are any:
+// (S, C).
 template <class T>
-nb::object splat_vjp(In<double, 2> x, In<T, 2> image, const std::string& filter, int width, int height, int threads) {
+nb::object splat_vjp(In<double, 2> x, In<T, 2> image, const std::string& filter, int width, int height, int threads,
+                     const std::optional<In<double, 1>>& weight) {
     const Places places = places_of(x);
     const size_t C = image.shape(1);
     if (image.shape(0) != size_t(width) * size_t(height)) refuse("image: expected a row for each pixel");
+    if (weight && int64_t(weight->size()) != places.size) refuse("weight: expected a number for each point");
     const FilteredPixels pixels(make_filter(filter), width, height);
-    std::vector<double> out(size_t(places.size) * C);
+    Array<T> out(places.size * int64_t(C));
     unlocked(threads, [&](Team& team) {
         team.each_block(places.size, [&](int64_t, int64_t first, int64_t last) {
-            for (int64_t i = first; i < last; ++i)
+            std::vector<double> sum(C);
+            for (int64_t i = first; i < last; ++i) {
+                std::fill(sum.begin(), sum.end(), 0.0);
                 pixels.around(places[i], [&](int64_t p, double w) {
-                    for (size_t c = 0; c < C; ++c) out[size_t(i) * C + c] += w * image.data()[size_t(p) * C + c];
+                    for (size_t c = 0; c < C; ++c) sum[c] += w * double(image.data()[size_t(p) * C + c]);
                 });
+                for (size_t c = 0; c < C; ++c)
+                    out[i * int64_t(C) + int64_t(c)] = T((weight ? (*weight)(size_t(i)) : 1) * sum[c]);
+            }
         });
     });
-    return rows(std::move(out), {C});
+    return shaped(std::move(out), {size_t(places.size), C});
 }
 
 template <class T>
@@ -268,7 +276,7 @@ void bind_for_shaders(nb::module_& m) {
     m.def("splat", &splat, "x"_a.noconvert(), "values"_a.noconvert(), "filter"_a, "width"_a, "height"_a);
     const auto bind_vjp = [&](auto function) {
         m.def("splat_vjp", function, "x"_a.noconvert(), "image"_a.noconvert(), "filter"_a, "width"_a, "height"_a,
-              "threads"_a);
+              "threads"_a, "weight"_a.noconvert() = nb::none());
     };
     bind_vjp(&splat_vjp<float>), bind_vjp(&splat_vjp<double>);
     m.def("most_shadow_samples", &most_shadow_samples, "width"_a, "height"_a, "spp"_a);
