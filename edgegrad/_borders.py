@@ -15,16 +15,16 @@ from ._check import values_visible
 from ._steps import FLOOR
 from .hits import Hits
 
-MOST = 8  # points of a face in a pixel
-SHARE = 4  # so many times the points of the first look, in all
+MOST = 8  # times the points of a face in a pixel
+SHARE = 4  # times the points of the first look, in all
 LEVELS = 1 << 14  # after which the sides of a step repeat here, so that small integers hold them
 
 
 class Borders:
-    """Of an image of `size` (height, width), from the first look at all of its pixels."""
+    """Of an image of `size` (height, width), from the first look at all of its pixels, at so many points of a face in each."""
 
-    def __init__(self, size: tuple[int, int]) -> None:
-        self._size = size
+    def __init__(self, size: tuple[int, int], points: int) -> None:
+        self._size, self._each = size, points
         self._points = torch.zeros(size[0] * size[1], dtype=torch.int32)
         self._least: list[Tensor] = []  # (H · W,) for each step
         self._greatest: list[Tensor] = []
@@ -60,7 +60,7 @@ class Borders:
             low, high = -_around(-least.reshape(self._size), -LEVELS), _around(greatest.reshape(self._size), -1)
             differ |= (low < high) & (high >= 0)
         first, there = int(self._points.sum()), int(self._points[differ.reshape(-1)].sum())
-        return differ, min(MOST, max(2, SHARE * first // max(there, 1)))
+        return differ, self._each * min(MOST, max(2, SHARE * first // max(there, 1)))
 
 
 def _sides(kind: str, values: Tensor) -> Tensor:

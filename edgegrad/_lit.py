@@ -31,7 +31,7 @@ from .hits import Hits
 from .lights import Light, LightPoints, SphericalHarmonics
 from .samples import Frame
 from .scene import Scene, image_dtype
-from .shader import Effort, render_shaded
+from .shader import Effort, render_shaded, shaded_points
 
 FEWEST_IN_PENUMBRA = 4  # points of a face in a pixel that are shaded, at least; else a quarter of its samples
 
@@ -64,7 +64,8 @@ class Lighting(NamedTuple):
             )
         # Each point sees another one of a light with an extent.
         extended = any(not light.punctual for light in scene.casting)
-        points = max(FEWEST_IN_PENUMBRA, request.image.spp // 4) if extended else 1
+        spp = request.image.spp
+        points = max(FEWEST_IN_PENUMBRA, spp // 4) if extended else shaded_points(spp)
         fused = is_fused(scene)
         adds_up = not scene.blends
         whole = (lambda frame: _whole(frame, self, points)) if fused and adds_up else None

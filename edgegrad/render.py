@@ -49,8 +49,9 @@ def render(
     """The image (H, W, C) of a scene, or (B, H, W, C) for a batch of cameras: linear radiance, row 0 on top.
 
     spp              samples a pixel of the image. In lit scenes and around shaders they find what covers a pixel; a face in it is
-                     shaded at one of them, under lights with an extent at up to a quarter of them, where a border runs
-                     through at up to 8: for less noise of shading render a larger image, and average
+                     shaded at one of each 16 of them, under lights with an extent at up to a quarter of them, where a border
+                     runs through at up to 8 times as many: for less noise of shading at the same time render a larger
+                     image, and average
     seed             the same seed gives the same bits, image and gradient, at any number of threads; cameras of a batch
                      get samples of their own. With a constant seed, each step of an optimisation repeats the samples of
                      image and gradient, and their error does not average out: pass seed=step
@@ -71,7 +72,7 @@ def render(
                      faces it hit, which says where to put them
     shader           a function or module of Hits that gives the radiance (N, C) of N points, in place of the meshes' colours
                      and textures: any PyTorch, as long as each point is by itself. It is asked once for each face in a
-                     pixel, in parts of some 131,072 points. Where it jumps within a face, that has a gradient if it says so by
+                     pixel, and for each 16 samples, in parts of some 131,072 points. Where it jumps within a face, that has a gradient if it says so by
                      hits.where(), hits.floor() or a nearest lookup
     creases          at which edges between two visible faces the shader may jump: "auto", where a property of the hits
                      jumps that it asked for (normals; texture coordinates at seams; attributes of interpolate(); all

@@ -39,13 +39,21 @@ Shader = Callable[[Hits], Tensor]
 
 # Points that a shader is given at once: with three layers of 64 numbers each takes some kilobytes.
 AT_ONCE = 1 << 17
+# So many samples of a pixel on one face are shaded at one of them: a face once at the usual number, and more often the more
+# there are, so that what shading leaves of noise falls with them too.
+SAMPLES_A_POINT = 16
 CREASES = ("auto", True, False)
+
+
+def shaded_points(spp: int) -> int:
+    """Of a face in a pixel with so many samples."""
+    return max(1, spp // SAMPLES_A_POINT)
 
 
 class Effort(NamedTuple):
     """What shading an image takes."""
 
-    points: int = 1  # of a face in a pixel that are shaded
+    points: int  # of a face in a pixel that are shaded
     # The values (H · W, C) of a whole image at once, or None where points are to be shaded one by one.
     whole: Callable[[Frame], Tensor | None] | None = None
     blended: bool = False  # whether one may see through surfaces
@@ -76,7 +84,7 @@ def render_shaded(
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
-    effort = effort or Effort()
+    effort = effort or Effort(shaded_points(request.image.spp))
     with shaded_room(request, textured=effort.lit and scene.textured_faces is not None):
         images = [
             _Image(Frame(scene, request, k), shader, creases, check, effort).render() for k in range(request.cameras)
@@ -134,9 +142,9 @@ class _Image:
     def _point_by_point(self) -> Tensor:
         """(H · W, C) what surfaces add to the image."""
         frame = self._frame
-        borders = Borders((frame.height, frame.width))
-        parts: list[Tensor] = []
         points = self._effort.points
+        borders = Borders((frame.height, frame.width), points)
+        parts: list[Tensor] = []
         for pixels, found in frame.sampler.pixel_hits(self._effort.at_once, points):
             seeds = frame.seeds_of_pixels("image", found.pixel, points)
             sums, hits = self._shaded(found, pixels, seeds)

@@ -491,6 +491,26 @@ def test_shading_once_is_unbiased():
     assert float(once.var(0).mean()) > 2 * float(every.var(0).mean())
 
 
+@pytest.mark.parametrize("lit", [False, True])
+def test_noise_of_shading_falls_with_samples(lit):
+    """16 times as many samples, a quarter of the noise."""
+    scene = textured()
+    texture = torch.rand((32, 32, 1), generator=torch.Generator().manual_seed(1), dtype=F64)
+    mesh = scene.meshes[0].replace(texture=texture)
+    lamp = eg.PointLight(torch.tensor([2.0, 3.0, 2.5], dtype=F64), 20.0)
+    scene = eg.Scene([mesh.replace(material=eg.Material())], lights=[lamp]) if lit else eg.Scene([mesh])
+    more = {} if lit else {"shader": by_hand(scene)}
+
+    def images(spp: int) -> Tensor:
+        with torch.no_grad():
+            return torch.stack([eg.render(scene, front_camera(SIZE), spp=spp, seed=k, **more) for k in range(12)])
+
+    few, many = images(16), images(256)
+    noise = (few.var(0).mean() / many.var(0).mean()).sqrt()
+    assert 3.2 < float(noise) < 5.5
+    assert abs(float(few.mean() / many.mean()) - 1) < 0.01
+
+
 def test_a_batch_of_attributes_of_faces_under_vmap():
     mesh, camera = icosphere(1), front_camera(SIZE)
     colors = torch.rand((3, len(mesh.faces), 2), generator=torch.Generator().manual_seed(0), dtype=F64)

@@ -10,8 +10,8 @@ namespace edgegrad {
 
 namespace {
 
-constexpr int most_again = 8;   // points of a face in a pixel that is shaded again
-constexpr int share_again = 4;  // so many times the points of the first look, in all
+constexpr int most_again = 8;   // times the points of a face in a pixel, where it is shaded again
+constexpr int share_again = 4;  // times the points of the first look, in all
 
 // What is seen of punctual lamps in the pixels of an image, and how many points were shaded there.
 class Sights {
@@ -31,7 +31,7 @@ class Sights {
             if (const int8_t s = seen[columns_[l]]; s != not_asked) here[l] |= s ? visible : hidden;
     }
 
-    // Pixels that borders run through, and how many points of each face in them are to be shaded.
+    // Pixels that borders run through, and how many times as many points of each face in them are to be shaded.
     int borders(std::vector<uint8_t>& pixels, Team& team) const {
         pixels.assign(points_.size(), 0);
         if (columns_.empty()) return 0;
@@ -156,8 +156,8 @@ LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Cam
     look({0, camera.height, sampling.points}, sampling.seed);
     if (!looks_again) return out;
     std::vector<uint8_t> borders;
-    if (const int points = sights->borders(borders, team))
-        look({0, camera.height, points, borders.data()}, sampling.again);
+    if (const int times = sights->borders(borders, team))
+        look({0, camera.height, times * sampling.points, borders.data()}, sampling.again);
     return out;
 }
 

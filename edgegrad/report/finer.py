@@ -1,4 +1,5 @@
-"""Images as means of finer ones: a face in the light is shaded about once a pixel, however many samples that has."""
+"""Images as means of finer ones: a face in the light is shaded about once for 16 samples of a pixel, of many small pixels each
+in a place of its own."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class Problem:
     image      (scene, camera) ↦ the image without sampling, where there are finite differences
     equal      parts ↦ (scene, camera) with the same image, of which they are taken; `make` when None
     steps      of those, one for each part
-    finer      so many times as many pixels each way, of which they take the mean: a lit face is shaded about once a pixel
+    finer      so many times as many pixels each way, of which they take the mean (report/finer.py)
     zero       of the adjoint's norm: what a reference may be by rounding that is zero
     reference  in words
     """
