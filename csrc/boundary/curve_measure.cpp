@@ -7,7 +7,9 @@
 #include "boundary/crease_control.h"
 #include "boundary/crease_faces.h"
 #include "boundary/crease_visibility.h"
-#include "boundary/intersection_source.h"
+#include "boundary/hidden_curves.h"
+#include "boundary/intersection_measure.h"
+#include "boundary/jump_scale.h"
 #include "core/channels.h"
 
 namespace edgegrad {
@@ -25,12 +27,6 @@ double samples_per_pixel(bool lit) { return lit ? 6 : 24; }
 // that all vertices share feels silhouettes more than creases, nor than takes a few milliseconds.
 constexpr double least_rest = 1.0 / 5, least_samples = 1 << 12;
 
-// How few samples a silhouette gets if it lies behind what the image hit (occlusion.h). Never none, for it may be
-// visible all the same; a gap may run along it, so that fewer rays than elsewhere find it. What was merely not hit
-// counts in full: at the limb of a fine mesh the faces beside a silhouette are a hundredth of a pixel wide and hit by
-// chance. Of creases more is known: crease_visibility.h.
-constexpr OcclusionHint::Few occluded{.rays = 8, .share = 1.0 / 256, .least = 1.0 / 16};
-
 // How far, in pixels, a ray may miss the points of a curve. A hundredth where it would be more: by then the image shows
 // floats, not faces.
 template <class T>
@@ -45,62 +41,6 @@ double reach_of_rays(const BackwardView<T>& view, const Curve& c) {
                     std::min(view.camera.pixels_per_unit / std::min(c.w0, c.w1) * error, Crossings::float_reach));
 }
 
-// What the sizes of jumps in all channels are compared by.
-struct JumpScale {
-    std::vector<double> weights;  // of the channels
-    double unknown = 0;           // the size of a jump of which nothing is known: Σ_c weight_c · (mean |L_c|)
-};
-
-// Mean of Σ_c weight_c |value_c| over all rows.
-template <class Number>
-double mean_size(const Number* values, int64_t rows, const double* weights, int width, Team& team) {
-    if (rows == 0 || width == 0) return 0;
-    const std::vector<double> parts = team.of_blocks(rows, [&](int64_t first, int64_t last) {
-        double sum = 0;
-        for (int64_t i = first; i < last; ++i)
-            for (int c = 0; c < width; ++c) sum += weights[c] * std::fabs(values[i * width + c]);
-        return sum;
-    });
-    double all = 0;
-    for (const double part : parts) all += part;
-    return all / double(rows);
-}
-
-// The channels of radiance have one unit. Attributes have units of their own, so there a channel counts as much as the
-// loss looks at it.
-template <class T>
-JumpScale jump_scale(const BackwardView<T>& view) {
-    const SceneView<T>& scene = view.scene;
-    const int C = scene.channels, R = scene.radiance;
-    JumpScale out{std::vector<double>(C, 1.0)};
-    if (C > R) {
-        const int64_t pixels = int64_t(view.camera.width) * view.camera.height;
-        const auto parts = view.team.of_blocks(pixels, [&](int64_t first, int64_t last) {
-            std::vector<double> sum(C, 0.0);
-            for (int64_t p = first; p < last; ++p)
-                for (int c = 0; c < C; ++c) sum[c] += std::fabs(view.adjoint.of(p)[c]);
-            return sum;
-        });
-        std::fill(out.weights.begin(), out.weights.end(), 0.0);
-        for (const std::vector<double>& sum : parts)
-            for (int c = 0; c < C; ++c) out.weights[c] += sum[c] / double(pixels);
-    }
-    const double* weights = out.weights.data();
-    out.unknown = mean_size(scene.colors, scene.n_colors, weights, R, view.team);
-    if (C > R) {
-        const Attributes& a = scene.attributes;
-        weights += R;
-        if (a.alpha) out.unknown += *weights++;
-        out.unknown += mean_size(a.vertex, scene.n_verts, weights, a.vertex_width, view.team);
-        weights += a.vertex_width;
-        out.unknown += mean_size(a.face, scene.n_faces, weights, a.face_width, view.team);
-        weights += a.face_width;
-        for (int i = 0; i < 3 * a.barycentrics; ++i) out.unknown += *weights++ / 3;
-        if (a.uv) out.unknown += mean_size(scene.uvs, scene.n_uvs, weights, 2, view.team);
-    }
-    return out;
-}
-
 template <class T>
 ImageSegment image_segment(const BackwardView<T>& view, const Curve& c, int64_t curve) {
     return {.edge = int32_t(c.edge),
@@ -110,13 +50,6 @@ ImageSegment image_segment(const BackwardView<T>& view, const Curve& c, int64_t 
             .reach = reach_of_rays(view, c),
             .rounding = c.rounding,
             .depth = c.nearest_depth()};
-}
-
-// In how many pixels a curve is behind all that was hit; 0: not in all of them.
-inline int64_t hiding_pixels(const OcclusionHint& occlusion, Vec2 low, Vec2 high, double nearest) {
-    const bool small = std::max(high.x - low.x, high.y - low.y) <= 2 * OcclusionHint::reach;
-    if (small && occlusion.hides_around(0.5 * (low + high), nearest)) return OcclusionHint::pixels_around;
-    return occlusion.hiding_pixels(low, high, nearest);
 }
 
 // What tells of creases without a sample.
@@ -320,98 +253,6 @@ class MeasuredEdges {
     std::optional<CreaseVisibility<T>> visibility_;
     Jump asked_[CreaseVisibility<T>::most];
 };
-
-// How much a line where faces pass through each other counts beside another one: by how the radiance differs at its
-// ends, which is known, and by how far it moves with the faces, which is far where their planes are nearly the same.
-template <int N, class T>
-class IntersectionSize {
-   public:
-    IntersectionSize(const BackwardView<T>& view, const JumpScale& scale) : view_(view), scale_(scale) {}
-
-    // Per pixel of its length.
-    double operator()(const IntersectionCurve& c) {
-        planes_.set(view_, c);
-        const Vec2 n0 = normalised(view_.camera, c.x0), n1 = normalised(view_.camera, c.x1);
-        const double moved =
-            planes_.as_silhouette(view_.camera, c.a.z, n0) + planes_.as_silhouette(view_.camera, c.b.z, n1);
-        return within(0.5 * moved / c.length, 64) * within(jump(*c.faces, n0, n1) / scale_.unknown, 2);
-    }
-
-   private:
-    // Not so little that a sample stands for too much, where ends do not tell of what lies between them.
-    static double within(double x, double most) { return x > 1.0 / 64 ? std::min(x, most) : 1.0 / 64; }
-
-    // The size of the mean where textures would have to be asked.
-    double jump(const Intersection& i, Vec2 n0, Vec2 n1) {
-        const SceneView<T>& scene = view_.scene;
-        if (is_textured(scene, i.face[0]) || is_textured(scene, i.face[1])) return scale_.unknown;
-        jump_.assign(2 * scene.channels, 0.0);
-        for (int k = 0; k < 2; ++k) {
-            const Barycentrics a = barycentrics_of_hit(planes_.map[k], n0), b = barycentrics_of_hit(planes_.map[k], n1);
-            const double sign = k ? -1 : 1;
-            each_corner_value<N>(scene, i.face[k], [&](int c, double c0, double c1, double c2) {
-                jump_[2 * c] += sign * (c0 + a.u * (c1 - c0) + a.v * (c2 - c0));
-                jump_[2 * c + 1] += sign * (c0 + b.u * (c1 - c0) + b.v * (c2 - c0));
-            });
-        }
-        double sum = 0;
-        for (int c = 0; c < scene.channels; ++c)
-            sum += scale_.weights[c] * (std::fabs(jump_[2 * c]) + std::fabs(jump_[2 * c + 1]));
-        return 0.5 * sum;
-    }
-
-    const BackwardView<T>& view_;
-    const JumpScale& scale_;
-    IntersectionPlanes planes_;
-    std::vector<double> jump_;  // of each channel, at either end
-};
-
-// Lines where faces pass through each other: those where the loss looks, appended to `out.intersection`. What is known
-// of their jumps tells how they compare with one another. Of silhouettes it is not known, so together they count as
-// half their length, for where they are many most join what is near in space too; and as more where each stands for
-// several that were not drawn.
-constexpr double share_of_length = 0.5;
-template <int N, class T>
-void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
-    const auto& all = view.geometry.intersections().all();
-    const int64_t n = int64_t(all.size());
-    if (n == 0) return;
-    const JumpScale scale = jump_scale(view);
-    struct Part {
-        std::vector<MeasuredIntersection> lines;
-        int64_t found = 0;
-        double pixels = 0, sized = 0, squares = 0;  // Σ pixels, Σ pixels · size, Σ measure²
-    };
-    const std::vector<Part> parts = view.team.of_blocks(n, [&](int64_t first, int64_t last) {
-        Part part;
-        IntersectionSize<N, T> size_of(view, scale);
-        for (int64_t i = first; i < last; ++i) {
-            IntersectionCurve c;
-            if (!find_intersection(view, out.finder.facing(), all[i], c)) continue;
-            ++part.found;
-            const auto [low, high] = view.camera.image_box(c.low(), c.high());
-            const double importance = view.importance.mean(low, high);
-            if (!(importance > 0)) continue;
-            const int64_t hiding = hiding_pixels(view.occlusion, low, high, c.nearest_depth());
-            const double pixels = c.length * view.camera.stretch(c.low(), c.high()) *
-                                  (hiding ? view.occlusion.factor(occluded, hiding, view.image.spp) : 1);
-            const double size = size_of(c);
-            part.pixels += pixels, part.sized += pixels * size;
-            part.squares += std::pow(pixels * size * importance, 2);
-            part.lines.push_back({pixels * size * importance, int32_t(i)});
-        }
-        return part;
-    });
-    double pixels = 0, sized = 0;
-    for (const Part& part : parts) pixels += part.pixels, sized += part.sized;
-    const double share = share_of_length * std::sqrt(view.geometry.intersections().each_stands_for()),
-                 scaled = sized > 0 ? share * pixels / sized : 0;
-    for (const Part& part : parts) {
-        out.pixels += part.pixels, out.intersections += part.found;
-        out.squares += scaled * scaled * part.squares, out.unknown += scaled * scaled * part.squares;
-        for (const MeasuredIntersection& i : part.lines) out.intersection.push_back({scaled * i.measure, i.index});
-    }
-}
 
 // The rim of what the lens shows, where the loss looks. Nothing is known of the jump.
 template <class T>

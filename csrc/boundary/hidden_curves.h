@@ -1,0 +1,25 @@
+// Curves that lie behind what the image hit.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+
+#include "backward/occlusion.h"
+#include "core/math.h"
+
+namespace edgegrad {
+
+// How few samples a silhouette gets if it lies behind what the image hit (occlusion.h). Never none, for it may be
+// visible all the same; a gap may run along it, so that fewer rays than elsewhere find it. What was merely not hit
+// counts in full: at the limb of a fine mesh the faces beside a silhouette are a hundredth of a pixel wide and hit by
+// chance. Of creases more is known: crease_visibility.h.
+constexpr OcclusionHint::Few occluded{.rays = 8, .share = 1.0 / 256, .least = 1.0 / 16};
+
+// In how many pixels a curve is behind all that was hit; 0: not in all of them.
+inline int64_t hiding_pixels(const OcclusionHint& occlusion, Vec2 low, Vec2 high, double nearest) {
+    const bool small = std::max(high.x - low.x, high.y - low.y) <= 2 * OcclusionHint::reach;
+    if (small && occlusion.hides_around(0.5 * (low + high), nearest)) return OcclusionHint::pixels_around;
+    return occlusion.hiding_pixels(low, high, nearest);
+}
+
+}  // namespace edgegrad
