@@ -72,8 +72,8 @@ def render(
                      faces it hit, which says where to put them
     shader           a function or module of Hits that gives the radiance (N, C) of N points, in place of the meshes' colours
                      and textures: any PyTorch, as long as each point is by itself. It is asked once for each face in a
-                     pixel, and for each 16 samples, in parts of some 131,072 points. Where it jumps within a face, that has a gradient if it says so by
-                     hits.where(), hits.floor() or a nearest lookup
+                     pixel, and for each 16 samples, in parts of some 131,072 points. Where it jumps within a face, that has a
+                     gradient if it says so by hits.where(), hits.floor() or a nearest lookup
     creases          at which edges between two visible faces the shader may jump: "auto", where a property of the hits
                      jumps that it asked for (normals; texture coordinates at seams; attributes of interpolate(); all
                      edges if it asked for `face` or `barycentrics`); True, at all; False, at none
