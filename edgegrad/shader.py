@@ -53,7 +53,7 @@ def shaded_points(spp: int) -> int:
 class Effort(NamedTuple):
     """What shading an image takes."""
 
-    points: int  # of a face in a pixel that are shaded
+    points: int = 1  # of a face in a pixel that are shaded
     # The values (H · W, C) of a whole image at once, or None where points are to be shaded one by one.
     whole: Callable[[Frame], Tensor | None] | None = None
     blended: bool = False  # whether one may see through surfaces

@@ -33,12 +33,13 @@ Vector<S> towards_viewer(const LitScene& lit, Vector<S> y) {
     return lit.perspective ? unit(eye - y) : eye;
 }
 
+// Written in place: it is large, and its scattering comes later.
 template <class S>
-Surface<S> surface(const LitScene& lit, int64_t face, const S* b) {
-    Surface<S> o;
+void set_surface(const LitScene& lit, int64_t face, const S* b, Surface<S>& o) {
     const std::vector<Table>& tables = lit.tables;
     o.mesh = &lit.mesh_of(face);
     o.at = {face - o.mesh->first_face, lit.faces + 3 * face, o.mesh->first_vertex, {b[0], b[1], b[2]}};
+    o.y = Vector<S>();
     for (int i = 0; i < 3; ++i) {
         o.frame.corner[i] = tables[lit.verts].vector_at<S>(o.at.vertex[i]);
         o.y += o.at.b[i] * o.frame.corner[i];
@@ -48,7 +49,6 @@ Surface<S> surface(const LitScene& lit, int64_t face, const S* b) {
     o.side = dot(plain(o.frame.g), plain(o.v)) >= 0 ? 1 : -1;
     o.g = o.side * o.frame.g;
     o.n = o.mesh->normal.is_flat() ? o.g : o.side * shading_normal(tables, o.mesh->normal, o.at, o.frame);
-    return o;
 }
 
 // The base colour, and what else scatters.
@@ -356,7 +356,7 @@ void look(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caste
     const size_t K = lights.size();
     room.surfaces.resize(points.size);
     for (int64_t i = 0; i < points.size; ++i)
-        if (wanted(i)) room.surfaces[i] = surface<double>(lit, points.face[i], points.b + 3 * i);
+        if (wanted(i)) set_surface<double>(lit, points.face[i], points.b + 3 * i, room.surfaces[i]);
     // Light by light, for rays that are cast together are the faster the more alike they are.
     for (size_t k = 0; k < K; ++k) {
         const Lamp& lamp = lit.lamps[lights[k].lamp];
@@ -424,7 +424,8 @@ void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& o
     std::fill(b_bar, b_bar + 3 * points.size, 0.0);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
         for (int64_t i = first; i < last; ++i) {
-            Surface<double> o = surface<double>(lit, points.face[i], points.b + 3 * i);
+            Surface<double> o;
+            set_surface<double>(lit, points.face[i], points.b + 3 * i, o);
             radiance_vjp(lit, points, options, lights, i, o, seen + i * lights.size(), bar + i * lit.channels,
                          b_bar + 3 * i, chunk);
         }
@@ -463,7 +464,8 @@ void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& o
         for (int64_t i = first; i < last; ++i) {
             Dual b[3], total[most_lit_channels];
             for (int k = 0; k < 3; ++k) b[k] = {points.b[3 * i + k], b_dot ? b_dot[3 * i + k] : 0};
-            Surface<Dual> o = surface<Dual>(lit, points.face[i], b);
+            Surface<Dual> o;
+            set_surface<Dual>(lit, points.face[i], b, o);
             look_up_material(lit, o);
             radiance<Dual>(lit, points, options, lights, i, o, seen + i * lights.size(), total);
             for (int c = 0; c < lit.channels; ++c) radiance_dot[i * lit.channels + c] = total[c].dot;
