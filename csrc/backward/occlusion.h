@@ -87,9 +87,9 @@ class OcclusionHint {
     };
     // The same where it is `least` with 16 samples a pixel: fewer miss more of what shows through a gap.
     static double factor(double least, int spp) { return std::min(1.0, least * std::max(1.0, 16.0 / spp)); }
-    double factor(Few few, int64_t pixels, int spp) const {
+    double factor(Few few, double pixels, int spp) const {
         const double most = std::max(1 / few.least, few.share * width_ * height_);
-        return 1 / std::clamp(spp * double(pixels) / few.rays, 1.0, most);
+        return 1 / std::clamp(spp * pixels / few.rays, 1.0, most);
     }
 
    private:

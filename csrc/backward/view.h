@@ -57,6 +57,15 @@ uint8_t side_of(const BackwardView<T>& view, int64_t face) {
     return view.camera.side(q[0], q[1], q[2]);
 }
 
+// What the density of samples is multiplied by on a face, and on curves beside it, of which so many px² lie in view:
+// less where rays of the image should have hit it and none did, for it is most likely occluded. By no less than an
+// eighth: a strip of it may show, and along a curve, too narrow for rays to find.
+template <class T>
+double where_unhit(const BackwardView<T>& view, int64_t face, double area) {
+    constexpr OcclusionHint::Few unhit{.rays = 16, .share = 0, .least = 1.0 / 8};
+    return view.seen[face] ? 1 : view.occlusion.factor(unhit, area, view.image.spp);
+}
+
 // Whether a face that the ray at n meets is there, not cut out.
 template <class T>
 bool is_there(const BackwardView<T>& view, int64_t face, Vec2 n) {

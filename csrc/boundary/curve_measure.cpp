@@ -184,7 +184,9 @@ class MeasuredEdges {
             add_crease(c, jump, hiding);
         } else {
             segments.push_back(image_segment(view_, c, jump.curve));
-            measure(c, jump, hiding ? view_.occlusion.factor(occluded, hiding, view_.image.spp) : 1);
+            measure(c, jump,
+                    std::min(hiding ? view_.occlusion.factor(occluded, double(hiding), view_.image.spp) : 1,
+                             beside_unhit(view_, c.minus.face >= 0 ? c.minus.face : c.plus.face)));
         }
     }
 

@@ -85,8 +85,10 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
             const double importance = view.importance.mean(low, high);
             if (!(importance > 0)) continue;
             const int64_t hiding = hiding_pixels(view.occlusion, low, high, c.nearest_depth());
-            const double pixels = c.length * view.camera.stretch(c.low(), c.high()) *
-                                  (hiding ? view.occlusion.factor(occluded, hiding, view.image.spp) : 1);
+            const double samples =
+                std::min(hiding ? view.occlusion.factor(occluded, double(hiding), view.image.spp) : 1,
+                         std::max(beside_unhit(view, all[i].face[0]), beside_unhit(view, all[i].face[1])));
+            const double pixels = c.length * view.camera.stretch(c.low(), c.high()) * samples;
             const double size = size_of(c);
             part.pixels += pixels, part.sized += pixels * size;
             part.squares += std::pow(pixels * size * importance, 2);

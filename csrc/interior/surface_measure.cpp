@@ -49,6 +49,10 @@ constexpr double large = 256;
 // is not wide, px. From `widest` on its corners say little.
 constexpr double least = 1.0 / 16, wide = 32, widest = 64;
 
+// Neighbours that were hit say that a face is visible unless so many rays should have hit it and none did: samples
+// would have to take away all that the control of a hidden face adds.
+constexpr double most_unhit = 4;
+
 // A face this long, px, has each of its points within OcclusionHint::reach of a corner: two thirds of the longest side
 // are the most that a point of a triangle is away from the nearest.
 constexpr double small = 1.5 * OcclusionHint::reach;
@@ -238,9 +242,10 @@ class MeasuredChunk {
     // `side()` says from which side the face would be visible.
     template <class Side>
     double default_samples(int64_t f, const Extent& e, ImageHits::Face hits, Side side) const {
-        const double m = (e.area + e.longest) * rate(f);
+        const double m = (e.area + e.longest) * rate(f), unhit = where_unhit(view_, f, e.area);
         const int64_t hiding = view_.seen[f] ? 0 : view_.occlusion.hiding_pixels(e.low, e.high, e.nearest);
-        if (hits.partly) return hiding ? m * OcclusionHint::factor(occluded_beside_hits, view_.image.spp) : m;
+        if (hits.partly)
+            return m * std::min(hiding ? OcclusionHint::factor(occluded_beside_hits, view_.image.spp) : 1, unhit);
         if (hiding) return m * hidden(hiding);
         return m * view_.hits->where_missed(view_.scene.faces[3 * f], side());
     }
@@ -284,8 +289,9 @@ class MeasuredChunk {
                 default_samples(f, extent, seen, [&] { return (l.wedge[i] > 0) == (view_.camera.k_det > 0) ? 1 : 2; });
             // One without texture and so small that its corners say what is between them. A face that comes near the
             // eye is not affine in the image.
-            if (seen.whole && l.longest[i] <= widest && view_.options.controls && !is_textured(view_.scene, f) &&
-                view_.camera.is_nearly_affine(l.depths[i])) {
+            const bool is_hit = view_.seen[f] || view_.image.spp * area < most_unhit;
+            if (is_hit && seen.whole && l.longest[i] <= widest && view_.options.controls &&
+                !is_textured(view_.scene, f) && view_.camera.is_nearly_affine(l.depths[i])) {
                 controlled_[i] = any = true;
                 clear_[i] = seen.clear;
                 gather_control(i);
