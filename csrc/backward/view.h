@@ -9,6 +9,7 @@
 #include "backward/occlusion.h"
 #include "camera/vertices.h"
 #include "contract/scatter.h"
+#include "core/sobol.h"
 #include "film/importance.h"
 #include "shading/surface.h"
 
@@ -55,6 +56,16 @@ template <class T>
 uint8_t side_of(const BackwardView<T>& view, int64_t face) {
     const auto q = corners_of(view, face);
     return view.camera.side(q[0], q[1], q[2]);
+}
+
+// Of 256 × 256 cells of the image, on the Z-order curve, that in which a vertex lies; the last one of what is out of view.
+template <class T>
+uint16_t cell_of(const BackwardView<T>& view, int32_t vertex) {
+    if (view.vertices.outcode[vertex]) return UINT16_MAX;
+    const double per_pixel = 256.0 / std::max(view.camera.width, view.camera.height);
+    const auto index = [&](double x) { return uint32_t(std::clamp(x * per_pixel, 0.0, 255.0)); };
+    const Vec2 x = view.vertices.x[vertex];
+    return uint16_t(z_order(index(x.x), index(x.y)));
 }
 
 // What the density of samples is multiplied by on a face, and on curves beside it, of which so many px² lie in view:

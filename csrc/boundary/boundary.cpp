@@ -12,6 +12,7 @@
 #include "boundary/edge_source.h"
 #include "boundary/intersection_source.h"
 #include "boundary/rim_source.h"
+#include "core/draws.h"
 #include "core/sampler.h"
 #include "core/systematic.h"
 
@@ -29,33 +30,36 @@ struct Witness {
     }
 };
 
+// Edges, lines where faces pass through each other, and the rim of a lens, in their order as primitives.
+enum Kind { on_edges, on_intersections, on_rim };
+
+template <class T>
+OrderedDraws ordered(const BackwardView<T>& view, const Curves<T>& curves, const Systematic& systematic, int64_t n) {
+    const int64_t edges = curves.curve.size(), lines = edges + int64_t(curves.intersection.size());
+    const auto cell = [&](int64_t k) -> uint16_t {
+        if (k >= lines) return 0;
+        if (k >= edges) {
+            const Intersection& i = view.geometry.intersections().all()[curves.intersection[k - edges].index];
+            return cell_of(view, view.scene.faces[3 * int64_t(i.face[0])]);
+        }
+        const HalfEdge& h = view.geometry.topology().half_edges(curves.curve[k].edge)[0];
+        return cell_of(view, vertex(view.scene, h, h.first()));
+    };
+    return {systematic, n, {edges, lines, lines + curves.arcs()}, cell, view.team};
+}
+
 // Some of the samples.
 struct Drawn {
-    const Systematic& systematic;
+    const OrderedDraws& draws;
     int64_t first, last;
 
     // Calls body(k, s, weight) for each: on the curve k, at its fraction s.
     template <class Body>
     void each(Body body) const {
-        int64_t k = systematic.primitive(systematic.position(first));
-        for (int64_t i = first; i < last; ++i) {
-            const double position = systematic.position(i);
-            k = systematic.primitive(position, k);
-            body(k, (position - systematic.begin_of(k)) / systematic.measure_of(k), systematic.weight(k));
-        }
-    }
-
-    // The first of them that is not on one of the first n curves.
-    int64_t before(int64_t n) const {
-        const auto on = [&](int64_t i) { return systematic.primitive(systematic.position(i)) < n; };
-        if (on(last - 1)) return last;
-        int64_t low = first, high = last - 1;  // which is not
-        while (low < high) {
-            const int64_t middle = (low + high) / 2;
-            if (on(middle)) low = middle + 1;
-            else high = middle;
-        }
-        return low;
+        const Systematic& systematic = draws.systematic();
+        draws.each(first, last, [&](int64_t k, int64_t i) {
+            body(k, (systematic.position(i) - systematic.begin_of(k)) / systematic.measure_of(k), systematic.weight(k));
+        });
     }
 };
 
@@ -76,18 +80,19 @@ bool find(const Curves<T>& curves, const MeasuredCurve& measured, Curve& curve) 
 // Whether any sample of a crease between hidden faces is visible, for once. No silhouette passes before these faces, so
 // that other curves on a crease (coincident.h) have no part in whether something hides it.
 template <class T>
-bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const Systematic& systematic, int64_t n) {
+bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const OrderedDraws& draws) {
     if (!curves.any_hidden) return false;
-    const CoincidentCurves alone({}, systematic, view.team);
+    const int64_t n = draws.end_of_kind(on_edges);
+    const CoincidentCurves alone({}, draws.systematic(), view.team);
     std::vector<uint8_t> found((n + scatter_chunk - 1) / scatter_chunk, 0);
     view.team.each(int64_t(found.size()), [&](int64_t chunk) {
         bool visible = false;
         EdgeSource<T> source(view, curves.finder, alone);
         CurveSamples samples(view, source, Witness{visible});
         Curve curve;
-        const Drawn drawn{systematic, chunk * scatter_chunk, std::min(n, (chunk + 1) * scatter_chunk)};
+        const Drawn drawn{draws, chunk * scatter_chunk, std::min(n, (chunk + 1) * scatter_chunk)};
         drawn.each([&](int64_t k, double s, double weight) {
-            if (k >= int64_t(curves.curve.size()) || !curves.curve[k].hidden) return;
+            if (!curves.curve[k].hidden) return;
             if (!find(curves, curves.curve[k], curve)) return;
             samples.add(curve, kept_off_ends(curve, s), weight);
         });
@@ -159,19 +164,22 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
     Systematic systematic(curves.measure, view.team);
     if (!(systematic.total() > 0)) return;
     systematic.draw(n, to_unit(hash(view.options.seed, 3, gradient_stream)));
-    const bool hidden = any_visible(view, curves, systematic, n);  // whether these count after all
+    const OrderedDraws draws = ordered(view, curves, systematic, n);
+    const bool hidden = any_visible(view, curves, draws);  // whether these count after all
     curves.add_segments(view, hidden);
     const CoincidentCurves coincident(std::move(curves.segments), systematic, view.team);
     profile.curves += watch.lap();
     if (!curves.x_bar.empty()) to.x = curves.x_bar.data();
     view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        const Drawn drawn{systematic, first, last};
-        const int64_t edges = drawn.before(int64_t(curves.curve.size()));
-        const int64_t lines = drawn.before(int64_t(curves.curve.size() + curves.intersection.size()));
-        if (first < edges)
-            add_edges<N>(view, curves, coincident, hidden, {systematic, first, edges}, contraction, grad);
-        if (edges < lines) add_intersections<N>(view, curves, {systematic, edges, lines}, contraction, grad);
-        if (lines < last) add_rim<N>(view, curves, {systematic, lines, last}, contraction, grad);
+        const auto part = [&](Kind kind) {
+            const int64_t begin = kind ? draws.end_of_kind(kind - 1) : 0;
+            return Drawn{draws, std::max(first, begin), std::min(last, draws.end_of_kind(kind))};
+        };
+        if (const Drawn d = part(on_edges); d.first < d.last)
+            add_edges<N>(view, curves, coincident, hidden, d, contraction, grad);
+        if (const Drawn d = part(on_intersections); d.first < d.last)
+            add_intersections<N>(view, curves, d, contraction, grad);
+        if (const Drawn d = part(on_rim); d.first < d.last) add_rim<N>(view, curves, d, contraction, grad);
     });
     to.x = nullptr;
 }

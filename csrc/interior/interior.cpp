@@ -13,6 +13,7 @@
 
 #include "camera/polygon.h"
 #include "core/channels.h"
+#include "core/draws.h"
 #include "core/sampler.h"
 #include "core/sobol.h"
 #include "core/systematic.h"
@@ -111,15 +112,15 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
                          const SurfaceMeasure<T>& surface, const Contraction& contraction, Destination& to,
                          double (&seconds)[2]) {
     const ShiftedSequence sequence(hash(view.options.seed, 2, gradient_stream));
+    const auto cell = [&](int64_t f) { return cell_of(view, view.scene.faces[3 * f]); };
+    const OrderedDraws draws(systematic, n, {view.scene.n_faces}, cell, view.team);
     view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         InteriorChunk chunk(view, contract<N>(view, contraction, to, grad));
         VisiblePolygon polygon;
         PolygonSampler sampler;
         int64_t face = -1;
         double share = 0;
-        for (int64_t i = first; i < last; ++i) {
-            const double position = systematic.position(i);
-            const int64_t f = face < 0 ? systematic.primitive(position) : systematic.primitive(position, face);
+        draws.each(first, last, [&](int64_t f, int64_t i) {
             if (f != face) {
                 face = f;
                 polygon.set(view.camera, view.volume, view.vertices, view.scene.faces + 3 * f);
@@ -127,7 +128,7 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
                 share = systematic.weight(f);
                 sampler.set(polygon, 1 / share);
             }
-            const double s = (position - systematic.begin_of(face)) / systematic.measure_of(face);
+            const double s = (systematic.position(i) - systematic.begin_of(face)) / systematic.measure_of(face);
             const Vec2 u = sampler(s, sequence(i));
             chunk.add({.face = int32_t(face),
                        .controlled = surface.is_controlled[face] != 0,
@@ -136,7 +137,7 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
                        .lambda = sampler.lambda(),
                        .share = share,
                        .weight = share * polygon.area * sampler.weight()});
-        }
+        });
         chunk.finish();
     });
 }
