@@ -129,17 +129,19 @@ class Step:
 
 
 class Converged:
-    """The gradient ∂loss/∂verts (V, 3) of a scene from four long runs: up to 20 seconds, once. It is then kept in `folder`.
+    """The gradient ∂loss/∂verts (V, 3) of a scene from long runs: up to 20 seconds, once. It is then kept in `folder`.
 
     The numbers of samples are given, not the kernel's defaults, and the estimate is unbiased: so kernels that place samples
     otherwise have the same expected value, and the file is keyed by the scene and the counts alone. `made_by` names the
     kernel that wrote it; after a change of what the expected value is (a rule for coincident edges, say) remove the file.
     """
 
-    RUNS = 4  # one random shift moves all samples of a run: its errors hang together, and two would not tell their size
+    # One random shift moves all samples of a run, and where faces pass through each other too often each run draws lines of
+    # its own, however many samples it has.
+    RUNS = 64
 
     def __init__(
-        self, scene: ReportScene, folder: Path, kernel: str, surface: int = 1 << 23, edge: int = 1 << 24
+        self, scene: ReportScene, folder: Path, kernel: str, surface: int = 1 << 19, edge: int = 1 << 20
     ) -> None:
         path = folder / f"converged-{scene.fingerprint}-{surface}-{edge}.pt"
         try:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from finite_differences import check_ratio, rotation
+from finite_differences import check, check_ratio, estimate, rotation
 from scenes import cube, front_camera, icosphere, smooth_adjoint, smooth_colors, soup
 from torch import Tensor
 
@@ -32,12 +32,14 @@ def joined(*meshes: eg.Mesh) -> tuple[Tensor, Tensor]:
     return torch.cat([m.verts for m in meshes]), torch.cat([m.faces + k for m, k in zip(meshes, first, strict=True)])
 
 
-def found(verts: Tensor, faces: Tensor, threads: int = 1, windings: Tensor | None = None):
-    """(face, face, end, end) of each, and for how many each stands."""
+def found(verts: Tensor, faces: Tensor, *, threads: int = 1, windings: Tensor | None = None, share=None, seed: int = 0):
+    """(face, face, end, end) of each; for how many each stands; and whether they are drawn, by the share (F,) of each face."""
     windings = faces if windings is None else windings
-    spacing = torch.finfo(verts.dtype).eps
+    share = torch.ones(len(faces)) if share is None else share
     arrays = verts.double().numpy(), faces.int().numpy(), windings.int().numpy()
-    return core.for_tests.intersections(*arrays, spacing, threads)
+    spacing = torch.finfo(verts.dtype).eps
+    pairs, drawn = core.for_tests.intersections(*arrays, spacing, share.numpy(), seed, threads)
+    return [pair[:4] for pair in pairs], torch.tensor([pair[4] for pair in pairs], dtype=F64), drawn
 
 
 # -- which there are --------------------------------------------------------------------------------------------------
@@ -59,8 +61,8 @@ def test_pairs_against_exhaustion(scene):
     verts, faces = scene
     corners = verts[faces]
     expected = torch.nonzero(torch.triu(faces_that_cross(corners))).tolist()
-    pairs, each = found(verts, faces)
-    assert each == 1 and len(expected) > 50
+    pairs, stands_for, drawn = found(verts, faces)
+    assert not drawn and bool((stands_for == 1).all()) and len(expected) > 50
     assert [list(pair[:2]) for pair in pairs] == expected
     assert found(verts, faces, threads=3)[0] == pairs
     for f, g, *ends in pairs:  # on both planes, and no point
@@ -129,7 +131,7 @@ def split(verts: Tensor, faces: Tensor, every: int = 7) -> tuple[Tensor, Tensor]
 SMOOTH = {
     "torus": torus(0.0, 1),
     "torus with waves": torus(0.05, 3),
-    "a rough torus": torus(0.01, 20),
+    "a rough torus": torus(0.005, 20),
     "spiral": spiral(0.0),
     "spiral through itself": spiral(0.25),
     "spheres": joined(icosphere(5), (other := icosphere(4)).replace(verts=0.8 * other.verts + 0.4)),
@@ -153,9 +155,8 @@ def test_height_fields_hide_no_pair(name, turned):
     verts, faces = SMOOTH[name]
     verts = (verts @ rotation((0.48, -0.6, 0.64), torch.tensor(turned)).T).float()
     reversed_faces = torch.where(torch.arange(len(faces))[:, None] % 2 == 0, faces, faces.flip(1))
-    pairs, each = found(verts, faces)
-    expected = found(verts, faces, windings=reversed_faces)
-    assert (pairs, each) == expected
+    pairs, stands_for, _ = found(verts, faces)
+    assert pairs == found(verts, faces, windings=reversed_faces)[0] and bool((stands_for == 1).all())
     assert bool(pairs) == (name in THROUGH)
 
 
@@ -201,13 +202,49 @@ def test_what_touches_does_not_pass_through(name):
     assert found(*TOUCHING[name])[0] == []
 
 
-def test_many_pairs_are_drawn_from():
-    """A soup of large triangles: as many pairs as the square of its faces."""
+def large_tangle(copies: int = 1) -> tuple[Tensor, Tensor]:
+    """25,853 pairs of faces; with copies of all faces."""
+    ball = icosphere(5)
+    verts = ball.verts + 0.03 * torch.randn(ball.verts.shape, generator=generator(), dtype=F64)
+    return torch.cat([verts] * copies), torch.cat([ball.faces + k * len(verts) for k in range(copies)])
+
+
+def test_many_pairs_are_drawn():
+    """Each pair with the product of the probabilities of its faces, for as many as there are."""
+    verts, faces = large_tangle()
+    pairs, stands_for, drawn = found(verts, faces)
+    assert drawn and bool((stands_for == 1).all()) and len(pairs) > 20_000
+    share = torch.where(torch.rand(len(faces), generator=generator(1)) < 0.3, 1.0, 0.5)
+    totals = []
+    for seed in range(24):
+        some, stands_for, drawn = found(verts, faces, share=share, seed=seed)
+        assert drawn and len(some) < 0.5 * len(pairs) and {pair[:2] for pair in some} <= {pair[:2] for pair in pairs}
+        f, g = torch.tensor([pair[:2] for pair in some]).T
+        assert torch.equal(stands_for, 1 / (share[f] * share[g]).double())
+        totals.append(float(stands_for.sum()))
+    check("pairs", len(pairs), estimate(totals))
+    assert found(verts, faces, share=share, seed=seed, threads=3)[0] == some
+
+
+def test_copies_share_what_is_drawn():
+    """Whichever of them are."""
+    pairs = len(found(*large_tangle())[0])
+    share = torch.where(torch.rand(2 * 20480, generator=generator(1)) < 0.3, 1.0, 0.5)
+    totals = []
+    for seed in range(24):
+        some, stands_for, drawn = found(*large_tangle(2), share=share, seed=seed)
+        assert drawn and len(some) < 2 * pairs  # of four times as many
+        totals.append(float(stands_for.sum()))
+    check("pairs", pairs, estimate(totals))
+
+
+def test_so_many_pairs_that_only_some_are_found():
+    """A soup of large triangles: as many as the square of its faces."""
     fraction = {}
     for n in (1200, 4000):
-        pairs, each = found(*random_triangles(n, 5))
-        fraction[n] = len(pairs) * each / n**2
-        assert (each > 1) == (n == 4000)
+        pairs, stands_for, drawn = found(*random_triangles(n, 5))
+        assert drawn == (n == 4000) and (not drawn or len(pairs) < 25_000)
+        fraction[n] = float(stands_for.sum()) / n**2
     assert abs(fraction[4000] / fraction[1200] - 1) < 0.05
 
 
@@ -425,6 +462,18 @@ def test_where_the_vertices_were_before_changes_no_bit():
     for scale in (1.1, 0.9):
         gradient(scale)
     assert torch.equal(gradient(), first)
+
+
+def test_gradient_where_they_are_drawn():
+    """Of faces that the image did not hit fewer are drawn, and stand for others. All that is hidden or not moves with the noise."""
+    ball, camera = icosphere(4), front_camera(48)
+    noise = torch.randn(ball.verts.shape, generator=generator(), dtype=F64)
+    assert found(ball.verts + 0.08 * noise, ball.faces)[2]
+
+    def tangled(theta: Tensor):
+        return eg.Scene([ball.replace(verts=ball.verts + (0.08 + theta) * noise)], BACKGROUND), camera
+
+    check_ratio(tangled, 0.0005, spp=2048, seeds=8)
 
 
 def test_plan_counts_them():

@@ -48,7 +48,7 @@ class SampleBudget {
     struct Cost {
         double surface, edge;
     };
-    static constexpr Cost plain{3.9, 5.2}, shaded{9, 18};
+    static constexpr Cost plain{3.9, 7.0}, shaded{9, 18};
     static constexpr double share_of_image = 1;
     static constexpr int64_t least = 1 << 14;  // some milliseconds, so that small images and few rays lose nothing
     const Cost cost_;

@@ -39,7 +39,7 @@ OrderedDraws ordered(const BackwardView<T>& view, const Curves<T>& curves, const
     const auto cell = [&](int64_t k) -> uint16_t {
         if (k >= lines) return 0;
         if (k >= edges) {
-            const Intersection& i = view.geometry.intersections().all()[curves.intersection[k - edges].index];
+            const Intersection& i = curves.lines(view.geometry)[curves.intersection[k - edges].index];
             return cell_of(view, view.scene.faces[3 * int64_t(i.face[0])]);
         }
         const HalfEdge& h = view.geometry.topology().half_edges(curves.curve[k].edge)[0];
@@ -130,14 +130,14 @@ void add_edges(const BackwardView<T>& view, const Curves<T>& curves, const Coinc
 template <int N, class Contraction, class T>
 void add_intersections(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& drawn,
                        const Contraction& contraction, ChunkGrad& grad) {
-    const Intersections& intersections = view.geometry.intersections();
+    const Array<Intersection>& all = curves.lines(view.geometry);
     IntersectionSource<T> source(view);
     CurveSamples samples(view, source, on_curves<N>(view, contraction, grad));
     IntersectionCurve curve;
     drawn.each([&](int64_t k, double s, double weight) {
-        const Intersection& i = intersections.all()[curves.intersection[k - int64_t(curves.curve.size())].index];
+        const Intersection& i = all[curves.intersection[k - int64_t(curves.curve.size())].index];
         if (curve.faces != &i) find_intersection(view, curves.finder.facing(), i, curve);
-        samples.add(curve, std::clamp(s, 0.0, 1.0), weight * intersections.each_stands_for());
+        samples.add(curve, std::clamp(s, 0.0, 1.0), weight);
     });
     samples.finish(grad);
 }

@@ -34,7 +34,7 @@ struct ClearCrease {
 };
 struct MeasuredIntersection {
     double measure = 0;
-    int32_t index;  // of Intersections
+    int32_t index;  // of Curves::lines()
 };
 // Bytes of a curve in view, at most; the list of curves doubles as it grows.
 constexpr int64_t bytes_per_curve() {
@@ -45,6 +45,7 @@ template <class T>
 struct Curves : CurvesFound {
     CurveFinder<T> finder;
     Array<MeasuredCurve> curve{0};                   // those where the loss looks, by ascending edges
+    Array<Intersection> drawn{0};                    // of those of the geometry, if this view draws its own
     std::vector<MeasuredIntersection> intersection;  // after them, those of faces that pass through each other
     std::optional<RimCurve> rim_curve;               // and after these the rim of what a lens shows, if it is asked for
     Array<double> measure{0};                        // of all
@@ -55,6 +56,9 @@ struct Curves : CurvesFound {
 
     Curves(const BackwardView<T>& view, Array<int8_t> facing);
 
+    const Array<Intersection>& lines(const Geometry& geometry) const {
+        return geometry.intersections().are_drawn() ? drawn : geometry.intersections().all();
+    }
     int64_t arcs() const { return rim_curve ? int64_t(rim_curve->arcs.size()) : 0; }
 
     // Samples: so many as are given, if not −1, or the defaults.

@@ -10,6 +10,7 @@
 #include "boundary/hidden_curves.h"
 #include "boundary/intersection_source.h"
 #include "boundary/jump_scale.h"
+#include "core/sampler.h"
 
 namespace edgegrad {
 
@@ -26,7 +27,9 @@ class IntersectionSize {
         const Vec2 n0 = normalised(view_.camera, c.x0), n1 = normalised(view_.camera, c.x1);
         const double moved =
             planes_.as_silhouette(view_.camera, c.a.z, n0) + planes_.as_silhouette(view_.camera, c.b.z, n1);
-        return within(0.5 * moved / c.length, 64) * within(jump(*c.faces, n0, n1) / scale_.unknown, 2);
+        const double weight = c.faces->weight;
+        return weight * within(0.5 * moved / (weight * c.length), 64) *
+               within(jump(*c.faces, n0, n1) / scale_.unknown, 2);
     }
 
    private:
@@ -58,14 +61,35 @@ class IntersectionSize {
     std::vector<double> jump_;  // of each channel, at either end
 };
 
+// Where there are too many for all to be found: of faces that are hidden, most likely, or out of view, fewer are drawn.
+template <class T>
+Array<Intersection> draw_intersections(const BackwardView<T>& view) {
+    constexpr float hidden = 1.0f / 8;
+    Array<float> share(view.scene.n_faces);
+    view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
+        const VertexView& p = view.vertices;
+        for (int64_t f = first; f < last; ++f) {
+            const int32_t* v = view.scene.faces + 3 * f;
+            const auto behind = [&](int i) { return view.occlusion.hides_around(p.x[v[i]], p.q[v[i]].z); };
+            const uint8_t some = p.outcode[v[0]] | p.outcode[v[1]] | p.outcode[v[2]];
+            if (view.seen[f]) share[f] = 1;
+            else if (some) share[f] = p.outcode[v[0]] & p.outcode[v[1]] & p.outcode[v[2]] ? hidden : 1;
+            else share[f] = behind(0) && behind(1) && behind(2) ? hidden : float(beside_unhit(view, f));
+        }
+    });
+    return view.geometry.intersections().drawn(
+        {view.scene.faces, view.scene.n_faces, view.scene.verts, *view.scene.spacing, view.geometry.topology()}, share,
+        hash(view.options.seed, 12, gradient_stream), view.team);
+}
+
 // Lines where faces pass through each other: those where the loss looks, appended to `out.intersection`. What is known
 // of their jumps tells how they compare with one another. Of silhouettes it is not known, so together they count as
-// half their length, for where they are many most join what is near in space too; and as more where each stands for
-// several that were not drawn.
+// half their length, for where they are many most join what is near in space too.
 constexpr double share_of_length = 0.5;
 template <int N, class T>
 void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
-    const auto& all = view.geometry.intersections().all();
+    if (view.geometry.intersections().are_drawn()) out.drawn = draw_intersections(view);
+    const Array<Intersection>& all = out.lines(view.geometry);
     const int64_t n = int64_t(all.size());
     if (n == 0) return;
     const JumpScale scale = jump_scale(view);
@@ -90,7 +114,7 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
                          std::max(beside_unhit(view, all[i].face[0]), beside_unhit(view, all[i].face[1])));
             const double pixels = c.length * view.camera.stretch(c.low(), c.high()) * samples;
             const double size = size_of(c);
-            part.pixels += pixels, part.sized += pixels * size;
+            part.pixels += all[i].weight * pixels, part.sized += pixels * size;
             part.squares += std::pow(pixels * size * importance, 2);
             part.lines.push_back({pixels * size * importance, int32_t(i)});
         }
@@ -98,8 +122,7 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
     });
     double pixels = 0, sized = 0;
     for (const Part& part : parts) pixels += part.pixels, sized += part.sized;
-    const double share = share_of_length * std::sqrt(view.geometry.intersections().each_stands_for()),
-                 scaled = sized > 0 ? share * pixels / sized : 0;
+    const double scaled = sized > 0 ? share_of_length * pixels / sized : 0;
     for (const Part& part : parts) {
         out.pixels += part.pixels, out.intersections += part.found;
         out.squares += scaled * scaled * part.squares, out.unknown += scaled * scaled * part.squares;

@@ -313,19 +313,26 @@ void bind_for_tests(nb::module_& m) {
             for (const HalfEdge& h : topology.half_edges(e)) out[e].emplace_back(h.face, h.corner, h.backwards);
         return out;
     });
-    // Where faces pass through each other, as (face, face, end, end), and for how many each of them stands. How the
-    // surface goes on is told from `windings`, the same faces as they are or turned round.
-    p.def("intersections", [](Verts verts, Faces faces, Faces windings, double spacing, int threads) {
+    // Where faces pass through each other, as (face, face, end, end, for how many it stands), and whether they are
+    // drawn: by these shares (F,). How the surface goes on is told from `windings`, the same faces as they are or
+    // turned round.
+    p.def("intersections", [](Verts verts, Faces faces, Faces windings, double spacing, In<float, 1> shares,
+                              uint64_t seed, int threads) {
         Team team(threads);
         FaceOrder order;
         const Spacing all{{0}, {spacing}};
         Topology topology(windings.data(), faces.shape(0), verts.shape(0), team);
         topology.weld(verts.data(), all, team);
-        const Intersections found(faces.data(), faces.shape(0), verts.data(), all, topology, order, team);
-        std::vector<std::tuple<int, int, A3, A3>> out;
-        for (const Intersection& i : found.all())
-            out.emplace_back(i.face[0], i.face[1], A3{i.a.x, i.a.y, i.a.z}, A3{i.b.x, i.b.y, i.b.z});
-        return std::tuple(out, found.each_stands_for());
+        const PlacedFaces placed{faces.data(), int64_t(faces.shape(0)), verts.data(), all, topology};
+        const Intersections found(placed, order, team);
+        Array<float> share(shares.shape(0));
+        std::copy_n(shares.data(), shares.shape(0), share.begin());
+        const Array<Intersection> drawn =
+            found.are_drawn() ? found.drawn(placed, share, seed, team) : Array<Intersection>(0);
+        std::vector<std::tuple<int, int, A3, A3, double>> out;
+        for (const Intersection& i : found.are_drawn() ? drawn : found.all())
+            out.emplace_back(i.face[0], i.face[1], A3{i.a.x, i.a.y, i.a.z}, A3{i.b.x, i.b.y, i.b.z}, i.weight);
+        return std::tuple(out, found.are_drawn());
     });
 }
 

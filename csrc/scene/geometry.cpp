@@ -49,7 +49,8 @@ class KeptGeometry {
         if (find_intersections_) {
             work.intersections = true;
             const Topology& topology = topology_ ? *topology_ : *geometry_->topology_;
-            intersections_ = std::make_unique<Intersections>(faces, n_faces_, verts_, spacing_, topology, order_, team);
+            intersections_ =
+                std::make_unique<Intersections>(PlacedFaces{faces, n_faces_, verts_, spacing_, topology}, order_, team);
         }
         keep(moved);
         return geometry_;

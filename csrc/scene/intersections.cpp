@@ -3,13 +3,13 @@
 #include <algorithm>
 #include <atomic>
 #include <bit>
+#include <cmath>
 #include <tuple>
 #include <utility>
 
 #include "core/array.h"
 #include "core/sampler.h"
 #include "scene/face_pair.h"
-#include "scene/height_field.h"
 
 namespace edgegrad {
 
@@ -20,6 +20,7 @@ struct AlongEdge {
     int32_t through, beside;
     int32_t edge[2];  // vertices, ascending
     bool before;
+    int64_t leaf, other;  // that they are in
     Vec3 a, b;
 
     bool on_same_edge(const AlongEdge& o) const {
@@ -33,29 +34,49 @@ struct Found {
     std::vector<AlongEdge> along;
 };
 
-// A tangle of noise, or a soup of large triangles, has so many intersections that finding them all would take longer
-// than all else, and most of them are hidden. So from one for each face on, some are drawn, by pairs of leaves. How
-// many there are is estimated from so many leaves; where there are not much more of these, all are searched.
-constexpr int64_t enough_intersections = 1 << 15, leaves_in_pilot = 128, most_in_pilot = 32;
+// How many there are is estimated from so many leaves, if there are twice as many of these. Up to `few`, and one for
+// each of some faces, all are found; else so many are drawn.
+constexpr int64_t leaves_in_pilot = 128, most_in_pilot = 32;
+constexpr int64_t few = 1 << 12, faces_for_one_of_few = 8, many = 1 << 14, faces_for_one_of_many = 2;
 constexpr int64_t leaves_in_block = 16;
+
+// Among which faces intersections are looked for: among all, or, if there are bits for the faces of each leaf, among
+// those that are drawn, in pairs of leaves that are drawn too.
+struct DrawnPairs {
+    std::vector<uint8_t> faces_of_leaf;
+    std::vector<float> stands_for;  // (F,): each face for so many
+    double leaves = 1;              // probability of a pair of leaves
+    uint64_t seed = 0;
+
+    bool all() const { return faces_of_leaf.empty(); }
+    unsigned in(int64_t leaf) const { return all() ? ~0u : faces_of_leaf[leaf]; }
+    bool has(int64_t leaf, int64_t other) const {
+        return in(other) && (leaves == 1 || to_unit(hash(seed, uint64_t(leaf), uint64_t(other))) < leaves);
+    }
+    // For how many a pair of faces stands.
+    double weight(int32_t face, int32_t other) const {
+        return all() ? 1 : double(stands_for[face]) * double(stands_for[other]) / leaves;
+    }
+    // Where both faces beside an edge are found.
+    double weight(const AlongEdge& own, const AlongEdge& next) const {
+        if (all()) return 1;
+        const bool together = own.leaf == next.leaf && own.other == next.other;
+        return weight(own.through, own.beside) * double(stands_for[next.beside]) / (together ? 1 : leaves);
+    }
+};
 
 class PairFinder {
    public:
-    PairFinder(const FaceTree& tree, const HeightFields& fields, const int32_t* faces, const double* verts,
-               const Spacing& spacing)
-        : tree_(tree),
-          fields_(fields),
-          faces_(faces),
-          verts_(verts),
-          spacing_(spacing),
-          coarsest_(spacing.coarsest()) {}
+    PairFinder(const FaceTree& tree, const HeightFields& fields, const PlacedFaces& faces, const DrawnPairs& drawn)
+        : tree_(tree), fields_(fields), faces_(faces), drawn_(drawn), coarsest_(faces.spacing.coarsest()) {}
 
-    // Calls found(other) for the leaves from this one on that overlap it, where faces may pass through each other.
+    // Calls found(other) for the leaves from this one on that overlap it, where drawn faces may pass through each
+    // other.
     template <class Found>
     void each_overlapping(int64_t leaf, Found found) const {
-        if (!fields_.crossed(leaf)) return;
+        if (!drawn_.in(leaf) || !fields_.crossed(leaf)) return;
         tree_.each_leaf(tree_.bounds(leaf), leaf, fields_.but(leaf), [&](int64_t other) {
-            if (fields_.crossed(leaf, other)) found(other);
+            if (drawn_.has(leaf, other) && fields_.crossed(leaf, other)) found(other);
             return true;
         });
     }
@@ -65,9 +86,9 @@ class PairFinder {
         if (leaf != leaf_) place(leaf);
         const BoxGroup &own = tree_.leaf(leaf), &others = tree_.leaf(other);
         unsigned any = 0, met_by[FaceTree::leaf_size];  // of the other leaf, each with those of this one
-        for (unsigned hits = own.overlapping(tree_.bounds(other)); hits; hits &= hits - 1) {
+        for (unsigned hits = own.overlapping(tree_.bounds(other)) & drawn_.in(leaf); hits; hits &= hits - 1) {
             const int i = std::countr_zero(hits);
-            unsigned met = others.overlapping(own.box(i));
+            unsigned met = others.overlapping(own.box(i)) & drawn_.in(other);
             if (leaf == other) met &= ~0u << (i + 1);
             if (met) met &= tree_.corners(other).may_cross(plane_[i], coarsest_);
             for (; met; met &= met - 1) {
@@ -83,7 +104,7 @@ class PairFinder {
             unsigned met = met_by[j] & tree_.corners(leaf).may_cross(plane_of(placed), coarsest_);
             for (; met; met &= met - 1) {
                 const int i = std::countr_zero(met);
-                add_pair(placed_[i], tree_.face(leaf, i), placed, face, out);
+                add_pair({placed_[i], tree_.face(leaf, i), leaf}, {placed, face, other}, out);
             }
         }
     }
@@ -95,32 +116,44 @@ class PairFinder {
             if (const int32_t f = tree_.face(leaf, i); f >= 0) place(placed_[i], f), plane_[i] = plane_of(placed_[i]);
     }
     void place(PlacedFace& placed, int32_t face) const {
-        const int32_t* v = faces_ + 3 * int64_t(face);
-        placed.set(verts_, v, spacing_.of(v[0]));
+        const int32_t* v = faces_.faces + 3 * int64_t(face);
+        placed.set(faces_.verts, v, faces_.spacing.of(v[0]));
     }
     static FacePlane plane_of(const PlacedFace& f) {
         return {f.vertex, f.p[0], f.normal, f.normal_length, f.coordinate};
     }
 
-    void add_pair(const PlacedFace& f, int32_t face, const PlacedFace& g, int32_t other, Found& out) {
-        FacePair pair;
+    struct InLeaf {
+        const PlacedFace& placed;
+        int32_t face;
+        int64_t leaf;
+    };
+    void add_pair(const InLeaf& one, const InLeaf& other, Found& out) {
         // In the order of the faces, so that the same numbers are found whoever comes first.
-        const bool ascending = face < other;
-        const int32_t faces[2] = {std::min(face, other), std::max(face, other)};
-        const FacePair::Kind kind = pair.set(ascending ? f : g, ascending ? g : f);
+        const auto [f, g] = one.face < other.face ? std::tie(one, other) : std::tie(other, one);
+        FacePair pair;
+        const FacePair::Kind kind = pair.set(f.placed, g.placed);
         if (kind == FacePair::Kind::through)
-            out.through.push_back({.face = {faces[0], faces[1]}, .a = pair.a, .b = pair.b});
+            out.through.push_back(
+                {.face = {f.face, g.face}, .weight = drawn_.weight(f.face, g.face), .a = pair.a, .b = pair.b});
         if (kind != FacePair::Kind::along) return;
-        const int32_t beside = faces[pair.lies_beside], *v = faces_ + 3 * int64_t(beside);
+        const auto [beside, through] = pair.lies_beside ? std::tie(g, f) : std::tie(f, g);
+        const int32_t* v = beside.placed.vertex;
         const auto [low, high] = std::minmax(v[(pair.corner + 1) % 3], v[(pair.corner + 2) % 3]);
-        out.along.push_back({faces[1 - pair.lies_beside], beside, {low, high}, pair.before, pair.a, pair.b});
+        out.along.push_back({.through = through.face,
+                             .beside = beside.face,
+                             .edge = {low, high},
+                             .before = pair.before,
+                             .leaf = one.leaf,
+                             .other = other.leaf,
+                             .a = pair.a,
+                             .b = pair.b});
     }
 
     const FaceTree& tree_;
     const HeightFields& fields_;
-    const int32_t* const faces_;
-    const double* const verts_;
-    const Spacing& spacing_;
+    const PlacedFaces& faces_;
+    const DrawnPairs& drawn_;
     const double coarsest_;
     int64_t leaf_ = -1;
     PlacedFace placed_[FaceTree::leaf_size];  // its faces
@@ -128,7 +161,7 @@ class PairFinder {
 };
 
 // Adds those at which a surface passes through: two faces of an edge, one on each side.
-void add_along(std::vector<AlongEdge>& along, std::vector<Intersection>& out) {
+void add_along(std::vector<AlongEdge>& along, const DrawnPairs& drawn, std::vector<Intersection>& out) {
     std::sort(along.begin(), along.end(), [](const AlongEdge& p, const AlongEdge& q) {
         return std::tie(p.through, p.edge[0], p.edge[1], p.before, p.beside) <
                std::tie(q.through, q.edge[0], q.edge[1], q.before, q.beside);
@@ -138,7 +171,7 @@ void add_along(std::vector<AlongEdge>& along, std::vector<Intersection>& out) {
         out.push_back({.face = {std::min(own.through, own.beside), std::max(own.through, own.beside)},
                        .next = next.beside,
                        .beside = ascending,
-                       .weight = 0.5,
+                       .weight = 0.5 * drawn.weight(own, next),
                        .a = own.a,
                        .b = own.b});
     };
@@ -153,23 +186,21 @@ void add_along(std::vector<AlongEdge>& along, std::vector<Intersection>& out) {
     }
 }
 
-// Divides what copies of faces have in common among them.
-void share_among_copies(Array<Intersection>& all, const int32_t* faces, const double* verts, Team& team) {
-    // Of where both faces lie, whatever the order of their corners.
-    const auto place = [&](int32_t face) {
-        uint64_t bits = 0;
-        for (int i = 0; i < 3; ++i) {
-            const double* p = verts + 3 * int64_t(faces[3 * int64_t(face) + i]);
-            bits += hash(std::bit_cast<uint64_t>(p[0] + 0.0), std::bit_cast<uint64_t>(p[1] + 0.0),
-                         std::bit_cast<uint64_t>(p[2] + 0.0));
-        }
-        return hash(bits, 0);
-    };
-    const int64_t n = all.size();
-    Array<uint64_t> key(n);
-    team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
-        for (int64_t i = first; i < last; ++i) key[i] = place(all[i].face[0]) + place(all[i].face[1]);
-    });
+// Random bits of where a face lies, whatever the order of its corners.
+uint64_t place_of(const PlacedFaces& faces, int32_t face) {
+    uint64_t bits = 0;
+    for (int i = 0; i < 3; ++i) {
+        const double* p = faces.verts + 3 * int64_t(faces.faces[3 * int64_t(face) + i]);
+        bits += hash(std::bit_cast<uint64_t>(p[0] + 0.0), std::bit_cast<uint64_t>(p[1] + 0.0),
+                     std::bit_cast<uint64_t>(p[2] + 0.0));
+    }
+    return hash(bits, 0);
+}
+
+// Calls body(i, n) for those keys i of which there are n > 1.
+template <class Body>
+void each_of_several(const Array<uint64_t>& key, Body body) {
+    const int64_t n = key.size();
     // Nearly all are alone: a table of bits finds those that may not be.
     const uint64_t bits = std::bit_ceil(uint64_t(std::max<int64_t>(n, 4)) * 16);
     std::vector<uint64_t> once(bits / 64, 0), again(bits / 64, 0);
@@ -184,8 +215,29 @@ void share_among_copies(Array<Intersection>& all, const int32_t* faces, const do
     std::sort(several.begin(), several.end());
     for (size_t i = 0, end; i < several.size(); i = end) {
         for (end = i + 1; end < several.size() && several[end].first == several[i].first;) ++end;
-        for (size_t k = i; k < end; ++k) all[several[k].second].weight /= double(end - i);
+        for (size_t k = i; k < end && end > i + 1; ++k) body(several[k].second, end - i);
     }
+}
+
+// Divides what copies of faces have in common among them, if all are there.
+void share_among_copies(Array<Intersection>& all, const PlacedFaces& faces, Team& team) {
+    Array<uint64_t> key(all.size());
+    team.each_block(all.size(), [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i)
+            key[i] = place_of(faces, all[i].face[0]) + place_of(faces, all[i].face[1]);
+    });
+    each_of_several(key, [&](int64_t i, size_t n) { all[i].weight /= double(n); });
+}
+
+// Of each face what it has of that, by how many of them there are.
+Array<float> shares_of_copies(const PlacedFaces& faces, Team& team) {
+    Array<uint64_t> key(faces.n_faces);
+    Array<float> share(faces.n_faces);
+    team.each_block(faces.n_faces, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t f = first; f < last; ++f) key[f] = place_of(faces, int32_t(f)), share[f] = 1;
+    });
+    each_of_several(key, [&](int64_t f, size_t n) { share[f] /= float(n); });
+    return share;
 }
 
 // All parts by ascending faces: those of each lower face side by side, and these, which are few, in order.
@@ -214,20 +266,41 @@ Array<Intersection> sorted(const std::vector<std::vector<Intersection>>& parts, 
     return all;
 }
 
+// Those of the drawn faces, by ascending faces.
+Array<Intersection> found(const FaceTree& tree, const HeightFields& fields, const PlacedFaces& faces,
+                          const DrawnPairs& drawn, Team& team) {
+    const int64_t leaves = tree.n_leaves(), blocks = (leaves + leaves_in_block - 1) / leaves_in_block;
+    std::vector<Found> of_block(blocks);
+    team.each_with(
+        blocks, [&] { return std::make_unique<PairFinder>(tree, fields, faces, drawn); },
+        [&](PairFinder& pairs, int64_t block) {
+            Found part;
+            for (int64_t leaf = block * leaves_in_block; leaf < std::min(leaves, (block + 1) * leaves_in_block); ++leaf)
+                pairs.each_overlapping(leaf, [&](int64_t other) { pairs.add(leaf, other, part); });
+            of_block[block] = std::move(part);
+        });
+    std::vector<std::vector<Intersection>> parts(1);
+    std::vector<AlongEdge> along;
+    for (Found& part : of_block) {
+        parts.push_back(std::move(part.through));
+        along.insert(along.end(), part.along.begin(), part.along.end());
+    }
+    add_along(along, drawn, parts[0]);
+    team.check();
+    return sorted(parts, faces.n_faces, team);
+}
+
 }  // namespace
 
-Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double* verts, const Spacing& spacing,
-                             const Topology& topology, FaceOrder& order, Team& team) {
-    const bool kept_order = !order.face.empty();
-    FaceTree tree(faces, n_faces, verts, topology, order, team);
-    HeightFields fields(tree, topology, team);
-    const auto finder = [&] { return std::make_unique<PairFinder>(tree, fields, faces, verts, spacing); };
-    const int64_t leaves = tree.n_leaves();
-    const auto share_to_draw = [&] {
-        const int64_t step = leaves / leaves_in_pilot;
-        if (step < 2) return 1.0;
-        std::vector<double> expected(leaves_in_pilot);  // of the leaves for which each of them stands
-        team.each_with(leaves_in_pilot, finder, [&](PairFinder& pairs, int64_t i) {
+// Pairs of some leaves, if there are many leaves.
+std::vector<Intersections::Pair> Intersections::some_pairs(const PlacedFaces& faces, Team& team) const {
+    const int64_t step = tree_->n_leaves() / leaves_in_pilot;
+    if (step < 2) return {};
+    const DrawnPairs all;
+    std::vector<std::vector<Pair>> of_leaf(leaves_in_pilot);
+    team.each_with(
+        leaves_in_pilot, [&] { return std::make_unique<PairFinder>(*tree_, *fields_, faces, all); },
+        [&](PairFinder& pairs, int64_t i) {
             const int64_t leaf = i * step;
             int64_t others = 0;
             pairs.each_overlapping(leaf, [&](int64_t) { ++others; });
@@ -237,47 +310,57 @@ Intersections::Intersections(const int32_t* faces, int64_t n_faces, const double
                 if (part == 1 || to_unit(hash(1, uint64_t(leaf), uint64_t(other))) < part)
                     pairs.add(leaf, other, found);
             });
-            expected[i] = double(step) * double(found.through.size()) / part;
+            for (const Intersection& f : found.through)
+                of_leaf[i].push_back({{f.face[0], f.face[1]}, double(step) / part});
         });
-        double all = 0;
-        for (const double e : expected) all += e;
-        return std::min(1.0, double(n_faces + enough_intersections) / all);
+    std::vector<Pair> out;
+    for (const auto& pairs : of_leaf) out.insert(out.end(), pairs.begin(), pairs.end());
+    return out;
+}
+
+Intersections::Intersections(const PlacedFaces& faces, FaceOrder& order, Team& team) : order_(std::move(order)) {
+    const auto prepare = [&] {
+        tree_ = std::make_unique<FaceTree>(faces.faces, faces.n_faces, faces.verts, faces.topology, order_, team);
+        fields_ = std::make_unique<HeightFields>(*tree_, faces.topology, team);
+        pilot_ = some_pairs(faces, team);
+        double expected = 0;
+        for (const Pair& p : pilot_) expected += p.stands_for;
+        return expected > double(few + faces.n_faces / faces_for_one_of_few);
     };
-    double share = share_to_draw();
-    if (share < 1 && kept_order) {
-        // What is drawn depends on the leaves, and must not on where the vertices were before.
-        order = {};
-        tree = FaceTree(faces, n_faces, verts, topology, order, team);
-        fields = HeightFields(tree, topology, team);
-        share = share_to_draw();
+    const bool kept_order = !order_.face.empty();
+    bool drawn = prepare();
+    // What the leaves are must not depend on where the vertices were before.
+    if (drawn && kept_order) order_ = {}, drawn = prepare();
+    if (drawn) {
+        copies_ = shares_of_copies(faces, team);
+        return;
     }
-    stands_for_ = 1 / share;
-    // Others where the vertices are elsewhere, so that the mean over the steps of a fit is right.
-    uint64_t seed = 0;
-    for (int i = 0; i < 9; ++i) seed = hash(seed, std::bit_cast<uint64_t>(verts[3 * int64_t(faces[i / 3]) + i % 3]));
-    const int64_t blocks = (leaves + leaves_in_block - 1) / leaves_in_block;
-    std::vector<Found> found(blocks);
-    team.each_with(blocks, finder, [&](PairFinder& pairs, int64_t block) {
-        Found part;
-        for (int64_t leaf = block * leaves_in_block; leaf < std::min(leaves, (block + 1) * leaves_in_block); ++leaf)
-            pairs.each_overlapping(leaf, [&](int64_t other) {
-                if (share == 1 || to_unit(hash(seed, uint64_t(leaf), uint64_t(other))) < share)
-                    pairs.add(leaf, other, part);
-            });
-        found[block] = std::move(part);
+    all_ = found(*tree_, *fields_, faces, {}, team);
+    team.check();
+    share_among_copies(all_, faces, team);
+    order = std::move(order_);
+    fields_.reset(), tree_.reset(), pilot_ = {};
+}
+
+Array<Intersection> Intersections::drawn(const PlacedFaces& faces, const Array<float>& share, uint64_t seed,
+                                         Team& team) const {
+    double expected = 0;
+    for (const Pair& p : pilot_) expected += p.stands_for * double(share[p.face[0]]) * double(share[p.face[1]]);
+    const double most = double(many + faces.n_faces / faces_for_one_of_many);
+    DrawnPairs some{.faces_of_leaf = std::vector<uint8_t>(tree_->n_leaves(), 0),
+                    .stands_for = std::vector<float>(faces.n_faces),
+                    .leaves = expected > most ? most / expected : 1,
+                    .seed = seed};
+    team.each_block(tree_->n_leaves(), [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t leaf = first; leaf < last; ++leaf)
+            for (int lane = 0; lane < FaceTree::leaf_size; ++lane) {
+                const int32_t f = tree_->face(leaf, lane);
+                if (f < 0) continue;
+                some.stands_for[f] = copies_[f] / share[f];
+                if (share[f] == 1 || to_unit(hash(seed, uint64_t(f))) < share[f]) some.faces_of_leaf[leaf] |= 1 << lane;
+            }
     });
-    std::vector<std::vector<Intersection>> parts(1);
-    std::vector<AlongEdge> along;
-    for (Found& part : found) {
-        parts.push_back(std::move(part.through));
-        along.insert(along.end(), part.along.begin(), part.along.end());
-    }
-    add_along(along, parts[0]);
-    team.check();
-    all_ = sorted(parts, n_faces, team);
-    team.check();
-    share_among_copies(all_, faces, verts, team);
-    if (share < 1) order = {};  // there will be as many the next time, and then it may not be kept either
+    return found(*tree_, *fields_, faces, some, team);
 }
 
 }  // namespace edgegrad

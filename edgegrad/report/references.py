@@ -28,19 +28,20 @@ Keep = Callable[
 
 @dataclass(frozen=True)
 class Effort:
-    """How long the long runs are: so many samples, but no fewer than `factor` times the default, and no more than `most`."""
+    """How long the long runs are: so many samples, but no fewer than `factor` times the default, and no more than `most`. Where
+    faces pass through each other too often, each run draws lines of its own: so there are many."""
 
-    surface_samples: int = 1 << 25
-    edge_samples: int = 1 << 22
-    factor: float = 64.0
-    most: int = 1 << 25
-    runs: int = 4
+    surface_samples: int = 1 << 23
+    edge_samples: int = 1 << 20
+    factor: float = 16.0
+    most: int = 1 << 23
+    runs: int = 16
     check_spp: int = 256  # of the finite differences
     check_seeds: int = 4
 
 
 # Lit scenes are shaded in PyTorch, point by point.
-LIT = Effort(1 << 18, 1 << 21, most=1 << 21)
+LIT = Effort(1 << 18, 1 << 21, 64.0, 1 << 21, runs=4)
 QUICK = Effort(1 << 16, 1 << 14, 4.0, 1 << 21, runs=2, check_spp=16, check_seeds=2)
 
 
