@@ -465,7 +465,7 @@ def test_where_the_vertices_were_before_changes_no_bit():
 
 
 def test_gradient_where_they_are_drawn():
-    """Of faces that the image did not hit fewer are drawn, and stand for others. All that is hidden or not moves with the noise."""
+    """Of faces that the image did not hit fewer are drawn, and stand for others."""
     ball, camera = icosphere(4), front_camera(48)
     noise = torch.randn(ball.verts.shape, generator=generator(), dtype=F64)
     assert found(ball.verts + 0.08 * noise, ball.faces)[2]
