@@ -6,6 +6,10 @@
 #include <memory>
 #include <type_traits>
 
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
 #include "core/parallel.h"
 
 namespace edgegrad {
@@ -23,6 +27,17 @@ void prefetch_all(const T* p, int64_t n) {
     prefetch(p), prefetch(reinterpret_cast<const char*>(p + n) - 1);
 }
 
+// Asks Linux for large pages, as NumPy does: memory of this size is fetched from the system anew each time, and by small
+// pages that takes as long as all that is then written to it.
+inline void prefer_large_pages([[maybe_unused]] void* p, [[maybe_unused]] size_t bytes) {
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+    constexpr uintptr_t page = 1 << 12, least = 1 << 22;
+    if (bytes < least) return;
+    const uintptr_t begin = (reinterpret_cast<uintptr_t>(p) + page - 1) & ~(page - 1);
+    madvise(reinterpret_cast<void*>(begin), reinterpret_cast<uintptr_t>(p) + bytes - begin, MADV_HUGEPAGE);
+#endif
+}
+
 // An array of which every element will be written before it is read, by several threads. Unlike std::vector it sets
 // nothing to zero: one thread would do that, and fetch the pages from the system, while the others wait. Memory comes
 // from the one that writes it first.
@@ -31,7 +46,9 @@ class Array {
    public:
     static_assert(std::is_trivially_copyable_v<T> && std::is_trivially_destructible_v<T>);
 
-    explicit Array(int64_t n) : data_(static_cast<T*>(::operator new(n * sizeof(T)))), size_(n) {}
+    explicit Array(int64_t n) : data_(static_cast<T*>(::operator new(n * sizeof(T)))), size_(n) {
+        prefer_large_pages(data_.get(), n * sizeof(T));
+    }
 
     T& operator[](int64_t i) { return data_.get()[i]; }
     const T& operator[](int64_t i) const { return data_.get()[i]; }
