@@ -166,7 +166,7 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
     systematic.draw(n, to_unit(hash(view.options.seed, 3, gradient_stream)));
     const OrderedDraws draws = ordered(view, curves, systematic, n);
     const bool hidden = any_visible(view, curves, draws);  // whether these count after all
-    curves.add_segments(view, hidden);
+    curves.add_segments(view, systematic, hidden);
     const CoincidentCurves coincident(std::move(curves.segments), systematic, view.team);
     profile.curves += watch.lap();
     if (!curves.x_bar.empty()) to.x = curves.x_bar.data();

@@ -14,6 +14,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <limits>
 #include <type_traits>
 #include <vector>
 
@@ -106,12 +107,10 @@ class CreaseControl {
     double density(double least) const { return std::clamp(std::max(curve_->length / wide, bend_), least, 1.0); }
 
     void add_integral() {
-        const bool box = view_.image.filter.is_box();
+        if (view_.image.filter.is_box()) return add_integral_of_box();
         for (double begin = 0; begin < 1;) {
             const double end = end_of_piece(begin);
-            const Piece piece(*this, begin, end);
-            if (box) add_constant(piece, begin, end);
-            else add_quadratic(piece, begin, end);
+            add_quadratic(Piece(*this, begin, end), begin, end);
             begin = end;
         }
     }
@@ -149,8 +148,6 @@ class CreaseControl {
                                              });
             if (box) a_[0] = a_[2] = a_[1], b_[0] = b_[2] = b_[1];
         }
-        // Ã times the jump at either end of the curve, in the middle.
-        typename CreaseJumps<N, T>::Ends ends() const { return {a_[1], b_[1]}; }
         double at(double s) const {
             const double r = half_ > 0 ? (s - middle_) / half_ : 0, low = 0.5 * r * (r - 1), high = 0.5 * r * (r + 1);
             const double a = low * a_[0] + (1 - r * r) * a_[1] + high * a_[2];
@@ -162,18 +159,43 @@ class CreaseControl {
         double middle_, half_, a_[3] = {}, b_[3] = {};  // Ã times the jump at either end of the curve
     };
 
-    // ∫ φ_k (φ_a a + φ_b b) ds for constants a and b.
-    void add_constant(const Piece& piece, double begin, double end) {
-        const auto power = [&](double (&p)[3], double s) { p[0] = s, p[1] = s * s / 2, p[2] = s * s * s / 3; };
-        double low[3], high[3];
-        power(low, begin), power(high, end);
-        const double one = high[0] - low[0], s = high[1] - low[1], s2 = high[2] - low[2];
-        const auto [a, b] = piece.ends();
-        at_a_ += (one - 2 * s + s2) * a + (s - s2) * b;
-        at_b_ += (s - s2) * a + s2 * b;
+    // Where a curve passes the borders of pixels along one axis: at `next`, and then every `step`.
+    struct Borders {
+        double next, step;
+        Borders(double origin, double along, double per) : step(std::fabs(per)) {
+            const double line = along > 0 ? std::floor(origin) + 1 : std::ceil(origin) - 1;
+            next = along == 0 ? std::numeric_limits<double>::infinity() : (line - origin) * per;
+        }
+        void pass(double end) {
+            if (next <= end) next += step;
+        }
+    };
+
+    // Σ over the pixels passed, in each of which Ã is a constant, of ∫ φ_k (φ_a a + φ_b b) ds with a and b, Ã times the
+    // jump at either end.
+    void add_integral_of_box() {
+        const int width = view_.camera.width, height = view_.camera.height;
+        Borders columns(curve_->x0.x, tangent_.x, per_[0]), rows(curve_->x0.y, tangent_.y, per_[1]);
+        struct Powers {
+            double s, s2, s3;  // ∫ ds, ∫ s ds, ∫ s² ds from 0 on
+        } low{};
+        for (double begin = 0; begin < 1;) {
+            const double end = std::min({columns.next, rows.next, 1.0});
+            columns.pass(end), rows.pass(end);
+            const Powers high{end, end * end / 2, end * end * end / 3};
+            const Vec2 middle = curve_->position(0.5 * (begin + end));
+            const double i = std::floor(middle.x), j = std::floor(middle.y);
+            if (i >= 0 && j >= 0 && i < width && j < height) {
+                const auto [a, b] = jumps_.times(view_.adjoint.of(int64_t(j) * width + int64_t(i)));
+                const double one = high.s - low.s, s = high.s2 - low.s2, s2 = high.s3 - low.s3;
+                at_a_ += (one - 2 * s + s2) * a + (s - s2) * b;
+                at_b_ += (s - s2) * a + s2 * b;
+            }
+            begin = end, low = high;
+        }
     }
 
-    // The same where Ã is a quadratic: by Gauss's rule with three points, exact up to degree 5.
+    // The same on a piece where Ã is a quadratic: by Gauss's rule with three points, exact up to degree 5.
     void add_quadratic(const Piece& piece, double begin, double end) {
         constexpr double node[3] = {-0.7745966692414834, 0, 0.7745966692414834},
                          weight[3] = {5. / 18, 8. / 18, 5. / 18};

@@ -94,6 +94,7 @@ class MeasuredEdges {
     bool any_hidden = false;
 
     void add(int64_t first, int64_t last) {
+        if (faces_) curves.reserve(last - first);  // where faces differ nearly all edges are curves
         finder_.each(first, last, FaceGlance{*this}, [&](int64_t e) {
             if (!add_clear(e)) add_any(e);
         });
@@ -300,7 +301,7 @@ int64_t Curves<T>::wanted(const GradientOptions& o) const {
 }
 
 template <class T>
-void Curves<T>::add_segments(const BackwardView<T>& view, bool all) {
+void Curves<T>::add_segments(const BackwardView<T>& view, const Systematic& samples, bool all) {
     const int64_t n = int64_t(segments.size());
     const auto segment = [&](int64_t k) {
         Curve c;
@@ -317,15 +318,20 @@ void Curves<T>::add_segments(const BackwardView<T>& view, bool all) {
         segments.insert(segments.end(), std::make_move_iterator(hidden.begin()), std::make_move_iterator(hidden.end()));
     }
     if (std::all_of(clear.begin(), clear.end(), [](const auto& part) { return part.empty(); })) return;
-    CellMarks marks(view.camera.width, view.camera.height);
+    // Two curves on one line matter if either is sampled, and two clear creases never do.
+    CellMarks marks(view.camera.width, view.camera.height), marks_of_sampled(view.camera.width, view.camera.height);
     if (!all)
         view.team.each(n, [&](int64_t part) {
-            for (const ImageSegment& s : segments[part]) marks.mark(s.a, s.b, s.reach);
+            for (const ImageSegment& s : segments[part]) {
+                marks.mark(s.a, s.b, s.reach);
+                if (samples.may_draw(s.curve)) marks_of_sampled.mark(s.a, s.b, s.reach);
+            }
         });
     view.team.each(int64_t(clear.size()), [&](int64_t part) {
         std::vector<ImageSegment> near;
         for (const ClearCrease& c : clear[part])
-            if (all || marks.any(c.cells)) near.push_back(segment(c.curve));
+            if (all || marks_of_sampled.any(c.cells) || (samples.may_draw(c.curve) && marks.any(c.cells)))
+                near.push_back(segment(c.curve));
         segments[part].insert(segments[part].end(), near.begin(), near.end());
     });
 }

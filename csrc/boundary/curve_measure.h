@@ -64,8 +64,9 @@ struct Curves : CurvesFound {
     // Samples: so many as are given, if not −1, or the defaults.
     int64_t wanted(const GradientOptions& o) const;
 
-    // Adds the segments of those clear creases in whose pixels any other curve lies; or of all creases.
-    void add_segments(const BackwardView<T>& view, bool all);
+    // Adds the segments of those clear creases in whose pixels any other curve lies, where either has samples; or of
+    // all creases.
+    void add_segments(const BackwardView<T>& view, const Systematic& samples, bool all);
 };
 
 // Finds and measures all curves, and begins x_bar with the integrals of the controls. `facing` (F,): Camera::facing.
