@@ -39,6 +39,7 @@ class Intersections {
    public:
     // Finds all of them, if they are few. `order` is kept from time to time.
     Intersections(const PlacedFaces& faces, FaceOrder& order, Team& team);
+    Intersections(const Intersections&) = delete;  // the tree points to its order
 
     // A tangle of noise, or a soup of large triangles, has so many that finding them all would take longer than all
     // else, and most of them are hidden. So each view draws its own, at random.
