@@ -464,6 +464,24 @@ def test_where_the_vertices_were_before_changes_no_bit():
     assert torch.equal(gradient(), first)
 
 
+def test_whether_they_are_drawn_does_not_depend_on_where_the_vertices_were():
+    """Nor what is, for so many that some estimates say one thing and some the other."""
+    camera, adjoint, ball = front_camera(48), smooth_adjoint(48, 48, 3).to(F64), icosphere(4)
+    noise = torch.randn(ball.verts.shape, generator=generator(4), dtype=F64)
+
+    def gradient(size: float) -> Tensor:
+        verts = (ball.verts + size * noise).requires_grad_()
+        return torch.autograd.grad(eg.render(ball.replace(verts=verts), camera, spp=4), verts, adjoint)[0]
+
+    for size in torch.linspace(0.05, 0.062, 13).tolist():
+        core.clear_geometry()
+        first = gradient(size)
+        for before in (0.3, 0.6):
+            core.clear_geometry()
+            gradient(before * size)
+            assert torch.equal(gradient(size), first)
+
+
 def test_gradient_where_they_are_drawn():
     """Of faces that the image did not hit fewer are drawn, and stand for others."""
     ball, camera = icosphere(4), front_camera(48)

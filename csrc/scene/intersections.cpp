@@ -319,18 +319,20 @@ std::vector<Intersections::Pair> Intersections::some_pairs(const PlacedFaces& fa
 }
 
 Intersections::Intersections(const PlacedFaces& faces, FaceOrder& order, Team& team) : order_(std::move(order)) {
-    const auto prepare = [&] {
+    const auto expected = [&] {
         tree_ = std::make_unique<FaceTree>(faces.faces, faces.n_faces, faces.verts, faces.topology, order_, team);
         fields_ = std::make_unique<HeightFields>(*tree_, faces.topology, team);
         pilot_ = some_pairs(faces, team);
-        double expected = 0;
-        for (const Pair& p : pilot_) expected += p.stands_for;
-        return expected > double(few + faces.n_faces / faces_for_one_of_few);
+        double sum = 0;
+        for (const Pair& p : pilot_) sum += p.stands_for;
+        return sum;
     };
+    const double most = double(few + faces.n_faces / faces_for_one_of_few);
     const bool kept_order = !order_.face.empty();
-    bool drawn = prepare();
-    // What the leaves are must not depend on where the vertices were before.
-    if (drawn && kept_order) order_ = {}, drawn = prepare();
+    double n = expected();
+    // What is drawn, and whether, depends on the leaves, which must not depend on where the vertices were before.
+    if (kept_order && n > most / 2) order_ = {}, n = expected();
+    const bool drawn = n > most;
     if (drawn) {
         copies_ = shares_of_copies(faces, team);
         return;
