@@ -44,7 +44,8 @@ constexpr int64_t leaves_in_block = 16;
 // those that are drawn, in pairs of leaves that are drawn too.
 struct DrawnPairs {
     std::vector<uint8_t> faces_of_leaf;
-    std::vector<float> stands_for;  // (F,): each face for so many
+    const float* share = nullptr;   // (F,): probability of each face
+    std::vector<float> stands_for;  // (F,): for so many it does, divided among its copies
     double leaves = 1;              // probability of a pair of leaves
     uint64_t seed = 0;
 
@@ -61,7 +62,7 @@ struct DrawnPairs {
     double weight(const AlongEdge& own, const AlongEdge& next) const {
         if (all()) return 1;
         const bool together = own.leaf == next.leaf && own.other == next.other;
-        return weight(own.through, own.beside) * double(stands_for[next.beside]) / (together ? 1 : leaves);
+        return weight(own.through, own.beside) / double(share[next.beside]) / (together ? 1 : leaves);
     }
 };
 
@@ -350,6 +351,7 @@ Array<Intersection> Intersections::drawn(const PlacedFaces& faces, const Array<f
     for (const Pair& p : pilot_) expected += p.stands_for * double(share[p.face[0]]) * double(share[p.face[1]]);
     const double most = double(many + faces.n_faces / faces_for_one_of_many);
     DrawnPairs some{.faces_of_leaf = std::vector<uint8_t>(tree_->n_leaves(), 0),
+                    .share = share.data(),
                     .stands_for = std::vector<float>(faces.n_faces),
                     .leaves = expected > most ? most / expected : 1,
                     .seed = seed};
