@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 import torch
-from finite_differences import check, estimate
+from finite_differences import check, check_ratio, estimate
 from scenes import front_camera, icosphere, smooth_adjoint
 from torch import Tensor
 
@@ -126,7 +126,11 @@ def test_tangles_are_sampled_where_they_show() -> None:
     runs = [gradient(seed, 4000) for seed in range(16)]
     error = torch.stack([(run - correct).square().sum() for run in runs]).mean().sqrt()
     assert error < 0.065 * correct.norm()  # 0.053; where only depths say what is hidden, 0.090
-    check("along the gradient", correct.square().sum().item(), estimate([(run * correct).sum().item() for run in runs]))
+
+    def growing(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
+        return eg.Scene([mesh.replace(verts=mesh.verts + (0.1 + theta) * noise)]), camera
+
+    check_ratio(growing, 0.0005, spp=2048, seeds=8, surface_samples=4000, edge_samples=8000)
 
 
 def test_hidden_layers() -> None:

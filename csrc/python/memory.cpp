@@ -18,6 +18,7 @@
 #include "camera/vertices.h"
 #include "camera/windows.h"
 #include "contract/scatter.h"
+#include "core/draws.h"
 #include "scene/geometry.h"
 
 namespace nb = nanobind;
@@ -79,6 +80,7 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         bytes["controls"] = w.motion ? rows(s.faces, s.faces, 3, 2, s.verts) : 0;
         const int64_t n = w.surface_samples < 0 ? many : w.surface_samples;
         int64_t& samples = bytes["surface samples"];
+        samples = OrderedDraws::bytes(w.surface_samples < 0 ? s.faces : w.surface_samples, s.faces);
         if (w.motion) samples += rows(n, s.faces, 3, 3, s.verts);
         // A face has a texture or colours: a run of samples leaves rows of one kind.
         if (w.colors) samples += rows(n, s.faces, 3, s.radiance, s.colors);
@@ -104,8 +106,9 @@ Bytes gradient_bytes(const PassSize& s, const GradientWork& w) {
         bytes["creases"] = s.jumps ? 2 * word * s.verts + int64_t(sizeof(CreaseFace)) * s.faces +
                                          (MeetingParts::bytes_per_pixel + CellMarks::bytes_per_pixel) * s.pixels
                                    : 0;
-        bytes["edge samples"] = rows(w.edge_samples < 0 ? many : w.edge_samples,
-                                     w.curves < 0 ? s.edges() : w.curves + w.intersections, 6, 3, s.verts);
+        const int64_t lines = w.curves < 0 ? s.edges() : w.curves + w.intersections;
+        bytes["edge samples"] = OrderedDraws::bytes(w.edge_samples < 0 ? lines : w.edge_samples, lines) +
+                                rows(w.edge_samples < 0 ? many : w.edge_samples, lines, 6, 3, s.verts);
         bytes["topology"] = Topology::bytes(s.faces, s.edges()) + FaceTree::bytes(s.faces);
         bytes["intersections"] = Intersections::bytes(w.intersections < 0 ? s.faces / 4 : w.intersections, s.faces);
     }
