@@ -238,6 +238,32 @@ def test_copies_share_what_is_drawn():
     check("pairs", pairs, estimate(totals))
 
 
+@pytest.mark.parametrize("copies", [1, 2])
+@pytest.mark.parametrize("apart", [False, True])
+def test_one_side_of_an_edge_in_a_face_is_drawn_without_the_other(copies, apart):
+    """A roof whose ridge lies in a sheet, beside a tangle. The other side of the ridge is mostly hidden, and counts no less."""
+    verts = torch.tensor(
+        [[-2, -2, 0], [2, -2, 0], [0, 3, 0], [0, -0.5, 0], [0, 0.5, 0], [-1, 0, -1], [1, 0, 1]], dtype=F64
+    )
+    faces = torch.tensor([[0, 1, 2], [3, 4, 5], [4, 3, 6]])
+    assert float(found(verts, faces)[1].sum()) == 1
+    sheets = [(verts, faces)] * (copies if apart else 1)
+    roof = torch.cat([v for v, _ in sheets]), torch.cat([f + len(verts) * k for k, (_, f) in enumerate(sheets)])
+    if not apart:
+        roof = verts, torch.cat([faces, *[faces[1:]] * (copies - 1)])
+    ball = icosphere(4)
+    noise = torch.randn(ball.verts.shape, generator=generator(), dtype=F64)
+    tangle = ball.verts + 0.08 * noise + torch.tensor([100.0, 0.0, 0.0], dtype=F64)
+    both = torch.cat([roof[0], tangle]), torch.cat([roof[1], ball.faces + len(roof[0])])
+    of_roof = len(roof[1])
+    for never, expected in (([], 1.0), ([2], 1.0), ([1, 2], 1 - 1 / copies)):
+        share = torch.ones(len(both[1]))
+        share[never] = 1e-9
+        pairs, stands_for, drawn = found(*both, share=share)
+        on_roof = torch.tensor([max(pair[:2]) < of_roof for pair in pairs])
+        assert drawn and float(stands_for[on_roof].sum()) == pytest.approx(expected, abs=1e-6)
+
+
 def test_so_many_pairs_that_only_some_are_found():
     """A soup of large triangles: as many as the square of its faces."""
     fraction = {}

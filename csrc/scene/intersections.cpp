@@ -1,9 +1,10 @@
 #include "scene/intersections.h"
 
 #include <algorithm>
+#include <array>
 #include <atomic>
 #include <bit>
-#include <cmath>
+#include <map>
 #include <tuple>
 #include <utility>
 
@@ -20,11 +21,15 @@ struct AlongEdge {
     int32_t through, beside;
     int32_t edge[2];  // vertices, ascending
     bool before;
-    int64_t leaf, other;  // that they are in
+    bool drawn;  // false: it is only known to be there
     Vec3 a, b;
 
     bool on_same_edge(const AlongEdge& o) const {
         return through == o.through && edge[0] == o.edge[0] && edge[1] == o.edge[1];
+    }
+    bool operator<(const AlongEdge& o) const {
+        return std::tie(through, edge[0], edge[1], before, beside) <
+               std::tie(o.through, o.edge[0], o.edge[1], o.before, o.beside);
     }
 };
 
@@ -45,7 +50,7 @@ constexpr int64_t leaves_in_block = 16;
 struct DrawnPairs {
     std::vector<uint8_t> faces_of_leaf;
     const float* share = nullptr;   // (F,): probability of each face
-    std::vector<float> stands_for;  // (F,): for so many it does, divided among its copies
+    const float* copies = nullptr;  // (F,): 1 over how many copies of it there are
     double leaves = 1;              // probability of a pair of leaves
     uint64_t seed = 0;
 
@@ -54,17 +59,51 @@ struct DrawnPairs {
     bool has(int64_t leaf, int64_t other) const {
         return in(other) && (leaves == 1 || to_unit(hash(seed, uint64_t(leaf), uint64_t(other))) < leaves);
     }
-    // For how many a pair of faces stands.
-    double weight(int32_t face, int32_t other) const {
-        return all() ? 1 : double(stands_for[face]) * double(stands_for[other]) / leaves;
+    // For how many a pair of faces stands, divided among its copies, where that of `face` and `by` is drawn.
+    double weight(int32_t face, int32_t other, int32_t by) const {
+        return all() ? 1 : double(copies[face]) * double(copies[other]) / (double(share[face]) * share[by] * leaves);
     }
-    // Where both faces beside an edge are found.
-    double weight(const AlongEdge& own, const AlongEdge& next) const {
-        if (all()) return 1;
-        const bool together = own.leaf == next.leaf && own.other == next.other;
-        return weight(own.through, own.beside) / double(share[next.beside]) / (together ? 1 : leaves);
+    double weight(int32_t face, int32_t other) const { return weight(face, other, other); }
+    // Of two faces beside an edge, that which stands for both.
+    const AlongEdge& likelier(const AlongEdge& a, const AlongEdge& b) const {
+        return all() || share[a.beside] >= share[b.beside] ? a : b;
     }
 };
+
+// A face, and where it is.
+struct Placed {
+    const PlacedFace& placed;
+    int32_t face;
+};
+
+PlacedFace placed(const PlacedFaces& faces, int32_t face) {
+    const int32_t* v = faces.faces + 3 * int64_t(face);
+    PlacedFace out;
+    out.set(faces.verts, v, faces.spacing.of(v[0]));
+    return out;
+}
+
+// Adds what two faces have in common.
+void add_pair(const Placed& one, const Placed& other, const DrawnPairs& drawn, Found& out) {
+    // In the order of the faces, so that the same numbers are found whoever comes first.
+    const auto [f, g] = one.face < other.face ? std::tie(one, other) : std::tie(other, one);
+    FacePair pair;
+    const FacePair::Kind kind = pair.set(f.placed, g.placed);
+    if (kind == FacePair::Kind::through)
+        out.through.push_back(
+            {.face = {f.face, g.face}, .weight = drawn.weight(f.face, g.face), .a = pair.a, .b = pair.b});
+    if (kind != FacePair::Kind::along) return;
+    const auto [beside, through] = pair.lies_beside ? std::tie(g, f) : std::tie(f, g);
+    const int32_t* v = beside.placed.vertex;
+    const auto [low, high] = std::minmax(v[(pair.corner + 1) % 3], v[(pair.corner + 2) % 3]);
+    out.along.push_back({.through = through.face,
+                         .beside = beside.face,
+                         .edge = {low, high},
+                         .before = pair.before,
+                         .drawn = true,
+                         .a = pair.a,
+                         .b = pair.b});
+}
 
 class PairFinder {
    public:
@@ -97,15 +136,14 @@ class PairFinder {
                 met_by[j] = (any >> j & 1 ? met_by[j] : 0) | 1u << i, any |= 1u << j;
             }
         }
-        PlacedFace placed;
         for (; any; any &= any - 1) {
             const int j = std::countr_zero(any);
             const int32_t face = tree_.face(other, j);
-            place(placed, face);
+            const PlacedFace placed = edgegrad::placed(faces_, face);
             unsigned met = met_by[j] & tree_.corners(leaf).may_cross(plane_of(placed), coarsest_);
             for (; met; met &= met - 1) {
                 const int i = std::countr_zero(met);
-                add_pair({placed_[i], tree_.face(leaf, i), leaf}, {placed, face, other}, out);
+                add_pair({placed_[i], tree_.face(leaf, i)}, {placed, face}, drawn_, out);
             }
         }
     }
@@ -114,41 +152,11 @@ class PairFinder {
     void place(int64_t leaf) {
         leaf_ = leaf;
         for (int i = 0; i < FaceTree::leaf_size; ++i)
-            if (const int32_t f = tree_.face(leaf, i); f >= 0) place(placed_[i], f), plane_[i] = plane_of(placed_[i]);
-    }
-    void place(PlacedFace& placed, int32_t face) const {
-        const int32_t* v = faces_.faces + 3 * int64_t(face);
-        placed.set(faces_.verts, v, faces_.spacing.of(v[0]));
+            if (const int32_t f = tree_.face(leaf, i); f >= 0)
+                placed_[i] = placed(faces_, f), plane_[i] = plane_of(placed_[i]);
     }
     static FacePlane plane_of(const PlacedFace& f) {
         return {f.vertex, f.p[0], f.normal, f.normal_length, f.coordinate};
-    }
-
-    struct InLeaf {
-        const PlacedFace& placed;
-        int32_t face;
-        int64_t leaf;
-    };
-    void add_pair(const InLeaf& one, const InLeaf& other, Found& out) {
-        // In the order of the faces, so that the same numbers are found whoever comes first.
-        const auto [f, g] = one.face < other.face ? std::tie(one, other) : std::tie(other, one);
-        FacePair pair;
-        const FacePair::Kind kind = pair.set(f.placed, g.placed);
-        if (kind == FacePair::Kind::through)
-            out.through.push_back(
-                {.face = {f.face, g.face}, .weight = drawn_.weight(f.face, g.face), .a = pair.a, .b = pair.b});
-        if (kind != FacePair::Kind::along) return;
-        const auto [beside, through] = pair.lies_beside ? std::tie(g, f) : std::tie(f, g);
-        const int32_t* v = beside.placed.vertex;
-        const auto [low, high] = std::minmax(v[(pair.corner + 1) % 3], v[(pair.corner + 2) % 3]);
-        out.along.push_back({.through = through.face,
-                             .beside = beside.face,
-                             .edge = {low, high},
-                             .before = pair.before,
-                             .leaf = one.leaf,
-                             .other = other.leaf,
-                             .a = pair.a,
-                             .b = pair.b});
     }
 
     const FaceTree& tree_;
@@ -161,18 +169,57 @@ class PairFinder {
     FacePlane plane_[FaceTree::leaf_size];    // theirs
 };
 
+// The faces at some edges, by the vertices of these.
+using FacesAtEdges = std::map<std::array<int32_t, 2>, std::vector<int32_t>>;
+void find_faces(FacesAtEdges& at, const PlacedFaces& faces) {
+    std::vector<uint8_t> asked;  // of vertices
+    for (const auto& [edge, none] : at) {
+        asked.resize(std::max<size_t>(asked.size(), edge[1] + 1), 0);
+        asked[edge[0]] = asked[edge[1]] = 1;
+    }
+    const auto is_asked = [&](int32_t v) { return size_t(v) < asked.size() && asked[v]; };
+    for (int64_t e = 0; e < faces.topology.n_edges(); ++e)
+        for (const HalfEdge& h : faces.topology.half_edges(e)) {
+            const int32_t* v = faces.faces + 3 * int64_t(h.face);
+            const auto [low, high] = std::minmax(v[h.first()], v[h.second()]);
+            if (!is_asked(low) || !is_asked(high)) continue;
+            if (const auto found = at.find({low, high}); found != at.end()) found->second.push_back(h.face);
+        }
+}
+
+// Adds what else lies beside the same edges, whether it is drawn or not: one side tells of the surface that passes
+// through only together with the other, which is mostly hidden. So that which is drawn more often stands for both.
+void add_other_sides(std::vector<AlongEdge>& along, const PlacedFaces& faces, const DrawnPairs& drawn) {
+    std::sort(along.begin(), along.end());
+    FacesAtEdges at;
+    for (const AlongEdge& a : along) at[{a.edge[0], a.edge[1]}];
+    find_faces(at, faces);
+    std::vector<AlongEdge> others;
+    for (size_t i = 0, end; i < along.size(); i = end) {
+        for (end = i + 1; end < along.size() && along[end].on_same_edge(along[i]);) ++end;
+        const int32_t through = along[i].through;
+        const PlacedFace own = placed(faces, through);
+        for (const int32_t f : at[{along[i].edge[0], along[i].edge[1]}]) {
+            if (std::any_of(along.begin() + i, along.begin() + end, [&](const AlongEdge& a) { return a.beside == f; }))
+                continue;
+            Found found;
+            add_pair({own, through}, {placed(faces, f), f}, drawn, found);
+            for (AlongEdge& a : found.along)
+                if (a.beside == f && a.on_same_edge(along[i])) a.drawn = false, others.push_back(a);
+        }
+    }
+    along.insert(along.end(), others.begin(), others.end());
+}
+
 // Adds those at which a surface passes through: two faces of an edge, one on each side.
 void add_along(std::vector<AlongEdge>& along, const DrawnPairs& drawn, std::vector<Intersection>& out) {
-    std::sort(along.begin(), along.end(), [](const AlongEdge& p, const AlongEdge& q) {
-        return std::tie(p.through, p.edge[0], p.edge[1], p.before, p.beside) <
-               std::tie(q.through, q.edge[0], q.edge[1], q.before, q.beside);
-    });
-    const auto add = [&](const AlongEdge& own, const AlongEdge& next) {
+    std::sort(along.begin(), along.end());
+    const auto add = [&](const AlongEdge& own, const AlongEdge& next, const AlongEdge& by) {
         const bool ascending = own.through < own.beside;
         out.push_back({.face = {std::min(own.through, own.beside), std::max(own.through, own.beside)},
                        .next = next.beside,
                        .beside = ascending,
-                       .weight = 0.5 * drawn.weight(own, next),
+                       .weight = 0.5 * drawn.weight(own.through, own.beside, by.beside),
                        .a = own.a,
                        .b = own.b});
     };
@@ -182,8 +229,10 @@ void add_along(std::vector<AlongEdge>& along, const DrawnPairs& drawn, std::vect
         const size_t behind =
             std::count_if(along.begin() + i, along.begin() + end, [](const AlongEdge& e) { return !e.before; });
         if (2 * behind != end - i) continue;
-        for (size_t k = 0; k < behind; ++k)
-            add(along[i + k], along[i + behind + k]), add(along[i + behind + k], along[i + k]);
+        for (size_t k = i; k < i + behind; ++k) {
+            const AlongEdge &one = along[k], &other = along[k + behind], &by = drawn.likelier(one, other);
+            if (by.drawn) add(one, other, by), add(other, one, by);
+        }
     }
 }
 
@@ -286,6 +335,7 @@ Array<Intersection> found(const FaceTree& tree, const HeightFields& fields, cons
         parts.push_back(std::move(part.through));
         along.insert(along.end(), part.along.begin(), part.along.end());
     }
+    if (!drawn.all() && !along.empty()) add_other_sides(along, faces, drawn);
     add_along(along, drawn, parts[0]);
     team.check();
     return sorted(parts, faces.n_faces, team);
@@ -352,7 +402,7 @@ Array<Intersection> Intersections::drawn(const PlacedFaces& faces, const Array<f
     const double most = double(many + faces.n_faces / faces_for_one_of_many);
     DrawnPairs some{.faces_of_leaf = std::vector<uint8_t>(tree_->n_leaves(), 0),
                     .share = share.data(),
-                    .stands_for = std::vector<float>(faces.n_faces),
+                    .copies = copies_.data(),
                     .leaves = expected > most ? most / expected : 1,
                     .seed = seed};
     team.each_block(tree_->n_leaves(), [&](int64_t, int64_t first, int64_t last) {
@@ -360,7 +410,6 @@ Array<Intersection> Intersections::drawn(const PlacedFaces& faces, const Array<f
             for (int lane = 0; lane < FaceTree::leaf_size; ++lane) {
                 const int32_t f = tree_->face(leaf, lane);
                 if (f < 0) continue;
-                some.stands_for[f] = copies_[f] / share[f];
                 if (share[f] == 1 || to_unit(hash(seed, uint64_t(f))) < share[f]) some.faces_of_leaf[leaf] |= 1 << lane;
             }
     });

@@ -56,7 +56,7 @@ class Intersections {
     // what they are drawn by. Lists double as they grow.
     static int64_t bytes(int64_t found, int64_t faces) {
         return found * int64_t(3 * sizeof(Intersection) + sizeof(uint64_t)) +
-               faces * int64_t(sizeof(uint32_t) + 3 * sizeof(float) + sizeof(uint8_t));
+               faces * int64_t(sizeof(uint32_t) + 2 * sizeof(float) + sizeof(uint8_t));
     }
 
    private:
