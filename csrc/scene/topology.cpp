@@ -171,10 +171,19 @@ void Topology::build(Team& team) {
         int32_t upper;
         HalfEdge half_edge;
     };
+    // Vertices in the order in which faces come to them, so that edges that follow each other are near one another
+    // where faces are: a subdivision appends its new vertices to all others.
+    std::vector<int32_t> rank(n_verts_, -1);
     const auto at = [&](int64_t face, int corner) {
         const int32_t v = faces_[3 * face + corner % 3];
-        return welded_.empty() ? v : welded_[v];
+        return rank[welded_.empty() ? v : welded_[v]];
     };
+    int32_t next = 0;
+    for (int64_t i = 0; i < 3 * n_faces_; ++i) {
+        if (i % check_every == 0) team.check();
+        const int32_t v = welded_.empty() ? faces_[i] : welded_[faces_[i]];
+        if (rank[v] < 0) rank[v] = next++;
+    }
     // A face that uses a place twice has no area and no part in the surface.
     const auto degenerate = [&](int64_t f) {
         return at(f, 0) == at(f, 1) || at(f, 1) == at(f, 2) || at(f, 2) == at(f, 0);
