@@ -31,6 +31,13 @@ class Occupancy {
     uint64_t mask_;
 };
 
+// Calls body(k, first, last) for parts of n segments, few enough for all threads to have some.
+constexpr int64_t few = 256;
+template <class Body>
+void each_few(int64_t n, Team& team, Body body) {
+    team.each((n + few - 1) / few, [&](int64_t k) { body(k, k * few, std::min(n, (k + 1) * few)); });
+}
+
 }  // namespace
 
 // Whether two segments run side by side within their reach.
@@ -51,12 +58,17 @@ bool CoincidentCurves::side_by_side(const ImageSegment& s, const ImageSegment& o
 
 CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, const Systematic& samples,
                                    Team& team) {
+    const int64_t n_parts = int64_t(parts.size());
+    std::vector<double> length_of(parts.size()), reach_of(parts.size());
+    team.each(n_parts, [&](int64_t k) {
+        double length = 0, reach = 0;
+        for (const ImageSegment& s : parts[k]) length += edgegrad::length(s.b - s.a), reach = std::max(reach, s.reach);
+        length_of[k] = length, reach_of[k] = reach;
+    });
     int64_t n = 0;
     double total = 0;
-    for (const auto& part : parts) {
-        n += int64_t(part.size());
-        for (const ImageSegment& s : part) total += length(s.b - s.a), margin_ = std::max(margin_, s.reach);
-    }
+    for (int64_t k = 0; k < n_parts; ++k)
+        n += int64_t(parts[k].size()), total += length_of[k], margin_ = std::max(margin_, reach_of[k]);
     if (n == 0) return;
     // Some segments wide, so that few share a cell where a mesh is fine and many where it is coarse; a millionth: so
     // that cells can be counted; at most 16 px, so that distances in a cell tell lines apart, unless many long segments
@@ -133,7 +145,7 @@ void CoincidentCurves::fill(Team& team) {
     mask_ = uint64_t(buckets - 1);
     std::vector<std::atomic<uint32_t>> end(buckets);
     const auto each_entry = [&](auto entry) {
-        team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
+        each_few(n, team, [&](int64_t, int64_t first, int64_t last) {
             for (int64_t i = first; i < last; ++i)
                 lines_.each_cell(segments_[i], [&](const LineBuckets::Line& l) { entry(i, l); });
         });
@@ -192,7 +204,8 @@ void CoincidentCurves::find_companions(const Systematic& samples, Team& team) {
         }
         return false;
     };
-    const auto parts = team.of_blocks(segments_.size(), [&](int64_t first, int64_t last) {
+    std::vector<std::vector<Companion>> parts((segments_.size() + few - 1) / few);
+    each_few(segments_.size(), team, [&](int64_t k, int64_t first, int64_t last) {
         std::vector<Companion> part;
         for (int64_t i = first; i < last; ++i) {
             if (!samples.may_draw(segments_[i].curve)) continue;
@@ -201,7 +214,7 @@ void CoincidentCurves::find_companions(const Systematic& samples, Team& team) {
                              [&](const LineBuckets::Line& l) { found = found || any_beside(segments_[i], l); });
             if (found) part.push_back({segments_[i].edge, uint32_t(i)});
         }
-        return part;
+        parts[k] = std::move(part);
     });
     for (const auto& part : parts) companions_.insert(companions_.end(), part.begin(), part.end());
     std::sort(companions_.begin(), companions_.end(),

@@ -35,7 +35,12 @@ class CreaseFaces {
    public:
     CreaseFaces(const BackwardView<T>& view, const CurveFinder<T>& finder, const Crossings& crossings,
                 const MeetingParts& meeting)
-        : view_(view), finder_(finder), crossings_(crossings), meeting_(meeting), faces_(view.scene.n_faces) {
+        : view_(view),
+          finder_(finder),
+          crossings_(crossings),
+          meeting_(meeting),
+          faces_(view.scene.n_faces),
+          hidden_(view.occlusion.factor(CreaseSamples::hidden, OcclusionHint::pixels_around, view.image.spp)) {
         set_largest();
         view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
             constexpr int64_t ahead = 16;
@@ -68,8 +73,7 @@ class CreaseFaces {
             high{std::max({a.x, b.x, c.x}), std::max({a.y, b.y, c.y})};
         const auto [nearest, farthest] = std::minmax({p.q[v[0]].z, p.q[v[1]].z, p.q[v[2]].z});
         const double touching = contact(spacing_, largest_, std::max(std::fabs(nearest), std::fabs(farthest)));
-        const double w = view_.camera.perspective ? nearest : 1;
-        if (!(finder_.rounding(by_axis_, w, pixels_) < Crossings::float_reach)) return out;
+        if ((view_.camera.perspective ? nearest : 1) < least_weight_) return out;
         const bool crossed = crossings_.in(low, high, farthest + touching);
         if (!crossed && hit.clear && !hit.missed) {
             if (!meeting_.in(low, high)) out.state = view_.seen[f] ? CreaseFace::seen : CreaseFace::clear;
@@ -77,10 +81,11 @@ class CreaseFaces {
         }
         if (!hit.missed) return out;
         // Each point of a side is as near to one of its ends as the hint reaches.
-        const double longest = std::max({length(b - a), length(c - b), length(a - c)});
+        const auto squared = [](Vec2 side) { return side.x * side.x + side.y * side.y; };
+        const double longest = std::sqrt(std::max({squared(b - a), squared(c - b), squared(a - c)}));
         double samples = 0;
         if (behind && !crossed && longest <= 2 * OcclusionHint::reach) {
-            samples = view_.occlusion.factor(CreaseSamples::hidden, OcclusionHint::pixels_around, view_.image.spp);
+            samples = hidden_;
             out.state = CreaseFace::hidden;
         } else if (hits.is_turned_away(v[0], side_of(view_, f))) {
             samples = CreaseSamples::turned_away;
@@ -115,14 +120,23 @@ class CreaseFaces {
                 for (int i = 0; i < 3; ++i) most[i] = std::max(most[i], std::fabs(view_.scene.verts[3 * v + i]));
             return Vec3{most[0], most[1], most[2]};
         });
+        double by_axis[3] = {};
         for (const Vec3& m : parts) {
             const double of_part[3] = {m.x, m.y, m.z};
-            for (int i = 0; i < 3; ++i) by_axis_[i] = std::max(by_axis_[i], of_part[i]);
+            for (int i = 0; i < 3; ++i) by_axis[i] = std::max(by_axis[i], of_part[i]);
         }
-        largest_ = std::max({by_axis_[0], by_axis_[1], by_axis_[2]});
+        largest_ = std::max({by_axis[0], by_axis[1], by_axis[2]});
         spacing_ = view_.scene.spacing->coarsest();
         const double margin = 2 * (view_.importance.radius() + 1);
-        pixels_ = 2 * (view_.camera.width + view_.camera.height + 2 * margin);
+        const double pixels = 2 * (view_.camera.width + view_.camera.height + 2 * margin);
+        const auto matters = [&](double w) { return !(finder_.rounding(by_axis, w, pixels) < Crossings::float_reach); };
+        if (matters(least_weight_)) {
+            while (least_weight_ < std::numeric_limits<double>::infinity() && matters(least_weight_))
+                least_weight_ *= 2;
+        } else {
+            while (least_weight_ > std::numeric_limits<double>::min() && !matters(least_weight_ / 2))
+                least_weight_ /= 2;
+        }
     }
 
     const BackwardView<T>& view_;
@@ -130,7 +144,9 @@ class CreaseFaces {
     const Crossings& crossings_;
     const MeetingParts& meeting_;
     Array<CreaseFace> faces_;
-    double by_axis_[3] = {}, largest_ = 0, spacing_ = 0, pixels_ = 0;
+    double largest_ = 0, spacing_ = 0;
+    double least_weight_ = 1;  // to a power of two: from which denominator on the rounding of positions does not matter
+    const double hidden_;      // what the density is multiplied by on creases that lie behind all around them
 };
 
 }  // namespace edgegrad

@@ -34,7 +34,8 @@ class Crossings {
         }
         cell_ =
             std::max({2.0, std::sqrt(double(width) * height / 0x1p18), total / (4 * double(first.back()) + 0x1p16)});
-        columns_ = int(width / cell_) + 1, rows_ = int(height / cell_) + 1;
+        per_cell_ = 1 / cell_;
+        columns_ = int(width * per_cell_) + 1, rows_ = int(height * per_cell_) + 1;
         begin_.assign(size_t(columns_) * rows_ + 1, 0);
         segments_ = Array<Segment>(first.back());
         const auto each_cell = [&](int64_t k, auto body) {
@@ -85,14 +86,15 @@ class Crossings {
         return found;
     }
 
-    // Whether one of them may lie in a box of the image, no farther away than a depth.
+    // Whether one of them passes a box of the image, by less than rays may miss it, no farther away than a depth.
     bool in(Vec2 low, Vec2 high, double farthest) const {
         const int i0 = index(low.x, columns_), i1 = index(high.x, columns_);
         const int j0 = index(low.y, rows_), j1 = index(high.y, rows_);
         if (int64_t(i1 - i0 + 1) * (j1 - j0 + 1) > most_cells) return true;
         for (int j = j0; j <= j1; ++j)
             for (int i = i0; i <= i1; ++i)
-                if (!each_in(size_t(j) * columns_ + i, [&](const Segment& s) { return s.depth > farthest; }))
+                if (!each_in(size_t(j) * columns_ + i,
+                             [&](const Segment& s) { return s.depth > farthest || !passes(s, low, high); }))
                     return true;
         return false;
     }
@@ -112,6 +114,16 @@ class Crossings {
         for (uint32_t i = begin_[cell]; i < begin_[cell + 1]; ++i)
             if (!body(segments_[entries_[i]])) return false;
         return true;
+    }
+
+    static bool passes(const Segment& s, Vec2 low, Vec2 high) {
+        const double margin = float_reach + s.rounding;
+        const Vec2 middle = 0.5 * (low + high), half = 0.5 * (high - low) + Vec2{margin, margin};
+        // Separated along x, along y or across the segment.
+        const Vec2 to_a = s.a - middle, to_b = s.b - middle, along = s.b - s.a;
+        return std::min(to_a.x, to_b.x) <= half.x && std::max(to_a.x, to_b.x) >= -half.x &&
+               std::min(to_a.y, to_b.y) <= half.y && std::max(to_a.y, to_b.y) >= -half.y &&
+               std::fabs(wedge(along, to_a)) <= std::fabs(along.x) * half.y + std::fabs(along.y) * half.x;
     }
 
     // Those that meet the curve in an end are apart: silhouettes that go on from a vertex of a crease.
@@ -151,14 +163,14 @@ class Crossings {
         }
         return true;
     }
-    int index(double x, int count) const { return int(std::clamp(x / cell_, 0.0, double(count - 1))); }
+    int index(double x, int count) const { return int(std::clamp(x * per_cell_, 0.0, double(count - 1))); }
 
     // So many in a cell, of two pixels or so, and some of them cross.
     static constexpr uint32_t most_in_a_cell = 32;
     // Larger boxes are not searched.
     static constexpr int64_t most_cells = 64;
 
-    double cell_;  // px
+    double cell_, per_cell_;  // px, and 1 over it
     int columns_, rows_;
     std::vector<uint32_t> begin_;  // of each cell, in entries_
     Array<Segment> segments_{0};

@@ -382,11 +382,13 @@ class CurveFinder {
 
     void prefetch_place(int64_t edge) const {
         const HalfEdge& h = view_.geometry.topology().half_edges(edge)[0];
-        const int32_t v = vertex(view_.scene, h, h.first());
-        if (view_.vertices.outcode[v]) return;
-        const Vec2 x = view_.vertices.x[v];
-        view_.importance.prefetch(x);
-        if (jumps_) prefetch(view_.adjoint.of(view_.pixel(x)));
+        for (const int corner : {h.first(), h.second()}) {
+            const int32_t v = vertex(view_.scene, h, corner);
+            if (view_.vertices.outcode[v]) return;
+            const Vec2 x = view_.vertices.x[v];
+            if (corner == h.first()) view_.importance.prefetch(x);
+            if (jumps_) prefetch(view_.adjoint.of(view_.pixel(x)));
+        }
     }
 
     bool carries_jump(int64_t edge) const {

@@ -135,8 +135,9 @@ class MeasuredEdges {
         if (!(pixels > 0)) return;
         found.pixels += pixels;
         any_hidden |= alone;
-        curves.push_back(
-            {.measure = pixels * std::max(one.importance, other.importance), .edge = int32_t(e), .hidden = alone});
+        const MeasuredCurve curve{
+            .measure = pixels * std::max(one.importance, other.importance), .edge = int32_t(e), .hidden = alone};
+        curves.push_back(curve);
     }
 
     // Adds the segment of the next curve, a crease that is turned away, before which a silhouette may pass; returns its
@@ -305,7 +306,8 @@ void Curves<T>::add_segments(const BackwardView<T>& view, const Systematic& samp
     const int64_t n = int64_t(segments.size());
     const auto segment = [&](int64_t k) {
         Curve c;
-        finder.find(curve[k].edge, c);
+        finder.find_between(curve[k].edge, c);
+        c.rounding = finder.rounding(c);
         return image_segment(view, c, k);
     };
     if (all) {

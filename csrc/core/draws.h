@@ -72,7 +72,7 @@ class OrderedDraws {
         int64_t primitive, sample, count, place;
         uint16_t key;
     };
-    static constexpr int64_t part = 1 << 14;  // samples of a thread's; a run ends with it
+    static constexpr int64_t part = 1 << 10;  // samples of a thread's; a run ends with it
 
     // By the lower and then by the upper byte of the key.
     void sort(size_t first, size_t last) {
