@@ -159,15 +159,20 @@ class CreaseControl {
         double middle_, half_, a_[3] = {}, b_[3] = {};  // Ã times the jump at either end of the curve
     };
 
-    // Where a curve passes the borders of pixels along one axis: at `next`, and then every `step`.
-    struct Borders {
+    // The pixels that a curve passes along one axis: the one it is in, and where it leaves that at `next`; from there
+    // on it leaves one after every `step`.
+    struct Passed {
+        int64_t pixel;
+        int by;
         double next, step;
-        Borders(double origin, double along, double per) : step(std::fabs(per)) {
-            const double line = along > 0 ? std::floor(origin) + 1 : std::ceil(origin) - 1;
-            next = along == 0 ? std::numeric_limits<double>::infinity() : (line - origin) * per;
-        }
+        Passed(double origin, double along, double per)
+            : pixel(int64_t(along < 0 ? std::ceil(origin) - 1 : std::floor(origin))),
+              by(along < 0 ? -1 : 1),
+              next(along == 0 ? std::numeric_limits<double>::infinity()
+                              : (double(along < 0 ? pixel : pixel + 1) - origin) * per),
+              step(std::fabs(per)) {}
         void pass(double end) {
-            if (next <= end) next += step;
+            if (next <= end) next += step, pixel += by;
         }
     };
 
@@ -175,24 +180,25 @@ class CreaseControl {
     // jump at either end.
     void add_integral_of_box() {
         const int width = view_.camera.width, height = view_.camera.height;
-        Borders columns(curve_->x0.x, tangent_.x, per_[0]), rows(curve_->x0.y, tangent_.y, per_[1]);
+        Passed columns(curve_->x0.x, tangent_.x, per_[0]), rows(curve_->x0.y, tangent_.y, per_[1]);
         struct Powers {
             double s, s2, s3;  // ∫ ds, ∫ s ds, ∫ s² ds from 0 on
         } low{};
+        double at_a = 0, at_b = 0;
         for (double begin = 0; begin < 1;) {
             const double end = std::min({columns.next, rows.next, 1.0});
-            columns.pass(end), rows.pass(end);
             const Powers high{end, end * end / 2, end * end * end / 3};
-            const Vec2 middle = curve_->position(0.5 * (begin + end));
-            const double i = std::floor(middle.x), j = std::floor(middle.y);
+            const int64_t i = columns.pixel, j = rows.pixel;
+            columns.pass(end), rows.pass(end);
             if (i >= 0 && j >= 0 && i < width && j < height) {
-                const auto [a, b] = jumps_.times(view_.adjoint.of(int64_t(j) * width + int64_t(i)));
+                const auto [a, b] = jumps_.times(view_.adjoint.of(j * width + i));
                 const double one = high.s - low.s, s = high.s2 - low.s2, s2 = high.s3 - low.s3;
-                at_a_ += (one - 2 * s + s2) * a + (s - s2) * b;
-                at_b_ += (s - s2) * a + s2 * b;
+                at_a += (one - 2 * s + s2) * a + (s - s2) * b;
+                at_b += (s - s2) * a + s2 * b;
             }
             begin = end, low = high;
         }
+        at_a_ += at_a, at_b_ += at_b;
     }
 
     // The same on a piece where Ã is a quadratic: by Gauss's rule with three points, exact up to degree 5.

@@ -27,8 +27,8 @@ void prefetch_all(const T* p, int64_t n) {
     prefetch(p), prefetch(reinterpret_cast<const char*>(p + n) - 1);
 }
 
-// Asks Linux for large pages, as NumPy does: memory of this size is fetched from the system anew each time, and by small
-// pages that takes as long as all that is then written to it.
+// Asks Linux for large pages, as NumPy does: memory of this size is fetched from the system anew each time, and by
+// small pages that takes as long as all that is then written to it.
 inline void prefer_large_pages([[maybe_unused]] void* p, [[maybe_unused]] size_t bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
     constexpr uintptr_t page = 1 << 12, least = 1 << 22;
