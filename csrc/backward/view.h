@@ -58,7 +58,8 @@ uint8_t side_of(const BackwardView<T>& view, int64_t face) {
     return view.camera.side(q[0], q[1], q[2]);
 }
 
-// Of 256 × 256 cells of the image, on the Z-order curve, that in which a vertex lies; the last one of what is out of view.
+// Of 256 × 256 cells of the image, on the Z-order curve, that in which a vertex lies; the last one of what is out of
+// view.
 template <class T>
 uint16_t cell_of(const BackwardView<T>& view, int32_t vertex) {
     if (view.vertices.outcode[vertex]) return UINT16_MAX;

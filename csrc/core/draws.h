@@ -1,5 +1,5 @@
-// The samples of a systematic draw in an order in which neighbours are near one another in the image, so that their rays
-// pass the same boxes and what is asked of their primitives is in the cache. Meshes come in any order: that of a
+// The samples of a systematic draw in an order in which neighbours are near one another in the image, so that their
+// rays pass the same boxes and what is asked of their primitives is in the cache. Meshes come in any order: that of a
 // subdivision visits distant faces by turns.
 #pragma once
 
