@@ -151,7 +151,7 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(options, stops, tmp_path)
         sizes = [step.size[0] for step in whole.history]
         assert [sizes.count(n) for n in (24, 48)] == [30, 6] and sizes.count(96) > 2
     for stop in stops:
-        stop %= whole.steps  # the last step is the final comparison
+        stop %= whole.steps  # −1: the last step but the final comparison
 
         def after_step(fit, stop=stop):
             if fit.steps == stop:

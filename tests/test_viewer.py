@@ -81,13 +81,13 @@ def test_a_camera_moves_before_a_scene_at_rest(viewer):
     away = at.world_to_camera.clone()
     away[0, 3] += 0.1
     fit = fit_camera(bracket(), picture(at), at.replace(world_to_camera=away), focal=False, background=BACKGROUND,
-                     callback=viewer, **QUIET)  # fmt: skip
+                     callback=viewer, **QUIET | {"spp": 64})  # fmt: skip
     viewer.show(fit)
     np.testing.assert_allclose(
         extent(vertices(page(viewer)._meshes[0].handle)), extent(bracket().verts.T.numpy()), atol=1e-6
     )
     np.testing.assert_allclose(page(viewer)._frusta[0][1].position, fit.camera.eye, atol=1e-9)
-    assert float((fit.camera.eye - at.eye).norm()) < 0.06  # of 0.1; the noise of the image leaves up to 0.046
+    assert float((fit.camera.eye - at.eye).norm()) < 0.02  # of 0.1; over seeds up to 0.009
 
 
 def test_shapes_are_shown_as_they_move_also_after_remeshing(viewer, monkeypatch):

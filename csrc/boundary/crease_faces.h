@@ -40,8 +40,9 @@ class CreaseFaces {
           crossings_(crossings),
           meeting_(meeting),
           faces_(view.scene.n_faces),
-          hidden_(view.occlusion.factor(CreaseSamples::hidden, OcclusionHint::pixels_around, view.image.spp)) {
-        set_largest();
+          density_of_hidden_(
+              view.occlusion.factor(CreaseSamples::hidden, OcclusionHint::pixels_around, view.image.spp)) {
+        set_bounds();
         view.team.each_block(view.scene.n_faces, [&](int64_t, int64_t first, int64_t last) {
             constexpr int64_t ahead = 16;
             for (int64_t f = first; f < last; ++f) {
@@ -85,7 +86,7 @@ class CreaseFaces {
         const double longest = std::sqrt(std::max({squared(b - a), squared(c - b), squared(a - c)}));
         double samples = 0;
         if (behind && !crossed && longest <= 2 * OcclusionHint::reach) {
-            samples = hidden_;
+            samples = density_of_hidden_;
             out.state = CreaseFace::hidden;
         } else if (hits.is_turned_away(v[0], side_of(view_, f))) {
             samples = CreaseSamples::turned_away;
@@ -113,7 +114,7 @@ class CreaseFaces {
     }
 
     // Bounds for all faces, of what else would be asked of each edge: how large coordinates and how coarse they are.
-    void set_largest() {
+    void set_bounds() {
         const auto parts = view_.team.of_blocks(view_.scene.n_verts, [&](int64_t first, int64_t last) {
             double most[3] = {};
             for (int64_t v = first; v < last; ++v)
@@ -146,7 +147,7 @@ class CreaseFaces {
     Array<CreaseFace> faces_;
     double largest_ = 0, spacing_ = 0;
     double least_weight_ = 1;  // to a power of two: from which denominator on the rounding of positions does not matter
-    const double hidden_;      // what the density is multiplied by on creases that lie behind all around them
+    const double density_of_hidden_;  // relative, on creases that lie behind all around them
 };
 
 }  // namespace edgegrad
