@@ -38,22 +38,28 @@ void each_few(int64_t n, Team& team, Body body) {
     team.each((n + few - 1) / few, [&](int64_t k) { body(k, k * few, std::min(n, (k + 1) * few)); });
 }
 
-}  // namespace
-
-// Whether two segments run side by side within their reach.
-bool CoincidentCurves::side_by_side(const ImageSegment& s, const ImageSegment& o) {
-    const Vec2 along = s.b - s.a;
-    const double squared = along.x * along.x + along.y * along.y, reach = std::max(s.reach, o.reach);
+// How s meets o, over the part of s that lies beside o.
+CoincidentCurves::Meeting meeting_within(const ImageSegment& s, const ImageSegment& o) {
+    const Vec2 along = s.b - s.a, other = o.b - o.a;
+    const double squared = along.x * along.x + along.y * along.y;
     const auto parameter = [&](Vec2 x) { return ((x.x - s.a.x) * along.x + (x.y - s.a.y) * along.y) / squared; };
     const double t0 = parameter(o.a), t1 = parameter(o.b);
     // Segments that merely touch end to end do not; a millionth of the length is no loss.
     const double first = std::max(0.0, std::min(t0, t1)), last = std::min(1.0, std::max(t0, t1));
-    if (!(last - first > 1e-6)) return false;
-    const auto distance = [&](double t) {  // of the point t of s to the line of o
-        const Vec2 x = s.a + t * along, other = o.b - o.a;
-        return std::fabs(wedge(other, x - o.a)) / length(other);
-    };
-    return distance(first) <= reach && distance(last) <= reach;
+    using Meeting = CoincidentCurves::Meeting;
+    if (!(last - first > 1e-6)) return Meeting::none;
+    const double reach = std::max(s.reach, o.reach) * length(other);
+    const auto aside = [&](double t) { return wedge(other, s.a + t * along - o.a); };  // px times the length of o
+    const double d0 = aside(first), d1 = aside(last);
+    const bool near0 = std::fabs(d0) <= reach, near1 = std::fabs(d1) <= reach;
+    if (near0 && near1) return Meeting::along;
+    return near0 || near1 || (d0 > 0) != (d1 > 0) ? Meeting::across : Meeting::none;
+}
+
+}  // namespace
+
+CoincidentCurves::Meeting CoincidentCurves::meeting(const ImageSegment& s, const ImageSegment& o) {
+    return std::max(meeting_within(s, o), meeting_within(o, s));
 }
 
 CoincidentCurves::CoincidentCurves(std::vector<std::vector<ImageSegment>> parts, const Systematic& samples,
@@ -198,8 +204,7 @@ void CoincidentCurves::find_companions(const Systematic& samples, Team& team) {
             for (uint32_t i = first; i < last; ++i) {
                 const Entry& e = entries_[i];
                 const ImageSegment& o = segments_[e.segment];
-                if (e.low <= high && low <= e.high && &o != &s && (side_by_side(s, o) || side_by_side(o, s)))
-                    return true;
+                if (e.low <= high && low <= e.high && &o != &s && meeting(s, o) != Meeting::none) return true;
             }
         }
         return false;
@@ -227,13 +232,15 @@ const ImageSegment* CoincidentCurves::find(int64_t edge) const {
     return at != companions_.end() && at->edge == edge ? &segments_[at->segment] : nullptr;
 }
 
-bool CoincidentCurves::passes(const ImageSegment& other, const ImageSegment& own, Vec2 x) {
+CoincidentCurves::Meeting CoincidentCurves::at_point(const ImageSegment& other, const ImageSegment& own, Vec2 x) {
     const Vec2 along = other.b - other.a, from = x - other.a;
     const double far = length(along), reach = std::max(own.reach, other.reach);
     const double t = from.x * along.x + from.y * along.y;
-    if (!(t >= -reach * far && t <= (far + reach) * far)) return false;
-    if (!(std::fabs(wedge(along, from)) <= 2 * reach * far)) return false;  // spares most of what follows
-    return side_by_side(own, other) || side_by_side(other, own);
+    if (!(t >= -reach * far && t <= (far + reach) * far)) return Meeting::none;
+    const double aside = std::fabs(wedge(along, from));
+    if (!(aside <= 2 * reach * far)) return Meeting::none;  // spares most of what follows
+    const Meeting found = meeting(own, other);
+    return found == Meeting::across && !(aside <= reach * far) ? Meeting::none : found;
 }
 
 }  // namespace edgegrad

@@ -1,5 +1,6 @@
 // Curves that lie on one another in the image: the front and the back edge of a box that is seen straight on, meshes
-// in the same place, a long edge against two short ones.
+// in the same place, a long edge against two short ones; or nearly so, as what leaves one vertex at the limb of a
+// sphere.
 //
 // Pairs of them are not kept, for N curves on one line have N² / 2. Curves are sorted into buckets by direction,
 // distance and cell of the image, and who lies on a curve at one of its points is looked up there, from near to far.
@@ -125,8 +126,12 @@ class CoincidentCurves {
     // The segment of an edge that has samples; null if no other lies on it anywhere.
     const ImageSegment* find(int64_t edge) const;
 
-    // Calls found(other) for the segments that run side by side with one of find() and pass its point x, by less than
-    // floats are apart, until it returns false.
+    // How two segments meet that come closer in the image than rays err: side by side wherever both are, or at an angle
+    // so small that more than a point of one is so near to the other, as where they share an end.
+    enum class Meeting { none, across, along };
+
+    // Calls found(other, meeting) for the segments that pass the point x of one of find() so closely, until it returns
+    // false.
     template <class Found>
     void at(const ImageSegment& own, Vec2 x, Found found) const {
         const LineBuckets::Line line = lines_.line_at(own, x);
@@ -140,7 +145,9 @@ class CoincidentCurves {
                 const Entry& e = entries_[i];
                 if (!(e.low <= place && place <= e.high)) continue;
                 const ImageSegment& other = segments_[e.segment];
-                if (&other != &own && passes(other, own, x) && !found(other)) return;
+                if (&other == &own) continue;
+                const Meeting meeting = at_point(other, own, x);
+                if (meeting != Meeting::none && !found(other, meeting)) return;
             }
         }
     }
@@ -156,8 +163,8 @@ class CoincidentCurves {
                               Team& team) const;
     void fill(Team& team);
     void find_companions(const Systematic& samples, Team& team);
-    static bool side_by_side(const ImageSegment& s, const ImageSegment& o);
-    static bool passes(const ImageSegment& other, const ImageSegment& own, Vec2 x);
+    static Meeting meeting(const ImageSegment& s, const ImageSegment& o);
+    static Meeting at_point(const ImageSegment& other, const ImageSegment& own, Vec2 x);
 
     LineBuckets lines_;
     // A segment that others lie on.

@@ -216,14 +216,15 @@ class EdgeSource {
             coincidence_.start(place.own, sample.u, sample.t);
         };
         bool alone = true, visible = true;
-        const auto add = [&](const ImageSegment& o) {
-            if (alone) begin(), alone = false;
+        const auto add = [&](const ImageSegment& o, CoincidentCurves::Meeting meeting) {
+            const bool on_line = meeting == CoincidentCurves::Meeting::along;
+            if (alone && on_line) begin(), alone = false;
             const auto faces = topology.faces(o.edge);
             const Vec2 along = o.b - o.a, from = sample.u - o.a;
             const double squared = along.x * along.x + along.y * along.y,
                          s = (from.x * along.x + from.y * along.y) / squared;
             const double apart = std::fabs(wedge(along, from)) / std::sqrt(squared);
-            if (apart <= std::max(curve.rounding, o.rounding)) {
+            if (on_line && apart <= std::max(curve.rounding, o.rounding)) {
                 ignored.insert(ignored.end(), faces.begin(), faces.end());
                 if (s < 0 || s > 1) return true;
                 const CoincidentCurve& c = other(o.edge, curve);
@@ -232,10 +233,11 @@ class EdgeSource {
                 return visible = coincidence_.add(c, c.curve.parameter(s));
             }
             for (const int32_t f : faces) {
-                if (!asked_.insert(f)) continue;
+                // One that the ray misses stays for it to find: where float takes it for a neighbour, that one is found
+                // as well (Visibility::beyond_float).
+                if (!asked_.insert(f) || !meets(view_, f, sample.n)) continue;
                 ignored.push_back(f);
-                if (meets(view_, f, sample.n) && !visibility_.lies_behind(f, place.faces, sample))
-                    return visible = false;
+                if (!visibility_.lies_behind(f, place.faces, sample)) return visible = false;
             }
             return true;
         };
