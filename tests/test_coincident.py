@@ -282,5 +282,5 @@ def test_what_a_convex_surface_hides_moves_nothing() -> None:
         wrong += int((verts.grad[hidden] != 0).any(1).sum())
         seen += int((verts.grad[~hidden] != 0).any(1).sum())
     assert seen > 6 * 0.3 * len(sphere.verts)
-    # What is left is a crack that rays find between two faces seen edge-on.
-    assert wrong <= 3
+    # One in a million may be left, where the faces before it are narrower than rays err.
+    assert wrong <= 1

@@ -151,7 +151,7 @@ def test_finite_differences(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_all_finite_differences(name):
-    check_ratio(CASES[name], 0.01, spp=4096, seeds=16, step_spacing=1 / 32, surface_samples=50_000, edge_samples=50_000)
+    check_ratio(CASES[name], 0.01, spp=4096, seeds=48, step_spacing=1 / 32, surface_samples=50_000, edge_samples=50_000)
 
 
 # -- exact ------------------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <iterator>
 #include <limits>
 #include <span>
 #include <vector>
@@ -33,8 +34,8 @@ class Visibility {
     // The face that a ray truly meets, where `face` is what the cast found. Float and double may place the ray on
     // different sides of an edge between two faces that it runs through, and where that edge lies on the curve in the
     // image (the diagonal of a box's front, before an edge of its back) they do so again and again. Then float misses
-    // the neighbour that double would meet; so beside the ray that passes through the refused face goes another that is
-    // moved off that face by as much as floats may err.
+    // the neighbour that double would meet; so beside the ray that passes through the refused face go others that are
+    // moved off that face: by as much as floats may err, and by less, for the neighbour may be narrower than that.
     int32_t beyond_float(const CurveSample& sample, int32_t face) const {
         const Vec2 n = sample.n;
         const auto decide = [&](int32_t f) {
@@ -51,21 +52,30 @@ class Visibility {
                 face = view_.frame.beyond_float(n, face, ignored, decide);
                 break;
             }
-            const Vec2 beside = moved_off(face, n);
-            rays.n_x[0] = n.x, rays.n_y[0] = n.y, rays.n_x[1] = beside.x, rays.n_y[1] = beside.y, rays.count = 2;
+            const Vec2 off = out_of(face, n);
+            rays.count = 0;
+            for (const double part : moved_by) {
+                const Vec2 beside = n + part * off;
+                rays.n_x[rays.count] = beside.x, rays.n_y[rays.count++] = beside.y;
+            }
             ignored.insert(std::upper_bound(ignored.begin(), ignored.end(), face), face);
-            const std::span<const int32_t> all[2] = {ignored, ignored};
+            std::span<const int32_t> all[n_moved];
+            std::fill(std::begin(all), std::end(all), ignored);
             rays.prepare();
             view_.frame.cast(rays, all);
             face = rays.face[0];
-            if (const int32_t other = rays.face[1]; other >= 0 && decide(other))
-                if (const double z = depth_of(view_, other, n); z < depth) nearest = other, depth = z;
+            for (int i = 1; i < n_moved; ++i)
+                if (const int32_t other = rays.face[i]; other >= 0 && decide(other))
+                    if (const double z = depth_of(view_, other, n); z < depth) nearest = other, depth = z;
         }
         return face >= 0 && depth_of(view_, face, n) < depth ? face : nearest;
     }
 
    private:
     static constexpr int most_refused = 3;
+    // How far rays pass from the point, of the error of floats; the first one is the sample's own.
+    static constexpr double moved_by[] = {0, 2, 0.5, 1.0 / 8, 1.0 / 32};
+    static constexpr int n_moved = int(std::size(moved_by));
 
     // Whether a face that the ray meets lies before the point: its plane has the point on one side and the viewer on
     // the other. Surfaces that touch at the curve (a cube on the ground) are not before it, however flat the view: the
@@ -89,8 +99,8 @@ class Visibility {
         return std::any_of(others.begin(), others.end(), [&](int32_t f) { return share_vertex(view_.scene, face, f); });
     }
 
-    // n, moved away from a face that does not cover it, across the side that it lies beyond.
-    Vec2 moved_off(int64_t face, Vec2 n) const {
+    // The way from n, which a face does not cover, across the side that it lies beyond: as long as floats may err.
+    Vec2 out_of(int64_t face, Vec2 n) const {
         const FaceMap m = face_map(view_.camera, corners_of(view_, face).data());
         const Vec3 p = m.times(n);
         const double sign = p.z < 0 ? -1 : 1;
@@ -108,7 +118,7 @@ class Visibility {
             const double* q = view_.scene.verts + 3 * int64_t(view_.scene.faces[3 * int64_t(face) + i]);
             error = std::max(error, view_.frame.error({q[0], q[1], q[2]}));
         }
-        return n + (2 * error / view_.camera.unit_at_depth(depth_of(view_, face, n))) * away;
+        return (error / view_.camera.unit_at_depth(depth_of(view_, face, n))) * away;
     }
 
     const BackwardView<T>& view_;
