@@ -4,6 +4,8 @@ ratio must lie within 1 ± 0.02. The comment at each test says what went wrong e
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from finite_differences import Estimate, check_ratio, finite_difference, gradient, right_ratio, rotation
@@ -298,3 +300,24 @@ def test_corners_on_the_border_up_to_rounding() -> None:
     image.sum().backward()
     assert colors.grad is not None
     assert abs(colors.grad.sum() / image.sum() - 1) < 0.01  # the image is linear in its one colour
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, 0.9])
+def test_slivers_hidden_by_a_hair(angle: float) -> None:
+    """A tetrahedron whose far corner lies just inside a side of its front: the two faces that meet there are narrower than
+    rays err, which see them beside the front. The corner's gradient is zero: 3e-4 of the whole before."""
+    camera = eg.Camera.orthographic((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.4, (48, 48)).to(F64)
+    faces = torch.tensor([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]])
+    colors = torch.rand(4, 3, generator=torch.Generator().manual_seed(1), dtype=F64)
+    cos, sin = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]], dtype=F64)
+    for inside in (1e-4, 1e-5, 1e-6, 1e-7):
+        corners = [[-0.6, 0.2, 0.0], [0.7, 0.2, 0.0], [0.1, -0.8, -0.2], [0.1, 0.2 - inside, 0.5]]
+        verts = (torch.tensor(corners, dtype=F64) @ turn).requires_grad_()
+        for seed in range(4):
+            image = eg.render(eg.Mesh(verts, faces, colors=colors), camera, seed=seed, surface_samples=50_000)
+            image.square().sum().backward()
+        assert verts.grad is not None
+        whole, hidden = float(verts.grad.norm()), float(verts.grad[3].norm())
+        assert whole > 1.0
+        assert hidden < 5e-6 * whole, f"{inside:g} inside: {hidden / whole:.2g} of the gradient"

@@ -78,6 +78,11 @@ double where_unhit(const BackwardView<T>& view, int64_t face, double area) {
     return view.seen[face] ? 1 : view.occlusion.factor(unhit, area, view.image.spp);
 }
 
+// px by which rays may miss a point, at most: by then the image shows floats, not faces. What runs along a silhouette
+// so near is decided with it in double (coincident.h), and where a crease ends at one its samples keep so far from the
+// end.
+constexpr double float_reach = 0.01;
+
 // Whether a face that the ray at n meets is there, not cut out.
 template <class T>
 bool is_there(const BackwardView<T>& view, int64_t face, Vec2 n) {

@@ -65,7 +65,7 @@ struct Drawn {
 
 // Samples keep so far from the ends of a crease that what floats leave of a silhouette there does not matter.
 double kept_off_ends(const Curve& curve, double s) {
-    const double end = curve.is_crease() ? std::min(Crossings::float_reach / curve.length, 0.1) : 0;
+    const double end = curve.is_crease() ? std::min(float_reach / curve.length, 0.1) : 0;
     return std::clamp(s, end, 1 - end);
 }
 

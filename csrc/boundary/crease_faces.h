@@ -130,7 +130,7 @@ class CreaseFaces {
         spacing_ = view_.scene.spacing->coarsest();
         const double margin = 2 * (view_.importance.radius() + 1);
         const double pixels = 2 * (view_.camera.width + view_.camera.height + 2 * margin);
-        const auto matters = [&](double w) { return !(finder_.rounding(by_axis, w, pixels) < Crossings::float_reach); };
+        const auto matters = [&](double w) { return !(finder_.rounding(by_axis, w, pixels) < float_reach); };
         if (matters(least_weight_)) {
             while (least_weight_ < std::numeric_limits<double>::infinity() && matters(least_weight_))
                 least_weight_ *= 2;

@@ -20,10 +20,6 @@ namespace edgegrad {
 // Segments in the cells of a grid over the image.
 class Crossings {
    public:
-    // px by which rays may miss a point, at most (curve_measure.cpp): what runs along a silhouette so near is decided
-    // with it in double (coincident.h), and where a crease ends at one its samples keep so far from the end.
-    static constexpr double float_reach = 0.01;
-
     // Of silhouettes and borders, in parts.
     Crossings(const std::vector<std::vector<ImageSegment>>& parts, int width, int height, Team& team) {
         std::vector<int64_t> first(parts.size() + 1, 0);

@@ -37,8 +37,7 @@ double reach_of_rays(const BackwardView<T>& view, const Curve& c) {
         const double* p = view.scene.verts + 3 * int64_t(vertex(view.scene, h, corner));
         error = std::max(error, view.frame.error({p[0], p[1], p[2]}));
     }
-    return std::max(c.rounding,
-                    std::min(view.camera.pixels_per_unit / std::min(c.w0, c.w1) * error, Crossings::float_reach));
+    return std::max(c.rounding, std::min(view.camera.pixels_per_unit / std::min(c.w0, c.w1) * error, float_reach));
 }
 
 template <class T>

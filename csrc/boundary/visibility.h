@@ -5,11 +5,11 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <iterator>
 #include <limits>
 #include <span>
 #include <vector>
 
+#include "backward/beside.h"
 #include "backward/view.h"
 #include "boundary/curve_source.h"
 #include "scene/contact.h"
@@ -43,7 +43,6 @@ class Visibility {
         };
         if (face < 0 || decide(face)) return face;
         std::vector<int32_t> ignored(sample.ignored.begin(), sample.ignored.end());
-        CameraRays rays(view_.frame);
         int32_t nearest = -1;
         double depth = std::numeric_limits<double>::infinity();
         for (int refused = 0; face >= 0 && !decide(face); ++refused) {
@@ -52,30 +51,18 @@ class Visibility {
                 face = view_.frame.beyond_float(n, face, ignored, decide);
                 break;
             }
-            const Vec2 off = out_of(face, n);
-            rays.count = 0;
-            for (const double part : moved_by) {
-                const Vec2 beside = n + part * off;
-                rays.n_x[rays.count] = beside.x, rays.n_y[rays.count++] = beside.y;
-            }
+            const Vec2 error = out_of(face, n);
             ignored.insert(std::upper_bound(ignored.begin(), ignored.end(), face), face);
-            std::span<const int32_t> all[n_moved];
-            std::fill(std::begin(all), std::end(all), ignored);
-            rays.prepare();
-            view_.frame.cast(rays, all);
-            face = rays.face[0];
-            for (int i = 1; i < n_moved; ++i)
-                if (const int32_t other = rays.face[i]; other >= 0 && decide(other))
-                    if (const double z = depth_of(view_, other, n); z < depth) nearest = other, depth = z;
+            face = each_beside(view_, n, error, ignored, [&](int32_t met) {
+                if (!decide(met)) return;
+                if (const double z = depth_of(view_, met, n); z < depth) nearest = met, depth = z;
+            });
         }
         return face >= 0 && depth_of(view_, face, n) < depth ? face : nearest;
     }
 
    private:
     static constexpr int most_refused = 3;
-    // How far rays pass from the point, of the error of floats; the first one is the sample's own.
-    static constexpr double moved_by[] = {0, 2, 0.5, 1.0 / 8, 1.0 / 32};
-    static constexpr int n_moved = int(std::size(moved_by));
 
     // Whether a face that the ray meets lies before the point: its plane has the point on one side and the viewer on
     // the other. Surfaces that touch at the curve (a cube on the ground) are not before it, however flat the view: the

@@ -18,6 +18,7 @@ struct SurfaceSample {
     Vec2 u, x;
     Barycentrics lambda;
     double share, weight;
+    Vec2 across = {};  // a narrow face, by as much as rays err, px; 0: it is wide
 };
 
 // Each offers: wants(i, sample), false if nothing could come of it; add(i, sample, n, visible) for those that it

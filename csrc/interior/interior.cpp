@@ -11,6 +11,7 @@
 #include <algorithm>
 #include <vector>
 
+#include "backward/beside.h"
 #include "camera/polygon.h"
 #include "core/channels.h"
 #include "core/draws.h"
@@ -77,8 +78,8 @@ class InteriorChunk {
     // apart; then what counts is whether what it met instead lies behind, by more than floats can tell.
     bool is_visible(int i) const {
         const int32_t own = sample_[i].face;
-        if (rays_.face[i] == own) return true;
         const Vec2 n = rays_.n(i);
+        if (rays_.face[i] == own) return !is_hidden_by_a_hair(i);
         if (!is_there(view_, own, n)) return false;
         const double depth = depth_of(view_, own, n);
         const auto far_before = [&](int32_t face) { return lies_far_before(view_, face, depth); };
@@ -90,11 +91,50 @@ class InteriorChunk {
         return depth_of(view_, met, n) > depth + view_.frame.error({p[0], p[1], p[2]});
     }
 
+    // Whether something lies before the sample of a face that is narrower than rays err, though its ray found it: the
+    // border of what hides it runs so near that floats take the ray for one beside it.
+    bool is_hidden_by_a_hair(int i) const {
+        const SurfaceSample& sample = sample_[i];
+        if (sample.across.x == 0 && sample.across.y == 0) return false;
+        const int32_t own = sample.face;
+        const Vec2 n = rays_.n(i);
+        const double* p = view_.scene.verts + 3 * int64_t(view_.scene.faces[3 * int64_t(own)]);
+        const double before = depth_of(view_, own, n) - view_.frame.error({p[0], p[1], p[2]});
+        bool hidden = false;
+        for (const double side : {-1.0, 1.0}) {
+            const Vec2 error = normalised(view_.camera, sample.u + side * sample.across) - n;
+            each_beside(view_, n, error, {&own, 1}, [&](int32_t met) {
+                hidden = hidden || (meets(view_, met, n) && depth_of(view_, met, n) < before);
+            });
+        }
+        return hidden;
+    }
+
     const BackwardView<T>& view_;
     Contraction contraction_;
     CameraRays rays_;
     SurfaceSample sample_[RayBatch::size];
 };
+
+// Across a face that is narrower than some errors of rays, by as much as one errs, px; 0: it is wide.
+template <class T>
+Vec2 across_narrow(const BackwardView<T>& view, int64_t face, const VisiblePolygon& polygon) {
+    constexpr double narrow = 4;
+    if (polygon.starred || !(2 * polygon.area < narrow * float_reach * polygon.longest)) return {};
+    double error = 0;
+    for (int i = 0; i < 3; ++i) {
+        const double* p = view.scene.verts + 3 * int64_t(view.scene.faces[3 * face + i]);
+        error = std::max(error, view.frame.error({p[0], p[1], p[2]}));
+    }
+    error = std::min(error / view.camera.pixel_at_depth(polygon.nearest), float_reach);
+    if (!(2 * polygon.area < narrow * error * polygon.longest)) return {};
+    Vec2 along;
+    for (int i = 0; i < polygon.n; ++i) {
+        const Vec2 side = polygon.corner[(i + 1) % polygon.n] - polygon.corner[i];
+        if (length(side) > length(along)) along = side;
+    }
+    return (error / length(along)) * Vec2{along.y, -along.x};
+}
 
 // What the gradient of a face will ask for once its rays are cast.
 template <class T>
@@ -120,6 +160,7 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
         PolygonSampler sampler;
         int64_t face = -1;
         double share = 0;
+        Vec2 across;
         draws.each(first, last, [&](int64_t f, int64_t i) {
             if (f != face) {
                 face = f;
@@ -127,6 +168,7 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
                 prefetch_face(view, f);
                 share = systematic.weight(f);
                 sampler.set(polygon, 1 / share);
+                across = across_narrow(view, f, polygon);
             }
             const double s = (systematic.position(i) - systematic.begin_of(face)) / systematic.measure_of(face);
             const Vec2 u = sampler(s, sequence(i));
@@ -136,7 +178,8 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
                        .x = {},
                        .lambda = sampler.lambda(),
                        .share = share,
-                       .weight = share * polygon.area * sampler.weight()});
+                       .weight = share * polygon.area * sampler.weight(),
+                       .across = across});
         });
         chunk.finish();
     });
