@@ -3,9 +3,9 @@
 // something lies before.
 //
 // Where other curves lie on this one in the image (coincident.h), the ray runs along the borders of their faces, and
-// which of these it meets would be left to rounding. So it ignores them too, and they are asked in double. One that
-// lies apart by more than the rounding of doubles covers the point or not; those that do not, coincidence.h puts in
-// order.
+// which of these it meets would be left to rounding. So they are asked in double. A face whose curve lies apart by more
+// than the rounding of doubles, or meets this one at an angle, covers the point or not, and the ray ignores those that
+// do; faces of curves on the same line it ignores too, and coincidence.h puts them in order.
 #pragma once
 
 #include <algorithm>
