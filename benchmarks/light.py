@@ -15,12 +15,12 @@ from table import Bench, Row, milliseconds, ratio_row, seconds_of
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._kernel import core
-from edgegrad._lit import Lighting
-from edgegrad._request import make_request
+from edgegrad.kernel.request import make_request
+from edgegrad.library import core
+from edgegrad.light.radiance import Lighting
+from edgegrad.points.samples import Frame
 from edgegrad.report import build
 from edgegrad.report.scenes import ReportScene
-from edgegrad.samples import Frame
 from edgegrad.shader import Effort, _Image
 
 # Samples on the borders of shadows.

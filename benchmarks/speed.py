@@ -35,9 +35,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 import edgegrad as eg
-from edgegrad._kernel import core
-from edgegrad.report import build, mitsuba
-from edgegrad.report.methods import default_samples, differentiate
+from edgegrad.library import core
+from edgegrad.report import build
+from edgegrad.report.error_time import mitsuba
+from edgegrad.report.error_time.methods import default_samples, differentiate
 from edgegrad.report.scenes import ReportScene, cube, front_camera, smooth_adjoint, smooth_colors
 from edgegrad.report.scenes import sphere as icosphere
 

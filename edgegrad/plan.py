@@ -13,19 +13,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import _memory as memory
-from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
-from ._kernel import core
-from ._lit import Lighting, check_unlit
-from ._ops import Hits, backward_kernel, forward_kernel, image_room, pass_size
-from ._request import MOVING, SLOTS, Request, Work, as_scene, label, make_request, required
-from ._samples import CURVE_BYTES, SURFACE_BYTES, without_colors
-from ._shadows import ShadowLight
-from ._surfaces import every_face
-from .camera import Camera
-from .mesh import Mesh
+from .camera.camera import Camera
+from .check import as_tensor, check_finite, check_float, check_positive_int, check_shape
+from .kernel import memory as memory
+from .kernel.flat import Flat
+from .kernel.operators import Hits, backward_kernel, forward_kernel, image_room, pass_size
+from .kernel.request import MOVING, SLOTS, Request, Work, label, make_request, required
+from .library import core
+from .light.radiance import Lighting, check_unlit
+from .points.records import CURVE_BYTES, SURFACE_BYTES, without_colors
+from .points.shadows import ShadowLight
+from .points.surfaces import every_face
 from .render import SHADING, render
-from .scene import Flat, Scene
+from .scene.mesh import Mesh
+from .scene.scene import Scene, as_scene
 from .shader import AT_ONCE
 
 # -- the plan ---------------------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 The value of the image and its gradient come from different samples. Those of the image are shaded without a graph, several of a
 face where borders of steps run through a pixel. To it
-terms are attached of which only the derivatives count (_splat.py):
+terms are attached of which only the derivatives count (points/splat.py):
 samples inside faces, shaded with a graph at points that move with the scene while
 their pixel stays; samples on curves, shaded without one on both sides, whose jump multiplies the curve's velocity; and, where
 the shader declares steps, samples on these. All of it is PyTorch, so whatever the shader uses gets its gradient by itself.
@@ -18,22 +18,23 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from ._background import environments
-from ._blend import Blended
-from ._borders import Borders
-from ._check import all_finite, values_visible
-from ._derivatives import differentiates, moves, transformed
-from ._request import Request, derived_seed
-from ._samples import PixelRecords, RayRecords, shaded_room, without_colors
-from ._shadows import ShadowLight
-from ._splat import Term
-from ._steps import UNEQUAL, Crossings, Points, Steps, find_crossings
-from ._surfaces import every_face
-from ._warnings import warn
-from .camera import Camera
-from .hits import Hits
-from .samples import EdgeSamples, Frame, SurfaceSamples, boundary
-from .scene import Flat, Scene
+from .camera.camera import Camera
+from .check import all_finite, values_visible
+from .kernel.derivatives import differentiates, moves, transformed
+from .kernel.flat import Flat
+from .kernel.request import Request, derived_seed
+from .points.background import environments
+from .points.blend import Blended
+from .points.borders import Borders
+from .points.hits import Hits
+from .points.records import PixelRecords, RayRecords, shaded_room, without_colors
+from .points.samples import EdgeSamples, Frame, SurfaceSamples, boundary
+from .points.shadows import ShadowLight
+from .points.splat import Term
+from .points.steps import UNEQUAL, Crossings, Points, Steps, find_crossings
+from .points.surfaces import every_face
+from .scene.scene import Scene
+from .warnings import warn
 
 Shader = Callable[[Hits], Tensor]
 

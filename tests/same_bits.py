@@ -1,7 +1,7 @@
 """Images and gradients of six scenes, to be compared bit by bit before and after a change that is to change no result.
 
-    python tests/same_bits.py FILE.npz            writes them
-    python tests/same_bits.py FILE.npz --compare  fails where one differs from what is in the file
+python tests/same_bits.py FILE.npz            writes them
+python tests/same_bits.py FILE.npz --compare  fails where one differs from what is in the file
 """
 
 from __future__ import annotations
@@ -70,9 +70,7 @@ def textured() -> Arrays:
     uvs = leaf((verts[:, :2] + 1) / 2)
     verts, texture = leaf(verts), leaf(colors(64, 1).reshape(8, 8, 1))
     alpha = colors(64, 1).reshape(8, 8)
-    mesh = eg.Mesh(
-        verts, faces, texture=texture, uvs=uvs, uv_faces=faces, alpha=alpha, filter="nearest", wrap="repeat"
-    )
+    mesh = eg.Mesh(verts, faces, texture=texture, uvs=uvs, uv_faces=faces, alpha=alpha, filter="nearest", wrap="repeat")
     view = camera().replace(distortion=leaf(torch.tensor([0.05, -0.02, 0.001, 0.002])))
     image = eg.render(eg.Scene(mesh, background=torch.tensor([0.2])), view, spp=8, seed=4)
     leaves = {"verts": verts, "texture": texture, "uvs": uvs, "K": view.K, "distortion": view.distortion}

@@ -201,7 +201,7 @@ def test_what_is_only_announced_takes_no_memory(tmp_path):
 
 def test_an_image_too_large_to_hold_is_refused_by_its_header(tmp_path, monkeypatch):
     """A whole file, and a small one: 3 MB of zeros unpack to ten times 2³⁰ numbers."""
-    monkeypatch.setattr("edgegrad.image.MOST_NUMBERS", 1000)
+    monkeypatch.setattr("edgegrad.files.image.MOST_NUMBERS", 1000)
     path = write(tmp_path, "a.png", png(40, 26, bytes(26 * (1 + 40)), 8, 0))
     with pytest.raises(ValueError, match=r"a\.png: expected at most 1000 pixels times channels, got 26 × 40 × 1"):
         eg.read_image(path)

@@ -27,8 +27,8 @@ from torch.autograd import gradcheck
 
 import edgegrad as eg
 import edgegrad.reference
-from edgegrad.hits import Forced
-from edgegrad.lights import harmonics
+from edgegrad.points.hits import Forced
+from edgegrad.scene.lights import harmonics
 
 WHITE = eg.Material(base_color=1.0)
 
