@@ -22,6 +22,7 @@ from PIL import EpsImagePlugin, Image
 from test_io import GOOD, OFF, SQUARE, STL, TEXELS, TRIANGLES, glb, linear, ply, square_glb
 
 import edgegrad as eg
+from edgegrad.files.parts import MESHES
 
 IMAGES = (".png", ".jpg", ".bmp", ".tif", ".hdr", ".exr")
 
@@ -162,6 +163,7 @@ LOAD_ALL = """
 import json, pathlib, sys
 import torch
 import edgegrad as eg
+from edgegrad.files.parts import MESHES
 import lxml.etree, networkx, OpenImageIO, PIL.Image, trimesh.exchange.load
 
 sys.path.insert(0, sys.argv[1])
@@ -278,7 +280,7 @@ class Touch:
         return Path.touch, (self.path,)
 
 
-@pytest.mark.parametrize("suffix", [*eg._parts.MESHES, *IMAGES, ".json"])
+@pytest.mark.parametrize("suffix", [*MESHES, *IMAGES, ".json"])
 @pytest.mark.parametrize("form", ["pickle", "torch", "npy", "npz"])
 def test_no_pickle_is_opened(tmp_path, suffix, form):
     evil, stream = Touch(tmp_path / "ran"), io.BytesIO()
