@@ -18,7 +18,7 @@ import edgegrad as eg
 from edgegrad.kernel.request import make_request
 from edgegrad.library import core
 from edgegrad.light.radiance import Lighting
-from edgegrad.points.samples import Frame
+from edgegrad.points.frame import Frame
 from edgegrad.report import build
 from edgegrad.report.scenes import ReportScene
 from edgegrad.shader import Effort, _Image

@@ -26,11 +26,12 @@ from .kernel.request import Request, derived_seed
 from .points.background import environments
 from .points.blend import Blended
 from .points.borders import Borders
+from .points.frame import Frame
 from .points.hits import Hits
 from .points.records import PixelRecords, RayRecords, shaded_room, without_colors
-from .points.samples import EdgeSamples, Frame, SurfaceSamples, boundary
+from .points.samples import EdgeSamples, SurfaceSamples
 from .points.shadows import ShadowLight
-from .points.splat import Term
+from .points.splat import Term, boundary
 from .points.steps import UNEQUAL, Crossings, Points, Steps, find_crossings
 from .points.surfaces import every_face
 from .scene.scene import Scene

@@ -27,7 +27,7 @@ from torch.autograd import gradcheck
 
 import edgegrad as eg
 import edgegrad.reference
-from edgegrad.points.hits import Forced
+from edgegrad.points.shadow_rays import Forced
 from edgegrad.scene.lights import harmonics
 
 WHITE = eg.Material(base_color=1.0)

@@ -16,8 +16,9 @@ from edgegrad.kernel.first_order import unreached
 from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel, radiance
 from edgegrad.points import borders
-from edgegrad.points.hits import Forced, Hits
-from edgegrad.points.samples import Frame
+from edgegrad.points.frame import Frame
+from edgegrad.points.hits import Hits
+from edgegrad.points.shadow_rays import Forced
 from edgegrad.scene.lights import LightPoints
 
 F64 = torch.float64

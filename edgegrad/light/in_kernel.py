@@ -14,9 +14,9 @@ from ..kernel.first_order import Tensors, apply, array, doubles, without_derivat
 from ..kernel.flat import Flat
 from ..kernel.operators import kernel_scene
 from ..library import core
+from ..points.frame import Frame
 from ..points.hits import Hits
 from ..points.records import values_of
-from ..points.samples import Frame
 from ..points.seeds import STEPS, mixed_bits
 from ..points.surfaces import Surfaces, View
 from ..scene.environment import Environment

@@ -20,8 +20,8 @@ from ..check import all_finite, check_positive_int, values_visible
 from ..kernel.first_order import unreached
 from ..kernel.flat import image_dtype
 from ..kernel.request import Request
+from ..points.frame import Frame
 from ..points.hits import Hits
-from ..points.samples import Frame
 from ..points.surfaces import Rays, Surfaces, View
 from ..scene.appearance import OnMesh, jumps
 from ..scene.environment import Environment

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ..scene.appearance import OnMesh
 from ..scene.textures import look_up
+from .frame import Frame
 from .hits import Hits
 from .records import trace
-from .samples import Frame
 
 MOST = 8  # surfaces in a row; what lies behind the last is left out
 

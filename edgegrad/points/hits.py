@@ -4,36 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from ..check import as_tensor, check_finite, check_float, check_shape, values_visible
-from ..kernel.derivatives import moves
 from ..scene.lights import Light, LightPoints
 from ..scene.material import WRAPS
 from ..scene.mesh import FILTERS
 from ..scene.rows import interpolated, rows_of
-from ..scene.textures import bilinear, in_texels, nearest, pyramid
+from ..scene.textures import bilinear, in_texels, nearest, trilinear
+from .footprints import Footprints, pyramid_of
 from .records import RayRecords, visible
-from .seeds import STEPS, mixed_bits, signed
+from .seeds import uniform
+from .shadow_rays import Forced, seen_from
 from .steps import Steps, StepsOfSome
 from .surfaces import Rays, Surfaces, View, every_face
-
-
-class Forced(NamedTuple):
-    """What is known of the shadow of one light at some points, instead of being drawn and traced."""
-
-    light: int  # place in scene.casting
-    points: LightPoints  # N of them
-    lit: Tensor  # (N,) 0 or 1
-    some: Tensor  # (N,) bool: at which points; elsewhere light points are drawn, and shadow rays cast
-    only: bool = False  # whether nothing is wanted but what this light adds
-
-    def select(self, index: Tensor | slice) -> Forced:
-        return Forced(self.light, self.points.select(index), self.lit[index], self.some[index], self.only)
 
 
 class Hits:
@@ -272,51 +260,11 @@ class Hits:
             return nearest(texture, self.floor(in_texels(texture, uv)), wraps)
         if filter == "linear":
             return bilinear(texture, uv, wraps)
-        assert corners is not None
-        levels = self._pyramid(texture)
-        level = self._level(texture, corners).clamp(0, len(levels) - 1)
-        below = level.floor()
-        value: Any = 0
-        for k, image in enumerate(levels):
-            weight = torch.where(below == k, 1 - (level - below), torch.where(below == k - 1, level - below, 0.0))
-            value = value + weight.to(texture.dtype)[:, None] * bilinear(image, uv, wraps)
-        return value
-
-    def _pyramid(self, texture: Tensor) -> list[Tensor]:
-        """The levels of a texture, kept where they have no graph."""
-        kept = self._surfaces.pyramids
-        if torch.is_grad_enabled():
-            return pyramid(texture)
-        if id(texture) not in kept:
-            kept[id(texture)] = texture, pyramid(texture)
-        return kept[id(texture)][1]
-
-    def _level(self, texture: Tensor, corner_uvs: Tensor) -> Tensor:
-        """(N,) the logarithm of how many texels neighbouring pixels are apart, at most."""
         if self._rays_at is None or self._pixel is None or isinstance(self._view, Rays):
             raise ValueError("mipmap: expected hits of a camera, for rays of trace() have no neighbours; leave it out")
-        rays_at, view, pixel, corners = self._rays_at, self._view, self._pixel, corner_uvs.double()
-        size = torch.tensor([texture.shape[1], texture.shape[0]], dtype=torch.float64, device=corners.device)
-        step = 1 / 64  # px, within which the face's plane is as good as straight
-        rays = rays_at(pixel)
-
-        def beside(axis: int, aside: float) -> Tensor:
-            if not moves(rays.along):
-                return rays.along + aside * rays.along_by_x[:, :, axis]
-            # As functions of the intrinsics; where the lens shows nothing there, as if all were the same.
-            offset = torch.zeros(2, dtype=pixel.dtype, device=pixel.device)
-            offset[axis] = aside
-            along = rays_at(pixel + offset).along
-            return torch.where(torch.isfinite(along), along, rays.along)
-
-        def squared(axis: int) -> Tensor:
-            """How many texels a pixel is along an axis, squared."""
-            b = [view.barycentrics(self._surfaces, self._face, beside(axis, aside)) for aside in (step, -step)]
-            texels = interpolated(b[0] - b[1], corners) * size / (2 * step)
-            return (texels * texels).sum(1)
-
-        most = torch.nan_to_num(torch.maximum(squared(0), squared(1)), nan=1.0, posinf=1e18).clamp(1, 1e18)
-        return 0.5 * most.log2()
+        assert corners is not None
+        footprints = Footprints(self._surfaces, self._view, self._face, self._pixel, self._rays_at)
+        return trilinear(pyramid_of(self._surfaces, texture), footprints.level(texture, corners), uv, wraps)
 
     # -- steps ---------------------------------------------------------------------------------------------------------
 
@@ -390,12 +338,7 @@ class Hits:
         """(N, n) float64, uniform in [0, 1): the same for what belongs to the same sample, without derivatives. Points that
         follow one another, and the `parts` of one point, have numbers that fill the unit cube evenly (a Kronecker sequence
         with the powers of the generalised golden ratio of three dimensions); `stream` gives others."""
-        seed = self._seed * parts + part
-        columns = []
-        for k in range(n):
-            mixed = seed * STEPS[k % 3] + signed(mixed_bits(stream * 0x10001 + k))
-            columns.append(((mixed >> 11) & ((1 << 53) - 1)).double() * 2.0**-53)
-        return torch.stack(columns, 1)
+        return uniform(self._seed * parts + part, n, stream)
 
     def light_points(self, light: Light, sample: int = 0, samples: int = 1) -> LightPoints:
         """A point of a light of `lights` for each of the N points, drawn by what the light emits, or one after another of so many
@@ -403,14 +346,7 @@ class Hits:
         index = self._index(light)
         points = light.draw(self.random(3, index, sample, samples))
         forced = self._forced
-        if forced is None or forced.light != index:
-            return points
-        some = forced.some
-        return LightPoints(
-            torch.where(some, forced.points.index, points.index),
-            torch.where(some[:, None], forced.points.uv, points.uv),
-            torch.where(some, forced.points.density, points.density),
-        )
+        return points if forced is None or forced.light != index else forced.among(points)
 
     def visible_from(self, light: Light, points: LightPoints) -> Tensor:
         """(N,) 1 where nothing lies between the points and those of a light, else 0: see visible(). A border of its shadow is
@@ -419,19 +355,8 @@ class Hits:
         s.shadowing.add(index)
         if forced is not None and forced.light == index and values_visible(forced.some) and bool(forced.some.all()):
             return forced.lit.to(self.position.dtype)
-        place = light.place(points).detach().to(s.verts.device, torch.float64)
-        here = self.position.detach().double()
-        spacing = torch.finfo(s.verts.dtype).eps
-        size = here.abs().amax(1)
-        if light.infinite:
-            center, radius = s.ball
-            place = here + place * ((here - center).norm(dim=1, keepdim=True) + 1.01 * radius)
-        else:
-            size = torch.maximum(size, place.abs().amax(1))
-            if not light.punctual:
-                # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
-                spacing = max(spacing, 2.0**-40)
-        lit = visible(s.casters, self._face, self._exact[:, 1:], place, 16 * spacing * size)
+        place, near = seen_from(light, points, s, self.position.detach().double())
+        lit = visible(s.casters, self._face, self._exact[:, 1:], place, near)
         self._noted(index, lit)
         lit = lit.to(self.position.dtype)
         if forced is None or forced.light != index:
