@@ -74,7 +74,7 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
         if shadows and bool((own >= 0).any()):
             surfaces.shadowing.add(light)
             if casting.punctual:
-                hits._noted(light, own)
+                hits.note_visibility(light, own)
         column += 1 if casting.punctual else samples
     return found.to(surfaces.verts)
 
@@ -123,7 +123,7 @@ def _forced(points: Any, lit: Tensor) -> tuple[Tensor, ...]:
 
 
 class _Points(NamedTuple):
-    """Tensors of points, apart from their barycentrics."""
+    """Tensors of points; their barycentrics are an argument of their own."""
 
     face: Tensor  # (N,) int64
     seed: Tensor  # (N,) int64

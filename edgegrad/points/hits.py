@@ -20,7 +20,7 @@ from .footprints import Footprints, pyramid_of
 from .records import RayRecords, visible
 from .seeds import uniform
 from .shadow_rays import Forced, seen_from
-from .steps import Steps, StepsOfSome
+from .steps import Steps, StepsOfSubset
 from .surfaces import Rays, Surfaces, View, every_face
 
 
@@ -53,7 +53,7 @@ class Hits:
         self._face, self._exact = face, barycentrics
         self._barycentrics = barycentrics.to(surfaces.verts.dtype)
         self._pixel, self._steps = pixel, steps or Steps()
-        self._whole: tuple[Hits, Tensor] | None = None  # of which these are some points, the rows of these
+        self._all: tuple[Hits, Tensor] | None = None  # the hits that these are a subset of, and the rows of these
         # (N,) int8, by lights of scene.casting: visible_from(), −1 where it was not asked
         self.lit: dict[int, Tensor] = {}
 
@@ -78,20 +78,20 @@ class Hits:
         wrong = (index < -count) | (index >= count)
         if values_visible(index) and bool(wrong.any()):
             raise ValueError(f"index: expected numbers from {-count} to {count - 1}, got {int(index[wrong][0])}")
-        return self.apart(index, StepsOfSome(self._steps, index % max(count, 1), count))
+        return self.subset(index, StepsOfSubset(self._steps, index % max(count, 1), count))
 
-    def apart(self, index: Tensor | slice, steps: Steps | None = None) -> Hits:
-        """Some of the points, as hits that know nothing of the whole."""
+    def subset(self, index: Tensor | slice, steps: Steps | None = None) -> Hits:
+        """Some of the points. Unlike select(), steps that are declared of them are not declared of all."""
         view = self._view.select(index) if isinstance(self._view, Rays) else self._view
         pixel = None if self._pixel is None else self._pixel[index]
         forced = None if self._forced is None else self._forced.select(index)
         place = self._face[index], self._exact[index], pixel
         some = Hits(self._surfaces, view, *place, self._rays_at, steps, self._seed[index], forced)
-        if self._whole is None:
+        if self._all is None:
             rows = torch.arange(len(self), device=self._face.device)[index] if isinstance(index, slice) else index
-            some._whole = self, rows
+            some._all = self, rows
         else:
-            some._whole = self._whole[0], self._whole[1][index]
+            some._all = self._all[0], self._all[1][index]
         return some
 
     @property
@@ -108,12 +108,13 @@ class Hits:
             raise ValueError("hits.ray: expected hits of trace(), these are of a camera; see hits.pixel")
         return self._view.ray
 
-    def _note(self, key: Any, corners: Callable[[], Tensor]) -> None:
+    def note_jump(self, key: Any, corners: Callable[[], Tensor]) -> None:
+        """That radiance depends on values at the corners of faces (F, 3, K): edges where these differ may be creases."""
         self._surfaces.jumping.setdefault(key, corners)
 
     def _note_faces(self) -> None:
         s = self._surfaces
-        self._note("face", lambda: every_face(len(s.faces)).to(s.verts.device))
+        self.note_jump("face", lambda: every_face(len(s.faces)).to(s.verts.device))
 
     @property
     def face(self) -> Tensor:
@@ -125,7 +126,7 @@ class Hits:
     def mesh(self) -> Tensor:
         """(N,) int64: the mesh of the scene."""
         s = self._surfaces
-        self._note("mesh", lambda: s.mesh_of_face[:, None, None].expand(-1, 3, 1))
+        self.note_jump("mesh", lambda: s.mesh_of_face[:, None, None].expand(-1, 3, 1))
         return s.mesh_of_face[self._face]
 
     @property
@@ -150,14 +151,14 @@ class Hits:
         """(N, 3) unit normal of the face, to the side from which its vertices run counter-clockwise."""
         s = self._surfaces
         every = torch.arange(len(s.faces), device=s.verts.device)
-        self._note("normal", lambda: s.face_normals(every)[:, None].expand(-1, 3, -1))
+        self.note_jump("normal", lambda: s.face_normals(every)[:, None].expand(-1, 3, -1))
         return s.face_normals(self._face)
 
     @cached_property
     def shading_normal(self) -> Tensor:
         """(N, 3) unit normal, interpolated between those of the vertices: means of their faces' by area."""
         s = self._surfaces
-        self._note("shading_normal", lambda: s.vertex_normals[s.faces])
+        self.note_jump("shading_normal", lambda: s.vertex_normals[s.faces])
         normals = rows_of(s.vertex_normals, rows_of(s.faces, self._face))
         return normalize(interpolated(self._barycentrics, normals), dim=-1)
 
@@ -165,7 +166,7 @@ class Hits:
     def uv(self) -> Tensor:
         """(N, 2) texture coordinates, v running up."""
         s = self._surfaces
-        self._note("uv", lambda: s.corner_uvs)
+        self.note_jump("uv", lambda: s.corner_uvs)
         return interpolated(self._barycentrics, rows_of(s.corner_uvs, self._face))
 
     @cached_property
@@ -204,7 +205,7 @@ class Hits:
                 else attribute[:, None].expand(-1, 3, -1)
             )
 
-        self._note(("attribute", id(attribute)), corners)
+        self.note_jump(("attribute", id(attribute)), corners)
         if per == "face":
             return rows_of(attribute, self._face)
         values = rows_of(attribute, rows_of(s.faces, self._face) if per == "vertex" else self._face)
@@ -357,22 +358,22 @@ class Hits:
             return forced.lit.to(self.position.dtype)
         place, near = seen_from(light, points, s, self.position.detach().double())
         lit = visible(s.casters, self._face, self._exact[:, 1:], place, near)
-        self._noted(index, lit)
+        self.note_visibility(index, lit)
         lit = lit.to(self.position.dtype)
         if forced is None or forced.light != index:
             return lit
         return torch.where(forced.some, forced.lit.to(lit), lit)
 
-    def _noted(self, light: int, lit: Tensor) -> None:
-        """Known to the whole of which these are some points: 1 or 0, and −1 where it was not asked."""
+    def note_visibility(self, light: int, lit: Tensor) -> None:
+        """Kept with the hits that these are a subset of: 1 or 0, and −1 where it was not asked."""
         if not values_visible(lit):
             return
         lit = lit.to(torch.int8)
-        if self._whole is None:
+        if self._all is None:
             self.lit[light] = lit
             return
-        whole, rows = self._whole
-        known = whole.lit.setdefault(light, lit.new_full((len(whole),), -1))
+        every, rows = self._all
+        known = every.lit.setdefault(light, lit.new_full((len(every),), -1))
         known.index_copy_(0, rows, lit)
 
     @property
