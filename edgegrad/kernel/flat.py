@@ -47,7 +47,7 @@ def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:
     must not wrap around, nor reach into the rows of another mesh, so unless the mesh is alone it becomes −1."""
     index = index.cpu()
     if alone:
-        # A look at the extremes costs less than a copy of a million indices.
+        # Comparing the extremes costs less than a copy of a million indices.
         if index.dtype == torch.int64 and (not values_visible(index) or not all_below(index, 2**31)):
             index = index.clamp(-(2**31), 2**31 - 1)
     else:

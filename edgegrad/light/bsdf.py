@@ -52,7 +52,7 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 def ggx(n: Tensor, h: Tensor, a2: Tensor) -> Tensor:
     """(N, 1): the density of microfacets with the normal h, α² = a2 (Walter et al. 2007). The sine is that of a cross product:
-    1 − cos² would round away what a small α looks at."""
+    1 − cos² would round away what decides where α is small."""
     sine = torch.linalg.cross(n, h)
     d = dot(sine, sine) + a2 * dot(n, h) ** 2
     return a2 / (math.pi * d * d)

@@ -1,4 +1,4 @@
-"""The surfaces of a scene as functions of its tensors, and how a camera or rays look at them: what hits are computed from."""
+"""The surfaces of a scene, and views of them by a camera or by rays, as functions of tensors: what hits are computed from."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def meet(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
 
 
 class View:
-    """How one camera looks."""
+    """Of a camera: where points are in its coordinates, and where its rays meet faces."""
 
     def __init__(self, world_to_camera: Tensor, perspective: bool) -> None:
         self.world_to_camera, self.perspective = world_to_camera, perspective  # (4, 4) float64
@@ -198,7 +198,7 @@ class View:
 
 
 class Rays(NamedTuple):
-    """How rays of the user's look, each at one point."""
+    """Of rays of the user, one for each point."""
 
     ray: Tensor  # (N,) int64, that of each point
     origin: Tensor  # (N, 3) world coordinates, float64

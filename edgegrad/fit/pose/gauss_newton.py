@@ -80,7 +80,7 @@ class GaussNewton:
         return self._gradient
 
     @property
-    def blind(self) -> bool:
+    def flat(self) -> bool:
         """Whether nothing in the image depends on p."""
         return not bool(self._curvature.diagonal().sum() > 0)
 

@@ -27,11 +27,8 @@ ASIDE, ASIDE_STEPS = 0.2, 20  # radians between the starts on the coarsest level
 FINAL_SPP = 64  # samples a pixel when ends are compared
 ROUNDS = 2  # of second opinions at most
 FAR_ABOVE = 4.0  # the noise: a loss that this does not explain, beside what is covered, may be that of a place nearby
-LOOKS, KEPT, FOLLOWED = (
-    150,
-    4,
-    3,
-)  # poses that a second opinion looks at, how many it follows a few steps, and how many more
+# Of a second opinion: poses that are compared, how many of them take a few steps, and how many are followed further.
+COMPARED, KEPT, FOLLOWED = 150, 4, 3
 COMMON = 0.2  # c of losses that are compared, as a part of the pictures' range
 FARTHEST, FARTHEST_SHIFT = 0.7, 0.15  # radians and object sizes of these from the start or the best pose
 
@@ -161,7 +158,7 @@ class Search:
                 c = min(c, compared.scale())
                 search.loss = loss = compared.loss(c)[0]
             way = way._replace(c=c, search=search.state(), random=self.generator.get_state())
-            if search.blind:
+            if search.flat:
                 self.journal.keep(way := way._replace(done=True))
                 break
             move = search.step()
@@ -211,7 +208,7 @@ class Search:
         """The few best of many poses around the start and the best one, by their loss on the coarsest level."""
         level, drawn = self.levels[0], []
         entries = [entry for entry in range(TURN, GROW) if entry in self.task.free]
-        for k in range(LOOKS):
+        for k in range(COMPARED):
             p = torch.zeros(GROW, dtype=torch.float64)
             p[TURN:SHIFT] = FARTHEST * self._ball()
             p[SHIFT:GROW] = FARTHEST_SHIFT * self._ball()

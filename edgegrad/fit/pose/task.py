@@ -185,12 +185,12 @@ class PoseTask:
         factors += [finest] * (len(BLURS) + 1 - len(factors))
         blurs = [*BLURS, *[0.0] * (len(factors) - len(BLURS))]
         # Perspective shows in fine detail only: on a blurred level the focal length would run away.
-        blind = [entry for entry in self.free if entry < ZOOM]
+        without_lens = [entry for entry in self.free if entry < ZOOM]
         levels = []
         for factor, blur in zip(factors, blurs, strict=True):
             coarseness = finest / factor
             samples = max(spp, min(MOST_SPP, round(spp * coarseness**2)))
-            levels.append(self.level(factor, blur, coarseness, samples, blind if blur else self.free))
+            levels.append(self.level(factor, blur, coarseness, samples, without_lens if blur else self.free))
         return levels
 
     def turned_over(self) -> PoseTask:
