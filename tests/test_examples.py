@@ -62,6 +62,7 @@ def test_a_shape_and_its_shadow() -> None:
     assert after < 0.4 * before
 
 
+@pytest.mark.slow
 def test_a_pose_of_which_a_quarter_is_covered() -> None:
     pose = example("pose")
     before, after, fit = pose.trial(pose.objects.pebble(64, 3), "covered", seed=1, size=64)

@@ -89,7 +89,7 @@ FIT_POSE = edgegrad.fit.fit_pose
 
 
 @linux
-@pytest.mark.parametrize("kills", [3, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [2, pytest.param(60, marks=pytest.mark.slow)])
 def test_a_killed_fit_leaves_the_best_pose_so_far(files, kills, monkeypatch):
     monkeypatch.setattr(edgegrad.fit, "fit_pose", told_fit)
     chance = random.Random(kills)

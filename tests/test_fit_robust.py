@@ -38,7 +38,7 @@ def test_a_quarter_covered(how):
     assert fit.converged and fit.explained > 0.5
 
 
-@pytest.mark.parametrize("looks", [True, False])
+@pytest.mark.parametrize("looks", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
     """Where noise does not explain the loss left, as with a board cut out of the mask, turned poses are looked at."""
     view = camera(64)
@@ -88,7 +88,7 @@ def test_what_is_not_in_the_picture_is_not_found(steps):
     assert fit.state.startswith("not converged: the picture shows")
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("masked", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_picture_from_the_bottom_up_is_named(masked):
     view = camera(32)
     target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
@@ -293,6 +293,7 @@ def test_pictures_and_masks_of_bytes_are_named():
         fit_scene(bracket(), [view], None, {"meshes[0].verts": 0.01}, masks=masks, progress=False)
 
 
+@pytest.mark.slow
 def test_a_rig_of_cameras(tmp_path):
     """Two cameras that keep their places to one another find where they are, and the lens that they share."""
     left = camera(64, distance=2.6)
@@ -348,7 +349,9 @@ def of_object(kind, image, alpha):
     return image + (1.0 - alpha) * {"before black": 0.0, "photograph": 0.9}[kind]
 
 
-@pytest.mark.parametrize("kind", ["before black", "straight", "photograph"])
+@pytest.mark.parametrize(
+    "kind", ["straight", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("before black", "photograph"))]
+)
 def test_what_a_picture_holds_at_a_soft_mask_does_not_matter(kind):
     view = camera(64)
     seen = eg.render_aovs(bracket(), view, ["image", "alpha"], spp=256, seed=1 << 40)
