@@ -60,7 +60,7 @@ def changes() -> list[Change]:
             continue
         file, line, changed, *mutants = rows
         assert line.startswith("- ") and changed.startswith("+ "), block
-        tests = {name.strip(): listed.split() for name, listed in (row.split(":") for row in mutants)}
+        tests = {name.strip(): listed.split() for name, listed in (row.split(": ") for row in mutants)}
         found.append(Change(file, line[2:], changed[2:], tests))
     return found
 

@@ -36,7 +36,7 @@ def face_colored(mesh: eg.Mesh, seed: int = 0) -> eg.Mesh:
 
 def check(case: Callable[[Tensor], list[eg.Mesh]], view: str, step: float = 0.004, **options: object) -> None:
     check_ratio(
-        lambda theta: (eg.Scene(case(theta), BACKGROUND), VIEWS[view]), step, spp=2048, **{**SAMPLES, **options}
+        lambda theta: (eg.Scene(case(theta), BACKGROUND), VIEWS[view]), step, spp=1024, **{**SAMPLES, **options}
     )
 
 
@@ -152,7 +152,7 @@ def test_thin_plate_far_from_the_origin() -> None:
         verts = plate.verts * size + place + theta * ALONG
         return eg.Scene(plate.replace(verts=verts.float()), BACKGROUND), camera
 
-    check_ratio(case, 0.006, spp=2048, **SAMPLES)
+    check_ratio(case, 0.006, spp=1024, **SAMPLES)
 
 
 @pytest.mark.parametrize("flat", [False, True], ids=["deep", "flat"])
