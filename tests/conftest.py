@@ -15,7 +15,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # what started the tes
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--budget", type=float, help="seconds of processor time that a test may take if it is not slow")
-    parser.addoption("--dearest", type=int, default=10, help="how many of the tests that took most are listed at the end")
+    parser.addoption(
+        "--dearest", type=int, default=10, help="how many of the tests that took most are listed at the end"
+    )
 
 
 def processor_time() -> float:

@@ -341,7 +341,7 @@ def test_transforms() -> None:
     """Forward mode and reverse mode give one number, and torch.vmap is a loop."""
     scene, camera = two_meshes(), front_camera(SIZE)
     names = ["alpha", "depth", "normal", "shading_normal", "uv", "position", "barycentrics"]
-    many: dict[str, Any] = {"surface_samples": 20_000, "edge_samples": 40_000}
+    many: dict[str, Any] = {"surface_samples": 10_000, "edge_samples": 20_000}
     direction = torch.tensor([0.3, 1.0, 0.2], dtype=F64)
 
     def channels(theta: Tensor) -> dict[str, Tensor]:

@@ -70,7 +70,9 @@ def errors(fit, R=None):
 
 
 @pytest.mark.parametrize(
-    "background", [pytest.param(BACKGROUND, marks=pytest.mark.slow), None, "image"], ids=["colour", "border", "image"]
+    "background",
+    [pytest.param(BACKGROUND, marks=pytest.mark.slow), None, pytest.param("image", marks=pytest.mark.slow)],
+    ids=["colour", "border", "image"],
 )
 def test_finds_the_pose(background, capsys):
     view = camera()
@@ -94,7 +96,7 @@ def test_a_start_that_is_the_answer_is_converged():
     """More steps would not find a better one."""
     target = picture(camera())
     fit = fit_pose(bracket(), target, camera(), background=BACKGROUND, progress=False)
-    assert fit.converged and errors(fit)[0] < 0.2
+    assert fit.converged and errors(fit)[0] < 0.2 and errors(fit)[1] < 0.5
 
 
 @pytest.mark.parametrize("mode", [pytest.param(torch.no_grad, marks=pytest.mark.slow), torch.inference_mode])
@@ -140,8 +142,8 @@ SECOND_OPINION = {"target": picture(camera(32)).flip(1), "steps": 21, "fit_focal
     ("options", "stops"),
     [
         # In the first of the starts, in another, between the levels, within and (−1) at the end of the last.
-        ({}, (13, 30, -1)),
-        pytest.param({}, (1, 31, 37), marks=pytest.mark.slow, id="other places"),
+        ({}, (13, 30)),
+        pytest.param({}, (1, 31, 37, -1), marks=pytest.mark.slow, id="other places"),
         # Among other starts, on their ways to finer levels, on that of the best.
         pytest.param(SECOND_OPINION, (100, 210, 330), marks=pytest.mark.slow, id="second opinions"),
     ],
@@ -252,7 +254,14 @@ def test_finds_the_scale():
     start[:3, 3] -= off * forward
     larger = bracket().transformed(torch.eye(3).double(), -0.12 * center, 1.12)
     fit = fit_pose(
-        bracket(), picture(view, larger), view, init=start, background=BACKGROUND, fit_scale=True, progress=False
+        bracket(),
+        picture(view, larger),
+        view,
+        init=start,
+        background=BACKGROUND,
+        fit_scale=True,
+        steps=12,
+        progress=False,
     )
     degrees, percent = errors(fit)
     assert fit.scale == pytest.approx(1.12, rel=0.005)
@@ -265,7 +274,14 @@ def test_finds_the_focal_length():
     K[:2, :2] *= 1.1
     start = about_center(rotation(0.05, -0.06, 0.04), (0.04, -0.03, 0.05))
     fit = fit_pose(
-        bracket(), picture(near.replace(K=K)), near, init=start, background=BACKGROUND, fit_focal=True, progress=False
+        bracket(),
+        picture(near.replace(K=K)),
+        near,
+        init=start,
+        background=BACKGROUND,
+        fit_focal=True,
+        steps=12,
+        progress=False,
     )
     degrees, percent = errors(fit)
     assert float(fit.camera.K[0, 0] / K[0, 0]) == pytest.approx(1.0, abs=0.02)
@@ -276,7 +292,7 @@ def test_finds_the_focal_length():
 def test_orthographic_camera_leaves_the_depth():
     center = torch.tensor([1.0, 0.75, 0.4]).double()
     view = eg.Camera.orthographic(center + torch.tensor([1.4, 1.2, 3.5]).double(), center, height=3.5, size=(64, 64))
-    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, progress=False)
+    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, steps=10, progress=False)
     degrees, _ = errors(fit)
     q = view.world_to_camera[:3, :3] @ (fit.R @ center + fit.t - center)
     started = view.world_to_camera[:3, :3] @ (START[:3, :3] @ center + START[:3, 3] - center)
@@ -286,7 +302,7 @@ def test_orthographic_camera_leaves_the_depth():
 def test_scene_of_several_meshes_moves_together():
     view, mesh = camera(), bracket()
     parts = [mesh.replace(faces=mesh.faces[k], face_colors=mesh.face_colors[k]) for k in (slice(0, 9), slice(9, 20))]
-    fit = fit_pose(eg.Scene(parts, BACKGROUND), picture(view), view, init=START, progress=False)
+    fit = fit_pose(eg.Scene(parts, BACKGROUND), picture(view), view, init=START, steps=10, progress=False)
     assert max(errors(fit)) < 0.5
 
 
@@ -306,12 +322,6 @@ def test_the_same_seed_gives_the_same_fit():
     ]
     assert torch.equal(fits[0].matrix, fits[1].matrix)
     assert not torch.equal(fits[0].matrix, fits[2].matrix)
-
-
-def test_a_start_at_the_truth_stays():
-    view = camera(48)
-    fit = fit_pose(bracket(), picture(view), view, background=BACKGROUND, progress=False)
-    assert max(errors(fit)) < 0.5
 
 
 def test_interruption_keeps_the_best_pose():
