@@ -44,7 +44,7 @@ def fit(files, *more):
 
 def test_fit_pose(files, capsys):
     out = files / "new" / "out"
-    assert fit(files, "--init", files / "init.json", "--out", out) == 0
+    assert fit(files, "--init", files / "init.json", "--steps", 12, "--out", out) == 0
     found = PoseFit.from_json((out / "pose.json").read_text())
     assert max(errors(found)) < 1.0 and found.converged
     said = capsys.readouterr()
@@ -79,7 +79,7 @@ def test_fit_pose_with(what, files):
     more = {"mask": ["--mask", files / "mask.png"], "background": ["--background", colour], "alpha": []}[what]
     if what == "alpha":
         write_image(files / "target.png", torch.cat([picture(view), silhouette(view)], -1))
-    assert fit(files, "--init", files / "init.json", *more, "--out", files / "out") == 0
+    assert fit(files, "--init", files / "init.json", "--steps", 12, *more, "--out", files / "out") == 0
     assert max(errors(PoseFit.from_json((files / "out" / "pose.json").read_text()))) < 0.5
 
 

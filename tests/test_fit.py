@@ -95,7 +95,7 @@ def test_finds_the_pose(background, capsys):
 def test_a_start_that_is_the_answer_is_converged():
     """More steps would not find a better one."""
     target = picture(camera())
-    fit = fit_pose(bracket(), target, camera(), background=BACKGROUND, progress=False)
+    fit = fit_pose(bracket(), target, camera(), background=BACKGROUND, steps=12, progress=False)
     assert fit.converged and errors(fit)[0] < 0.2 and errors(fit)[1] < 0.5
 
 
@@ -238,7 +238,9 @@ def test_a_checkpoint_that_cannot_be_written_ends_no_fit(tmp_path, monkeypatch):
 def test_finds_the_pose_with_a_mask(plain):
     view = camera()
     clutter = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
-    fit = fit_pose(bracket(plain), picture(view, background=clutter), view, silhouette(view), START, progress=False)
+    fit = fit_pose(
+        bracket(plain), picture(view, background=clutter), view, silhouette(view), START, steps=12, progress=False
+    )
     degrees, percent = errors(fit)
     # Pixels on the border mix in what lies behind the object, which the mask does not undo.
     assert degrees < 1.5 and percent < 1.5

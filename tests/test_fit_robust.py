@@ -32,7 +32,7 @@ def test_a_quarter_covered(how):
     told = {"background": BACKGROUND}
     if how == "weight":
         told["weight"] = free
-    fit = fit_pose(bracket(), image, view, init=START, progress=False, **told)
+    fit = fit_pose(bracket(), image, view, init=START, steps=12, progress=False, **told)
     degrees, percent = errors(fit)
     assert degrees < 1.0 and percent < 1.0, (degrees, percent)
     assert fit.converged and fit.explained > 0.5
@@ -63,7 +63,7 @@ def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
 def test_noise_explains_the_loss_of_a_pose_that_is_right():
     """Of what is seen whole: no other poses are looked at."""
     view = camera(64)
-    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, progress=False)
+    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, steps=12, progress=False)
     pose = pose_from_matrix("", fit.matrix)
     assert fit.task is not None
     _, _, noise = search.Search(fit.task, fit.task.pyramid(pose, 64, 16), pose, 40, 3e-4, 0)._judged(pose)
@@ -118,7 +118,9 @@ def test_several_pictures_share_the_pose():
     larger = bracket().transformed(torch.eye(3).double(), -0.08 * center, 1.08)
     views = [first, second]
     images = [picture(view, larger) for view in views]
-    fit = fit_pose(bracket(), images, views, init=START, background=BACKGROUND, fit_scale=True, progress=False)
+    fit = fit_pose(
+        bracket(), images, views, init=START, background=BACKGROUND, fit_scale=True, steps=12, progress=False
+    )
     assert max(errors(fit)) < 0.5 and fit.scale == pytest.approx(1.08, rel=0.01) and fit.converged
     figure = fit.plot()
     assert len(figure.axes) == 8
@@ -128,7 +130,7 @@ def test_the_start_is_placed_where_the_picture_shows_the_object():
     view, away = camera(48), torch.tensor([40.0, -30.0, 25.0]).double()
     far = bracket().transformed(t=away)
     mask = silhouette(view)
-    fit = fit_pose(far, picture(view), view, mask, progress=False)
+    fit = fit_pose(far, picture(view), view, mask, steps=12, progress=False)
     where = fit.R @ (torch.tensor([1.0, 0.75, 0.4]).double() + away) + fit.t
     assert float((where - torch.tensor([1.0, 0.75, 0.4]).double()).norm()) < 0.1
     started = fit.history[0].pose
@@ -191,7 +193,7 @@ def test_a_camera_and_its_focal_length():
     K = true.K.clone()
     K[:2, :2] *= 1.1
     start = true.replace(world_to_camera=true.world_to_camera @ off, K=K)
-    fit = fit_camera(bracket(), picture(true), start, background=BACKGROUND, progress=False)
+    fit = fit_camera(bracket(), picture(true), start, background=BACKGROUND, steps=16, progress=False)
     found = fit.camera
     assert float(found.K[0, 0] / true.K[0, 0]) == pytest.approx(1.0, abs=0.02)
     assert fit.converged and fit.state == "converged"
@@ -382,6 +384,6 @@ def test_a_texture_under_a_soft_mask(kind):
     colour = torch.tensor([0.8, 0.5, 0.2])
     seen = eg.render_aovs(square.replace(texture=colour.expand(8, 8, 3)), view, ["image", "alpha"], spp=256, seed=9)
     image = of_object(kind, seen["image"], seen["alpha"])
-    options = {"steps": 150, "spp": 8, "progress": False}
+    options = {"steps": 80, "spp": 8, "progress": False}
     fit = fit_texture(square, view, image, 8, masks=seen["alpha"], **options)
     torch.testing.assert_close(fit.mesh.texture, colour.expand(8, 8, 3), atol=0.03, rtol=0)
