@@ -97,7 +97,7 @@ def test_color_step_between_coplanar_faces() -> None:
         move[4] = torch.tensor([0.6, -0.8, 0.0])
         return eg.Scene([eg.Mesh(verts + theta * move, faces, face_colors=colors)], BACKGROUND), camera
 
-    check_ratio(inner_vertex, 0.01, **SAMPLES)
+    check_ratio(inner_vertex, 0.01, spp=1024, **SAMPLES)
     assert gradient(inner_vertex, 2, visibility=False).mean == 0
 
 
