@@ -44,11 +44,11 @@ mutants: $(VENV)/.ready
 # not built with them, so they are loaded before it; what it leaks at its end is not looked at.
 SANITIZE := build/sanitize
 # Those that reach the lines of each source of the kernel, as `make coverage` checks, and are quick.
-WATCHED := sanitizers pieces rays pitfalls coincident intersections steps shadows rim wide_fisheye panorama lens aovs lit_kernel forward_mode samples control
+WATCHED := sanitizers pieces rays pitfalls coincident steps shadows rim wide_fisheye aovs lit_kernel forward_mode samples messages
 WATCHED_TESTS := $(WATCHED:%=tests/test_%.py)
 # Of all that `make test` has, files, pictures, whole fits and long statistics call the kernel as the other tests do, only for
 # longer; tests of load measure memory and time, of which the sanitizers take more, and fork() takes minutes with them.
-WITHOUT := bad_files browser cli derivatives distributed docs fit fit_faults io load notebooks oracles report viewer
+WITHOUT := bad_files browser cli derivatives distributed docs fit fit_faults late_imports mesh_files mesh_file_faults gltf_files images saved_cameras load notebooks oracles report viewer
 sanitize-all: WATCHED_TESTS := $(WITHOUT:%=--ignore=tests/test_%.py)
 PRELOAD := $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so 2>/dev/null))
 sanitize sanitize-all: $(VENV)/.ready

@@ -3,7 +3,7 @@
     python tests/kernel_coverage.py TEST_FILE …
 
 Compiles the kernel for gcov in build/coverage, runs the tests with it, and prints the share of lines of each source that ran.
-Fails where that is less than a half of a source that has ten lines and more. `make coverage` runs this; it is no test itself.
+Fails where that is less than two thirds of a source that has ten lines and more. `make coverage` runs this; it is no test itself.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 BUILD = ROOT / "build" / "coverage"
-LEAST, FEW = 0.5, 10  # the share of lines; lines of a source too short to ask it of
+LEAST, FEW = 2 / 3, 10  # the share of lines; lines of a source too short to ask it of
 
 
 def build() -> None:
@@ -73,12 +73,12 @@ def main() -> None:
     for name in sorted(found):
         count, share = len(found[name]), sum(found[name].values()) / max(len(found[name]), 1)
         print(f"{share:6.0%} of {count:4} lines  {name}")
-        if share < LEAST and count >= FEW:
+        if share < LEAST and count >= FEW and not name.startswith("checks/"):  # which benchmarks call
             missed.append(name)
     total = sum(map(len, found.values()))
     print(f"{sum(sum(ran.values()) for ran in found.values()) / total:6.0%} of {total} lines of {len(found)} sources")
     whole = {str(path.relative_to(ROOT / "csrc")) for path in (ROOT / "csrc").rglob("*.cpp")}
-    missed += sorted(whole - set(found) - {"checks/faults.cpp", "checks/threads.cpp"})  # no part of the kernel
+    missed += sorted(name for name in whole - set(found) if not name.startswith("checks/"))
     if missed:
         sys.exit("The tests reach too little of " + ", ".join(missed))
 

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import EpsImagePlugin, Image
-from test_io import GOOD, OFF, SQUARE, STL, TEXELS, TRIANGLES, glb, linear, ply, square_glb
+from mesh_files import GOOD, OFF, SQUARE, STL, TEXELS, TRIANGLES, glb, linear, ply, square_glb
 
 import edgegrad as eg
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 from test_bad_files import changed
-from test_io import SQUARE, TEXELS, TRIANGLES, glb, linear, ply, write_obj
+from mesh_files import SQUARE, TEXELS, TRIANGLES, glb, linear, ply, write_obj
 
 import edgegrad as eg
 from edgegrad._appearance import OnMesh
