@@ -5,7 +5,7 @@ import warnings
 import pytest
 import torch
 from scenes import cube
-from test_lit_files import file
+from lit_gltf import file
 from trimesh.exchange.gltf import get_schema
 
 import edgegrad as eg
