@@ -58,10 +58,12 @@ def changes() -> list[Change]:
         rows = [row for row in block.splitlines() if not row.startswith("#")]
         if not rows:
             continue
-        file, line, changed, *mutants = rows
-        assert line.startswith("- ") and changed.startswith("+ "), block
+        file, line, *rest = rows
+        changed = [row[2:] for row in rest if row.startswith("+ ")]
+        mutants = [row for row in rest if not row.startswith("+ ")]
+        assert line.startswith("- ") and changed and mutants, block
         tests = {name.strip(): listed.split() for name, listed in (row.split(": ") for row in mutants)}
-        found.append(Change(file, line[2:], changed[2:], tests))
+        found.append(Change(file, line[2:], "\n".join(changed), tests))
     return found
 
 
