@@ -8,7 +8,8 @@ SOURCES := pyproject.toml $(shell find csrc -name '*.cpp' -o -name '*.h' -o -nam
 # Tests start Python some hundred times, and each would compile all that it imports where it may not keep it.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-slow test-browser sanitize sanitize-threads bench lint docs wheel format clean
+.PHONY: demo test test-slow test-browser mutants coverage sanitize sanitize-all sanitize-threads bench lint docs wheel format
+.PHONY: clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.ready
@@ -31,18 +32,30 @@ test-browser: $(VENV)/.ready
 	  echo "make test-browser: skipped without Chromium and its chromedriver; on Debian: apt-get install chromium chromium-driver"
 	$(BIN)/python -m pytest tests/test_browser.py
 
-# The tests of the kernel, with a kernel in which AddressSanitizer and UndefinedBehaviorSanitizer watch every access and
-# sum. Python itself is not built with them, so they are loaded before it; what it leaks at its end is not looked at.
+# What builds the kernel again in another way needs what pip would fetch for the build alone.
+TOOLS := $(BIN)/uv pip install --quiet --python $(BIN)/python "cmake>=3.26" ninja "nanobind>=3.1"
+
+# Whether tests notice a gradient of which one term is 5 % off.
+mutants: $(VENV)/.ready
+	$(TOOLS)
+	$(BIN)/python tests/mutants.py
+
+# Tests with a kernel in which AddressSanitizer and UndefinedBehaviorSanitizer watch every access and sum. Python itself is
+# not built with them, so they are loaded before it; what it leaks at its end is not looked at.
 SANITIZE := build/sanitize
-# Files, pictures, whole fits and long statistics call the kernel as the other tests do, only for longer; tests of load
-# measure memory and time, of which the sanitizers take more, and fork() takes minutes with them.
-WITHOUT := bad_files browser cli derivatives distributed docs fit fit_faults io load notebooks oracles report viewer
+# Those that reach the lines of each source of the kernel, as `make coverage` checks, and are quick.
+WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points importance topology rays pitfalls coincident steps shadows rim wide_fisheye aovs lit_kernel forward_mode samples messages
+WATCHED_TESTS := $(WATCHED:%=tests/test_%.py)
+# Of all that `make test` has, files, pictures, whole fits and long statistics call the kernel as the other tests do, only for
+# longer; tests of load measure memory and time, of which the sanitizers take more, and fork() takes minutes with them.
+WITHOUT := bad_files browser cli derivatives distributed docs fit fit_faults late_imports mesh_files mesh_file_faults gltf_files images saved_cameras load notebooks oracles report viewer
+sanitize-all: WATCHED_TESTS := $(WITHOUT:%=--ignore=tests/test_%.py)
 PRELOAD := $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so 2>/dev/null))
-sanitize: $(VENV)/.ready
+sanitize sanitize-all: $(VENV)/.ready
 ifneq ($(words $(filter /%,$(PRELOAD))),3)
 	@echo "make sanitize: skipped, for $(CXX) has no libasan.so and libubsan.so, which come with g++ on Linux"
 else
-	$(BIN)/uv pip install --quiet --python $(BIN)/python "cmake>=3.26" ninja "nanobind>=3.1"
+	$(TOOLS)
 	PATH=$(CURDIR)/$(BIN):$$PATH cmake -S csrc -B $(SANITIZE) -G Ninja -DCMAKE_BUILD_TYPE=Debug -DCMAKE_CXX_FLAGS_DEBUG=-O1 \
 	  -DCMAKE_CXX_COMPILER=$(CXX) -DEDGEGRAD_SANITIZE=address,undefined,float-cast-overflow \
 	  -DPython_EXECUTABLE=$(CURDIR)/$(BIN)/python -Dnanobind_DIR=$$($(BIN)/python -m nanobind --cmake_dir)
@@ -50,8 +63,13 @@ else
 	EDGEGRAD_KERNEL=$(CURDIR)/$(SANITIZE)/_core.abi3.so LD_PRELOAD="$(PRELOAD)" \
 	  ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1:detect_stack_use_after_return=1 \
 	  UBSAN_OPTIONS=print_stacktrace=1:halt_on_error=1 \
-	  $(BIN)/python -m pytest -m "not slow" -n 2 -p no:faulthandler $(WITHOUT:%=--ignore=tests/test_%.py)
+	  $(BIN)/python -m pytest -m "not slow" -n 2 -p no:faulthandler $(WATCHED_TESTS)
 endif
+
+# What the tests of `make sanitize` reach of the kernel, by gcov.
+coverage: $(VENV)/.ready
+	$(TOOLS)
+	$(BIN)/python tests/kernel_coverage.py $(WATCHED_TESTS)
 
 # The kernel without Python, from several threads, under ThreadSanitizer. First it must report a race that is there on
 # purpose. Addresses are not randomised where this can be had: the sanitizer's own map has no room for all of them.

@@ -170,7 +170,7 @@ FAINT = 0.02
 
 def check_gradient(case: Case, spp: int = 2048, seeds: int = 4, step: float = 0.005, filter: str = "box") -> None:
     fd = finite_difference(case, step, spp, seeds, filter=filter)
-    found = gradient(case, 4, surface_samples=400_000, edge_samples=50_000, filter=filter)
+    found = gradient(case, 4, surface_samples=100 * spp, edge_samples=50_000, filter=filter)
     high, low = (eg.render(*case(torch.tensor(h, dtype=F64)), spp=256) for h in (0.01, -0.01))
     size = float((high - low).abs().sum()) / 0.02
     noise = math.hypot(fd.error, found.error)

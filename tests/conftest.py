@@ -15,6 +15,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # what started the tes
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--budget", type=float, help="seconds of processor time that a test may take if it is not slow")
+    parser.addoption(
+        "--dearest", type=int, default=10, help="how many of the tests that took most are listed at the end"
+    )
 
 
 def processor_time() -> float:
@@ -38,7 +41,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """The tests that took most, so that one sees what to make shorter."""
     reports = terminalreporter.stats.get("passed", [])
     times = {r.nodeid: dict(r.user_properties).get("processor time", 0.0) for r in reports if r.when == "call"}
+    listed = terminalreporter.config.getoption("dearest")
     if terminalreporter.config.getoption("budget") is not None and times:
         terminalreporter.section(f"{sum(times.values()):.0f} s of processor time")
-        for name in sorted(times, key=times.__getitem__, reverse=True)[:10]:
+        for name in sorted(times, key=times.__getitem__, reverse=True)[:listed]:
             terminalreporter.line(f"{times[name]:6.1f} s  {name}")

@@ -68,7 +68,7 @@ def check(name: str, truth: float, found: Estimate, slack: float = 0.005, most: 
 
 
 def check_ratio(
-    case: Case, step: float, spp: int = 1024, seeds: int = 4, filter: str = "box", **options: object
+    case: Case, step: float, spp: int = 512, seeds: int = 4, filter: str = "box", **options: object
 ) -> float:
     """The gradient over the finite difference; it must be right."""
     fd = finite_difference(case, step, spp, seeds, filter=filter)

@@ -44,7 +44,7 @@ def fit(files, *more):
 
 def test_fit_pose(files, capsys):
     out = files / "new" / "out"
-    assert fit(files, "--init", files / "init.json", "--out", out) == 0
+    assert fit(files, "--init", files / "init.json", "--steps", 12, "--out", out) == 0
     found = PoseFit.from_json((out / "pose.json").read_text())
     assert max(errors(found)) < 1.0 and found.converged
     said = capsys.readouterr()
@@ -79,7 +79,7 @@ def test_fit_pose_with(what, files):
     more = {"mask": ["--mask", files / "mask.png"], "background": ["--background", colour], "alpha": []}[what]
     if what == "alpha":
         write_image(files / "target.png", torch.cat([picture(view), silhouette(view)], -1))
-    assert fit(files, "--init", files / "init.json", *more, "--out", files / "out") == 0
+    assert fit(files, "--init", files / "init.json", "--steps", 12, *more, "--out", files / "out") == 0
     assert max(errors(PoseFit.from_json((files / "out" / "pose.json").read_text()))) < 0.5
 
 
@@ -327,18 +327,18 @@ def test_fit_pose_resumes(files, monkeypatch):
 
     def write_pose(folder, fit):
         write(folder, fit)
-        if fit.steps == 30:
+        if fit.steps == 15:
             raise KeyboardInterrupt
 
-    said = ["--init", files / "init.json", "--steps", 8]
+    said = ["--init", files / "init.json", "--steps", 4]
     assert fit(files, *said, "--out", files / "whole") == 0
     write = outputs.write_pose
     monkeypatch.setattr(outputs, "write_pose", write_pose)
     assert fit(files, *said, "--resume", "--out", files / "half") == cli.INTERRUPTED
     monkeypatch.undo()
-    assert found("half")["steps"] == 30
+    assert found("half")["steps"] == 15
     assert fit(files, *said, "--resume", "--out", files / "half") == 0
-    assert found("half") == found("whole") and found("whole")["steps"] > 40
+    assert found("half") == found("whole") and found("whole")["steps"] > 20
     for name in ("fit.png", "loss.png"):
         assert (files / "half" / name).read_bytes() == (files / "whole" / name).read_bytes()
 

@@ -8,6 +8,7 @@ from functools import partial
 
 import pytest
 import torch
+from combinations import diagonal
 from scenes import front_camera, icosphere, smooth_adjoint
 from torch import Tensor
 
@@ -108,9 +109,7 @@ class Gradient:
         return torch.cat([motions, paints, grads[-2][:2].reshape(-1), grads[-1][:3].reshape(-1)])  # type: ignore[list-item]
 
 
-@pytest.mark.parametrize("filter", ["box", "gaussian"])
-@pytest.mark.parametrize("rough", [False, True], ids=["smooth", "rough"])
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(("name", "rough", "filter"), diagonal(list(SCENES), [False, True], ["box", "gaussian"]))
 def test_few_samples_estimate_what_is_exact(name: str, rough: bool, filter: str) -> None:
     """Few samples, mostly control, after images of one sample a pixel, which decide where there is a control; against exact
     integrals, which have none."""

@@ -8,6 +8,7 @@ from functools import partial
 
 import pytest
 import torch
+from combinations import diagonal
 from finite_differences import check, check_ratio, estimate
 from scenes import front_camera, icosphere, smooth_adjoint
 from torch import Tensor
@@ -40,8 +41,7 @@ def textured_scene(ball: bool) -> eg.Scene:
     return eg.Scene(meshes, torch.zeros(3, dtype=F64))
 
 
-@pytest.mark.parametrize("filter", ["box", "gaussian"])
-@pytest.mark.parametrize("ball", [False, True], ids=["quad", "quad and ball"])
+@pytest.mark.parametrize(("ball", "filter"), diagonal([False, True], ["gaussian", "box"]))
 def test_large_textured_triangles_agree_with_exact_derivatives(ball: bool, filter: str) -> None:
     """Along the gradient, where nothing cancels."""
     scene, fields = textured_scene(ball), ("verts", "uvs", "texture")
@@ -52,7 +52,7 @@ def test_large_textured_triangles_agree_with_exact_derivatives(ball: bool, filte
         return list(torch.autograd.grad((render(moved, CAMERA) * ADJOINT).sum(), list(leaves.values())))
 
     exact = gradients(partial(exact_image, order=7, filter=filter))
-    samples = partial(eg.render, spp=4, filter=filter, surface_samples=60_000)
+    samples = partial(eg.render, spp=4, filter=filter, surface_samples=20_000)
     runs = [gradients(partial(samples, seed=seed)) for seed in range(8)]
     for i, (field, truth) in enumerate(zip(fields, exact, strict=True)):
         along = [(run[i] * truth).sum().item() for run in runs]
@@ -122,7 +122,7 @@ def test_tangles_are_sampled_where_they_show() -> None:
         assert verts.grad is not None
         return verts.grad
 
-    correct = torch.stack([gradient(1000 + seed, 200_000) for seed in range(4)]).mean(0)
+    correct = torch.stack([gradient(1000 + seed, 100_000) for seed in range(3)]).mean(0)
     runs = [gradient(seed, 4000) for seed in range(16)]
     error = torch.stack([(run - correct).square().sum() for run in runs]).mean().sqrt()
     assert error < 0.065 * correct.norm()  # 0.053; where only depths say what is hidden, 0.090
@@ -130,7 +130,7 @@ def test_tangles_are_sampled_where_they_show() -> None:
     def growing(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
         return eg.Scene([mesh.replace(verts=mesh.verts + (0.1 + theta) * noise)]), camera
 
-    check_ratio(growing, 0.0005, spp=2048, seeds=8, surface_samples=4000, edge_samples=8000)
+    check_ratio(growing, 0.0005, spp=512, seeds=8, surface_samples=4000, edge_samples=8000)
 
 
 def test_hidden_layers() -> None:

@@ -71,14 +71,14 @@ def test_image(name: str, projection: str) -> None:
     # 64 random combinations of all pixels: each is a sum of many independent errors, and they are nearly independent.
     signs = torch.randn((64, exact.numel()), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     errors = {}
-    for spp in (4, 16, 64, 256):
+    for spp in (4, 16, 64):
         images = [eg.render(scene, camera, spp=spp, seed=seed) for seed in range(SEEDS)]
         # The mean of 64 squares of t₁₅ is 1.15 ± 0.23; 4 standard deviations are allowed. A bias of one standard
         # deviation of a single image would give 17.
         assert mean_z2([signs @ image.reshape(-1) for image in images], signs @ exact.reshape(-1)) < 2.1
         errors[spp] = torch.stack([(image - exact).square().mean() for image in images]).mean().sqrt().item()
-    # A lattice falls like 1/n^(3/4) at edges in each pixel; 1/√n would be a factor 8, and 10 tells them apart.
-    assert errors[4] / errors[256] > 10, errors
+    # A lattice falls like 1/n^(3/4) at edges in each pixel; of 8; 1/√n would be one of 4, and 5.5 tells them apart.
+    assert errors[4] / errors[64] > 5.5, errors
 
 
 @pytest.mark.parametrize(("name", "projection"), CASES)
@@ -86,7 +86,7 @@ def test_gradients(name: str, projection: str) -> None:
     scene, camera = SCENES[name](), front_camera(SIZE, projection)
     exact = gradients(scene, camera, exact_image)
     previous: dict[str, float] = {}
-    for surface, edge in ((4_000, 2_000), (16_000, 8_000), (64_000, 32_000)):
+    for surface, edge in ((4_000, 2_000), (16_000, 8_000)):
         samples: dict[str, list[Tensor]] = {key: [] for key in exact}
         for seed in range(SEEDS):
             options = {"spp": 16, "seed": seed, "surface_samples": surface, "edge_samples": edge}
@@ -105,7 +105,7 @@ def test_gradients(name: str, projection: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name in ("triangle", "slivers") else name for name in SCENES]
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name != "occluded triangle" else name for name in SCENES]
 )
 def test_boundary_error_falls_like_one_over_n(name: str) -> None:
     scene, camera = SCENES[name](), front_camera(SIZE)
@@ -119,10 +119,10 @@ def test_boundary_error_falls_like_one_over_n(name: str) -> None:
     # boundary term. Its exact value is the exact gradient less an interior part whose own error is below 10⁻⁴ of it.
     exact = gradients(scene, camera, exact_image)
     whole = torch.cat([g for key, g in exact.items() if key.startswith("verts")])
-    interior = torch.stack([verts_gradient(64, 70 + s, False, 4_000_000) for s in range(4)]).mean(0)
+    interior = torch.stack([verts_gradient(64, 70 + s, False, 2_000_000) for s in range(4)]).mean(0)
     boundary = whole - interior
 
-    counts = [1_000, 4_000, 16_000, 64_000] if name != "slivers" else [16_000, 64_000, 256_000]
+    counts = [1_000, 4_000, 16_000] if name != "slivers" else [16_000, 64_000, 256_000]
     errors = []
     for n in counts:
         e2 = [(verts_gradient(n, s) - verts_gradient(n, s, False) - boundary).square().sum() for s in range(8)]

@@ -23,8 +23,8 @@ def example(name: str) -> ModuleType:
 
 
 def test_a_texture_and_its_light() -> None:
-    pictures, before, after = example("harmonics").fit(steps=30)
-    assert after < 0.4 * before
+    pictures, before, after = example("harmonics").fit(steps=20)
+    assert after < 0.5 * before
     assert len(pictures) == 3
 
 
@@ -62,6 +62,7 @@ def test_a_shape_and_its_shadow() -> None:
     assert after < 0.4 * before
 
 
+@pytest.mark.slow
 def test_a_pose_of_which_a_quarter_is_covered() -> None:
     pose = example("pose")
     before, after, fit = pose.trial(pose.objects.pebble(64, 3), "covered", seed=1, size=64)

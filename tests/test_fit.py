@@ -70,7 +70,9 @@ def errors(fit, R=None):
 
 
 @pytest.mark.parametrize(
-    "background", [pytest.param(BACKGROUND, marks=pytest.mark.slow), None, "image"], ids=["colour", "border", "image"]
+    "background",
+    [pytest.param(BACKGROUND, marks=pytest.mark.slow), None, pytest.param("image", marks=pytest.mark.slow)],
+    ids=["colour", "border", "image"],
 )
 def test_finds_the_pose(background, capsys):
     view = camera()
@@ -93,8 +95,8 @@ def test_finds_the_pose(background, capsys):
 def test_a_start_that_is_the_answer_is_converged():
     """More steps would not find a better one."""
     target = picture(camera())
-    fit = fit_pose(bracket(), target, camera(), background=BACKGROUND, progress=False)
-    assert fit.converged and errors(fit)[0] < 0.2
+    fit = fit_pose(bracket(), target, camera(), background=BACKGROUND, steps=12, progress=False)
+    assert fit.converged and errors(fit)[0] < 0.2 and errors(fit)[1] < 0.5
 
 
 @pytest.mark.parametrize("mode", [pytest.param(torch.no_grad, marks=pytest.mark.slow), torch.inference_mode])
@@ -140,7 +142,8 @@ SECOND_OPINION = {"target": picture(camera(32)).flip(1), "steps": 21, "fit_focal
     ("options", "stops"),
     [
         # In the first of the starts, in another, between the levels, within and (−1) at the end of the last.
-        ({}, (1, 13, 30, 31, 37, -1)),
+        ({}, (13, 30)),
+        pytest.param({}, (1, 31, 37, -1), marks=pytest.mark.slow, id="other places"),
         # Among other starts, on their ways to finer levels, on that of the best.
         pytest.param(SECOND_OPINION, (100, 210, 330), marks=pytest.mark.slow, id="second opinions"),
     ],
@@ -235,7 +238,9 @@ def test_a_checkpoint_that_cannot_be_written_ends_no_fit(tmp_path, monkeypatch):
 def test_finds_the_pose_with_a_mask(plain):
     view = camera()
     clutter = torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0))
-    fit = fit_pose(bracket(plain), picture(view, background=clutter), view, silhouette(view), START, progress=False)
+    fit = fit_pose(
+        bracket(plain), picture(view, background=clutter), view, silhouette(view), START, steps=12, progress=False
+    )
     degrees, percent = errors(fit)
     # Pixels on the border mix in what lies behind the object, which the mask does not undo.
     assert degrees < 1.5 and percent < 1.5
@@ -251,7 +256,14 @@ def test_finds_the_scale():
     start[:3, 3] -= off * forward
     larger = bracket().transformed(torch.eye(3).double(), -0.12 * center, 1.12)
     fit = fit_pose(
-        bracket(), picture(view, larger), view, init=start, background=BACKGROUND, fit_scale=True, progress=False
+        bracket(),
+        picture(view, larger),
+        view,
+        init=start,
+        background=BACKGROUND,
+        fit_scale=True,
+        steps=12,
+        progress=False,
     )
     degrees, percent = errors(fit)
     assert fit.scale == pytest.approx(1.12, rel=0.005)
@@ -264,7 +276,14 @@ def test_finds_the_focal_length():
     K[:2, :2] *= 1.1
     start = about_center(rotation(0.05, -0.06, 0.04), (0.04, -0.03, 0.05))
     fit = fit_pose(
-        bracket(), picture(near.replace(K=K)), near, init=start, background=BACKGROUND, fit_focal=True, progress=False
+        bracket(),
+        picture(near.replace(K=K)),
+        near,
+        init=start,
+        background=BACKGROUND,
+        fit_focal=True,
+        steps=12,
+        progress=False,
     )
     degrees, percent = errors(fit)
     assert float(fit.camera.K[0, 0] / K[0, 0]) == pytest.approx(1.0, abs=0.02)
@@ -275,7 +294,7 @@ def test_finds_the_focal_length():
 def test_orthographic_camera_leaves_the_depth():
     center = torch.tensor([1.0, 0.75, 0.4]).double()
     view = eg.Camera.orthographic(center + torch.tensor([1.4, 1.2, 3.5]).double(), center, height=3.5, size=(64, 64))
-    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, progress=False)
+    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, steps=10, progress=False)
     degrees, _ = errors(fit)
     q = view.world_to_camera[:3, :3] @ (fit.R @ center + fit.t - center)
     started = view.world_to_camera[:3, :3] @ (START[:3, :3] @ center + START[:3, 3] - center)
@@ -285,15 +304,15 @@ def test_orthographic_camera_leaves_the_depth():
 def test_scene_of_several_meshes_moves_together():
     view, mesh = camera(), bracket()
     parts = [mesh.replace(faces=mesh.faces[k], face_colors=mesh.face_colors[k]) for k in (slice(0, 9), slice(9, 20))]
-    fit = fit_pose(eg.Scene(parts, BACKGROUND), picture(view), view, init=START, progress=False)
+    fit = fit_pose(eg.Scene(parts, BACKGROUND), picture(view), view, init=START, steps=10, progress=False)
     assert max(errors(fit)) < 0.5
 
 
 def test_a_picture_larger_than_max_size_is_reduced():
-    view = camera(128)
-    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, max_size=48, progress=False)
-    assert max(max(step.size) for step in fit.history) == 48
-    assert max(errors(fit)) < 1.0
+    view = camera(96)
+    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, max_size=32, progress=False)
+    assert max(max(step.size) for step in fit.history) == 32
+    assert max(errors(fit)) < 1.5
     assert fit.camera is view
 
 
@@ -305,12 +324,6 @@ def test_the_same_seed_gives_the_same_fit():
     ]
     assert torch.equal(fits[0].matrix, fits[1].matrix)
     assert not torch.equal(fits[0].matrix, fits[2].matrix)
-
-
-def test_a_start_at_the_truth_stays():
-    view = camera(48)
-    fit = fit_pose(bracket(), picture(view), view, background=BACKGROUND, progress=False)
-    assert max(errors(fit)) < 0.5
 
 
 def test_interruption_keeps_the_best_pose():

@@ -33,13 +33,13 @@ def test_a_quarter_covered(how):
     told = {"background": BACKGROUND}
     if how == "weight":
         told["weight"] = free
-    fit = fit_pose(bracket(), image, view, init=START, progress=False, **told)
+    fit = fit_pose(bracket(), image, view, init=START, steps=12, progress=False, **told)
     degrees, percent = errors(fit)
     assert degrees < 1.0 and percent < 1.0, (degrees, percent)
     assert fit.converged and fit.explained > 0.5
 
 
-@pytest.mark.parametrize("looks", [True, False])
+@pytest.mark.parametrize("looks", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
     """Where noise does not explain the loss left, as with a board cut out of the mask, turned poses are looked at."""
     view = camera(64)
@@ -64,7 +64,7 @@ def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
 def test_noise_explains_the_loss_of_a_pose_that_is_right():
     """Of what is seen whole: no other poses are looked at."""
     view = camera(64)
-    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, progress=False)
+    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, steps=12, progress=False)
     pose = pose_from_matrix("", fit.matrix)
     assert fit.task is not None
     _, _, noise = search.Search(fit.task, fit.task.pyramid(pose, 64, 16), pose, 40, 3e-4, 0)._judged(pose)
@@ -89,7 +89,7 @@ def test_what_is_not_in_the_picture_is_not_found(steps):
     assert fit.state.startswith("not converged: the picture shows")
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("masked", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_picture_from_the_bottom_up_is_named(masked):
     view = camera(32)
     target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
@@ -119,7 +119,9 @@ def test_several_pictures_share_the_pose():
     larger = bracket().transformed(torch.eye(3).double(), -0.08 * center, 1.08)
     views = [first, second]
     images = [picture(view, larger) for view in views]
-    fit = fit_pose(bracket(), images, views, init=START, background=BACKGROUND, fit_scale=True, progress=False)
+    fit = fit_pose(
+        bracket(), images, views, init=START, background=BACKGROUND, fit_scale=True, steps=12, progress=False
+    )
     assert max(errors(fit)) < 0.5 and fit.scale == pytest.approx(1.08, rel=0.01) and fit.converged
     figure = fit.plot()
     assert len(figure.axes) == 8
@@ -129,7 +131,7 @@ def test_the_start_is_placed_where_the_picture_shows_the_object():
     view, away = camera(48), torch.tensor([40.0, -30.0, 25.0]).double()
     far = bracket().transformed(t=away)
     mask = silhouette(view)
-    fit = fit_pose(far, picture(view), view, mask, progress=False)
+    fit = fit_pose(far, picture(view), view, mask, steps=12, progress=False)
     where = fit.R @ (torch.tensor([1.0, 0.75, 0.4]).double() + away) + fit.t
     assert float((where - torch.tensor([1.0, 0.75, 0.4]).double()).norm()) < 0.1
     started = fit.history[0].pose
@@ -192,7 +194,7 @@ def test_a_camera_and_its_focal_length():
     K = true.K.clone()
     K[:2, :2] *= 1.1
     start = true.replace(world_to_camera=true.world_to_camera @ off, K=K)
-    fit = fit_camera(bracket(), picture(true), start, background=BACKGROUND, progress=False)
+    fit = fit_camera(bracket(), picture(true), start, background=BACKGROUND, steps=16, progress=False)
     found = fit.camera
     assert float(found.K[0, 0] / true.K[0, 0]) == pytest.approx(1.0, abs=0.02)
     assert fit.converged and fit.state == "converged"
@@ -294,6 +296,7 @@ def test_pictures_and_masks_of_bytes_are_named():
         fit_scene(bracket(), [view], None, {"meshes[0].verts": 0.01}, masks=masks, progress=False)
 
 
+@pytest.mark.slow
 def test_a_rig_of_cameras(tmp_path):
     """Two cameras that keep their places to one another find where they are, and the lens that they share."""
     left = camera(64, distance=2.6)
@@ -349,7 +352,9 @@ def of_object(kind, image, alpha):
     return image + (1.0 - alpha) * {"before black": 0.0, "photograph": 0.9}[kind]
 
 
-@pytest.mark.parametrize("kind", ["before black", "straight", "photograph"])
+@pytest.mark.parametrize(
+    "kind", ["straight", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("before black", "photograph"))]
+)
 def test_what_a_picture_holds_at_a_soft_mask_does_not_matter(kind):
     view = camera(64)
     seen = eg.render_aovs(bracket(), view, ["image", "alpha"], spp=256, seed=1 << 40)
@@ -380,6 +385,6 @@ def test_a_texture_under_a_soft_mask(kind):
     colour = torch.tensor([0.8, 0.5, 0.2])
     seen = eg.render_aovs(square.replace(texture=colour.expand(8, 8, 3)), view, ["image", "alpha"], spp=256, seed=9)
     image = of_object(kind, seen["image"], seen["alpha"])
-    options = {"steps": 150, "spp": 8, "progress": False}
+    options = {"steps": 80, "spp": 8, "progress": False}
     fit = fit_texture(square, view, image, 8, masks=seen["alpha"], **options)
     torch.testing.assert_close(fit.mesh.texture, colour.expand(8, 8, 3), atol=0.03, rtol=0)

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from combinations import diagonal
 from finite_differences import Estimate, estimate
 from scenes import cube, front_camera, icosphere, one_triangle, smooth_adjoint, smooth_colors
 from torch import Tensor
@@ -283,9 +284,9 @@ def test_tangents_that_do_not_fit(tangents, message):
 
 
 @pytest.mark.parametrize(
-    "camera", [CAMERA, ORTHOGRAPHIC, BENT, PANORAMA], ids=["perspective", "orthographic", "bent", "panorama"]
+    ("camera", "scene", "filter"),
+    diagonal([CAMERA, ORTHOGRAPHIC, BENT, PANORAMA], [mixed_scene, crossing_scene], ["gaussian", "box"]),
 )
-@pytest.mark.parametrize(("scene", "filter"), [(mixed_scene, "gaussian"), (crossing_scene, "box")])
 def test_screen_gradient_sums_to_that_of_moving_everything(camera, scene, filter):
     """By (1, 0) and (0, 1) px, as the principal point does."""
     scene = scene()

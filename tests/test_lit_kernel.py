@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from combinations import diagonal
 from scenes import icosphere
 from torch import Tensor
 
@@ -453,9 +454,9 @@ AROUND_PYRAMID = {
 }
 
 
-@pytest.mark.parametrize("filter", ["box", "tent", "gaussian"])
-@pytest.mark.parametrize("view", AROUND_PYRAMID)
-@pytest.mark.parametrize("samples", [None, 150])
+@pytest.mark.parametrize(
+    ("samples", "view", "filter"), diagonal([None, 150], list(AROUND_PYRAMID), ["box", "tent", "gaussian"])
+)
 def test_textured_faces_by_samples_of_pixels(samples: int | None, view: str, filter: str) -> None:
     """An image is linear in the base colour: the derivative along the texture is the image."""
     generator = torch.Generator().manual_seed(3)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import torch
+from combinations import diagonal
 from scenes import cube, front_camera, icosphere, occluded_triangle, one_triangle, random_slivers
 from torch import Tensor
 
@@ -165,8 +166,7 @@ def test_gauss_rule_has_converged(name: str) -> None:
 # -- exact_image: gradients -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("projection", PROJECTIONS)
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(("name", "projection"), diagonal(list(SCENES), PROJECTIONS))
 def test_exact_gradient(name: str, projection: str) -> None:
     """All inputs moved together, in a random direction, against central differences.
 
@@ -240,8 +240,7 @@ def test_interior_gradient_suffices_where_no_edge_is_seen() -> None:
 # -- reference --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("projection", PROJECTIONS)
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(("name", "projection"), diagonal(list(SCENES), PROJECTIONS))
 def test_reference_converges_to_exact(name: str, projection: str) -> None:
     """A pixel that an edge crosses has an error of O(1/grid), and less where edges lie at odd angles to the grid."""
     camera = front_camera(24, projection)

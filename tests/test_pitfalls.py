@@ -47,14 +47,14 @@ def test_edge_that_crosses_the_camera_plane() -> None:
     mesh = eg.Mesh(verts, torch.tensor([[0, 1, 2]]), colors=smooth_colors(verts))
     # A step of 0.012 is 12 % off, of 0.006 2 %, of 0.003 0.5 %: the loss curves strongly there.
     case = moving(mesh, camera, torch.tensor([0.9, 0.3, 0.2], dtype=F64))
-    check_ratio(case, 0.003, spp=8192, seeds=8, **SAMPLES)
+    check_ratio(case, 0.003, spp=8192, seeds=5, **SAMPLES)
 
     def vertex_behind(theta: Tensor):
         move = torch.zeros_like(verts)
         move[0] = torch.tensor([0.6, -0.5, 0.7])
         return eg.Scene([mesh.replace(verts=verts + theta * move)], BACKGROUND), camera
 
-    check_ratio(vertex_behind, 0.02, spp=2048, **SAMPLES)
+    check_ratio(vertex_behind, 0.02, **SAMPLES)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -97,7 +97,7 @@ def test_color_step_between_coplanar_faces() -> None:
         move[4] = torch.tensor([0.6, -0.8, 0.0])
         return eg.Scene([eg.Mesh(verts + theta * move, faces, face_colors=colors)], BACKGROUND), camera
 
-    check_ratio(inner_vertex, 0.01, **SAMPLES)
+    check_ratio(inner_vertex, 0.01, spp=1024, **SAMPLES)
     assert gradient(inner_vertex, 2, visibility=False).mean == 0
 
 
@@ -171,7 +171,7 @@ def test_very_large_triangle() -> None:
     def plane_turns(theta: Tensor):
         return eg.Scene([plane.transformed(rotation((0.8, 0.0, 0.6), theta))], BACKGROUND), camera
 
-    check_ratio(plane_turns, 0.004, spp=4096, **SAMPLES)
+    check_ratio(plane_turns, 0.004, spp=1024, **SAMPLES)
 
     standing = cube(0.4).transformed(
         rotation((0.0, 1.0, 0.0), torch.tensor(0.5, dtype=F64)), torch.tensor([0.0, 0.4, 0.0], dtype=F64)
@@ -222,7 +222,7 @@ def test_non_manifold_edge(faces_on_edge: int) -> None:
         move[:2] = torch.tensor([0.9, -0.4, 0.2])
         return eg.Scene([eg.Mesh(verts + theta * move, faces, face_colors=colors)], BACKGROUND), camera
 
-    check_ratio(edge_moves, 0.01, spp=2048, **SAMPLES)
+    check_ratio(edge_moves, 0.01, spp=1024, **SAMPLES)
 
 
 def test_loss_of_a_sparse_adjoint() -> None:
@@ -274,7 +274,7 @@ def test_vertex_in_the_eye() -> None:
     at_eye = [0.0, -1.0930554040108831e-18, -7.1293334889470566e-18]
     others = [[-0.25, -0.25000000052974081, 0.50000000069431005], [0.74999999999043598, 0.75, 1.5]]
     generator = torch.Generator().manual_seed(0)
-    for trial in range(2000):
+    for trial in range(500):
         noise = 1e-9 * torch.randn((3, 3), dtype=F64, generator=generator) if trial else torch.zeros((3, 3), dtype=F64)
         verts = torch.tensor([others[0], at_eye, others[1]], dtype=F64) + noise * torch.tensor([[1.0], [1e-9], [1.0]])
         verts.requires_grad_()

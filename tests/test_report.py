@@ -196,10 +196,12 @@ def test_sweep_stops_where_the_next_point_would_cost_too_much():
     assert module._expected([(1, 2.0), (4, 2.3)], 16) == pytest.approx(3.5)  # mostly a cost that does not grow
 
 
-@pytest.mark.parametrize("scene", scenes.LIT)
+@pytest.mark.parametrize(
+    "scene", [pytest.param(name, marks=pytest.mark.slow) if name == "lit-sky" else name for name in scenes.LIT]
+)
 def test_lit_scenes(scene, tmp_path):
     """From a reference that is computed anew. Their terms are not timed alone."""
-    document, _ = error_time(tmp_path, [scene], ["edgegrad", "boundary"], size=16, seeds=2, limit=5.0, quick=True)
+    document, _ = error_time(tmp_path, [scene], ["edgegrad", "boundary"], size=16, seeds=2, limit=2.0, quick=True)
     of_scene = document["scenes"][scene]
     assert "not timed apart" in of_scene["left_out"]["boundary"]
     assert 0 < of_scene["reference"]["error"]["boundary"]["translation"] < 0.5

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 import torch
 import torch.utils.checkpoint
+from combinations import diagonal
 from finite_differences import Estimate, estimate, right_ratio
 from scenes import front_camera, icosphere, smooth_adjoint, smooth_colors
 from torch import Tensor
@@ -78,9 +79,10 @@ def gradients(scene: eg.Scene, camera: eg.Camera, shaded: bool, seed: int, **opt
     return dict(zip(leaves, values, strict=True)) | {"image": image.detach()}
 
 
-@pytest.mark.parametrize("filter", ["box", "gaussian"])
-@pytest.mark.parametrize("view", ["perspective", "orthographic", "distorted"])
-@pytest.mark.parametrize("kind", ["colors", "texture"])
+@pytest.mark.parametrize(
+    ("kind", "view", "filter"),
+    diagonal(["colors", "texture"], ["perspective", "orthographic", "distorted"], ["box", "gaussian"]),
+)
 def test_the_same_as_the_kernels_own(kind: str, view: str, filter: str):
     scene = colored()[0] if kind == "colors" else textured()
     camera = cameras()[view]
@@ -304,7 +306,7 @@ def check(name: str, of: str, seeds: int) -> None:
     right_ratio(differences(at, step, seeds), derivative(at, 24 if stepped else 6))
 
 
-@pytest.mark.parametrize("name", ["network", "flat normals", "disc"])
+@pytest.mark.parametrize("name", ["network", "flat normals", pytest.param("disc", marks=pytest.mark.slow)])
 def test_against_finite_differences(name: str):
     check(name, "pose", 8)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -155,6 +156,31 @@ def test_penumbra_of_a_rectangle(motion: str) -> None:
             truth += float(wa * wb) * exact(motion, (a * U + b * V)[None])
     found = estimate([gradient(motion, panel, seed) for seed in range(8)])
     check(f"panel, {motion}", truth, found)
+
+
+def sky(s: Setting) -> object:
+    return eg.Environment(vector(1.0), visible=False)
+
+
+def test_shadow_before_an_even_sky() -> None:
+    """Of all directions, the caster hides the solid angle that it is seen under (van Oosterom and Strackee 1983)."""
+    setting, theta = Setting(), torch.zeros((), dtype=DOUBLE, requires_grad=True)
+    MOTIONS["caster grows"](setting, theta)
+    pixel = torch.arange(SIZE, dtype=DOUBLE) + 0.5 - SIZE / 2
+    y, x = torch.meshgrid(-pixel, pixel, indexing="ij")
+    place = (
+        torch.stack([x, y, -setting.focal.expand(SIZE, SIZE)], -1) * (setting.camera[2] / setting.focal)
+        + setting.camera
+    )
+    corners = torch.cat([setting.corners, setting.height.expand(4, 1)], 1)
+    a, *others = torch.nn.functional.normalize(corners - place[:, :, None], dim=-1).unbind(2)
+    hidden = torch.zeros(SIZE, SIZE, dtype=DOUBLE)
+    for b, c in itertools.pairwise(others):
+        volume = (a * torch.linalg.cross(b, c)).sum(-1)
+        around = 1 + (a * b).sum(-1) + (b * c).sum(-1) + (c * a).sum(-1)
+        hidden = hidden + 2 * torch.atan2(volume, around) / (4 * math.pi)
+    truth = -torch.autograd.grad((hidden[:, :, None] * adjoint()).sum(), theta)[0].item()
+    check("sky, caster grows", truth, estimate([gradient("caster grows", sky, seed) for seed in range(32)]))
 
 
 def lamp(s: Setting) -> object:

@@ -255,7 +255,9 @@ def test_area_of_a_triangle_that_reaches_around() -> None:
 # -- gradients ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("place", "what"), [("beside", "vertices"), ("behind", "d1"), ("behind", "K11")])
+@pytest.mark.parametrize(
+    ("place", "what"), [("beside", "vertices"), ("behind", "d1"), pytest.param("behind", "K11", marks=pytest.mark.slow)]
+)
 def test_gradient(place: str, what: str) -> None:
     case = moved(lambda dx=0.0: both(PLACES[place], dx), camera(), what)
     check_gradient(case, spp=1024, seeds=3, step=0.01 if what[0] == "d" else 0.005)

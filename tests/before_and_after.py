@@ -1,7 +1,7 @@
 """Images and gradients of six scenes, to be compared bit by bit before and after a change that is to change no result.
 
-python tests/same_bits.py FILE.npz            writes them
-python tests/same_bits.py FILE.npz --compare  fails where one differs from what is in the file
+python tests/before_and_after.py FILE.npz            writes them
+python tests/before_and_after.py FILE.npz --compare  fails where one differs from what is in the file
 """
 
 from __future__ import annotations

@@ -1,0 +1,190 @@
+"""Images in and out: the sRGB curve, every kind of file, and faults by name."""
+
+import os
+
+import numpy as np
+import pytest
+import torch
+from mesh_files import linear
+from PIL import Image
+
+from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
+
+
+def test_srgb_curve_is_the_standard_s_and_inverts():
+    codes = np.arange(256)
+    got = srgb_to_linear(torch.tensor(codes / 255.0))
+    np.testing.assert_allclose(got.numpy(), linear(codes), rtol=1e-12, atol=0)
+    assert got[0] == 0.0 and got[255] == 1.0
+    # The constants of the standard are rounded, so the two halves of the curve meet only to about 1e-6.
+    np.testing.assert_allclose(linear_to_srgb(got).numpy() * 255, codes, rtol=0, atol=2e-4)
+    assert float(srgb_to_linear(torch.tensor(0.5))) == pytest.approx(0.21404114, rel=1e-6)
+
+
+def test_srgb_curve_has_finite_gradients_at_zero():
+    for curve in (srgb_to_linear, linear_to_srgb):
+        x = torch.zeros(3, requires_grad=True)
+        curve(x).sum().backward()
+        assert torch.isfinite(x.grad).all() and (x.grad > 0).all()
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "tif", "exr", "hdr", "jpg"])
+def test_image_round_trip(tmp_path, suffix):
+    generator = torch.Generator().manual_seed(1)
+    image = torch.rand(6, 9, 3, generator=generator)
+    if suffix == "jpg":  # smooth, since JPEG keeps little else
+        image = image[:1, :1].expand(16, 24, 3) * torch.linspace(0.5, 1, 24)[:, None]
+    path = tmp_path / f"a.{suffix}"
+    write_image(path, image)
+    back = read_image(path)
+    assert back.dtype == torch.float32 and back.shape == image.shape and back.is_contiguous()
+    if suffix == "exr":
+        assert torch.equal(back, image)
+    elif suffix == "hdr":
+        assert ((back - image).abs() <= image.amax(-1, keepdim=True) / 128).all()  # one exponent for three channels
+    else:
+        steps = (linear_to_srgb(back) - linear_to_srgb(image)).abs() * 255
+        assert float(steps.max()) <= (3.0 if suffix == "jpg" else 0.5001)
+    assert [file.name for file in tmp_path.iterdir()] == [f"a.{suffix}"]  # no temporary file is left
+
+
+def test_png_values_are_srgb_rounded_to_nearest_and_clipped(tmp_path):
+    codes = torch.arange(256, dtype=torch.float64)
+    shifted = torch.stack([codes - 0.49, codes, codes + 0.49]) / 255
+    write_image(tmp_path / "r.png", srgb_to_linear(shifted))
+    stored = np.asarray(Image.open(tmp_path / "r.png"))
+    np.testing.assert_array_equal(stored, np.tile(np.arange(256), (3, 1)))
+    np.testing.assert_allclose(read_image(tmp_path / "r.png")[0, :, 0].numpy(), linear(np.arange(256)), atol=2e-7)
+    write_image(tmp_path / "c.png", torch.tensor([[-1.0, 7.0, 0.5]]))
+    assert np.asarray(Image.open(tmp_path / "c.png")).tolist() == [[0, 255, 188]]
+
+
+def test_alpha_is_kept_apart(tmp_path):
+    stored = np.array([[[200, 100, 50, 128], [255, 255, 255, 0], [1, 2, 3, 255]]], np.uint8)
+    Image.fromarray(stored).save(tmp_path / "a.png")
+    image = read_image(tmp_path / "a.png")
+    np.testing.assert_allclose(image[..., :3].numpy(), linear(stored[..., :3]), atol=1e-6)
+    np.testing.assert_allclose(image[..., 3].numpy(), stored[..., 3] / 255.0, atol=1e-6)
+    assert torch.equal(read_image(tmp_path / "a.png", channels=3), image[..., :3])
+    write_image(tmp_path / "b.png", image)
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "b.png")), stored)
+    grey = torch.tensor([[[0.5, 0.25], [0.1, 1.0]]])
+    write_image(tmp_path / "la.png", grey)
+    np.testing.assert_allclose(read_image(tmp_path / "la.png").numpy(), grey.numpy(), atol=5e-3)
+
+
+def test_kinds_of_png(tmp_path):
+    stored = np.random.default_rng(2).integers(0, 256, (4, 5, 3), dtype=np.uint8)
+    palette = Image.fromarray(stored).convert("P")
+    palette.save(tmp_path / "palette.png")
+    expected = linear(np.asarray(palette.convert("RGB")))
+    np.testing.assert_allclose(read_image(tmp_path / "palette.png").numpy(), expected, atol=1e-6)
+    Image.fromarray(stored[..., 0]).save(tmp_path / "grey.png")
+    np.testing.assert_allclose(read_image(tmp_path / "grey.png").numpy(), linear(stored[..., :1]), atol=1e-6)
+    deep = np.random.default_rng(3).integers(0, 65536, (4, 5), dtype=np.uint16)
+    Image.fromarray(deep).save(tmp_path / "deep.png")
+    np.testing.assert_allclose(read_image(tmp_path / "deep.png")[..., 0].numpy(), linear(deep / 257.0), atol=1e-6)
+    Image.fromarray(stored[..., 0] > 128).save(tmp_path / "bits.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "bits.png")[..., 0].numpy(), stored[..., 0] > 128)
+
+
+def test_cmyk_jpeg_and_exif_orientation(tmp_path):
+    stored = np.full((8, 8, 3), (200, 100, 50), np.uint8)
+    Image.fromarray(stored).convert("CMYK").save(tmp_path / "cmyk.jpg", quality=100)
+    expected = linear(np.asarray(Image.open(tmp_path / "cmyk.jpg").convert("RGB")))
+    np.testing.assert_allclose(read_image(tmp_path / "cmyk.jpg").numpy(), expected, atol=0.02)
+    wide = Image.fromarray(np.random.default_rng(4).integers(0, 256, (3, 5, 3), dtype=np.uint8))
+    exif = wide.getexif()
+    exif[0x112] = 6  # to be shown turned clockwise by a quarter
+    wide.save(tmp_path / "turned.png", exif=exif)
+    expected = linear(np.rot90(np.asarray(wide), -1))
+    np.testing.assert_allclose(read_image(tmp_path / "turned.png").numpy(), expected, atol=1e-6)
+
+
+def test_channels_convert(tmp_path):
+    write_image(tmp_path / "rgb.exr", torch.tensor([[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.5, 0.5]]]))
+    grey = read_image(tmp_path / "rgb.exr", channels=1)
+    np.testing.assert_allclose(grey[0, :, 0].numpy(), [0.2126, 0.7152, 0.5], atol=1e-6)
+    assert read_image(tmp_path / "rgb.exr", channels=4)[0, 0].tolist() == [1, 0, 0, 1]
+    write_image(tmp_path / "y.exr", torch.tensor([[0.25, 2.0]]))
+    assert read_image(tmp_path / "y.exr").shape == (1, 2, 1)
+    assert read_image(tmp_path / "y.exr", channels=3)[0, 1].tolist() == [2, 2, 2]
+    write_image(tmp_path / "many.exr", torch.arange(24.0).reshape(1, 2, 12))
+    assert torch.equal(read_image(tmp_path / "many.exr"), torch.arange(24.0).reshape(1, 2, 12))
+    with pytest.raises(ValueError, match=r"many\.exr: expected 1 or 3 colour channels, got 12"):
+        read_image(tmp_path / "many.exr", channels=3)
+    with pytest.raises(ValueError, match="channels: expected None, 1, 3 or 4"):
+        read_image(tmp_path / "y.exr", channels=2)
+
+
+def test_write_image_takes_what_a_loop_has_at_hand(tmp_path):
+    values = torch.rand(3, 4, 3, dtype=torch.float64, requires_grad=True)
+    write_image(tmp_path / "a.exr", values)
+    assert torch.equal(read_image(tmp_path / "a.exr"), values.detach().float())
+    for image in (values.detach().numpy(), values.half(), values.bfloat16(), values.transpose(0, 1), values.flip(0)):
+        write_image(tmp_path / "b.png", image)
+    write_image(str(tmp_path / "c.PNG"), values[..., 0])
+    assert read_image(tmp_path / "c.PNG").shape == (3, 4, 1)
+
+
+def test_image_faults(tmp_path):
+    image = torch.rand(3, 4, 3)
+    with pytest.raises(ValueError, match=r"a\.gif: expected a file name that ends in \.png, \.jpg.*\.exr, \.hdr"):
+        write_image(tmp_path / "a.gif", image)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(
+        OSError, match=r"a\.png: expected a folder to write to, got .*file \(Not a directory\)|File exists"
+    ):
+        write_image(tmp_path / "file" / "a.png", image)
+    write_image(tmp_path / "new" / "folders" / "a.png", image)
+    assert read_image(tmp_path / "new" / "folders" / "a.png").shape == (3, 4, 3)
+    with pytest.raises(ValueError, match=r"img: expected finite numbers, got nan at \[1, 2, 0\]"):
+        image_nan = image.clone()
+        image_nan[1, 2, 0] = float("nan")
+        write_image(tmp_path / "a.png", image_nan)
+    with pytest.raises(TypeError, match=r"img: expected linear radiance of a floating dtype, got torch\.uint8"):
+        write_image(tmp_path / "a.png", torch.zeros(2, 2, 3, dtype=torch.uint8))
+    with pytest.raises(ValueError, match="img: expected shape"):
+        write_image(tmp_path / "a.png", torch.zeros(2))
+    for suffix, channels in (("png", 5), ("jpg", 4), ("jpg", 2), ("hdr", 1), ("bmp", 2)):
+        with pytest.raises(ValueError, match=rf"a\.{suffix}: expected .* channels in a .* file, got {channels}"):
+            write_image(tmp_path / f"a.{suffix}", torch.zeros(2, 2, channels))
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(ValueError, match=r"folder\.png: expected a file name, got a directory"):
+        write_image(tmp_path / "folder.png", image)
+    with pytest.raises(ValueError, match=r"folder\.png: expected a file, got a directory"):
+        read_image(tmp_path / "folder.png")
+    (tmp_path / "folder.png").rmdir()
+    with pytest.raises(FileNotFoundError, match=r"gone\.png"):
+        read_image(tmp_path / "gone.png")
+    with pytest.raises(ValueError, match=r"a\.webm: expected a file name that ends in"):
+        read_image(tmp_path / "a.webm")
+    (tmp_path / "zero.png").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"zero\.png: expected data, got an empty file"):
+        read_image(tmp_path / "zero.png")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["file", "new", "zero.png"]
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "bmp", "tif", "exr", "hdr"])
+def test_damaged_images(tmp_path, suffix):
+    path = tmp_path / f"a.{suffix}"
+    write_image(path, torch.rand(64, 64, 3))
+    whole = path.read_bytes()
+    for content in (whole[: len(whole) // 3], b"not an image at all"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=rf"a\.{suffix}: expected a whole image"):
+            read_image(path)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.png"
+    write_image(path, torch.zeros(2, 2, 3))
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="no space"):
+        write_image(path, torch.ones(2, 2, 3))
+    assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1

@@ -1,0 +1,60 @@
+"""Libraries that files need are imported late, and missed by name."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+from mesh_files import GOOD
+from PIL import Image
+
+from edgegrad.files.image import write_image
+from edgegrad.files.load import load_mesh
+
+trimesh = pytest.importorskip("trimesh")
+
+
+def test_libraries_are_imported_late_and_missed_by_name(tmp_path):
+    write_image(tmp_path / "a.png", torch.zeros(1, 1, 3))
+    (tmp_path / "a.obj").write_text(GOOD)
+    code = (
+        "import sys, edgegrad.io as io\n"
+        "print({'trimesh', 'OpenImageIO', 'PIL', 'roma', 'viser', 'matplotlib', 'torch._dynamo'} & set(sys.modules))\n"
+        "sys.modules.update({'OpenImageIO': None, 'trimesh': None, 'trimesh.exchange.load': None})\n"
+        "for name, read in (('a.png', io.read_image), ('a.obj', io.load_mesh)):\n"
+        "    try: read(name)\n"
+        "    except ImportError as error: print(error)\n"
+    )
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    text = subprocess.check_output([sys.executable, "-c", code], text=True, cwd=tmp_path, env=env)
+    early, image, mesh = text.splitlines()
+    assert early == "set()"
+    assert "pip install OpenImageIO" in image and "pip install trimesh" in mesh
+
+
+@pytest.mark.parametrize(
+    "missing, names",
+    [
+        ("PIL", ["a.glb", "a.obj"]),
+        pytest.param("lxml", ["a.3mf"], marks=pytest.mark.slow),
+        pytest.param("networkx", ["a.3mf"], marks=pytest.mark.slow),
+    ],
+)
+def test_missing_libraries_are_asked_for_by_their_extra(tmp_path, missing, names):
+    for name in names:
+        box = trimesh.creation.box()
+        if missing == "PIL":
+            box.visual = trimesh.visual.TextureVisuals(uv=box.vertices[:, :2], image=Image.new("RGB", (2, 2)))
+        box.export(tmp_path / name)
+        assert len(load_mesh(tmp_path / name).faces) == 12
+    code = (
+        f"import sys\nsys.modules['{missing}'] = None\nimport edgegrad as eg\nfor name in {names}:\n"
+        "    try: eg.load_mesh(name)\n    except ImportError as error: print(error)"
+    )
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    text = subprocess.check_output([sys.executable, "-c", code], text=True, cwd=tmp_path, env=env)
+    lines = text.splitlines()
+    assert len(lines) == len(names)
+    for line in lines:
+        assert line.startswith("reading") and "pip install 'edgegrad[files]'" in line

@@ -1,0 +1,146 @@
+"""What is wrong in a file of a mesh is named."""
+
+import os
+import struct
+
+import numpy as np
+import pytest
+from mesh_files import GOOD, OFF, SQUARE, STL, TRIANGLES, ply, png_bytes, square_glb, write_obj
+from PIL import Image
+
+from edgegrad.files.load import load_mesh, load_scene
+
+MIXED = ply([*SQUARE, [2, 2, 0]], [[0, 1, 2, 3], [0, 1, 4]], face_colors=[[1, 2, 3]] * 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "fault"),
+    [
+        ("a.xyz", "1 2 3", "ends in .obj, .gltf"),
+        ("a.pkl", b"\x80\x04N.", "ends in .obj, .gltf"),
+        ("a", GOOD, "'no ending'"),
+        ("a.obj", "", "an empty file"),
+        ("a.obj", "# nothing\n", "expected triangles, got none"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "expected triangles, got none"),
+        ("a.obj", GOOD + "f 1 2 9\n", "cannot be read"),
+        ("a.obj", GOOD + "f 0 1 2\n", "count from 1, got 0"),
+        ("a.obj", GOOD + "f 1 2 -7\n", "cannot be read"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 1 1 0\nf -3 -2 -1\n", "negative indices"),
+        ("a.obj", GOOD + "f 1 x 3\nf 1 2 3\n", "cannot be read"),
+        ("a.obj", GOOD + "f 1 2\n", "the 2 faces that the file announces, got 1"),
+        ("a.obj", GOOD.replace("v 0 1 0", "v 0 nan 0"), "finite positions.* at vertex 2"),
+        ("a.obj", GOOD.replace("v 0 1 0", "v 0 1e99 0"), "finite positions.* at vertex 2"),
+        ("a.obj", "v 0 0 0 0 0 0\nv 1 0 0 0 nan 0\nv 0 1 0 1 1 1\nf 1 2 3\n", "vertex colours.*nan.* at vertex 1"),
+        ("a.obj", "v 0 0 0 0 0 0\nv 1 0 0 0 -1 0\nv 0 1 0 1 1 1\nf 1 2 3\n", "vertex colours.*-1.* at vertex 1"),
+        ("a.obj", "mtllib a.mtl\nmtllib b.mtl\n" + GOOD, "several"),
+        ("a.obj", "mtllib ../a.mtl\n" + GOOD, r"'\.\./a\.mtl', outside its folder"),
+        ("a.obj", "mtllib /etc/passwd\n" + GOOD, "'/etc/passwd', outside its folder"),
+        ("a.obj", "mtllib C:\\a.mtl\n" + GOOD, "outside its folder"),
+        ("a.off", OFF.replace("3 0 1 2", "3 0 1 5"), "cannot be read"),
+        ("a.off", OFF.replace("3 1 0", "3 2 0"), "the 2 faces that the file announces, got 1"),
+        ("a.off", OFF[:20], "cannot be read"),
+        ("a.off", "hello", "cannot be read"),
+        ("a.stl", STL[:60], "expected triangles, got none"),
+        ("a.stl", STL + STL[:-9], "the 2 faces that the file announces, got 1"),
+        ("a.stl", b"\0" * 80 + struct.pack("<I", 3) + b"\0" * 60, "expected triangles, got none"),
+        ("a.stl", STL.replace("vertex 0 1 0", "vertex 0 inf 0"), "finite positions"),
+        ("a.ply", ply(SQUARE, []), "expected triangles, got none"),
+        ("a.ply", ply(SQUARE, TRIANGLES)[:-10], "truncated"),
+        ("a.ply", ply(SQUARE, TRIANGLES)[:-20], "truncated"),
+        ("a.ply", ply(SQUARE, TRIANGLES, binary=True)[:-4], "cannot be read"),
+        ("a.ply", ply(SQUARE, TRIANGLES)[:60], "cannot be read"),
+        ("a.ply", ply(SQUARE, [[0, 1, 4]]), "indices from 0 to 3, got 4"),
+        ("a.ply", ply(SQUARE, [[0, 1, -1]], binary=True), "indices from 0 to 3, got -1"),
+        ("a.ply", ply([[0, 0, 0], [1, 0, 0], [0, float("nan"), 0]], [[0, 1, 2]], binary=True), "finite positions"),
+        ("a.ply", MIXED, "expected 3 colours for 3 triangles, got 2"),
+        ("a.glb", b"glTF", "something else"),
+        ("a.glb", square_glb()[:60], "cannot be read"),
+        ("a.glb", square_glb()[:-8], "cannot be read"),
+        ("a.glb", square_glb(scenes=[{"nodes": []}]), "expected triangles, got none"),
+        ("a.glb", square_glb(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression"),
+        ("a.glb", square_glb(materials=5), "cannot be read"),
+        ("a.glb", square_glb(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 6}]}]), "a triangle fan"),
+        ("a.gltf", "{", "cannot be read"),
+        ("a.gltf", "[]", "JSON object"),
+        ("a.3mf", b"PK\x03\x04 not a zip", "cannot be read"),
+    ],
+)
+def test_faults_are_named(tmp_path, name, content, fault):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    for load in (load_mesh, load_scene):
+        with pytest.raises(ValueError, match=fault) as caught:
+            load(path)
+        assert str(caught.value).startswith(str(path))
+
+
+def test_path_faults(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"gone\.obj: expected a file"):
+        load_mesh(tmp_path / "gone.obj")
+    with pytest.raises(ValueError, match="got a directory"):
+        load_mesh(tmp_path)
+    with pytest.raises(ValueError, match="ends in"):
+        load_mesh("http://127.0.0.1/mesh")
+    with pytest.raises(FileNotFoundError, match=r"127\.0\.0\.1"):
+        load_mesh("http://127.0.0.1/mesh.obj")
+    with pytest.raises(TypeError, match="path: expected a str"):
+        load_mesh(3)
+
+
+def test_texture_faults(tmp_path):
+    path = write_obj(tmp_path)
+    (tmp_path / "skin.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"quad\.obj: names 'skin\.png'.*materials=False"):
+        load_mesh(path)
+    assert load_mesh(path, materials=False).texture is None
+    (tmp_path / "skin.png").write_bytes(b"not an image")
+    with pytest.raises(ValueError, match=r"quad\.obj.*image in the texture 'skin\.png'"):
+        load_mesh(path)
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(tmp_path / "skin.png")
+    whole = (tmp_path / "skin.png").read_bytes()
+    (tmp_path / "skin.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=r"quad\.obj.*whole image in the texture 'skin\.png'"):
+        load_mesh(path)
+    (tmp_path / "quad.mtl").unlink()
+    with pytest.raises(FileNotFoundError, match=r"quad\.obj: names 'quad\.mtl'"):
+        load_mesh(path)
+    for name in ("../skin.png", str(tmp_path / "skin.png"), "..\\skin.png"):
+        path = write_obj(tmp_path, mtl=f"newmtl skin\nmap_Kd {name}\n")
+        with pytest.raises(ValueError, match=r"quad\.obj.*outside its folder"):
+            load_mesh(path)
+    path = write_obj(tmp_path, body="mtllib quad.mtl\nusemtl skin\n" + GOOD)
+    with pytest.raises(ValueError, match=r"quad\.obj.*expected texture coordinates"):
+        load_mesh(path)
+
+
+def test_a_link_out_of_the_folder_is_not_followed(tmp_path):
+    (tmp_path / "inside").mkdir()
+    path = write_obj(tmp_path / "inside")
+    (tmp_path / "inside" / "skin.png").rename(tmp_path / "skin.png")
+    os.symlink(tmp_path / "skin.png", tmp_path / "inside" / "skin.png")
+    with pytest.raises(ValueError, match="outside its folder"):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"images": [{"bufferView": 0, "name": "bark"}]}, "image in the texture 'bark'"),
+        (
+            {"colors": np.eye(4, dtype="<f4")},
+            r"vertex colours that differ, got both.*load it with lit=True, which multiplies them, or materials=False",
+        ),
+        ({"uv": False}, "expected texture coordinates"),
+        ({"reference": {"index": 0, "texCoord": 1}}, "expected texture coordinates TEXCOORD_1"),
+        ({"images": [{"uri": "gone.png"}]}, "names 'gone.png'"),
+    ],
+)
+def test_gltf_texture_faults(tmp_path, change, fault):
+    options = {"uv": True, "extra": [png_bytes()], "textures": [{"source": 0}], **change}
+    base = {"baseColorTexture": options.pop("reference", {"index": 0})}
+    view = 2 + bool(options["uv"]) + ("colors" in options)
+    options.setdefault("images", [{"bufferView": view}])
+    (tmp_path / "t.glb").write_bytes(square_glb({"pbrMetallicRoughness": base}, **options))
+    with pytest.raises((ValueError, FileNotFoundError), match=rf"t\.glb.*{fault}"):
+        load_mesh(tmp_path / "t.glb")

@@ -1,0 +1,107 @@
+"""The same bits: at any number of threads, whatever came before, for each seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from scenes import cube, front_camera, icosphere
+from torch_scenes import CAMERA, F32, F64, TRIANGLE, image_and_gradients, mixed_scene, same_bits
+
+import edgegrad as eg
+from edgegrad.library import core
+
+
+@pytest.fixture
+def threads() -> Iterator[Callable[[int], None]]:
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+REPEATABLE = {
+    "mixed": lambda: (mixed_scene(), CAMERA),
+    "mixed, float32": lambda: (mixed_scene().to(F32), CAMERA),
+    "20,480 faces": lambda: (eg.Scene(icosphere(5)), front_camera(64)),
+    "soup": lambda: (eg.Scene(soup(icosphere(4))), front_camera(64)),
+}
+
+
+def soup(mesh: eg.Mesh) -> eg.Mesh:
+    """Each face with vertices of its own."""
+    corners = mesh.faces.reshape(-1)
+    return eg.Mesh(mesh.verts[corners], torch.arange(len(corners)).reshape(-1, 3), colors=mesh.colors[corners])
+
+
+@pytest.mark.parametrize("case", REPEATABLE)
+def test_same_bits_at_any_number_of_threads(case, threads):
+    scene, camera = REPEATABLE[case]()
+    results = []
+    for n in (1, 2, 3):
+        threads(n)
+        core.clear_geometry()
+        results.append(image_and_gradients(scene, camera, seed=11))
+    assert same_bits(results[0], results[1]) and same_bits(results[0], results[2])
+
+
+@pytest.mark.parametrize("case", REPEATABLE)
+def test_same_bits_whatever_was_rendered_before(case):
+    """Geometry is kept between calls, and moved: none of that may show."""
+    scene, camera = REPEATABLE[case]()
+    core.clear_geometry()
+    expected = image_and_gradients(scene, camera)
+    assert same_bits(image_and_gradients(scene, camera), expected)
+    for i in range(3):
+        image_and_gradients(
+            scene.transformed(t=torch.tensor([0.1 * i, 0.2, 0.0], dtype=F64), scale=1.0 + 0.3 * i), camera
+        )
+    for i in range(9):  # more than are kept
+        eg.render(cube(0.1 + 0.1 * i).replace(faces=cube().faces[: 12 - i]), camera, 1)
+    eg.render(scene, camera, 1, visibility=False)
+    assert same_bits(image_and_gradients(scene, camera), expected)
+
+
+def test_same_bits_after_the_same_positions_in_another_precision():
+    """Copies of a vertex that differ by a rounding of float32 are one vertex there, and two in float64."""
+    mesh = soup(cube())
+    noise = 2.0**-24 * torch.randn(mesh.verts.shape, generator=torch.Generator().manual_seed(0))
+    coarse = mesh.replace(verts=(mesh.verts + noise).float())
+    fine = coarse.replace(verts=coarse.verts.double())
+    for first, second in ((coarse, fine), (fine, coarse)):
+        core.clear_geometry()
+        expected = image_and_gradients(eg.Scene(second), CAMERA)
+        core.clear_geometry()
+        image_and_gradients(eg.Scene(first), CAMERA)
+        assert same_bits(image_and_gradients(eg.Scene(second), CAMERA), expected)
+
+
+def test_same_bits_from_several_python_threads():
+    """The interpreter's lock is released meanwhile, and they share what is kept."""
+    scene, camera = REPEATABLE["mixed"]()
+    moves = [torch.tensor([0.05 * i, 0.0, 0.0], dtype=F64) for i in range(4)]
+    expected = [image_and_gradients(scene.transformed(t=t), camera) for t in moves]
+    with ThreadPoolExecutor(4) as pool:
+        futures = [pool.submit(image_and_gradients, scene.transformed(t=t), camera) for t in moves * 5]
+    assert all(same_bits(future.result(), expected[i % 4]) for i, future in enumerate(futures))
+
+
+def test_seeds():
+    scene = mixed_scene()
+    first = image_and_gradients(scene, CAMERA, seed=0)
+    for options in ({"seed": 1}, {"seed": 2**63 - 1}):
+        assert not any(map(torch.equal, first, image_and_gradients(scene, CAMERA, **options)))
+    image, *grads = image_and_gradients(scene, CAMERA, seed=0, grad_seed=5)
+    assert torch.equal(image, first[0])
+    # The gradient of the background follows from the image's own samples, the others have their own.
+    background = len(grads) - 3
+    for i, (a, b) in enumerate(zip(grads, first[1:], strict=True)):
+        assert torch.equal(a, b) == (i == background)
+    # The samples of the gradient depend on those of the image only by which faces these hit: here the one there is.
+    (image, *grads), (other_image, *others) = (
+        image_and_gradients(TRIANGLE, CAMERA, seed=seed, grad_seed=5) for seed in (0, 1)
+    )
+    assert not torch.equal(image, other_image)
+    for i, (a, b) in enumerate(zip(grads, others, strict=True)):
+        assert torch.equal(a, b) == (i != len(grads) - 3)

@@ -1,0 +1,54 @@
+"""The kernel's texture look-up against its definition."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from adjoints import check_vjp, pieces, random
+
+
+def texels(height: int = 4, width: int = 5, channels: int = 3) -> np.ndarray:
+    return random(height, width, channels, seed=3)
+
+
+def texel_centre(row: int, column: int, height: int, width: int) -> tuple[float, float]:
+    return (column + 0.5) / width, 1 - (row + 0.5) / height
+
+
+def test_texture_has_its_texels_at_their_centres():
+    """Row 0 on top, where v is largest; repeated on all sides."""
+    texture = texels()
+    for row, column in np.ndindex(texture.shape[:2]):
+        u, v = texel_centre(row, column, 4, 5)
+        for i, j in [(0, 0), (1, -2), (-3, 5)]:
+            np.testing.assert_allclose(pieces.texture_eval(texture, [u + i, v + j]), texture[row, column], atol=1e-13)
+
+
+def test_texture_is_linear_between_texels():
+    texture = texels()
+    u, v = texel_centre(1, 2, 4, 5)
+    value = pieces.texture_eval(texture, [u + 0.25 / 5, v - 0.6 / 4])  # a quarter to the right, 0.6 down
+    upper = 0.75 * texture[1, 2] + 0.25 * texture[1, 3]
+    lower = 0.75 * texture[2, 2] + 0.25 * texture[2, 3]
+    np.testing.assert_allclose(value, 0.4 * upper + 0.6 * lower, rtol=1e-13)
+
+
+@pytest.mark.parametrize("uv", [(0.33, 0.71), (0.02, 0.97), (-1.37, 2.11), (0.995, 0.005)])
+@pytest.mark.parametrize("shape", [(4, 5, 3), (1, 1, 2), (1, 7, 1), (3, 1, 20)])
+def test_texture_eval_vjp(uv, shape):
+    def forward(texture, uv):
+        return np.array(pieces.texture_eval(texture, uv))
+
+    def vjp(texture, uv, bar):
+        uv_bar, rows, weights = pieces.texture_eval_vjp(texture, uv, bar)
+        texture_bar = np.zeros((texture.shape[0] * texture.shape[1], texture.shape[2]))
+        np.add.at(texture_bar, rows, np.outer(weights, bar))
+        return texture_bar.reshape(texture.shape), uv_bar
+
+    check_vjp(forward, vjp, [texels(*shape), np.array(uv)])
+
+
+def test_texture_far_out():
+    """Beyond what an integer holds a coordinate has no fraction left, and must still find a texel."""
+    for uv in ([1e30, 0.5], [-1e30, 1e25], [2.0**62, -(2.0**63)]):
+        assert np.isfinite(pieces.texture_eval(texels(), uv)).all()
