@@ -72,7 +72,7 @@ def test_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [0, 0, 1]])
     faces = torch.tensor([[0, 1, 3], [1, 2, 3], [2, 0, 3], [2, 1, 0]])
-    model = edgegrad.Mesh(corners, faces, face_colors=torch.eye(4)[:, :3] + 0.2)
+    model = edgegrad.Mesh(corners, faces, face_colors=0.2 + 0.6 * torch.eye(4)[:, :3])
     edgegrad.save_mesh("model.glb", model)
     camera = edgegrad.Camera.look_at(eye=(0, 0, 3), target=(0, 0, 0), up=(0, 1, 0), fov_y=40, size=(32, 32))
     shown = edgegrad.render_aovs(model, camera, ["image", "alpha"], spp=64)
