@@ -11,8 +11,9 @@ from .camera.camera import Camera
 from .files.save import from_trimesh, to_trimesh
 from .io import View, load_camera, load_cameras, load_mesh, load_scene, read_image, save_camera, save_mesh, write_image
 from .live import viewer
-from .plan import Plan, plan, profile
+from .plan import Plan, plan
 from .points.hits import Hits
+from .points.rays import trace
 from .points.samples import (
     EdgeSamples,
     PrimaryHits,
@@ -21,9 +22,9 @@ from .points.samples import (
     edge_samples,
     primary_hits,
     surface_samples,
-    trace,
 )
 from .preview import thumbnail
+from .profile import profile
 from .render import jvp, render, screen_gradient
 from .scene import provided
 from .scene.environment import Environment

@@ -6,6 +6,7 @@ the derivative of the expected image.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any, overload
 
@@ -210,3 +211,10 @@ def screen_gradient(
     images = adjoint.to(request.scene.colors).reshape(request.cameras, *shape).contiguous()
     gradient = screen_gradient_kernel(images, hits, request)
     return (gradient if camera.batch is not None else gradient[0]).to(adjoint.device)
+
+
+def check_options(function: str, options: Mapping[str, Any]) -> None:
+    """What a `function` that takes the options of render() was given are such. Raises TypeError."""
+    known = [name for name, p in inspect.signature(render).parameters.items() if p.kind is p.KEYWORD_ONLY]
+    if unknown := [name for name in options if name not in known]:
+        raise TypeError(f"{function}: expected only the options {', '.join(known)}, got {unknown[0]!r}")

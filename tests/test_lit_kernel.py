@@ -16,8 +16,9 @@ from edgegrad.kernel.first_order import unreached
 from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel, radiance
 from edgegrad.points import borders
-from edgegrad.points.hits import Forced, Hits
-from edgegrad.points.samples import Frame
+from edgegrad.points.frame import Frame
+from edgegrad.points.hits import Hits
+from edgegrad.points.shadow_rays import Forced
 from edgegrad.scene.lights import LightPoints
 
 F64 = torch.float64
@@ -277,7 +278,7 @@ def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatc
             for whole in (True, False):
                 with monkeypatch.context() as patch:
                     if not whole:
-                        patch.setattr(radiance, "_whole", lambda *arguments: None)
+                        patch.setattr(radiance, "_kernel_image", lambda *arguments: None)
                         keep = lambda self: (again.append(found := kept(self)), found)[1]  # noqa: E731
                         patch.setattr(borders.Borders, "found", keep)
                     found.append(eg.render(scene, camera, **options))
@@ -338,7 +339,7 @@ def test_light_on_flat_faces(view: str) -> None:
     leaves = numbers_of("point directional")
     scene = scene_of("point directional", leaves).replace(meshes=scene_of("point", leaves).meshes[:1])
     frame = Frame(scene, make_request(scene, CAMERAS[view], 2, 0))
-    found = radiance._of_flat(frame.fixed, 0, frame.fixed_view)
+    found = radiance._flat_radiance(frame.fixed, 0, frame.fixed_view)
     (mesh,) = scene.meshes
     corner = mesh.verts[mesh.faces.long()]
     n = torch.nn.functional.normalize(

@@ -467,7 +467,7 @@ def test_profile_rebuilds_for_every_repeat(monkeypatch):
         built.append(bool(output[2][0]["built rays"]))
         return output
 
-    monkeypatch.setattr(importlib.import_module("edgegrad.plan"), "forward_kernel", forward_kernel)
+    monkeypatch.setattr(importlib.import_module("edgegrad.profile"), "forward_kernel", forward_kernel)
     eg.profile(icosphere(3), CAMERA, spp=1, repeats=3)
     assert built == [True] * 6
 

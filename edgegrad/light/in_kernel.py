@@ -14,9 +14,9 @@ from ..kernel.first_order import Tensors, apply, array, doubles, without_derivat
 from ..kernel.flat import Flat
 from ..kernel.operators import kernel_scene
 from ..library import core
+from ..points.frame import Frame
 from ..points.hits import Hits
 from ..points.records import values_of
-from ..points.samples import Frame
 from ..points.seeds import STEPS, mixed_bits
 from ..points.surfaces import Surfaces, View
 from ..scene.environment import Environment
@@ -74,7 +74,7 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
         if shadows and bool((own >= 0).any()):
             surfaces.shadowing.add(light)
             if casting.punctual:
-                hits._noted(light, own)
+                hits.note_visibility(light, own)
         column += 1 if casting.punctual else samples
     return found.to(surfaces.verts)
 
@@ -123,7 +123,7 @@ def _forced(points: Any, lit: Tensor) -> tuple[Tensor, ...]:
 
 
 class _Points(NamedTuple):
-    """Tensors of points, apart from their barycentrics."""
+    """Tensors of points; their barycentrics are an argument of their own."""
 
     face: Tensor  # (N,) int64
     seed: Tensor  # (N,) int64

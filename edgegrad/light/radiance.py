@@ -20,8 +20,8 @@ from ..check import all_finite, check_positive_int, values_visible
 from ..kernel.first_order import unreached
 from ..kernel.flat import image_dtype
 from ..kernel.request import Request
+from ..points.frame import Frame
 from ..points.hits import Hits
-from ..points.samples import Frame
 from ..points.surfaces import Rays, Surfaces, View
 from ..scene.appearance import OnMesh, jumps
 from ..scene.environment import Environment
@@ -68,9 +68,16 @@ class Lighting(NamedTuple):
         spp = request.image.spp
         points = max(FEWEST_IN_PENUMBRA, spp // 4) if extended else shaded_points(spp)
         fused = is_fused(scene)
-        adds_up = not scene.blends
-        whole = (lambda frame: _whole(frame, self, points)) if fused and adds_up else None
-        effort = Effort(points, whole, scene.blends, True, fused, fused and adds_up, adds_up)
+        additive = not scene.blends
+        effort = Effort(
+            points=points,
+            kernel_image=(lambda frame: _kernel_image(frame, self, points)) if fused and additive else None,
+            blended=scene.blends,
+            lit=True,
+            keeps_little=fused,
+            gives_derivatives=fused and additive,
+            additive=additive,
+        )
         image = render_shaded(scene, camera, self, request, creases, False, effort)
         if not scene.is_lit:  # as the kernel has it where there are no mipmaps
             image = image.to(image_dtype(scene))
@@ -83,23 +90,23 @@ class Lighting(NamedTuple):
         return radiance(hits, *self)
 
 
-def _whole(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:
-    """(H · W, C) what surfaces add to an image, at so many points of a face in a pixel. None where it is not finite: shading
-    points one by one says which."""
+def _kernel_image(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:
+    """(H · W, C) the radiance of surfaces before black, shaded at so many points of a face in a pixel. None where it is not
+    finite: shading points one by one then names the first that is not."""
     _note_jumps(frame.no_hits)
     found = in_kernel.image(frame, lighting.shadows, lighting.samples, points)
     return found if all_finite(found) else None
 
 
 class _Surface(NamedTuple):
-    """Points that light falls on."""
+    """Points that are shaded."""
 
     position: Tensor  # (N, 3)
     v: Tensor  # (N, 3) unit directions to the viewer
     g: Tensor  # (N, 3) unit normals of the faces, on the viewer's side
-    n: Tensor  # (N, 3) those that shade
+    n: Tensor  # (N, 3) unit shading normals
     scattering: Scattering
-    flat: bool  # whether they are the same
+    flat: bool  # whether n is g
 
     def select(self, rows: Tensor) -> _Surface:
         position, v, g, n = (part[rows] for part in (self.position, self.v, self.g, self.n))
@@ -158,19 +165,19 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
             continue
         count = 1 if light.punctual or hits.only_light else lighting.samples
         for sample in range(count):
-            total = total + _from_light(hits, light, (sample, count), surface, lighting.shadows) / count
+            total = total + _light_sample(hits, light, (sample, count), surface, lighting.shadows) / count
     return total if material.two_sided else torch.where(front, total, 0.0)
 
 
-def _from_light(hits: Hits, light: Light, which: tuple[int, int], surface: _Surface, shadows: bool) -> Tensor:
-    """(N, C): f max(0, n·l) V E of one point of a light, `which` of so many."""
-    points = hits.light_points(light, *which)
+def _light_sample(hits: Hits, light: Light, sample: tuple[int, int], surface: _Surface, shadows: bool) -> Tensor:
+    """(N, C): f max(0, n·l) V E of one point of a light, `sample` = (number, count)."""
+    points = hits.light_points(light, *sample)
     if isinstance(light, Environment) and not hits.knows_light(light):
         points = light.above(points, surface.g)
     with torch.no_grad():
         l = _towards(light, points, surface.position)
-        lit = ((dot(surface.n, l) > 0) & (dot(surface.g, l) > 0))[:, 0]
-    rows = lit.nonzero()[:, 0]
+        facing = ((dot(surface.n, l) > 0) & (dot(surface.g, l) > 0))[:, 0]
+    rows = facing.nonzero()[:, 0]
     C = hits._surfaces.scene.channels
     total = surface.position.new_zeros((len(hits), C))
     if len(rows) == 0:
@@ -181,7 +188,7 @@ def _from_light(hits: Hits, light: Light, which: tuple[int, int], surface: _Surf
     if not surface.flat:
         arriving = arriving * terminator(surface.g, surface.n, l)
     if shadows:
-        arriving = arriving * hits.apart(rows).visible_from(light, points)[:, None]
+        arriving = arriving * hits.subset(rows).visible_from(light, points)[:, None]
     scattered = surface.scattering.evaluate(surface.v, surface.n, l) * arriving
     return total.index_copy(0, rows, scattered.expand(len(rows), C))
 
@@ -192,27 +199,29 @@ def _towards(light: Light, points: LightPoints, position: Tensor) -> Tensor:
     return place if light.infinite else normalize(place - position, dim=-1)
 
 
-# -- at which edges it may jump -------------------------------------------------------------------------------------------
+# -- creases: edges at which radiance may jump --------------------------------------------------------------------------
 
 
 def _note_jumps(hits: Hits) -> None:
     surfaces = hits._surfaces
     scene = surfaces.scene
     if len(scene.meshes) > 1:
-        hits._note("mesh", lambda: surfaces.mesh_of_face[:, None, None].expand(-1, 3, 1))
+        hits.note_jump("mesh", lambda: surfaces.mesh_of_face[:, None, None].expand(-1, 3, 1))
     for index, mesh in enumerate(scene.meshes):
-        hits._note(("looks", index), _of_scene(surfaces, index, lambda mesh=mesh: jumps(mesh)))
+        hits.note_jump(("appearance", index), _of_scene(surfaces, index, lambda mesh=mesh: jumps(mesh)))
         if mesh.material is None or not (scene.lights or scene.casting):
             continue
         if mesh.normals is None:
             seen_by = hits._view
-            hits._note(("g", index), _of_scene(surfaces, index, lambda i=index, v=seen_by: _of_flat(surfaces, i, v)))
+            hits.note_jump(
+                ("g", index), _of_scene(surfaces, index, lambda i=index, v=seen_by: _flat_radiance(surfaces, i, v))
+            )
             continue
         if mesh.normal_faces is not None:
             normals, rows = mesh.normals, mesh.normal_faces
-            hits._note(("n", index), _of_scene(surfaces, index, lambda n=normals, r=rows: n[r.long()]))
+            hits.note_jump(("n", index), _of_scene(surfaces, index, lambda n=normals, r=rows: n[r.long()]))
         if scene.casting:
-            hits._note(("lit", index), _of_scene(surfaces, index, lambda i=index: _sunken(surfaces, i)))
+            hits.note_jump(("lit", index), _of_scene(surfaces, index, lambda i=index: _shadow_terminators(surfaces, i)))
 
 
 def _of_scene(surfaces: Surfaces, index: int, of_mesh: Callable[[], Tensor]) -> Callable[[], Tensor]:
@@ -239,11 +248,11 @@ def _face_normals(surfaces: Surfaces, index: int) -> Tensor:
     return surfaces.face_normals(_faces_of(surfaces, index))[:, None].expand(-1, 3, -1)
 
 
-def _of_flat(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
-    """(F, 3, K) of a mesh without normals: what its radiance depends on that may jump, colours apart. That is the normal n on the
-    viewer's side; of points of light alone only where one is in front, and of Lambertian surfaces then E max(0, n·l) of each. It
-    is the same at both ends of an edge only if it is along all of it: as n·l has the sign, and over 1/|l| the size, of a face's
-    distance to the light. The cone of a spot light, which may lie between the ends, is left out."""
+def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
+    """(F, 3, K) of a mesh without shading normals: what of its radiance, besides colours, may jump at edges. That is the normal n
+    on the viewer's side. With punctual lights alone only faces that one of them lights count, and of Lambertian ones only
+    E max(0, n·l) of each light. Equal values at both ends of an edge are equal along all of it, for n·l |l| is a face's distance
+    to the light. The cone of a spot light, whose border may lie between the ends, is left out."""
     scene, mesh = surfaces.scene, surfaces.scene.meshes[index]
     material = mesh.material
     assert material is not None
@@ -263,10 +272,10 @@ def _of_flat(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
     return torch.where(away[:, None], -g, g) * (found != 0).any(-1, keepdim=True)
 
 
-def _sunken(surfaces: Surfaces, index: int) -> Tensor:
-    """(F, 3, K): n·l at corners with interpolated normals times what terminator() leaves of it, for each light. The face's own
-    normal g comes in by that alone, and changes nothing where g·l ≥ (g·n)(n·l): so of a fine mesh only edges near the border of
-    its shaded side are creases. A light with an extent has such a border for each of its points: then all faces' normals."""
+def _shadow_terminators(surfaces: Surfaces, index: int) -> Tensor:
+    """(F, 3, K): n·l at corners with interpolated normals n, times the shadow terminator, for each light. The face's normal g
+    comes in by the terminator alone, which is 1 where g·l ≥ (g·n)(n·l): so of a fine mesh only edges near the terminator are
+    creases. A light with an extent has a terminator for each of its points: then all edges between faces of other normals are."""
     mesh, lights = surfaces.scene.meshes[index], surfaces.scene.casting
     assert mesh.normals is not None
     of_faces = _face_normals(surfaces, index)

@@ -8,7 +8,7 @@ from torch import Tensor
 from ..camera.poses import constant
 from ..kernel.derivatives import moves
 from ..scene.environment import Environment
-from .samples import Frame
+from .frame import Frame
 
 AT_ONCE = 1 << 16  # pixels whose rays are held at a time
 

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ..scene.appearance import OnMesh
 from ..scene.textures import look_up
+from .frame import Frame
 from .hits import Hits
 from .records import trace
-from .samples import Frame
 
 MOST = 8  # surfaces in a row; what lies behind the last is left out
 
@@ -32,7 +32,7 @@ class Blended:
             through = (alpha < 1)[:, 0].nonzero()[:, 0]
         if left == 1 or len(through) == 0:
             return radiance
-        behind = self._behind(hits.apart(through), radiance.shape[1], left).to(radiance.dtype)
+        behind = self._behind(hits.subset(through), radiance.shape[1], left).to(radiance.dtype)
         return (alpha * radiance).index_add(0, through, (1 - alpha[through]) * behind)
 
     def _behind(self, hits: Hits, channels: int, left: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""Pixels that borders of a shader's steps, or of shadows, run through: there one point of a face is a poor guess at the whole
+"""Pixels that borders of a shader's steps, or of shadows, run through: there one point of a face is a poor estimate of the
 pixel.
 
 A pixel is one of them where a step is on different sides in the pixels around it. What was found in the pixel itself is not
@@ -16,12 +16,12 @@ from .hits import Hits
 from .steps import FLOOR
 
 MOST = 8  # times the points of a face in a pixel
-SHARE = 4  # times the points of the first look, in all
+SHARE = 4  # times the points of the first pass, in all
 LEVELS = 1 << 14  # after which the sides of a step repeat here, so that small integers hold them
 
 
 class Borders:
-    """Of an image of `size` (height, width), from the first look at all of its pixels, at so many points of a face in each."""
+    """Of an image of `size` (height, width), from a first pass over all of its pixels, at so many points of a face in each."""
 
     def __init__(self, size: tuple[int, int], points: int) -> None:
         self._size, self._each = size, points

@@ -4,36 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from ..check import as_tensor, check_finite, check_float, check_shape, values_visible
-from ..kernel.derivatives import moves
 from ..scene.lights import Light, LightPoints
 from ..scene.material import WRAPS
 from ..scene.mesh import FILTERS
 from ..scene.rows import interpolated, rows_of
-from ..scene.textures import bilinear, in_texels, nearest, pyramid
+from ..scene.textures import bilinear, in_texels, nearest, trilinear
+from .footprints import Footprints, pyramid_of
 from .records import RayRecords, visible
-from .seeds import STEPS, mixed_bits, signed
-from .steps import Steps, StepsOfSome
+from .seeds import uniform
+from .shadow_rays import Forced, seen_from
+from .steps import Steps, StepsOfSubset
 from .surfaces import Rays, Surfaces, View, every_face
-
-
-class Forced(NamedTuple):
-    """What is known of the shadow of one light at some points, instead of being drawn and traced."""
-
-    light: int  # place in scene.casting
-    points: LightPoints  # N of them
-    lit: Tensor  # (N,) 0 or 1
-    some: Tensor  # (N,) bool: at which points; elsewhere light points are drawn, and shadow rays cast
-    only: bool = False  # whether nothing is wanted but what this light adds
-
-    def select(self, index: Tensor | slice) -> Forced:
-        return Forced(self.light, self.points.select(index), self.lit[index], self.some[index], self.only)
 
 
 class Hits:
@@ -65,7 +53,7 @@ class Hits:
         self._face, self._exact = face, barycentrics
         self._barycentrics = barycentrics.to(surfaces.verts.dtype)
         self._pixel, self._steps = pixel, steps or Steps()
-        self._whole: tuple[Hits, Tensor] | None = None  # of which these are some points, the rows of these
+        self._all: tuple[Hits, Tensor] | None = None  # the hits that these are a subset of, and the rows of these
         # (N,) int8, by lights of scene.casting: visible_from(), −1 where it was not asked
         self.lit: dict[int, Tensor] = {}
 
@@ -90,20 +78,20 @@ class Hits:
         wrong = (index < -count) | (index >= count)
         if values_visible(index) and bool(wrong.any()):
             raise ValueError(f"index: expected numbers from {-count} to {count - 1}, got {int(index[wrong][0])}")
-        return self.apart(index, StepsOfSome(self._steps, index % max(count, 1), count))
+        return self.subset(index, StepsOfSubset(self._steps, index % max(count, 1), count))
 
-    def apart(self, index: Tensor | slice, steps: Steps | None = None) -> Hits:
-        """Some of the points, as hits that know nothing of the whole."""
+    def subset(self, index: Tensor | slice, steps: Steps | None = None) -> Hits:
+        """Some of the points. Unlike select(), steps that are declared of them are not declared of all."""
         view = self._view.select(index) if isinstance(self._view, Rays) else self._view
         pixel = None if self._pixel is None else self._pixel[index]
         forced = None if self._forced is None else self._forced.select(index)
         place = self._face[index], self._exact[index], pixel
         some = Hits(self._surfaces, view, *place, self._rays_at, steps, self._seed[index], forced)
-        if self._whole is None:
+        if self._all is None:
             rows = torch.arange(len(self), device=self._face.device)[index] if isinstance(index, slice) else index
-            some._whole = self, rows
+            some._all = self, rows
         else:
-            some._whole = self._whole[0], self._whole[1][index]
+            some._all = self._all[0], self._all[1][index]
         return some
 
     @property
@@ -120,12 +108,13 @@ class Hits:
             raise ValueError("hits.ray: expected hits of trace(), these are of a camera; see hits.pixel")
         return self._view.ray
 
-    def _note(self, key: Any, corners: Callable[[], Tensor]) -> None:
+    def note_jump(self, key: Any, corners: Callable[[], Tensor]) -> None:
+        """That radiance depends on values at the corners of faces (F, 3, K): edges where these differ may be creases."""
         self._surfaces.jumping.setdefault(key, corners)
 
     def _note_faces(self) -> None:
         s = self._surfaces
-        self._note("face", lambda: every_face(len(s.faces)).to(s.verts.device))
+        self.note_jump("face", lambda: every_face(len(s.faces)).to(s.verts.device))
 
     @property
     def face(self) -> Tensor:
@@ -137,7 +126,7 @@ class Hits:
     def mesh(self) -> Tensor:
         """(N,) int64: the mesh of the scene."""
         s = self._surfaces
-        self._note("mesh", lambda: s.mesh_of_face[:, None, None].expand(-1, 3, 1))
+        self.note_jump("mesh", lambda: s.mesh_of_face[:, None, None].expand(-1, 3, 1))
         return s.mesh_of_face[self._face]
 
     @property
@@ -162,14 +151,14 @@ class Hits:
         """(N, 3) unit normal of the face, to the side from which its vertices run counter-clockwise."""
         s = self._surfaces
         every = torch.arange(len(s.faces), device=s.verts.device)
-        self._note("normal", lambda: s.face_normals(every)[:, None].expand(-1, 3, -1))
+        self.note_jump("normal", lambda: s.face_normals(every)[:, None].expand(-1, 3, -1))
         return s.face_normals(self._face)
 
     @cached_property
     def shading_normal(self) -> Tensor:
         """(N, 3) unit normal, interpolated between those of the vertices: means of their faces' by area."""
         s = self._surfaces
-        self._note("shading_normal", lambda: s.vertex_normals[s.faces])
+        self.note_jump("shading_normal", lambda: s.vertex_normals[s.faces])
         normals = rows_of(s.vertex_normals, rows_of(s.faces, self._face))
         return normalize(interpolated(self._barycentrics, normals), dim=-1)
 
@@ -177,7 +166,7 @@ class Hits:
     def uv(self) -> Tensor:
         """(N, 2) texture coordinates, v running up."""
         s = self._surfaces
-        self._note("uv", lambda: s.corner_uvs)
+        self.note_jump("uv", lambda: s.corner_uvs)
         return interpolated(self._barycentrics, rows_of(s.corner_uvs, self._face))
 
     @cached_property
@@ -216,7 +205,7 @@ class Hits:
                 else attribute[:, None].expand(-1, 3, -1)
             )
 
-        self._note(("attribute", id(attribute)), corners)
+        self.note_jump(("attribute", id(attribute)), corners)
         if per == "face":
             return rows_of(attribute, self._face)
         values = rows_of(attribute, rows_of(s.faces, self._face) if per == "vertex" else self._face)
@@ -272,51 +261,11 @@ class Hits:
             return nearest(texture, self.floor(in_texels(texture, uv)), wraps)
         if filter == "linear":
             return bilinear(texture, uv, wraps)
-        assert corners is not None
-        levels = self._pyramid(texture)
-        level = self._level(texture, corners).clamp(0, len(levels) - 1)
-        below = level.floor()
-        value: Any = 0
-        for k, image in enumerate(levels):
-            weight = torch.where(below == k, 1 - (level - below), torch.where(below == k - 1, level - below, 0.0))
-            value = value + weight.to(texture.dtype)[:, None] * bilinear(image, uv, wraps)
-        return value
-
-    def _pyramid(self, texture: Tensor) -> list[Tensor]:
-        """The levels of a texture, kept where they have no graph."""
-        kept = self._surfaces.pyramids
-        if torch.is_grad_enabled():
-            return pyramid(texture)
-        if id(texture) not in kept:
-            kept[id(texture)] = texture, pyramid(texture)
-        return kept[id(texture)][1]
-
-    def _level(self, texture: Tensor, corner_uvs: Tensor) -> Tensor:
-        """(N,) the logarithm of how many texels neighbouring pixels are apart, at most."""
         if self._rays_at is None or self._pixel is None or isinstance(self._view, Rays):
             raise ValueError("mipmap: expected hits of a camera, for rays of trace() have no neighbours; leave it out")
-        rays_at, view, pixel, corners = self._rays_at, self._view, self._pixel, corner_uvs.double()
-        size = torch.tensor([texture.shape[1], texture.shape[0]], dtype=torch.float64, device=corners.device)
-        step = 1 / 64  # px, within which the face's plane is as good as straight
-        rays = rays_at(pixel)
-
-        def beside(axis: int, aside: float) -> Tensor:
-            if not moves(rays.along):
-                return rays.along + aside * rays.along_by_x[:, :, axis]
-            # As functions of the intrinsics; where the lens shows nothing there, as if all were the same.
-            offset = torch.zeros(2, dtype=pixel.dtype, device=pixel.device)
-            offset[axis] = aside
-            along = rays_at(pixel + offset).along
-            return torch.where(torch.isfinite(along), along, rays.along)
-
-        def squared(axis: int) -> Tensor:
-            """How many texels a pixel is along an axis, squared."""
-            b = [view.barycentrics(self._surfaces, self._face, beside(axis, aside)) for aside in (step, -step)]
-            texels = interpolated(b[0] - b[1], corners) * size / (2 * step)
-            return (texels * texels).sum(1)
-
-        most = torch.nan_to_num(torch.maximum(squared(0), squared(1)), nan=1.0, posinf=1e18).clamp(1, 1e18)
-        return 0.5 * most.log2()
+        assert corners is not None
+        footprints = Footprints(self._surfaces, self._view, self._face, self._pixel, self._rays_at)
+        return trilinear(pyramid_of(self._surfaces, texture), footprints.level(texture, corners), uv, wraps)
 
     # -- steps ---------------------------------------------------------------------------------------------------------
 
@@ -390,12 +339,7 @@ class Hits:
         """(N, n) float64, uniform in [0, 1): the same for what belongs to the same sample, without derivatives. Points that
         follow one another, and the `parts` of one point, have numbers that fill the unit cube evenly (a Kronecker sequence
         with the powers of the generalised golden ratio of three dimensions); `stream` gives others."""
-        seed = self._seed * parts + part
-        columns = []
-        for k in range(n):
-            mixed = seed * STEPS[k % 3] + signed(mixed_bits(stream * 0x10001 + k))
-            columns.append(((mixed >> 11) & ((1 << 53) - 1)).double() * 2.0**-53)
-        return torch.stack(columns, 1)
+        return uniform(self._seed * parts + part, n, stream)
 
     def light_points(self, light: Light, sample: int = 0, samples: int = 1) -> LightPoints:
         """A point of a light of `lights` for each of the N points, drawn by what the light emits, or one after another of so many
@@ -403,14 +347,7 @@ class Hits:
         index = self._index(light)
         points = light.draw(self.random(3, index, sample, samples))
         forced = self._forced
-        if forced is None or forced.light != index:
-            return points
-        some = forced.some
-        return LightPoints(
-            torch.where(some, forced.points.index, points.index),
-            torch.where(some[:, None], forced.points.uv, points.uv),
-            torch.where(some, forced.points.density, points.density),
-        )
+        return points if forced is None or forced.light != index else forced.among(points)
 
     def visible_from(self, light: Light, points: LightPoints) -> Tensor:
         """(N,) 1 where nothing lies between the points and those of a light, else 0: see visible(). A border of its shadow is
@@ -419,35 +356,24 @@ class Hits:
         s.shadowing.add(index)
         if forced is not None and forced.light == index and values_visible(forced.some) and bool(forced.some.all()):
             return forced.lit.to(self.position.dtype)
-        place = light.place(points).detach().to(s.verts.device, torch.float64)
-        here = self.position.detach().double()
-        spacing = torch.finfo(s.verts.dtype).eps
-        size = here.abs().amax(1)
-        if light.infinite:
-            center, radius = s.ball
-            place = here + place * ((here - center).norm(dim=1, keepdim=True) + 1.01 * radius)
-        else:
-            size = torch.maximum(size, place.abs().amax(1))
-            if not light.punctual:
-                # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
-                spacing = max(spacing, 2.0**-40)
-        lit = visible(s.casters, self._face, self._exact[:, 1:], place, 16 * spacing * size)
-        self._noted(index, lit)
+        place, near = seen_from(light, points, s, self.position.detach().double())
+        lit = visible(s.casters, self._face, self._exact[:, 1:], place, near)
+        self.note_visibility(index, lit)
         lit = lit.to(self.position.dtype)
         if forced is None or forced.light != index:
             return lit
         return torch.where(forced.some, forced.lit.to(lit), lit)
 
-    def _noted(self, light: int, lit: Tensor) -> None:
-        """Known to the whole of which these are some points: 1 or 0, and −1 where it was not asked."""
+    def note_visibility(self, light: int, lit: Tensor) -> None:
+        """Kept with the hits that these are a subset of: 1 or 0, and −1 where it was not asked."""
         if not values_visible(lit):
             return
         lit = lit.to(torch.int8)
-        if self._whole is None:
+        if self._all is None:
             self.lit[light] = lit
             return
-        whole, rows = self._whole
-        known = whole.lit.setdefault(light, lit.new_full((len(whole),), -1))
+        every, rows = self._all
+        known = every.lit.setdefault(light, lit.new_full((len(every),), -1))
         known.index_copy_(0, rows, lit)
 
     @property

@@ -37,3 +37,13 @@ def sample_seeds(seed: int, stream: int, first: int, count: int) -> Tensor:
     """(count,) int64: of the samples from `first` on of a stream."""
     start = mixed_bits(mixed_bits(seed) ^ mixed_bits(-1 - stream)) >> 1
     return torch.arange(first, first + count) + signed(start)
+
+
+def uniform(seed: Tensor, n: int, stream: int = 0) -> Tensor:
+    """(N, n) float64 in [0, 1) of seeds (N,): those of seeds that follow one another fill the unit cube evenly, a Kronecker
+    sequence with the powers of the generalised golden ratio of three dimensions; `stream` gives others."""
+    columns = []
+    for k in range(n):
+        mixed = seed * STEPS[k % 3] + signed(mixed_bits(stream * 0x10001 + k))
+        columns.append(((mixed >> 11) & ((1 << 53) - 1)).double() * 2.0**-53)
+    return torch.stack(columns, 1)

@@ -114,3 +114,15 @@ class _Attached(NamedTuple):
                 moved = self.film.sum(x, tangent if weight is None else weight[:, None] * tangent)
                 total = total + (moved if behind is None else moved * behind).to(total)
         return total
+
+
+def boundary(
+    x: Tensor, velocity: Tensor, jump: Tensor, to_background: Tensor | None, background: Tensor | None
+) -> list[Term]:
+    """Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
+    x, velocity = x.detach(), velocity.to(jump.dtype)[:, None]
+    terms = [Term(x, velocity * jump)]
+    if background is not None and to_background is not None:
+        behind = background.detach().reshape(-1, jump.shape[1]).to(jump)
+        terms.append(Term(x, velocity * to_background.to(jump.dtype)[:, None], behind=behind))
+    return terms

@@ -57,16 +57,16 @@ class Steps:
         return self._states[:, len(self.kinds) - 1].to(values.device)
 
 
-class StepsOfSome(Steps):
+class StepsOfSubset(Steps):
     """Those of some of the points, which are steps of all of them."""
 
-    def __init__(self, whole: Steps, index: Tensor, count: int) -> None:
+    def __init__(self, steps: Steps, index: Tensor, count: int) -> None:
         super().__init__()
-        self._whole, self._index, self._count = whole, index, count
+        self._all, self._index, self._count = steps, index, count
 
     def _note(self, kind: str, values: Tensor) -> Tensor | None:
         nothing = values.new_full((self._count,), torch.nan)
-        forced = self._whole._note(kind, nothing.index_copy(0, self._index, values))
+        forced = self._all._note(kind, nothing.index_copy(0, self._index, values))
         return None if forced is None else forced[self._index]
 
 

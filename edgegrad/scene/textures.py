@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -61,3 +63,14 @@ def pyramid(texture: Tensor) -> list[Tensor]:
         size = max(1, image.shape[2] // 2), max(1, image.shape[3] // 2)
         levels.append(torch.nn.functional.adaptive_avg_pool2d(image, size)[0].movedim(0, -1))
     return levels
+
+
+def trilinear(levels: list[Tensor], level: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
+    """(N, K) between the two levels of a pyramid around `level` (N,)."""
+    level = level.clamp(0, len(levels) - 1)
+    below = level.floor()
+    value: Any = 0
+    for k, image in enumerate(levels):
+        weight = torch.where(below == k, 1 - (level - below), torch.where(below == k - 1, level - below, 0.0))
+        value = value + weight.to(image.dtype)[:, None] * bilinear(image, uv, wraps)
+    return value

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from ...check import check_positive_int
 from ...files.paths import replacing
-from ...plan import profile
+from ...profile import profile
 from ..document import METRICS, Document, duration, percent, settings
 from ..scenes import SCENES, ReportScene, build
 from .methods import METHODS, Method, missing
