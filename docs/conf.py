@@ -24,15 +24,17 @@ copyright = author
 version = release = edgegrad.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton"]
+extensions += ["mathml", "offline"]  # this folder's own
 exclude_patterns = ["_build"]
 smartquotes = False
 html_theme = "furo"
+html_math_renderer = "mathml"
 html_title = f"edgegrad {version}"
 html_static_path = ["static"]
 html_css_files = ["edgegrad.css"]
 copybutton_exclude = ".linenos, .gp, .go"
 
-myst_enable_extensions = ["colon_fence", "deflist"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"  # tests run the notebooks
 
@@ -45,7 +47,7 @@ python_maximum_signature_line_length = 88
 python_use_unqualified_type_names = True
 # No inventories of other projects: the site builds without a network. So their types have nothing to link to.
 OTHERS = r"(torch|numpy|collections|os|pathlib|typing)\..*|Tensor|Vector|Figure|Path"
-nitpick_ignore_regex = [("py:.*", OTHERS), ("py:class", r"edgegrad\.fit\.views\.View|PoseTask")]
+nitpick_ignore_regex = [("py:.*", OTHERS), ("py:class", r"edgegrad\.(fit\.views\.View|camera\.fields\.CameraT)|PoseTask")]
 # Nobody calls these: functions return them.
 RETURNED = {"Hits", "Plan", "Profile", "PrimaryHits", "SurfaceSamples", "EdgeSamples", "PoseFit", "CameraFit", "Fit"}
 

@@ -202,7 +202,7 @@ show(pictures)
 # %% [markdown]
 # *What to see:* the plate thins out to a line and then fades.
 #
-# What is known to be limited is listed in the README: two finely detailed objects $10^5$ times their size apart in one
+# What is known to be limited is listed in docs/limits.md: two finely detailed objects $10^5$ times their size apart in one
 # scene, say.
 #
 # ## Check

@@ -209,7 +209,7 @@ def test_few_samples_are_unbiased(edge_samples: int | None) -> None:
 @pytest.mark.parametrize("spacings", [4, 16])
 def test_what_lies_closer_than_the_input_tells(spacings: int) -> None:
     """A sheet that another hides from less than eight spacings of float32 away counts as touching it, and has a gradient
-    (README, Limits); from farther away it has none."""
+    (docs/limits.md); from farther away it has none."""
     corners = torch.tensor([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
     faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
     behind = (0.8 * corners + torch.tensor([0.03, 0.02, spacings * 2.0**-24])).requires_grad_()
@@ -224,7 +224,7 @@ def test_what_lies_closer_than_the_input_tells(spacings: int) -> None:
 @pytest.mark.parametrize(("apart", "least", "most"), [(3e-7, 0.999, 1.001), (1e-6, 1.15, 1.25), (1e-4, 1.0, 1.04)])
 def test_copies_that_are_not_quite_in_one_place(apart: float, least: float, most: float) -> None:
     """Faces with vertices of their own, in float32: up to eight spacings they are one; just beyond, each side of a face is a
-    border that its neighbour does not quite cover, and the gradient is up to a fifth too large (README, Limits)."""
+    border that its neighbour does not quite cover, and the gradient is up to a fifth too large (docs/limits.md)."""
     ball = icosphere(2)
     colors = torch.rand((len(ball.faces), 3), generator=torch.Generator().manual_seed(0))
     camera = eg.Camera.look_at((0.1, 0.2, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (64, 64))

@@ -62,6 +62,42 @@ def test_page(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
             assert same(source, printed), f"{page}: it says\n{source}\nand prints\n{printed}"
 
 
+def test_readme_is_short() -> None:
+    text = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
+    assert len(text.split()) <= 1300
+
+
+def test_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From top to bottom, with a small model and its picture in place of the reader's, and few steps."""
+    monkeypatch.chdir(tmp_path)
+    corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0], [0, 0, 1]])
+    faces = torch.tensor([[0, 1, 3], [1, 2, 3], [2, 0, 3], [2, 1, 0]])
+    model = edgegrad.Mesh(corners, faces, face_colors=0.2 + 0.6 * torch.eye(4)[:, :3])
+    edgegrad.save_mesh("model.glb", model)
+    camera = edgegrad.Camera.look_at(eye=(0, 0, 3), target=(0, 0, 0), up=(0, 1, 0), fov_y=40, size=(32, 32))
+    shown = edgegrad.render_aovs(model, camera, ["image", "alpha"], spp=64)
+    edgegrad.write_image("photo.png", shown["image"])
+    edgegrad.write_image("mask.png", shown["alpha"])
+    floor = torch.tensor([[-3.0, -3, -1], [3, -3, -1], [3, 3, -1], [-3, 3, -1]])
+    names: dict[str, object] = {"ground": edgegrad.Mesh(floor, torch.tensor([[0, 1, 2], [0, 2, 3]]))}
+    text = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
+    blocks = [source for kind, source in FENCE.findall(text) if kind == "python"]
+    assert len(blocks) == 3
+    for source in blocks:
+        exec(compile(source.replace("range(200)", "range(3)"), "README.md", "exec"), names)
+    found, sun = (names[name] for name in ("fit", "sun"))
+    assert isinstance(found, edgegrad.fit.PoseFit) and isinstance(sun, torch.Tensor)
+    assert found.loss < 1e-3 and sun.grad is not None and sun.grad.abs().max() > 0
+
+
+def test_equations_are_typeset() -> None:
+    """None stands as characters in code: integrals, sums and partial derivatives are between dollar signs."""
+    for page in FOLDER.rglob("*.md"):
+        text = FENCE.sub("", page.read_text(encoding="utf-8"))
+        code = re.findall(r"`[^`\n]+`|^    \S.*$", text, re.MULTILINE)
+        assert not [found for found in code if re.search("[∫∮∂∇]", found)], page.name
+
+
 @pytest.mark.parametrize("module", [edgegrad, edgegrad.fit])
 def test_reference_has_all_that_is_public(module: ModuleType) -> None:
     reference = "".join(page.read_text(encoding="utf-8") for page in (FOLDER / "api").glob("*.md"))

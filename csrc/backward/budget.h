@@ -44,7 +44,7 @@ class SampleBudget {
    private:
     // A sample of the gradient costs several rays of the image: it is placed by a search, traced among strangers,
     // decided in double and scattered; and shaded by lights, each of which it asks whether it sees it, where there are
-    // any (docs/performance.md).
+    // any (docs/tried.md).
     struct Cost {
         double surface, edge;
     };

@@ -18,7 +18,7 @@ namespace {
 
 // Default samples a pixel of curve; see surface_measure.cpp. Of lit scenes, where a sample costs three times as much
 // and most of the error is that of faces: with a quarter of the samples it grows by a tenth at most
-// (docs/performance.md).
+// (docs/tried.md).
 double samples_per_pixel(bool lit) { return lit ? 6 : 24; }
 
 // The error of a gradient is seen relative to all of it. What controls know has none, so the more of it that is, the

@@ -25,7 +25,7 @@ constexpr double occluded_beside_hits = 1.0 / 8;
 
 // Default samples a unit of (area + longest side · 1 px): where colours are interpolated, and where a texture may vary
 // from pixel to pixel. Chosen with the samples at edges so that a smaller error of either would cost the same time
-// (docs/performance.md).
+// (docs/tried.md).
 constexpr double colored = 0.5, textured = 4;
 
 // Shaded by lights a sample costs several times as much, so textures get no more samples there than colours do; but of
