@@ -10,7 +10,15 @@ from typing import Any
 from sphinx.errors import SphinxError
 
 # What a browser loads by itself; links that a reader follows (`a`) may lead anywhere.
-LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "video": "src", "audio": "src", "embed": "src"}
+LOADED = {
+    "script": "src",
+    "img": "src",
+    "iframe": "src",
+    "source": "src",
+    "video": "src",
+    "audio": "src",
+    "embed": "src",
+}
 LOADED |= {"link": "href", "object": "data", "image": "href"}
 NAMED_ONLY = {"canonical", "license", "author", "next", "prev"}
 HOST = re.compile(r"\s*(?:https?:)?//")
