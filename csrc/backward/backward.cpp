@@ -1,8 +1,10 @@
 // The backward pass: the two terms, and what they found turned into the gradients of the user's arrays.
 
 #include <algorithm>
+#include <functional>
 #include <numeric>
 #include <optional>
+#include <type_traits>
 #include <vector>
 
 #include "backward/budget.h"
@@ -90,10 +92,13 @@ struct InImage {
     static double margin_of(const ImageOptions& image) { return image.filter.radius() - 0.5; }
 };
 
+template <class T>
+using ViewBody = std::function<void(const BackwardView<T>&)>;
+
 // Calls body(view) with what all terms look at through one window.
-template <class T, class Body>
+template <class T>
 void with_view(const BackwardInput<T>& input, const Camera& camera, const InImage<T>& in_image,
-               const GradientOptions& o, const Terms& terms, Team& team, Body body) {
+               const GradientOptions& o, const Terms& terms, Team& team, const ViewBody<T>& body) {
     const auto& [scene, whole, geometry, image, adjoint, hit_buffers, detailed] = input;
     const auto& [filtered, importance, occlusion] = in_image;
     const ViewVolume volume(camera, InImage<T>::margin_of(image));
@@ -210,7 +215,7 @@ std::vector<GradientOptions> options_of_windows(const BackwardInput<T>& input, c
     std::vector<SampleCounts> wanted(windows.size());
     SampleCounts all;
     for (size_t k = 0; k < windows.size(); ++k)
-        with_view(input, windows[k], in_image, counted, terms, team, [&](const BackwardView<T>& view) {
+        with_view<T>(input, windows[k], in_image, counted, terms, team, [&](const BackwardView<T>& view) {
             Destination none;
             BackwardProfile profile;
             measure_terms(view, terms, none, profile);
@@ -231,8 +236,9 @@ std::vector<GradientOptions> options_of_windows(const BackwardInput<T>& input, c
 }
 
 // Calls body(view) for each window of the camera.
-template <class T, class Body>
-void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Terms& terms, Team& team, Body body) {
+template <class T>
+void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Terms& terms, Team& team,
+               const std::type_identity_t<ViewBody<T>>& body) {
     const std::vector<Camera> windows = windows_of(input.camera, InImage<T>::margin_of(input.image));
     const InImage<T> in_image(input, team);
     const std::vector<GradientOptions> options = options_of_windows(input, windows, in_image, o, terms, team);
