@@ -65,7 +65,7 @@ else
 	printf '%s\n' $(filter-out csrc/python/% csrc/checks/faults.cpp,$(filter %.cpp,$(SOURCES))) | \
 	  xargs -P 2 -I@ sh -c '$(CXX) -std=c++20 -O1 -g -pthread -fsanitize=thread -ffp-contract=off -w -Icsrc -c @ -o $(THREADS)/$$(basename @).o'
 	$(CXX) -pthread -fsanitize=thread $(THREADS)/*.o -ldl -o $(THREADS)/threads
-	embree=$$($(BIN)/python -c "from edgegrad._kernel import embree_path as path; print(path())") && \
+	embree=$$($(BIN)/python -c "from edgegrad.library import embree_path as path; print(path())") && \
 	export TSAN_OPTIONS=ignore_noninstrumented_modules=1 && \
 	$(FIXED) $(THREADS)/threads $$embree race 2>&1 | grep -q "WARNING: ThreadSanitizer: data race" && \
 	echo "The race on purpose is reported." && $(FIXED) $(THREADS)/threads $$embree && echo "The kernel has none."
@@ -77,7 +77,7 @@ bench: $(VENV)/.ready
 
 lint: $(VENV)/.ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[dev,demo,test]"
-	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright --pythonpath $(BIN)/python && $(BIN)/lint-imports
 	$(BIN)/clang-format --dry-run --Werror $(filter-out %.txt %.toml,$(SOURCES))
 
 # Warnings are errors; build/docs/index.html is the site.

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._files import replacing
-from edgegrad._kernel import core
-from edgegrad._ops import Hits, Profile, kernel_camera, kernel_channels, kernel_hits, kernel_scene
-from edgegrad._request import make_request
-from edgegrad.report.methods import differentiate
-from edgegrad.report.references import standard_error
+from edgegrad.files.paths import replacing
+from edgegrad.kernel.operators import Hits, Profile, kernel_camera, kernel_channels, kernel_hits, kernel_scene
+from edgegrad.kernel.request import make_request
+from edgegrad.library import core
+from edgegrad.report.error_time.methods import differentiate
+from edgegrad.report.error_time.references import standard_error
 from edgegrad.report.scenes import ReportScene, smooth_adjoint
 from edgegrad.report.scenes import sphere as icosphere
 

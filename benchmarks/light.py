@@ -15,12 +15,12 @@ from table import Bench, Row, milliseconds, ratio_row, seconds_of
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._kernel import core
-from edgegrad._lit import Lighting
-from edgegrad._request import make_request
+from edgegrad.kernel.request import make_request
+from edgegrad.library import core
+from edgegrad.light.radiance import Lighting
+from edgegrad.points.frame import Frame
 from edgegrad.report import build
 from edgegrad.report.scenes import ReportScene
-from edgegrad.samples import Frame
 from edgegrad.shader import Effort, _Image
 
 # Samples on the borders of shadows.
@@ -115,7 +115,7 @@ def border_gradient(scene: ReportScene, count: int, seed: int) -> tuple[Tensor, 
     verts = scene.verts.float().requires_grad_()
     moved = scene.moved(verts)
     request = make_request(moved, scene.camera, 16, 0, edge_samples=None if count < 0 else count, grad_seed=seed)
-    image = Borders(Frame(moved, request, 0), Lighting(True, 1), False, False, Effort(keeps_little=True, adds_up=True))
+    image = Borders(Frame(moved, request, 0), Lighting(True, 1), False, False, Effort(keeps_little=True, additive=True))
     found = image.render()
     begin = time.perf_counter()
     (gradient,) = torch.autograd.grad((found * scene.adjoint).sum(), verts)

@@ -3,27 +3,18 @@
 import torch
 
 from . import fit
-from ._mesh_light import MeshLight
+from . import image as image
+from . import io as io
+from . import lights as lights
 from .aovs import render_aovs
-from .camera import Camera
-from .environment import Environment
-from .exchange import save_mesh
-from .hits import Hits
-from .io import View, load_camera, load_cameras, load_mesh, load_scene, read_image, save_camera, write_image
-from .lights import (
-    AreaLight,
-    DirectionalLight,
-    LightPoints,
-    PointLight,
-    SphericalHarmonics,
-    SpotLight,
-)
+from .camera.camera import Camera
+from .files.save import from_trimesh, to_trimesh
+from .io import View, load_camera, load_cameras, load_mesh, load_scene, read_image, save_camera, save_mesh, write_image
 from .live import viewer
-from .material import Material, Texture, vertex_normals
-from .mesh import Mesh
-from .plan import Plan, plan, profile
-from .render import jvp, render, screen_gradient
-from .samples import (
+from .plan import Plan, plan
+from .points.hits import Hits
+from .points.rays import trace
+from .points.samples import (
     EdgeSamples,
     PrimaryHits,
     SurfaceSamples,
@@ -31,9 +22,20 @@ from .samples import (
     edge_samples,
     primary_hits,
     surface_samples,
-    trace,
 )
-from .scene import Scene
+from .preview import thumbnail
+from .profile import profile
+from .render import jvp, render, screen_gradient
+from .scene import provided
+from .scene.environment import Environment
+from .scene.lights import AreaLight, DirectionalLight, LightPoints, PointLight, SphericalHarmonics, SpotLight
+from .scene.material import Material, Texture, vertex_normals
+from .scene.mesh import Mesh
+from .scene.mesh_light import MeshLight
+from .scene.scene import Scene
+
+# What the classes of scenes can do with the help of packages above them.
+provided.from_trimesh, provided.to_trimesh, provided.thumbnail = from_trimesh, to_trimesh, thumbnail
 
 # What torch.load(weights_only=True) may make: dataclasses of tensors, which run nothing when they are loaded.
 torch.serialization.add_safe_globals(

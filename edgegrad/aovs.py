@@ -12,12 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ._autograd import faces_at_centers, render_image
-from ._lit import Lighting
-from ._request import Channels, Request, as_scene, make_request
-from .camera import Camera
-from .mesh import Mesh
-from .scene import Scene, image_dtype
+from .camera.camera import Camera
+from .kernel.autograd import faces_at_centers, render_image
+from .kernel.flat import image_dtype
+from .kernel.request import Channels, Request, make_request
+from .light.radiance import Lighting
+from .scene.mesh import Mesh
+from .scene.scene import Scene, as_scene
 
 IDS = ("mesh_id", "face_id")
 # In the order in which the kernel has them (csrc/scene/scene.h).

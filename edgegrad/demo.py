@@ -15,13 +15,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ._files import require
-from .camera import Camera
+from .camera.camera import Camera
+from .files.image import read_image
 from .fit import PoseFit, fit_pose
-from .image import read_image
-from .mesh import Mesh
+from .optional import require
 from .render import render
-from .scene import Scene
+from .scene.mesh import Mesh
+from .scene.scene import Scene
 
 SIZE = 256  # pixels
 TARGET_SPP = 256

@@ -1,34 +1,30 @@
-"""plan(): what a render does and what it leaves out, before it runs. profile(): where its time goes."""
+"""plan(): what a render does and what it leaves out, before it runs."""
 
 from __future__ import annotations
 
-import inspect
 import math
-import statistics
-import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from . import _memory as memory
-from ._check import as_tensor, check_finite, check_float, check_positive_int, check_shape
-from ._kernel import core
-from ._lit import Lighting, check_unlit
-from ._ops import Hits, backward_kernel, forward_kernel, image_room, pass_size
-from ._request import MOVING, SLOTS, Request, Work, as_scene, label, make_request, required
-from ._samples import CURVE_BYTES, SURFACE_BYTES, without_colors
-from ._shadows import ShadowLight
-from ._surfaces import every_face
-from .camera import Camera
-from .mesh import Mesh
-from .render import SHADING, render
-from .scene import Flat, Scene
+from .camera.camera import Camera
+from .kernel import memory as memory
+from .kernel.counts import COUNTS, table
+from .kernel.flat import Flat
+from .kernel.operators import Hits, backward_kernel, image_room, pass_size
+from .kernel.request import MOVING, SLOTS, Request, Work, label, make_request, required
+from .library import core
+from .light.radiance import Lighting
+from .points.records import CURVE_BYTES, SURFACE_BYTES, without_colors
+from .points.shadows import ShadowLight
+from .points.surfaces import every_face
+from .render import SHADING, check_options
+from .scene.mesh import Mesh
+from .scene.scene import Scene, as_scene
 from .shader import AT_ONCE
-
-# -- the plan ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -78,7 +74,7 @@ class Plan(Mapping[str, Term]):
             for name, term in self.items()
         ]
         total = ("in all", "", _count(self.samples), memory.size(self.bytes), "")
-        return _table([("term", "", "samples", "memory", "why"), *rows, total], "<<>><")
+        return table([("term", "", "samples", "memory", "why"), *rows, total], "<<>><")
 
     __repr__ = __str__
 
@@ -90,7 +86,7 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
     everywhere and an image that sees every face: where the adjoint is zero none are taken, and fewer on faces that no
     sample of the image hits. Nothing is drawn; the ray structure and the edges are built, and render() then finds them.
     """
-    _check_options("plan", options)
+    check_options("plan", options)
     scene = as_scene(scene)
     shading = {name: options.pop(name) for name in SHADING if name in options}
     request = make_request(scene, camera, spp, seed, **options)
@@ -214,7 +210,7 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
         flat.faces.new_ones((B, len(flat.faces)), dtype=torch.uint8),
     )
     _, profiles = backward_kernel(ones, hits, request, wanted, dry=True, lit=lit)
-    counts = {name: int(sum(profile[name] for profile in profiles)) for name in _COUNTS}
+    counts = {name: int(sum(profile[name] for profile in profiles)) for name in COUNTS}
     surface, edge, silhouettes, creases, intersections, rim = (
         counts[name] for name in ("surface_samples", "edge_samples", "silhouettes", "creases", "intersections", "rim")
     )
@@ -300,13 +296,6 @@ def _gradient_terms(request: Request, wanted: Collection[str], lit: Scene | None
     return terms
 
 
-# What the kernel counts.
-_CURVES = ("silhouettes", "creases", "intersections", "rim")
-_COUNTS = (
-    "surface_samples", "edge_samples", "surface_wanted", "edge_wanted", "step_lines", *_CURVES,
-)  # fmt: skip
-
-
 def _bound(samples: int, wanted: int) -> str:
     """What plan() says where the budget (csrc/backward/budget.h) may cut the default samples."""
     return f"; by default up to {wanted:,}, but no more than take the image's time" if 0 < samples < wanted else ""
@@ -321,148 +310,6 @@ def _bytes_of_copies(scene: Scene, flat: Flat) -> int:
         storage.data_ptr(): storage.nbytes() for storage in (t.untyped_storage() for t in flat if isinstance(t, Tensor))
     }
     return sum(size for where, size in copies.items() if where not in own)
-
-
-# -- the profile ------------------------------------------------------------------------------------------------------
-
-# What the kernel measures, in the order of a step.
-_PARTS = (
-    "update", "forward", "view", "surface measure", "surface rays", "surface scatter", "curves", "edge rays",
-    "edge scatter", "step rays", "step scatter", "world",
-)  # fmt: skip
-_BAR = 24  # characters of a bar of 100 %
-
-
-class Profile(Mapping[str, float]):
-    """Median seconds of each part of a step, by name, and `samples`, how many of each kind. Prints as a table.
-
-    update           for vertices that moved: the ray structure, who meets at edges, which faces pass through each other
-    forward          the image
-    view             vertices in the image, where the loss looks, and the background's gradient
-    surface …        triangles laid end to end; samples and their rays; adding what they found
-    curves, edge …   the same at edges
-    step …           the same at steps within faces
-    world            from camera coordinates to the user's arrays
-    python           all the rest: checks and copies of tensors
-    """
-
-    def __init__(self, seconds: Mapping[str, float], samples: Mapping[str, int]) -> None:
-        self._seconds, self.samples = dict(seconds), dict(samples)
-
-    def __getitem__(self, name: str) -> float:
-        try:
-            return self._seconds[name]
-        except KeyError:
-            raise KeyError(f"part: expected one of {', '.join(self._seconds)}, got {name!r}") from None
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._seconds)
-
-    def __len__(self) -> int:
-        return len(self._seconds)
-
-    @property
-    def seconds(self) -> float:
-        """Of the whole step."""
-        return sum(self.values())
-
-    def __str__(self) -> str:
-        rows = [("part", "ms", "share", "")]
-        for name, seconds in self.items():
-            share = seconds / self.seconds
-            rows.append((name, f"{1e3 * seconds:.2f}", f"{100 * share:.0f} %", "█" * round(_BAR * share)))
-        rows.append(("in all", f"{1e3 * self.seconds:.2f}", "", ""))
-        counts = ", ".join(f"{name.replace('_', ' ')} {count:,}" for name, count in self.samples.items())
-        return _table(rows, "<>><") + "\n" + counts
-
-    __repr__ = __str__
-
-
-def profile(
-    scene: Scene | Mesh,
-    camera: Camera,
-    adjoint: Tensor | None = None,
-    spp: int = 16,
-    seed: int = 0,
-    *,
-    repeats: int = 5,
-    **options: Any,
-) -> Profile:
-    """Where the time of a step goes: vertices that moved, an image, and the gradient of what requires one.
-
-    adjoint   (H, W, C) or (B, H, W, C), ∂loss/∂image; ones when None
-    repeats   steps of which the medians are taken
-
-    The other arguments are those of render(). If nothing requires a gradient, that of the vertices is taken. A batch of
-    cameras counts as one step. Autograd itself is not run, so what it costs is not here. Raises what render() raises.
-    """
-    _check_options("profile", options)
-    if options.get("shader") is not None:
-        raise ValueError("shader: expected None, for profile() measures the kernel alone; torch.profiler sees a shader")
-    check_unlit("profile", as_scene(scene), "it measures the kernel alone; torch.profiler sees what shades")
-    options = {name: value for name, value in options.items() if name not in SHADING}
-    scene, repeats = as_scene(scene), check_positive_int("repeats", repeats)
-    # What is kept between calls must not help: before each step the vertices are elsewhere, each time somewhere else.
-    request = make_request(scene, camera, spp, seed, **options)
-    wanted = required(request) or ("verts",)
-    adjoint = _adjoint(adjoint, camera, request)
-
-    runs = []
-    for repeat in range(repeats):
-        verts = request.scene.verts.detach() * (1.001 + 1e-6 * repeat)
-        elsewhere = request._replace(scene=request.scene._replace(verts=verts), image=request.image._replace(spp=1))
-        forward_kernel(elsewhere)
-        begin = time.perf_counter()
-        step = make_request(scene, camera, spp, seed, **options)
-        _, hits, forward = forward_kernel(step)
-        _, backward = backward_kernel(adjoint, hits, step, wanted)
-        wall = time.perf_counter() - begin
-        done = _sum([*forward, *backward])
-        runs.append({**done, "python": wall - sum(done[part] for part in _PARTS)})
-    seconds = {part: statistics.median(run[part] for run in runs) for part in (*_PARTS, "python")}
-    samples = {
-        "image_samples": adjoint.shape[:-1].numel() * request.image.spp,
-        **{name: int(runs[-1][name]) for name in ("surface_samples", "edge_samples", "step_lines", *_CURVES)},
-    }
-    return Profile(seconds, samples)
-
-
-def _check_options(function: str, options: Mapping[str, Any]) -> None:
-    """Only those of render(), which would name a function that the user did not call. Raises TypeError."""
-    known = [name for name, p in inspect.signature(render).parameters.items() if p.kind is p.KEYWORD_ONLY]
-    if unknown := [name for name in options if name not in known]:
-        raise TypeError(f"{function}: expected only the options {', '.join(known)}, got {unknown[0]!r}")
-
-
-def _adjoint(adjoint: Tensor | None, camera: Camera, request: Request) -> Tensor:
-    """(B, H, W, C), as the kernel reads it. Raises TypeError or ValueError."""
-    B, shape = request.cameras, (*camera.size, request.channels)
-    if adjoint is None:
-        return request.scene.colors.new_ones((B, *shape))
-    adjoint = as_tensor("adjoint", adjoint, floating=True).detach()
-    check_float("adjoint", adjoint)
-    fix = "it is the derivative of the loss by the image: give it the image's shape"
-    check_shape("adjoint", adjoint, shape if camera.batch is None else (B, *shape), fix=fix)
-    check_finite("adjoint", adjoint)
-    return adjoint.to(request.scene.colors).reshape(B, *shape).contiguous()
-
-
-def _sum(profiles: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    total: dict[str, float] = {}
-    for profile in profiles:
-        for name, value in profile.items():
-            total[name] = total.get(name, 0.0) + value
-    return total
-
-
-# -- text -------------------------------------------------------------------------------------------------------------
-
-
-def _table(rows: Sequence[Sequence[str]], align: str) -> str:
-    """Rows of text in columns, each aligned to the left (<) or to the right (>)."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    cells = [[f"{cell:{side}{w}s}" for cell, side, w in zip(row, align, widths, strict=True)] for row in rows]
-    return "\n".join("  ".join(row).rstrip() for row in cells)
 
 
 def _count(n: int) -> str:

@@ -23,10 +23,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ._lit import check_unlit
-from .camera import Camera
-from .mesh import PLAIN, Mesh
-from .scene import Scene
+from .camera.camera import Camera
+from .light.radiance import check_unlit
+from .scene.mesh import PLAIN, Mesh
+from .scene.scene import Scene
 
 BLOCK = 128  # image points that are tested against all faces at once
 

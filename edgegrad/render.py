@@ -6,6 +6,7 @@ the derivative of the expected image.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any, overload
 
@@ -13,16 +14,16 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
-from ._autograd import render_image
-from ._check import as_tensor, check_finite, check_float, check_not_meta, check_shape
-from ._lit import Lighting, check_unlit
-from ._ops import forward_kernel, screen_gradient_kernel
-from ._request import as_scene, make_request
-from ._tree import map_tensors, tensors_in
 from .aovs import IDS, check_aovs, render_aovs
-from .camera import Camera
-from .mesh import Mesh
-from .scene import Scene
+from .camera.camera import Camera
+from .check import as_tensor, check_finite, check_float, check_not_meta, check_shape
+from .kernel.autograd import render_image
+from .kernel.operators import forward_kernel, screen_gradient_kernel
+from .kernel.request import make_request
+from .light.radiance import Lighting, check_unlit
+from .scene.mesh import Mesh
+from .scene.scene import Scene, as_scene
+from .scene.tree import map_tensors, tensors_in
 from .shader import Shader, render_shaded
 
 SHADING = ("shader", "creases", "check_shader", "shadows", "light_samples")  # the options of shaders and of lit scenes
@@ -210,3 +211,10 @@ def screen_gradient(
     images = adjoint.to(request.scene.colors).reshape(request.cameras, *shape).contiguous()
     gradient = screen_gradient_kernel(images, hits, request)
     return (gradient if camera.batch is not None else gradient[0]).to(adjoint.device)
+
+
+def check_options(function: str, options: Mapping[str, Any]) -> None:
+    """What a `function` that takes the options of render() was given are such. Raises TypeError."""
+    known = [name for name, p in inspect.signature(render).parameters.items() if p.kind is p.KEYWORD_ONLY]
+    if unknown := [name for name in options if name not in known]:
+        raise TypeError(f"{function}: expected only the options {', '.join(known)}, got {unknown[0]!r}")

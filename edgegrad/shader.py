@@ -2,7 +2,7 @@
 
 The value of the image and its gradient come from different samples. Those of the image are shaded without a graph, several of a
 face where borders of steps run through a pixel. To it
-terms are attached of which only the derivatives count (_splat.py):
+terms are attached of which only the derivatives count (points/splat.py):
 samples inside faces, shaded with a graph at points that move with the scene while
 their pixel stays; samples on curves, shaded without one on both sides, whose jump multiplies the curve's velocity; and, where
 the shader declares steps, samples on these. All of it is PyTorch, so whatever the shader uses gets its gradient by itself.
@@ -18,22 +18,24 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from ._background import environments
-from ._blend import Blended
-from ._borders import Borders
-from ._check import all_finite, values_visible
-from ._derivatives import differentiates, moves, transformed
-from ._request import Request, derived_seed
-from ._samples import PixelRecords, RayRecords, shaded_room, without_colors
-from ._shadows import ShadowLight
-from ._splat import Term
-from ._steps import UNEQUAL, Crossings, Points, Steps, find_crossings
-from ._surfaces import every_face
-from ._warnings import warn
-from .camera import Camera
-from .hits import Hits
-from .samples import EdgeSamples, Frame, SurfaceSamples, boundary
-from .scene import Flat, Scene
+from .camera.camera import Camera
+from .check import all_finite, values_visible
+from .kernel.derivatives import differentiates, moves, transformed
+from .kernel.flat import Flat
+from .kernel.request import Request, derived_seed
+from .points.background import environments
+from .points.blend import Blended
+from .points.borders import Borders
+from .points.frame import Frame
+from .points.hits import Hits
+from .points.records import PixelRecords, RayRecords, shaded_room, without_colors
+from .points.samples import EdgeSamples, SurfaceSamples
+from .points.shadows import ShadowLight
+from .points.splat import Term, boundary
+from .points.steps import UNEQUAL, Crossings, Points, Steps, find_crossings
+from .points.surfaces import every_face
+from .scene.scene import Scene
+from .warnings import warn
 
 Shader = Callable[[Hits], Tensor]
 
@@ -54,15 +56,13 @@ class Effort(NamedTuple):
     """What shading an image takes."""
 
     points: int = 1  # of a face in a pixel that are shaded
-    # The values (H · W, C) of a whole image at once, or None where points are to be shaded one by one.
-    whole: Callable[[Frame], Tensor | None] | None = None
+    # The image (H · W, C) in one call of the kernel; None, or where it gives None: points are shaded one by one.
+    kernel_image: Callable[[Frame], Tensor | None] | None = None
     blended: bool = False  # whether one may see through surfaces
     lit: bool = False  # whether the scene's materials and lights shade them
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where only derivatives are wanted, see Hits.values
-    adds_up: bool = (
-        False  # whether it is a sum over lights, and gives one of them alone where Hits.only_light asks for it
-    )
+    additive: bool = False  # whether it is a sum over lights, and gives one alone where Hits.only_light asks for it
 
     @property
     def at_once(self) -> int:
@@ -133,7 +133,7 @@ class _Image:
         """The image, without a graph of its surfaces."""
         frame = self._frame
         with torch.no_grad():
-            image = None if self._effort.whole is None else self._effort.whole(frame)
+            image = None if self._effort.kernel_image is None else self._effort.kernel_image(frame)
             if image is None:
                 image = self._point_by_point()
             self._channels = image.shape[1]
@@ -223,7 +223,7 @@ class _Image:
             light = ShadowLight.of(frame.surfaces, index, seed)
             moving = moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
             if moving or ShadowLight.moves(light.light):
-                one = self._effort.adds_up
+                one = self._effort.additive
                 casters = frame.fixed.casters if frame.surfaces.scene.blends else None
                 records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics), one, casters)
                 if len(records.x):
@@ -238,7 +238,7 @@ class _Image:
             for first in range(0, len(samples.hits), at_once):
                 points = samples.hits
                 if len(points) > at_once:
-                    points = points.apart(slice(first, first + at_once))
+                    points = points.subset(slice(first, first + at_once))
                 parts.append(self._shade(points).detach())
             jump = samples.sum(torch.cat(parts[1:] or parts))
         return boundary(samples.x, samples.velocity, jump, samples.to_background, self._background)
@@ -357,7 +357,7 @@ class _Image:
             order = torch.randperm(len(hits), generator=torch.Generator().manual_seed(0)).to(radiance.device)
             order = order[: (len(hits) + 1) // 2]
             with torch.no_grad():
-                again = self._shader(hits.apart(order)).to(radiance.dtype)
+                again = self._shader(hits.subset(order)).to(radiance.dtype)
             if not torch.allclose(
                 again, radiance.detach()[order], rtol=1e-4, atol=1e-5 * float(radiance.detach().abs().max())
             ):

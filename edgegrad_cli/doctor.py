@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     import torch
 
     import edgegrad
-    from edgegrad._kernel import core, embree_path
+    from edgegrad.library import core, embree_path
 
     took = time.perf_counter() - start
     lines = {"edgegrad": edgegrad.__version__, "Python": f"{platform.python_version()} on {platform.platform()}"}

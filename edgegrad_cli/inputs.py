@@ -54,7 +54,7 @@ def read_picture(path: Path) -> tuple[Tensor, Tensor | None]:
 
 def read_mask(path: Path) -> Tensor:
     """(H, W). A mask's greys are coverage as they are, not sRGB."""
-    from edgegrad.image import DISPLAY, linear_to_srgb, read_image
+    from edgegrad.files.image import DISPLAY, linear_to_srgb, read_image
 
     mask = read_image(path, channels=1)[..., 0]
     return linear_to_srgb(mask) if path.suffix.lower() in DISPLAY else mask
@@ -74,7 +74,7 @@ def read_background(text: str | None, picture: Tensor) -> Tensor | None:
     """A colour (3,) from #rrggbb, or an image (H, W, 3)."""
     import torch
 
-    from edgegrad.image import read_image, srgb_to_linear
+    from edgegrad.files.image import read_image, srgb_to_linear
 
     if text is None:
         return None
@@ -90,8 +90,8 @@ def read_background(text: str | None, picture: Tensor) -> Tensor | None:
 
 
 def read_pose(path: Path) -> Pose:
-    from edgegrad._files import check_readable
-    from edgegrad.fit.result import pose_from_json
+    from edgegrad.files.paths import check_readable
+    from edgegrad.fit.pose.result import pose_from_json
 
     try:
         return pose_from_json(check_readable(path, (".json",)).read_text(encoding="utf-8"))
@@ -104,8 +104,8 @@ def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | No
     import torch
 
     from edgegrad import load_camera
-    from edgegrad._framing import framing
     from edgegrad.fit import PoseFit
+    from edgegrad.preview import framing
 
     described = any(value is not None for value in (args.fov, args.eye, args.target, args.up))
     camera, source = None, args.camera

@@ -50,7 +50,7 @@ def linger(view: Viewer | None, fit: Fit | PoseFit | CameraFit) -> None:
 
 
 def write_pose(folder: Path, fit: PoseFit) -> None:
-    from edgegrad._files import replacing
+    from edgegrad.files.paths import replacing
 
     with replacing(folder / "pose.json") as temporary:
         temporary.write_text(fit.to_json() + "\n", encoding="utf-8")
@@ -64,9 +64,13 @@ def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
             if name == "pose.json":
                 write_pose(folder, fit)
             else:
-                from edgegrad.fit import report  # matplotlib takes a while to import
+                from edgegrad.fit.pose import pictures  # matplotlib takes a while to import
 
-                draw = {"fit.png": report.draw_fit, "loss.png": report.draw_loss, "fit.webp": report.draw_animation}
+                draw = {
+                    "fit.png": pictures.draw_fit,
+                    "loss.png": pictures.draw_loss,
+                    "fit.webp": pictures.draw_animation,
+                }
                 draw[name](folder / name, fit)
         except OSError as error:
             raise OSError(
@@ -85,7 +89,7 @@ def finish(fit: Fit, folder: Path) -> int:
 
 
 def _can_draw() -> bool:
-    from edgegrad._files import require
+    from edgegrad.optional import require
 
     try:
         for module in ("matplotlib", "PIL"):

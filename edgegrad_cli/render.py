@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     import torch
 
     from edgegrad import render, write_image
-    from edgegrad._preview import under_headlight
+    from edgegrad.preview import under_headlight
 
     scene = read_scene(args)
     pose = None if args.pose is None else read_pose(args.pose)

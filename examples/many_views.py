@@ -31,7 +31,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 import edgegrad as eg
 from edgegrad.fit.checkpoints import Checkpoint
-from edgegrad.fit.frame import Adam
+from edgegrad.fit.descent.adam import Adam
 from edgegrad.fit.smooth import Smooth
 
 

@@ -13,7 +13,7 @@ from scenes import cube, icosphere
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._kernel import core
+from edgegrad.library import core
 
 F64 = torch.float64
 Place = tuple[float, float, float]  # before the camera at pose(), in its coordinates

@@ -11,7 +11,7 @@ from scenes import icosphere, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._lit import radiance
+from edgegrad.light.radiance import radiance
 
 F64 = torch.float64
 

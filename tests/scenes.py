@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from edgegrad.report.methods import default_samples
+from edgegrad.report.error_time.methods import default_samples
 from edgegrad.report.scenes import (
     cube,
     front_camera,

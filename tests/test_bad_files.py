@@ -22,6 +22,7 @@ from PIL import EpsImagePlugin, Image
 from test_io import GOOD, OFF, SQUARE, STL, TEXELS, TRIANGLES, glb, linear, ply, square_glb
 
 import edgegrad as eg
+from edgegrad.files.parts import MESHES
 
 IMAGES = (".png", ".jpg", ".bmp", ".tif", ".hdr", ".exr")
 
@@ -162,6 +163,7 @@ LOAD_ALL = """
 import json, pathlib, sys
 import torch
 import edgegrad as eg
+from edgegrad.files.parts import MESHES
 import lxml.etree, networkx, OpenImageIO, PIL.Image, trimesh.exchange.load
 
 sys.path.insert(0, sys.argv[1])
@@ -201,7 +203,7 @@ def test_what_is_only_announced_takes_no_memory(tmp_path):
 
 def test_an_image_too_large_to_hold_is_refused_by_its_header(tmp_path, monkeypatch):
     """A whole file, and a small one: 3 MB of zeros unpack to ten times 2³⁰ numbers."""
-    monkeypatch.setattr("edgegrad.image.MOST_NUMBERS", 1000)
+    monkeypatch.setattr("edgegrad.files.image.MOST_NUMBERS", 1000)
     path = write(tmp_path, "a.png", png(40, 26, bytes(26 * (1 + 40)), 8, 0))
     with pytest.raises(ValueError, match=r"a\.png: expected at most 1000 pixels times channels, got 26 × 40 × 1"):
         eg.read_image(path)
@@ -278,7 +280,7 @@ class Touch:
         return Path.touch, (self.path,)
 
 
-@pytest.mark.parametrize("suffix", [*eg._parts.MESHES, *IMAGES, ".json"])
+@pytest.mark.parametrize("suffix", [*MESHES, *IMAGES, ".json"])
 @pytest.mark.parametrize("form", ["pickle", "torch", "npy", "npz"])
 def test_no_pickle_is_opened(tmp_path, suffix, form):
     evil, stream = Touch(tmp_path / "ran"), io.BytesIO()

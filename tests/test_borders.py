@@ -11,8 +11,8 @@ from scenes import front_camera
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad import _borders
-from edgegrad.report.painted import PAINTED
+from edgegrad.points import borders
+from edgegrad.report.stability.painted import PAINTED
 
 SIZE = 24
 FLAT = eg.Camera(
@@ -32,7 +32,7 @@ def images(
 
 def without_borders(monkeypatch: pytest.MonkeyPatch) -> None:
     nowhere = torch.zeros((SIZE, SIZE), dtype=torch.bool)
-    monkeypatch.setattr(_borders.Borders, "found", lambda self: (nowhere, 1))
+    monkeypatch.setattr(borders.Borders, "found", lambda self: (nowhere, 1))
 
 
 def dots(hits: eg.Hits) -> Tensor:

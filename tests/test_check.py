@@ -7,8 +7,8 @@ import torch
 from scenes import cube
 
 import edgegrad as eg
-from edgegrad._check import all_below, check_finite
-from edgegrad._kernel import core
+from edgegrad.check import all_below, check_finite
+from edgegrad.library import core
 
 # Around the sizes of vectors, of blocks, and of what is worth several threads.
 SIZES = [1, 7, 15, 16, 17, 33, 4095, 4096, 4097, (1 << 18) - 1, (1 << 18) + 3]

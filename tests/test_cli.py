@@ -12,9 +12,9 @@ from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, p
 
 import edgegrad as eg
 import edgegrad_cli as cli
+from edgegrad.files.cameras import save_camera
+from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
 from edgegrad.fit import PoseFit
-from edgegrad.image import linear_to_srgb, read_image, srgb_to_linear, write_image
-from edgegrad.io import save_camera
 from edgegrad_cli import doctor, outputs
 
 

@@ -13,7 +13,7 @@ from finite_differences import rotation
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._conventions import COLMAP_MODELS
+from edgegrad.camera.conventions import COLMAP_MODELS
 
 F64 = torch.float64
 SIZE = (48, 64)

@@ -13,8 +13,8 @@ from scenes import front_camera, icosphere, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
+from edgegrad.report.error_time.methods import default_samples
 from edgegrad.report.exact import exact_image
-from edgegrad.report.methods import default_samples
 from edgegrad.report.scenes import unproject
 
 F64 = torch.float64

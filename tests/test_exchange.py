@@ -12,8 +12,7 @@ from PIL import Image
 from scenes import cube
 
 import edgegrad as eg
-from edgegrad._framing import framing
-from edgegrad._preview import under_headlight
+from edgegrad.preview import framing, under_headlight
 
 VERTS, FACES = cube().verts.float(), cube().faces
 COLORS = torch.rand(8, 3, generator=torch.Generator().manual_seed(0))

@@ -13,7 +13,7 @@ from scenes import front_camera, icosphere, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._kernel import core
+from edgegrad.library import core
 
 F32, F64 = torch.float32, torch.float64
 

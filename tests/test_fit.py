@@ -10,8 +10,8 @@ import torch
 import edgegrad as eg
 from edgegrad.fit import PoseFit, fit_pose
 from edgegrad.fit.checkpoints import FORMAT
-from edgegrad.fit.gauss_newton import GaussNewton
-from edgegrad.fit.result import pose_from_json
+from edgegrad.fit.pose.gauss_newton import GaussNewton
+from edgegrad.fit.pose.result import pose_from_json
 
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 

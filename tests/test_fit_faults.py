@@ -16,9 +16,9 @@ from test_fit import START, bracket, camera, picture
 
 import edgegrad.fit
 import edgegrad_cli as cli
+from edgegrad.files.cameras import save_camera
+from edgegrad.files.image import linear_to_srgb, write_image
 from edgegrad.fit import PoseFit
-from edgegrad.image import linear_to_srgb, write_image
-from edgegrad.io import save_camera
 
 try:
     import resource

@@ -9,10 +9,11 @@ import torch
 from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, silhouette
 
 import edgegrad as eg
-from edgegrad.fit import fit_camera, fit_pose, fit_scene, fit_texture, search
-from edgegrad.fit.result import pose_from_matrix
-from edgegrad.fit.robust import Comparison
-from edgegrad.fit.task import PARTS, Lens, Names, PoseTask, is_clutter
+from edgegrad.fit import fit_camera, fit_pose, fit_scene, fit_texture
+from edgegrad.fit.pose import search
+from edgegrad.fit.pose.pose import pose_from_matrix
+from edgegrad.fit.pose.robust import Comparison
+from edgegrad.fit.pose.task import PARTS, Lens, Names, PoseTask, is_clutter
 from edgegrad.fit.views import before_black
 
 

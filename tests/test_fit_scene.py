@@ -9,7 +9,7 @@ from test_fit import BACKGROUND, bracket, camera
 
 import edgegrad as eg
 from edgegrad.fit import Parameter, fit_scene, fit_shape, fit_texture, losses, regularizers, verdict
-from edgegrad.fit.frame import Adam
+from edgegrad.fit.descent.adam import Adam
 from edgegrad.fit.smooth import Smooth
 from edgegrad.fit.verdict import explained, picture_noise
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 import edgegrad as eg
-from edgegrad import _memory, _ops
+from edgegrad.kernel import memory, operators
 from edgegrad.report.exact import exact_image
 
 F64 = torch.float64
@@ -192,16 +192,16 @@ def test_all_directions_take_one_pass(monkeypatch):
         calls.append(directions)
         return jvp_kernel(hits, request, tangents, directions)
 
-    jvp_kernel = _ops.jvp_kernel
-    monkeypatch.setattr(_ops, "jvp_kernel", watched)
+    jvp_kernel = operators.jvp_kernel
+    monkeypatch.setattr(operators, "jvp_kernel", watched)
     eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(40, 3, 3, dtype=F64)}, 4)
     torch.func.jacfwd(lambda t: eg.render(MESH.transformed(t=t), CAMERA, 4))(torch.zeros(3, dtype=F64))
     assert calls == [40, 3]
 
 
 def test_more_directions_than_memory(monkeypatch):
-    monkeypatch.setattr(_memory, "LOOK_FROM", 0)
-    monkeypatch.setattr(_memory, "available", lambda: 20_000_000)
+    monkeypatch.setattr(memory, "LOOK_FROM", 0)
+    monkeypatch.setattr(memory, "available", lambda: 20_000_000)
     with pytest.raises(MemoryError, match=r"jvp: .*\(samples in pixels 3.* GB.*ask for fewer directions"):
         eg.jvp(TRIANGLE, CAMERA, {MESH.verts: torch.ones(2000, 3, 3, dtype=F64)}, 4)
 

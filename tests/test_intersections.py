@@ -12,9 +12,9 @@ from scenes import cube, front_camera, icosphere, smooth_adjoint, smooth_colors,
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._kernel import core
-from edgegrad.report.crossing import cut_apart, faces_that_cross
+from edgegrad.library import core
 from edgegrad.report.exact import exact_image
+from edgegrad.report.stability.crossing import cut_apart, faces_that_cross
 
 F64 = torch.float64
 BACKGROUND = torch.tensor([0.15, 0.25, 0.4], dtype=F64)

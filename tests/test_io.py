@@ -15,18 +15,11 @@ import torch
 from PIL import Image
 
 import edgegrad as eg
-from edgegrad.camera import Camera
-from edgegrad.io import (
-    linear_to_srgb,
-    load_camera,
-    load_mesh,
-    load_scene,
-    read_image,
-    save_camera,
-    srgb_to_linear,
-    write_image,
-)
-from edgegrad.scene import Scene
+from edgegrad.camera.camera import Camera
+from edgegrad.files.cameras import load_camera, save_camera
+from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
+from edgegrad.files.load import load_mesh, load_scene
+from edgegrad.scene.scene import Scene
 
 trimesh = pytest.importorskip("trimesh")
 

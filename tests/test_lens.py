@@ -17,10 +17,10 @@ from scenes import icosphere, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._kernel import core
-from edgegrad._lens import bend
-from edgegrad._ops import kernel_camera
-from edgegrad._request import pack_camera
+from edgegrad.camera.lens import bend
+from edgegrad.kernel.operators import kernel_camera
+from edgegrad.kernel.request import pack_camera
+from edgegrad.library import core
 
 F64 = torch.float64
 DISTORTION = {

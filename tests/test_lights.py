@@ -27,8 +27,8 @@ from torch.autograd import gradcheck
 
 import edgegrad as eg
 import edgegrad.reference
-from edgegrad.hits import Forced
-from edgegrad.lights import harmonics
+from edgegrad.points.shadow_rays import Forced
+from edgegrad.scene.lights import harmonics
 
 WHITE = eg.Material(base_color=1.0)
 
@@ -292,7 +292,7 @@ def test_forced_shadows():
     some = torch.tensor([True, False, True, False])
     hits._forced = Forced(1, drawn._replace(density=drawn.density * 7), vector(0, 0, 1, 1), some)
     order = torch.tensor([2, 1, 0])
-    part = hits.apart(order)
+    part = hits.subset(order)
     torch.testing.assert_close(part.light_points(light).density / drawn.density[order], vector(7, 1, 7))
     lit = part.visible_from(light, drawn.select(order))
     assert torch.equal(lit, vector(1, 1, 0))

@@ -12,7 +12,7 @@ from test_bad_files import changed
 from test_io import SQUARE, TEXELS, TRIANGLES, glb, linear, ply, write_obj
 
 import edgegrad as eg
-from edgegrad._appearance import OnMesh
+from edgegrad.scene.appearance import OnMesh
 
 IMAGE = np.random.default_rng(3).integers(0, 256, (16, 16, 3), dtype=np.uint8)
 CORNERS = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], "<f4")  # texture coordinates of SQUARE, v running down
@@ -212,7 +212,7 @@ def test_vertex_colours_multiply_texture_and_factor(tmp_path):
     base = {"baseColorTexture": {"index": 0}, "baseColorFactor": [1.0, 0.5, 1.0, 1.0]}
     grey = np.full((1, 1, 3), 255)
     mesh = loaded(tmp_path, {"pbrMetallicRoughness": base}, [grey], attributes={"COLOR_0": colors})
-    at = OnMesh(mesh, torch.zeros(1, dtype=torch.int64), torch.full((1, 3), 1 / 3), None)
+    at = OnMesh(mesh, torch.zeros(1, dtype=torch.int64), torch.full((1, 3), 1 / 3))
     np.testing.assert_allclose(at.base_color()[0], [0.5, 0.5, 0.25], rtol=1e-6)
 
 

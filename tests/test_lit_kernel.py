@@ -11,13 +11,15 @@ from scenes import icosphere
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad import _borders, _lit, _lit_kernel
-from edgegrad._derivatives import transformed
-from edgegrad._operator import unreached
-from edgegrad._request import make_request
-from edgegrad.hits import Forced, Hits
-from edgegrad.lights import LightPoints
-from edgegrad.samples import Frame
+from edgegrad.kernel.derivatives import transformed
+from edgegrad.kernel.first_order import unreached
+from edgegrad.kernel.request import make_request
+from edgegrad.light import in_kernel, radiance
+from edgegrad.points import borders
+from edgegrad.points.frame import Frame
+from edgegrad.points.hits import Hits
+from edgegrad.points.shadow_rays import Forced
+from edgegrad.scene.lights import LightPoints
 
 F64 = torch.float64
 Leaves = dict[str, Tensor]
@@ -134,7 +136,7 @@ def hits_of(scene: eg.Scene, camera: eg.Camera) -> Hits:
 
 def both(words: str, view: str, samples: int, leaves: Leaves, w2c: Tensor) -> tuple[Hits, Hits, Tensor, Tensor]:
     hits = [hits_of(scene_of(words, leaves), CAMERAS[view].replace(world_to_camera=w2c)) for _ in range(2)]
-    return hits[0], hits[1], _lit.reference(hits[0], True, samples), _lit_kernel.radiance(hits[1], True, samples)
+    return hits[0], hits[1], radiance.reference(hits[0], True, samples), in_kernel.radiance(hits[1], True, samples)
 
 
 @pytest.mark.parametrize("view", CAMERAS)
@@ -170,9 +172,7 @@ def test_tangents_are_cotangents(words: str) -> None:
 
     def radiance(given: Leaves) -> Tensor:
         scene = scene_of(words, {name: v for name, v in given.items() if name != "w2c"})
-        return _lit_kernel.radiance(
-            hits_of(scene, CAMERAS["perspective"].replace(world_to_camera=given["w2c"])), True, 1
-        )
+        return in_kernel.radiance(hits_of(scene, CAMERAS["perspective"].replace(world_to_camera=given["w2c"])), True, 1)
 
     found, moved = torch.func.jvp(radiance, (values,), (tangents,))[:2]
     assert not transformed()
@@ -194,7 +194,7 @@ def test_points_of_a_light_that_are_given() -> None:
         lit = (torch.arange(n) % 2).double()
         forced = Forced(light, LightPoints(*points), lit, torch.ones(n, dtype=torch.bool))
         found = []
-        for shade in (_lit.reference, _lit_kernel.radiance):
+        for shade in (radiance.reference, in_kernel.radiance):
             given = Hits(
                 hits._surfaces, hits._view, hits._face, hits._exact, hits._pixel, seed=hits._seed, forced=forced
             )
@@ -216,8 +216,8 @@ def test_what_one_light_adds() -> None:
             forced = Forced(light, points, torch.full((n,), lit, dtype=F64), torch.ones(n, dtype=torch.bool), only)
             place = hits._face, hits._exact, hits._pixel
             given = [Hits(hits._surfaces, hits._view, *place, seed=hits._seed, forced=forced) for _ in range(2)]
-            L = _lit_kernel.radiance(given[0], True, 2)
-            assert torch.allclose(_lit.reference(given[1], True, 2), L, rtol=1e-12, atol=1e-12)
+            L = in_kernel.radiance(given[0], True, 2)
+            assert torch.allclose(radiance.reference(given[1], True, 2), L, rtol=1e-12, atol=1e-12)
             of.append([L, *torch.autograd.grad(L.sum(), list(leaves.values()), materialize_grads=True)])
         for with_light, without, alone in zip(*of, strict=True):
             assert torch.allclose(
@@ -234,7 +234,7 @@ def test_borders_of_shadows_by_what_the_light_adds() -> None:
     scene = scene_of("normals point area sky colors emission", {**leaves, "emission": torch.ones(3)})
     camera, found = CAMERAS["perspective"], []
     weights = torch.rand(24, 24, 3, generator=torch.Generator().manual_seed(1))
-    for shader in (None, lambda hits: _lit.radiance(hits, True, 1)):
+    for shader in (None, lambda hits: radiance.radiance(hits, True, 1)):
         image = eg.render(scene, camera, spp=4, shader=shader, edge_samples=4000)
         found.append(torch.autograd.grad((weights * image).sum(), [leaves["verts"], leaves["point"]]))
     for a, b in zip(*found, strict=True):
@@ -271,16 +271,16 @@ def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatc
     leaves = numbers_of(words)
     camera = AROUND[view].replace(world_to_camera=AROUND[view].world_to_camera.double())
     scenes = [scene_of(words, leaves), scene_of(words, leaves).replace(background=torch.rand(*camera.size, 3).double())]
-    again, borders = [], _borders.Borders.found
+    again, kept = [], borders.Borders.found
     for options in ({"spp": 7, "seed": 5}, {"spp": 1}, {"light_samples": 3, "filter": "tent"}, {"shadows": False}):
         for scene in scenes:
             found = []
             for whole in (True, False):
                 with monkeypatch.context() as patch:
                     if not whole:
-                        patch.setattr(_lit, "_whole", lambda *arguments: None)
-                        keep = lambda self: (again.append(found := borders(self)), found)[1]  # noqa: E731
-                        patch.setattr(_borders.Borders, "found", keep)
+                        patch.setattr(radiance, "_kernel_image", lambda *arguments: None)
+                        keep = lambda self: (again.append(found := kept(self)), found)[1]  # noqa: E731
+                        patch.setattr(borders.Borders, "found", keep)
                     found.append(eg.render(scene, camera, **options))
             assert float(found[0].max()) > 0.1
             assert float((found[0] - found[1]).abs().max()) <= 1e-12 * float(found[0].abs().max())
@@ -339,7 +339,7 @@ def test_light_on_flat_faces(view: str) -> None:
     leaves = numbers_of("point directional")
     scene = scene_of("point directional", leaves).replace(meshes=scene_of("point", leaves).meshes[:1])
     frame = Frame(scene, make_request(scene, CAMERAS[view], 2, 0))
-    found = _lit._of_flat(frame.fixed, 0, frame.fixed_view)
+    found = radiance._flat_radiance(frame.fixed, 0, frame.fixed_view)
     (mesh,) = scene.meshes
     corner = mesh.verts[mesh.faces.long()]
     n = torch.nn.functional.normalize(
@@ -362,9 +362,9 @@ def test_light_on_flat_faces(view: str) -> None:
 def test_without_shadows() -> None:
     words = SCENES[-1]
     scene = scene_of(words, numbers_of(words))
-    dark, lit = (_lit_kernel.radiance(hits_of(scene, CAMERAS["perspective"]), shadows, 1) for shadows in (True, False))
+    dark, lit = (in_kernel.radiance(hits_of(scene, CAMERAS["perspective"]), shadows, 1) for shadows in (True, False))
     assert bool((lit >= dark - 1e-12).all()) and float((lit - dark).max()) > 0.01
-    expected = _lit.reference(hits_of(scene, CAMERAS["perspective"]), False, 1)
+    expected = radiance.reference(hits_of(scene, CAMERAS["perspective"]), False, 1)
     assert torch.allclose(lit, expected, rtol=1e-12, atol=1e-12)
 
 
@@ -379,7 +379,7 @@ def test_derivatives_without_values(known: bool) -> None:
         hits.values = values
         lights = set(range(len(hits._surfaces.scene.casting)))
         hits._surfaces.shadowing.update(lights if known else ())
-        radiance = _lit_kernel.radiance(hits, True, 1)
+        radiance = in_kernel.radiance(hits, True, 1)
         assert hits._surfaces.shadowing == lights
         weights = torch.rand(radiance.shape, dtype=F64, generator=torch.Generator().manual_seed(3))
         found.append((radiance, torch.autograd.grad((weights * radiance).sum(), list(leaves.values()))))
@@ -396,7 +396,7 @@ def test_the_same_bits_on_any_number_of_threads() -> None:
     try:
         for threads in (1, 3):
             torch.set_num_threads(threads)
-            radiance = _lit_kernel.radiance(hits_of(scene_of(words, leaves), camera), True, 1)
+            radiance = in_kernel.radiance(hits_of(scene_of(words, leaves), camera), True, 1)
             found.append([radiance, *torch.autograd.grad(radiance.sum(), list(leaves.values()))])
     finally:
         torch.set_num_threads(before)
@@ -407,13 +407,13 @@ def test_the_same_bits_on_any_number_of_threads() -> None:
 def test_which_scenes_the_kernel_shades() -> None:
     scene = scene_of("texture point", numbers_of("texture point"))
     mesh, ground = scene.meshes
-    assert _lit_kernel.is_fused(scene)
-    assert not _lit_kernel.is_fused(scene.replace(meshes=[mesh.replace(filter="nearest"), ground]))
+    assert in_kernel.is_fused(scene)
+    assert not in_kernel.is_fused(scene.replace(meshes=[mesh.replace(filter="nearest"), ground]))
     assert mesh.texture is not None
     levels = mesh.replace(material=eg.Material(eg.Texture(mesh.texture, filter="mipmap")))
-    assert not _lit_kernel.is_fused(scene.replace(meshes=[levels, ground]))
+    assert not in_kernel.is_fused(scene.replace(meshes=[levels, ground]))
     many = mesh.replace(texture=mesh.texture[..., :1].expand(-1, -1, 17).contiguous())
-    assert not _lit_kernel.is_fused(eg.Scene([many], lights=scene.lights[:0]))
+    assert not in_kernel.is_fused(eg.Scene([many], lights=scene.lights[:0]))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, F64])

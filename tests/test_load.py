@@ -244,7 +244,7 @@ def test_workers_that_wait_sleep(tmp_path):
 # Each child has a time limit of its own, far above what it needs: what it guards against is waiting for ever.
 PROCESSES = """
 import importlib, multiprocessing
-import edgegrad._kernel
+import edgegrad.library
 
 NUMBERS = torch.linspace(0, 1, 1 << 20)
 
@@ -274,7 +274,7 @@ FORK = (
     + """
 if __name__ == "__main__":
     torch.set_num_threads(4)
-    importlib.reload(edgegrad._kernel)  # as where a notebook imports changed code anew: what fork() calls is there twice
+    importlib.reload(edgegrad.library)  # as where a notebook imports changed code anew: what fork() calls is there twice
     before = children("fork")
     child(0)
     expected = [step(k) for k in (0, 1, 0)]

@@ -15,9 +15,9 @@ from torch.autograd import gradcheck
 from torch.nn.functional import normalize
 
 import edgegrad as eg
-from edgegrad._bsdf import Scattering, ggx, masking, terminator
-from edgegrad._lit import radiance
-from edgegrad.hits import Hits
+from edgegrad.light.bsdf import Scattering, ggx, masking, terminator
+from edgegrad.light.radiance import radiance
+from edgegrad.points.hits import Hits
 
 UP = vector(0, 0, 1)
 

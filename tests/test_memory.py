@@ -6,7 +6,7 @@ import torch
 from scenes import cube, front_camera, icosphere
 
 import edgegrad as eg
-from edgegrad import _memory, _ops
+from edgegrad.kernel import memory, operators
 
 
 @pytest.fixture
@@ -14,8 +14,8 @@ def free(monkeypatch):
     """Sets how many bytes are free; renders of any size ask for it."""
 
     def set_free(count):
-        monkeypatch.setattr(_memory, "LOOK_FROM", 0)
-        monkeypatch.setattr(_memory, "available", lambda: count)
+        monkeypatch.setattr(memory, "LOOK_FROM", 0)
+        monkeypatch.setattr(memory, "available", lambda: count)
 
     return set_free
 
@@ -85,16 +85,16 @@ def test_a_backward_pass_that_does_not_fit(kind, free):
 def test_kept_geometry_makes_room(monkeypatch):
     """Other meshes' ray structures are given up before a render is refused."""
     counts = iter([1_000_000, 100_000_000])
-    monkeypatch.setattr(_memory, "LOOK_FROM", 0)
-    monkeypatch.setattr(_memory, "available", lambda: next(counts))
+    monkeypatch.setattr(memory, "LOOK_FROM", 0)
+    monkeypatch.setattr(memory, "available", lambda: next(counts))
     forgotten = []
-    monkeypatch.setattr(_memory, "clear_geometry", lambda: forgotten.append(True))
+    monkeypatch.setattr(memory, "clear_geometry", lambda: forgotten.append(True))
     eg.render(icosphere(5), front_camera(32), spp=1)
     assert forgotten == [True]
 
 
 def test_small_renders_do_not_ask(monkeypatch):
-    monkeypatch.setattr(_memory, "available", lambda: pytest.fail("asked for free memory"))
+    monkeypatch.setattr(memory, "available", lambda: pytest.fail("asked for free memory"))
     mesh = requiring(cube(), "verts", "colors")
     eg.render(mesh, front_camera(64), spp=4).sum().backward()
     assert mesh.verts.grad is not None
@@ -108,7 +108,7 @@ def test_a_failed_allocation_is_explained(cause, monkeypatch):
     def fail(*_, **__):
         raise cause
 
-    monkeypatch.setattr(_ops, "kernel_scene", fail)
+    monkeypatch.setattr(operators, "kernel_scene", fail)
     with pytest.raises(MemoryError, match=r"render: expected .*than the system grants, got about .*; lower") as error:
         eg.render(cube(), front_camera(16))
     assert error.value.__cause__ is cause
@@ -118,7 +118,7 @@ def test_other_errors_are_not_taken_for_memory(monkeypatch):
     def fail(*_, **__):
         raise RuntimeError("something else")
 
-    monkeypatch.setattr(_ops, "kernel_scene", fail)
+    monkeypatch.setattr(operators, "kernel_scene", fail)
     with pytest.raises(RuntimeError, match=r"^something else$"):
         eg.render(cube(), front_camera(16))
 
@@ -139,8 +139,8 @@ def test_what_control_groups_leave(tmp_path):
     group(tmp_path / "memory" / "c", 3000, 3500, "total_inactive_file 50\ninactive_file 3000\n", one)
     proc = tmp_path / "cgroup"
     proc.write_text("0::/a/b\n")
-    assert list(_memory._left_in_groups(proc, tmp_path)) == [4300, 600]
+    assert list(memory._left_in_groups(proc, tmp_path)) == [4300, 600]
     proc.write_text("9:cpu:/a/b\n4:hugetlb,memory:/c/gone\n")
-    assert list(_memory._left_in_groups(proc, tmp_path)) == [0]
-    assert list(_memory._left_in_groups(tmp_path / "none", tmp_path)) == []
-    assert 0 < _memory.available() <= psutil.virtual_memory().total
+    assert list(memory._left_in_groups(proc, tmp_path)) == [0]
+    assert list(memory._left_in_groups(tmp_path / "none", tmp_path)) == []
+    assert 0 < memory.available() <= psutil.virtual_memory().total

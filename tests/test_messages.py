@@ -15,10 +15,10 @@ import torch
 from scenes import cube, front_camera
 
 import edgegrad as eg
-from edgegrad import _kernel
-from edgegrad._kernel import core
-from edgegrad._ops import kernel_scene as scene_of_kernel
-from edgegrad.scene import flatten
+from edgegrad import library
+from edgegrad.kernel.flat import flatten
+from edgegrad.kernel.operators import kernel_scene as scene_of_kernel
+from edgegrad.library import core
 
 F64 = torch.float64
 NAN, INF = torch.nan, torch.inf
@@ -558,7 +558,7 @@ def test_import_without_a_usable_embree(tmp_path):
     """Not installed; installed without the library; a file that is no library; a library that is not Embree."""
     text = tmp_path / "libembree4.so"
     text.write_text("no library")
-    ways = ["not installed", None, str(text), str(tmp_path / "gone.so"), _kernel.core.__file__]
+    ways = ["not installed", None, str(text), str(tmp_path / "gone.so"), library.core.__file__]
     command = [sys.executable, "-c", WITHOUT_EMBREE, json.dumps(ways)]
     messages = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     reasons = [
@@ -566,7 +566,7 @@ def test_import_without_a_usable_embree(tmp_path):
         "the installed embreex 4.4.0 carries no libembree4",
         f"cannot open {text}",
         f"cannot open {tmp_path / 'gone.so'}",
-        f"{_kernel.core.__file__} lacks rtcNewDevice; version 4.x is needed",
+        f"{library.core.__file__} lacks rtcNewDevice; version 4.x is needed",
     ]
     for message, reason in zip(messages, reasons, strict=True):
         assert message.startswith("edgegrad needs the Embree 4 library") and "pip install 'embreex" in message

@@ -12,10 +12,10 @@ from scenes import cube, front_camera, icosphere, occluded_triangle, one_triangl
 from torch import Tensor
 
 from edgegrad import reference
-from edgegrad.camera import Camera
-from edgegrad.mesh import PLAIN, Mesh
+from edgegrad.camera.camera import Camera
 from edgegrad.report.exact import exact_image, gauss_triangle
-from edgegrad.scene import Scene
+from edgegrad.scene.mesh import PLAIN, Mesh
+from edgegrad.scene.scene import Scene
 
 PROJECTIONS = ("perspective", "orthographic")
 KINDS = ("plain", "colors", "face_colors", "corner_colors", "texture")

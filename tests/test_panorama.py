@@ -17,9 +17,9 @@ from scenes import cube, smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._kernel import core
-from edgegrad._ops import kernel_camera, pass_size
-from edgegrad._request import make_request, pack_camera
+from edgegrad.kernel.operators import kernel_camera, pass_size
+from edgegrad.kernel.request import make_request, pack_camera
+from edgegrad.library import core
 
 F64 = torch.float64
 SIZE = (24, 48)

@@ -11,7 +11,7 @@ import torch
 from scenes import cube, icosphere
 from scipy.special import erf
 
-from edgegrad._kernel import core
+from edgegrad.library import core
 
 pieces = core.for_tests
 Arrays = Sequence[np.ndarray]

@@ -13,10 +13,10 @@ import torch
 from scenes import cube, front_camera, icosphere, occluded_triangle, one_triangle, smooth_adjoint
 
 import edgegrad as eg
-from edgegrad import _ops
-from edgegrad._kernel import core
-from edgegrad._request import label, make_request, required
-from edgegrad.scene import flatten
+from edgegrad.kernel import operators
+from edgegrad.kernel.flat import flatten
+from edgegrad.kernel.request import label, make_request, required
+from edgegrad.library import core
 
 F64 = torch.float64
 CAMERA = front_camera(24)
@@ -88,7 +88,7 @@ def requiring(scene: eg.Scene | eg.Mesh, camera: eg.Camera, kinds: tuple[str, ..
 def kernel(monkeypatch):
     """What the kernel is given and says when render() and the backward pass call it."""
     seen = SimpleNamespace(scenes=[], forward=[], backward=[], grads=None, adjoint=None, everything=False)
-    forward, backward, scene = _ops.forward_kernel, _ops.backward_kernel, _ops.kernel_scene
+    forward, backward, scene = operators.forward_kernel, operators.backward_kernel, operators.kernel_scene
 
     def watched_forward(request):
         result = forward(request)
@@ -107,9 +107,9 @@ def kernel(monkeypatch):
         seen.scenes.append(flat)
         return scene(flat)
 
-    monkeypatch.setattr(_ops, "forward_kernel", watched_forward)
-    monkeypatch.setattr(_ops, "backward_kernel", watched_backward)
-    monkeypatch.setattr(_ops, "kernel_scene", watched_scene)
+    monkeypatch.setattr(operators, "forward_kernel", watched_forward)
+    monkeypatch.setattr(operators, "backward_kernel", watched_backward)
+    monkeypatch.setattr(operators, "kernel_scene", watched_scene)
     return seen
 
 
@@ -236,10 +236,10 @@ def built(mesh, camera=CAMERA, kinds=(), **options) -> tuple[bool, bool]:
     """Whether the kernel built the ray structure in the forward pass, and found the edges in the backward pass."""
     scene, camera = requiring(mesh, camera, kinds)
     request = make_request(scene, camera, 1, **options)
-    image, hits, (forward,) = _ops.forward_kernel(request)
+    image, hits, (forward,) = operators.forward_kernel(request)
     if not kinds:
         return bool(forward["built rays"]), False
-    backward = _ops.backward_kernel(torch.ones_like(image), hits, request, required(request))[1][0]
+    backward = operators.backward_kernel(torch.ones_like(image), hits, request, required(request))[1][0]
     assert not backward["built rays"]
     return bool(forward["built rays"]), bool(backward["built edges"])
 
@@ -463,11 +463,11 @@ def test_profile_rebuilds_for_every_repeat(monkeypatch):
     built = []
 
     def forward_kernel(request):
-        output = _ops.forward_kernel(request)
+        output = operators.forward_kernel(request)
         built.append(bool(output[2][0]["built rays"]))
         return output
 
-    monkeypatch.setattr(importlib.import_module("edgegrad.plan"), "forward_kernel", forward_kernel)
+    monkeypatch.setattr(importlib.import_module("edgegrad.profile"), "forward_kernel", forward_kernel)
     eg.profile(icosphere(3), CAMERA, spp=1, repeats=3)
     assert built == [True] * 6
 
@@ -486,9 +486,9 @@ def test_with_a_shader():
 
 
 def test_a_shader_that_does_not_fit_is_refused_before_it_runs(monkeypatch: pytest.MonkeyPatch):
-    from edgegrad import _memory
+    from edgegrad.kernel import memory
 
-    monkeypatch.setattr(_memory, "available", lambda: 100 << 20)
+    monkeypatch.setattr(memory, "available", lambda: 100 << 20)
     asked = []
     with pytest.raises(MemoryError, match=r"render with a shader: expected to need at most the 105 MB .* lower"):
         eg.render(creased(), CAMERA, shader=lambda hits: asked.append(hits) or hits.normal, surface_samples=10**7)

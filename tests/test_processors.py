@@ -14,7 +14,7 @@ from scenes import cube, front_camera, icosphere
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._kernel import core
+from edgegrad.library import core
 
 
 @cache

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 import edgegrad as eg
-from edgegrad._kernel import core
-from edgegrad._ops import kernel_scene
-from edgegrad.scene import Scene, flatten
+from edgegrad.kernel.flat import flatten
+from edgegrad.kernel.operators import kernel_scene
+from edgegrad.library import core
+from edgegrad.scene.scene import Scene
 
 
 class Rays(NamedTuple):

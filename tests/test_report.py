@@ -12,12 +12,13 @@ from trimesh.creation import icosphere
 
 import edgegrad as eg
 import edgegrad_cli as cli
-from edgegrad.report import mitsuba, references, scenes
-from edgegrad.report.error_time import error_time
-from edgegrad.report.methods import Edgegrad, FiniteDifferences, rigid
-from edgegrad.report.references import QUICK, exact, long_run
+from edgegrad.report import scenes
+from edgegrad.report.error_time import mitsuba, references
+from edgegrad.report.error_time.methods import Edgegrad, FiniteDifferences, rigid
+from edgegrad.report.error_time.references import QUICK, exact, long_run
+from edgegrad.report.error_time.run import error_time
 
-module = importlib.import_module("edgegrad.report.error_time")  # the package has a function of this name
+module = importlib.import_module("edgegrad.report.error_time.run")  # the package has a function of this name
 OURS = ("edgegrad", "interior", "boundary", "finite-differences")
 ASKED = ("--scene", "triangle", "--methods", *OURS, "--size", "32", "--seeds", "2", "--quick")
 

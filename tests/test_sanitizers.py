@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from edgegrad._kernel import core
+from edgegrad.library import core
 
 KERNEL = os.environ.get("EDGEGRAD_KERNEL", "")
 pytestmark = pytest.mark.skipif(not KERNEL, reason="run by `make sanitize`")

@@ -9,8 +9,8 @@ from test_lit_files import file
 from trimesh.exchange.gltf import get_schema
 
 import edgegrad as eg
-from edgegrad._formats import gltf
-from edgegrad.image import srgb_to_linear
+from edgegrad.files.formats import gltf
+from edgegrad.files.image import srgb_to_linear
 
 VERTS, FACES = cube().verts.float(), cube().faces
 random = torch.Generator().manual_seed(0)

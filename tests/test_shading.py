@@ -16,10 +16,10 @@ from torch.autograd.function import once_differentiable
 
 import edgegrad as eg
 from edgegrad import reference
-from edgegrad._kernel import core
-from edgegrad._ops import kernel_camera, kernel_scene
-from edgegrad._request import FILTERS, PackedCamera, pack_camera
-from edgegrad.scene import flatten
+from edgegrad.kernel.flat import flatten
+from edgegrad.kernel.operators import kernel_camera, kernel_scene
+from edgegrad.kernel.request import FILTERS, PackedCamera, pack_camera
+from edgegrad.library import core
 
 F64 = torch.float64
 

@@ -177,7 +177,7 @@ def test_lamp_of_many_faces() -> None:
 
 def test_triangles_of_directions() -> None:
     """They cover the sphere, each once, and where many directions are they are small."""
-    from edgegrad._shadows import triangles_of
+    from edgegrad.points.shadows import triangles_of
 
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn((1 << 12, 3), generator=generator, dtype=DOUBLE)

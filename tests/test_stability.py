@@ -19,13 +19,13 @@ from scenes import cube, front_camera, one_triangle
 import edgegrad as eg
 import edgegrad_cli as cli
 from edgegrad.fit.smooth import Smooth
-from edgegrad.report import fits, statistics, steps
-from edgegrad.report.cases import CASES, measure
-from edgegrad.report.cases.case import Case, Problem, everything
-from edgegrad.report.cases.measure import LIMIT, NOISY, QUICK, RAISED, RIGHT, WRONG, Effort
-from edgegrad.report.painted import PAINTED
+from edgegrad.report.stability import fits, statistics, steps
+from edgegrad.report.stability.cases import CASES, measure
+from edgegrad.report.stability.cases.case import Case, Problem, everything
+from edgegrad.report.stability.cases.measure import LIMIT, NOISY, QUICK, RAISED, RIGHT, WRONG, Effort
+from edgegrad.report.stability.painted import PAINTED
 
-stability = importlib.import_module("edgegrad.report.stability")  # the package has a function of this name
+stability = importlib.import_module("edgegrad.report.stability.run")  # the package has a function of this name
 FAST = [name for name, case in CASES.items() if not case.slow and case.group != "light"]
 
 

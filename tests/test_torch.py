@@ -15,11 +15,11 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad import reference
-from edgegrad._kernel import core
-from edgegrad._ops import Hits, kernel_camera, kernel_channels, kernel_hits, kernel_scene
-from edgegrad._request import SLOTS, make_request, pack_camera
 from edgegrad.aovs import _with_channels
-from edgegrad.scene import flatten
+from edgegrad.kernel.flat import flatten
+from edgegrad.kernel.operators import Hits, kernel_camera, kernel_channels, kernel_hits, kernel_scene
+from edgegrad.kernel.request import SLOTS, make_request, pack_camera
+from edgegrad.library import core
 
 F32, F64 = torch.float32, torch.float64
 SIZE = 20

@@ -17,9 +17,9 @@ from test_fit_scene import pictures, views
 
 import edgegrad as eg
 import edgegrad_cli as cli
+from edgegrad.files.cameras import save_camera
+from edgegrad.files.image import linear_to_srgb, write_image
 from edgegrad.fit import Parameter, fit_camera, fit_pose, fit_scene, fit_shape, fit_texture
-from edgegrad.image import linear_to_srgb, write_image
-from edgegrad.io import save_camera
 from edgegrad.live import frame, view
 from edgegrad.live.browser import Browser
 

@@ -31,9 +31,9 @@ from scenes import smooth_adjoint
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad._kernel import core
-from edgegrad._ops import kernel_camera, pass_size
-from edgegrad._request import make_request, pack_camera
+from edgegrad.kernel.operators import kernel_camera, pass_size
+from edgegrad.kernel.request import make_request, pack_camera
+from edgegrad.library import core
 
 F64 = torch.float64
 SIZE = (40, 48)
@@ -231,7 +231,7 @@ def test_what_lies_beyond_the_rim() -> None:
 
 def test_no_warning_where_the_rim_lies_outside() -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("edgegrad._ops.warn", lambda *_: pytest.fail("warned"))
+        patch.setattr("edgegrad.kernel.operators.warn", lambda *_: pytest.fail("warned"))
         eg.render(ball(PLACES["ahead"]), CAMERAS["usual"], 1)
 
 

@@ -1,14 +1,16 @@
 """Fitting: what pictures say about a scene, found by following the gradients of `render`."""
 
 from . import losses, regularizers
-from .camera import CameraFit, fit_camera
-from .fitted import Fit
-from .frame import Options, Parameter, Record
-from .pose import fit_pose
-from .result import Pose, PoseFit, Step
-from .scene import Progress, fit_scene
-from .shape import fit_shape
-from .texture import fit_texture
+from .descent.fit_scene import Progress, fit_scene
+from .descent.fit_shape import fit_shape
+from .descent.fit_texture import fit_texture
+from .descent.result import Fit
+from .history import Record
+from .options import Options, Parameter
+from .pose.fit_camera import CameraFit, fit_camera
+from .pose.fit_pose import fit_pose
+from .pose.pose import Pose
+from .pose.result import PoseFit, Step
 
 __all__ = [
     "CameraFit", "Fit", "Options", "Parameter", "Pose", "PoseFit", "Progress", "Record", "Step",

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from .._files import PathLike, replacing
-from .._warnings import warn
-from ..camera import Camera
-from .frame import Options, Parameter
+from ..camera.camera import Camera
+from ..files.paths import PathLike, replacing
+from ..warnings import warn
+from .options import Options, Parameter
 from .views import View
 
 FORMAT = 4

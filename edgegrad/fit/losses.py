@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .._files import require
+from ..optional import require
 
 Loss = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from ..image import linear_to_srgb
-from .frame import Record
+from ..files.image import linear_to_srgb
+from .history import Record
 
 INK = "#303030"
 

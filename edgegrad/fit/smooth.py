@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._files import require
+from ..optional import require
 from .regularizers import edges
 
 

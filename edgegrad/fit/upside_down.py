@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from .._warnings import warn
 from ..aovs import render_aovs
-from ..camera import Camera
-from ..scene import Scene
+from ..camera.camera import Camera
+from ..scene.scene import Scene
+from ..warnings import warn
 from .views import View
 
 MOST = 4  # views to look at

@@ -10,10 +10,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .._check import as_tensor, check_finite, check_float, check_shape
-from .._tree import map_tensors
-from .._warnings import warn
-from ..camera import Camera
+from ..camera.camera import Camera
+from ..check import as_tensor, check_finite, check_float, check_shape
+from ..scene.tree import map_tensors
+from ..warnings import warn
 
 Images = Tensor | Sequence[Tensor]
 FULL = 0.98  # a mask of more covers the whole pixel

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._files import require
-from .._formats.gltf_write import to_glb
-from .._tree import named_tensors
-from ..camera import Camera
-from ..material import Material, vertex_normals
-from ..mesh import PLAIN, Mesh
+from ..camera.camera import Camera
+from ..files.formats.gltf_write import to_glb
+from ..optional import require
+from ..scene.material import Material, vertex_normals
+from ..scene.mesh import PLAIN, Mesh
+from ..scene.tree import named_tensors
 from .frame import CONTRAST, Frame, as_bytes, displayed
 
 WIDTH = 480  # pixels of the panel beside the scene

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from .._files import require
+from ..optional import require
 from .frame import CONTRAST, Frame
 
 INK = "#303030"

@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._tree import map_tensors
 from ..aovs import render_aovs
-from ..camera import Camera
+from ..camera.camera import Camera
+from ..files.image import linear_to_srgb
 from ..fit import CameraFit, Fit, PoseFit, Progress
-from ..fit.result import Step
-from ..fit.task import PoseTask
+from ..fit.pose.result import Step
+from ..fit.pose.task import PoseTask
 from ..fit.views import Images, View, area_mean, cameras_of, views_of
-from ..image import linear_to_srgb
-from ..mesh import Mesh
-from ..scene import Scene
+from ..scene.mesh import Mesh
+from ..scene.scene import Scene
+from ..scene.tree import map_tensors
 
 LARGEST = 256  # pixels on the longer side of a picture
 SPP = 8

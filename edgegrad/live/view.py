@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from .._check import check_int, check_positive
-from .._files import require
-from ..camera import Camera
-from ..mesh import Mesh
-from ..scene import Scene
+from ..camera.camera import Camera
+from ..check import check_int, check_positive
+from ..optional import require
+from ..scene.mesh import Mesh
+from ..scene.scene import Scene
 
 if TYPE_CHECKING:
     from ..fit import CameraFit, Fit, PoseFit

@@ -26,9 +26,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..camera import Camera
-from ..mesh import PLAIN, Mesh
-from ..scene import Scene
+from ..camera.camera import Camera
+from ..scene.mesh import PLAIN, Mesh
+from ..scene.scene import Scene
 
 # Pixels. A point this close to a line counts as on it: above the rounding of coordinates (1e-14), far below anything
 # that matters to an area.

@@ -7,9 +7,9 @@ from typing import Any
 
 from torch import Tensor
 
-from ..camera import Camera
+from ..camera.camera import Camera
 from ..render import render
-from ..scene import Scene
+from ..scene.scene import Scene
 
 
 def finer_image(scene: Scene, camera: Camera, times: int, **options: Any) -> Tensor:

@@ -13,15 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._framing import framing
-from .._tree import tensors_in
-from ..camera import Camera
-from ..environment import Environment
-from ..io import load_scene
-from ..lights import AreaLight, Light, PointLight
-from ..material import Material
-from ..mesh import Mesh
-from ..scene import Scene
+from ..camera.camera import Camera
+from ..files.load import load_scene
+from ..preview import framing
+from ..scene.environment import Environment
+from ..scene.lights import AreaLight, Light, PointLight
+from ..scene.material import Material
+from ..scene.mesh import Mesh
+from ..scene.scene import Scene
+from ..scene.tree import tensors_in
 
 BACKGROUND = (0.15, 0.25, 0.4)
 

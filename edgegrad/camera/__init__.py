@@ -1,0 +1,1 @@
+"""Where a point lands in the image: cameras, their lenses, and how other libraries describe them."""

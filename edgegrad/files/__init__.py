@@ -1,0 +1,1 @@
+"""Meshes, scenes, images and cameras from and to files."""

@@ -1,0 +1,144 @@
+"""COLMAP's sparse reconstructions, text and binary: their cameras and poses (its documentation, "Output Format").
+
+Read here rather than by pycolmap, which ends the process where a file is damaged.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import NamedTuple
+
+import torch
+
+from ...camera.camera import Camera
+from .part import Fault
+from .views import View
+
+# Models by their number in binary files, with how many parameters they have.
+MODELS = {
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12,
+    "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12, "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4, "DIVISION": 5, "SIMPLE_FISHEYE": 3, "FISHEYE": 4, "EUCM": 6, "EQUIRECTANGULAR": 2,
+}  # fmt: skip
+POINT = struct.calcsize("<ddq")  # of an image: x, y and the 3D point
+
+
+class Lens(NamedTuple):
+    model: str
+    size: tuple[int, int]  # (H, W)
+    params: list[float]
+
+
+class Image(NamedTuple):
+    pose: list[float]  # quaternion w, x, y, z and translation, world to camera
+    camera: int
+    name: str
+
+
+def find(folder: Path) -> Path | None:
+    """The reconstruction in a folder: there, or in sparse/0 or sparse as COLMAP lays them; None where there is none."""
+    for place in (folder, folder / "sparse" / "0", folder / "sparse"):
+        if any((place / f"cameras.{end}").is_file() and (place / f"images.{end}").is_file() for end in ("bin", "txt")):
+            return place
+    return None
+
+
+def read(folder: Path, images: Path | None, dtype: torch.dtype) -> dict[str, View]:
+    """By the names of the images that have a pose, in their order. Raises Fault."""
+    binary = (folder / "cameras.bin").is_file()
+    cameras_file, images_file = (folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images"))
+    try:
+        if binary:
+            lenses, found = _lenses(_Bytes(cameras_file)), list(_images(_Bytes(images_file)))
+        else:
+            lenses, found = _lenses_of_text(_lines(cameras_file)), list(_images_of_text(_lines(images_file)))
+    except (struct.error, ValueError, IndexError) as error:
+        raise Fault(
+            f"expected a reconstruction of COLMAP, got one that cannot be read ({error}); export it again"
+        ) from error
+    places = [images] if images else [folder / "images", folder.parent / "images", folder.parent.parent / "images"]
+    views = {}
+    for image in sorted(found, key=lambda image: image.name):
+        try:
+            lens = lenses[image.camera]
+            pose = torch.tensor(image.pose, dtype=dtype)
+            camera = Camera.from_colmap(
+                pose[:4], pose[4:], lens.model, torch.tensor(lens.params, dtype=dtype), lens.size
+            )
+        except KeyError:
+            raise Fault(f"{image.name!r}: expected its camera {image.camera}, got none; export it again") from None
+        except ValueError as error:
+            raise Fault(f"camera {image.camera} of {image.name!r}: {error}") from error
+        views[image.name] = View(camera, _file(places, image.name))
+    return views
+
+
+def _file(places: list[Path], name: str) -> Path | None:
+    """The image's file, below one of the folders."""
+    if PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or ".." in PurePosixPath(name).parts:
+        return None
+    return next((place / name for place in places if (place / name).is_file()), None)
+
+
+# -- binary: little-endian -------------------------------------------------------------------------------------------------
+
+
+class _Bytes:
+    def __init__(self, file: Path) -> None:
+        self.data, self.at = file.read_bytes(), 0
+
+    def take(self, layout: str) -> tuple:
+        values = struct.unpack_from("<" + layout, self.data, self.at)
+        self.at += struct.calcsize("<" + layout)
+        return values
+
+    def text(self) -> str:
+        end = self.data.index(b"\0", self.at)
+        start, self.at = self.at, end + 1
+        return self.data[start:end].decode()
+
+
+def _lenses(data: _Bytes) -> dict[int, Lens]:
+    lenses = {}
+    for _ in range(*data.take("Q")):
+        index, number, width, height = data.take("iiQQ")
+        if not 0 <= number < len(MODELS):
+            raise ValueError(f"camera {index} of model {number}, which is not known")
+        model, count = list(MODELS.items())[number]
+        lenses[index] = Lens(model, (height, width), list(data.take(f"{count}d")))
+    return lenses
+
+
+def _images(data: _Bytes) -> Iterator[Image]:
+    for _ in range(*data.take("Q")):
+        index, *pose, camera = data.take("I7dI")
+        yield Image(pose, camera, data.text())
+        (points,) = data.take("Q")
+        data.at += points * POINT
+        if data.at > len(data.data):
+            raise ValueError(f"image {index} announces {points} points, more than the file holds")
+
+
+# -- text ---------------------------------------------------------------------------------------------------------------------
+
+
+def _lines(file: Path) -> list[str]:
+    return [line for line in file.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+
+
+def _lenses_of_text(lines: list[str]) -> dict[int, Lens]:
+    lenses = {}
+    for index, model, width, height, *params in map(str.split, filter(str.strip, lines)):
+        lenses[int(index)] = Lens(model, (int(height), int(width)), [float(value) for value in params])
+    return lenses
+
+
+def _images_of_text(lines: list[str]) -> Iterator[Image]:
+    """Each has two lines; the second, its points, may be empty."""
+    while lines and not lines[-1].strip():
+        lines.pop()
+    for line in lines[::2]:
+        _, *numbers, name = line.split(maxsplit=9)
+        yield Image([float(value) for value in numbers[:7]], int(numbers[7]), name)

@@ -1,0 +1,91 @@
+"""Positions, triangles and normals of parts of a file, in their places."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...optional import require
+from .part import Fault, Part
+
+
+def place(loaded: dict[str, Any]) -> list[tuple[str, dict[str, Any], np.ndarray]]:
+    """(name, arrays, matrix to world) of each part in the order of the file; one part may stand in several places."""
+    if "geometry" not in loaded:
+        return [("", loaded, np.eye(4))]
+    geometry, edges = loaded["geometry"], loaded.get("graph")
+    if edges is None:
+        return [(name, raw, np.eye(4)) for name, raw in geometry.items()]
+    # Node by node, from matrices that are known: trimesh looks for the way to each node anew, which takes minutes where
+    # thousands are nested.
+    to_matrix = require("trimesh.scene.transforms", "trimesh", "reading meshes").kwargs_to_matrix
+    parent = {edge["frame_to"]: edge for edge in edges}
+    if len(parent) < len(edges):
+        raise Fault("expected a tree of nodes, got some inside two others; export it again")
+    base = loaded.get("base_frame", "world")
+    world = {base: np.eye(4)}
+
+    def matrix(node: str) -> np.ndarray:
+        way = []
+        while node not in world:
+            if len(way) > len(parent) or node not in parent:
+                raise Fault("expected a tree of nodes, got some that no root leads to; export it again")
+            way.append(parent[node])
+            node = parent[node].get("frame_from", base)
+        for edge in reversed(way):
+            world[edge["frame_to"]] = world[edge.get("frame_from", base)] @ to_matrix(**edge)
+        return world[way[0]["frame_to"]] if way else world[node]
+
+    order = {name: i for i, name in enumerate(geometry)}
+    nodes = [(edge["geometry"], edge["frame_to"]) for edge in edges if edge.get("geometry") in order]
+    return [(name, geometry[name], matrix(node)) for name, node in sorted(nodes, key=lambda n: order[n[0]])]
+
+
+def shape(name: str, raw: dict[str, Any], matrix: np.ndarray) -> tuple[Part, np.ndarray]:
+    """Vertices in their place, and triangles; and for each triangle the number of the face it came from."""
+    v, faces = np.asarray(raw["vertices"], np.float64), np.asarray(raw["faces"])
+    if v.ndim != 2 or v.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] < 3:
+        got = f"{v.shape} and {faces.shape}"
+        raise Fault(f"expected positions (N, 3) and faces with three corners, got {got}; it may be truncated")
+    with np.errstate(over="ignore", invalid="ignore"):
+        # Elementwise: a matrix product may round equal rows differently, and they would not be welded.
+        v = v[:, 0:1] * matrix[:3, 0] + v[:, 1:2] * matrix[:3, 1] + v[:, 2:3] * matrix[:3, 2] + matrix[:3, 3]
+        verts = np.ascontiguousarray(v, np.float32)
+    corners = faces.shape[1]
+    fans = np.stack([faces[:, [0] * (corners - 2)], faces[:, 1:-1], faces[:, 2:]], -1).reshape(-1, 3).astype(np.int64)
+    if np.linalg.det(matrix[:3, :3]) < 0.0:
+        fans = fans[:, ::-1]  # in a mirror the front of a face stays its front
+    return Part(name, verts, np.ascontiguousarray(fans)), np.arange(len(faces)).repeat(corners - 2)
+
+
+def turned(part: Part, matrix: np.ndarray) -> np.ndarray | None:
+    """(N, 3) float32, in the world. Raises Fault where they are none."""
+    if part.normals is None:
+        return None
+    n = np.asarray(part.normals, np.float64)
+    if n.shape != part.verts.shape or not np.isfinite(n).all():
+        got = f"shape {n.shape}" if n.shape != part.verts.shape else "some that are not finite"
+        raise Fault(f"expected a finite normal for each of {len(part.verts)} vertices, got {got}; export it again")
+    a, b, c = matrix[:3, :3]
+    # The inverse transpose times the determinant's size: it is there for any matrix.
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
+    n = n[:, 0:1] * cofactors[:, 0] + n[:, 1:2] * cofactors[:, 1] + n[:, 2:3] * cofactors[:, 2]
+    length = np.linalg.norm(n, axis=1, keepdims=True)
+    side = -1.0 if np.linalg.det(matrix[:3, :3]) < 0.0 else 1.0
+    return (side * n / np.where(length > 0.0, length, 1.0)).astype(np.float32)
+
+
+def checked(part: Part) -> Part:
+    """The part itself, when positions are finite, indices in range and colours as many as they should be."""
+    N, F = len(part.verts), len(part.faces)
+    if not np.isfinite(part.verts).all():
+        bad = int(np.argwhere(~np.isfinite(part.verts))[0, 0])
+        raise Fault(f"expected finite positions (float32), got {part.verts[bad].tolist()} at vertex {bad}; repair it")
+    low, high = int(part.faces.min()), int(part.faces.max())
+    if low < 0 or high >= N:
+        raise Fault(f"expected vertex indices from 0 to {N - 1}, got {low if low < 0 else high}; repair the mesh")
+    for what, colors, count in (("vertices", part.colors, N), ("triangles", part.face_colors, F)):
+        if colors is not None and len(colors) != count:
+            raise Fault(f"expected {count} colours for {count} {what}, got {len(colors)}; export triangles only")
+    return part

@@ -1,0 +1,67 @@
+"""What a mesh file holds, before equal vertices are welded, and what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from torch import Tensor
+
+from ...scene.lights import Light
+from ...scene.material import Material
+from ..paths import PathLike
+
+
+class Fault(Exception):
+    """What is wrong with a file, said without its name."""
+
+
+class Part(NamedTuple):
+    """A part of a file as it stands there; colours are linear."""
+
+    name: str
+    verts: np.ndarray  # (N, 3) float32, transformations applied
+    faces: np.ndarray  # (F, 3) int64
+    uvs: np.ndarray | None = None  # (N, 2) float32, v running up
+    texture: Tensor | None = None  # (h, w, 3) float32
+    colors: Tensor | None = None  # (N, 3) float32
+    face_colors: Tensor | None = None  # (F, 3) float32
+    alpha: Tensor | None = None  # (h, w) float32, of what is cut out
+    cutoff: float = 0.5
+    wrap: tuple[str, str] = ("repeat", "repeat")  # of u and v
+    filter: str = "linear"
+    normals: np.ndarray | None = None  # (N, 3) float32, of any length
+    material: Material | None = None  # one for all parts that the file gives it to; None: not lit
+    material_uvs: Mapping[str, np.ndarray] = MappingProxyType({})  # (N, 2) of those of its textures that have their own
+
+
+class Model(NamedTuple):
+    """All of a file."""
+
+    parts: list[Part]  # at least one, each with at least one triangle
+    lights: list[Light]
+
+
+class Wanted(NamedTuple):
+    """What of a file is wanted."""
+
+    materials: bool = True  # textures and material colours
+    lit: bool = False  # materials that scatter light, normals and lights
+    split: bool = False  # the objects of an OBJ file apart
+    unwrap: bool = False  # texture coordinates also where the file has no texture
+
+
+@contextmanager
+def naming(path: PathLike) -> Iterator[None]:
+    """Makes every fault of a file an error that names the file."""
+    try:
+        yield
+    except Fault as fault:
+        raise ValueError(f"{path}: {fault}") from fault.__cause__
+    except ValueError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path}: {error}") from error

@@ -1,0 +1,163 @@
+"""A mesh file, the files that it names, its images as tensors, and what it asks for in vain."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path, PureWindowsPath
+from typing import Any, NamedTuple
+from urllib.parse import unquote
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...optional import require
+from ...warnings import warn
+from ..image import srgb_to_linear
+from ..paths import PathLike
+from .part import Fault, Wanted
+
+# What Pillow is let loose on. Not EPS, above all, for which it runs another program.
+TEXTURES = ("PNG", "JPEG", "MPO", "JPEG2000", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "DDS")
+
+
+class Folder:
+    """The folder of a mesh file, from which trimesh gets the files that the mesh names, and from nowhere else.
+
+    Where one fails, trimesh goes on without the material or texture; `failures` remembers why.
+    """
+
+    def __init__(self, path: PathLike) -> None:
+        self.path = path
+        self.root = Path(path).absolute().parent.resolve()
+        self.contents: dict[str, bytes] = {}
+        self.failures: dict[str, Exception] = {}
+
+    def get(self, name: str) -> bytes:
+        try:
+            self.contents[name] = self._read(name)
+        except Exception as error:
+            self.failures[name] = error
+            raise
+        return self.contents[name]
+
+    __getitem__ = get
+
+    def _read(self, name: str) -> bytes:
+        for text in (name.strip(), unquote(name.strip())):  # glTF writes names as URIs
+            file = (self.root / text.replace("\\", "/")).resolve()
+            if PureWindowsPath(text).drive or Path(text).is_absolute() or not file.is_relative_to(self.root):
+                raise Fault(f"names {name!r}, outside its folder, which is not read; copy it beside the mesh")
+            if file.is_file():
+                return file.read_bytes()
+        raise FileNotFoundError(
+            f"{self.path}: names {name!r}, and there is no such file in {self.root}; put it there, "
+            "or pass materials=False where only its look is missing"
+        )
+
+    def image(self, name: str) -> Any:
+        """A Pillow image, not yet decoded. Raises Fault or FileNotFoundError."""
+        return opened(name, self.get(name))
+
+
+def opened(name: str, content: bytes) -> Any:
+    """A Pillow image, not yet decoded. Raises Fault."""
+    pillow = require("PIL.Image", "edgegrad[files]", "reading textures")
+    try:
+        return pillow.open(io.BytesIO(content))
+    except (OSError, pillow.DecompressionBombError) as error:
+        raise no_image(name) from error
+
+
+def no_image(name: str) -> Fault:
+    require("PIL.Image", "edgegrad[files]", "reading textures")  # without it trimesh finds none and says nothing
+    return Fault(f"expected an image in the texture {name!r}, got none that Pillow reads; save it as PNG or JPEG")
+
+
+class Textures:
+    """Textures as tensors; parts that share an image share its tensor."""
+
+    def __init__(self) -> None:
+        self.known: dict[object, Tensor] = {}
+
+    def get(self, name: str, image: Any, factor: tuple[float, ...] = (1.0, 1.0, 1.0)) -> Tensor:
+        """(h, w, 3) linear radiance from a Pillow image, row 0 on top, times a linear factor."""
+        key = (id(image), factor)
+        if key not in self.known:
+            linear = srgb_to_linear(_texels(name, image)).float()
+            self.known[key] = linear * linear.new_tensor(factor)
+        return self.known[key]
+
+    def data(self, name: str, image: Any, channels: slice = slice(None)) -> Tensor:
+        """(h, w, K) float32: some channels of red, green and blue as they stand in the file, from 0 to 1."""
+        key = (id(image), "data", channels.start, channels.stop)
+        if key not in self.known:
+            self.known[key] = _texels(name, image)[..., channels].float()
+        return self.known[key]
+
+    def alpha(self, image: Any, factor: float) -> Tensor | None:
+        """(h, w) float32, of an image that get() took, times a factor; None where it has none."""
+        if "A" not in image.getbands() and "transparency" not in image.info:
+            return None
+        key = (id(image), factor, "alpha")
+        if key not in self.known:
+            texels = np.asarray(image.convert("RGBA"))[..., 3] / 255.0
+            self.known[key] = factor * torch.from_numpy(texels).float()
+        return self.known[key]
+
+
+def _texels(name: str, image: Any) -> Tensor:
+    """(h, w, 3) float64 in [0, 1]. Raises Fault."""
+    if image.format not in TEXTURES:
+        raise Fault(f"expected a {', '.join(TEXTURES)} image in the texture {name!r}, got {image.format}; convert it")
+    try:
+        deep = image.mode.startswith("I")  # convert() would clip 16-bit grey
+        texels = torch.from_numpy(np.asarray(image if deep else image.convert("RGB")) / (65535.0 if deep else 255.0))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise Fault(f"expected a whole image in the texture {name!r}, got a damaged one ({error})") from error
+    return texels[..., None].expand(-1, -1, 3) if texels.dim() == 2 else texels
+
+
+class Unsupported:
+    """What a file asks for and does not get, by name, and what is done instead."""
+
+    def __init__(self) -> None:
+        self.names: dict[str, str] = {}
+
+    def note(self, name: str, instead: str = "left out") -> None:
+        self.names[name] = instead
+
+    def say(self, path: PathLike) -> None:
+        """One warning for a file."""
+        if self.names:
+            listed = "; ".join(f"{name} ({instead})" for name, instead in self.names.items())
+            warn(f"{path}: {listed}", f"{path}: not rendered as the file asks: {listed}")
+
+
+class Source(NamedTuple):
+    """What is known of a file while it is read."""
+
+    folder: Folder
+    textures: Textures
+    wanted: Wanted
+    unsupported: Unsupported
+
+    @classmethod
+    def of(cls, path: PathLike, wanted: Wanted) -> Source:
+        return cls(Folder(path), Textures(), wanted, Unsupported())
+
+
+def linear_colors(what: str, values: np.ndarray, srgb: bool) -> Tensor:
+    """Linear float32 colours (N, 3) from integers of any width, or from floats; sRGB floats reach up to 1 or 255."""
+    values = np.asarray(values)
+    colors = values[:, :3].astype(np.float64)
+    if values.dtype.kind in "iu":
+        colors /= np.iinfo(values.dtype).max
+    elif srgb and colors.size and colors.max() > 1.0:
+        colors /= 255.0
+    good = (colors >= 0.0) & (colors <= (1.0 if srgb else np.finfo(np.float32).max))
+    if not good.all():
+        bad = int(np.argwhere(~good)[0, 0])
+        raise Fault(f"expected {what} colours from 0 to 1, got {values[bad].tolist()} at {what} {bad}; repair it")
+    linear = torch.from_numpy(colors)
+    return (srgb_to_linear(linear) if srgb else linear).float()

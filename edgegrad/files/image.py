@@ -1,0 +1,177 @@
+"""Images in and out through OpenImageIO, and the sRGB curve between files and linear radiance."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..camera.mistakes import warn_of_bytes
+from ..check import as_tensor, check_finite, check_not_meta, check_shape
+from ..optional import require
+from .paths import PathLike, check_readable, check_suffix, replacing
+
+DISPLAY = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # 8 bit, sRGB
+RADIANCE = (".exr", ".hdr")  # floating point, linear
+IMAGES = (*DISPLAY, *RADIANCE)
+MOST_NUMBERS = 1 << 30  # pixels times channels, four bytes each; a small file may announce more
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec. 709 primaries, which sRGB shares
+
+
+def srgb_to_linear(values: Tensor) -> Tensor:
+    """Linear radiance from sRGB values, any shape, 0 … 1; differentiable. The piecewise curve of IEC 61966-2-1."""
+    # The clamp keeps the power's unused branch, and its gradient, finite.
+    curve = ((values.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(values <= 0.04045, values / 12.92, curve)
+
+
+def linear_to_srgb(values: Tensor) -> Tensor:
+    """sRGB values from linear radiance, any shape, 0 … 1; differentiable. The inverse of srgb_to_linear."""
+    curve = 1.055 * values.clamp(min=0.0031308) ** (1.0 / 2.4) - 0.055
+    return torch.where(values <= 0.0031308, values * 12.92, curve)
+
+
+def read_image(path: PathLike, channels: int | None = None) -> Tensor:
+    """(H, W, C) float32 from an image file: linear radiance, row 0 on top, upright as its EXIF orientation says.
+
+    Integer pixels (PNG, JPEG, BMP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1;
+    floating-point pixels (EXR, HDR, float TIFF) are linear as they are. Alpha is the last channel, not gamma-corrected
+    and not multiplied into the colours (EXR files hold them multiplied; they stay so). At most 2³⁰ pixels times channels.
+
+    channels  None keeps what the file has. 1 gives the luminance and 3 the colours, both without alpha;
+              4 adds an alpha of 1 where the file has none
+
+    Raises FileNotFoundError, PermissionError, TypeError, ValueError (another kind of file, damaged, too large, colours that
+    do not convert)
+    or ImportError without OpenImageIO.
+    """
+    if channels not in (None, 1, 3, 4):
+        raise ValueError(f"channels: expected None, 1, 3 or 4, got {channels!r}")
+    file = check_readable(path, IMAGES)
+    oiio = require("OpenImageIO", "OpenImageIO", "reading images")
+    hint = oiio.ImageSpec()
+    hint["oiio:UnassociatedAlpha"] = 1
+    stored = oiio.ImageBuf(str(file), 0, 0, hint)
+    spec = stored.spec()  # from the header alone
+    if (
+        spec.full_width * spec.full_height * spec.nchannels > MOST_NUMBERS
+        or spec.image_pixels() * spec.nchannels > MOST_NUMBERS
+    ):
+        raise ValueError(
+            f"{path}: expected at most {MOST_NUMBERS} pixels times channels, got {spec.full_height} × {spec.full_width} × "
+            f"{spec.nchannels}; make it smaller"
+        )
+    upright = oiio.ImageBufAlgo.reorient(stored) if stored.read(0, 0, True, oiio.FLOAT) else None
+    pixels = None if upright is None else upright.get_pixels(oiio.FLOAT, upright.roi_full)
+    if pixels is None or (stored.file_format_name == "jpeg" and not _jpeg_ends(file.read_bytes())):
+        raise ValueError(f"{path}: expected a whole image, got one that cannot be read ({_reason(stored)})")
+    image = torch.from_numpy(np.ascontiguousarray(pixels))
+    a = stored.spec().alpha_channel
+    alpha = None if a < 0 else image[..., a : a + 1]
+    color = image if a < 0 else torch.cat([image[..., :a], image[..., a + 1 :]], -1)
+    # Not OpenImageIO's own conversion: what it does depends on the OCIO configuration that it finds.
+    if stored.nativespec().format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
+        for rows in color.split(
+            max(1, (1 << 20) // color[0].numel())
+        ):  # in place: doubles of all would be twice the image
+            rows.copy_(srgb_to_linear(rows.double()))
+    if channels is not None and color.shape[-1] not in (1, 3):
+        raise ValueError(f"{path}: expected 1 or 3 colour channels, got {color.shape[-1]}; read it without channels=…")
+    if channels == 1 and color.shape[-1] == 3:
+        color = color @ color.new_tensor(_LUMINANCE)[:, None]
+    elif channels in (3, 4) and color.shape[-1] == 1:
+        color = color.expand(-1, -1, 3)
+    if channels == 4 and alpha is None:
+        alpha = torch.ones_like(color[..., :1])
+    return (color if alpha is None or channels in (1, 3) else torch.cat([color, alpha], -1)).contiguous()
+
+
+def read_size(path: PathLike) -> tuple[int, int]:
+    """(H, W) of an image file as read_image reads it, by its header alone. Raises what read_image does."""
+    file = check_readable(path, IMAGES)
+    stored = require("OpenImageIO", "OpenImageIO", "reading images").ImageBuf(str(file))
+    spec = stored.spec()
+    if not spec.full_width or not spec.full_height:
+        raise ValueError(f"{path}: expected a whole image, got one that cannot be read ({_reason(stored)})")
+    turned = spec.getattribute("Orientation") in (5, 6, 7, 8)
+    return (spec.full_width, spec.full_height) if turned else (spec.full_height, spec.full_width)
+
+
+def write_image(path: PathLike, img: Tensor) -> None:
+    """Writes linear radiance `img`, (H, W) or (H, W, C) of any floating dtype, from any device, row 0 on top.
+
+    PNG, JPEG, BMP and TIFF: clipped to 0 … 1, sRGB, 8 bit, rounded to nearest; C up to 4 (2 and 4: the last is alpha,
+    not gamma-corrected; JPEG holds 1 or 3). HDR: linear, C = 3. EXR: linear float32, any C. The file appears whole or
+    not at all; an existing one is replaced, and missing folders are made.
+
+    Raises ValueError (unknown ending, wrong shape, NaN or infinity), TypeError (not floating-point),
+    OSError (cannot write) or ImportError without OpenImageIO.
+    """
+    file = check_suffix(path, IMAGES)
+    image = as_tensor("img", img).detach()
+    if not image.is_floating_point():
+        raise TypeError(
+            f"img: expected linear radiance of a floating dtype, got {image.dtype}; "
+            "for 8-bit sRGB values use srgb_to_linear(img / 255)"
+        )
+    check_not_meta("img", image)
+    check_shape("img", image, ("H", "W"), ("H", "W", "C"))
+    image = image.cpu().float().reshape(*image.shape[:2], -1)
+    check_finite("img", image)
+    warn_of_bytes("img", image)
+    H, W, C = image.shape
+    suffix = file.suffix.lower()
+    allowed = {".jpg": (1, 3), ".jpeg": (1, 3), ".bmp": (1, 3, 4), ".hdr": (3,)}.get(suffix, (1, 2, 3, 4))
+    if suffix != ".exr" and C not in allowed:
+        good = " or ".join(map(str, allowed))
+        raise ValueError(f"{path}: expected {good} channels in a {suffix} file, got {C}; pick some, or write an .exr")
+
+    oiio = require("OpenImageIO", "OpenImageIO", "writing images")
+    spec = oiio.ImageSpec(W, H, C, oiio.FLOAT if suffix in RADIANCE else oiio.UINT8)
+    if suffix in RADIANCE:
+        pixels = image.numpy()
+        if C == 2 or C > 4:
+            # EXR sorts channels by name: numbers of equal length keep their order, and no name makes one an alpha.
+            spec.channelnames = tuple(f"c{c:05d}" for c in range(C))
+    else:
+        shown = image.clamp(0.0, 1.0)
+        color = shown if C in (1, 3) else shown[..., :-1]
+        encoded = torch.cat([linear_to_srgb(color), shown[..., color.shape[-1] :]], -1)
+        pixels = (encoded * 255.0).round().to(torch.uint8).numpy()
+        spec["oiio:ColorSpace"] = "srgb_rec709_scene"
+        spec["oiio:UnassociatedAlpha"] = 1
+        spec.alpha_channel = -1 if C in (1, 3) else C - 1
+        spec["Compression"] = {".jpg": "jpeg:95", ".jpeg": "jpeg:95", ".tif": "zip", ".tiff": "zip"}.get(suffix, "")
+        spec["jpeg:subsampling"] = "4:4:4"
+    with replacing(path) as temporary:
+        output = oiio.ImageOutput.create(str(temporary))
+        if output is None:
+            raise OSError(f"{path}: cannot write a {suffix} file ({oiio.geterror()})")
+        done = output.open(str(temporary), spec) and output.write_image(pixels)
+        reason = _reason(output)
+        if not (output.close() and done):
+            raise OSError(f"{path}: cannot write the image ({reason})")
+
+
+def to_bytes(values: Tensor, linear: bool = False) -> np.ndarray:
+    """(…, 3) uint8 from (…, 1) or (…, 3), clipped to 0 … 1; sRGB unless told otherwise."""
+    values = values.detach().cpu().double().clamp(0.0, 1.0)
+    values = values.expand(*values.shape[:-1], 3)
+    return ((values if linear else linear_to_srgb(values)) * 255.0).round().to(torch.uint8).contiguous().numpy()
+
+
+def _reason(source: object) -> str:
+    """The last error of an OpenImageIO object, on one line."""
+    try:
+        return " ".join(source.geterror().split()) or "it ends early"  # type: ignore[attr-defined]
+    except UnicodeDecodeError:  # it quotes the damaged file
+        return "damaged header"
+
+
+def _jpeg_ends(data: bytes) -> bool:
+    """Whether a JPEG has its end marker; without it, the decoder fills the rest with grey and says nothing."""
+    at = 2
+    # Past the header first: a thumbnail in it has an end marker of its own.
+    while data[at : at + 1] == b"\xff" and data[at : at + 2] != b"\xff\xda":
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return data.find(b"\xff\xd9", at) >= 0

@@ -1,0 +1,93 @@
+"""Meshes and scenes from files; images come from image.py, cameras from cameras.py.
+
+What colours mean: vertex and face colours of OBJ and PLY files and the texels of textures of colour are sRGB on disk and
+become linear; factors of materials (glTF baseColorFactor, emissiveFactor, OBJ Kd, Ke), vertex colours of glTF and textures of
+data (normals, metallic, roughness) are linear already. All become float32. A glTF multiplies the texture, the factor and the
+vertex colours; those that differ from vertex to vertex beside a texture need lit=True, for a mesh that is not lit has one kind of
+colour. Elsewhere, where a file gives several looks, the first of these is taken: texture, vertex colours, face
+colours, the material's colour.
+
+lit=False, the default, takes these colours for radiance. Lights are dropped, as are normals and everything of a material but its
+base colour. Alpha is dropped, but where a material of a glTF has the alphaMode MASK: the alpha of its texture, or of its
+vertices (COLOR_0), times that of its factor is then the mesh's, with its alphaCutoff. Wrap and filter are those of a glTF's
+sampler.
+
+lit=True takes them for base colours:
+
+- glTF: metallic-roughness materials with all five textures, each on its own set of texture coordinates with its own
+  KHR_texture_transform, wraps and filter (mipmaps, but where the sampler says otherwise); KHR_materials_emissive_strength;
+  KHR_materials_specular where its factor, and metallic, are 0: Lambertian;
+  doubleSided, without which the back of faces is black; alphaMode MASK and BLEND (see Material). A material with
+  KHR_materials_unlit is none, and its colours are radiance. Normals, in the world, where the file has them; else faces are
+  flat. Point, spot and directional lights of KHR_lights_punctual, whose range is without end. Units are glTF's: candela, lux
+  and candela a square metre.
+- OBJ: Lambertian, with Ke for emission, and d and map_d cut out below 0.5. With highlights (Ks, unless illum is 0 or 1) a
+  dielectric, rough by Ns; with Pr or Pm metallic-roughness. vn are its normals.
+- other formats: Lambertian, with the normals of a PLY.
+
+What else a file asks for is said once, in one UserWarning that names it; without lit=True only what changes the shape of a glTF:
+animations, morph targets, skins (the transformation of a skinned node itself does not count), instancing.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ..scene.mesh import Mesh
+from ..scene.scene import Scene
+from .formats.part import Wanted, naming
+from .image import read_image
+from .parts import read_model
+from .paths import PathLike
+from .welding import merge, to_mesh
+
+
+def load_mesh(
+    path: PathLike, texture: PathLike | Tensor | None = None, materials: bool = True, lit: bool = False
+) -> Mesh:
+    """One Mesh from an OBJ, glTF, GLB, PLY, STL, OFF or 3MF file, in the file's units and axes.
+
+    Vertices that the file repeats (at texture seams, for normals, in triangle soups) are welded where their float32
+    positions are equal; unused ones are left out; polygons become fans of triangles. Texture coordinates are indexed
+    apart, v running up; an OBJ's and a glTF's are there without a texture too. Where welded vertices had different
+    colours, they become `corner_colors`. OFF and 3MF give the shape only. What colours mean stands at the top of this
+    module. Parts that look alike (all plain, all with
+    vertex colours, all with face colours, all on one texture; lit, all with one material) become one Mesh. Files that the
+    file names are read from its folder and below, and from nowhere else.
+
+    texture    an image file, or (h, w, C) linear radiance, to lay on the file's texture coordinates instead of its look
+    materials  False leaves out the file's textures and materials, and does not miss their files
+    lit        True: a mesh for lit scenes, with a material and normals; Lambertian where the file's own is left out. Lights of
+               the file come by load_scene
+
+    Raises FileNotFoundError (the file, or one that it names), ValueError (another kind of file, damaged, without
+    triangles, bad indices or positions, or parts that do not look alike: use load_scene), TypeError, or ImportError
+    without trimesh.
+    """
+    wanted = Wanted(materials and texture is None, _checked_lit(lit), unwrap=texture is not None)
+    with naming(path):
+        parts = read_model(path, wanted).parts
+        if texture is not None:
+            image = texture if isinstance(texture, Tensor) else read_image(texture, channels=3)
+            parts = [part._replace(colors=None, face_colors=None, texture=image) for part in parts]
+        return to_mesh(merge(parts))
+
+
+def load_scene(path: PathLike, materials: bool = True, lit: bool = False) -> Scene:
+    """A Scene with one Mesh for each part of a file: a primitive at a node of a glTF, a material in an object of an
+    OBJ, a solid of an STL, an item of a 3MF. Transformations are applied to the vertices.
+
+    lit   True: with materials, normals and the lights of the file; without lights, one that has none is black
+
+    See load_mesh for everything else, and for the errors.
+    """
+    wanted = Wanted(materials, _checked_lit(lit), split=True)
+    with naming(path):
+        model = read_model(path, wanted)
+        return Scene([to_mesh(part) for part in model.parts], lights=model.lights)
+
+
+def _checked_lit(lit: object) -> bool:
+    if not isinstance(lit, bool):
+        raise TypeError(f"lit: expected True or False, got {type(lit).__name__} ({lit!r})")
+    return lit

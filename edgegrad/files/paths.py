@@ -1,0 +1,67 @@
+"""Paths in and out: checked before a library sees them, written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+PathLike = str | os.PathLike[str]
+
+
+def check_readable(path: PathLike, suffixes: Collection[str]) -> Path:
+    """An existing, non-empty file whose name ends in one of `suffixes`.
+
+    Raises FileNotFoundError when nothing is there, PermissionError when it may not be read, ValueError when it is a directory
+    or a device, of another kind or empty.
+    """
+    file = check_suffix(path, suffixes)
+    if file.is_dir():
+        raise ValueError(f"{path}: expected a file, got a directory; name a file in it")
+    if not file.exists():
+        raise FileNotFoundError(f"{path}: expected a file, got no such file; look for it in {file.absolute().parent}")
+    if not file.is_file():
+        raise ValueError(f"{path}: expected a file, got a pipe or a device, which may never end; copy it to a file")
+    if not os.access(file, os.R_OK):
+        raise PermissionError(f"{path}: expected a file that may be read, got one without the permission; chmod it")
+    if file.stat().st_size == 0:
+        raise ValueError(f"{path}: expected data, got an empty file; export it again")
+    return file
+
+
+def check_suffix(path: PathLike, suffixes: Collection[str]) -> Path:
+    """`path` when its name ends in one of `suffixes`, in any case. Raises TypeError or ValueError."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"path: expected a str or pathlib.Path, got {type(path).__name__}")
+    file = Path(path)
+    if file.suffix.lower() not in suffixes and not file.is_dir():
+        raise ValueError(
+            f"{path}: expected a file name that ends in {', '.join(suffixes)}, got {file.suffix or 'no ending'!r}; "
+            "convert the file or rename it"
+        )
+    return file
+
+
+@contextmanager
+def replacing(path: PathLike) -> Iterator[Path]:
+    """A temporary file beside `path` that takes its place when the block succeeds and vanishes when it fails. Missing folders
+    are made.
+
+    Raises OSError when that fails, ValueError when `path` is a directory.
+    """
+    file = Path(path)
+    if file.is_dir():
+        raise ValueError(f"{path}: expected a file name, got a directory; add a name to it")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"{path}: expected a folder to write to, got {file.parent} ({error.strerror})") from error
+    # The same ending, since libraries choose the format by it; not tempfile, whose files only their owner may read.
+    temporary = file.with_name(f".{file.stem[:64]}-{secrets.token_hex(6)}{file.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, file)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,145 @@
+"""Meshes to and from trimesh, and into files by it.
+
+trimesh keeps colours as 8-bit sRGB, here they are linear; its texture coordinates are the vertices', which are split at seams.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from ..optional import require
+from ..scene.mesh import Mesh
+from ..warnings import warn
+from .formats.gltf_write import to_glb
+from .formats.part import Fault, Part
+from .formats.source import Textures, linear_colors
+from .image import to_bytes
+from .paths import PathLike, check_suffix, replacing
+from .welding import to_mesh
+
+WRITTEN = (".ply", ".obj", ".glb", ".stl", ".off")
+
+
+def from_trimesh(given: Any) -> Mesh:
+    """See Mesh.from_trimesh."""
+    trimesh = require("trimesh", "trimesh", "Mesh.from_trimesh")
+    if isinstance(given, trimesh.Scene):
+        raise TypeError("mesh: expected a trimesh.Trimesh, got a Scene; take scene.to_mesh(), or one of scene.geometry")
+    if not isinstance(given, trimesh.Trimesh):
+        raise TypeError(f"mesh: expected a trimesh.Trimesh, got {type(given).__name__}")
+    look: dict[str, Any] = {}
+    visual = given.visual
+    try:
+        if visual.kind == "vertex":
+            look["colors"] = linear_colors("vertex", visual.vertex_colors, srgb=True)
+        elif visual.kind == "face":
+            look["face_colors"] = linear_colors("face", visual.face_colors, srgb=True)
+        elif visual.kind == "texture" and visual.uv is not None:
+            look["uvs"] = np.asarray(visual.uv, np.float32)
+            material = visual.material
+            image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+            if image is not None:
+                image.format = image.format or "PNG"  # one that was made, not read
+                look["texture"] = Textures().get("texture", image)
+        return to_mesh(Part("", np.asarray(given.vertices, np.float32), np.asarray(given.faces, np.int64), **look))
+    except Fault as fault:
+        raise ValueError(f"mesh: {fault}") from fault.__cause__
+
+
+def to_trimesh(mesh: Mesh, faces_colored: bool = True) -> Any:
+    """See Mesh.to_trimesh. faces_colored: False where faces have none of their own, which those of their vertices then hold."""
+    trimesh = require("trimesh", "trimesh", "Mesh.to_trimesh")
+    _check_channels(mesh)
+    faces = _array(mesh.faces)
+    verts, colors = _array(mesh.verts), mesh.colors
+    if mesh.texture is not None:
+        assert mesh.uvs is not None and mesh.uv_faces is not None
+        pairs, index = np.unique(
+            np.stack([faces.reshape(-1), _array(mesh.uv_faces).reshape(-1)], 1), axis=0, return_inverse=True
+        )
+        pillow = require("PIL.Image", "edgegrad[files]", "saving textures")
+        material = trimesh.visual.material.PBRMaterial(
+            baseColorTexture=pillow.fromarray(to_bytes(mesh.texture)), metallicFactor=0.0, roughnessFactor=1.0
+        )
+        visual = trimesh.visual.TextureVisuals(uv=_array(mesh.uvs)[pairs[:, 1]], material=material)
+        faces = index.reshape(-1, 3)
+        return trimesh.Trimesh(verts[pairs[:, 0]], faces, visual=visual, process=False)
+    if mesh.corner_colors is not None or (mesh.face_colors is not None and not faces_colored):
+        given = mesh.corner_colors if mesh.face_colors is None else mesh.face_colors[:, None].expand(-1, 3, -1)
+        assert given is not None
+        verts, faces = verts[faces.reshape(-1)], np.arange(faces.size).reshape(-1, 3)
+        colors = given.reshape(-1, given.shape[-1])
+    look = {}
+    if colors is not None:
+        look["vertex_colors"] = to_bytes(colors)
+    elif mesh.face_colors is not None:
+        look["face_colors"] = to_bytes(mesh.face_colors)
+    return trimesh.Trimesh(verts, faces, process=False, **look)
+
+
+def save_mesh(path: PathLike, mesh: Mesh) -> None:
+    """Writes a mesh: PLY, OBJ, GLB, STL or OFF by the name's ending. Missing folders are made.
+
+    A GLB holds material, normals, alpha and textures with their coordinates, wraps and filters, as
+    `load_scene(path, lit=True)` reads them: factors and colours of vertices in full, textures in 8 bit (sRGB those of
+    colour), clipped to 0 … 1. Metallic, roughness and emission of vertices become their mean, for glTF has none. A
+    Lambertian material is one without a highlight (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an
+    OBJ also a texture, which lies beside it with its .mtl; STL and OFF the shape alone. A warning names what is left out
+    or clipped.
+
+    Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
+    """
+    file = check_suffix(path, WRITTEN)
+    if not isinstance(mesh, Mesh):
+        raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; save the meshes of a scene one by one")
+    _check_channels(mesh)
+    kind = file.suffix.lower()[1:]
+    beside = {}
+    if kind == "glb":
+        content, lost = to_glb(mesh)
+    else:
+        made, lost = to_trimesh(mesh, faces_colored=kind != "obj"), _left_out(mesh, kind)
+        if kind == "obj":
+            export = require("trimesh.exchange.obj", "trimesh", "saving meshes").export_obj
+            content, beside = export(made, return_texture=True, mtl_name=f"{file.stem}.mtl")
+        else:
+            content = made.export(file_type=kind)
+    if lost:
+        warn(
+            f"left out of {kind}",
+            f"save_mesh: {file.name} holds no {', no '.join(lost)}; torch.save(mesh, path) keeps all of a Mesh",
+        )
+    for name, data in {**beside, file.name: content}.items():
+        with replacing(file.parent / Path(name).name) as temporary:
+            temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def _check_channels(mesh: Mesh) -> None:
+    """Raises ValueError."""
+    if mesh.channels not in (None, 1, 3):
+        raise ValueError(f"mesh: expected 1 or 3 channels, got {mesh.channels}; pick some")
+
+
+def _left_out(mesh: Mesh, kind: str) -> list[str]:
+    """What of a mesh a file of this kind, other than GLB, does not hold."""
+    look = {"colors": mesh.colors, "face_colors": mesh.face_colors, "corner_colors": mesh.corner_colors}
+    look["texture"] = mesh.texture
+    never = {"material": mesh.material, "normals": mesh.normals, "alpha": mesh.alpha}
+    never["uvs"] = mesh.uvs if mesh.texture is None or kind != "obj" else None
+    found = [name for name, value in never.items() if value is not None]
+    for name, value in look.items():
+        if value is None:
+            continue
+        if kind in ("stl", "off") or (name == "texture" and kind != "obj"):
+            found.append(name)
+        elif bool((value < 0).any() | (value > 1).any()):
+            found.append(f"{name} beyond 0 … 1")
+    return found
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy()

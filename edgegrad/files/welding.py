@@ -1,0 +1,109 @@
+"""Parts of mesh files as meshes: joined where they look alike, and welded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..scene.mesh import LARGEST_UV, Mesh
+from .formats.part import Fault, Part
+
+
+def _look_of(part: Part) -> tuple[object, ...]:
+    """What parts that become one mesh have in common."""
+    missing = part.colors is None, part.face_colors is None, part.normals is None
+    images = id(part.texture), id(part.alpha), id(part.material), tuple(sorted(part.material_uvs))
+    return *missing, *images, part.cutoff if part.alpha is not None else None, part.wrap, part.filter
+
+
+def merge(parts: list[Part]) -> Part:
+    """One part from parts that look alike. Raises Fault when they do not."""
+    if len(parts) == 1:
+        return parts[0]
+    if len({_look_of(part) for part in parts}) > 1:
+        names = ", ".join(repr(part.name) for part in parts[:5]) + (", …" if len(parts) > 5 else "")
+        what = "textures or kinds of colour" if all(part.material is None for part in parts) else "materials or normals"
+        raise Fault(
+            f"expected one mesh, got {len(parts)} parts ({names}) with different {what}; "
+            "use load_scene, which keeps them apart, or materials=False"
+        )
+
+    def joined(name: str, join: Callable[[list], Any] = np.concatenate) -> Any:
+        found = [getattr(part, name) for part in parts]
+        return None if any(value is None for value in found) else join(found)
+
+    start = np.cumsum([0] + [len(part.verts) for part in parts])
+    return parts[0]._replace(
+        name="",
+        verts=joined("verts"),
+        faces=np.concatenate([part.faces + n for part, n in zip(parts, start, strict=False)]),
+        uvs=joined("uvs"),
+        colors=joined("colors", torch.cat),
+        face_colors=joined("face_colors", torch.cat),
+        normals=joined("normals"),
+        material_uvs={k: np.concatenate([part.material_uvs[k] for part in parts]) for k in parts[0].material_uvs},
+    )
+
+
+def to_mesh(part: Part) -> Mesh:
+    """Raises Fault."""
+    verts, faces = _weld(part.verts, part.faces)
+    images: dict[str, Any] = {**_material(part), "name": part.name or None}
+    shared = part.material is not None and set(part.material.textures) - set(part.material_uvs)
+    textured = part.texture is not None or part.alpha is not None or bool(shared)
+    if textured and part.uvs is None:
+        raise Fault(f"part {part.name!r}: expected texture coordinates for its texture, got none; unwrap the mesh")
+    # Those that nothing of the file needs are for textures to come, and for shaders.
+    if part.uvs is not None and (textured or bool((np.abs(part.uvs) <= LARGEST_UV).all())):
+        images["uvs"], images["uv_faces"] = _weld(part.uvs, part.faces)
+    if textured:
+        wrap = part.wrap[0] if part.wrap[0] == part.wrap[1] else part.wrap
+        images |= {"texture": part.texture, "wrap": wrap, "filter": part.filter}
+    if part.alpha is not None:
+        images |= {"alpha": part.alpha, "alpha_cutoff": part.cutoff}
+    if part.normals is not None:
+        corners = torch.from_numpy(part.normals)[torch.from_numpy(part.faces)]
+        normals = _of_vertices(corners, faces, len(verts))
+        if normals is None:
+            normals, images["normal_faces"] = _weld(part.normals, part.faces)
+        images["normals"] = normals
+    if part.colors is None or part.texture is not None:
+        return Mesh(verts, faces, face_colors=part.face_colors if part.texture is None else None, **images)
+    corners = part.colors[torch.from_numpy(part.faces)]
+    colors = _of_vertices(corners, faces, len(verts))
+    return Mesh(verts, faces, corner_colors=corners if colors is None else None, colors=colors, **images)
+
+
+def _material(part: Part) -> dict[str, Any]:
+    """The material, with texture coordinates for those of its textures that do not lie on the mesh's."""
+    if part.material is None:
+        return {}
+    own = {}
+    for name, rows in part.material_uvs.items():
+        uvs, uv_faces = _weld(rows, part.faces)
+        own[name] = part.material.textures[name].replace(uvs=uvs, uv_faces=uv_faces)
+    return {"material": part.material.replace(**own) if own else part.material}
+
+
+def _of_vertices(corners: Tensor, faces: Tensor, count: int) -> Tensor | None:
+    """(V, K) from values at corners (F, 3, K); None where those at one vertex differ."""
+    values = corners.new_zeros(count, corners.shape[-1])
+    values[faces] = corners
+    return values if torch.equal(values[faces], corners) else None
+
+
+def _weld(rows: np.ndarray, index: np.ndarray) -> tuple[Tensor, Tensor]:
+    """The rows that `index` (F, 3) uses, equal ones once, in the order of the file; and the index into them."""
+    used, flat = np.unique(index, return_inverse=True)
+    rows = rows[used]
+    order = np.lexsort(rows.T)
+    starts = np.concatenate([[True], (rows[order[1:]] != rows[order[:-1]]).any(1)])
+    first = np.empty(len(rows), np.int64)
+    first[order] = order[starts][np.cumsum(starts) - 1]  # the sort is stable: a group starts with its first row
+    kept, renumbered = np.unique(first, return_inverse=True)
+    faces = renumbered.reshape(-1)[flat.reshape(-1)].reshape(-1, 3).astype(np.int64)
+    return torch.from_numpy(rows[kept]), torch.from_numpy(faces)

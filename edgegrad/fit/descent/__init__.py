@@ -1,0 +1,1 @@
+"""Fits by gradient descent: any tensors of a scene, shapes, textures."""

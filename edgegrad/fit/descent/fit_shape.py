@@ -1,0 +1,180 @@
+"""fit_shape(): the vertices of a mesh, from coarse to fine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...camera.camera import Camera
+from ...check import check_positive, check_positive_int
+from ...optional import require
+from ...scene.mesh import Mesh
+from ...scene.scene import Scene
+from ..checkpoints import Checkpoint
+from ..history import Record
+from ..options import Options, Parameter
+from ..smooth import Smooth
+from ..upside_down import warn_of_masks
+from ..views import Images, View, views_of
+from .fit_scene import judged, objective_of, options_of, reporter
+from .loop import Descent, descend
+from .result import Fit
+
+SMOOTHNESS = 4.0  # λ of I + λ L
+SMALLEST = 64  # pixels on the shorter side of pictures of coarse levels
+REMESHING = 5  # rounds
+
+
+def fit_shape(
+    mesh: Mesh,
+    cameras: Camera | Sequence[Camera],
+    images: Images | None = None,
+    *,
+    masks: Images | None = None,
+    weights: Images | None = None,
+    levels: int = 3,
+    faces: int | None = None,
+    lr: float = 0.01,
+    smoothness: float = SMOOTHNESS,
+    look: Callable[[Mesh], Scene | Mesh] | None = None,
+    background: Tensor | None = None,
+    regularizer: Callable[[Scene], Tensor] | None = None,
+    **options: Any,
+) -> Fit:
+    """Finds the shape of a mesh from pictures or masks of it.
+
+    mesh        where the fit starts: a sphere around the object will do, where the object has no holes
+    levels      after each but the last the mesh is remeshed to triangles of even size, half as long on each level as on the one
+                before; 1: the mesh as it is
+    faces       about so many on the last level; None: four times as many as on the level before
+    lr          the learning rate on the first level, in diagonals of the mesh's bounding box; half as large on each further level
+    smoothness  λ of the coordinates (I + λ L) v in which steps are taken: the larger, the farther a vertex takes its neighbours
+                along (Nicolet, Jacobson and Jakob, Large Steps in Inverse Rendering of Geometry, 2021)
+    look        makes of a mesh of bare vertices and faces what is rendered: with normals, a material, lights. None: plain
+    background  behind the mesh where there are no masks, (C,) or (H, W, C)
+    options     see edgegrad.fit.Options; `steps` are those of each level, pictures of coarse levels are smaller
+
+    The rest is as for fit_scene(). Needs cholespy, and gpytoolbox for more than one level (`pip install 'edgegrad[fit]'`).
+    Raises TypeError or ValueError that names the argument, ImportError.
+    """
+    opts = options_of(options)
+    if not isinstance(mesh, Mesh):
+        raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; load one with load_mesh(path)")
+    check_positive_int("levels", levels, most=12)
+    for name, value in (("lr", lr), ("smoothness", smoothness)):
+        check_positive(name, value, least=0.0, most=1e9)
+    if faces is not None:
+        check_positive_int("faces", faces)
+    # Before the first level rather than after it.
+    if levels > 1 and (count := len(_gpytoolbox().non_manifold_edges(mesh.faces.cpu().numpy().astype(np.int32)))):
+        raise ValueError(
+            f"mesh: expected no more than two triangles at each edge, as remeshing needs, got {count} edges with more; "
+            "give levels=1, or a sphere around the object"
+        )
+    views = views_of(cameras, images, masks, weights)
+    behind = None if masks is not None else background
+    bare = Mesh(mesh.verts.detach().cpu().float().clone(), mesh.faces.detach().cpu().clone())
+    return _Search(views, opts, levels, faces, lr, smoothness, look or _itself, behind, regularizer).run(bare)
+
+
+def _itself(mesh: Mesh) -> Mesh:
+    return mesh
+
+
+class _Search:
+    """The levels of one fit."""
+
+    def __init__(
+        self, views: list[View], options: Options, levels: int, faces: int | None, lr: float, smoothness: float,
+        look: Callable[[Mesh], Scene | Mesh], background: Tensor | None, regularizer: Callable[[Scene], Tensor] | None,
+    ) -> None:  # fmt: skip
+        self.views, self.options, self.levels, self.faces, self.lr = views, options, levels, faces, lr
+        self.smoothness, self.look, self.background, self.regularizer = smoothness, look, background, regularizer
+
+    @torch.inference_mode(False)
+    @torch.enable_grad()
+    def run(self, mesh: Mesh) -> Fit:
+        start, level, history, seconds = mesh, 0, [], 0.0
+        checkpoint = Checkpoint.of(
+            self.options,
+            self.views,
+            {
+                "mesh": mesh, "levels": self.levels, "faces": self.faces, "lr": self.lr, "smoothness": self.smoothness,
+                "background": self.background,
+            },
+        )  # fmt: skip
+        saved = checkpoint.read()
+        last = self.faces or len(mesh.faces) * 4 ** (self.levels - 1)
+        if saved is not None:
+            level, mesh = saved["level"], Mesh(saved["verts"], saved["faces"])
+            history, seconds = [Record(*record) for record in saved["history"]], saved["seconds"]
+        else:
+            warn_of_masks(self.views, self.scene(mesh), [view.camera for view in self.views])
+        while True:
+            stage = {
+                "level": level, "verts": mesh.verts, "faces": mesh.faces,
+                "history": [tuple(record) for record in history], "seconds": seconds,
+            }  # fmt: skip
+
+            def save(loop: dict[str, Any], stage: dict[str, Any] = stage) -> None:
+                checkpoint.write({**stage, "loop": loop})
+
+            found = self.descend(mesh, level, save, None if saved is None else saved["loop"])
+            saved, mesh = None, mesh.replace(verts=found.values["verts"])
+            history += [record._replace(step=len(history) + k) for k, record in enumerate(found.history)]
+            seconds += found.seconds
+            if found.interrupted or level == self.levels - 1:
+                break
+            level += 1
+            mesh = remeshed(mesh, round(last / 4 ** (self.levels - 1 - level)))
+        whole = Descent({"verts": mesh.verts}, history, seconds, found.flat, found.interrupted)
+
+        def build(values: dict[str, Tensor]) -> tuple[Scene, list[Camera]]:
+            return self.scene(mesh.replace(verts=values["verts"])), [view.camera for view in self.views]
+
+        return judged(build, self.views, self.options, whole, self.scene(start))
+
+    def descend(
+        self, mesh: Mesh, level: int, save: Callable[[dict[str, Any]], None], saved: dict[str, Any] | None
+    ) -> Descent:
+        """One level, from `mesh`; the best vertices are in its values."""
+        smooth = Smooth(mesh.faces, len(mesh.verts), self.smoothness)
+        smallest = min(min(view.camera.size) for view in self.views)
+        factor = min(1.0, max(0.5 ** (self.levels - 1 - level), SMALLEST / smallest))
+        views = [view.resized(factor) for view in self.views]
+        low, high = mesh.verts.aminmax(dim=0)
+        rate = self.lr * float((high - low).norm()) * 0.5**level
+
+        def build(values: dict[str, Tensor]) -> tuple[Scene, list[Camera]]:
+            return self.scene(mesh.replace(verts=smooth(values["verts"]))), [view.camera for view in views]
+
+        objective = objective_of(build, views, self.options, self.regularizer)
+        parameters = {"verts": Parameter(rate, smooth.times(mesh.verts), uniform=True)}
+        title = f"level {level + 1} of {self.levels}"
+        found = descend(objective, parameters, self.options, save, saved, title, reporter(build, views))
+        return found._replace(values={"verts": smooth(found.values["verts"])})
+
+    def scene(self, mesh: Mesh) -> Scene:
+        made = self.look(mesh)
+        return made if isinstance(made, Scene) else Scene([made], self.background)
+
+
+def remeshed(mesh: Mesh, faces: int) -> Mesh:
+    """About so many even triangles on the same surface (Botsch and Kobbelt 2004), by gpytoolbox. Raises ImportError."""
+    a, b, c = mesh.verts.double()[mesh.faces.long()].unbind(1)
+    area = 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
+    edge = math.sqrt(4.0 * area / (math.sqrt(3.0) * faces))  # of equilateral triangles
+    verts, triangles = _gpytoolbox().remesh_botsch(
+        mesh.verts.double().numpy(), mesh.faces.numpy().astype(np.int32), REMESHING, edge, True
+    )
+    return Mesh(torch.from_numpy(verts).to(mesh.verts.dtype), torch.from_numpy(triangles.astype(np.int64)))
+
+
+def _gpytoolbox() -> ModuleType:
+    return require("gpytoolbox", "edgegrad[fit]", "remeshing")

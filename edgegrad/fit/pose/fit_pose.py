@@ -1,0 +1,191 @@
+"""fit_pose(): where a known mesh stands in a picture, or in several.
+
+The loss is the squared difference between pictures and renders, both blurred, on an image pyramid from coarse to fine, in which
+what covers the object hardly counts. Each step of a Gauss-Newton search moves the pose by a rotation about the object's centre, a
+shift in units of the object's size, and logarithms of scale and focal length, and starts anew from the pose that it reached.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from ...camera.camera import Camera
+from ...check import check_flag, check_int, check_positive_int
+from ...files.paths import PathLike
+from ...scene.mesh import Mesh
+from ...scene.scene import Scene
+from ..checkpoints import Checkpoint, traits
+from ..options import check_checkpoint
+from ..upside_down import BETTER, say_upside_down
+from ..verdict import ENOUGH
+from .journal import Journal
+from .place import placed
+from .pose import Pose, pose_from_matrix
+from .result import PoseFit
+from .search import Search
+from .task import Lens, Names, PoseTask
+
+
+@torch.inference_mode(False)
+@torch.enable_grad()
+def fit_pose(
+    mesh: Mesh | Scene,
+    target: Tensor | Sequence[Tensor],
+    camera: Camera | Sequence[Camera],
+    mask: Tensor | Sequence[Tensor] | None = None,
+    init: PoseFit | Tensor | None = None,
+    *,
+    fit_scale: bool = False,
+    fit_focal: bool = False,
+    background: Tensor | float | None = None,
+    weight: Tensor | Sequence[Tensor] | None = None,
+    max_size: int = 256,
+    steps: int = 40,
+    spp: int = 16,
+    tolerance: float = 3e-4,
+    seed: int = 0,
+    progress: bool = True,
+    callback: Callable[[PoseFit], None] | None = None,
+    checkpoint: PathLike | None = None,
+    checkpoint_every: int = 25,
+    resume: bool = False,
+) -> PoseFit:
+    """Rotation and translation (and scale, and focal length) of a known mesh in a picture, or in several.
+
+    mesh        what the picture shows, with its colours; the meshes of a Scene move together
+    target      (H, W, C) linear radiance, as read_image gives it, with the mesh's channels; or a list of pictures
+    camera      the camera of the picture, of size (H, W), or a list of them; with fit_focal, its focal length is where the fit
+                starts
+    mask        (H, W) or (H, W, 1), 1 on the object and 0 elsewhere. Then the colours inside the mask and the mask itself
+                are compared; a plain mesh, which has no colours to compare, is fitted to the mask alone. At the border of
+                a soft mask the colour beside it counts, times the mask: what the picture has there, before black, a
+                photograph's background or straight alpha, makes no difference
+    init        the pose to start from, within about 30° and 15 % of the object's size of the true one: an earlier fit, or
+                mesh to world as a matrix (4, 4) for column vectors. When None, where the mesh file puts the object, if the
+                camera sees it there (and the mask agrees); else in the middle of the mask, or of the picture
+    fit_scale   also find the mesh's scale. One picture shows size over distance only, so the centre then keeps its depth
+    fit_focal   also find the focal length: one factor for both of K
+    background  without a mask, what stands behind the object: a number, (C,) or (H, W, C); when None, the scene's own, or
+                else the median colour of the picture's border. If the border has many colours, the background counts as
+                unknown: then only what the object covers is compared
+    weight      (H, W) or (H, W, 1), from 0: how much a pixel counts
+    max_size    a larger picture is reduced to so many pixels on its longer side
+    steps       at most so many on each level of the pyramid
+    spp         samples a pixel of each render on the finest level; the others take as many in all
+    tolerance   a step on the finest level is short when it is below this: in radians, object sizes (the diagonal of the bounding
+                box), and logarithms of scale and focal length
+    seed        the same seed gives the same fit
+    progress    show a bar with the loss on standard error
+    callback    called after each step with the best fit so far
+    checkpoint  a file that holds the fit's state, written every `checkpoint_every` steps and at the end, never in part
+    resume      go on from the checkpoint, if there is one: the fit ends as if it had never stopped. One of a fit that
+                was given something else is refused
+
+    About a quarter of the object may be covered. The fit is `converged` when its last step was short and the pictures show at
+    least 60 % of the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few
+    times as long; where they do, but noise does not explain the loss, as when something covers the object, nearby, in about the
+    same time again. KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set.
+    Works in torch.no_grad() and torch.inference_mode() too. Raises TypeError or ValueError that names the argument, also when
+    the object leaves no trace in the picture at the start.
+    """
+    lens = Lens(check_flag("fit_scale", fit_scale), check_flag("fit_focal", fit_focal))
+    return search_pose(
+        mesh, target, camera, mask, init, lens, background, weight, Names(), max_size=max_size, steps=steps, spp=spp,
+        tolerance=tolerance, seed=seed, progress=progress, callback=callback, checkpoint=checkpoint,
+        checkpoint_every=checkpoint_every, resume=resume,
+    )  # fmt: skip
+
+
+@torch.inference_mode(False)
+@torch.enable_grad()
+def search_pose(
+    mesh: Mesh | Scene, target: object, camera: object, mask: object, init: object, lens: Lens,
+    background: Tensor | float | None, weight: object, names: Names, *, max_size: int, steps: int, spp: int, tolerance: float,
+    seed: int, progress: bool, callback: Callable[[PoseFit], None] | None, checkpoint: PathLike | None,
+    checkpoint_every: int, resume: bool,
+) -> PoseFit:  # fmt: skip
+    """fit_pose(), with whatever is sought of the lens."""
+    began = time.perf_counter()
+    for name, count in (("max_size", max_size), ("steps", steps), ("spp", spp)):
+        check_positive_int(name, count)
+    check_int("seed", seed, 0, 2**32 - 1)
+    if not isinstance(tolerance, (int, float)):
+        raise TypeError(f"tolerance: expected a number, got {type(tolerance).__name__} ({tolerance!r})")
+    if not tolerance > 0.0:
+        raise ValueError(f"tolerance: expected a number above 0, got {tolerance:g}")
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback: expected a function of a PoseFit, got {type(callback).__name__}")
+    check_checkpoint(checkpoint, checkpoint_every, check_flag("resume", resume))
+    given = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
+    task = PoseTask.of(mesh, target, camera, mask, weight, background, lens, float(given.scale), names)
+    start = placed(task) if init is None else given
+    given_cameras: list[Any] = list(camera) if isinstance(camera, Sequence) else [camera]
+    file = Checkpoint(checkpoint, resume, {
+        names.init: None if init is None else given.matrix, names.mesh: mesh, names.target: target, "mask": mask,
+        "weight": weight, "camera": [traits(one) for one in given_cameras], "background": background,
+        **dict(zip(names.lens, lens, strict=False)), "max_size": max_size, "steps": steps, "spp": spp,
+        "tolerance": tolerance, "seed": seed,
+    })  # fmt: skip
+    saved = file.read()
+    journal, earlier = (Journal(), 0.0) if saved is None else (Journal(saved["journal"]), saved["seconds"])
+    search = Search(task, task.pyramid(start, max_size, spp), start, steps, tolerance, seed, journal)
+    interrupted = False
+
+    def seconds() -> float:
+        return earlier + time.perf_counter() - began
+
+    def keep() -> None:
+        if checkpoint is not None:
+            file.write({"journal": journal.state(), "seconds": seconds()})
+
+    def result() -> PoseFit:
+        best: Pose = search.best
+        history = list(search.history)
+        cameras = [task.lens(one, best) for one in given_cameras]
+        return PoseFit(
+            best.R, best.t, float(best.scale), cameras[0], search.loss, len(history), seconds(),
+            search.converged and not interrupted, interrupted, search.explained, history, task, cameras,
+        )  # fmt: skip
+
+    total = max(search.planned, journal.steps)
+    bar = tqdm(total=total, initial=journal.steps, desc="fit", unit="step", disable=not progress, leave=False)
+
+    def after_step() -> None:
+        last = search.history[-1]
+        bar.set_postfix_str(f"{last.size[1]} × {last.size[0]} px, loss {last.loss:.2e}", refresh=False)
+        bar.total = max(bar.total, bar.n + 1)
+        bar.update()
+        if callback is not None:
+            callback(result())
+        if journal.steps % checkpoint_every == 0:
+            keep()
+
+    search.after_step = after_step
+    try:
+        search.run()
+        if search.explained < ENOUGH:
+            _warn_if_upside_down(task, search, init is None, max_size, spp)
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        bar.close()
+    keep()
+    return result()
+
+
+def _warn_if_upside_down(task: PoseTask, search: Search, place: bool, max_size: int, spp: int) -> None:
+    """Where a fit to the pictures turned over finds in them what it did not find as they are."""
+    turned = task.turned_over()
+    start = placed(turned) if place else search.start
+    again = Search(turned, turned.pyramid(start, max_size, spp), start, search.steps, search.tolerance, search.seed)
+    found = again.first_end()
+    if found >= max(ENOUGH, search.explained + BETTER):
+        say_upside_down(
+            search.task.names.target, f"it shows {found:.0%} of the render's edges, as given {search.explained:.0%}"
+        )

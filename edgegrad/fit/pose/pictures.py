@@ -1,0 +1,131 @@
+"""Pictures of a fit: what was compared, how the loss fell, and how the mesh moved."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
+
+from ...files.paths import PathLike, replacing
+from ..plots import comparison, displayed, draw_gradients
+from .result import PoseFit, Step
+from .task import Level, PoseTask
+
+PANEL, FRAME = 512, 256  # most pixels on a side of a panel, in draw_fit and in draw_animation
+FRAMES = 30
+SPP = 64
+FAINT = "#c4c4c4"
+
+
+def draw_fit(path: PathLike, fit: PoseFit) -> None:
+    """Writes target | start | fit | difference as one image; with a mask all over black, as they were compared.
+
+    Raises ValueError for a fit that did not take a step or came from JSON, OSError when the file cannot be written.
+    """
+    figure = sheet(fit)
+    with replacing(path) as temporary:
+        figure.savefig(temporary)
+
+
+def sheet(fit: PoseFit) -> Figure:
+    """What draw_fit writes: a row for each picture."""
+    task = _task(fit)
+    level = _level(task, PANEL)
+    start, end = (task.pictures(level, step.pose) for step in (fit.history[0], _way(fit)[-1]))
+    return comparison([(shot.target, a, b) for shot, a, b in zip(level.shots, start, end, strict=True)])
+
+
+def draw_loss(path: PathLike, fit: PoseFit) -> None:
+    """Writes what curves_of() draws. Raises ValueError, or OSError when the file cannot be written."""
+    figure = curves_of(fit)
+    with replacing(path) as temporary:
+        figure.savefig(temporary)
+
+
+def curves_of(fit: PoseFit) -> Figure:
+    """The loss of every step, one colour for each level of the image pyramid, grey where a search came to nothing; and the norms
+    of the gradient.
+
+    Raises ValueError for a fit that did not take a step or came from JSON.
+    """
+    _task(fit)
+    # The last entry of a whole fit is no step but the final comparison, which has less noise.
+    history = fit.history[:-1] if len(fit.history) > 1 and not fit.interrupted else fit.history
+    begins = [k for k, step in enumerate(history) if k == 0 or step.size != history[k - 1].size]
+    sizes = sorted({step.size for step in history})
+    figure = Figure(figsize=(6.4, 4.8), dpi=200, layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    above.plot(range(1, len(history) + 1), [step.loss for step in history], ".", color=FAINT, markersize=4)
+    labelled = set()
+    for begin, end in zip(begins, [*begins[1:], len(history)], strict=True):
+        best = [k for k in range(begin, end) if history[k].best]
+        h, w = history[begin].size
+        color = colormaps["viridis"](0.85 * sizes.index((h, w)) / max(1, len(sizes) - 1))
+        label = None if (h, w) in labelled else f"{w} × {h} px"  # later ones are of second opinions
+        labelled.add((h, w))
+        above.plot([k + 1 for k in best], [history[k].loss for k in best], ".-", color=color, label=label)
+    above.set_yscale("log")
+    above.set_ylabel("mean squared difference")
+    above.spines[["top", "right"]].set_visible(False)
+    above.legend(frameon=False, fontsize=8, title="best so far", title_fontsize=8)
+    draw_gradients(below, [step.gradient for step in history])
+    return figure
+
+
+def draw_animation(path: PathLike, fit: PoseFit) -> None:
+    """Writes target | fit | difference on the way from start to end as an animated WebP.
+
+    Raises ValueError for a fit that did not take a step or came from JSON, OSError when the file cannot be written.
+    """
+    task = _task(fit)
+    level = _level(task, FRAME)
+    target = displayed(level.shots[0].target)
+    font = ImageFont.load_default(max(9, round(0.05 * target.shape[0])))
+    frames = []
+    for step in _frames(_way(fit)):
+        image = displayed(task.pictures(level, step.pose)[0])
+        panels = np.concatenate([target, image, np.clip(2.0 * np.abs(image - target), 0, 1)], 1)
+        frame = Image.fromarray((panels * 255.0).round().astype(np.uint8))
+        edge = round(0.03 * frame.height)
+        for k, title in enumerate(("target", f"fit at {max(step.size)} px", "difference x 2")):
+            place = k * frame.width // 3 + edge, edge
+            ImageDraw.Draw(frame).text(place, title, "white", font, stroke_width=1, stroke_fill="black")
+        frames.append(frame)
+    durations = [1000, *[200] * (len(frames) - 2), 2500][-len(frames) :]  # milliseconds
+    with replacing(path) as temporary:
+        frames[0].save(temporary, save_all=True, append_images=frames[1:], duration=durations, loop=0, quality=85)
+
+
+def _task(fit: PoseFit) -> PoseTask:
+    if fit.task is None or not fit.history:
+        raise ValueError(
+            "fit: expected one that took a step, got one without; draw what fit_pose returns, not from_json"
+        )
+    return fit.task
+
+
+def _way(fit: PoseFit) -> list[Step]:
+    """The best poses in turn; the last one is what the fit returned."""
+    return [step for step in fit.history if step.best]
+
+
+def _frames(way: list[Step]) -> list[Step]:
+    """The steps that moved the mesh by more than a FRAMES-th of the whole way, and the ends."""
+    poses = torch.stack([step.pose.matrix[:3] for step in way])
+    left = poses - poses[-1]
+    # Rotation and translation count alike, each in proportion to the whole way.
+    turn, shift = (part.flatten(1).norm(dim=1) for part in (left[..., :3], left[..., 3:]))
+    far = turn / (turn.max() + 1e-30) + shift / (shift.max() + 1e-30)
+    kept = [0]
+    for k in range(1, len(way) - 1):
+        if abs(float(far[k] - far[kept[-1]])) > 2.0 / FRAMES:
+            kept.append(k)
+    return [way[k] for k in kept] + ([way[-1]] if len(way) > 1 else [])
+
+
+def _level(task: PoseTask, most: int) -> Level:
+    """The whole picture, at most so many pixels on its longer side."""
+    size = task.shots[0].camera.size
+    return task.level(min(1.0, most / max(size)), blur=0.0, coarseness=1.0, spp=SPP, free=[])

@@ -1,0 +1,80 @@
+"""A pose: mesh to world, and what was found of the lens."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...check import check_finite, check_shape
+
+
+class Pose(NamedTuple):
+    """Mesh to world, `world = scale · R v + t`, and the focal length relative to the given camera's. All float64."""
+
+    R: Tensor  # (3, 3)
+    t: Tensor  # (3,) world units
+    scale: Tensor  # ()
+    focal: Tensor  # ()
+    principal: Tensor = torch.zeros(2, dtype=torch.float64)  # how far the point moved, in widths of the image
+    distortion: Tensor = torch.zeros(8, dtype=torch.float64)  # what is added to the camera's
+
+    @property
+    def matrix(self) -> Tensor:
+        """(4, 4) float64, for column vectors."""
+        last = self.t.new_tensor([[0.0, 0.0, 0.0, 1.0]])
+        return torch.cat([torch.cat([self.scale * self.R, self.t[:, None]], 1), last])
+
+    @property
+    def numbers(self) -> list[float]:
+        """All of them, one after the other."""
+        return [number for field in self for number in field.flatten().tolist()]
+
+    @staticmethod
+    def of(numbers: list[float]) -> Pose:
+        """From `numbers`."""
+        R, t, scale, focal, principal, distortion = torch.tensor(numbers, dtype=torch.float64).split([9, 3, 1, 1, 2, 8])
+        return Pose(R.reshape(3, 3), t, scale[0], focal[0], principal, distortion)
+
+
+def pose_from_matrix(name: str, matrix: object) -> Pose:
+    """A pose from a 4 × 4 similarity for column vectors. Raises TypeError or ValueError."""
+    if not isinstance(matrix, Tensor):
+        try:
+            matrix = torch.tensor(matrix, dtype=torch.float64)  # lists would become float32
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name}: expected 4 × 4 numbers, got something else ({error})") from error
+    M = matrix.detach().cpu().double()
+    check_shape(name, M, (4, 4))
+    check_finite(name, M)
+    if M[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        raise ValueError(f"{name}: expected the last row 0, 0, 0, 1, got {M[3].tolist()}; is it transposed?")
+    det = float(torch.linalg.det(M[:3, :3]))
+    if det <= 0:
+        raise ValueError(f"{name}: expected a rotation times a scale above 0, got determinant {det:.3g}; flip one axis")
+    scale = det ** (1 / 3)
+    R = M[:3, :3] / scale
+    # 1e-3: far above what writing a matrix with six digits leaves, far below any shear that one means.
+    if (error := float((R @ R.T - torch.eye(3)).abs().max())) > 1e-3:
+        raise ValueError(
+            f"{name}: expected a rotation times a scale, got |R Rᵀ − 1| up to {error:.2g}; remove the shear"
+        )
+    U, _, Vh = torch.linalg.svd(R)
+    one = torch.ones((), dtype=torch.float64)
+    return Pose(U @ Vh, M[:3, 3].clone(), scale * one, one)
+
+
+def rotation(vector: Tensor) -> Tensor:
+    """(3, 3) by a rotation vector (3,), radians, differentiable: the exponential of its cross-product matrix."""
+    x, y, z = vector.unbind()
+    o = torch.zeros_like(x)
+    return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o]).reshape(3, 3))
+
+
+def angle(A: Tensor, B: Tensor) -> float:
+    """Radians of the rotation that takes A (3, 3) to B. By the sine and the cosine, for the cosine alone has no digits near 0."""
+    R = A.T @ B
+    sine = 0.5 * torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]).norm()
+    return math.atan2(float(sine), float(0.5 * (R.trace() - 1.0)))

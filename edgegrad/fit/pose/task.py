@@ -1,0 +1,370 @@
+"""What fit_pose compares, on each level of an image pyramid, and how a step moves the pose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ...aovs import render_aovs
+from ...camera.camera import Camera
+from ...check import as_tensor, check_finite, check_float, check_shape
+from ...scene.mesh import Mesh
+from ...scene.scene import Scene
+from ..views import area_mean, before_black, check_image
+from .pose import Pose, rotation
+
+COARSEST = 24  # pixels across the object where the fit begins: 15 % of its size is then a few pixels
+SMALLEST = 12  # pixels on the shorter side of the coarsest level
+BLURS = (1.5, 1.0)  # standard deviation in pixels on the coarsest levels; none on the finer ones
+MOST_SPP = 64  # samples a pixel on coarse levels
+FADED = 0.25  # of a picture behind the render, where the background is not known
+EVEN = (
+    0.1,
+    0.3,
+)  # a border is clutter when so large a share of it is farther from its median than this part of the range
+
+# A step has these entries: a rotation vector about the centre and a shift, both along the first camera's axes, logarithms
+# of scale and focal length, the principal point in widths of the image, and the lens's distortion. The first of each:
+TURN, SHIFT, GROW, ZOOM, PRINCIPAL, BEND = 0, 3, 6, 7, 8, 10
+ENTRIES = 18
+PARTS = {  # of a step, by name
+    "rotation": range(TURN, SHIFT), "shift": range(SHIFT, GROW), "scale": range(GROW, ZOOM), "focal": range(ZOOM, PRINCIPAL),
+    "principal": range(PRINCIPAL, BEND), "distortion": range(BEND, ENTRIES),
+}  # fmt: skip
+
+
+class Lens(NamedTuple):
+    """What is sought beside the pose."""
+
+    scale: bool = False
+    focal: bool = False
+    principal: bool = False
+    distortion: int = 0  # coefficients
+
+
+class Shot(NamedTuple):
+    """One picture at one resolution."""
+
+    camera: Camera
+    target: Tensor  # (h, w, C), blurred
+    background: Tensor | None  # (C,) or (h, w, C), not blurred: that comes after the render
+    weight: Tensor | None  # (h, w, 1)
+
+
+class Level(NamedTuple):
+    """The task at one resolution."""
+
+    shots: list[Shot]
+    blur: float  # pixels
+    coarseness: float  # size of a pixel, relative to the finest level's
+    spp: int
+    free: list[int]  # entries of a step that are sought
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(h, w) of the first picture."""
+        return self.shots[0].camera.size
+
+
+class Names(NamedTuple):
+    """What a function calls its arguments, for errors."""
+
+    mesh: str = "mesh"
+    target: str = "target"
+    init: str = "init"
+    lens: tuple[str, ...] = ("fit_scale", "fit_focal")  # of the entries of a Lens
+
+
+@dataclass(frozen=True)
+class PoseTask:
+    """What is compared, and how a pose moves. Geometry is float64."""
+
+    scene: Scene
+    aovs: tuple[str, ...]  # what is compared, one after the other: "image", "alpha" or both
+    shots: list[Shot]  # the pictures, whole
+    clutter: bool  # what stands behind the object is not known: where it is not seen, nothing is compared
+    extent: float  # norm over the channels of the pictures' range, of colours where there are any
+    center: Tensor  # (3,) of the bounding box, in the mesh's units
+    size: float  # its diagonal at the start, world units
+    free: list[int]  # entries of a step that are sought
+    names: Names
+
+    @staticmethod
+    def of(
+        mesh: Mesh | Scene, target: Any, camera: Any, mask: Any, weight: Any, background: Tensor | float | None,
+        lens: Lens, scale: float, names: Names,
+    ) -> PoseTask:  # fmt: skip
+        """`scale` is the mesh's at the start. Raises TypeError or ValueError."""
+        if not isinstance(mesh, Mesh | Scene):
+            raise TypeError(
+                f"{names.mesh}: expected a Mesh or a Scene, got {type(mesh).__name__}; load one with load_mesh(path)"
+            )
+        # Copies, for autograd does not keep tensors that were made in torch.inference_mode().
+        scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu", copy=True)
+        plain = all(part.channels is None for part in scene.meshes)
+        if mask is not None and background is not None:
+            raise ValueError("background: expected None with a mask, got both; the mask leaves no background")
+        shots, clutter = [], False
+        for name, view, picture, shape, count in _shots(camera, target, mask, weight, names):
+            image = check_image(f"{names.target}{name}", picture, view.size)
+            C = image.shape[-1] if plain else scene.channels
+            if image.shape[-1] != C:
+                raise ValueError(
+                    f"{names.target}{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
+                    "read it with read_image(path, channels=3), or give its alpha as the mask"
+                )
+            if count is not None:
+                count = check_image(f"weight{name}", count, view.size)
+                check_shape(f"weight{name}", count, (*view.size, 1))
+                if not bool((count >= 0).all()):
+                    raise ValueError(f"weight{name}: expected numbers from 0 up, got {float(count.min()):g}")
+            behind = None
+            if mask is not None:
+                shape = check_image(f"mask{name}", shape, view.size)
+                check_shape(f"mask{name}", shape, (*view.size, 1))
+                image = shape if plain else torch.cat([before_black(image, shape)[0], shape], -1)
+            else:
+                behind = background if background is not None else scene.background
+                if behind is None:
+                    clutter = clutter or is_clutter(image)
+                behind = _background(behind, image)
+            shots.append(Shot(view.to("cpu", torch.float64, copy=True), image, behind, count))
+        if clutter:
+            shots = [shot._replace(background=None) for shot in shots]
+        aovs = ("image", "alpha") if clutter or (mask is not None and not plain) else ("image",)
+        aovs = ("alpha",) if mask is not None and plain else aovs
+
+        double = [part.replace(verts=part.verts.detach().double()) for part in scene.meshes]
+        low, high = torch.cat([part.verts for part in double]).aminmax(dim=0)
+        size = float((high - low).norm() * scale)
+        if size == 0.0:
+            raise ValueError(
+                f"{names.mesh}: expected vertices apart from one another, got all in one place; check the file's units"
+            )
+        # One picture tells size from distance only together, and a parallel projection shows no distance at all.
+        orthographic = all(shot.camera.projection == "orthographic" for shot in shots)
+        depth = len(shots) > 1 or (not orthographic and not lens.scale)
+        if lens.scale and lens.focal and orthographic:
+            raise ValueError("fit_focal: expected False with fit_scale and an orthographic camera, where both are one")
+        free = [0, 1, 2, 3, 4] + [5] * depth + [GROW] * lens.scale + [ZOOM] * lens.focal
+        free += [PRINCIPAL, PRINCIPAL + 1] * lens.principal + list(range(BEND, BEND + lens.distortion))
+        seen = torch.cat([shot.target.flatten(0, 1) for shot in shots])
+        colours = (
+            seen[:, :-1] if aovs == ("image", "alpha") and not clutter else seen
+        )  # a mask's range says nothing of theirs
+        # A black object before nothing has no range of colours.
+        extent = next((r for x in (colours, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
+        if extent == 0.0:
+            raise ValueError(
+                f"{'mask' if mask is not None else names.target}: expected a picture of the object, got the same in every pixel; "
+                "was it read or rendered right?"
+            )
+        bare = scene.replace(meshes=double, background=None)
+        return PoseTask(bare, aovs, shots, clutter, extent, (low + high) / 2, size, free, names)
+
+    def pyramid(self, start: Pose, max_size: int, spp: int) -> list[Level]:
+        """From coarse to fine. Raises ValueError when the object is behind the camera."""
+        camera = self.shots[0].camera
+        H, W = camera.size
+        finest = min(1.0, max_size / max(H, W))
+        depth = float(depth_of(camera, start, self.center))
+        perspective = camera.projection != "orthographic"
+        if perspective and depth <= 0:
+            raise ValueError(
+                f"{self.names.init}: expected the object in front of the camera, got its centre at depth {depth:.3g}"
+            )
+        across = finest * focal_of(camera) * self.size / (depth if perspective else 1.0)  # pixels
+        halvings = round(math.log2(max(1.0, min(across / COARSEST, finest * min(H, W) / SMALLEST))))
+        factors = [finest / 2**n for n in range(halvings, -1, -1)]
+        factors += [finest] * (len(BLURS) + 1 - len(factors))
+        blurs = [*BLURS, *[0.0] * (len(factors) - len(BLURS))]
+        # Perspective shows in fine detail only: on a blurred level the focal length would run away.
+        blind = [entry for entry in self.free if entry < ZOOM]
+        levels = []
+        for factor, blur in zip(factors, blurs, strict=True):
+            coarseness = finest / factor
+            samples = max(spp, min(MOST_SPP, round(spp * coarseness**2)))
+            levels.append(self.level(factor, blur, coarseness, samples, blind if blur else self.free))
+        return levels
+
+    def turned_over(self) -> PoseTask:
+        """With the pictures upside down."""
+        shots = [
+            Shot(
+                shot.camera, shot.target.flip(0),
+                shot.background.flip(0) if shot.background is not None and shot.background.dim() == 3 else shot.background,
+                None if shot.weight is None else shot.weight.flip(0),
+            )
+            for shot in self.shots
+        ]  # fmt: skip
+        return replace(self, shots=shots)
+
+    def level(self, factor: float, blur: float, coarseness: float, spp: int, free: list[int]) -> Level:
+        """The task with the pictures' sides multiplied by `factor`."""
+        shots = []
+        for camera, target, behind, weight in self.shots:
+            H, W = camera.size
+            size = max(1, round(H * factor)), max(1, round(W * factor))
+            if behind is not None and behind.dim() == 3:
+                behind = area_mean(behind, size)
+            weight = None if weight is None else area_mean(weight, size)
+            shots.append(Shot(camera.resized(size), blurred(area_mean(target, size), blur), behind, weight))
+        return Level(shots, blur, coarseness, spp, free)
+
+    def moved(self, pose: Pose, free: list[int], p: Tensor) -> Pose:
+        """The pose after a step whose entries `free` are p, the others zero; differentiable in p."""
+        step = p.new_zeros(ENTRIES).index_put((torch.tensor(free),), p)
+        camera = self.shots[0].camera
+        view = camera.world_to_camera
+        R = rotation(view[:3, :3].T @ step[TURN:SHIFT]) @ pose.R
+        center = (
+            view[:3, :3] @ (pose.scale * (pose.R @ self.center) + pose.t) + view[:3, 3] + self.size * step[SHIFT:GROW]
+        )
+        scale, zoom = pose.scale * step[GROW].exp(), step[ZOOM].exp()
+        perspective = camera.projection != "orthographic"
+        if PRINCIPAL in free and perspective:
+            # Undone by a shift, what is left is the change of perspective, and the entries hardly disturb one another.
+            aside = step[PRINCIPAL:BEND] * camera.size[1] / focal_of(camera) / pose.focal.detach()
+            center = torch.cat([center[:2] - aside * center[2:].detach(), center[2:]])
+        if ZOOM in free and perspective:
+            # A longer lens enlarges the object. Undone by distance, or by scale where that is sought, what is left of
+            # the zoom is the change of perspective.
+            if GROW in free:
+                scale = scale / zoom
+            else:
+                center = torch.cat([center[:2], center[2:] * zoom])
+        t = view[:3, :3].T @ (center - view[:3, 3]) - scale * (R @ self.center)
+        bend = pose.distortion + step[BEND:]
+        return Pose(R, t, scale, pose.focal * zoom, pose.principal + step[PRINCIPAL:BEND], bend)
+
+    def lens(self, camera: Camera, pose: Pose) -> Camera:
+        """The camera with what was found of its lens."""
+        if ZOOM not in self.free and PRINCIPAL not in self.free and BEND not in self.free:
+            return camera
+        K = zoomed(camera.K, pose.focal.to(camera.K))
+        if PRINCIPAL in self.free:
+            across = torch.zeros_like(K)
+            across[0, 2] = across[1, 2] = camera.size[1]
+            K = K + across * torch.cat([pose.principal, pose.principal.new_zeros(1)]).to(K)[:, None]
+        fields: dict[str, Any] = {"K": K}
+        if BEND in self.free:
+            bend = pose.distortion[: self.free[-1] + 1 - BEND].to(K)
+            given = camera.distortion
+            if given is not None and len(given) > len(bend):
+                bend = torch.cat([bend, bend.new_zeros(len(given) - len(bend))])
+            fields["distortion"] = bend if given is None else bend + F.pad(given, (0, len(bend) - len(given)))
+        return camera.replace(**fields)
+
+    def images(self, level: Level, pose: Pose, spp: int, seed: int) -> list[Tensor]:
+        """The renders (h, w, C), blurred like the pictures, differentiable in the pose."""
+        moved = self.scene.transformed(pose.R, pose.t, pose.scale)
+        images = []
+        for k, shot in enumerate(level.shots):
+            scene = moved.replace(background=shot.background)
+            channels = render_aovs(
+                scene, self.lens(shot.camera, pose), self.aovs, spp=spp, seed=(seed + 977 * k) % 2**32
+            )
+            images.append(blurred(torch.cat([channels[name] for name in self.aovs], -1), level.blur))
+        return images
+
+    def pictures(self, level: Level, pose: Pose, seed: int = 0) -> list[Tensor]:
+        """The renders as pictures: over the background where that is known, else over the faded target; without an alpha that
+        was compared beside them only because of that."""
+        with torch.no_grad():
+            images = self.images(level, pose, level.spp, seed)
+        if not self.clutter:
+            return images
+        return [
+            image[..., :-1] + (1.0 - image[..., -1:]) * FADED * shot.target
+            for image, shot in zip(images, level.shots, strict=True)
+        ]
+
+
+def _shots(camera: Any, target: Any, mask: Any, weight: Any, names: Names) -> list[tuple[str, Camera, Any, Any, Any]]:
+    """Suffix of the arguments' names, camera, picture, mask and weight of each view. Raises TypeError or ValueError."""
+    several = isinstance(camera, Sequence) and not isinstance(camera, str)
+    cameras: list[Any] = list(camera) if several else [camera]
+    if not cameras:
+        raise ValueError("camera: expected at least one, got none")
+    columns = []
+    for name, value, needed in ((names.target, target, True), ("mask", mask, False), ("weight", weight, False)):
+        if value is None and not needed:
+            columns.append([None] * len(cameras))
+        elif not several:
+            columns.append([value])
+        elif not isinstance(value, (Sequence, Tensor)) or len(value) != len(cameras):
+            got = len(value) if isinstance(value, (Sequence, Tensor)) else type(value).__name__
+            raise ValueError(f"{name}: expected {len(cameras)}, one for each camera, got {got}")
+        else:
+            columns.append(list(value))
+    for i, one in enumerate(cameras):
+        if not isinstance(one, Camera):
+            raise TypeError(f"camera: expected a Camera, got {type(one).__name__}; make one with Camera.look_at(…)")
+        if one.batch is not None:
+            raise ValueError(f"camera: expected one camera, got {one.batch}; give a list of cameras, and of pictures")
+        if one.world_to_camera.dtype != one.K.dtype:
+            cameras[i] = one.to(torch.float64)
+    suffixes = [f"[{i}]" for i in range(len(cameras))] if several else [""]
+    return list(zip(suffixes, cameras, *columns, strict=True))
+
+
+def depth_of(camera: Camera, pose: Pose, point: Tensor) -> Tensor:
+    """Of a point of the mesh, along the camera's axis."""
+    view = camera.world_to_camera.double()
+    return (view[:3, :3] @ (pose.matrix[:3, :3] @ point + pose.t) + view[:3, 3])[2]
+
+
+def focal_of(camera: Camera) -> float:
+    """Pixels, the geometric mean of both axes."""
+    return float(torch.linalg.det(camera.K[:2, :2].double()).abs().sqrt())
+
+
+def is_clutter(picture: Tensor) -> bool:
+    """Whether the border of (H, W, C) is of many colours, so that none of them is the background."""
+    border = _border(picture)
+    extent = (picture.amax((0, 1)) - picture.amin((0, 1))).clamp(min=1e-30)
+    off = ((border - border.median(dim=0).values).abs() / extent).amax(1)
+    return float((off > EVEN[0]).float().mean()) > EVEN[1]
+
+
+def _border(picture: Tensor) -> Tensor:
+    return torch.cat([picture[0], picture[-1], picture[1:-1, 0], picture[1:-1, -1]])
+
+
+def _background(value: Tensor | float | None, picture: Tensor) -> Tensor:
+    """(C,) or (H, W, C). Raises TypeError or ValueError."""
+    H, W, C = picture.shape
+    if value is None:
+        return _border(picture).median(dim=0).values
+    behind = as_tensor("background", value, like=picture).detach().cpu()
+    if behind.dim() == 0:
+        behind = behind.expand(C)
+    check_float("background", behind)
+    check_shape("background", behind, (C,), (H, W, C), fix="it needs the picture's size and channels")
+    check_finite("background", behind)
+    return behind.float()
+
+
+def zoomed(K: Tensor, factor: Tensor) -> Tensor:
+    """K with its focal lengths multiplied; the principal point stays."""
+    lens = torch.zeros_like(K)
+    lens[:2, :2] = K[:2, :2].detach()
+    return K + (factor - 1.0) * lens
+
+
+def blurred(image: Tensor, sigma: float) -> Tensor:
+    """Gaussian blur by `sigma` pixels; the border's pixels are repeated outwards."""
+    if sigma == 0.0:
+        return image
+    radius = math.ceil(3.0 * sigma)
+    kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1).to(image) / sigma) ** 2)
+    kernel = kernel / kernel.sum()
+    rows = F.pad(image.movedim(-1, 0)[:, None], (radius, radius, radius, radius), mode="replicate")
+    rows = F.conv2d(F.conv2d(rows, kernel.reshape(1, 1, -1, 1)), kernel.reshape(1, 1, 1, -1))
+    return rows[:, 0].movedim(0, -1)

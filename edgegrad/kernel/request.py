@@ -1,0 +1,260 @@
+"""What a render is asked, as records of tensors and numbers. Operators of torch take flat arguments of a few types: each
+record is packed into them and unpacked again here, by the names of its fields, and nobody else counts positions.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple, get_type_hints
+
+import torch
+from torch import Tensor
+
+from ..camera.camera import Camera
+from ..camera.lens import MOST
+from ..camera.mistakes import warn_if_behind
+from ..check import as_int, check_not_meta, check_positive, check_positive_int, check_shape
+from ..library import core
+from ..scene.mesh import Mesh
+from ..scene.scene import Scene, as_scene
+from .flat import Flat, flatten
+
+FILTERS = ("box", "tent", "gaussian")
+
+
+class PackedCamera(NamedTuple):
+    """B cameras as the kernel reads them."""
+
+    world_to_camera: Tensor  # (B, 4, 4) float64
+    K: Tensor  # (B, 3, 3) float64
+    distortion: Tensor  # (B, 8) float64, zeros after the coefficients that there are
+    perspective: bool
+    lens: str
+    height: int
+    width: int
+
+
+class Channels(NamedTuple):
+    """What the image has beside the radiance, in this order (csrc/shading/attributes.h)."""
+
+    alpha: bool  # 1 wherever a face is seen
+    vertex_attributes: Tensor  # (B, V, n) float64, interpolated over the faces
+    unit: int  # the first of three of these that are a direction, given the length 1 once interpolated; −1: none
+    face_attributes: Tensor  # (F, m) float64, of whole faces
+    barycentrics: bool  # 3 channels
+    uv: bool  # 2 channels; all faces have texture coordinates
+
+
+class ImageOptions(NamedTuple):
+    spp: int
+    filter: str
+    seed: int
+
+
+class GradientOptions(NamedTuple):
+    surface_samples: int  # −1: the default
+    edge_samples: int  # −1: the default
+    grad_seed: int
+    channels_vary: bool  # over a face; if not, moving it changes nothing inside
+    visibility: bool  # whether what moves at silhouettes and other jumps counts
+    step_spacing: float  # px between the lines along which steps are looked for
+
+
+class Request(NamedTuple):
+    """All that an image and its gradient depend on."""
+
+    scene: Flat
+    camera: PackedCamera
+    beside: Channels
+    image: ImageOptions
+    gradient: GradientOptions
+
+    def pack(self) -> tuple[Any, ...]:
+        return (*self.scene, *self.camera, *self.beside, *self.image, *self.gradient)
+
+    @classmethod
+    def unpack(cls, values: Sequence[Any]) -> Request:
+        records, first = [], 0
+        for record in RECORDS:
+            end = first + len(record._fields)
+            records.append(record(*values[first:end]))
+            first = end
+        return cls(*records)
+
+    @property
+    def cameras(self) -> int:
+        return self.camera.world_to_camera.shape[0]
+
+    @property
+    def channels(self) -> int:
+        return self.scene.background.shape[-1]
+
+    def slot(self, name: str) -> Tensor:
+        """The tensor of a gradient slot."""
+        return getattr(next(record for record in self if name in record._fields), name)
+
+
+RECORDS: tuple[Any, ...] = (Flat, PackedCamera, Channels, ImageOptions, GradientOptions)
+FIELDS = tuple(field for record in RECORDS for field in record._fields)
+_TYPES = tuple(get_type_hints(record)[field] for record in RECORDS for field in record._fields)
+IS_TENSOR = tuple(kind is Tensor for kind in _TYPES)
+_NAMES = {Tensor: "Tensor", bool: "bool", int: "int", float: "float", str: "str", list[float]: "float[]"}
+# The arguments of the operators.
+SCHEMA = ", ".join(f"{_NAMES[kind]} {field}" for field, kind in zip(FIELDS, _TYPES, strict=True))
+
+# What a gradient can be asked for, from the kernel's table (csrc/scene/gradients.h), and where it is among the packed values.
+SLOTS: tuple[str, ...] = core.GRADIENT_SLOTS
+POSITIONS = tuple(FIELDS.index(name) for name in SLOTS)
+_LABELS = {"texels": "texture", "alphas": "alpha"}
+PER_CAMERA = (*PackedCamera._fields, "vertex_attributes")  # slots with a row for each camera
+MOVING = ("verts", *(name for name in SLOTS if name in PackedCamera._fields))  # slots that move the image
+APPEARANCE = ("colors", "uvs", "texels", "vertex_attributes", "face_attributes")
+STEPPING = (*MOVING, "uvs", "alphas")  # slots that move what is cut out, and the borders of nearest texels
+
+
+def label(slot: str) -> str:
+    """What the user calls it."""
+    return _LABELS.get(slot, slot)
+
+
+def tensors_of(packed: Sequence[Any]) -> list[Tensor]:
+    return [value for value, is_tensor in zip(packed, IS_TENSOR, strict=True) if is_tensor]
+
+
+def others_of(packed: Sequence[Any]) -> list[Any]:
+    return [value for value, is_tensor in zip(packed, IS_TENSOR, strict=True) if not is_tensor]
+
+
+def join(tensors: Sequence[Tensor], others: Sequence[Any]) -> list[Any]:
+    """The packed values of tensors_of() and others_of()."""
+    packed, t, o = [], 0, 0
+    for is_tensor in IS_TENSOR:
+        packed.append(tensors[t] if is_tensor else others[o])
+        t, o = t + is_tensor, o + (not is_tensor)
+    return packed
+
+
+def required(request: Request) -> tuple[str, ...]:
+    """The slots that a backward pass will be asked for: none under torch.no_grad()."""
+    return tuple(name for name in SLOTS if torch.is_grad_enabled() and request.slot(name).requires_grad)
+
+
+class Work(NamedTuple):
+    """Which terms the backward pass runs: what the kernel is told, and what plan() tells."""
+
+    motion: bool  # inside faces, of what moves them: vertices and camera
+    appearance: bool  # inside faces, of colours, textures and texture coordinates
+    boundary: bool  # at edges, of what moves them
+    steps: bool  # where faces are cut out, and at the borders of nearest texels
+
+    @classmethod
+    def of(cls, request: Request, wanted: Collection[str]) -> Work:
+        options = request.gradient
+        moves = any(name in wanted for name in MOVING)
+        appearance = any(name in wanted for name in APPEARANCE)
+        steps = request.scene.has_steps and any(name in wanted for name in STEPPING)
+        return cls(
+            moves and options.channels_vary, appearance, moves and options.visibility, steps and options.visibility
+        )
+
+
+# -- from what the user gives -------------------------------------------------------------------------------------------
+
+
+def make_request(
+    scene: Scene | Mesh,
+    camera: Camera,
+    spp: int = 16,
+    seed: int = 0,
+    *,
+    surface_samples: int | None = None,
+    edge_samples: int | None = None,
+    visibility: bool = True,
+    filter: str = "box",
+    grad_seed: int | None = None,
+    step_spacing: float = 1.0,
+    all_uvs: bool = False,
+) -> Request:
+    """The arguments of render(), checked; and whether texture coordinates that nothing needs are taken along. Raises TypeError
+    or ValueError."""
+    scene = as_scene(scene)
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
+    spp = check_positive_int("spp", spp, most=1 << 20)
+    seed = _check_seed("seed", seed)
+    grad_seed = derived_seed(seed) if grad_seed is None else _check_seed("grad_seed", grad_seed)
+    surface, edge = (
+        -1 if n is None else check_positive_int(name, n, most=1 << 40)
+        for name, n in (("surface_samples", surface_samples), ("edge_samples", edge_samples))
+    )
+    if not isinstance(visibility, bool):
+        raise TypeError(f"visibility: expected True or False, got {type(visibility).__name__} ({visibility!r})")
+    if filter not in FILTERS:
+        raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {filter!r}")
+    step_spacing = check_positive("step_spacing", step_spacing, least=1 / 64, most=64)
+    if scene.background is not None and scene.background.dim() == 3:
+        check_shape("background", scene.background, (*camera.size, "C"), fix="give it the camera's size")
+    _check_devices(scene, camera)
+
+    flat = flatten(scene, all_uvs)
+    if torch.compiler.is_compiling():
+        # Dynamo does not trace a function that is given one tensor twice; corners of vertex colours are the faces.
+        flat = flat._replace(corners=flat.corners.clone())
+    packed = pack_camera(camera)
+    if packed.perspective and packed.lens in ("pinhole", "brown-conrady"):  # others see what lies there
+        warn_if_behind(flat.verts, packed.world_to_camera)
+    cameras, V, F = len(packed.K), len(flat.verts), len(flat.faces)
+    return Request(
+        flat,
+        packed,
+        Channels(False, flat.verts.new_empty((cameras, V, 0)), -1, flat.verts.new_empty((F, 0)), False, False),
+        ImageOptions(spp, filter, seed),
+        GradientOptions(surface, edge, grad_seed, _radiance_varies(scene), visibility, step_spacing),
+    )
+
+
+def pack_camera(camera: Camera) -> PackedCamera:
+    world_to_camera = camera.world_to_camera.cpu().double().reshape(-1, 4, 4)
+    K = camera.K.cpu().double().reshape(-1, 3, 3)
+    distortion = camera.coefficients.cpu().double()
+    distortion = torch.nn.functional.pad(distortion, (0, MOST - distortion.shape[-1])).reshape(-1, MOST)
+    B = max(world_to_camera.shape[0], K.shape[0], distortion.shape[0])
+    return PackedCamera(
+        world_to_camera.expand(B, 4, 4).contiguous(),
+        K.expand(B, 3, 3).contiguous(),
+        distortion.expand(B, MOST).contiguous(),
+        camera.projection != "orthographic",
+        camera.lens,
+        *camera.size,
+    )
+
+
+def _check_devices(scene: Scene, camera: Camera) -> None:
+    """Tensors may lie on any device that holds numbers. Raises ValueError."""
+    materials = [mesh.material for mesh in scene.meshes if mesh.material is not None]
+    textures = [texture for material in materials for texture in material.textures.values()]
+    for thing in (*scene.meshes, *materials, *textures, scene, *scene.lights, camera):
+        # Not vars(), at which torch.compile stops in torch 2.9 and before. Each light is a dataclass, though Light is none.
+        for field in dataclasses.fields(thing):  # pyright: ignore[reportArgumentType]
+            if isinstance(value := getattr(thing, field.name), Tensor):
+                check_not_meta(field.name, value)
+
+
+def _radiance_varies(scene: Scene) -> bool:
+    return any(
+        m.colors is not None or m.corner_colors is not None or (m.texture is not None and m.filter != "nearest")
+        for m in scene.meshes
+    )
+
+
+def _check_seed(name: str, seed: object) -> int:
+    number = as_int(name, seed)
+    if not 0 <= number < 2**63:
+        raise ValueError(f"{name}: expected an int from 0 to 2⁶³ − 1, got {number}")
+    return number
+
+
+def derived_seed(seed: int, stream: int = 1) -> int:
+    """Another seed for each stream: multiplication by an odd number is a bijection, so no two seeds meet."""
+    return (seed * 0x5851F42D4C957F2D + stream * 0x14057B7EF767814F) & (2**63 - 1)

@@ -1,0 +1,64 @@
+"""Opens Embree and imports the compiled kernel."""
+
+from __future__ import annotations
+
+import atexit
+import importlib
+import importlib.metadata
+import importlib.util
+import os
+from typing import Any
+
+import torch  # noqa: F401  first, so that the kernel shares torch's OpenMP runtime
+
+HOW_TO_GET_EMBREE = (
+    "edgegrad needs the Embree 4 library that comes with the embreex package; install it with "
+    "`pip install 'embreex>=4.4,<5'` (wheels exist for x86-64 Linux, Windows and macOS)"
+)
+
+
+def embree_path() -> str:
+    """Path of libembree4 among the files of the installed embreex distribution. Raises ImportError."""
+    try:
+        files = importlib.metadata.distribution("embreex").files or []
+    except importlib.metadata.PackageNotFoundError:
+        raise ImportError(f"{HOW_TO_GET_EMBREE}; embreex is not installed") from None
+    for file in files:
+        if "embree4" in file.name and (".so" in file.name or file.suffix in (".dll", ".dylib")):
+            return str(file.locate())
+    raise ImportError(
+        f"{HOW_TO_GET_EMBREE}; the installed embreex {importlib.metadata.version('embreex')} carries no libembree4"
+    )
+
+
+def load() -> Any:
+    """The kernel module, with Embree open. Raises ImportError that says how to get what is missing.
+
+    Two environment variables serve its tests: EDGEGRAD_KERNEL, the file of another build of it, with sanitizers; and
+    EDGEGRAD_EMBREE, options of Embree's device, such as "max_isa=avx2" for what older processors run.
+    """
+    if path := os.environ.get("EDGEGRAD_KERNEL"):
+        spec = importlib.util.spec_from_file_location("edgegrad._core", path)
+        assert spec is not None and spec.loader is not None, f"EDGEGRAD_KERNEL: expected a compiled module, got {path}"
+        _core = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(_core)
+    else:
+        _core = importlib.import_module("edgegrad._core")
+
+    try:
+        _core.open_embree(embree_path(), os.environ.get("EDGEGRAD_EMBREE", ""))
+    except RuntimeError as error:
+        raise ImportError(f"{HOW_TO_GET_EMBREE}; {error}") from None
+    return _core
+
+
+core = load()
+# Without this a process that ends while daemon threads render is often aborted (csrc/python/unlocked.h).
+atexit.register(core.await_callers)
+# Without this a worker of a DataLoader, or of multiprocessing, that is forked after its parent rendered waits for ever.
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=core.before_fork,
+        after_in_parent=lambda: core.after_fork(child=False),
+        after_in_child=lambda: core.after_fork(child=True),
+    )

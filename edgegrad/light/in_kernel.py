@@ -1,0 +1,381 @@
+"""Radiance of lit surfaces by the kernel (csrc/shading/lit), with derivatives by all tensors of the scene, in reverse and in
+forward mode; radiance.py computes the same in PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..kernel.first_order import Tensors, apply, array, doubles, without_derivatives
+from ..kernel.flat import Flat
+from ..kernel.operators import kernel_scene
+from ..library import core
+from ..points.frame import Frame
+from ..points.hits import Hits
+from ..points.records import values_of
+from ..points.seeds import STEPS, mixed_bits
+from ..points.surfaces import Surfaces, View
+from ..scene.environment import Environment
+from ..scene.lights import DirectionalLight, Light, PointLight, SphericalHarmonics, SpotLight
+from ..scene.material import WRAPS, Parameter, Texture
+from ..scene.mesh import FILTERS, Mesh
+from ..scene.mesh_light import MeshLight
+from ..scene.scene import Scene
+
+_64_BITS = 2**64 - 1
+
+
+def is_fused(scene: Scene) -> bool:
+    """Whether the kernel shades a scene: not where textures have borders of texels, or levels by their footprints."""
+    if scene.channels > core.MOST_LIT_CHANNELS:
+        return False
+    textures = [t for m in scene.meshes if m.material is not None for t in m.material.textures.values()]
+    own = [mesh.filter for mesh in scene.meshes if mesh.texture is not None]
+    return all(filter == "linear" for filter in (*own, *(t.filter for t in textures)))
+
+
+def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
+    """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours; or zeros
+    with the same derivatives, for hits of which no more is wanted. What was found of shadows is noted in the hits."""
+    surfaces, view = hits._surfaces, hits._view
+    assert isinstance(view, View)
+    layout, tables = _layout(surfaces, view)
+    forced = hits._forced
+    points = _Points(
+        hits._face.cpu(),
+        hits._seed.cpu(),
+        *((None,) * 4 if forced is None else _forced(forced.points, forced.lit)),
+    )
+    number = -1 if forced is None else forced.light
+    only = number if hits.only_light else -1
+    samples = samples if only < 0 else 1
+    casters = surfaces.casters
+    # Of the derivatives alone nothing is computed ahead of them, once it is known of which lights shadows are asked.
+    known = not shadows or len(surfaces.shadowing) == len(surfaces.scene.casting)
+    values = hits.values or not known
+    shading = _Shading(
+        layout=layout, tables=len(tables), forced=number, shadows=shadows, samples=samples, only=only, values=values,
+        dtype=surfaces.verts.dtype, cutoffs=casters.cutoffs, spacing=casters.spacing,
+    )  # fmt: skip
+    arrays = (part for part in casters if isinstance(part, Tensor))
+    found, *kept = apply(shading, [hits._exact.cpu(), *points, *tables, *arrays])
+    if not values:
+        return found.to(surfaces.verts)
+    (seen,) = kept
+    column = 0
+    for light, casting in enumerate(surfaces.scene.casting):
+        if only not in (-1, light):
+            continue
+        own = seen[:, column]
+        if shadows and bool((own >= 0).any()):
+            surfaces.shadowing.add(light)
+            if casting.punctual:
+                hits.note_visibility(light, own)
+        column += 1 if casting.punctual else samples
+    return found.to(surfaces.verts)
+
+
+def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
+    """(H · W, C) of the scene's surfaces before black, without derivatives, at so many points of a face in a pixel."""
+    layout, tables = _layout(frame.fixed, frame.fixed_view)
+    seed, again = (int(frame.seeds(kind, 1)) & _64_BITS for kind in ("image", "image again"))
+
+    def compute(kernel: Any, faces: Tensor, arguments: dict[str, Any], *tables: Tensor) -> Sequence[Tensor]:
+        found, asked = kernel.lit_image(
+            lit=layout.kernel(tables, faces),
+            options=core.LitOptions(shadows=shadows, samples=samples, only=-1),
+            points=points,
+            seed=seed,
+            again=again,
+            **arguments,
+        )
+        return torch.from_numpy(found), torch.from_numpy(asked)
+
+    found, asked = frame.sampler.lit_image(compute, *tables)
+    if shadows:
+        lights = range(len(frame.surfaces.scene.casting))
+        frame.surfaces.shadowing.update(light for light in lights if asked[light, 0])
+    return frame.here(found)
+
+
+def light_on_faces(
+    verts: Tensor, faces: Tensor, view: View, infinite: list[bool], place: Tensor, power: Tensor
+) -> Tensor:
+    """(F, 3, L) float64 by csrc/shading/lit/flat_light.h: E max(0, n·l) at the corners of flat faces, over the greatest of them,
+    of points of light at places (L, 3), with power (L,) in W/sr, or W/m² of what is infinitely far away."""
+
+    def compute(*tensors: Tensor) -> Sequence[Tensor]:
+        verts, faces, eye, place, power = map(array, tensors)
+        threads = torch.get_num_threads()
+        found = core.light_on_faces(verts, faces, eye, view.perspective, place, infinite, power.tolist(), threads)
+        return (torch.from_numpy(found),)
+
+    tensors = (verts.double(), faces.int(), view.eye.double(), place.double(), power.double())
+    return without_derivatives(compute, *tensors)[0].to(verts.device)
+
+
+def _forced(points: Any, lit: Tensor) -> tuple[Tensor, ...]:
+    return points.index.cpu(), points.uv.cpu().double(), points.density.cpu().double(), lit.cpu().to(torch.uint8)
+
+
+class _Points(NamedTuple):
+    """Tensors of points; their barycentrics are an argument of their own."""
+
+    face: Tensor  # (N,) int64
+    seed: Tensor  # (N,) int64
+    index: Tensor | None  # pyright: ignore[reportIncompatibleMethodOverride]: those of a light whose shadow is known
+    uv: Tensor | None
+    density: Tensor | None
+    lit: Tensor | None  # (N,) uint8
+
+
+class _Tables:
+    """Tensors of a scene as tables on the CPU, each of them once."""
+
+    def __init__(self) -> None:
+        self.tensors: list[Tensor] = []
+
+    def add(self, tensor: Tensor | float | None, width: int) -> int:
+        """The number of the table with rows of this width; −1 where there is no tensor."""
+        if tensor is None:
+            return -1
+        tensor = torch.as_tensor(tensor).cpu()
+        if tensor.dtype not in (torch.float32, torch.float64):
+            tensor = tensor.double()
+        self.tensors.append(tensor.reshape(-1, width))
+        return len(self.tensors) - 1
+
+    def add_numbers(self, tensor: Tensor | float | None) -> int:
+        """All in one row."""
+        return -1 if tensor is None else self.add(tensor, torch.as_tensor(tensor).numel())
+
+
+class _Layout(NamedTuple):
+    """How the tables are a scene; all but the tables themselves."""
+
+    meshes: list[Any]
+    lamps: list[Any]
+    verts: int
+    eye: int
+    perspective: bool
+    channels: int
+    ball: list[float]
+
+    @classmethod
+    def of(cls, surfaces: Surfaces, view: View, tables: _Tables) -> _Layout:
+        scene = surfaces.scene
+        verts, seen_from = tables.add(surfaces.bare.verts, 3), tables.add(view.eye, 3)
+        firsts = np.cumsum([0, *(len(mesh.verts) for mesh in scene.meshes)])
+        meshes = [
+            _mesh(mesh, first, int(vertex), tables)
+            for mesh, first, vertex in zip(scene.meshes, surfaces.first_faces, firsts[:-1], strict=True)
+        ]
+        eps = torch.finfo(surfaces.verts.dtype).eps
+        still = (light for light in scene.lights if isinstance(light, SphericalHarmonics))
+        lamps = [_lamp(scene, light, k, eps, tables) for k, light in enumerate((*scene.casting, *still))]
+        center, radius = surfaces.ball
+        ball = [*map(float, values_of(center)[0]), radius]
+        return cls(meshes, lamps, verts, seen_from, view.perspective, scene.channels, ball)
+
+    def kernel(self, tables: Sequence[Tensor], faces: Tensor) -> Any:
+        parts = self._asdict()
+        return core.Lit(
+            tables=[array(t) for t in tables], faces=array(faces), step=[s & _64_BITS for s in STEPS], **parts
+        )
+
+
+def _layout(surfaces: Surfaces, view: View) -> tuple[_Layout, list[Tensor]]:
+    """How surfaces and a view are tables, and these; the same for all points that have no derivatives."""
+    if surfaces.layout is None or surfaces.layout[0] is not view:
+        tables = _Tables()
+        found = view, _Layout.of(surfaces, view, tables), tables.tensors
+        if surfaces.has_derivatives:
+            return found[1:]
+        surfaces.layout = found
+    return surfaces.layout[1:]
+
+
+def _mesh(mesh: Mesh, first_face: int, first_vertex: int, tables: _Tables) -> Any:
+    none, material = core.LitSource("constant"), mesh.material
+
+    def source(parameter: Parameter | float | None) -> Any:
+        return none if parameter is None else _source(mesh, parameter, tables)
+
+    color = none
+    if mesh.texture is not None:
+        color = _texture(mesh, Texture(mesh.texture, wrap=mesh.wrap), tables)
+    elif mesh.colors is not None:
+        color = core.LitSource("vertex", tables.add(mesh.colors, mesh.colors.shape[1]))
+    elif mesh.face_colors is not None:
+        color = core.LitSource("face", tables.add(mesh.face_colors, mesh.face_colors.shape[1]))
+    elif mesh.corner_colors is not None:
+        color = core.LitSource("corner", tables.add(mesh.corner_colors, mesh.corner_colors.shape[2]))
+    normal_rows = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
+    map_ = None if material is None else material.normal_map
+    return core.LitMesh(
+        first_face=first_face,
+        faces=len(mesh.faces),
+        first_vertex=first_vertex,
+        has_material=material is not None,
+        two_sided=material is None or material.two_sided,
+        lambertian=material is None or (material.metallic is None and material.roughness is None),
+        color=color,
+        base_color=source(None if material is None else material.base_color),
+        metallic=source(None if material is None else material.metallic),
+        roughness=source(None if material is None else material.roughness),
+        emission=source(None if material is None else material.emission),
+        normal_map=source(map_),
+        normal_scale=-1 if map_ is None or material is None else tables.add(material.normal_scale, 1),
+        normals=tables.add(mesh.normals, 3),
+        normal_faces=None if mesh.normals is None else _rows(normal_rows),
+    )
+
+
+def _source(mesh: Mesh, parameter: Parameter | float, tables: _Tables) -> Any:
+    if isinstance(parameter, Texture):
+        return _texture(mesh, parameter, tables)
+    value = torch.as_tensor(parameter)
+    if value.dim() == 2:
+        return core.LitSource("vertex", tables.add(value, value.shape[1]))
+    return core.LitSource("constant", tables.add_numbers(value))
+
+
+def _texture(mesh: Mesh, texture: Texture, tables: _Tables) -> Any:
+    uvs, uv_faces = (mesh.uvs, mesh.uv_faces) if texture.uvs is None else (texture.uvs, texture.uv_faces)
+    assert uvs is not None and uv_faces is not None
+    height, width, channels = texture.image.shape
+    return core.LitSource(
+        "texture",
+        tables.add(texture.image, channels),
+        tables.add_numbers(texture.factor),
+        tables.add(uvs, 2),
+        _rows(uv_faces),
+        height,
+        width,
+        [*(WRAPS.index(wrap) for wrap in texture.wraps), FILTERS.index("linear")],
+    )
+
+
+def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) -> Any:
+    stream = [mixed_bits(number * 0x10001 + k) for k in range(3)]
+
+    def lamp(kind: str, **fields: Any) -> Any:
+        return core.Lamp(kind, stream=stream, **{"eps": eps, **fields})
+
+    if isinstance(light, MeshLight):
+        mesh = next(i for i, mesh in enumerate(scene.meshes) if mesh is light.mesh)
+        running, density = values_of(*light._table)
+        # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
+        return lamp("mesh", mesh=mesh, running=running, density=density, eps=max(eps, 2.0**-40))
+    if isinstance(light, Environment):
+        running, density = values_of(*light._table)
+        height, width = light._size
+        return lamp(
+            "environment",
+            radiance=tables.add(light.radiance, light.radiance.shape[-1]),
+            rotation=tables.add_numbers(light.rotation),
+            height=height,
+            width=width,
+            is_image=light.radiance.dim() == 3,
+            running=running,
+            density=density,
+        )
+    if isinstance(light, SphericalHarmonics):
+        coefficients = tables.add(light.coefficients, light.coefficients.shape[1])
+        return lamp("spherical harmonics", radiance=coefficients, rotation=tables.add_numbers(light.rotation))
+    assert isinstance(light, (DirectionalLight, PointLight, SpotLight))
+    power = {"intensity": tables.add(light.intensity, 1), "color": tables.add_numbers(light.color)}
+    if isinstance(light, DirectionalLight):
+        return lamp("directional", direction=tables.add(light.direction, 3), **power)
+    if isinstance(light, PointLight):
+        return lamp("point", position=tables.add(light.position, 3), **power)
+    return lamp(
+        "spot",
+        position=tables.add(light.position, 3),
+        direction=tables.add(light.direction, 3),
+        inner_angle=tables.add(light.inner_angle, 1),
+        outer_angle=tables.add(light.outer_angle, 1),
+        **power,
+    )
+
+
+def _rows(index: Tensor) -> np.ndarray:
+    return values_of(index)[0].astype(np.int32)
+
+
+class _Shading(NamedTuple):
+    """csrc/shading/lit/lit.h, of the tensors (b, *points, *tables, *flat): the result is radiance (N, C) float64, and beside it
+    which samples of lights are seen, (N, K) int8, −1 where they are below the surface; or zeros with its derivatives alone."""
+
+    layout: _Layout
+    tables: int  # how many
+    forced: int  # the light whose shadow is known, −1: none
+    shadows: bool
+    samples: int
+    only: int  # the light of which alone radiance is wanted, −1: of all
+    values: bool
+    dtype: torch.dtype  # of the zeros
+    cutoffs: list[float]  # of the flat scene, whose other fields are tensors
+    spacing: list[float]
+
+    @property
+    def _first(self) -> int:
+        """Of the tables."""
+        return 1 + len(_Points._fields)
+
+    @property
+    def moving(self) -> Sequence[int]:
+        return 0, *range(self._first, self._first + self.tables)
+
+    def _flat(self, tensors: Tensors) -> Flat:
+        arrays = tensors[self._first + self.tables :]
+        return Flat(*arrays, cutoffs=self.cutoffs, spacing=self.spacing)  # pyright: ignore[reportArgumentType]
+
+    def _tables(self, tensors: Tensors) -> list[Tensor]:
+        return list(tensors[self._first : self._first + self.tables])  # pyright: ignore[reportReturnType]
+
+    def _arguments(self, tensors: Tensors) -> dict[str, Any]:
+        points = _Points(*tensors[1 : self._first])  # pyright: ignore[reportArgumentType]
+        arrays = {name: None if t is None else array(t) for name, t in points._asdict().items()}
+        b = tensors[0]
+        assert b is not None
+        return {
+            "lit": self.layout.kernel(self._tables(tensors), self._flat(tensors).faces),
+            "points": core.LitPoints(b=array(b), forced_lamp=self.forced, **arrays),
+            "options": core.LitOptions(shadows=self.shadows, samples=self.samples, only=self.only),
+            "threads": torch.get_num_threads(),
+        }
+
+    def _shade(self, tensors: Tensors) -> tuple[Tensor, Tensor]:
+        found, seen = kernel_scene(self._flat(tensors)).shade(values=self.values, **self._arguments(tensors))
+        return torch.from_numpy(found), torch.from_numpy(seen)
+
+    def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
+        if self.values:
+            return self._shade(tensors)
+        b = tensors[0]
+        assert b is not None
+        return (torch.zeros((len(b), self.layout.channels), dtype=self.dtype),)
+
+    def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
+        arguments = {"bar": doubles(bar), "wanted": list(wanted[1:]), **self._arguments(tensors)}
+        if kept:
+            (seen,) = kept
+            assert seen is not None
+            found, b_bar = core.shade_vjp(seen=array(seen), **arguments)
+        else:
+            found, b_bar = kernel_scene(self._flat(tensors)).look_and_shade_vjp(**arguments)
+        none = bar.new_zeros(0)
+        return [torch.from_numpy(b_bar), *(none if g is None else torch.from_numpy(g) for g in found)]
+
+    def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
+        seen = kept[0] if kept else self._shade(tensors)[1]
+        assert seen is not None
+        b_dot, *rest = (doubles(tangent) for tangent in tangents)
+        return torch.from_numpy(
+            core.shade_jvp(seen=array(seen), tangents=rest, b_dot=b_dot, **self._arguments(tensors))
+        )

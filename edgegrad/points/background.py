@@ -1,0 +1,37 @@
+"""What lies behind all surfaces: environments that a scene shows."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..camera.poses import constant
+from ..kernel.derivatives import moves
+from ..scene.environment import Environment
+from .frame import Frame
+
+AT_ONCE = 1 << 16  # pixels whose rays are held at a time
+
+
+def environments(frame: Frame) -> Tensor | None:
+    """(H, W, C): the environments that are shown, each pixel the mean of four places in it; None where there are none."""
+    scene = frame.surfaces.scene
+    shown = [light for light in scene.lights if isinstance(light, Environment) and light.visible]
+    if scene.background is not None or not shown:
+        return None
+    y, x = torch.meshgrid(torch.arange(frame.height), torch.arange(frame.width), indexing="ij")
+    corner = torch.stack([x, y], -1).reshape(-1, 2).double()
+    offsets = torch.tensor([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]], dtype=torch.float64)
+    back = torch.linalg.inv(frame.view.world_to_camera[:3, :3])
+    parts = []
+    for pixels in corner.split(AT_ONCE):
+        rays = frame.sampler.rays_at((pixels[:, None] + offsets).reshape(-1, 2))
+        along = rays.along
+        if moves(frame.intrinsics):
+            along = along + rays.along_by_k @ (frame.intrinsics - frame.intrinsics.detach())
+        if not frame.view.perspective:
+            along = torch.zeros_like(along) + constant([0.0, 0.0, 1.0], along)
+        direction = frame.here(along) @ back.mT
+        total = torch.stack([light.towards(direction).expand(-1, scene.channels) for light in shown]).sum(0)
+        parts.append(total.reshape(len(pixels), 4, -1).mean(1))
+    return torch.cat(parts).reshape(frame.height, frame.width, -1).to(frame.dtype)

@@ -1,0 +1,81 @@
+"""Surfaces that one sees through (glTF's alpha mode BLEND): rays go on behind them, surface after surface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ..scene.appearance import OnMesh
+from ..scene.textures import look_up
+from .frame import Frame
+from .hits import Hits
+from .records import trace
+
+MOST = 8  # surfaces in a row; what lies behind the last is left out
+
+
+class Blended:
+    """A shader of all that is seen at a point: α L + (1 − α) L_behind (Porter and Duff 1984, "over")."""
+
+    def __init__(self, frame: Frame, shader: Callable[[Hits], Tensor], background: Callable[[], Tensor | None]) -> None:
+        self._frame, self._shader, self._background = frame, shader, background
+
+    def __call__(self, hits: Hits) -> Tensor:
+        return self._from(hits, MOST)
+
+    def _from(self, hits: Hits, left: int) -> Tensor:
+        radiance = self._shader(hits)
+        alpha = opacity(hits).to(radiance.dtype)
+        with torch.no_grad():
+            through = (alpha < 1)[:, 0].nonzero()[:, 0]
+        if left == 1 or len(through) == 0:
+            return radiance
+        behind = self._behind(hits.subset(through), radiance.shape[1], left).to(radiance.dtype)
+        return (alpha * radiance).index_add(0, through, (1 - alpha[through]) * behind)
+
+    def _behind(self, hits: Hits, channels: int, left: int) -> Tensor:
+        """(N, C) what rays meet behind hits."""
+        frame = self._frame
+        with torch.no_grad():
+            found = trace(hits._surfaces.bare, hits.position.double(), -hits.view.double(), hits._face)
+            face = frame.here(found.face)
+            meets = (face >= 0).nonzero()[:, 0]
+            x, seed = hits.pixel.double().cpu(), hits._seed[meets]
+        total = self._behind_all(x, channels)
+        if len(meets) == 0:
+            return total
+        x = x[meets.cpu()]
+        if hits._surfaces is frame.surfaces:
+            next_ = frame.moving_hits(face[meets], frame.sampler.rays_at(x), x, seed)
+        else:
+            next_ = frame.fixed_hits(face[meets], frame.here(found.b)[meets], x, seed)
+        radiance = self._from(next_, left - 1)
+        return total.to(radiance.dtype).index_copy(0, meets, radiance)
+
+    def _behind_all(self, x: Tensor, channels: int) -> Tensor:
+        """(N, C) the background at places (N, 2)."""
+        frame, background = self._frame, self._background()
+        if background is None:
+            return frame.fixed.verts.new_zeros((len(x), channels))
+        if background.dim() == 1:
+            return background.expand(len(x), -1)
+        column, row = (x[:, k].floor().long().clamp(0, n - 1) for k, n in enumerate((frame.width, frame.height)))
+        return background[frame.here(row), frame.here(column)]
+
+
+def opacity(hits: Hits) -> Tensor:
+    """(N, 1): the alpha of meshes that blend, at most 1; 1 elsewhere."""
+    surfaces = hits._surfaces
+    alpha = surfaces.verts.new_ones((len(hits), 1))
+    for index, mesh in enumerate(surfaces.scene.meshes):
+        if not mesh.blends:
+            continue
+        assert mesh.alpha is not None and mesh.uvs is not None and mesh.uv_faces is not None
+        rows = (surfaces.mesh_of_face[hits._face] == index).nonzero()[:, 0]
+        at = OnMesh(mesh, hits._face[rows] - surfaces.first_faces[index], hits._barycentrics[rows])
+        uv = at.interpolated(mesh.uvs, mesh.uv_faces)
+        found = look_up(mesh.alpha.to(surfaces.verts.device)[..., None], uv, mesh.wraps, mesh.filter)
+        alpha = alpha.index_copy(0, rows, found.to(alpha).clamp(0, 1))
+    return alpha

@@ -1,0 +1,78 @@
+"""Pixels that borders of a shader's steps, or of shadows, run through: there one point of a face is a poor estimate of the
+pixel.
+
+A pixel is one of them where a step is on different sides in the pixels around it. What was found in the pixel itself is not
+asked: whether it is shaded again, with other points, must not depend on the points that it then does without, or the mean
+over seeds would be off.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..check import values_visible
+from .hits import Hits
+from .steps import FLOOR
+
+MOST = 8  # times the points of a face in a pixel
+SHARE = 4  # times the points of the first pass, in all
+LEVELS = 1 << 14  # after which the sides of a step repeat here, so that small integers hold them
+
+
+class Borders:
+    """Of an image of `size` (height, width), from a first pass over all of its pixels, at so many points of a face in each."""
+
+    def __init__(self, size: tuple[int, int], points: int) -> None:
+        self._size, self._each = size, points
+        self._points = torch.zeros(size[0] * size[1], dtype=torch.int32)
+        self._least: list[Tensor] = []  # (H · W,) for each step
+        self._greatest: list[Tensor] = []
+        self._known = True
+
+    def add(self, pixel: Tensor, hits: Hits) -> None:
+        """Points of the pixels (N,), after they were shaded."""
+        steps = list(zip(hits._steps.kinds, hits._steps.values, strict=True))
+        self._known = self._known and values_visible(*(values for _, values in steps if values is not None))
+        # Where a light has an extent each point sees another part of it, and what neighbours see says nothing of borders.
+        lights = [k for k, light in enumerate(hits.lights) if light.punctual]
+        if not self._known or not (steps or lights):
+            return
+        sides = [None if values is None else _sides(kind, values) for kind, values in steps]
+        sides += [hits.lit.get(k) for k in lights]
+        self._points += torch.bincount(pixel, minlength=len(self._points)).int()
+        for k, side in enumerate(sides):
+            if k == len(self._least):
+                self._least.append(torch.full_like(self._points, LEVELS, dtype=torch.int16))
+                self._greatest.append(torch.full_like(self._points, -1, dtype=torch.int16))
+            if side is None:
+                continue
+            side = side.cpu().to(torch.int16)
+            self._least[k].scatter_reduce_(0, pixel, torch.where(side < 0, LEVELS, side), "amin")
+            self._greatest[k].scatter_reduce_(0, pixel, side, "amax")
+
+    def found(self) -> tuple[Tensor, int]:
+        """The pixels (H, W) bool, and how many points of each face in them are to be shaded."""
+        differ = torch.zeros(self._size, dtype=torch.bool)
+        if not self._known:
+            return differ, 1
+        for least, greatest in zip(self._least, self._greatest, strict=True):
+            low, high = -_around(-least.reshape(self._size), -LEVELS), _around(greatest.reshape(self._size), -1)
+            differ |= (low < high) & (high >= 0)
+        first, there = int(self._points.sum()), int(self._points[differ.reshape(-1)].sum())
+        return differ, self._each * min(MOST, max(2, SHARE * first // max(there, 1)))
+
+
+def _sides(kind: str, values: Tensor) -> Tensor:
+    """(N,) int16: on which side of a step points are; −1 where it was not asked."""
+    values = values.detach()
+    side = values.double().nan_to_num().floor() % LEVELS if kind == FLOOR else values > 0
+    return side.to(torch.int16).masked_fill(~torch.isfinite(values), -1)
+
+
+def _around(values: Tensor, outside: int) -> Tensor:
+    """(H, W): the greatest of the eight neighbours of each pixel, with this value beyond the border."""
+    padded = torch.nn.functional.pad(values, (1, 1, 1, 1), value=outside)
+    beside = torch.maximum(padded[:, :-2], padded[:, 2:])
+    three = torch.maximum(beside, padded[:, 1:-1])
+    return torch.maximum(beside[1:-1], torch.maximum(three[:-2], three[2:]))

@@ -1,0 +1,117 @@
+"""One image of a scene: what all points in it share, whatever they are taken for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from ..kernel.derivatives import moves
+from ..kernel.operators import camera_seed
+from ..kernel.request import Request
+from ..scene.scene import Scene
+from .hits import Hits
+from .records import RayRecords, Sampler, SurfaceRecords, barycentrics, without_colors
+from .seeds import sample_seeds
+from .shadow_rays import Forced
+from .splat import Term, attached
+from .steps import Steps
+from .surfaces import Surfaces, View
+
+_Rays = TypeVar("_Rays", bound=RayRecords | SurfaceRecords)
+SAMPLES = ("image", "inside", "edges", "steps", "shadows", "image again")  # kinds that draw numbers of their own
+
+
+class Frame:
+    """One image of a scene: what all its samples share."""
+
+    def __init__(self, scene: Scene, request: Request, index: int = 0) -> None:
+        packed = request.camera
+        self.request, self._index = request._replace(scene=without_colors(request.scene)), index
+        self.surfaces = Surfaces(scene, self.request.scene)
+        self.device, self.dtype = self.surfaces.verts.device, self.surfaces.verts.dtype
+        self.sampler = Sampler(self.request, index, torch.finfo(self.dtype).eps ** (2 / 3))
+        self.view = View(packed.world_to_camera[index].to(self.device, torch.float64), packed.perspective)
+        self.fixed, self.fixed_view = self.surfaces.detach(), self.view.detach()
+        self.intrinsics = torch.cat([packed.K[index, :2].reshape(6), packed.distortion[index]])
+        self.height, self.width = packed.height, packed.width
+
+    @property
+    def pixels(self) -> int:
+        return self.height * self.width
+
+    def here(self, tensor: Tensor) -> Tensor:
+        """On the device of the scene."""
+        return tensor.to(self.device)
+
+    def seeds(self, kind: str, count: int, first: int = 0) -> Tensor:
+        """(count,) int64: of the samples of a kind from `first` on."""
+        request = self.request
+        seed = camera_seed(request.image.seed, self._index) if kind.startswith("image") else self.sampler.grad_seed
+        return self.here(sample_seeds(seed, SAMPLES.index(kind), first, count))
+
+    def seeds_of_pixels(self, kind: str, pixel: Tensor, each: int) -> Tensor:
+        """(N,) int64: of hits in the pixels (N,), in their order, about `each` in one. A pixel has the same ones whatever the
+        others see, so that the images of a scene and of one that is moved a little differ by little."""
+        row = torch.arange(len(pixel))
+        begins = torch.ones(len(pixel), dtype=torch.bool)
+        begins[1:] = pixel[1:] != pixel[:-1]
+        among = row - torch.where(begins, row, 0).cummax(0).values if len(pixel) else row
+        return self.seeds(kind, 1) + self.here(each * pixel + among)
+
+    def fixed_hits(
+        self,
+        face: Tensor,
+        b: Tensor,
+        x: Tensor,
+        seed: Tensor | None = None,
+        steps: Steps | None = None,
+        forced: Forced | None = None,
+    ) -> Hits:
+        """Without derivatives; b (N, 3), or the last two barycentrics."""
+        place = self.here(face), self.here(b if b.shape[1] == 3 else barycentrics(b)), self.here(x)
+        return Hits(self.fixed, self.fixed_view, *place, self.sampler.rays_at, steps, seed, forced)
+
+    @property
+    def no_hits(self) -> Hits:
+        """None of them: for what a shader notes of the scene, such as where it jumps."""
+        none = torch.zeros(0, dtype=torch.int64)
+        return self.fixed_hits(
+            none, torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.float64), none
+        )
+
+    def moving_hits(
+        self, face: Tensor, rays: RayRecords | SurfaceRecords, x: Tensor, seed: Tensor | None = None
+    ) -> Hits:
+        """Functions of vertices and camera, at fixed places in the image."""
+        face = self.here(face)
+        b = self.view.barycentrics(self.surfaces, face, self.here(self._moving(rays).along))
+        return Hits(
+            self.surfaces, self.view, face, b, self.here(x), lambda x: self._moving(self.sampler.rays_at(x)), seed=seed
+        )
+
+    def _moving(self, rays: _Rays) -> _Rays:
+        """The rays as functions of the intrinsics, at fixed places in the image."""
+        if not moves(self.intrinsics):
+            return rays
+        moved = rays.along_by_k @ (self.intrinsics - self.intrinsics.detach()).to(rays.along_by_k.device)
+        return rays._replace(along=rays.along + moved)
+
+    def image(self, pixel: Tensor, values: Tensor, pixels: range | None = None) -> Tensor:
+        """(H · W, C), or of these pixels: the sums of rows of values (N, C) by pixel."""
+        pixels = pixels or range(self.pixels)
+        return values.new_zeros((len(pixels), values.shape[1])).index_add(0, self.here(pixel) - pixels.start, values)
+
+    def attached(self, image: Tensor, terms: Sequence[Term]) -> Tensor:
+        """The image, and of terms (H · W, C) their derivatives."""
+        return attached(image.reshape(self.pixels, -1), terms, self.request).reshape(image.shape)
+
+    def composed(self, image: Tensor, background: Tensor | None) -> Tensor:
+        """(H, W, C), before a background (C,) or (H, W, C)."""
+        image = image.reshape(self.height, self.width, -1)
+        if background is None:
+            return image
+        coverage = self.here(self.sampler.coverage).to(image.dtype)
+        return image + (1 - coverage)[:, :, None] * background.to(image)

@@ -1,0 +1,293 @@
+"""Parts of a renderer to build others from: rays, the hits of an image, samples inside faces and on edges.
+
+render(…, shader=fn) is made of them:
+
+    primary = primary_hits(scene, camera)
+    with torch.no_grad():
+        image = primary.image(fn(primary.hits), background)
+    inside = surface_samples(primary)
+    image = image + zero_of(inside.image(fn(inside.hits)))       # x − x.detach(): the gradient inside faces
+    edges = edge_samples(primary)
+    with torch.no_grad():
+        jump = edges.jump(fn(edges.hits))
+    image = attach_boundary(image, edges, jump, background)      # the gradient of what moves at silhouettes
+
+Or with less: the image of primary_hits with a graph has the gradient inside faces by itself.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..camera.camera import Camera
+from ..check import as_tensor, check_finite, check_float, check_positive_int, check_shape
+from ..kernel.derivatives import moves
+from ..kernel.request import Request, make_request
+from ..scene.mesh import Mesh
+from ..scene.scene import Scene, as_scene
+from .frame import Frame
+from .hits import Hits
+from .moving import Form, velocity
+from .records import CurveRecords, SurfaceRecords, shaded_room, without_colors
+from .shadow_rays import Forced
+from .shadows import ShadowLight
+from .splat import Term, boundary, splat
+from .surfaces import every_face
+
+ALL_AT_ONCE = 1 << 40
+
+
+class PrimaryHits:
+    """What the rays of an image hit: all samples of a pixel on one face are one hit, at one of them drawn at random.
+
+    hits      Hits, N points, differentiable functions of vertices and camera at fixed places in the image
+    index     (N,) int64, the pixel of each, row by row
+    weight    (N,) the share of the pixel's samples on that face
+    coverage  (H, W) the share of each pixel that is covered
+    """
+
+    def __init__(self, scene: Scene, request: Request) -> None:
+        self.frame = frame = Frame(scene, request)
+        ((_, found),) = frame.sampler.pixel_hits(ALL_AT_ONCE)
+        seed = frame.seeds_of_pixels("image", found.pixel, 1)
+        self.hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, seed)
+        self.index, self.weight = frame.here(found.pixel), frame.here(found.weight).to(frame.dtype)
+        self.coverage = frame.here(frame.sampler.coverage)
+
+    def __repr__(self) -> str:
+        return f"PrimaryHits({len(self.hits)} points in {self.frame.height} x {self.frame.width} pixels)"
+
+    def image(self, radiance: Tensor, background: Tensor | None = None) -> Tensor:
+        """(H, W, C) from the radiance (N, C) of the hits, before a background (C,) or (H, W, C).
+
+        Its gradient by the radiance, and so inside faces, is right; that of what moves at edges is not in it. Raises TypeError
+        or ValueError that names the argument.
+        """
+        radiance = _rows("radiance", radiance, len(self.hits))
+        background = _background(background, radiance, self.frame)
+        sums = self.frame.image(self.index, self.weight.to(radiance.dtype)[:, None] * radiance)
+        return self.frame.composed(sums, background)
+
+
+class SurfaceSamples:
+    """Samples inside faces, where the image sees them.
+
+    hits    Hits, S points, differentiable functions of vertices and camera at fixed places in the image
+    weight  (S,) px² that each stands for
+    """
+
+    def __init__(self, frame: Frame, records: SurfaceRecords, first: int = 0) -> None:
+        self.frame, self._records, self._first = frame, records, first
+        self.weight = frame.here(records.weight)
+        self._hits: Hits | None = None
+
+    def __len__(self) -> int:
+        return len(self._records.face)
+
+    def __repr__(self) -> str:
+        return f"SurfaceSamples({len(self)} points)"
+
+    def part(self, first: int, end: int) -> SurfaceSamples:
+        """Some of them."""
+        return SurfaceSamples(self.frame, SurfaceRecords(*(part[first:end] for part in self._records)), first)
+
+    @property
+    def hits(self) -> Hits:
+        if self._hits is None:
+            seed = self.frame.seeds("inside", len(self), self._first)
+            self._hits = self.frame.moving_hits(self._records.face, self._records, self._records.x, seed)
+        return self._hits
+
+    def image(self, radiance: Tensor) -> Tensor:
+        """(H, W, C) from the radiance (S, C) of the samples: an estimate of the image before black whose gradient is that inside
+        faces, for its weights stand for areas of the image and not for shares of a pixel's samples. Raises TypeError or
+        ValueError that names the argument."""
+        radiance = _rows("radiance", radiance, len(self))
+        weighted = self.weight.to(radiance.dtype)[:, None] * radiance
+        return self.frame.composed(splat(self._records.x, weighted, self.frame.request), None)
+
+    def _term(self, radiance: Tensor) -> Term:
+        """The same, for attached()."""
+        return Term(self._records.x, radiance, self._records.weight)
+
+
+class EdgeSamples:
+    """Samples on the curves where the image jumps: silhouettes, borders, intersections and creases, and
+    the rim where a lens folds or ends.
+
+    hits      Hits, the N points on their surfaces, at most three a sample; without derivatives
+    sample    (N,) int64, whose each is
+    x         (S, 2) places in the image, px
+    velocity  (S,) of the curve across itself, times the length that a sample stands for: its value is zero, its derivative is
+              that of the place by vertices and camera
+    """
+
+    def __init__(
+        self, frame: Frame, records: CurveRecords, light: ShadowLight | None = None, only: bool = False
+    ) -> None:
+        """Of borders of the shadow of a light; `only`: the hits, those in the light alone, ask what it adds."""
+        self.frame, self._records = frame, records
+        self.x = frame.here(records.x)
+        self._in_order = only and len(records.hit_sample) == len(records.x)  # whether the i-th hit is the i-th sample's
+        self.sample, self._factor = frame.here(records.hit_sample), frame.here(records.hit_factor)
+        of_hits = slice(None) if self._in_order else self.sample
+        self.to_background = frame.here(records.to_background)
+        points = None
+        if light is not None:
+            points, share = light.points(frame.here(records.light), frame.here(records.light_uv))
+            self._factor, self.to_background = self._factor * share[of_hits], self.to_background * share
+        # All sides of a sample see the same points of lights.
+        seed = frame.seeds("edges" if light is None else "shadows", len(self))[of_hits]
+        forced = None
+        if light is not None and points is not None:
+            lit = frame.here(records.hit_side == 0).to(frame.dtype)
+            some = torch.ones_like(lit, dtype=torch.bool)
+            forced = Forced(light.number, points.select(of_hits), lit, some, only)
+        self.hits = frame.fixed_hits(records.hit_face, records.hit_b, records.hit_x, seed, forced=forced)
+        flat = frame.request.scene
+        forms = [
+            (Form(records.row_of, records.vertex, records.by_q), frame.view.in_camera(frame.surfaces.verts)),
+            (Form(records.uv_row_of, records.uv, records.by_uv), flat.uvs),
+            (Form(records.alpha_row_of, records.alpha, records.by_alpha[:, None]), flat.alphas[:, :1]),
+        ]
+        every = torch.arange(len(self))
+        if len(records.by_k):
+            forms.append((Form(every, torch.zeros_like(every), records.by_k), frame.intrinsics[None]))
+        if light is not None and points is not None and (moves(frame.view.world_to_camera) or light.moves(light.light)):
+            place = light.light.place(points).double()
+            place = frame.view.turned(place) if light.light.infinite else frame.view.in_camera(place)
+            forms.append((Form(every, every, records.by_light), place))
+        self.velocity = frame.here(velocity(len(self), forms))
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __repr__(self) -> str:
+        return f"EdgeSamples({len(self)} samples, {len(self.hits)} points)"
+
+    def jump(self, radiance: Tensor) -> Tensor:
+        """(S, C) how the image jumps at each sample, from the radiance (N, C) of the hits; a background comes in by
+        attach_boundary(). Raises TypeError or ValueError that names the argument."""
+        return self.sum(_rows("radiance", radiance, len(self.hits)))
+
+    def sum(self, radiance: Tensor) -> Tensor:
+        """(S, C) from the radiance (N, C)."""
+        weighted = self._factor.to(radiance.dtype)[:, None] * radiance
+        if self._in_order:
+            return weighted
+        return radiance.new_zeros((len(self), radiance.shape[1])).index_add(0, self.sample, weighted)
+
+
+# -- what users call ----------------------------------------------------------------------------------------------------
+
+
+def primary_hits(
+    scene: Scene | Mesh,
+    camera: Camera,
+    spp: int = 16,
+    seed: int = 0,
+    *,
+    filter: str = "box",
+    grad_seed: int | None = None,
+) -> PrimaryHits:
+    """What the rays of an image hit: render()'s samples, for a pipeline of your own. The arguments are render()'s, with one
+    camera. Raises what render() raises."""
+    request = make_request(scene, camera, spp, seed, filter=filter, grad_seed=grad_seed)
+    if camera.batch is not None:
+        raise ValueError(f"camera: expected one camera, got a batch of {camera.batch}; take camera[i] one by one")
+    return PrimaryHits(as_scene(scene), request)
+
+
+def surface_samples(primary: PrimaryHits, count: int | None = None) -> SurfaceSamples:
+    """Samples for the gradient inside faces, fewer than those of the image: by default half a sample a pixel of surface.
+
+    primary   of primary_hits()
+    count     of samples; see surface_samples of render()
+
+    Raises TypeError or ValueError that names the argument, MemoryError if so many do not fit.
+    """
+    request = _request_of(primary, "surface_samples", count)
+    with shaded_room(request._replace(gradient=request.gradient._replace(edge_samples=0)), gradient=True):
+        moving = moves(primary.frame.intrinsics)
+        surface, _ = primary.frame.sampler.samples(request, interior=True, boundary=False, intrinsics=moving)
+    return SurfaceSamples(primary.frame, surface)
+
+
+def edge_samples(primary: PrimaryHits, count: int | None = None, creases: bool | Tensor = True) -> EdgeSamples:
+    """Samples for the gradient of what moves at edges.
+
+    primary   of primary_hits()
+    count     of samples; see edge_samples of render()
+    creases   at which edges between two visible faces radiance may jump: True, at all; False, at none; or numbers at the corners
+              of faces (F, 3, K), at those where these differ on both sides
+
+    Raises TypeError or ValueError that names the argument, MemoryError if so many do not fit.
+    """
+    request = _request_of(primary, "edge_samples", count)
+    F = len(primary.frame.surfaces.faces)
+    attributes = None
+    if isinstance(creases, Tensor):
+        check_float("creases", creases)
+        check_shape("creases", creases, (F, 3, "K"))
+        check_finite("creases", creases)
+        attributes = creases.detach().cpu()
+    elif creases is True:
+        attributes = every_face(F)
+    elif creases is not False:
+        raise TypeError(f"creases: expected True, False or a tensor (F, 3, K), got {type(creases).__name__}")
+    request = request._replace(scene=without_colors(request.scene, attributes))
+    frame = primary.frame
+    with shaded_room(request._replace(gradient=request.gradient._replace(surface_samples=0)), gradient=True):
+        _, curves = frame.sampler.samples(
+            request, interior=False, boundary=True, intrinsics=moves(frame.intrinsics), steps=request.scene.has_steps
+        )
+    return EdgeSamples(frame, curves)
+
+
+def attach_boundary(image: Tensor, samples: EdgeSamples, jump: Tensor, background: Tensor | None = None) -> Tensor:
+    """The image, with the gradient of what moves at edges: its value is the same.
+
+    image       (H, W, C)
+    samples     of edge_samples()
+    jump        (S, C) samples.jump(…), without derivatives
+    background  (C,) or (H, W, C) behind all surfaces; black when None
+
+    In reverse and in forward mode, once. Raises TypeError or ValueError that names the argument.
+    """
+    if not isinstance(samples, EdgeSamples):
+        raise TypeError(f"samples: expected what edge_samples() returned, got {type(samples).__name__}")
+    frame = samples.frame
+    jump = _rows("jump", jump, len(samples)).detach()
+    image = as_tensor("image", image, like=jump, floating=True)
+    check_float("image", image)
+    check_shape("image", image, (frame.height, frame.width, jump.shape[1]))
+    background = _background(background, jump, frame)
+    terms = boundary(samples.x, samples.velocity, jump, samples.to_background, background)
+    return frame.attached(image, terms)
+
+
+def _request_of(primary: PrimaryHits, name: str, count: int | None) -> Request:
+    if not isinstance(primary, PrimaryHits):
+        raise TypeError(f"primary: expected what primary_hits() returned, got {type(primary).__name__}")
+    request = primary.frame.request
+    if count is None:
+        return request
+    number = check_positive_int("count", count, most=1 << 40)
+    return request._replace(gradient=request.gradient._replace(**{name: number}))
+
+
+def _rows(name: str, value: Tensor, count: int) -> Tensor:
+    value = as_tensor(name, value, floating=True)
+    check_float(name, value)
+    check_shape(name, value, (count, "C"))
+    return value
+
+
+def _background(background: Tensor | None, like: Tensor, frame: Frame) -> Tensor | None:
+    if background is None:
+        return None
+    background = as_tensor("background", background, like=like, floating=True)
+    check_float("background", background)
+    check_shape("background", background, (like.shape[1],), (frame.height, frame.width, like.shape[1]))
+    return background

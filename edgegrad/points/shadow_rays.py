@@ -1,0 +1,49 @@
+"""Rays from points of surfaces to points of lights: where they end, and what is known of them before they are cast."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..scene.lights import Light, LightPoints
+from .surfaces import Surfaces
+
+THIN = (
+    2.0**-40
+)  # where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself
+
+
+class Forced(NamedTuple):
+    """What is known of the shadow of one light at some points, instead of being drawn and traced."""
+
+    light: int  # place in scene.casting
+    points: LightPoints  # N of them
+    lit: Tensor  # (N,) 0 or 1
+    some: Tensor  # (N,) bool: at which points; elsewhere light points are drawn, and shadow rays cast
+    only: bool = False  # whether nothing is wanted but what this light adds
+
+    def select(self, index: Tensor | slice) -> Forced:
+        return Forced(self.light, self.points.select(index), self.lit[index], self.some[index], self.only)
+
+    def among(self, drawn: LightPoints) -> LightPoints:
+        """These at some points, those that were drawn elsewhere."""
+        return LightPoints(
+            torch.where(self.some, self.points.index, drawn.index),
+            torch.where(self.some[:, None], self.points.uv, drawn.uv),
+            torch.where(self.some, self.points.density, drawn.density),
+        )
+
+
+def seen_from(light: Light, points: LightPoints, surfaces: Surfaces, here: Tensor) -> tuple[Tensor, Tensor]:
+    """Where shadow rays from `here` (N, 3) end, (N, 3) float64, and (N,) how near to their ends nothing hides anything: sixteen
+    times the spacing of the numbers. Of a light at infinity they end outside of the ball that holds the scene."""
+    place = light.place(points).detach().to(surfaces.verts.device, torch.float64)
+    spacing = torch.finfo(surfaces.verts.dtype).eps
+    size = here.abs().amax(1)
+    if light.infinite:
+        center, radius = surfaces.ball
+        return here + place * ((here - center).norm(dim=1, keepdim=True) + 1.01 * radius), 16 * spacing * size
+    size = torch.maximum(size, place.abs().amax(1))
+    return place, 16 * (spacing if light.punctual else max(spacing, THIN)) * size

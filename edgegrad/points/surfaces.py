@@ -1,0 +1,221 @@
+"""The surfaces of a scene as functions of its tensors, and how a camera or rays look at them: what hits are computed from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from ..kernel.derivatives import transformed
+from ..kernel.flat import Flat
+from ..scene.rows import columns, dot, rows_of, scaled
+from ..scene.scene import Scene
+from .moving import barycentrics, barycentrics_by
+from .records import bare
+
+
+class Surfaces:
+    """Meshes laid end to end.
+
+    It also notes which properties that may jump at an edge a shader asks for, and which shadows: there it may jump too.
+    """
+
+    def __init__(self, scene: Scene, bare: Flat | None = None) -> None:
+        """`bare`: as bare() makes it, if that is there."""
+        meshes = scene.meshes
+        first = [sum(len(m.verts) for m in meshes[:k]) for k in range(len(meshes))]
+        dtype = max((m.verts.dtype for m in meshes), key=lambda t: torch.finfo(t).bits)
+        self.verts = torch.cat([m.verts.to(dtype) for m in meshes])
+        self.faces = torch.cat([m.faces.long() + k for m, k in zip(meshes, first, strict=True)])
+        counts = torch.tensor([len(m.faces) for m in meshes])
+        self.mesh_of_face = torch.repeat_interleave(torch.arange(len(meshes)), counts).to(self.verts.device)
+        self.scene = scene
+        self._bare = bare
+        self.jumping: dict[Any, Callable[[], Tensor]] = {}  # (F, 3, K) at corners, of what may jump
+        self.shadowing: set[int] = set()  # lights, in scene.casting, of which a shader asks for shadows
+        self.pyramids: dict[int, tuple[Tensor, list[Tensor]]] = {}  # of textures, by their ids
+        self._moving: Surfaces | None = None  # of which these are the values
+        self.layout: Any = None  # as the kernel shades them, kept where nothing has derivatives (light/in_kernel.py)
+        self.has_derivatives = True
+
+    def detach(self) -> Surfaces:
+        """The same without derivatives; what it notes is noted for both."""
+        other = Surfaces.__new__(Surfaces)
+        other.__dict__.update(self.__dict__)
+        for name in ("bare", "casters", "corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
+            other.__dict__.pop(name, None)
+        if self._bare is not None:
+            parts = self._bare._asdict().items()
+            other._bare = self._bare._replace(**{k: v.detach() for k, v in parts if isinstance(v, Tensor)})
+        other.verts, other.scene, other.pyramids = self.verts.detach(), self.scene.detach(), {}
+        other.layout, other.has_derivatives, other._moving = None, False, self
+        return other
+
+    @cached_property
+    def first_faces(self) -> list[int]:
+        """The first face of each mesh."""
+        return [sum(len(m.faces) for m in self.scene.meshes[:k]) for k in range(len(self.scene.meshes))]
+
+    @cached_property
+    def bare(self) -> Flat:
+        """As the kernel reads them, without colours."""
+        return bare(self.scene) if self._bare is None else self._bare
+
+    @cached_property
+    def casters(self) -> Flat:
+        """The same as shadow rays meet them: what blends is cut out where its alpha is below ½."""
+        return bare(self.scene, blended=False) if self.scene.blends else self.bare
+
+    @cached_property
+    def ball(self) -> tuple[Tensor, float]:
+        """A centre (3,) and a radius of a ball around all vertices, float64."""
+        if self._moving is not None:
+            return self._moving.ball
+        # By columns that are contiguous, which is four times as fast.
+        low, high = (bound.double() for bound in torch.aminmax(self.verts.detach().T.contiguous(), dim=1))
+        return (low + high) / 2, float((high - low).norm()) / 2
+
+    @cached_property
+    def corner_uvs(self) -> Tensor:
+        """(F, 3, 2) texture coordinates of corners."""
+        parts = []
+        for i, mesh in enumerate(self.scene.meshes):
+            if mesh.uvs is None or mesh.uv_faces is None:
+                raise ValueError(
+                    f"hits.uv: meshes[{i}] has no texture coordinates; give it uvs and uv_faces, or choose "
+                    "another mesh by hits.mesh"
+                )
+            parts.append(rows_of(mesh.uvs.to(self.verts.dtype), mesh.uv_faces.long()))
+        return torch.cat(parts)
+
+    @cached_property
+    def vertex_normals(self) -> Tensor:
+        """(V, 3) unit normals: the mean of the incident faces' by area, of vertices as they are indexed."""
+        corner = rows_of(self.verts, self.faces)
+        area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        index = self.faces.reshape(-1)
+        return normalize(torch.zeros_like(self.verts).index_add(0, index, area.repeat_interleave(3, 0)), dim=-1)
+
+    def corners(self, face: Tensor) -> Tensor:
+        """(N, 3, 3) world coordinates of those of faces (N,)."""
+        return rows_of(self.verts, rows_of(self.faces, face))
+
+    def face_normals(self, face: Tensor) -> Tensor:
+        corner = self.corners(face)
+        return normalize(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=-1)
+
+    def crease_attributes(self) -> Tensor:
+        """(F, 3, K) of all that was asked for and may jump, each scaled to its largest number."""
+        parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
+        attributes = columns([scaled(p) for p in parts if p.shape[-1]], len(self.faces), self.verts)
+        return _Beside.apply(attributes) if transformed() else attributes
+
+
+class _Beside(torch.autograd.Function):
+    """Attributes (F, 3, K); under torch.vmap those of all elements side by side, for all share the samples of one image."""
+
+    @staticmethod
+    def forward(attributes: Tensor) -> Tensor:
+        return attributes.clone()
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.mark_non_differentiable(output)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Any) -> None:
+        return None
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> None:
+        return None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int, ...], *args: Any) -> tuple[Tensor, None]:
+        (attributes,), (batch,) = args, in_dims
+        return _Beside.apply(attributes.movedim(batch, -1).flatten(2)), None
+
+
+def every_face(count: int) -> Tensor:
+    """(F, 3, 1): a number for each face, of which neighbours differ: multiples of the golden ratio, less their whole part."""
+    return (torch.arange(count).double() * 0.6180339887498949 % 1 + 0.5)[:, None, None].expand(-1, 3, 1)
+
+
+def meet(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
+    """(N, 3) barycentrics of where rays meet the planes of faces with corners (N, 3, 3) (Möller and Trumbore 1997)."""
+    e1, e2, s = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
+    p, q = torch.linalg.cross(direction, e2), torch.linalg.cross(s, e1)
+    scale = 1 / dot(e1, p)
+    u, v = dot(s, p) * scale, dot(direction, q) * scale
+    return torch.stack([1 - u - v, u, v], 1)
+
+
+class View:
+    """How one camera looks."""
+
+    def __init__(self, world_to_camera: Tensor, perspective: bool) -> None:
+        self.world_to_camera, self.perspective = world_to_camera, perspective  # (4, 4) float64
+
+    def detach(self) -> View:
+        return View(self.world_to_camera.detach(), self.perspective)
+
+    def in_camera(self, points: Tensor) -> Tensor:
+        """World points (..., 3) in camera coordinates, float64."""
+        return points.double() @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+
+    def turned(self, directions: Tensor) -> Tensor:
+        """World directions (..., 3) in camera coordinates, float64."""
+        return directions.double() @ self.world_to_camera[:3, :3].T
+
+    def barycentrics(self, surfaces: Surfaces, face: Tensor, along: Tensor) -> Tensor:
+        """(N, 3) where rays meet the planes of faces. `along` (N, 3): the directions of rays from the eye in camera coordinates,
+        or, in an orthographic view, points that rays along the axis go through."""
+        bare = surfaces.bare
+        return barycentrics(bare.verts, bare.faces, face, self.world_to_camera, along, self.perspective)
+
+    def barycentrics_by(self, surfaces: Surfaces, face: Tensor, along: Tensor, by: Tensor) -> tuple[Tensor, Tensor]:
+        """The same, and their derivatives (N, 3, K) by what `along` has the derivatives `by` (N, 3, K) by."""
+        bare = surfaces.bare
+        return barycentrics_by(bare.verts, bare.faces, face, self.world_to_camera, along, by, self.perspective)
+
+    def depth(self, points: Tensor) -> Tensor:
+        """(N,) along the axis."""
+        return self.in_camera(points)[:, 2]
+
+    @property
+    def eye(self) -> Tensor:
+        """(3,) world coordinates; in an orthographic view, the unit direction towards it. float64."""
+        back = torch.linalg.inv(self.world_to_camera[:3, :3])
+        return -back @ self.world_to_camera[:3, 3] if self.perspective else normalize(-back[:, 2], dim=0)
+
+    def to_viewer(self, points: Tensor) -> Tensor:
+        """(N, 3) unit directions, float64."""
+        return normalize(self.eye - points.double(), dim=-1) if self.perspective else self.eye.expand(len(points), 3)
+
+
+class Rays(NamedTuple):
+    """How rays of the user's look, each at one point."""
+
+    ray: Tensor  # (N,) int64, that of each point
+    origin: Tensor  # (N, 3) world coordinates, float64
+    direction: Tensor  # (N, 3)
+
+    def select(self, index: Tensor | slice) -> Rays:
+        return Rays(*(part[index] for part in self))
+
+    def barycentrics(self, corners: Tensor, b: Tensor) -> Tensor:
+        """Those of the hits b (N, 3), as functions of the corners (N, 3, 3) and the rays."""
+        moved = meet(corners, self.origin, self.direction)
+        return b + (moved - moved.detach())
+
+    def depth(self, points: Tensor) -> Tensor:
+        """(N,) in lengths of the direction."""
+        d = self.direction
+        return dot(points.double() - self.origin, d) / dot(d, d)
+
+    def to_viewer(self, points: Tensor) -> Tensor:
+        return -normalize(self.direction, dim=-1)

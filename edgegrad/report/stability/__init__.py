@@ -1,0 +1,5 @@
+"""Extreme cases, unbiasedness, steps within faces and ill-conditioned fits."""
+
+from .run import failures, stability
+
+__all__ = ["failures", "stability"]

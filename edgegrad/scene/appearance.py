@@ -1,0 +1,143 @@
+"""What surfaces look like at points: colours, parameters of materials, texture coordinates, normals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from .material import Parameter, Texture
+from .mesh import PLAIN, Mesh
+from .rows import columns, rows_of, scaled
+from .textures import look_up
+
+# (texture, uv, wraps, filter, uv at the corners of faces) to (N, C)
+LookUp = Callable[[Tensor, Tensor, tuple[str, str], str, Tensor], Tensor]
+
+
+class OnMesh(NamedTuple):
+    """Points of one mesh."""
+
+    mesh: Mesh
+    face: Tensor  # (N,) int64, as the mesh counts them
+    b: Tensor  # (N, 3), barycentrics
+    look_up: LookUp | None = None  # of textures, by footprints of pixels; None: by texture coordinates alone
+
+    def interpolated(self, rows: Tensor, index: Tensor) -> Tensor:
+        """(N, K) from rows (R, K) by the corners of faces, index (F, 3)."""
+        corners = rows.to(self.b)[index[self.face].long()]
+        return (self.b[:, :, None] * corners).sum(1)
+
+    def value(self, parameter: Parameter | float) -> Tensor:
+        """(N, K), or (1, K) of what is the same everywhere."""
+        if isinstance(parameter, Texture):
+            return self._looked_up(parameter)
+        value = torch.as_tensor(parameter).to(self.b)
+        return self.interpolated(value, self.mesh.faces) if value.dim() == 2 else value.reshape(1, -1)
+
+    def _looked_up(self, texture: Texture) -> Tensor:
+        uvs, uv_faces = coordinates(self.mesh, texture)
+        uv = self.interpolated(uvs, uv_faces)
+        image = texture.image.to(self.b.device)
+        if self.look_up is None:
+            found = look_up(image, uv, texture.wraps, "nearest" if texture.filter == "nearest" else "linear")
+        else:
+            corners = uvs.to(self.b)[uv_faces[self.face].long()]
+            found = self.look_up(image, uv, texture.wraps, texture.filter, corners)
+        found = found.to(self.b)
+        return found if texture.factor is None else found * torch.as_tensor(texture.factor).to(self.b)
+
+    def color(self) -> Tensor | None:
+        """(N, C) of the mesh itself, whatever kind it has."""
+        mesh = self.mesh
+        if mesh.texture is not None:
+            return self._looked_up(Texture(mesh.texture, wrap=mesh.wrap, filter=mesh.filter))
+        if mesh.colors is not None:
+            return self.interpolated(mesh.colors, mesh.faces)
+        if mesh.face_colors is not None:
+            return mesh.face_colors.to(self.b)[self.face]
+        if mesh.corner_colors is not None:
+            return (self.b[:, :, None] * mesh.corner_colors.to(self.b)[self.face]).sum(1)
+        return None
+
+    def base_color(self) -> Tensor:
+        """(N, C), (N, 1) or (1, K): colours times the material's factor; radiance where there is no material."""
+        own = self.color()
+        of_material = None if self.mesh.material is None else self.mesh.material.base_color
+        if of_material is None:
+            return self.b.new_full((1, 1), PLAIN) if own is None else own
+        factor = self.value(of_material)
+        return factor if own is None else own * factor
+
+    def corners(self) -> Tensor:
+        """(N, 3, 3) positions of the corners of the faces."""
+        return self.mesh.verts.to(self.b)[self.mesh.faces[self.face].long()]
+
+    def shading_normal(self, g: Tensor) -> Tensor:
+        """(N, 3) unit normals on the side of the faces' own normals g (N, 3): interpolated if there are any, and bent by the
+        material's normal map."""
+        n, mesh = g, self.mesh
+        if mesh.normals is not None:
+            index = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
+            n = self.interpolated(mesh.normals, index)
+            n = torch.where((n.detach() * n.detach()).sum(1, keepdim=True) > 0, n, g)
+            n = normalize(n, dim=-1)
+            n = torch.where((n.detach() * g.detach()).sum(1, keepdim=True) < 0, -n, n)
+        material = mesh.material
+        if material is None or material.normal_map is None:
+            return n
+        bent = 2 * self.value(material.normal_map) - 1
+        scale = torch.as_tensor(material.normal_scale).to(bent)
+        tangent, hand = self._tangent(material.normal_map)
+        t = tangent - n * (n * tangent).sum(1, keepdim=True)
+        there = (t.detach() * t.detach()).sum(1, keepdim=True) > 0  # else there is no frame
+        t = normalize(torch.where(there, t, 1.0), dim=-1)
+        bitangent = hand * torch.linalg.cross(n, t)
+        m = scale * (bent[:, 0:1] * t + bent[:, 1:2] * bitangent) + bent[:, 2:3] * n
+        m = torch.where(there & ((m.detach() * m.detach()).sum(1, keepdim=True) > 0), m, n)
+        return normalize(m, dim=-1)
+
+    def _tangent(self, texture: Texture) -> tuple[Tensor, Tensor]:
+        """(N, 3) along which u grows on the face, of any length, and (N, 1) 1, or −1 where the image is mirrored."""
+        uvs, uv_faces = coordinates(self.mesh, texture)
+        return tangents(self.corners(), uvs.to(self.b)[uv_faces[self.face].long()])
+
+
+def tangents(corners: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+    """Of faces with corners (N, 3, 3) and texture coordinates (N, 3, 2): ∂x/∂u times the determinant's size, and its sign."""
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    d1, d2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    determinant = (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])[:, None]
+    sign = torch.where(determinant.detach() < 0, -1.0, 1.0).to(uv)
+    return sign * (d2[:, 1:2] * e1 - d1[:, 1:2] * e2), sign
+
+
+def coordinates(mesh: Mesh, texture: Texture | None) -> tuple[Tensor, Tensor]:
+    """Texture coordinates and their indices: those of the texture, or else of the mesh."""
+    if texture is not None and texture.uvs is not None and texture.uv_faces is not None:
+        return texture.uvs, texture.uv_faces
+    assert mesh.uvs is not None and mesh.uv_faces is not None
+    return mesh.uvs, mesh.uv_faces
+
+
+def jumps(mesh: Mesh) -> Tensor:
+    """(F, 3, K) at the corners of faces: what of the mesh's looks may jump at edges, but for normals; each of a size near 1."""
+    found: list[Tensor] = []
+    if mesh.corner_colors is not None:
+        found.append(mesh.corner_colors)
+    if mesh.face_colors is not None:
+        found.append(mesh.face_colors[:, None].expand(-1, 3, -1))
+    textures = [] if mesh.material is None else list(mesh.material.textures.values())
+    for texture in [*([None] if mesh.texture is not None else []), *textures]:
+        uvs, uv_faces = coordinates(mesh, texture)
+        found.append(rows_of(uvs, uv_faces.long()))
+    material = mesh.material
+    if material is not None and material.normal_map is not None:
+        # Frames of tangents are of each face: on curved meshes they jump at every edge.
+        uvs, uv_faces = coordinates(mesh, material.normal_map)
+        tangent, hand = tangents(mesh.verts[mesh.faces.long()], uvs.to(mesh.verts)[uv_faces.long()])
+        found.append((hand * normalize(tangent, dim=-1))[:, None].expand(-1, 3, -1))
+    return columns([scaled(part.detach().to(mesh.verts)) for part in found], len(mesh.faces), mesh.verts)

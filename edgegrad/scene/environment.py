@@ -1,0 +1,164 @@
+"""Light from all around: a constant, or an image of directions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from ..check import check_shape
+from .affine import Affine, check_rotation
+from .lights import Light, LightPoints
+from .material import numbers
+
+EVEN = 0.1  # the share of points of a light that is drawn evenly, so that what is dark has a gradient too
+
+
+@dataclass(frozen=True, eq=False)
+class Environment(Light):
+    """Light from infinitely far away, from all around.
+
+    radiance  (C,), the same from all around, or (h, w, C), an image of directions, linear, in the equirectangular projection:
+              row 0 is around +Y, the last one around −Y, the middle looks along −Z, and +X is to the right of it. Between the
+              centres of texels it is bilinear, around the whole turn
+    rotation  (3, 3)  from that frame to the world; the identity when None
+    visible   shown behind all surfaces where the scene has no background of its own
+
+    Directions are drawn by what texels emit times their solid angle, a tenth of them evenly. Radiance below zero is not refused,
+    for an optimisation may pass there: like a negative intensity of other lights, it takes light away.
+
+    Raises TypeError or ValueError that names the argument.
+    """
+
+    radiance: Tensor
+    rotation: Tensor | None = None
+    visible: bool = True
+
+    infinite = True
+    punctual = False
+
+    def __post_init__(self) -> None:
+        radiance = numbers("radiance", self.radiance)
+        check_shape("radiance", radiance, ("C",), ("h", "w", "C"))
+        object.__setattr__(self, "radiance", radiance)
+        if self.rotation is not None:
+            self._set("rotation", 3, 3)
+            assert self.rotation is not None
+            check_rotation("rotation", self.rotation, "an environment can only be turned")
+        if not isinstance(self.visible, bool):
+            raise TypeError(f"visible: expected True or False, got {type(self.visible).__name__}")
+
+    @property
+    def channels(self) -> int | None:
+        C = self.radiance.shape[-1]
+        return C if C > 1 else None
+
+    def _moved(self, affine: Affine) -> Environment:
+        return self.replace(rotation=affine.rotated("an environment", self.rotation))
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        return (1, 1) if self.radiance.dim() == 1 else (self.radiance.shape[0], self.radiance.shape[1])
+
+    @cached_property
+    def _table(self) -> tuple[Tensor, Tensor]:
+        """(h · w,) float64: the running sum of the probabilities of texels, and their densities by solid angle."""
+        with torch.no_grad():
+            h, w = self._size
+            image = self.radiance.detach().double().reshape(h, w, -1).abs().mean(2)
+            # The mean of the bilinear function over a texel.
+            rows = torch.cat([image[:1], image, image[-1:]])
+            image = (rows[:-2] + 6 * rows[1:-1] + rows[2:]) / 8
+            image = (image.roll(1, 1) + 6 * image + image.roll(-1, 1)) / 8
+            border = torch.arange(h + 1, device=image.device).double().mul(math.pi / h).cos()
+            angle = ((border[:-1] - border[1:]) * (2 * math.pi / w))[:, None].expand(h, w)
+            power = image * angle
+            total = float(power.sum())
+            share = angle / (4 * math.pi)
+            chance = (1 - EVEN) * power / total + EVEN * share if total > 0 else share
+            return chance.reshape(-1).cumsum(0), (chance / angle).reshape(-1)
+
+    def draw(self, u: Tensor) -> LightPoints:
+        running, density = self._table
+        index = pick(running, u[:, 0])
+        return LightPoints(index, u[:, 1:3].detach().double(), density[index])
+
+    def _own_directions(self, points: LightPoints) -> Tensor:
+        """(N, 3) float64, in the frame of the image."""
+        h, w = self._size
+        row, column = points.index // w, points.index % w
+        border = torch.stack([row, row + 1]).double().mul(math.pi / h).cos()
+        y = torch.lerp(border[0], border[1], points.uv[:, 1])
+        phi = (2 * math.pi / w) * (column + points.uv[:, 0]) - math.pi
+        across = (1 - y * y).clamp(min=0).sqrt()
+        return torch.stack([across * phi.sin(), y, -across * phi.cos()], 1)
+
+    def points_at(self, direction: Tensor) -> LightPoints:
+        """Those at unit directions (N, 3) in the world; without derivatives."""
+        with torch.no_grad():
+            d = direction.double()
+            x, y, z = (d if self.rotation is None else normalize(d @ self.rotation.to(d), dim=-1)).unbind(-1)
+            h, w = self._size
+            row = (torch.acos(y.clamp(-1, 1)) * (h / math.pi)).long().clamp(0, h - 1)
+            border = torch.stack([row, row + 1]).double().mul(math.pi / h).cos()
+            turn = (torch.atan2(x, -z) / (2 * math.pi) + 0.5) * w
+            column = turn.long().clamp(0, w - 1)
+            index = row * w + column
+            uv = torch.stack([turn - column, (y - border[0]) / (border[1] - border[0])], 1).clamp(0, 1)
+            return LightPoints(index, uv, self._table[1][index])
+
+    def above(self, points: LightPoints, normal: Tensor) -> LightPoints:
+        """The same directions, those below surfaces with unit normals (N, 3) mirrored to above them: each stands for both."""
+        with torch.no_grad():
+            d, n = self.place(points), normal.detach().double()
+            cosine = (d * n).sum(1, keepdim=True)
+            mirrored = self.points_at(d - 2 * cosine * n)
+            below = cosine[:, 0] < 0
+            return LightPoints(
+                torch.where(below, mirrored.index, points.index),
+                torch.where(below[:, None], mirrored.uv, points.uv),
+                points.density + mirrored.density,
+            )
+
+    def place(self, points: LightPoints) -> Tensor:
+        d = self._own_directions(points)
+        return d if self.rotation is None else normalize(d @ self.rotation.to(d).mT, dim=-1)
+
+    def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
+        radiance = self._looked_up(self._own_directions(points))
+        return (radiance / points.density[:, None]).to(position)
+
+    def towards(self, direction: Tensor) -> Tensor:
+        """(N, C): the radiance from where directions (N, 3) in the world point to, of any length; differentiable."""
+        return self._looked_up(direction if self.rotation is None else direction @ self.rotation.to(direction))
+
+    def _looked_up(self, d: Tensor) -> Tensor:
+        if self.radiance.dim() == 1:
+            return self.radiance.to(d).expand(len(d), -1)
+        h, w = self._size
+        x, y, z = d.double().unbind(-1)
+        squared = x * x + z * z
+        some = squared > 0  # the axis has no longitude
+        x, z = torch.where(some, x, 0.0), torch.where(some, z, -1.0)
+        across = torch.where(some, torch.where(some, squared, 1.0).sqrt(), 0.0)
+        column = (torch.atan2(x, -z) / (2 * math.pi) + 0.5) * w - 0.5
+        row = torch.atan2(across, y) / math.pi * h - 0.5
+        c0, r0 = column.detach().floor(), row.detach().floor()
+        fc, fr = (column - c0).to(d)[:, None], (row - r0).to(d)[:, None]
+        flat = self.radiance.to(d).reshape(h * w, -1)
+
+        def texel(down: int, right: int) -> Tensor:
+            return flat[(r0 + down).clamp(0, h - 1).long() * w + (c0 + right).long() % w]
+
+        top = torch.lerp(texel(0, 0), texel(0, 1), fc)
+        return torch.lerp(top, torch.lerp(texel(1, 0), texel(1, 1), fc), fr)
+
+
+def pick(running: Tensor, u: Tensor) -> Tensor:
+    """(N,) int64: rows by their probabilities, of which `running` (M,) is the running sum, from numbers u (N,) in [0, 1)."""
+    last = running[-1]
+    return torch.searchsorted(running, (u.double() * last).contiguous(), right=True).clamp(max=len(running) - 1)

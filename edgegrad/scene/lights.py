@@ -1,0 +1,329 @@
+"""Lights: points, spots, directions; faces that emit; and irradiance as spherical harmonics."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from ..check import check_fields, check_positive_int, check_shape, values_visible
+from .affine import Affine, check_rotation
+from .material import Material, numbers
+from .mesh import Mesh
+
+
+class LightPoints(NamedTuple):
+    """Points of a light by coordinates that stay while it moves, without derivatives.
+
+    index    (N,) int64: the face of an emissive mesh, the texel of an environment
+    uv       (N, 2) float64: the last two barycentrics there, or the place within the texel
+    density  (N,) float64, by world area or by solid angle; 1 for a light without extent
+    """
+
+    index: Tensor  # pyright: ignore[reportIncompatibleMethodOverride]
+    uv: Tensor
+    density: Tensor
+
+    def select(self, rows: Tensor | slice) -> LightPoints:
+        """Some of them."""
+        return LightPoints(self.index[rows], self.uv[rows], self.density[rows])
+
+
+class Light:
+    """What all lights have in common. Negative radiances, intensities and colours are not refused, for an optimisation may pass
+    there: they take light away, and images stay linear in them."""
+
+    casts = True  # whether it casts shadows
+    infinite = False  # whether it is a direction
+    punctual = True  # whether it is one point
+
+    def replace(self, **fields: Any) -> Any:
+        """This light with some fields replaced."""
+        check_fields(self, fields)
+        return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
+
+    @property
+    def channels(self) -> int | None:
+        """C, or None for a light of one colour in all channels."""
+        color = getattr(self, "color", None)
+        return None if color is None or color.shape[0] == 1 else color.shape[0]
+
+    def transformed(self, R: Tensor | None = None, t: Tensor | None = None, scale: Tensor | float = 1.0) -> Any:
+        """The light, moved as Mesh.transformed moves meshes. Raises TypeError or ValueError."""
+        return self._moved(Affine.of(R, t, scale, torch.empty(0, dtype=torch.float64)))
+
+    def _moved(self, affine: Affine) -> Light:
+        raise NotImplementedError
+
+    def draw(self, u: Tensor) -> LightPoints:
+        """Points from numbers u (N, 3), uniform in [0, 1)."""
+        count = len(u)
+        one = torch.ones(count, dtype=torch.float64, device=u.device)
+        return LightPoints(torch.zeros(count, dtype=torch.int64, device=u.device), one[:, None].expand(-1, 2) * 0, one)
+
+    def place(self, points: LightPoints) -> Tensor:
+        """(N, 3) where they are; if the light is infinite, the unit directions towards them. Differentiable."""
+        raise NotImplementedError
+
+    def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
+        """(N, C) or (N, 1): the irradiance at normal incidence at positions (N, 3), over the density, nothing in between.
+        Differentiable."""
+        raise NotImplementedError
+
+    # -- what the classes share ---------------------------------------------------------------------------------------
+
+    def _set(self, name: str, *shape: int | str, unit: bool = False) -> None:
+        value = numbers(name, getattr(self, name))
+        if shape == ():
+            if value.numel() != 1:
+                raise ValueError(f"{name}: expected one number, got shape {tuple(value.shape)}")
+            value = value if value.dim() == 0 else value.reshape(())  # a leaf stays one
+        else:
+            check_shape(name, value, shape)
+        if unit and values_visible(value) and not bool((value.detach() != 0).any()):
+            raise ValueError(f"{name}: expected a direction, got zeros")
+        object.__setattr__(self, name, value)
+
+    def _set_power(self) -> None:
+        self._set("intensity")
+        if getattr(self, "color") is not None:  # noqa: B009
+            self._set("color", "C")
+
+    def _power(self, like: Tensor) -> Tensor:
+        """(1, C) or (1, 1): intensity times colour."""
+        intensity, color = (getattr(self, name) for name in ("intensity", "color"))
+        power = intensity.to(like).reshape(1, 1)
+        return power if color is None else power * color.to(like)
+
+
+@dataclass(frozen=True, eq=False)
+class DirectionalLight(Light):
+    """Light from infinitely far away, such as the sun's.
+
+    direction  (3,)    in which it travels, world axes, of any length but zero
+    intensity  number  irradiance of a surface that it meets head-on, W/m² (glTF: lux)
+    color      (C,)    multiplies the intensity; ones when None
+
+    Raises TypeError or ValueError that names the argument.
+    """
+
+    direction: Tensor
+    intensity: Tensor | float = 1.0
+    color: Tensor | None = None
+
+    infinite = True
+
+    def __post_init__(self) -> None:
+        self._set("direction", 3, unit=True)
+        self._set_power()
+
+    def _moved(self, affine: Affine) -> DirectionalLight:
+        return self.replace(direction=affine.vectors(self.direction))
+
+    def place(self, points: LightPoints) -> Tensor:
+        return -unit(self.direction).expand(len(points.index), 3)
+
+    def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
+        return self._power(position).expand(len(position), -1)
+
+
+@dataclass(frozen=True, eq=False)
+class PointLight(Light):
+    """Light from one point in all directions.
+
+    position   (3,)    world units
+    intensity  number  W/sr (glTF: cd), for distances in world units
+    color      (C,)    multiplies the intensity; ones when None
+
+    Raises TypeError or ValueError that names the argument.
+    """
+
+    position: Tensor
+    intensity: Tensor | float = 1.0
+    color: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        self._set("position", 3)
+        self._set_power()
+
+    def _moved(self, affine: Affine) -> PointLight:
+        # The same irradiance in other units of length.
+        return self.replace(position=affine.points(self.position), intensity=self.intensity * affine.area)
+
+    def place(self, points: LightPoints) -> Tensor:
+        return self.position.expand(len(points.index), 3)
+
+    def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
+        return self._power(position) * inverse_square(self.position.to(position) - position)
+
+
+@dataclass(frozen=True, eq=False)
+class SpotLight(Light):
+    """Light from one point in a cone, as in glTF (KHR_lights_punctual).
+
+    position     (3,)    world units
+    direction    (3,)    of the cone's axis, away from the light, of any length but zero
+    intensity    number  W/sr (glTF: cd) on the axis, for distances in world units
+    color        (C,)    multiplies the intensity; ones when None
+    inner_angle  number  rad from the axis, up to which it is as bright as there
+    outer_angle  number  rad from the axis, where it ends: 0 ≤ inner < outer ≤ π/2
+
+    Between these the intensity falls by the square of (cos θ − cos outer) / (cos inner − cos outer). Raises TypeError or
+    ValueError that names the argument.
+    """
+
+    position: Tensor
+    direction: Tensor
+    intensity: Tensor | float = 1.0
+    color: Tensor | None = None
+    inner_angle: Tensor | float = 0.0
+    outer_angle: Tensor | float = math.pi / 4
+
+    def __post_init__(self) -> None:
+        self._set("position", 3)
+        self._set("direction", 3, unit=True)
+        self._set_power()
+        self._set("inner_angle")
+        self._set("outer_angle")
+        if not values_visible(*(torch.as_tensor(angle) for angle in (self.inner_angle, self.outer_angle))):
+            return
+        inner, outer = (float(torch.as_tensor(angle).detach()) for angle in (self.inner_angle, self.outer_angle))
+        if not 0 <= inner < outer <= math.pi / 2 + 1e-6:
+            raise ValueError(
+                f"inner_angle: expected 0 ≤ inner_angle < outer_angle ≤ π/2, got {inner:.6g} and {outer:.6g}; angles are radians "
+                "from the axis"
+            )
+
+    def _moved(self, affine: Affine) -> SpotLight:
+        return self.replace(
+            position=affine.points(self.position),
+            direction=affine.vectors(self.direction),
+            intensity=self.intensity * affine.area,
+        )
+
+    def place(self, points: LightPoints) -> Tensor:
+        return self.position.expand(len(points.index), 3)
+
+    def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
+        away = position - self.position.to(position)
+        cosine = normalize(away, dim=-1) @ unit(self.direction).to(position)
+        inner, outer = (torch.as_tensor(a).to(position).cos() for a in (self.inner_angle, self.outer_angle))
+        scale = 1 / (inner - outer).clamp(min=1e-3)  # glTF's own limit
+        ramp = ((cosine - outer) * scale).clamp(0, 1) ** 2
+        return self._power(position) * ramp[:, None] * inverse_square(away)
+
+
+def unit(direction: Tensor) -> Tensor:
+    """(3,) of any length but zero: scaled first, for squares of short ones vanish and of long ones overflow."""
+    return normalize(direction / direction.detach().abs().max(), dim=0)
+
+
+def inverse_square(v: Tensor) -> Tensor:
+    """(N, 1): 1/|v|² of vectors (N, 3); zero, without a derivative, where they have no direction."""
+    squared = (v * v).sum(-1, keepdim=True)
+    some = squared > 0
+    return torch.where(some, 1 / torch.where(some, squared, 1.0), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class SphericalHarmonics(Light):
+    """Irradiance by the direction of the normal, without shadows: cheap and smooth.
+
+    coefficients  (9, C)   E(n) = Σ c_i Y_i(n), in the order Y_00, Y_1−1, Y_10, Y_11, Y_2−2 … Y_22 of the real, orthonormal
+                           spherical harmonics (Ramamoorthi and Hanrahan 2001): coefficients of irradiance, not of radiance
+    rotation      (3, 3)   from the frame of the coefficients to the world; the identity when None
+
+    It is scattered by the Lambertian part of a material alone. Raises TypeError or ValueError that names the argument.
+    """
+
+    coefficients: Tensor
+    rotation: Tensor | None = None
+
+    casts = False
+    infinite = True
+
+    def __post_init__(self) -> None:
+        self._set("coefficients", 9, "C")
+        if self.rotation is not None:
+            self._set("rotation", 3, 3)
+            assert self.rotation is not None
+            check_rotation("rotation", self.rotation, "spherical harmonics can only be turned")
+
+    @property
+    def channels(self) -> int | None:
+        return self.coefficients.shape[1] if self.coefficients.shape[1] > 1 else None
+
+    def _moved(self, affine: Affine) -> SphericalHarmonics:
+        return self.replace(rotation=affine.rotated("spherical harmonics", self.rotation))
+
+    def irradiance(self, normal: Tensor) -> Tensor:
+        """(N, C) of surfaces with unit normals (N, 3)."""
+        n = normal if self.rotation is None else normal @ self.rotation.to(normal)
+        return harmonics(n) @ self.coefficients.to(normal)
+
+
+def harmonics(n: Tensor) -> Tensor:
+    """(N, 9): the real spherical harmonics up to the second order, of unit vectors (N, 3)."""
+    x, y, z = n.unbind(-1)
+    one, c1, c2 = 0.5 / math.sqrt(math.pi), math.sqrt(3 / (4 * math.pi)), math.sqrt(15 / (4 * math.pi))
+    return torch.stack(
+        [
+            one * torch.ones_like(x), c1 * y, c1 * z, c1 * x, c2 * x * y, c2 * y * z,
+            math.sqrt(5 / (16 * math.pi)) * (3 * z * z - 1), c2 * x * z, c2 / 2 * (x * x - y * y),
+        ], -1,
+    )  # fmt: skip
+
+
+class AreaLight:
+    """Makes meshes that emit light. Any mesh whose material has emission is a light; these are short ways to some. They go among
+    the lights or the meshes of a Scene, and are seen."""
+
+    @staticmethod
+    def of(mesh: Mesh, radiance: Tensor | float, two_sided: bool = True) -> Mesh:
+        """A mesh that scatters nothing and emits `radiance`, a number or (C,), W/(sr m²); if not two_sided, only to the side from
+        which the vertices of its faces run counter-clockwise. Raises TypeError or ValueError."""
+        if not isinstance(mesh, Mesh):
+            raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}")
+        return mesh.replace(
+            material=Material(base_color=0.0, emission=numbers("radiance", radiance), two_sided=two_sided)
+        )
+
+    @staticmethod
+    def rectangle(center: Tensor, u: Tensor, v: Tensor, radiance: Tensor | float, two_sided: bool = True) -> Mesh:
+        """A parallelogram with the corners center ± u ± v, (3,) each, world units; its front is that of u × v.
+        Raises TypeError or ValueError."""
+        center, u, v = _vectors(center=center, u=u, v=v)
+        verts = torch.stack([center - u - v, center + u - v, center + u + v, center - u + v])
+        faces = torch.tensor([[0, 1, 2], [0, 2, 3]], device=verts.device)
+        return AreaLight.of(Mesh(verts, faces), radiance, two_sided)
+
+    @staticmethod
+    def disc(
+        center: Tensor, u: Tensor, v: Tensor, radiance: Tensor | float, segments: int = 64, two_sided: bool = True
+    ) -> Mesh:
+        """A polygon of `segments` corners center + u cos φ + v sin φ, (3,) each, world units; its front is that of u × v.
+        Raises TypeError or ValueError."""
+        center, u, v = _vectors(center=center, u=u, v=v)
+        check_positive_int("segments", segments, most=1 << 20)
+        if segments < 3:
+            raise ValueError(f"segments: expected at least 3, got {segments}")
+        k = torch.arange(segments, device=center.device)
+        angle = (2 * math.pi / segments * k).to(center)[:, None]
+        rim = center + angle.cos() * u + angle.sin() * v
+        faces = torch.stack([torch.full_like(k, segments), k, (k + 1) % segments], 1)
+        return AreaLight.of(Mesh(torch.cat([rim, center[None]]), faces), radiance, two_sided)
+
+
+def _vectors(**given: Tensor) -> list[Tensor]:
+    found = []
+    for name, value in given.items():
+        vector = numbers(name, value)
+        check_shape(name, vector, (3,))
+        found.append(vector)
+    dtype = max((v.dtype for v in found), key=lambda t: torch.finfo(t).bits)
+    return [v.to(dtype) for v in found]

@@ -1,0 +1,66 @@
+"""The order of the packages: who may import whom, the figure of it, and what a process imports when."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import grimp
+import pytest
+from importlinter.cli import EXIT_STATUS_ERROR, EXIT_STATUS_SUCCESS, lint_imports
+
+ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT / "docs"))
+import house  # noqa: E402
+
+
+def test_imports_run_downward(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(ROOT)
+    assert lint_imports(no_cache=True) == EXIT_STATUS_SUCCESS, capsys.readouterr().out
+
+
+def test_an_import_upward_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    build = grimp.build_graph
+
+    def with_one_more(*args: object, **kwargs: object) -> grimp.ImportGraph:
+        graph = build(*args, **kwargs)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        graph.add_import(importer="edgegrad.scene.mesh", imported="edgegrad.files.save")
+        return graph
+
+    monkeypatch.setattr("grimp.build_graph", with_one_more)
+    assert lint_imports(no_cache=True) == EXIT_STATUS_ERROR
+
+
+def test_the_figure_is_that_of_the_imports() -> None:
+    """`python docs/house.py` was run after the last change."""
+    storeys = house.floors(house.imports())
+    assert house.description(storeys) in (ROOT / "docs" / "house.svg").read_text(encoding="utf-8")
+    assert len(storeys) > 8
+
+
+def test_a_circle_has_no_floors() -> None:
+    with pytest.raises(ValueError, match="a circle among a, b"):
+        house.floors({"a": {"b"}, "b": {"a"}, "c": set()})
+
+
+FIRST_STEP = """
+import sys, torch, edgegrad as eg
+verts = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+mesh = eg.Mesh(verts, torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]), colors=verts)
+camera = eg.Camera.look_at((0.8, 0.6, 3.0), (0.3, 0.3, 0.3), (0.0, 1.0, 0.0), 40.0, (32, 32))
+target = eg.render(mesh.transformed(t=torch.tensor([0.05, 0.0, 0.0])), camera)
+def stop(*fit):
+    raise KeyboardInterrupt
+fit = eg.fit.fit_pose(mesh, target, camera, init=torch.eye(4), callback=stop, progress=False)
+assert fit.interrupted and fit.steps
+slow = sorted({"torch._dynamo", "torch._inductor", "roma", "trimesh", "matplotlib", "OpenImageIO"} & set(sys.modules))
+assert not slow, slow
+"""
+
+
+def test_a_fit_imports_no_compiler() -> None:
+    """torch's compiler takes longer to import than torch itself, and than a fit."""
+    done = subprocess.run([sys.executable, "-c", FIRST_STEP], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
