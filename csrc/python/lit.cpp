@@ -1,5 +1,5 @@
-// Lit scenes as Python hands them over (edgegrad/_lit_kernel.py): tables, and meshes and lights that refer to them by
-// number.
+// Lit scenes as Python hands them over (edgegrad/light/in_kernel.py): tables, and meshes and lights that refer to them
+// by number.
 
 #include "shading/lit/lit.h"
 
@@ -367,15 +367,15 @@ nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, cons
 }
 
 template <class T>
-nb::tuple look_and_shade_points_vjp(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
-                                    const LitOptions& options, In<double, 2> bar, const std::vector<bool>& wanted,
-                                    int threads) {
+nb::tuple trace_and_shade_points_vjp(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
+                                     const LitOptions& options, In<double, 2> bar, const std::vector<bool>& wanted,
+                                     int threads) {
     check_faces(arrays, lit);
     const LitPoints view = points.view(lit.scene, faces_of(lit));
     return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, double* b_bar, Team& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
-        look_and_shade_vjp(lit.scene, arrays.view(), geometry->caster(), view, options, bar.data(), to, b_bar, team);
+        trace_and_shade_vjp(lit.scene, arrays.view(), geometry->caster(), view, options, bar.data(), to, b_bar, team);
     });
 }
 
@@ -407,7 +407,7 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
 template <class T>
 void bind_scene_lit(nb::class_<SceneArrays<T>>& scene) {
     scene.def("shade", &shade_points<T>, "lit"_a, "points"_a, "options"_a, "values"_a, "threads"_a)
-        .def("look_and_shade_vjp", &look_and_shade_points_vjp<T>, "lit"_a, "points"_a, nb::kw_only(), "options"_a,
+        .def("trace_and_shade_vjp", &trace_and_shade_points_vjp<T>, "lit"_a, "points"_a, nb::kw_only(), "options"_a,
              "bar"_a.noconvert(), "wanted"_a, "threads"_a)
         .def("lit_image", &lit_image<T>, "lit"_a, "camera"_a, "image"_a, "options"_a, "points"_a, "seed"_a, "again"_a,
              "threads"_a, "hits"_a);
