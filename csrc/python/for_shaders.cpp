@@ -1,6 +1,7 @@
 // What shaders written in PyTorch are made of: samples as records of arrays, what is seen at places and along rays.
 
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
 
 #include <optional>
 
