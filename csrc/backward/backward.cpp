@@ -1,8 +1,10 @@
 // The backward pass: the two terms, and what they found turned into the gradients of the user's arrays.
 
 #include <algorithm>
+#include <functional>
 #include <numeric>
 #include <optional>
+#include <type_traits>
 #include <vector>
 
 #include "backward/budget.h"
@@ -13,7 +15,6 @@
 #include "boundary/shadows.h"
 #include "boundary/steps.h"
 #include "camera/windows.h"
-#include "core/channels.h"
 #include "interior/interior.h"
 #include "interior/surface_measure.h"
 
@@ -91,10 +92,13 @@ struct InImage {
     static double margin_of(const ImageOptions& image) { return image.filter.radius() - 0.5; }
 };
 
+template <class T>
+using ViewBody = std::function<void(const BackwardView<T>&)>;
+
 // Calls body(view) with what all terms look at through one window.
-template <class T, class Body>
+template <class T>
 void with_view(const BackwardInput<T>& input, const Camera& camera, const InImage<T>& in_image,
-               const GradientOptions& o, const Terms& terms, Team& team, Body body) {
+               const GradientOptions& o, const Terms& terms, Team& team, const ViewBody<T>& body) {
     const auto& [scene, whole, geometry, image, adjoint, hit_buffers, detailed] = input;
     const auto& [filtered, importance, occlusion] = in_image;
     const ViewVolume volume(camera, InImage<T>::margin_of(image));
@@ -141,21 +145,21 @@ struct Measured {
     SampleCounts wanted;
 };
 
-template <int N, class T>
+template <class T>
 Measured<T> measure_terms(const BackwardView<T>& view, const Terms& terms, Destination& to, BackwardProfile& profile) {
     const GradientOptions& o = view.options;
     Stopwatch watch;
     Measured<T> out;
     Array<int8_t> facing(terms.boundary ? view.scene.n_faces : 0);
     if (terms.interior()) {
-        out.surface.emplace(measure_surface<N>(view, terms.motion, facing, to));
+        out.surface.emplace(measure_surface(view, terms.motion, facing, to));
         out.wanted.surface = out.surface->wanted(o.surface_samples);
         profile.surface_wanted = out.surface->pixel_samples() + out.wanted.surface;
         profile.measure = watch.lap();
     }
     if (terms.boundary) {
         if (!terms.interior()) facing = facing_of_faces(view);
-        const Curves<T>& curves = out.curves.emplace(measure_curves<N>(view, std::move(facing), terms.rim));
+        const Curves<T>& curves = out.curves.emplace(measure_curves(view, std::move(facing), terms.rim));
         out.wanted.edge = profile.edge_wanted = curves.wanted(o);
         profile.silhouettes = curves.silhouettes, profile.creases = curves.creases;
         profile.intersections = curves.intersections, profile.rim = curves.rim;
@@ -176,25 +180,25 @@ SampleCounts within_budget(const BackwardInput<T>& input, const GradientOptions&
 }
 
 // Measures what the terms sample, draws the samples and contracts them.
-template <int N, class Contraction, class T>
+template <class T>
 void add_terms(const BackwardInput<T>& input, const BackwardView<T>& view, const Terms& terms,
                const Contraction& contraction, Destination& to, BackwardProfile& profile) {
     const GradientOptions& o = view.options;
     if (o.pixel_spp) {
         std::vector<int64_t> all(int64_t(view.camera.width) * view.camera.height);
         std::iota(all.begin(), all.end(), 0);
-        add_pixel_samples<N>(view, {all, o.pixel_spp, o.seed, nullptr}, contraction, to, profile.surface);
+        add_pixel_samples(view, {all, o.pixel_spp, o.seed, nullptr}, contraction, to, profile.surface);
         return;
     }
     // Both terms are measured before samples are drawn, since they share a budget.
-    Measured<T> measured = measure_terms<N>(view, terms, to, profile);
+    Measured<T> measured = measure_terms(view, terms, to, profile);
     const SampleCounts n = within_budget(input, o, measured.wanted, view.team);
-    if (measured.surface) add_interior<N>(view, *measured.surface, n.surface, contraction, to, profile);
+    if (measured.surface) add_interior(view, *measured.surface, n.surface, contraction, to, profile);
     if (Curves<T>* curves = measured.curves ? &*measured.curves : nullptr) {
-        add_boundary<N>(view, *curves, n.edge, contraction, to, profile);
+        add_boundary(view, *curves, n.edge, contraction, to, profile);
         if (!curves->x_bar.empty()) add_places(view, curves->x_bar, to);
     }
-    if (terms.steps) add_steps<N>(view, contraction, to, profile);
+    if (terms.steps) add_steps(view, contraction, to, profile);
 }
 
 // The options for each of several windows: samples in proportion to what each wants, as many as one image would get.
@@ -211,10 +215,10 @@ std::vector<GradientOptions> options_of_windows(const BackwardInput<T>& input, c
     std::vector<SampleCounts> wanted(windows.size());
     SampleCounts all;
     for (size_t k = 0; k < windows.size(); ++k)
-        with_view(input, windows[k], in_image, counted, terms, team, [&](const BackwardView<T>& view) {
+        with_view<T>(input, windows[k], in_image, counted, terms, team, [&](const BackwardView<T>& view) {
             Destination none;
             BackwardProfile profile;
-            measure_terms<0>(view, terms, none, profile);
+            measure_terms(view, terms, none, profile);
             wanted[k] = {profile.surface_wanted, profile.edge_wanted};
             all.surface += wanted[k].surface, all.edge += wanted[k].edge;
         });
@@ -232,8 +236,9 @@ std::vector<GradientOptions> options_of_windows(const BackwardInput<T>& input, c
 }
 
 // Calls body(view) for each window of the camera.
-template <class T, class Body>
-void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Terms& terms, Team& team, Body body) {
+template <class T>
+void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Terms& terms, Team& team,
+               const std::type_identity_t<ViewBody<T>>& body) {
     const std::vector<Camera> windows = windows_of(input.camera, InImage<T>::margin_of(input.image));
     const InImage<T> in_image(input, team);
     const std::vector<GradientOptions> options = options_of_windows(input, windows, in_image, o, terms, team);
@@ -315,8 +320,7 @@ BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOpt
         to.q = grad.geometry() ? q_bar.data() : nullptr;
         to.colors = grad.colors, to.uvs = grad.uvs, to.texels = grad.texels, to.alphas = grad.alphas;
         to.vertex_attributes = grad.vertex_attributes, to.face_attributes = grad.face_attributes;
-        dispatch_channels(scene.channels, scene.channels > scene.radiance,
-                          [&]<int N>() { add_terms<N>(input, view, terms, Reverse{terms.motion}, to, own); });
+        add_terms(input, view, terms, Reverse{terms.motion}, to, own);
         watch.lap();
         if (grad.geometry()) add_world(view.camera, scene.verts, q_bar, team, grad);
         add_intrinsics(view.camera, to.k, grad.K, grad.distortion);
@@ -346,7 +350,7 @@ void render_tangents(const BackwardInput<T>& input, GradientOptions o, Team& tea
         std::vector<Direction> directions;
         for (const Tangents& t : tangents)
             directions.push_back(make_direction(t, view.camera, scene.verts, scene.n_verts, team));
-        add_terms<0>(input, view, terms, Forward{directions}, to, profile);
+        add_terms(input, view, terms, Forward{directions}, to, profile);
     });
 }
 
@@ -359,7 +363,7 @@ void render_screen_gradient(const BackwardInput<T>& input, GradientOptions o, Te
     to.pixels = gradient, to.pixel_width = 2;
     BackwardProfile profile;
     each_view(input, o, terms, team,
-              [&](const BackwardView<T>& view) { add_terms<0>(input, view, terms, Screen{}, to, profile); });
+              [&](const BackwardView<T>& view) { add_terms(input, view, terms, Screen{}, to, profile); });
 }
 
 template <class T>
@@ -371,9 +375,8 @@ RecordList record_samples(const BackwardInput<T>& input, GradientOptions o, Team
     Destination to;
     to.records = &records;
     BackwardProfile profile;
-    each_view(input, o, terms, team, [&](const BackwardView<T>& view) {
-        add_terms<0>(input, view, terms, Record{o.intrinsics}, to, profile);
-    });
+    each_view(input, o, terms, team,
+              [&](const BackwardView<T>& view) { add_terms(input, view, terms, Record{o.intrinsics}, to, profile); });
     return records;
 }
 

@@ -3,8 +3,10 @@
 #include "boundary/boundary.h"
 
 #include <algorithm>
+#include <memory>
 #include <vector>
 
+#include "boundary/contractions.h"
 #include "boundary/crease_control.h"
 #include "boundary/crossings.h"
 #include "boundary/curve_measure.h"
@@ -87,8 +89,9 @@ bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const Ord
     std::vector<uint8_t> found((n + scatter_chunk - 1) / scatter_chunk, 0);
     view.team.each(int64_t(found.size()), [&](int64_t chunk) {
         bool visible = false;
+        Witness witness{visible};
         EdgeSource<T> source(view, curves.finder, alone);
-        CurveSamples samples(view, source, Witness{visible});
+        CurveSamples samples(view, source, witness);
         Curve curve;
         const Drawn drawn{draws, chunk * scatter_chunk, std::min(n, (chunk + 1) * scatter_chunk)};
         drawn.each([&](int64_t k, double s, double weight) {
@@ -102,37 +105,37 @@ bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const Ord
     return std::find(found.begin(), found.end(), 1) != found.end();
 }
 
-template <int N, class Contraction, class T>
+template <class T>
 void add_edges(const BackwardView<T>& view, const Curves<T>& curves, const CoincidentCurves& coincident, bool hidden,
-               const Drawn& drawn, const Contraction& contraction, ChunkGrad& grad) {
+               const Drawn& drawn, CurveContraction& contraction, ChunkGrad& grad) {
     EdgeSource<T> source(view, curves.finder, coincident);
-    CurveSamples samples(view, source, on_curves<N>(view, contraction, grad));
-    CreaseControl<N, T> control(view);
+    CurveSamples samples(view, source, contraction);
+    const std::unique_ptr<CreaseControl> control = make_crease_control(view);
     Curve curve;
     bool controlled = false;
     drawn.each([&](int64_t k, double s, double weight) {
         const MeasuredCurve& measured = curves.curve[k];
         if (measured.hidden && !hidden) return;
         if (curve.edge != measured.edge) {
-            if (controlled) control.flush(grad.x);
+            if (controlled) control->flush(grad.x);
             controlled = false;
             if (!find(curves, measured, curve)) return;
-            controlled = measured.controlled && control.set(curve);
+            controlled = measured.controlled && control->set(curve);
         }
         s = kept_off_ends(curve, s);
-        if (controlled) control.subtract(s, weight);
+        if (controlled) control->subtract(s, weight);
         samples.add(curve, s, weight);
     });
-    if (controlled) control.flush(grad.x);
+    if (controlled) control->flush(grad.x);
     samples.finish(grad);
 }
 
-template <int N, class Contraction, class T>
+template <class T>
 void add_intersections(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& drawn,
-                       const Contraction& contraction, ChunkGrad& grad) {
+                       CurveContraction& contraction, ChunkGrad& grad) {
     const Array<Intersection>& all = curves.lines(view.geometry);
     IntersectionSource<T> source(view);
-    CurveSamples samples(view, source, on_curves<N>(view, contraction, grad));
+    CurveSamples samples(view, source, contraction);
     IntersectionCurve curve;
     drawn.each([&](int64_t k, double s, double weight) {
         const Intersection& i = all[curves.intersection[k - int64_t(curves.curve.size())].index];
@@ -142,10 +145,10 @@ void add_intersections(const BackwardView<T>& view, const Curves<T>& curves, con
     samples.finish(grad);
 }
 
-template <int N, class Contraction, class T>
-void add_rim(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& drawn, const Contraction& contraction,
+template <class T>
+void add_rim(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& drawn, CurveContraction& contraction,
              ChunkGrad& grad) {
-    RimSamples samples(view, curves.rim_curve->rim, on_curves<N>(view, contraction, grad));
+    RimSamples samples(view, curves.rim_curve->rim, contraction);
     const auto before = int64_t(curves.curve.size() + curves.intersection.size());
     drawn.each([&](int64_t k, double s, double weight) {
         samples.add(curves.rim_curve->arcs[k - before].arc, std::clamp(s, 0.0, 1.0), weight);
@@ -155,7 +158,7 @@ void add_rim(const BackwardView<T>& view, const Curves<T>& curves, const Drawn& 
 
 }  // namespace
 
-template <int N, class Contraction, class T>
+template <class T>
 void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, const Contraction& contraction,
                   Destination& to, BackwardProfile& profile) {
     profile.edge_samples = n;
@@ -171,24 +174,23 @@ void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, con
     profile.curves += watch.lap();
     if (!curves.x_bar.empty()) to.x = curves.x_bar.data();
     view.scatter.add(n, to, profile.edge, [&](int64_t first, int64_t last, ChunkGrad& grad) {
+        const std::unique_ptr<CurveContraction> to_chunk = contract_curves(view, contraction, grad);
         const auto part = [&](Kind kind) {
             const int64_t begin = kind ? draws.end_of_kind(kind - 1) : 0;
             return Drawn{draws, std::max(first, begin), std::min(last, draws.end_of_kind(kind))};
         };
         if (const Drawn d = part(on_edges); d.first < d.last)
-            add_edges<N>(view, curves, coincident, hidden, d, contraction, grad);
+            add_edges(view, curves, coincident, hidden, d, *to_chunk, grad);
         if (const Drawn d = part(on_intersections); d.first < d.last)
-            add_intersections<N>(view, curves, d, contraction, grad);
-        if (const Drawn d = part(on_rim); d.first < d.last) add_rim<N>(view, curves, d, contraction, grad);
+            add_intersections(view, curves, d, *to_chunk, grad);
+        if (const Drawn d = part(on_rim); d.first < d.last) add_rim(view, curves, d, *to_chunk, grad);
     });
     to.x = nullptr;
 }
 
-// clang-format off
-#define EDGEGRAD_INSTANTIATE(N, C, T) \
-    template void add_boundary<N, C, T>(const BackwardView<T>&, Curves<T>&, int64_t, const C&, Destination&, BackwardProfile&);
-EDGEGRAD_FOR_CONTRACTIONS(EDGEGRAD_INSTANTIATE)
-#undef EDGEGRAD_INSTANTIATE
-// clang-format on
+template void add_boundary(const BackwardView<float>&, Curves<float>&, int64_t, const Contraction&, Destination&,
+                           BackwardProfile&);
+template void add_boundary(const BackwardView<double>&, Curves<double>&, int64_t, const Contraction&, Destination&,
+                           BackwardProfile&);
 
 }  // namespace edgegrad

@@ -15,9 +15,8 @@ namespace edgegrad {
 template <class T>
 struct Curves;
 
-// Adds what n samples find on the measured curves. See contract/contraction.h; N: the number of channels that code is
-// compiled for, or 0.
-template <int N, class Contraction, class T>
+// Adds what n samples find on the measured curves.
+template <class T>
 void add_boundary(const BackwardView<T>& view, Curves<T>& curves, int64_t n, const Contraction& contraction,
                   Destination& to, BackwardProfile& profile);
 

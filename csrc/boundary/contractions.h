@@ -1,242 +1,78 @@
 // What becomes of a sample on a curve, given the surfaces on its sides: in reverse mode cotangents of what the curve
 // moves with, in forward mode a derivative of the pixels around it, or the gradient by its place in the image.
+//
+// Contractions are compiled once for each type of image and number of channels, sources of curves without either: a
+// sample is handed over through an interface.
 #pragma once
 
-#include <algorithm>
-#include <vector>
+#include <concepts>
+#include <memory>
 
 #include "backward/view.h"
 #include "boundary/curve_source.h"
 #include "contract/contraction.h"
-#include "shading/shade.h"
 
 namespace edgegrad {
 
-// Each offers: wants(i, x), false if nothing could come of a sample at x; and add(i, source, sample) for those that it
-// wanted, where i tells the samples of a batch apart.
-
-// With Ã · L in place of radiance: one number a surface.
-template <int N, class T>
-class AdjointRadiance {
+// A sample and its curve: what MovingCurve offers, of whichever source.
+class MovingSample {
    public:
-    explicit AdjointRadiance(const BackwardView<T>& view)
-        : view_(view), C_(channels_of<N>(view.scene)), adjoint_(RayBatch::size * C_), radiance_(C_) {}
+    virtual Vec2 x() const = 0;
+    virtual const CurveSample* on_surfaces() const = 0;  // null along the rim of a lens, where there is one side
+    virtual SampleSurfaces surfaces() = 0;
+    virtual CurveJumps jumps(const double* radiance) const = 0;
+    virtual CurveJumps velocities(const Direction& direction) const = 0;
+    virtual Vec2 normal() const = 0;
+    virtual void add_motion(CurveJumps jumps, ChunkGrad& grad) = 0;
+    virtual void finish(ChunkGrad& grad) = 0;
 
-    bool wants(int i, Vec2 x) { return view_.adjoint.template at<N>(x, adjoint_.data() + i * C_); }
-
-    double of(int i, Vec2 x, const SurfacePoint& p) {
-        if (p.face < 0) return view_.adjoint.template times_background<N>(x);
-        shade<N>(view_.scene, p.face, p.b, radiance_.data());
-        const double* adjoint = adjoint_.data() + i * C_;
-        double sum = 0;
-        for (int c = 0; c < C_; ++c) sum += adjoint[c] * radiance_[c];
-        return sum;
-    }
-
-    // The jumps of the loss at a sample.
-    template <MovingCurve Source>
-    CurveJumps jumps(int i, Source& source, typename Source::Sample& sample) {
-        const SampleSurfaces surfaces = source.surfaces(sample);
-        double radiance[SampleSurfaces::most];
-        for (int k = 0; k < surfaces.count; ++k) radiance[k] = of(i, sample.x, surfaces.at[k]);
-        return source.jumps(sample, radiance);
-    }
-
-   private:
-    const BackwardView<T>& view_;
-    const int C_;
-    std::vector<double> adjoint_, radiance_;
+   protected:
+    ~MovingSample() = default;
 };
 
-template <int N, class T>
-class ReverseBoundary {
+template <MovingCurve Source>
+class SampleOf final : public MovingSample {
    public:
-    ReverseBoundary(const BackwardView<T>& view, ChunkGrad& grad) : radiance_(view), grad_(grad) {}
+    SampleOf(Source& source, typename Source::Sample& sample) : source_(source), sample_(sample) {}
 
-    bool wants(int i, Vec2 x) { return radiance_.wants(i, x); }
+    Vec2 x() const override { return sample_.x; }
+    const CurveSample* on_surfaces() const override {
+        if constexpr (std::derived_from<typename Source::Sample, CurveSample>) return &sample_;
+        else return nullptr;
+    }
+    SampleSurfaces surfaces() override { return source_.surfaces(sample_); }
+    CurveJumps jumps(const double* radiance) const override { return source_.jumps(sample_, radiance); }
+    CurveJumps velocities(const Direction& direction) const override { return source_.velocities(sample_, direction); }
+    Vec2 normal() const override { return source_.normal(sample_); }
+    void add_motion(CurveJumps jumps, ChunkGrad& grad) override { source_.add_motion(sample_, jumps, grad); }
+    void finish(ChunkGrad& grad) override { source_.finish(grad); }
+
+   private:
+    Source& source_;
+    typename Source::Sample& sample_;
+};
+
+class CurveContraction {
+   public:
+    virtual ~CurveContraction() = default;
+
+    // False if nothing could come of a sample at the pixel position x; i tells the samples of a batch apart.
+    virtual bool wants(int i, Vec2 x) = 0;
+
+    // One that it wanted, and that is visible.
     template <MovingCurve Source>
     void add(int i, Source& source, typename Source::Sample& sample) {
-        source.add_motion(sample, radiance_.jumps(i, source, sample), grad_);
+        SampleOf<Source> moving(source, sample);
+        contract(i, moving);
     }
 
    private:
-    AdjointRadiance<N, T> radiance_;
-    ChunkGrad& grad_;
+    virtual void contract(int i, MovingSample& sample) = 0;
 };
 
+// Of the samples of one chunk.
 template <class T>
-class ForwardBoundary {
-   public:
-    ForwardBoundary(const BackwardView<T>& view, Directions directions, ChunkGrad& grad)
-        : view_(view),
-          directions_(directions),
-          C_(view.scene.channels),
-          pixels_(view.image.filter, view.camera.width, view.camera.height),
-          grad_(grad),
-          radiance_(SampleSurfaces::most * C_),
-          values_(directions.size() * C_) {}
-
-    bool wants(int, Vec2) const { return true; }
-
-    template <MovingCurve Source>
-    void add(int, Source& source, typename Source::Sample& sample) {
-        const SampleSurfaces surfaces = source.surfaces(sample);
-        for (int k = 0; k < surfaces.count; ++k)
-            if (const SurfacePoint& p = surfaces.at[k]; p.face >= 0)
-                shade<0>(view_.scene, p.face, p.b, radiance_.data() + k * C_);
-        velocity_.resize(directions_.size());
-        for (size_t d = 0; d < directions_.size(); ++d) velocity_[d] = source.velocities(sample, directions_[d]);
-        pixels_.around(sample.x, [&](int64_t pixel, double weight) {
-            // Each pixel has a background of its own.
-            const T* background = view_.scene.background_at(pixel);
-            for (int c = 0; c < C_; ++c) {
-                double radiance[SampleSurfaces::most];
-                for (int k = 0; k < surfaces.count; ++k)
-                    radiance[k] = surfaces.at[k].face >= 0 ? radiance_[k * C_ + c] : double(background[c]);
-                const CurveJumps jumps = source.jumps(sample, radiance);
-                for (size_t d = 0; d < directions_.size(); ++d)
-                    values_[d * C_ + c] =
-                        weight * (jumps.first * velocity_[d].first + jumps.second * velocity_[d].second);
-            }
-            grad_.pixels.add(pixel, values_.data());
-        });
-    }
-
-   private:
-    const BackwardView<T>& view_;
-    const Directions directions_;
-    const int C_;
-    const FilteredPixels pixels_;
-    ChunkGrad& grad_;
-    std::vector<double> radiance_;  // (3, C) of the surfaces
-    std::vector<CurveJumps> velocity_;
-    std::vector<double> values_;  // (D, C)
-};
-
-template <class T>
-class ScreenBoundary {
-   public:
-    ScreenBoundary(const BackwardView<T>& view, ChunkGrad& grad) : view_(view), radiance_(view), grad_(grad) {}
-
-    bool wants(int i, Vec2 x) { return radiance_.wants(i, x); }
-    template <MovingCurve Source>
-    void add(int i, Source& source, typename Source::Sample& sample) {
-        const CurveJumps jumps = radiance_.jumps(i, source, sample);
-        const Vec2 moved = (jumps.first + jumps.second) * source.normal(sample);
-        grad_.pixels.template add<2>(view_.pixel(sample.x), &moved.x);
-    }
-
-   private:
-    const BackwardView<T>& view_;
-    AdjointRadiance<0, T> radiance_;
-    ChunkGrad& grad_;
-};
-
-template <class T>
-class RecordBoundary {
-   public:
-    RecordBoundary(const BackwardView<T>& view, const Record& kept, CurveRecords& records)
-        : view_(view), kept_(kept), camera_(view.camera), records_(records) {
-        form_.q.prepare(3, 1), form_.uvs.prepare(2, 1), form_.alphas.prepare(1, 1);
-        records_.reserve(scatter_chunk);
-    }
-
-    bool wants(int, Vec2) const { return true; }
-
-    template <MovingCurve Source>
-    void add(int, Source& source, typename Source::Sample& sample) {
-        const SampleSurfaces surfaces = source.surfaces(sample);
-        double first[CurveRecords::surfaces] = {}, second[CurveRecords::surfaces] = {};
-        for (int k = 0; k < surfaces.count; ++k) {
-            double radiance[SampleSurfaces::most] = {};
-            radiance[k] = 1;
-            const CurveJumps jumps = source.jumps(sample, radiance);
-            first[k] = jumps.first, second[k] = jumps.second;
-        }
-        add(source, sample, surfaces, {1, 0}, first), add(source, sample, surfaces, {0, 1}, second);
-    }
-
-   private:
-    static_assert(CurveRecords::surfaces == SampleSurfaces::most);
-
-    // One of the curves. Its velocity is what its motion is the adjoint of.
-    template <MovingCurve Source>
-    void add(Source& source, const typename Source::Sample& sample, const SampleSurfaces& surfaces, CurveJumps curve,
-             const double* factor) {
-        if (std::all_of(factor, factor + CurveRecords::surfaces, [](double f) { return f == 0; })) return;
-        form_.q.clear(), form_.uvs.clear(), form_.alphas.clear();
-        form_.k = {}, form_.light = {};
-        source.add_motion(sample, curve, form_);
-        source.finish(form_);
-        const int64_t sample_index = records_.size();
-        append(records_.x, {sample.x.x, sample.x.y});
-        // Along the rim of a lens there is one side.
-        constexpr bool has_sides = std::derived_from<typename Source::Sample, CurveSample>;
-        Vec2 normal;
-        if constexpr (has_sides) normal = in_straight_image(source.normal(sample), sample.n);
-        for (int k = 0; k < CurveRecords::surfaces; ++k) {
-            const SurfacePoint p = k < surfaces.count ? surfaces.at[k] : SurfacePoint();
-            records_.face.push_back(k < surfaces.count ? int32_t(p.face) : -2);
-            Barycentrics b = p.b;
-            if constexpr (has_sides)
-                if (factor[k] != 0 && p.face >= 0) b = aside(p, sample, normal, factor[k] > 0 ? -1 : 1);
-            append(records_.b, {b.u, b.v});
-            records_.factor.push_back(factor[k]);
-        }
-        if (kept_.intrinsics) append_intrinsics(records_.by_k, camera_, form_.k);
-        form_.q.each([&](int64_t vertex, const double* by_q) {
-            if (by_q[0] == 0 && by_q[1] == 0 && by_q[2] == 0) return;
-            records_.row_of.push_back(sample_index);
-            records_.vertex.push_back(int32_t(vertex));
-            // From the frame of the window to that of the camera.
-            const Vec3 q = transposed_times(camera_.turn, {by_q[0], by_q[1], by_q[2]});
-            append(records_.by_q, {q.x, q.y, q.z});
-        });
-        form_.uvs.each([&](int64_t row, const double* by_uv) {
-            records_.uv_row_of.push_back(sample_index), records_.uv.push_back(int32_t(row));
-            append(records_.by_uv, {by_uv[0], by_uv[1]});
-        });
-        form_.alphas.each([&](int64_t texel, const double* by_alpha) {
-            records_.alpha_row_of.push_back(sample_index), records_.alpha.push_back(texel);
-            records_.by_alpha.push_back(*by_alpha);
-        });
-        if (const LightMotion& light = form_.light; light.part >= 0) {
-            records_.light.push_back(light.part), append(records_.light_uv, {light.uv.x, light.uv.y});
-            const Vec3 place = transposed_times(camera_.turn, light.by_place);
-            append(records_.by_light, {place.x, place.y, place.z});
-        }
-    }
-
-    // (∂x/∂u)ᵀ x̄.
-    Vec2 in_straight_image(Vec2 x_bar, Vec2 n) const {
-        const auto along = [&](Vec2 u) {
-            const Vec2 x = bend_jvp(camera_, n, u);
-            return x.x * x_bar.x + x.y * x_bar.y;
-        };
-        return {along({1, 0}), along({0, 1})};
-    }
-
-    // A point of a surface moved a little off the curve to the side where it is visible: there alone is it known what
-    // lies between it and a light, where the curve is one of contact, and which of two steps along it was taken.
-    Barycentrics aside(const SurfacePoint& p, const CurveSample& sample, Vec2 normal, double side) const {
-        constexpr double little = 1e-5, most = 1e-2;  // px; of the face
-        const double size = length(normal);
-        if (!(size > 0 && std::isfinite(size))) return p.b;
-        const auto corner = corners_of(view_, p.face);
-        Barycentrics b;
-        if (!barycentrics(face_map(camera_, corner.data()),
-                          normalised(camera_, sample.u + (side * little / size) * normal), b))
-            return p.b;
-        const double u = b.u - p.b.u, v = b.v - p.b.v, moved = std::max(std::fabs(u), std::fabs(v));
-        const double part = moved > most ? most / moved : 1;
-        return inside({p.b.u + part * u, p.b.v + part * v});
-    }
-
-    const BackwardView<T>& view_;
-    const Record kept_;
-    const Camera& camera_;
-    CurveRecords& records_;
-    ChunkGrad form_;
-};
+std::unique_ptr<CurveContraction> contract_curves(const BackwardView<T>& view, const Contraction& contraction,
+                                                  ChunkGrad& grad);
 
 }  // namespace edgegrad

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <optional>
 
 #include "boundary/crease_control.h"
@@ -10,7 +11,6 @@
 #include "boundary/hidden_curves.h"
 #include "boundary/intersection_measure.h"
 #include "boundary/jump_scale.h"
-#include "core/channels.h"
 
 namespace edgegrad {
 
@@ -67,7 +67,7 @@ struct CreaseHints {
 };
 
 // The curves of one chunk of edges.
-template <int N, class T>
+template <class T>
 class MeasuredEdges {
     using Relation = Crossings::Relation;
 
@@ -80,8 +80,7 @@ class MeasuredEdges {
           scale_(scale),
           faces_(hints && hints->faces ? &*hints->faces : nullptr),
           x_(x),
-          jumps_(view),
-          control_(view) {
+          control_(make_crease_control(view)) {
         if (hints) visibility_.emplace(view, hints->crossings, hints->meeting);
     }
 
@@ -162,9 +161,10 @@ class MeasuredEdges {
         if (std::min(one.state, other.state) < CreaseFace::clear || std::max(one.state, other.state) < CreaseFace::seen)
             return false;
         Curve c;
-        if (!finder_.find_between(e, c) || !control_.set(c)) return false;
+        if (!finder_.find_between(e, c) || !control_->set(c)) return false;
         ++found.creases;
-        const Jump jump{int64_t(curves.size()), relative(control_.jumps()), view_.importance.mean(c.low(), c.high())};
+        const Jump jump{int64_t(curves.size()), relative(control_->jump(scale_.weights)),
+                        view_.importance.mean(c.low(), c.high())};
         if (!(jump.importance > 0)) return true;
         clear.push_back({int32_t(curves.size()), CellMarks::around(c.low(), c.high())});
         curves.push_back({.edge = int32_t(e)});
@@ -204,7 +204,7 @@ class MeasuredEdges {
         const Relation relation = visibility_->relation(c);
         segments.push_back(image_segment(view_, c, jump.curve));
         if (hiding) return measure(c, jump, visibility_->hidden(relation, hiding).samples);
-        const bool controls = control_.set(c);
+        const bool controls = control_->set(c);
         if (const auto expected = visibility_->without_rays(c, controls ? relation : Relation::across)) {
             if (controls) expect(c, jump, *expected);
             else measure(c, jump, expected->samples);
@@ -217,7 +217,7 @@ class MeasuredEdges {
     void answer() {
         if (!visibility_) return;
         visibility_->answer([&](int k, const Curve& c, Expected expected) {
-            control_.set(c);
+            control_->set(c);
             expect(c, asked_[k], expected);
         });
     }
@@ -225,20 +225,19 @@ class MeasuredEdges {
     void expect(const Curve& c, const Jump& jump, Expected expected) {
         if (expected.visible) {
             curves[jump.curve].controlled = true;
-            control_.add_integral();
-            control_.flush(*x_);
+            control_->add_integral();
+            control_->flush(*x_);
         }
-        measure(c, jump, control_.density(expected.samples));
+        measure(c, jump, control_->density(expected.samples));
     }
 
     // Relative to a jump of the size of the mean, which is taken where nothing is known.
     double size_of_jump(const Curve& c) {
         if (!joins_colors(view_.scene, c)) return 1;
-        jumps_.set(c.minus, c.plus);
-        return relative(jumps_);
+        return relative(control_->jump_between(c.minus, c.plus, scale_.weights));
     }
-    double relative(const CreaseJumps<N, T>& jumps) const {
-        const double size = jumps.size(scale_.weights) / scale_.unknown;
+    double relative(double jump) const {
+        const double size = jump / scale_.unknown;
         return size > 0 && !visibility_ ? std::clamp(size, least, largest) : std::min(size, largest);
     }
 
@@ -251,8 +250,7 @@ class MeasuredEdges {
     const JumpScale& scale_;
     const CreaseFaces<T>* faces_;
     RowBuffer* x_;
-    CreaseJumps<N, T> jumps_;
-    CreaseControl<N, T> control_;
+    const std::unique_ptr<CreaseControl> control_;
     std::optional<CreaseVisibility<T>> visibility_;
     Jump asked_[CreaseVisibility<T>::most];
 };
@@ -337,7 +335,7 @@ void Curves<T>::add_segments(const BackwardView<T>& view, const Systematic& samp
     });
 }
 
-template <int N, class T>
+template <class T>
 Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool rim) {
     Curves<T> out(view, std::move(facing));
     const int64_t E = view.geometry.topology().n_edges();
@@ -348,7 +346,7 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool
     std::vector<std::vector<MeasuredCurve>> curves;
     std::vector<uint8_t> any_hidden;
     const auto measure = [&](int64_t k, int64_t first, int64_t last, RowBuffer* x) {
-        MeasuredEdges<N, T> part(view, out.finder, scale, hints ? &*hints : nullptr, x);
+        MeasuredEdges<T> part(view, out.finder, scale, hints ? &*hints : nullptr, x);
         part.add(first, last);
         found[k] = part.found, curves[k] = std::move(part.curves), out.segments[k] = std::move(part.segments);
         out.clear[k] = std::move(part.clear);
@@ -375,7 +373,7 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool
     std::vector<int64_t> first{0};  // of each part, in all
     for (const auto& part : curves) first.push_back(first.back() + int64_t(part.size()));
     const int64_t n = first.back();
-    measure_intersections<N>(view, out);
+    measure_intersections(view, out);
     if (rim) measure_rim(view, out);
     out.curve = Array<MeasuredCurve>(n), out.measure = Array<double>(n + int64_t(out.intersection.size()) + out.arcs());
     int64_t next = n;
@@ -392,14 +390,9 @@ Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool
     return out;
 }
 
-// clang-format off
-#define EDGEGRAD_INSTANTIATE(N) \
-    template Curves<float> measure_curves<N>(const BackwardView<float>&, Array<int8_t>, bool); \
-    template Curves<double> measure_curves<N>(const BackwardView<double>&, Array<int8_t>, bool);
-EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
-#undef EDGEGRAD_INSTANTIATE
+template Curves<float> measure_curves(const BackwardView<float>&, Array<int8_t>, bool);
+template Curves<double> measure_curves(const BackwardView<double>&, Array<int8_t>, bool);
 template struct Curves<float>;
 template struct Curves<double>;
-// clang-format on
 
 }  // namespace edgegrad

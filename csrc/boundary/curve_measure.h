@@ -71,7 +71,7 @@ struct Curves : CurvesFound {
 
 // Finds and measures all curves, and begins x_bar with the integrals of the controls. `facing` (F,): Camera::facing.
 // `rim`: whether that of a lens counts, which moves with its parameters alone.
-template <int N, class T>
+template <class T>
 Curves<T> measure_curves(const BackwardView<T>& view, Array<int8_t> facing, bool rim);
 
 }  // namespace edgegrad

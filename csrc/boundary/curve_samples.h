@@ -2,7 +2,6 @@
 #pragma once
 
 #include <span>
-#include <utility>
 
 #include "boundary/contractions.h"
 #include "boundary/curve_source.h"
@@ -10,31 +9,12 @@
 
 namespace edgegrad {
 
-// What a contraction does with samples on curves.
-template <int N, class T>
-ReverseBoundary<N, T> on_curves(const BackwardView<T>& view, const Reverse&, ChunkGrad& grad) {
-    return {view, grad};
-}
-template <int N, class T>
-ForwardBoundary<T> on_curves(const BackwardView<T>& view, const Forward& c, ChunkGrad& grad) {
-    return {view, c.directions, grad};
-}
-template <int N, class T>
-ScreenBoundary<T> on_curves(const BackwardView<T>& view, const Screen&, ChunkGrad& grad) {
-    return {view, grad};
-}
-
-template <int N, class T>
-RecordBoundary<T> on_curves(const BackwardView<T>& view, const Record& c, ChunkGrad& grad) {
-    return {view, c, grad.records.curves};
-}
-
-// Samples of one source, in batches of rays.
+// Samples of one source, in batches of rays. The contraction is a CurveContraction, or offers the same.
 template <class Contraction, class T, CurveSource Source>
 class CurveSamples {
    public:
-    CurveSamples(const BackwardView<T>& view, Source& source, Contraction contraction)
-        : view_(view), visibility_(view), source_(source), contraction_(std::move(contraction)), rays_(view.frame) {}
+    CurveSamples(const BackwardView<T>& view, Source& source, Contraction& contraction)
+        : view_(view), visibility_(view), source_(source), contraction_(contraction), rays_(view.frame) {}
 
     // The point at the fraction s of the curve.
     void add(const typename Source::Curve& curve, double s, double weight) {
@@ -73,7 +53,7 @@ class CurveSamples {
     const BackwardView<T>& view_;
     const Visibility<T> visibility_;
     Source& source_;
-    Contraction contraction_;
+    Contraction& contraction_;
 
     CameraRays rays_;
     typename Source::Sample sample_[RayBatch::size];

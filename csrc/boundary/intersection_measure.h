@@ -16,7 +16,7 @@ namespace edgegrad {
 
 // How much a line where faces pass through each other counts beside another one: by how the radiance differs at its
 // ends, which is known, and by how far it moves with the faces, which is far where their planes are nearly the same.
-template <int N, class T>
+template <class T>
 class IntersectionSize {
    public:
     IntersectionSize(const BackwardView<T>& view, const JumpScale& scale) : view_(view), scale_(scale) {}
@@ -44,7 +44,7 @@ class IntersectionSize {
         for (int k = 0; k < 2; ++k) {
             const Barycentrics a = barycentrics_of_hit(planes_.map[k], n0), b = barycentrics_of_hit(planes_.map[k], n1);
             const double sign = k ? -1 : 1;
-            each_corner_value<N>(scene, i.face[k], [&](int c, double c0, double c1, double c2) {
+            each_corner_value<0>(scene, i.face[k], [&](int c, double c0, double c1, double c2) {
                 jump_[2 * c] += sign * (c0 + a.u * (c1 - c0) + a.v * (c2 - c0));
                 jump_[2 * c + 1] += sign * (c0 + b.u * (c1 - c0) + b.v * (c2 - c0));
             });
@@ -86,7 +86,7 @@ Array<Intersection> draw_intersections(const BackwardView<T>& view) {
 // of their jumps tells how they compare with one another. Of silhouettes it is not known, so together they count as
 // half their length, for where they are many most join what is near in space too.
 constexpr double share_of_length = 0.5;
-template <int N, class T>
+template <class T>
 void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
     if (view.geometry.intersections().are_drawn()) out.drawn = draw_intersections(view);
     const Array<Intersection>& all = out.lines(view.geometry);
@@ -100,7 +100,7 @@ void measure_intersections(const BackwardView<T>& view, Curves<T>& out) {
     };
     const std::vector<Part> parts = view.team.of_blocks(n, [&](int64_t first, int64_t last) {
         Part part;
-        IntersectionSize<N, T> size_of(view, scale);
+        IntersectionSize<T> size_of(view, scale);
         for (int64_t i = first; i < last; ++i) {
             IntersectionCurve c;
             if (!find_intersection(view, out.finder.facing(), all[i], c)) continue;

@@ -7,10 +7,10 @@
 #include <cmath>
 #include <cstdint>
 #include <optional>
-#include <utility>
 #include <vector>
 
 #include "backward/view.h"
+#include "boundary/contractions.h"
 #include "boundary/curve_source.h"
 #include "camera/camera_rays.h"
 #include "camera/rim.h"
@@ -80,11 +80,11 @@ class RimSource {
 static_assert(MovingCurve<RimSource>);
 
 // Samples in batches of rays, of which none ignores a face: nothing hides a point of the rim.
-template <class Contraction, class T>
+template <class T>
 class RimSamples {
    public:
-    RimSamples(const BackwardView<T>& view, const Rim& rim, Contraction contraction)
-        : view_(view), rim_(rim), source_(rim), contraction_(std::move(contraction)), rays_(view.frame) {}
+    RimSamples(const BackwardView<T>& view, const Rim& rim, CurveContraction& contraction)
+        : view_(view), rim_(rim), source_(rim), contraction_(contraction), rays_(view.frame) {}
 
     // The point at the fraction s of an arc; its x is a place that shows the inside, for who asks there for a ray.
     void add(Rim::Arc arc, double s, double weight) {
@@ -127,7 +127,7 @@ class RimSamples {
     const BackwardView<T>& view_;
     const Rim& rim_;
     RimSource source_;
-    Contraction contraction_;
+    CurveContraction& contraction_;
     CameraRays rays_;
     RimSource::Sample sample_[RayBatch::size];
 };

@@ -10,8 +10,10 @@
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <vector>
 
+#include "boundary/contractions.h"
 #include "boundary/curve_samples.h"
 #include "boundary/light_rays.h"
 #include "boundary/shadow_edges.h"
@@ -212,13 +214,13 @@ struct ShadowScene {
 template <class T, class Contraction>
 class ShadowChunk {
    public:
-    ShadowChunk(const ShadowScene<T>& scene, uint64_t seed, Contraction contraction)
+    ShadowChunk(const ShadowScene<T>& scene, uint64_t seed, Contraction& contraction)
         : scene_(scene),
           sequence_(seed),
           wedge_(scene.view, scene.faces),
           source_(scene.view, scene.light.infinite),
           light_rays_(scene.view, scene.casters, scene.light),
-          samples_(scene.view, source_, std::move(contraction)) {}
+          samples_(scene.view, source_, contraction) {}
 
     // The i-th of places that ascend, with so many samples: a second one mirrors the first on the edge. How samples
     // fall to the two ends would make most of the noise where there are few on an edge.
@@ -284,7 +286,8 @@ void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const
     const uint64_t pilot_seed = hash(view.options.seed, 10, gradient_stream);
     view.team.each((count + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {
         ChunkGrad unused;
-        ShadowChunk chunk(scene, mix(pilot_seed), Pilots(view, light, of_interval));
+        Pilots pilots_of_block(view, light, of_interval);
+        ShadowChunk chunk(scene, mix(pilot_seed), pilots_of_block);
         const int64_t first = block * intervals_of_block, last = std::min(first + intervals_of_block, count);
         for (int64_t i = first; i < last; ++i) {
             const double shift = to_unit(hash(pilot_seed, i));
@@ -315,7 +318,8 @@ void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const
                        view.team);
     double seconds[2] = {};
     view.scatter.add(places, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        ShadowChunk chunk(scene, hash(view.options.seed, 9, gradient_stream), on_curves<0>(view, record, grad));
+        const std::unique_ptr<CurveContraction> to_chunk = contract_curves(view, record, grad);
+        ShadowChunk chunk(scene, hash(view.options.seed, 9, gradient_stream), *to_chunk);
         Places place(drawn);
         for (int64_t i = first; i < last; ++i) {
             const auto [position, interval, weight] = place(i);

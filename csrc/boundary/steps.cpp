@@ -4,8 +4,10 @@
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <vector>
 
+#include "boundary/contractions.h"
 #include "boundary/curve_samples.h"
 #include "boundary/step_finder.h"
 #include "boundary/step_source.h"
@@ -115,7 +117,7 @@ class StepLines {
 
 }  // namespace
 
-template <int N, class Contraction, class T>
+template <class T>
 void add_steps(const BackwardView<T>& view, const Contraction& contraction, Destination& to, BackwardProfile& profile) {
     Stopwatch watch;
     const StepLines<T> lines(view);
@@ -125,7 +127,8 @@ void add_steps(const BackwardView<T>& view, const Contraction& contraction, Dest
     const uint64_t seed = hash(view.options.seed, 7, gradient_stream);
     view.scatter.add(lines.count(), to, profile.step, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         StepSource<T> source(view);
-        CurveSamples samples(view, source, on_curves<N>(view, contraction, grad));
+        const std::unique_ptr<CurveContraction> to_chunk = contract_curves(view, contraction, grad);
+        CurveSamples samples(view, source, *to_chunk);
         StepFinder<T> finder(view);
         lines.each(first, last, [&](const LinedFace& face, Vec2 a, Vec2 b, bool vertical, int64_t line) {
             finder.set(face.face);
@@ -139,11 +142,7 @@ void add_steps(const BackwardView<T>& view, const Contraction& contraction, Dest
     });
 }
 
-// clang-format off
-#define EDGEGRAD_INSTANTIATE(N, C, T) \
-    template void add_steps<N, C, T>(const BackwardView<T>&, const C&, Destination&, BackwardProfile&);
-EDGEGRAD_FOR_CONTRACTIONS(EDGEGRAD_INSTANTIATE)
-#undef EDGEGRAD_INSTANTIATE
-// clang-format on
+template void add_steps(const BackwardView<float>&, const Contraction&, Destination&, BackwardProfile&);
+template void add_steps(const BackwardView<double>&, const Contraction&, Destination&, BackwardProfile&);
 
 }  // namespace edgegrad

@@ -11,7 +11,7 @@ namespace edgegrad {
 constexpr int64_t lined_face_bytes = 3 * 104;
 
 // Adds what lines find on the faces in view, GradientOptions::step_spacing apart; see add_boundary.
-template <int N, class Contraction, class T>
+template <class T>
 void add_steps(const BackwardView<T>& view, const Contraction& contraction, Destination& to, BackwardProfile& profile);
 
 }  // namespace edgegrad

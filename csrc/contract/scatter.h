@@ -8,7 +8,7 @@
 
 #include <algorithm>
 #include <cstdint>
-#include <utility>
+#include <functional>
 #include <vector>
 
 #include "camera/camera.h"
@@ -130,38 +130,12 @@ struct Destination {
     RecordList* records = nullptr;
 };
 
-// The rows of both, and their width.
-constexpr int as_radiance = 0, as_pixels = -1, as_vertex_attributes = -2, as_face_attributes = -3;
-struct RowSlot {
-    RowBuffer ChunkGrad::* rows;
-    double* Destination::* to;
-    int width;
-};
-constexpr RowSlot row_slots[] = {{&ChunkGrad::q, &Destination::q, 3},
-                                 {&ChunkGrad::x, &Destination::x, 2},
-                                 {&ChunkGrad::colors, &Destination::colors, as_radiance},
-                                 {&ChunkGrad::uvs, &Destination::uvs, 2},
-                                 {&ChunkGrad::texels, &Destination::texels, as_radiance},
-                                 {&ChunkGrad::alphas, &Destination::alphas, 1},
-                                 {&ChunkGrad::vertex_attributes, &Destination::vertex_attributes, as_vertex_attributes},
-                                 {&ChunkGrad::face_attributes, &Destination::face_attributes, as_face_attributes},
-                                 {&ChunkGrad::pixels, &Destination::pixels, as_pixels}};
+struct RowSlot;  // the rows of both, and their width
 
 // Samples in a chunk, chunks that are in memory at a time for each thread, and owners at most: more would only split
 // the buffers further.
 constexpr int64_t scatter_chunk = 512, chunks_in_flight = 16;
 constexpr int most_owners = 16;
-
-inline int64_t RowBuffer::bytes(const Load& load, int threads) {
-    const int64_t chunks = std::min((load.samples + scatter_chunk - 1) / scatter_chunk, chunks_in_flight * threads);
-    const int64_t samples = std::min(load.samples, scatter_chunk * chunks), owners = std::min(threads, most_owners);
-    // They come in order, so there are no more runs than primitives and ends of chunks.
-    const int64_t runs = load.primitives < 0 ? samples : std::min(samples, load.primitives + chunks);
-    const int64_t used = std::min<int64_t>(owners, (load.destinations + run - 1) / run);
-    const int64_t rows = std::max(load.each * runs, chunks * used * int64_t(fewest_rows));
-    return rows * int64_t(sizeof(int64_t) + sizeof(double) * load.width) +
-           chunks * (owners * int64_t(sizeof(Rows)) + n_recent * int64_t(sizeof(Recent)));
-}
 
 // Calls body(first, last, chunk) for all samples 0 … n − 1, after prepare(chunk, owners); then add(chunk, owner) for
 // the chunks in order and each owner, and last(chunk). `seconds`: of the samples and of the adding.
@@ -197,51 +171,14 @@ class Scatter {
     };
     Scatter(Team& team, Widths widths) : team_(team), widths_(widths) {}
 
-    // Calls body(first, last, ChunkGrad&) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
+    // Calls body(first, last, grad) for all samples 0 … n − 1, and adds what it wrote to `to`. `seconds`: of the
     // samples and of the adding.
-    template <class Body>
-    void add(int64_t n, Destination& to, double (&seconds)[2], Body body) {
-        scatter_in_waves(
-            team_, n, grads_, [&](ChunkGrad& g, int owners) { prepare(g, to, owners); }, body,
-            [&](const ChunkGrad& g, int owner) {
-                for (const RowSlot& slot : row_slots)
-                    if (double* const there = to.*slot.to) (g.*slot.rows).add_to(there, owner);
-            },
-            [&](ChunkGrad& g) {
-                to.k += g.k;
-                if (!to.records) return;
-                to.records->surface.push_back(std::exchange(g.records.surface, {}));
-                to.records->curves.push_back(std::exchange(g.records.curves, {}));
-            },
-            seconds);
-    }
+    using Body = std::function<void(int64_t first, int64_t last, ChunkGrad& grad)>;
+    void add(int64_t n, Destination& to, double (&seconds)[2], const Body& body);
 
    private:
-    // Empties a chunk's buffers, and makes those that are wanted.
-    void prepare(ChunkGrad& g, const Destination& to, int owners) const {
-        for (const RowSlot& slot : row_slots) {
-            RowBuffer& rows = g.*slot.rows;
-            const int width = width_of(slot, to);
-            if (to.*slot.to) rows.prepare(width, owners);
-            rows.clear();
-        }
-        g.k = {};
-    }
-
-    int width_of(const RowSlot& slot, const Destination& to) const {
-        switch (slot.width) {
-            case as_radiance:
-                return widths_.radiance;
-            case as_pixels:
-                return to.pixel_width;
-            case as_vertex_attributes:
-                return widths_.vertex_attributes;
-            case as_face_attributes:
-                return widths_.face_attributes;
-            default:
-                return slot.width;
-        }
-    }
+    void prepare(ChunkGrad& g, const Destination& to, int owners) const;
+    int width_of(const RowSlot& slot, const Destination& to) const;
 
     Team& team_;
     const Widths widths_;

@@ -9,9 +9,9 @@ inline constexpr int all_channels = N < 0 ? -N : N;
 template <int N>
 inline constexpr int radiance_channels = N < 0 ? 0 : N;  // 0: not known
 
-// Calls f.template operator()<N>() with the N that code is compiled for.
+// What f.template operator()<N>() returns with the N that code is compiled for.
 template <class F>
-void dispatch_channels(int channels, bool attributes, F f) {
+auto dispatch_channels(int channels, bool attributes, F f) {
     if (attributes) return channels == 4 ? f.template operator()<-4>() : f.template operator()<0>();
     switch (channels) {
         case 1:

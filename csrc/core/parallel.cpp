@@ -178,6 +178,43 @@ Pool* pool = new Pool;
 
 }  // namespace
 
+// Runs f unless the call is failing already; keeps what it throws.
+template <class F>
+void Team::guard(F f) noexcept {
+    if (failed_.load(std::memory_order_relaxed)) return;
+    try {
+        f();
+    } catch (...) {
+        const std::lock_guard lock(mutex_);
+        if (!failure_) failure_ = std::current_exception();
+        failed_.store(true, std::memory_order_relaxed);
+    }
+}
+
+void Team::check() {
+    if (failed_.load(std::memory_order_relaxed)) throw Interrupted();
+    if (!interrupted_ || std::this_thread::get_id() != caller_) return;
+    const auto now = std::chrono::steady_clock::now();
+    if (now - asked_ < asking_time) return;
+    asked_ = now;
+    if (interrupted_()) throw Interrupted();
+}
+
+void Team::run(int64_t n, const ItemBody& item) {
+    check();
+    const int threads = threads_for(n);
+    const auto guarded = [&](int thread, int64_t i) {
+        guard([&] {
+            check();
+            item(thread, i);
+        });
+    };
+    if (threads > 1) share(n, threads, guarded, [&] { guard([&] { check(); }); });
+    else
+        for (int64_t i = 0; i < n; ++i) guarded(0, i);
+    if (failed_) std::rethrow_exception(failure_);
+}
+
 void share(int64_t n, int threads, const ItemBody& body, const std::function<void()>& waiting) {
     const auto job = std::make_shared<Job>(n, threads - 1, body);
     pool->add(job);

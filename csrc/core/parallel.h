@@ -47,57 +47,27 @@ class Team {
     // As many as there are items to share. Waking a thread takes longer than a small item, so few items take one.
     int threads_for(int64_t items) const { return int(std::clamp<int64_t>(items, 1, threads_)); }
 
-    // Runs f unless the call is failing already; keeps what it throws.
-    template <class F>
-    void guard(F f) noexcept {
-        if (failed_.load(std::memory_order_relaxed)) return;
-        try {
-            f();
-        } catch (...) {
-            const std::lock_guard lock(mutex_);
-            if (!failure_) failure_ = std::current_exception();
-            failed_.store(true, std::memory_order_relaxed);
-        }
-    }
+    // Within long work: throws where the call is to stop.
+    void check();
 
-    // After a region: throws what one of its threads threw.
-    void rethrow() {
-        if (failed_) std::rethrow_exception(failure_);
-    }
-
-    // Within long work, under a guard: throws where the call is to stop.
-    void check() {
-        if (failed_.load(std::memory_order_relaxed)) throw Interrupted();
-        if (!interrupted_ || std::this_thread::get_id() != caller_) return;
-        const auto now = std::chrono::steady_clock::now();
-        if (now - asked_ < std::chrono::milliseconds(50)) return;
-        asked_ = now;
-        if (interrupted_()) throw Interrupted();
-    }
+    // item(thread, i) for i = 0 … n − 1, in no order. Compiled once: what a loop does besides its items would otherwise
+    // be a large part of all code.
+    void run(int64_t n, const ItemBody& item);
 
     // body(i) for i = 0 … n − 1, in no order.
     template <class Body>
     void each(int64_t n, Body body) {
-        each_with(n, [] { return std::make_unique<char>(); }, [&](char&, int64_t i) { body(i); });
+        run(n, [&](int, int64_t i) { body(i); });
     }
 
     // body(state, i) for i = 0 … n − 1, in no order, with a state for each thread: make() gives a pointer that owns it.
     template <class Make, class Body>
     void each_with(int64_t n, Make make, Body body) {
-        check();
-        const int threads = threads_for(n);
-        std::vector<decltype(make())> states(threads);
-        const auto item = [&](int thread, int64_t i) {
-            guard([&] {
-                check();
-                if (!states[thread]) states[thread] = make();
-                body(*states[thread], i);
-            });
-        };
-        if (threads > 1) share(n, threads, item, [&] { guard([&] { check(); }); });
-        else
-            for (int64_t i = 0; i < n; ++i) item(0, i);
-        rethrow();
+        std::vector<decltype(make())> states(threads_for(n));
+        run(n, [&](int thread, int64_t i) {
+            if (!states[thread]) states[thread] = make();
+            body(*states[thread], i);
+        });
     }
 
     // body(k, first, last) for the blocks k of 0 … n − 1. Their size is fixed, so that sums over them are rounded alike
@@ -118,6 +88,9 @@ class Team {
     }
 
    private:
+    template <class F>
+    void guard(F f) noexcept;
+
     const int threads_;
     bool (*const interrupted_)();
     const std::thread::id caller_;

@@ -11,12 +11,12 @@ namespace edgegrad {
 namespace {
 
 constexpr int most_again = 8;   // times the points of a face in a pixel, where it is shaded again
-constexpr int share_again = 4;  // times the points of the first look, in all
+constexpr int share_again = 4;  // times the points of the first pass, in all
 
 // What is seen of punctual lamps in the pixels of an image, and how many points were shaded there.
-class Sights {
+class LampVisibility {
    public:
-    Sights(int width, int height, const std::vector<LightSample>& lights, const LitScene& lit)
+    LampVisibility(int width, int height, const std::vector<LightSample>& lights, const LitScene& lit)
         : width_(width), height_(height), points_(int64_t(width) * height, 0) {
         for (size_t k = 0; k < lights.size(); ++k)
             if (lit.lamps[lights[k].lamp].is_punctual()) columns_.push_back(k);
@@ -67,7 +67,7 @@ class Sights {
 
 // What rows have in common.
 template <class T>
-struct Look {
+struct RowInput {
     const LitScene& lit;
     const SceneView<T>& scene;
     const RayCaster& caster;
@@ -76,59 +76,59 @@ struct Look {
     uint64_t seed;
     const uint8_t* only;  // pixels, null: all
     LitImage<T>& to;
-    Sights* sights;  // null: not wanted
+    LampVisibility* visibility;  // null: not wanted
 };
 
 template <class T>
 class LitRow : public RowVisitor {
    public:
-    explicit LitRow(const Look<T>& look)
-        : look_(look),
-          lights_(light_samples(look.lit, look.options)),
-          room_(shade_room(look.lit, look.options)),
-          sums_(int64_t(look.width) * look.lit.channels) {}
+    explicit LitRow(const RowInput<T>& in)
+        : in_(in),
+          lights_(light_samples(in.lit, in.options)),
+          buffers_(shade_buffers(in.lit, in.options)),
+          sums_(int64_t(in.width) * in.lit.channels) {}
 
     void visit(int y, std::vector<PixelHit>& hits) override {
         std::fill(sums_.begin(), sums_.end(), 0.0);
         among_ = 0;
         for (size_t first = 0; first < hits.size(); first += shaded_at_once)
             shade(hits, first, std::min(hits.size() - first, size_t(shaded_at_once)));
-        const int C = look_.lit.channels;
-        for (int x = 0; x < look_.width; ++x) {
-            const int64_t pixel = int64_t(y) * look_.width + x;
-            if (look_.only && !look_.only[pixel]) continue;
-            for (int c = 0; c < C; ++c) look_.to.radiance[pixel * C + c] = T(sums_[int64_t(x) * C + c]);
+        const int C = in_.lit.channels;
+        for (int x = 0; x < in_.width; ++x) {
+            const int64_t pixel = int64_t(y) * in_.width + x;
+            if (in_.only && !in_.only[pixel]) continue;
+            for (int c = 0; c < C; ++c) in_.to.radiance[pixel * C + c] = T(sums_[int64_t(x) * C + c]);
         }
     }
 
    private:
     void shade(const std::vector<PixelHit>& hits, size_t first, size_t n) {
-        const int C = look_.lit.channels;
+        const int C = in_.lit.channels;
         const size_t K = lights_.size();
         face_.clear(), b_.clear(), seed_.clear(), radiance_.resize(n * C), seen_.resize(n * K);
         for (size_t i = first; i < first + n; ++i) {
             const PixelHit& hit = hits[i];
             among_ = i > 0 && hits[i - 1].pixel == hit.pixel ? among_ + 1 : 0;
             face_.push_back(hit.face), b_.insert(b_.end(), {1 - (hit.b.u + hit.b.v), hit.b.u, hit.b.v});
-            seed_.push_back(int64_t(look_.seed + uint64_t(look_.points) * uint64_t(hit.pixel) + among_));
+            seed_.push_back(int64_t(in_.seed + uint64_t(in_.points) * uint64_t(hit.pixel) + among_));
         }
-        shade_some(look_.lit, look_.scene, look_.caster, {int64_t(n), face_.data(), b_.data(), seed_.data(), {}},
-                   look_.options, *room_, radiance_.data(), seen_.data());
+        shade_some(in_.lit, in_.scene, in_.caster, {int64_t(n), face_.data(), b_.data(), seed_.data(), {}}, in_.options,
+                   *buffers_, radiance_.data(), seen_.data());
         for (size_t i = 0; i < n; ++i) {
             const PixelHit& hit = hits[first + i];
-            double* sum = &sums_[int64_t(hit.pixel % look_.width) * C];
+            double* sum = &sums_[int64_t(hit.pixel % in_.width) * C];
             for (int c = 0; c < C; ++c) sum[c] += hit.weight * radiance_[i * C + c];
             const int8_t* seen = seen_.data() + i * K;
-            if (look_.sights) look_.sights->add(hit.pixel % look_.width, hit.pixel / look_.width, seen);
+            if (in_.visibility) in_.visibility->add(hit.pixel % in_.width, hit.pixel / in_.width, seen);
             for (size_t k = 0; k < K; ++k)
                 if (seen[k] != not_asked)
-                    std::atomic_ref(look_.to.asked[lights_[k].lamp]).store(1, std::memory_order_relaxed);
+                    std::atomic_ref(in_.to.asked[lights_[k].lamp]).store(1, std::memory_order_relaxed);
         }
     }
 
-    const Look<T>& look_;
+    const RowInput<T>& in_;
     std::vector<LightSample> lights_;
-    std::shared_ptr<ShadeRoom> room_;
+    std::shared_ptr<ShadeBuffers> buffers_;
     std::vector<double> sums_;  // of the row
     uint64_t among_ = 0;        // the hits of one pixel, which this is
     std::vector<int64_t> face_, seed_;
@@ -144,20 +144,21 @@ LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Cam
                        const HitBuffers<T>& hits) {
     LitImage<T> out{Array<T>(int64_t(camera.width) * camera.height * lit.channels),
                     std::vector<uint8_t>(lit.lamps.size(), 0)};
-    const bool looks_again = options.shadows && image.spp > 1;
-    std::unique_ptr<Sights> sights;
-    if (looks_again) sights = std::make_unique<Sights>(camera.width, camera.height, light_samples(lit, options), lit);
-    const auto look = [&](const PixelChoice& choice, uint64_t seed) {
-        const Look<T> rows{lit,         scene, caster,      options, camera.width,
-                           choice.most, seed,  choice.only, out,     choice.only ? nullptr : sights.get()};
+    const bool twice = options.shadows && image.spp > 1;
+    std::unique_ptr<LampVisibility> visibility;
+    if (twice)
+        visibility = std::make_unique<LampVisibility>(camera.width, camera.height, light_samples(lit, options), lit);
+    const auto shade_pixels = [&](const PixelChoice& choice, uint64_t seed) {
+        const RowInput<T> rows{lit,         scene, caster,      options, camera.width,
+                               choice.most, seed,  choice.only, out,     choice.only ? nullptr : visibility.get()};
         visit_pixel_hits(scene, camera, caster, image, choice, team, hits,
                          [&] { return std::make_unique<LitRow<T>>(rows); });
     };
-    look({0, camera.height, sampling.points}, sampling.seed);
-    if (!looks_again) return out;
+    shade_pixels({0, camera.height, sampling.points}, sampling.seed);
+    if (!twice) return out;
     std::vector<uint8_t> borders;
-    if (const int times = sights->borders(borders, team))
-        look({0, camera.height, times * sampling.points, borders.data()}, sampling.again);
+    if (const int times = visibility->borders(borders, team))
+        shade_pixels({0, camera.height, times * sampling.points, borders.data()}, sampling.again);
     return out;
 }
 

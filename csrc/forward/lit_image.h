@@ -14,7 +14,7 @@ namespace edgegrad {
 // of one that is moved a little differ by little.
 struct LitSampling {
     int points;            // of the samples of a pixel on one face, that are shaded
-    uint64_t seed, again;  // of the first look, and of pixels that are shaded again
+    uint64_t seed, again;  // of the first pass, and of pixels that are shaded again
 };
 
 // (H · W, C) before what lies behind the surfaces, and for each lamp whether a point asked for its shadow.
@@ -27,8 +27,8 @@ struct LitImage {
 // Pixels that the border of a punctual lamp's shadow runs through are shaded again, at several points: there one point
 // of a face is a poor guess at the whole pixel. A pixel is one of them where the pixels around it see the lamp and do
 // not. What was found in the pixel itself is not asked: whether it is shaded again, with other points, must not depend
-// on the points that it then does without, or the mean over seeds would be off. edgegrad/_borders.py has the same rule
-// for shaders.
+// on the points that it then does without, or the mean over seeds would be off. edgegrad/points/borders.py has the same
+// rule for shaders.
 template <class T>
 LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                        const ImageOptions& image, const LitOptions& options, const LitSampling& sampling, Team& team,

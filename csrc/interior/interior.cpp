@@ -9,11 +9,11 @@
 #include "interior/interior.h"
 
 #include <algorithm>
+#include <memory>
 #include <vector>
 
 #include "backward/beside.h"
 #include "camera/polygon.h"
-#include "core/channels.h"
 #include "core/draws.h"
 #include "core/sampler.h"
 #include "core/sobol.h"
@@ -21,35 +21,18 @@
 #include "film/film.h"
 #include "interior/contractions.h"
 #include "interior/surface_measure.h"
+#include "shading/shade.h"
 
 namespace edgegrad {
 
 namespace {
 
-template <int N, class T>
-ReverseInterior<N, T> contract(const BackwardView<T>& view, const Reverse& c, const Destination& to, ChunkGrad& grad) {
-    return {view, c.geometry, to, grad};
-}
-template <int N, class T>
-ForwardInterior<T> contract(const BackwardView<T>& view, const Forward& c, const Destination&, ChunkGrad& grad) {
-    return {view, c.directions, grad};
-}
-template <int N, class T>
-ScreenInterior<T> contract(const BackwardView<T>& view, const Screen&, const Destination&, ChunkGrad& grad) {
-    return {view, grad};
-}
-
-template <int N, class T>
-RecordInterior<T> contract(const BackwardView<T>& view, const Record& c, const Destination&, ChunkGrad& grad) {
-    return {view, c, grad.records.surface};
-}
-
 // The samples of one chunk.
-template <class Contraction, class T>
+template <class T>
 class InteriorChunk {
    public:
-    InteriorChunk(const BackwardView<T>& view, Contraction contraction)
-        : view_(view), contraction_(std::move(contraction)), rays_(view.frame) {}
+    InteriorChunk(const BackwardView<T>& view, SurfaceContraction& contraction)
+        : view_(view), contraction_(contraction), rays_(view.frame) {}
 
     void add(SurfaceSample sample) {
         const int i = rays_.count;
@@ -111,7 +94,7 @@ class InteriorChunk {
     }
 
     const BackwardView<T>& view_;
-    Contraction contraction_;
+    SurfaceContraction& contraction_;
     CameraRays rays_;
     SurfaceSample sample_[RayBatch::size];
 };
@@ -147,7 +130,7 @@ void prefetch_face(const BackwardView<T>& view, int64_t face) {
 }
 
 // Adds what n samples find on the faces, which are laid end to end.
-template <int N, class Contraction, class T>
+template <class T>
 void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systematic& systematic,
                          const SurfaceMeasure<T>& surface, const Contraction& contraction, Destination& to,
                          double (&seconds)[2]) {
@@ -155,7 +138,8 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
     const auto cell = [&](int64_t f) { return cell_of(view, view.scene.faces[3 * f]); };
     const OrderedDraws draws(systematic, n, {view.scene.n_faces}, cell, view.team);
     view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        InteriorChunk chunk(view, contract<N>(view, contraction, to, grad));
+        const std::unique_ptr<SurfaceContraction> to_chunk = contract_surfaces(view, contraction, to, grad);
+        InteriorChunk chunk(view, *to_chunk);
         VisiblePolygon polygon;
         PolygonSampler sampler;
         int64_t face = -1;
@@ -192,7 +176,7 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
 // For a large triangle with a texture this beats surface samples: its rays are the most coherent there are, and those
 // of a pixel and of its neighbours are spread evenly over it (sobol.h). For others it is poor: a triangle that is seen
 // at a grazing angle, or is smaller than a pixel, is hit by chance.
-template <int N, class Contraction, class T>
+template <class T>
 void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Contraction& contraction,
                        Destination& to, double (&seconds)[2]) {
     const auto& [pixels, spp, seed, faces, share, beyond] = samples;
@@ -201,7 +185,7 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
     const double weight = 1 / (spp * share);
     const ScrambledSobol sobol(seed);
     view.scatter.add(int64_t(pixels.size()), to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        auto chunk = contract<N>(view, contraction, to, grad);
+        const std::unique_ptr<SurfaceContraction> chunk = contract_surfaces(view, contraction, to, grad);
         CameraRays rays(view.frame);
         struct {
             int64_t pixel;
@@ -215,14 +199,14 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
             for (int i = 0; i < rays.count; ++i) {
                 const int32_t face = rays.face[i];
                 if (face < 0 || (faces && !faces[face])) continue;
-                if (drawn[i].pixel != pixel) chunk.begin_pixel(pixel = drawn[i].pixel, weight);
-                chunk.add_in_pixel(face, rays.n(i), drawn[i].x);
+                if (drawn[i].pixel != pixel) chunk->begin_pixel(pixel = drawn[i].pixel, weight);
+                chunk->add_in_pixel(face, rays.n(i), drawn[i].x);
             }
             rays.count = 0;
         };
         for (int64_t p = first; p < last; ++p) {
             const int64_t pixel = pixels[p];
-            if (!chunk.begin_pixel(pixel, weight)) continue;
+            if (!chunk->begin_pixel(pixel, weight)) continue;
             const int column = int(pixel % stride), row = int(pixel / stride), x = column - margin, y = row - margin;
             const uint64_t place = z_order(column, row) * spp;
             for (int done = 0; done < spp;) {
@@ -236,11 +220,11 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
             }
         }
         cast();
-        chunk.finish();
+        chunk->finish();
     });
 }
 
-template <int N, class Contraction, class T>
+template <class T>
 void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64_t n, const Contraction& contraction,
                   Destination& to, BackwardProfile& profile) {
     const GradientOptions& o = view.options;
@@ -250,21 +234,22 @@ void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64
         PixelSamples samples{surface.pixels, surface.pixel_spp, hash(o.seed, 4, gradient_stream),
                              surface.by_pixels.data(), surface.pixel_share};
         if (view.detailed) samples.beyond = surface.beyond;
-        add_pixel_samples<N>(view, samples, contraction, to, profile.surface);
+        add_pixel_samples(view, samples, contraction, to, profile.surface);
     }
     if (n == 0) return;
     Systematic systematic(surface.of_face, view.team);
     if (!(systematic.total() > 0)) return;
     systematic.draw(n, to_unit(hash(o.seed, 1, gradient_stream)));
-    add_surface_samples<N>(view, n, systematic, surface, contraction, to, profile.surface);
+    add_surface_samples(view, n, systematic, surface, contraction, to, profile.surface);
 }
 
-// clang-format off
-#define EDGEGRAD_INSTANTIATE(N, C, T) \
-    template void add_interior<N, C, T>(const BackwardView<T>&, SurfaceMeasure<T>&, int64_t, const C&, Destination&, BackwardProfile&); \
-    template void add_pixel_samples<N, C, T>(const BackwardView<T>&, const PixelSamples&, const C&, Destination&, double (&)[2]);
-EDGEGRAD_FOR_CONTRACTIONS(EDGEGRAD_INSTANTIATE)
+#define EDGEGRAD_INSTANTIATE(T)                                                                                       \
+    template void add_interior(const BackwardView<T>&, SurfaceMeasure<T>&, int64_t, const Contraction&, Destination&, \
+                               BackwardProfile&);                                                                     \
+    template void add_pixel_samples(const BackwardView<T>&, const PixelSamples&, const Contraction&, Destination&,    \
+                                    double (&)[2]);
+EDGEGRAD_INSTANTIATE(float)
+EDGEGRAD_INSTANTIATE(double)
 #undef EDGEGRAD_INSTANTIATE
-// clang-format on
 
 }  // namespace edgegrad

@@ -12,9 +12,8 @@ namespace edgegrad {
 template <class T>
 struct SurfaceMeasure;
 
-// Adds what n samples find on the measured surface, and those of the pixels. See contract/contraction.h; N: the number
-// of channels that code is compiled for, or 0.
-template <int N, class Contraction, class T>
+// Adds what n samples find on the measured surface, and those of the pixels.
+template <class T>
 void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64_t n, const Contraction& contraction,
                   Destination& to, BackwardProfile& profile);
 
@@ -29,7 +28,7 @@ struct PixelSamples {
     // and samples are uniform in them; else these are drawn in proportion to the filter of their pixel.
     std::optional<int> beyond = {};
 };
-template <int N, class Contraction, class T>
+template <class T>
 void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Contraction& contraction,
                        Destination& to, double (&seconds)[2]);
 

@@ -7,7 +7,6 @@
 
 #include "backward/vertex_image.h"
 #include "camera/polygon.h"
-#include "core/channels.h"
 #include "core/sampler.h"
 #include "interior/control.h"
 #include "interior/face_lanes.h"
@@ -108,7 +107,7 @@ class PixelMask {
 };
 
 // Looks at the faces of one chunk.
-template <int N, class T>
+template <class T>
 class MeasuredChunk {
    public:
     MeasuredChunk(const BackwardView<T>& view, const std::vector<double>& importance_around, bool geometry,
@@ -123,7 +122,7 @@ class MeasuredChunk {
           out_(out),
           mask_(mask),
           grad_(grad),
-          C_(channels_of<N>(view.scene)),
+          C_(view.scene.channels),
           rough_(2 * view.importance.roughness() * view.importance.roughness()),
           want_values_(to.colors || to.vertex_attributes || to.face_attributes) {}
 
@@ -303,7 +302,7 @@ class MeasuredChunk {
     }
 
     void gather_control(int i) {
-        const int C = N ? all_channels<N> : C_;
+        const int C = C_;
         const int64_t f = lanes_->face[i];
         const int32_t* v = view_.scene.faces + 3 * f;
         constexpr int next = FaceLanes::size;
@@ -317,14 +316,14 @@ class MeasuredChunk {
                 view_.adjoint.of(int64_t(lanes_->inside[1][k][i]) * view_.camera.width + lanes_->inside[0][k][i]);
             for (int c = 0; c < C; ++c) adjoint[(7 * c + 3 + k) * next] = A[c];
         }
-        each_corner_value<N>(view_.scene, f, [&](int c, double c0, double c1, double c2) {
+        each_corner_value<0>(view_.scene, f, [&](int c, double c0, double c1, double c2) {
             color[2 * c * next] = c1 - c0;
             color[(2 * c + 1) * next] = c2 - c0;
         });
     }
 
     void add_controls() {
-        const int C = N ? all_channels<N> : C_, R = radiance_of<N>(view_.scene);
+        const int C = C_, R = view_.scene.radiance;
         FaceLanes& l = *lanes_;
         l.integrate();
         for (int i = 0; i < l.count; ++i) {
@@ -409,7 +408,7 @@ void thin_out(std::vector<int64_t>& pixels, double share, double offset) {
 
 }  // namespace
 
-template <int N, class T>
+template <class T>
 SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Array<int8_t>& facing, Destination& to) {
     const GradientOptions& o = view.options;
     const int64_t F = view.scene.n_faces, chunks = (F + scatter_chunk - 1) / scatter_chunk;
@@ -435,7 +434,7 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
     });
     double seconds[2] = {};
     view.scatter.add(F, whole, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        MeasuredChunk<N, T> chunk(view, importance_around, geometry, to, facing, out, mask, grad);
+        MeasuredChunk<T> chunk(view, importance_around, geometry, to, facing, out, mask, grad);
         chunk.add(first, last);
         total[first / scatter_chunk] = chunk.total(), of_pixels[first / scatter_chunk] = chunk.of_pixels();
     });
@@ -452,12 +451,7 @@ SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Ar
     return out;
 }
 
-// clang-format off
-#define EDGEGRAD_INSTANTIATE(N) \
-    template SurfaceMeasure<float> measure_surface<N>(const BackwardView<float>&, bool, Array<int8_t>&, Destination&); \
-    template SurfaceMeasure<double> measure_surface<N>(const BackwardView<double>&, bool, Array<int8_t>&, Destination&);
-EDGEGRAD_FOR_CHANNELS(EDGEGRAD_INSTANTIATE)
-#undef EDGEGRAD_INSTANTIATE
-// clang-format on
+template SurfaceMeasure<float> measure_surface(const BackwardView<float>&, bool, Array<int8_t>&, Destination&);
+template SurfaceMeasure<double> measure_surface(const BackwardView<double>&, bool, Array<int8_t>&, Destination&);
 
 }  // namespace edgegrad

@@ -40,7 +40,7 @@ struct SurfaceMeasure {
 
 // Measures all faces, and adds to `to` the integrals of the controls. What it finds of their orientation in the image
 // it writes into `facing` (F,), as Camera::facing has it, unless that is empty.
-template <int N, class T>
+template <class T>
 SurfaceMeasure<T> measure_surface(const BackwardView<T>& view, bool geometry, Array<int8_t>& facing, Destination& to);
 
 }  // namespace edgegrad

@@ -1,6 +1,7 @@
 // What shaders written in PyTorch are made of: samples as records of arrays, what is seen at places and along rays.
 
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
 
 #include <optional>
 
@@ -19,14 +20,6 @@ using namespace nanobind::literals;
 namespace edgegrad {
 
 namespace {
-
-// What work(Team&) gives, without the interpreter's lock.
-template <class Work>
-auto on_team(int threads, Work work) {
-    std::optional<std::invoke_result_t<Work, Team&>> out;
-    unlocked(threads, [&](Team& team) { out.emplace(work(team)); });
-    return *std::move(out);
-}
 
 template <class T>
 nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& options, int threads,
@@ -52,16 +45,16 @@ nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const Im
 
 nb::dict arrays_of(const std::vector<CurveRecords>& parts, double least, bool one, int threads) {
     nb::dict curves;
-    CurveHits hits = on_team(threads, [&](Team& team) { return curve_hits(parts, least, one, team); });
+    CurveHits hits = unlocked(threads, [&](Team& team) { return curve_hits(parts, least, one, team); });
     curves["hit_sample"] = rows(std::move(hits.sample)), curves["hit_face"] = rows(std::move(hits.face));
     curves["hit_side"] = rows(std::move(hits.side)), curves["hit_b"] = rows(std::move(hits.b), {3});
     curves["hit_x"] = rows(std::move(hits.x), {2}), curves["hit_factor"] = rows(std::move(hits.factor));
     curves["to_background"] = rows(std::move(hits.to_background));
     const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {
-        curves[name] = rows(on_team(threads, [&](Team& team) { return joined(parts, field, team); }), std::move(row));
+        curves[name] = rows(unlocked(threads, [&](Team& team) { return joined(parts, field, team); }), std::move(row));
     };
     const auto add_rows = [&](const char* name, auto field) {
-        curves[name] = rows(on_team(threads, [&](Team& team) { return joined_rows(parts, field, team); }));
+        curves[name] = rows(unlocked(threads, [&](Team& team) { return joined_rows(parts, field, team); }));
     };
     using C = CurveRecords;
     add("x", &C::x, {2}), add("by_k", &C::by_k, {intrinsics_width});
@@ -88,7 +81,7 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
     nb::dict surface;
     const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {
         surface[name] =
-            rows(on_team(threads, [&](Team& team) { return joined(found.surface, field, team); }), std::move(row));
+            rows(unlocked(threads, [&](Team& team) { return joined(found.surface, field, team); }), std::move(row));
     };
     using S = SurfaceRecords;
     add("face", &S::face), add("x", &S::x, {2}), add("along", &S::along, {3}), add("weight", &S::weight);

@@ -1,4 +1,4 @@
-// Barycentrics of hits as functions of vertices, camera and rays, for edgegrad/_moving_hits.py.
+// Barycentrics of hits as functions of vertices, camera and rays, for edgegrad/points/moving.py.
 
 #include "forward/moving_hits.h"
 

@@ -38,7 +38,7 @@ using Tangents = Slots<const double>;
 // A new differentiable parameter is a member above, a row here, and what computes it.
 template <class T>
 struct GradientSlot {
-    const char* name;  // of the array that it belongs to, in edgegrad/_request.py
+    const char* name;  // of the array that it belongs to, in edgegrad/kernel/request.py
     double* Gradients::* to;
     const double* Tangents::* from;
     int64_t (*size)(const SceneView<T>& scene, int64_t pixels);

@@ -1,4 +1,4 @@
-// Plain views of the arrays of a scene, as edgegrad/scene.py lays them out.
+// Plain views of the arrays of a scene, as edgegrad/kernel/flat.py lays them out.
 #pragma once
 
 #include <algorithm>

@@ -368,7 +368,7 @@ class _Shading(NamedTuple):
             assert seen is not None
             found, b_bar = core.shade_vjp(seen=array(seen), **arguments)
         else:
-            found, b_bar = kernel_scene(self._flat(tensors)).look_and_shade_vjp(**arguments)
+            found, b_bar = kernel_scene(self._flat(tensors)).trace_and_shade_vjp(**arguments)
         none = bar.new_zeros(0)
         return [torch.from_numpy(b_bar), *(none if g is None else torch.from_numpy(g) for g in found)]
 

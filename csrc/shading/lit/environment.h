@@ -1,4 +1,4 @@
-// Light from all around: the same, or an image of directions (edgegrad/environment.py says which).
+// Light from all around: the same, or an image of directions (edgegrad/scene/environment.py says which).
 #pragma once
 
 #include <algorithm>

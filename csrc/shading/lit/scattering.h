@@ -1,5 +1,5 @@
 // How a surface scatters light: Lambert's law f = base / π, and the metallic-roughness model of glTF 2.0 (appendix B),
-// whose terms edgegrad/material.py names. Value, and beneath it the _vjp.
+// whose terms edgegrad/scene/material.py names. Value, and beneath it the _vjp.
 #pragma once
 
 #include <algorithm>

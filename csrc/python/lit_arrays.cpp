@@ -1,0 +1,228 @@
+#include "python/lit_arrays.h"
+
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include <algorithm>
+#include <string>
+#include <utility>
+
+using namespace nanobind::literals;
+
+namespace edgegrad {
+
+namespace {
+
+// A number out of a list of names. Raises ValueError.
+template <class Kind>
+Kind kind_of(const char* argument, const std::string& name, const std::vector<std::string>& names) {
+    for (size_t i = 0; i < names.size(); ++i)
+        if (names[i] == name) return Kind(i);
+    refuse(std::string(argument) + ": unknown kind \"" + name + "\"");
+}
+
+const int32_t* data_of(const std::optional<Rows>& rows) { return rows ? rows->data() : nullptr; }
+
+SourceArrays make_source(const std::string& kind, int value, int factor, int uvs, std::optional<Rows> uv_faces,
+                         int64_t height, int64_t width, const std::vector<int>& sampler) {
+    if (sampler.size() != 3) refuse("sampler: expected the wrap of u and of v, and the filter");
+    const Source source{kind_of<Source::Kind>("kind", kind, {"constant", "vertex", "face", "corner", "texture"}),
+                        value,
+                        uvs,
+                        factor,
+                        data_of(uv_faces),
+                        height,
+                        width,
+                        {Wrap(sampler[0]), Wrap(sampler[1]), TextureFilter(sampler[2])}};
+    return {source, uv_faces};
+}
+
+MeshArrays make_mesh(int64_t first_face, int64_t faces, int32_t first_vertex, bool has_material, bool two_sided,
+                     bool lambertian, const SourceArrays& color, const SourceArrays& base, const SourceArrays& metallic,
+                     const SourceArrays& roughness, const SourceArrays& emission, const SourceArrays& normal_map,
+                     int normal_scale, int normals, std::optional<Rows> normal_faces) {
+    LitMesh mesh{first_face, faces,     first_vertex,  has_material,   two_sided,     lambertian,
+                 color.view, base.view, metallic.view, roughness.view, emission.view, {}};
+    mesh.normal = {normals, data_of(normal_faces), normal_map.view, normal_scale};
+    return {mesh, {color, base, metallic, roughness, emission, normal_map}, normal_faces};
+}
+
+LampArrays make_lamp(const std::string& kind, int position, int direction, int intensity, int color, int inner_angle,
+                     int outer_angle, int rotation, int radiance, int mesh, int64_t height, int64_t width,
+                     bool is_image, std::optional<In<double, 1>> running, std::optional<In<double, 1>> density,
+                     const std::vector<uint64_t>& stream, double eps) {
+    Lamp lamp;
+    lamp.kind = kind_of<Lamp::Kind>("kind", kind,
+                                    {"directional", "point", "spot", "mesh", "environment", "spherical harmonics"});
+    lamp.position = position, lamp.direction = direction, lamp.intensity = intensity, lamp.color = color;
+    lamp.inner_angle = inner_angle, lamp.outer_angle = outer_angle, lamp.rotation = rotation, lamp.radiance = radiance;
+    lamp.mesh = mesh, lamp.height = height, lamp.width = width, lamp.is_image = is_image, lamp.eps = eps;
+    if (!lamp.is_punctual()) {
+        if (!running || !density || running->size() != density->size() || running->size() == 0)
+            refuse("running, density: expected a number for each face or texel");
+        lamp.running = running->data(), lamp.density = density->data(), lamp.size = int64_t(running->size());
+    }
+    if (stream.size() != 3) refuse("stream: expected three numbers");
+    std::copy(stream.begin(), stream.end(), lamp.stream);
+    return {lamp, running, density};
+}
+
+}  // namespace
+
+LitArrays::LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshes, std::vector<LampArrays> lamps,
+                     Rows faces, int verts, int eye, bool perspective, int channels, const std::vector<double>& ball,
+                     const std::vector<uint64_t>& step)
+    : tables_(std::move(tables)), meshes_(std::move(meshes)), lamps_(std::move(lamps)), faces_(faces) {
+    if (channels < 1 || channels > most_lit_channels) refuse("channels: expected 1 to 16");
+    if (ball.size() != 4 || step.size() != 3) refuse("ball, step: expected 4 and 3 numbers");
+    for (const AnyTable& t : tables_) {
+        const bool wide = t.dtype() == nb::dtype<double>();
+        if (!wide && t.dtype() != nb::dtype<float>()) refuse("tables: expected floats or doubles");
+        scene.tables.push_back({t.data(), wide, int64_t(t.shape(0)), int(t.shape(1))});
+    }
+    scene.faces = faces_.data(), scene.verts = verts, scene.eye = eye, scene.perspective = perspective;
+    scene.channels = channels, scene.center = {ball[0], ball[1], ball[2]}, scene.radius = ball[3];
+    std::copy(step.begin(), step.end(), scene.step);
+    check_table("verts", verts, 1, 3), check_table("eye", eye, 1, 3);
+    if (faces.shape(1) != 3) refuse("faces: expected three columns");
+    check_indices("faces", faces.data(), faces.size(), size_t(table(verts).rows), "verts", 1);
+    for (const MeshArrays& mesh : meshes_) check_mesh(mesh), scene.meshes.push_back(mesh.view);
+    for (const LampArrays& lamp : lamps_) check_lamp(lamp.view), scene.lamps.push_back(lamp.view);
+}
+
+void LitArrays::check_table(const char* name, int number, int64_t rows, int columns) const {
+    if (number < 0 || size_t(number) >= scene.tables.size()) refuse(std::string(name) + ": expected a table");
+    if (table(number).rows < rows || (columns && table(number).width != columns))
+        refuse(std::string(name) + ": expected a table of " + std::to_string(columns) + " columns and at least " +
+               std::to_string(rows) + " rows");
+}
+void LitArrays::check_channels(const char* name, int number, int64_t rows, int channels) const {
+    check_table(name, number, rows, 0);
+    if (const int n = table(number).width; n != 1 && n != channels)
+        refuse(std::string(name) + ": expected 1 or " + std::to_string(channels) + " columns, got " +
+               std::to_string(n));
+}
+void LitArrays::check_index(const char* name, const int32_t* index, int64_t faces, int number) const {
+    if (!index) refuse(std::string(name) + ": expected three indices a face");
+    check_indices(name, index, size_t(3 * faces), size_t(table(number).rows), "the table", 1);
+}
+void LitArrays::check_source(const char* name, const SourceArrays& arrays, const LitMesh& mesh, int channels) const {
+    const Source& s = arrays.view;
+    if (!s.exists()) return;
+    using Kind = Source::Kind;
+    check_channels(name, s.value,
+                   s.kind == Kind::face     ? mesh.faces
+                   : s.kind == Kind::corner ? 3 * mesh.faces
+                                            : 1,
+                   channels);
+    if (s.factor != no_table) check_channels(name, s.factor, 1, channels);
+    if (s.kind == Kind::vertex)
+        for (int64_t f = 3 * mesh.first_face; f < 3 * (mesh.first_face + mesh.faces); ++f)
+            if (const int64_t row = int64_t(faces_.data()[f]) - mesh.first_vertex;
+                row < 0 || row >= table(s.value).rows)
+                refuse(std::string(name) + ": expected a row for each vertex of the mesh");
+    if (s.kind != Kind::texture) return;
+    if (s.height < 1 || s.width < 1 || s.height * s.width != table(s.value).rows)
+        refuse(std::string(name) + ": expected a row for each texel");
+    check_table(name, s.uvs, 1, 2);
+    if (!arrays.uv_faces || int64_t(arrays.uv_faces->shape(0)) != mesh.faces || arrays.uv_faces->shape(1) != 3)
+        refuse(std::string(name) + ": expected uv_faces with a row for each face");
+    check_index(name, s.uv_faces, mesh.faces, s.uvs);
+}
+void LitArrays::check_mesh(const MeshArrays& arrays) const {
+    const LitMesh& m = arrays.view;
+    if (m.first_face < 0 || m.faces < 1 || m.first_face + m.faces > int64_t(faces_.shape(0)))
+        refuse("meshes: expected faces of the scene");
+    const char* names[] = {"color", "base_color", "metallic", "roughness", "emission", "normal_map"};
+    const int channels[] = {scene.channels, scene.channels, 1, 1, scene.channels, 3};
+    for (int i = 0; i < 6; ++i) check_source(names[i], arrays.kept[size_t(i)], m, channels[i]);
+    if (m.normal.map.exists()) {
+        check_table("normal_scale", m.normal.map_scale, 1, 1);
+        if (m.normal.map.kind != Source::Kind::texture) refuse("normal_map: expected a texture");
+    }
+    if (m.normal.normals == no_table) return;
+    check_table("normals", m.normal.normals, 1, 3);
+    if (!arrays.normal_faces || int64_t(arrays.normal_faces->shape(0)) != m.faces || arrays.normal_faces->shape(1) != 3)
+        refuse("normal_faces: expected a row for each face");
+    check_index("normal_faces", m.normal.normal_faces, m.faces, m.normal.normals);
+}
+void LitArrays::check_lamp(const Lamp& lamp) const {
+    using Kind = Lamp::Kind;
+    const auto optional = [&](const char* name, int number, int64_t rows, int columns) {
+        if (number != no_table) check_table(name, number, rows, columns);
+    };
+    optional("rotation", lamp.rotation, 1, 9);
+    if (lamp.kind == Kind::directional || lamp.kind == Kind::point || lamp.kind == Kind::spot) {
+        check_table("intensity", lamp.intensity, 1, 1);
+        if (lamp.color != no_table) check_channels("color", lamp.color, 1, scene.channels);
+    }
+    if (lamp.kind == Kind::point || lamp.kind == Kind::spot) check_table("position", lamp.position, 1, 3);
+    if (lamp.kind == Kind::directional || lamp.kind == Kind::spot) check_table("direction", lamp.direction, 1, 3);
+    if (lamp.kind == Kind::spot)
+        check_table("inner_angle", lamp.inner_angle, 1, 1), check_table("outer_angle", lamp.outer_angle, 1, 1);
+    if (lamp.kind == Kind::harmonics) check_channels("coefficients", lamp.radiance, 9, scene.channels);
+    if (lamp.kind == Kind::environment) {
+        if (lamp.height < 1 || lamp.width < 1 || lamp.height * lamp.width != lamp.size)
+            refuse("radiance: expected a density for each texel");
+        check_channels("radiance", lamp.radiance, lamp.is_image ? lamp.size : 1, scene.channels);
+    }
+    if (lamp.kind != Kind::mesh) return;
+    if (lamp.mesh < 0 || size_t(lamp.mesh) >= scene.meshes.size()) refuse("mesh: expected one of the scene");
+    if (lamp.size != scene.meshes[size_t(lamp.mesh)].faces || !scene.meshes[size_t(lamp.mesh)].emission.exists())
+        refuse("mesh: expected one that emits, and a density for each of its faces");
+}
+
+LitPoints PointArrays::view(const LitScene& scene, int64_t faces) const {
+    const size_t n = face.size();
+    if (b.shape(0) != n || b.shape(1) != 3 || seed.size() != n) refuse("b, seed: expected a row a point");
+    for (size_t i = 0; i < n; ++i)
+        if (face(i) < 0 || face(i) >= faces) refuse("face: expected faces of the scene");
+    LitPoints points{int64_t(n), face.data(), b.data(), seed.data(), {}};
+    if (forced_lamp < 0) return points;
+    if (size_t(forced_lamp) >= scene.lamps.size() || !index || !uv || !density || !lit || index->size() != n ||
+        uv->shape(0) != n || uv->shape(1) != 2 || density->size() != n || lit->size() != n)
+        refuse("forced: expected a row a point");
+    const Lamp& lamp = scene.lamps[size_t(forced_lamp)];
+    for (size_t i = 0; !lamp.is_punctual() && i < n; ++i)
+        if ((*index)(i) < 0 || (*index)(i) >= lamp.size) refuse("forced: expected faces or texels of the light");
+    points.forced = {forced_lamp, index->data(), uv->data(), density->data(), lit->data()};
+    return points;
+}
+
+void bind_lit_arrays(nb::module_& m) {
+    m.attr("MOST_LIT_CHANNELS") = most_lit_channels;
+    nb::class_<SourceArrays>(m, "LitSource")
+        .def(nb::new_(&make_source), "kind"_a, "value"_a = no_table, "factor"_a = no_table, "uvs"_a = no_table,
+             "uv_faces"_a.noconvert() = nb::none(), "height"_a = 0, "width"_a = 0,
+             "sampler"_a = std::vector<int>{0, 0, 0});
+    nb::class_<MeshArrays>(m, "LitMesh")
+        .def(nb::new_(&make_mesh), nb::kw_only(), "first_face"_a, "faces"_a, "first_vertex"_a, "has_material"_a,
+             "two_sided"_a, "lambertian"_a, "color"_a, "base_color"_a, "metallic"_a, "roughness"_a, "emission"_a,
+             "normal_map"_a, "normal_scale"_a, "normals"_a, "normal_faces"_a.noconvert());
+    nb::class_<LampArrays>(m, "Lamp").def(
+        nb::new_(&make_lamp), "kind"_a, nb::kw_only(), "position"_a = no_table, "direction"_a = no_table,
+        "intensity"_a = no_table, "color"_a = no_table, "inner_angle"_a = no_table, "outer_angle"_a = no_table,
+        "rotation"_a = no_table, "radiance"_a = no_table, "mesh"_a = -1, "height"_a = 1, "width"_a = 1,
+        "is_image"_a = false, "running"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(), "stream"_a,
+        "eps"_a);
+    nb::class_<LitArrays>(m, "Lit").def(
+        nb::init<std::vector<AnyTable>, std::vector<MeshArrays>, std::vector<LampArrays>, Rows, int, int, bool, int,
+                 const std::vector<double>&, const std::vector<uint64_t>&>(),
+        nb::kw_only(), "tables"_a, "meshes"_a, "lamps"_a, "faces"_a.noconvert(), "verts"_a, "eye"_a, "perspective"_a,
+        "channels"_a, "ball"_a, "step"_a);
+    nb::class_<PointArrays>(m, "LitPoints")
+        .def(nb::new_([](In<int64_t, 1> face, In<double, 2> b, In<int64_t, 1> seed, int forced_lamp,
+                         std::optional<In<int64_t, 1>> index, std::optional<In<double, 2>> uv,
+                         std::optional<In<double, 1>> density, std::optional<In<uint8_t, 1>> lit) {
+                 return PointArrays{face, b, seed, forced_lamp, index, uv, density, lit};
+             }),
+             nb::kw_only(), "face"_a.noconvert(), "b"_a.noconvert(), "seed"_a.noconvert(), "forced_lamp"_a = -1,
+             "index"_a.noconvert() = nb::none(), "uv"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(),
+             "lit"_a.noconvert() = nb::none());
+    nb::class_<LitOptions>(m, "LitOptions")
+        .def(nb::new_([](bool shadows, int samples, int only) { return LitOptions{shadows, samples, only}; }),
+             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a);
+}
+
+}  // namespace edgegrad

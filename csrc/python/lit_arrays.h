@@ -1,0 +1,71 @@
+// Lit scenes as Python hands them over (edgegrad/light/in_kernel.py): tables, and meshes and lights that refer to them
+// by number; kept alive, and checked.
+#pragma once
+
+#include <cstdint>
+#include <optional>
+#include <vector>
+
+#include "python/checks.h"
+#include "shading/lit/lit_scene.h"
+
+namespace edgegrad {
+
+using AnyTable = nb::ndarray<nb::numpy, nb::ro, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Rows = In<int32_t, 2>;
+
+struct SourceArrays {
+    Source view;
+    std::optional<Rows> uv_faces;
+};
+
+struct MeshArrays {
+    LitMesh view;
+    std::vector<SourceArrays> kept;
+    std::optional<Rows> normal_faces;
+};
+
+struct LampArrays {
+    Lamp view;
+    std::optional<In<double, 1>> running, density;
+};
+
+// All of it, checked: what indexes what exists.
+class LitArrays {
+   public:
+    LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshes, std::vector<LampArrays> lamps, Rows faces,
+              int verts, int eye, bool perspective, int channels, const std::vector<double>& ball,
+              const std::vector<uint64_t>& step);
+
+    LitScene scene;
+
+   private:
+    const Table& table(int number) const { return scene.tables[size_t(number)]; }
+    void check_table(const char* name, int number, int64_t rows, int columns) const;
+    void check_channels(const char* name, int number, int64_t rows, int channels) const;
+    void check_index(const char* name, const int32_t* index, int64_t faces, int number) const;
+    void check_source(const char* name, const SourceArrays& arrays, const LitMesh& mesh, int channels) const;
+    void check_mesh(const MeshArrays& arrays) const;
+    void check_lamp(const Lamp& lamp) const;
+
+    std::vector<AnyTable> tables_;
+    std::vector<MeshArrays> meshes_;
+    std::vector<LampArrays> lamps_;
+    Rows faces_;
+};
+
+// Points, and what is forced of one light at them.
+struct PointArrays {
+    In<int64_t, 1> face;
+    In<double, 2> b;
+    In<int64_t, 1> seed;
+    int forced_lamp;
+    std::optional<In<int64_t, 1>> index;
+    std::optional<In<double, 2>> uv;
+    std::optional<In<double, 1>> density;
+    std::optional<In<uint8_t, 1>> lit;
+
+    LitPoints view(const LitScene& scene, int64_t faces) const;
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,34 @@
+// The opened library, for the sources of this folder alone.
+#pragma once
+
+#include "rays/embree_api.h"
+
+namespace edgegrad::embree {
+
+struct Library {
+#define EDGEGRAD_DECLARE(name, result, parameters) result(*name) parameters = nullptr;
+    EDGEGRAD_EMBREE_FUNCTIONS(EDGEGRAD_DECLARE)
+#undef EDGEGRAD_DECLARE
+    Device device = nullptr;
+    int version = 0;
+    int packet_width = 8;
+};
+extern Library rtc;
+
+// Throws what went wrong in this thread since it last asked.
+void throw_on_error(const char* doing);
+
+// While it lives, threads that this one starts count as Embree's: see let_embree_sleep().
+class NamedWorkers {
+   public:
+    NamedWorkers();
+    ~NamedWorkers();
+
+   private:
+    [[maybe_unused]] char own_[16] = {};
+};
+
+// To be said with embree_mutex held.
+void note_build();
+
+}  // namespace edgegrad::embree

@@ -1,0 +1,84 @@
+// Radiance at a point of which it is known which lights it sees, and its _vjp.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <vector>
+
+#include "shading/lit/light_sample.h"
+#include "shading/lit/spherical_harmonics.h"
+
+namespace edgegrad {
+
+// Everything but lights that cast shadows.
+template <class S>
+void add_unshadowed(const LitScene& lit, const Surface<S>& o, S* total) {
+    if (!o.mesh->has_material) {
+        for (int c = 0; c < lit.channels; ++c) total[c] += o.scattering.base[c];
+        return;
+    }
+    S own[most_lit_channels];
+    if (o.mesh->emission.exists()) {
+        value(lit.tables, o.mesh->emission, o.at, lit.channels, own);
+        for (int c = 0; c < lit.channels; ++c) total[c] += own[c];
+    }
+    for (const Lamp& lamp : lit.lamps) {
+        if (lamp.casts()) continue;
+        irradiance<S>(lit.tables, lamp, lit.channels, o.n, own);
+        for (int c = 0; c < lit.channels; ++c) total[c] += S(1 / M_PI) * o.scattering.diffuse(c) * own[c];
+    }
+}
+inline void add_unshadowed_vjp(const LitScene& lit, const Surface<double>& o, const double* total_bar, SurfaceBar& bar,
+                               Cotangents& to) {
+    if (!o.mesh->has_material) {
+        for (int c = 0; c < lit.channels; ++c) bar.scattering.base[c] += total_bar[c];
+        return;
+    }
+    if (o.mesh->emission.exists()) value_vjp(lit.tables, o.mesh->emission, o.at, lit.channels, total_bar, bar.b, to);
+    double E[most_lit_channels], E_bar[most_lit_channels];
+    for (const Lamp& lamp : lit.lamps) {
+        if (lamp.casts()) continue;
+        irradiance<double>(lit.tables, lamp, lit.channels, o.n, E);
+        for (int c = 0; c < lit.channels; ++c) {
+            E_bar[c] = total_bar[c] / M_PI * o.scattering.diffuse(c);
+            diffuse_vjp(o.scattering, c, total_bar[c] / M_PI * E[c], bar.scattering);
+        }
+        irradiance_vjp(lit.tables, lamp, lit.channels, o.n, E_bar, bar.n, to);
+    }
+}
+
+template <class S>
+void radiance(const LitScene& lit, const LitPoints& points, const LitOptions& options,
+              const std::vector<LightSample>& lights, int64_t i, const Surface<S>& o, const int8_t* seen, S* total) {
+    std::fill(total, total + lit.channels, S(0));
+    if (o.is_black()) return;
+    if (options.only < 0) add_unshadowed(lit, o, total);
+    for (size_t k = 0; k < lights.size(); ++k)
+        if (seen[k] > 0)
+            add_light<S>(lit, lit.lamps[lights[k].lamp], light_point(lit, points, i, lights[k], plain(o.g)),
+                         1.0 / lights[k].count, o, total);
+}
+// Whether no light that a point sees, nor anything else, gives it radiance: then it has no derivatives either.
+inline bool is_unlit(const LitScene& lit, int64_t face, const int8_t* seen, size_t lights) {
+    const LitMesh& mesh = lit.mesh_of(face);
+    if (!mesh.has_material || mesh.emission.exists()) return false;
+    return std::none_of(seen, seen + lights, [](int8_t s) { return s > 0; }) &&
+           std::all_of(lit.lamps.begin(), lit.lamps.end(), [](const Lamp& lamp) { return lamp.casts(); });
+}
+inline void radiance_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options,
+                         const std::vector<LightSample>& lights, int64_t i, Surface<double>& o, const int8_t* seen,
+                         const double* total_bar, double* b_bar, Cotangents& to) {
+    if (o.is_black() || is_unlit(lit, points.face[i], seen, lights.size())) return;
+    look_up_material(lit, o);
+    SurfaceBar bar(lit.channels);
+    if (options.only < 0) add_unshadowed_vjp(lit, o, total_bar, bar, to);
+    for (size_t k = 0; k < lights.size(); ++k)
+        if (seen[k] > 0)
+            add_light_vjp(lit, lit.lamps[lights[k].lamp], light_point(lit, points, i, lights[k], o.g),
+                          1.0 / lights[k].count, o, total_bar, bar, to);
+    look_up_material_vjp(lit, o, bar, to);
+    surface_vjp(lit, o, bar, to);
+    std::copy(bar.b, bar.b + 3, b_bar);
+}
+
+}  // namespace edgegrad

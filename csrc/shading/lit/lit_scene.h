@@ -1,0 +1,97 @@
+// A scene with materials and lights, as tables and what refers to them by number; and points of its surfaces.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <vector>
+
+#include "core/math.h"
+#include "shading/lit/area.h"
+#include "shading/lit/lamp.h"
+#include "shading/lit/normals.h"
+#include "shading/lit/source.h"
+#include "shading/lit/tables.h"
+
+namespace edgegrad {
+
+struct LitMesh {
+    int64_t first_face = 0, faces = 0;
+    int32_t first_vertex = 0;
+    bool has_material = false, two_sided = true, lambertian = true;
+    Source color, base, metallic, roughness, emission;  // the colour of the mesh itself, and its material's
+    NormalSource normal;
+};
+
+struct LitScene {
+    std::vector<Table> tables;
+    std::vector<LitMesh> meshes;  // ascending by first face
+    std::vector<Lamp> lamps;
+    const int32_t* faces = nullptr;  // (F, 3) rows of `verts`
+    int verts = no_table;
+    int eye = no_table;  // where it is; in an orthographic view, the unit direction towards it
+    bool perspective = true;
+    int channels = 0;
+    Vec3 center;  // of a ball around all vertices
+    double radius = 0;
+    uint64_t step[3] = {};  // of random numbers, from one seed to the next
+
+    const LitMesh& mesh_of(int64_t face) const {
+        size_t k = 0;
+        while (k + 1 < meshes.size() && face >= meshes[k + 1].first_face) ++k;
+        return meshes[k];
+    }
+    EmissiveFaces emitter(const Lamp& lamp) const {
+        const LitMesh& mesh = meshes[lamp.mesh];
+        return {faces, mesh.first_face, mesh.first_vertex, verts, mesh.emission, mesh.two_sided};
+    }
+};
+
+// What is known of the shadow of one light, instead of being drawn and traced: a row for each point.
+struct ForcedLight {
+    int lamp = -1;  // −1: nothing
+    const int64_t* index = nullptr;
+    const double *uv = nullptr, *density = nullptr;
+    const uint8_t* lit = nullptr;
+};
+
+struct LitPoints {
+    int64_t size = 0;
+    const int64_t* face = nullptr;
+    const double* b = nullptr;      // (N, 3) barycentrics
+    const int64_t* seed = nullptr;  // (N,) of random numbers
+    ForcedLight forced;
+
+    // So many from `first` on, or those that there are.
+    LitPoints part(int64_t first, int64_t count) const {
+        LitPoints o{std::min(count, size - first), face + first, b + 3 * first, seed + first, forced};
+        if (forced.lamp >= 0)
+            o.forced = {forced.lamp, forced.index + first, forced.uv + 2 * first, forced.density + first,
+                        forced.lit + first};
+        return o;
+    }
+};
+
+struct LitOptions {
+    bool shadows = true;
+    int samples = 1;  // points of each light with an extent, for each point that is shaded
+    int only = -1;    // the lamp of which alone radiance is wanted; −1: of all that there is
+};
+
+// Whether a point sees a light sample: 1, or 0 where it is in shadow, or that it was not asked, for the surface is
+// turned away from it.
+constexpr int8_t not_asked = -1;
+
+struct LightSample {
+    int lamp, sample, count;  // one of so many of a lamp
+};
+inline std::vector<LightSample> light_samples(const LitScene& lit, const LitOptions& options) {
+    std::vector<LightSample> out;
+    for (int k = 0; k < int(lit.lamps.size()); ++k) {
+        if (!lit.lamps[k].casts() || !(options.only < 0 || options.only == k)) continue;
+        const int count = lit.lamps[k].is_punctual() ? 1 : options.samples;
+        for (int s = 0; s < count; ++s) out.push_back({k, s, count});
+    }
+    return out;
+}
+
+}  // namespace edgegrad

@@ -1,0 +1,79 @@
+// Visibility queries: which light samples the points of surfaces see.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <vector>
+
+#include "forward/trace.h"
+#include "rays/raycast.h"
+#include "scene/scene.h"
+#include "shading/lit/light_sample.h"
+
+namespace edgegrad {
+
+// Shadow rays from points to points of lights.
+struct ShadowRays {
+    std::vector<int32_t> face;
+    std::vector<double> b, to, contact;
+    std::vector<int8_t*> result;
+
+    void clear() { face.clear(), b.clear(), to.clear(), contact.clear(), result.clear(); }
+    void add(const LitScene& lit, const Lamp& lamp, int64_t face_, const Surface<double>& o, Vec3 there, int8_t* seen) {
+        const auto largest = [](Vec3 v) { return std::max({std::fabs(v.x), std::fabs(v.y), std::fabs(v.z)}); };
+        double size = largest(o.y);
+        if (lamp.is_infinite()) there = o.y + (length(o.y - lit.center) + 1.01 * lit.radius) * there;
+        else size = std::max(size, largest(there));
+        face.push_back(int32_t(face_)), result.push_back(seen), contact.push_back(16 * lamp.eps * size);
+        b.insert(b.end(), {o.at.b[1], o.at.b[2]}), to.insert(to.end(), {there.x, there.y, there.z});
+    }
+    template <class T>
+    void cast(const SceneView<T>& scene, const RayCaster& caster, std::vector<uint8_t>& found) {
+        found.resize(face.size());
+        see(scene, caster, {face.data(), b.data(), to.data(), contact.data(), int64_t(face.size())}, found.data());
+        for (size_t k = 0; k < found.size(); ++k) *result[k] = int8_t(found[k]);
+        clear();
+    }
+};
+
+// What queries keep from one call to the next.
+struct ShadeBuffers {
+    std::vector<LightSample> lights;
+    std::vector<Surface<double>> surfaces;
+    ShadowRays rays;
+    std::vector<uint8_t> found;
+};
+
+// Finds the surfaces at points that are `wanted`, and which lights they see.
+template <class T, class Wanted>
+void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                      const LitOptions& options, ShadeBuffers& buffers, int8_t* seen, Wanted wanted) {
+    const std::vector<LightSample>& lights = buffers.lights;
+    const size_t K = lights.size();
+    buffers.surfaces.resize(points.size);
+    for (int64_t i = 0; i < points.size; ++i)
+        if (wanted(i)) set_surface<double>(lit, points.face[i], points.b + 3 * i, buffers.surfaces[i]);
+    // Light by light, for rays that are cast together are the faster the more alike they are.
+    for (size_t k = 0; k < K; ++k) {
+        const Lamp& lamp = lit.lamps[lights[k].lamp];
+        const Vec3 only_place = lamp.is_punctual() ? place(lit, lamp, {}) : Vec3();
+        for (int64_t i = 0; i < points.size; ++i) {
+            if (!wanted(i)) continue;
+            const Surface<double>& o = buffers.surfaces[i];
+            int8_t& found = seen[i * K + k] = not_asked;
+            if (!o.mesh->has_material || o.is_black()) continue;
+            const Vec3 there =
+                lamp.is_punctual() ? only_place : place(lit, lamp, light_point(lit, points, i, lights[k], o.g));
+            const Vec3 l = lamp.is_infinite() ? there : unit(there - o.y);
+            if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
+            found = 1;
+            if (!options.shadows) continue;
+            if (points.forced.lamp == lights[k].lamp) found = int8_t(points.forced.lit[i]);
+            else buffers.rays.add(lit, lamp, points.face[i], o, there, &found);
+        }
+    }
+    buffers.rays.cast(scene, caster, buffers.found);
+}
+
+}  // namespace edgegrad
