@@ -1,7 +1,8 @@
-// Threads of our own, not OpenMP's. How those wait is fixed when torch loads them: by default they spin for
-// milliseconds, and a loop ends when all of them had a processor, work or no work. Beside a busy process a step took 10
-// times as long.
+// Loops shared among OpenMP's threads. The runtime is torch's, which is loaded before the kernel: torch and the kernel
+// use the same threads, one after the other.
 #include "core/parallel.h"
+
+#include <omp.h>
 
 #include <condition_variable>
 #include <system_error>
@@ -9,15 +10,18 @@
 #if defined(__x86_64__) || defined(_M_X64)
 #include <immintrin.h>
 #endif
-#ifdef __linux__
+#ifndef _WIN32
 #include <dlfcn.h>
+#endif
+#ifdef __SANITIZE_THREAD__
+#include <sanitizer/tsan_interface.h>
 #endif
 
 namespace edgegrad {
 
 namespace {
 
-// Long enough to be there for the next loop of the same pass; short beside what other processes would miss.
+// Long enough for threads that finish together; short beside what other processes would miss.
 constexpr std::chrono::microseconds spin_time(100);
 constexpr std::chrono::milliseconds asking_time(50);
 
@@ -38,131 +42,71 @@ bool spin(Ready ready) {
     return false;
 }
 
-// A loop whose items are taken one by one. The caller waits for items that were taken, not for threads: a worker that
-// joined and then got no processor holds up nobody, and later finds that nothing is left.
-class Job {
+// The items of a loop, taken one by one by the threads of a team.
+class Items {
    public:
-    Job(int64_t n, int places, const ItemBody& body) : places(places), n_(n), body_(body) {}
+    Items(int64_t n, const ItemBody& body) : n_(n), body_(body) {}
 
-    // Takes items until none is left. What belongs to the caller is touched only while one is not done.
+    // On each thread: takes items until none is left.
     void work(int thread) {
-        for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < n_;) {
-            body_(thread, i);
-            const bool last = done_.fetch_add(1, std::memory_order_release) + 1 == n_;
-            if (!last || thread == 0) continue;
-            const std::lock_guard lock(mutex_);
-            finished_.notify_one();
-        }
+        for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < n_;) body_(thread, i);
     }
 
-    void wait(const std::function<void()>& waiting) {
-        const auto finished = [this] { return done_.load(std::memory_order_acquire) == n_; };
-        if (spin(finished)) return;
+    // On each thread but the caller's, after its work.
+    void leave() {
+        const std::lock_guard lock(mutex_);
+        left_.fetch_add(1, std::memory_order_release);
+        left_one_.notify_one();
+    }
+
+    // On the caller's thread, after its work: until `others` have left. OpenMP's own barrier at the end of a region would
+    // wait as well, but without calls of waiting() meanwhile.
+    void wait(int others, const std::function<void()>& waiting) {
+        const auto all_left = [&] { return left_.load(std::memory_order_acquire) == others; };
+        spin(all_left);
         std::unique_lock lock(mutex_);
-        while (!finished_.wait_for(lock, asking_time, finished)) {
+        while (!left_one_.wait_for(lock, asking_time, all_left)) {
             lock.unlock();
             waiting();
             lock.lock();
         }
     }
 
-    // Workers that may still join and that did: threads 1, 2, … Guarded by the mutex of the pool.
-    int places, joined = 0;
-
    private:
     const int64_t n_;
     const ItemBody& body_;
-    std::atomic<int64_t> next_{0}, done_{0};
+    std::atomic<int64_t> next_{0};
+    std::atomic<int> left_{0};
     std::mutex mutex_;
-    std::condition_variable finished_;
+    std::condition_variable left_one_;
 };
 
-// The workers: as many as a call asked for beside its own thread. Calls at the same time share them.
-class Pool {
-   public:
-    void add(const std::shared_ptr<Job>& job) {
-        int wake;
-        {
-            const std::lock_guard guard(mutex_);
-            start_workers(job->places);
-            jobs_.push_back(job);
-            places_ += job->places;
-            wake = std::min(sleeping_, places_ - spinning_);
-        }
-        for (; wake > 0; --wake) wake_.notify_one();
-    }
+// ThreadSanitizer does not see how the runtime, which is not built with it, starts the threads of a region. That they have
+// left is told by an atomic and a mutex of ours, which it sees.
+#ifdef __SANITIZE_THREAD__
+#define EDGEGRAD_UNSEEN __attribute__((no_sanitize_thread))
+void start(Items& items) { __tsan_release(&items); }
+void started(Items& items) { __tsan_acquire(&items); }
+#else
+#define EDGEGRAD_UNSEEN
+void start(Items&) {}
+void started(Items&) {}
+#endif
 
-    // No worker joins it from now on.
-    void remove(const Job& job) {
-        const std::lock_guard guard(mutex_);
-        drop(job);
-    }
-
-    void lock() { mutex_.lock(); }
-    void unlock() { mutex_.unlock(); }
-
-   private:
-    void start_workers(int n) {
-        try {
-            for (; workers_ < n; ++workers_) std::thread([this] { run(); }).detach();
-        } catch (const std::system_error&) {  // the system gives no more: those that there are do the work
-        }
-    }
-
-    void drop(const Job& job) {
-        const auto found = std::find_if(jobs_.begin(), jobs_.end(), [&](const auto& j) { return j.get() == &job; });
-        if (found == jobs_.end()) return;
-        places_ -= job.places;
-        jobs_.erase(found);
-    }
-
-    void run() {
-        std::unique_lock lock(mutex_);
-        for (;;) {
-            if (!jobs_.empty()) {
-                const std::shared_ptr<Job> job = jobs_.front();
-                const int thread = ++job->joined;
-                --places_;
-                if (--job->places == 0) drop(*job);
-                lock.unlock();
-                job->work(thread);
-                lock.lock();
-                drop(*job);  // nothing is left of it
-                continue;
-            }
-            ++spinning_;
-            lock.unlock();
-            spin([this] { return places_.load(std::memory_order_relaxed) > 0; });
-            lock.lock();
-            --spinning_;
-            ++sleeping_;
-            wake_.wait(lock, [this] { return !jobs_.empty(); });
-            --sleeping_;
-        }
-    }
-
-    std::mutex mutex_;
-    std::condition_variable wake_;
-    std::vector<std::shared_ptr<Job>> jobs_;  // those with places, the oldest first
-    std::atomic<int> places_{0};              // of all of them
-    int workers_ = 0, spinning_ = 0, sleeping_ = 0;
-};
-
-// Lets torch's threads sleep while they wait. Those of GNU's OpenMP spin for milliseconds between torch's operators,
-// and so take processors from our workers, from other processes and from each other; but a hundred turns only where the
-// process has more of them than processors, as its manual says of GOMP_SPINCOUNT. So one thread makes as many as there
-// are processors, which sleep for good. Where nothing of this name is loaded, or LLVM's or Intel's OpenMP, which answer
-// to it too and have rules of their own, nothing is done. Where OMP_THREAD_LIMIT allows no more threads, torch's spin
-// as before. It changes how threads wait and no result. A system that has not so many threads to give ends the process,
-// as it would for torch's own.
+// Lets threads sleep while they wait, ours and torch's. Those of GNU's OpenMP spin for milliseconds between two regions,
+// and so take processors from other processes and from each other; but a hundred turns only where the process has more
+// of them than processors, as its manual says of GOMP_SPINCOUNT. So one thread makes as many as there are processors,
+// which sleep for good. LLVM's and Intel's OpenMP, which answer to GNU's names too, have rules of their own: there
+// nothing is done. Where OMP_THREAD_LIMIT allows no more threads, they spin. It changes how threads wait and no result.
+// A system that has not so many threads to give ends the process, as it would for any region.
 bool calm_openmp() {
 #ifdef __linux__
-    using Parallel = void (*)(void (*)(void*), void*, unsigned, unsigned);
-    const auto parallel = reinterpret_cast<Parallel>(dlsym(RTLD_DEFAULT, "GOMP_parallel"));
-    if (!parallel || dlsym(RTLD_DEFAULT, "__kmpc_fork_call")) return false;  // not GNU's
+    if (dlsym(RTLD_DEFAULT, "__kmpc_fork_call")) return false;  // not GNU's
     try {
-        std::thread([parallel] {
-            parallel([](void*) {}, nullptr, std::max(2u, std::thread::hardware_concurrency()), 0);
+        std::thread([] {
+#pragma omp parallel num_threads(std::max(2u, std::thread::hardware_concurrency()))
+            {
+            }
             for (;;) std::this_thread::sleep_for(std::chrono::hours(1));
         }).detach();
     } catch (const std::system_error&) {
@@ -173,33 +117,55 @@ bool calm_openmp() {
 
 [[maybe_unused]] const bool calm = calm_openmp();
 
-// Never destroyed: workers wait in it until the process is gone.
-Pool* pool = new Pool;
+// In a forked child to which the runtime would not start threads: it would wait for those that the parent had.
+bool alone = false;
 
 }  // namespace
 
-void share(int64_t n, int threads, const ItemBody& body, const std::function<void()>& waiting) {
-    const auto job = std::make_shared<Job>(n, threads - 1, body);
-    pool->add(job);
-    job->work(0);
-    pool->remove(*job);
-    job->wait(waiting);
+EDGEGRAD_UNSEEN void share(int64_t n, int threads, const ItemBody& body, const std::function<void()>& waiting) {
+    Items items(n, body);
+    if (alone) return items.work(0);
+    start(items);
+#pragma omp parallel num_threads(threads)
+    {
+        started(items);
+        const int thread = omp_get_thread_num();
+        items.work(thread);
+        if (thread > 0) items.leave();
+        else items.wait(omp_get_num_threads() - 1, waiting);
+    }
 }
+
+namespace {
+
+bool ended = false;  // the runtime's threads, before the fork
+
+}  // namespace
 
 void before_fork_of_workers() {
 #ifdef __linux__
-    // Torch's own too: in the child GNU's OpenMP would wait for the threads that the parent's had. It starts new ones
-    // where there are none.
+    // In the child GNU's OpenMP would wait for the threads that this one had; it starts new ones where there are none. Looked
+    // up by name: the oldest torch may bring a runtime of before OpenMP 5.0. Refused within a region, as where a signal
+    // handler forks.
     constexpr int omp_pause_hard = 2;
-    if (void* pause = dlsym(RTLD_DEFAULT, "omp_pause_resource_all"))
-        reinterpret_cast<int (*)(int)>(pause)(omp_pause_hard);
+    void* const pause = dlsym(RTLD_DEFAULT, "omp_pause_resource_all");
+    ended = pause && reinterpret_cast<int (*)(int)>(pause)(omp_pause_hard) == 0;
+#else
+    ended = true;  // LLVM's OpenMP minds forks by itself
 #endif
-    pool->lock();
 }
 
 void after_fork_of_workers(bool child) {
-    if (child) pool = new Pool;  // the old one is as its threads left it, and may be locked for ever
-    else pool->unlock();
+    if (child && !ended) alone = true;
+}
+
+std::string openmp_runtime() {
+#ifdef _WIN32
+    return "vcomp140.dll";
+#else
+    Dl_info info;
+    return dladdr(reinterpret_cast<void*>(&omp_get_thread_num), &info) && info.dli_fname ? info.dli_fname : "";
+#endif
 }
 
 }  // namespace edgegrad

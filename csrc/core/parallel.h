@@ -1,4 +1,4 @@
-// Loops over threads: how many a loop is worth, and what happens when one of them fails.
+// Loops over OpenMP's threads, and what happens when one of them fails.
 //
 // An exception must not leave a thread: the process would end. So bodies run under a guard, which keeps the first
 // exception, lets the others finish early, and hands it on when all have. The same way out serves whoever wants to stop
@@ -13,6 +13,7 @@
 #include <functional>
 #include <memory>
 #include <mutex>
+#include <string>
 #include <thread>
 #include <vector>
 
@@ -27,13 +28,16 @@ struct Interrupted : std::exception {
 using ItemBody = std::function<void(int, int64_t)>;
 
 // Calls body(thread, i) once for each i = 0 … n − 1, in no order, on the calling thread and up to `threads` − 1
-// workers. While the calling thread waits for what the others took, it calls waiting() 20 times a second. Neither may
+// others of OpenMP. While the calling thread waits for what they took, it calls waiting() 20 times a second. Neither may
 // throw.
 void share(int64_t n, int threads, const ItemBody& body, const std::function<void()>& waiting);
 
-// To be called around fork(), in whose child there are no workers; they are started anew.
+// To be called around fork(), in whose child there are no threads but the calling one; the others are started anew.
 void before_fork_of_workers();
 void after_fork_of_workers(bool child);
+
+// The file of the OpenMP runtime that the kernel uses.
+std::string openmp_runtime();
 
 // The threads of one call of the kernel.
 class Team {
@@ -43,9 +47,6 @@ class Team {
         : threads_(std::max(1, threads)), interrupted_(interrupted), caller_(std::this_thread::get_id()) {}
 
     int threads() const { return threads_; }
-
-    // As many as there are items to share. Waking a thread takes longer than a small item, so few items take one.
-    int threads_for(int64_t items) const { return int(std::clamp<int64_t>(items, 1, threads_)); }
 
     // Runs f unless the call is failing already; keeps what it throws.
     template <class F>
@@ -85,8 +86,7 @@ class Team {
     template <class Make, class Body>
     void each_with(int64_t n, Make make, Body body) {
         check();
-        const int threads = threads_for(n);
-        std::vector<decltype(make())> states(threads);
+        std::vector<decltype(make())> states(threads_);
         const auto item = [&](int thread, int64_t i) {
             guard([&] {
                 check();
@@ -94,7 +94,8 @@ class Team {
                 body(*states[thread], i);
             });
         };
-        if (threads > 1) share(n, threads, item, [&] { guard([&] { check(); }); });
+        // All threads or one: libgomp ends those that a smaller team leaves over, and starts them anew for the next.
+        if (n > 1 && threads_ > 1) share(n, threads_, item, [&] { guard([&] { check(); }); });
         else
             for (int64_t i = 0; i < n; ++i) item(0, i);
         rethrow();
