@@ -42,30 +42,29 @@ bool spin(Ready ready) {
     return false;
 }
 
-// The items of a loop, taken one by one by the threads of a team.
+// A loop whose items are taken one by one by the threads of a team. The caller waits for items that were taken, and asks
+// meanwhile whether to stop; what is left then is OpenMP's own barrier, which other threads pass without work.
 class Items {
    public:
     Items(int64_t n, const ItemBody& body) : n_(n), body_(body) {}
 
     // On each thread: takes items until none is left.
     void work(int thread) {
-        for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < n_;) body_(thread, i);
+        for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < n_;) {
+            body_(thread, i);
+            const bool last = done_.fetch_add(1, std::memory_order_release) + 1 == n_;
+            if (!last || thread == 0) continue;
+            const std::lock_guard lock(mutex_);
+            finished_.notify_one();
+        }
     }
 
-    // On each thread but the caller's, after its work.
-    void leave() {
-        const std::lock_guard lock(mutex_);
-        left_.fetch_add(1, std::memory_order_release);
-        left_one_.notify_one();
-    }
-
-    // On the caller's thread, after its work: until `others` have left. OpenMP's own barrier at the end of a region would
-    // wait as well, but without calls of waiting() meanwhile.
-    void wait(int others, const std::function<void()>& waiting) {
-        const auto all_left = [&] { return left_.load(std::memory_order_acquire) == others; };
-        spin(all_left);
+    // On the caller's thread, after its work.
+    void wait(const std::function<void()>& waiting) {
+        const auto finished = [this] { return done_.load(std::memory_order_acquire) == n_; };
+        if (spin(finished)) return;
         std::unique_lock lock(mutex_);
-        while (!left_one_.wait_for(lock, asking_time, all_left)) {
+        while (!finished_.wait_for(lock, asking_time, finished)) {
             lock.unlock();
             waiting();
             lock.lock();
@@ -75,22 +74,21 @@ class Items {
    private:
     const int64_t n_;
     const ItemBody& body_;
-    std::atomic<int64_t> next_{0};
-    std::atomic<int> left_{0};
+    std::atomic<int64_t> next_{0}, done_{0};
     std::mutex mutex_;
-    std::condition_variable left_one_;
+    std::condition_variable finished_;
 };
 
-// ThreadSanitizer does not see how the runtime, which is not built with it, starts the threads of a region. That they have
-// left is told by an atomic and a mutex of ours, which it sees.
+// ThreadSanitizer does not see how the runtime, which is not built with it, starts the threads of a region and waits for
+// them: it is told.
 #ifdef __SANITIZE_THREAD__
 #define EDGEGRAD_UNSEEN __attribute__((no_sanitize_thread))
-void start(Items& items) { __tsan_release(&items); }
-void started(Items& items) { __tsan_acquire(&items); }
+void release(Items& items) { __tsan_release(&items); }
+void acquire(Items& items) { __tsan_acquire(&items); }
 #else
 #define EDGEGRAD_UNSEEN
-void start(Items&) {}
-void started(Items&) {}
+void release(Items&) {}
+void acquire(Items&) {}
 #endif
 
 // Lets threads sleep while they wait, ours and torch's. Those of GNU's OpenMP spin for milliseconds between two regions,
@@ -125,15 +123,16 @@ bool alone = false;
 EDGEGRAD_UNSEEN void share(int64_t n, int threads, const ItemBody& body, const std::function<void()>& waiting) {
     Items items(n, body);
     if (alone) return items.work(0);
-    start(items);
+    release(items);
 #pragma omp parallel num_threads(threads)
     {
-        started(items);
+        acquire(items);
         const int thread = omp_get_thread_num();
         items.work(thread);
-        if (thread > 0) items.leave();
-        else items.wait(omp_get_num_threads() - 1, waiting);
+        if (thread == 0) items.wait(waiting);
+        release(items);
     }
+    acquire(items);
 }
 
 namespace {
