@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
     lines |= {name: _version(name) or "not installed" for name in LIBRARIES}
     number = core.embree_version()
     lines["Embree"] = f"{number // 10000}.{number // 100 % 100}.{number % 100}, {embree_path()}"
+    lines["OpenMP"] = core.openmp_runtime()
     lines["kernel"] = core.__file__
     lines["processor"] = (
         f"{torch.backends.cpu.get_cpu_capability()}; rays in packets of {core.packet_width()}, "

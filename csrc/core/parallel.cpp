@@ -1,7 +1,10 @@
-// Threads of our own, not OpenMP's. How those wait is fixed when torch loads them: by default they spin for
-// milliseconds, and a loop ends when all of them had a processor, work or no work. Beside a busy process a step took 10
-// times as long.
+// The threads are OpenMP's, and the runtime is torch's, which is loaded before the kernel. They stay in one parallel
+// region for good and take the loops of all calls from a queue. A region for each loop, or for each call, ends only
+// when all of its threads had a processor, work or no work, and shares them with torch's operators: beside two busy
+// processes a step took 1.5 to 2.3 times as long (docs/tried.md).
 #include "core/parallel.h"
+
+#include <omp.h>
 
 #include <condition_variable>
 #include <system_error>
@@ -9,8 +12,11 @@
 #if defined(__x86_64__) || defined(_M_X64)
 #include <immintrin.h>
 #endif
-#ifdef __linux__
+#ifndef _WIN32
 #include <dlfcn.h>
+#endif
+#ifdef __SANITIZE_THREAD__
+#include <sanitizer/tsan_interface.h>
 #endif
 
 namespace edgegrad {
@@ -77,7 +83,19 @@ class Job {
     std::condition_variable finished_;
 };
 
-// The workers: as many as a call asked for beside its own thread. Calls at the same time share them.
+// ThreadSanitizer does not see how the runtime, which is not built with it, starts the threads of a region: it is told.
+#ifdef __SANITIZE_THREAD__
+#define EDGEGRAD_UNSEEN __attribute__((no_sanitize_thread))
+void release(void* of) { __tsan_release(of); }
+void acquire(void* of) { __tsan_acquire(of); }
+#else
+#define EDGEGRAD_UNSEEN
+void release(void*) {}
+void acquire(void*) {}
+#endif
+
+// The workers: as many as there are processors, or as a call asked for beside its own thread. Calls at the same time
+// share them.
 class Pool {
    public:
     void add(const std::shared_ptr<Job>& job) {
@@ -92,6 +110,11 @@ class Pool {
         for (; wake > 0; --wake) wake_.notify_one();
     }
 
+    void start() {
+        const std::lock_guard guard(mutex_);
+        start_workers(1);
+    }
+
     // No worker joins it from now on.
     void remove(const Job& job) {
         const std::lock_guard guard(mutex_);
@@ -103,9 +126,25 @@ class Pool {
 
    private:
     void start_workers(int n) {
+        if (workers_ >= n) return;
         try {
-            for (; workers_ < n; ++workers_) std::thread([this] { run(); }).detach();
+            std::thread([this, more = n - workers_] { open_region(more); }).detach();
+            workers_ = n;
         } catch (const std::system_error&) {  // the system gives no more: those that there are do the work
+        }
+    }
+
+    // Of at least as many threads as there are processors, for torch's sake. GNU's OpenMP lets threads that wait spin
+    // for milliseconds, and so take processors from other processes and from each other; but a hundred turns only where
+    // the process has more of them than processors, as its manual says of GOMP_SPINCOUNT.
+    EDGEGRAD_UNSEEN void open_region(int workers) {
+        const int threads = std::max({workers, int(std::thread::hardware_concurrency()), 2});
+        release(this);
+#pragma omp parallel num_threads(threads)
+        {
+            acquire(this);
+            if (omp_get_thread_num() < workers) run();
+            for (;;) std::this_thread::sleep_for(std::chrono::hours(1));
         }
     }
 
@@ -148,33 +187,11 @@ class Pool {
     int workers_ = 0, spinning_ = 0, sleeping_ = 0;
 };
 
-// Lets torch's threads sleep while they wait. Those of GNU's OpenMP spin for milliseconds between torch's operators,
-// and so take processors from our workers, from other processes and from each other; but a hundred turns only where the
-// process has more of them than processors, as its manual says of GOMP_SPINCOUNT. So one thread makes as many as there
-// are processors, which sleep for good. Where nothing of this name is loaded, or LLVM's or Intel's OpenMP, which answer
-// to it too and have rules of their own, nothing is done. Where OMP_THREAD_LIMIT allows no more threads, torch's spin
-// as before. It changes how threads wait and no result. A system that has not so many threads to give ends the process,
-// as it would for torch's own.
-bool calm_openmp() {
-#ifdef __linux__
-    using Parallel = void (*)(void (*)(void*), void*, unsigned, unsigned);
-    const auto parallel = reinterpret_cast<Parallel>(dlsym(RTLD_DEFAULT, "GOMP_parallel"));
-    if (!parallel || dlsym(RTLD_DEFAULT, "__kmpc_fork_call")) return false;  // not GNU's
-    try {
-        std::thread([parallel] {
-            parallel([](void*) {}, nullptr, std::max(2u, std::thread::hardware_concurrency()), 0);
-            for (;;) std::this_thread::sleep_for(std::chrono::hours(1));
-        }).detach();
-    } catch (const std::system_error&) {
-    }
-#endif
-    return true;
-}
-
-[[maybe_unused]] const bool calm = calm_openmp();
-
 // Never destroyed: workers wait in it until the process is gone.
 Pool* pool = new Pool;
+
+// At once, not with the first loop: torch's threads are to sleep from the first render on.
+[[maybe_unused]] const bool started = (pool->start(), true);
 
 }  // namespace
 
@@ -237,6 +254,15 @@ void before_fork_of_workers() {
 void after_fork_of_workers(bool child) {
     if (child) pool = new Pool;  // the old one is as its threads left it, and may be locked for ever
     else pool->unlock();
+}
+
+std::string openmp_runtime() {
+#ifdef _WIN32
+    return "vcomp140.dll";
+#else
+    Dl_info info;
+    return dladdr(reinterpret_cast<void*>(&omp_get_thread_num), &info) && info.dli_fname ? info.dli_fname : "";
+#endif
 }
 
 }  // namespace edgegrad

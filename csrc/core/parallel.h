@@ -1,4 +1,4 @@
-// Loops over threads: how many a loop is worth, and what happens when one of them fails.
+// Loops over OpenMP's threads: how many a loop is worth, and what happens when one of them fails.
 //
 // An exception must not leave a thread: the process would end. So bodies run under a guard, which keeps the first
 // exception, lets the others finish early, and hands it on when all have. The same way out serves whoever wants to stop
@@ -13,6 +13,7 @@
 #include <functional>
 #include <memory>
 #include <mutex>
+#include <string>
 #include <thread>
 #include <vector>
 
@@ -34,6 +35,9 @@ void share(int64_t n, int threads, const ItemBody& body, const std::function<voi
 // To be called around fork(), in whose child there are no workers; they are started anew.
 void before_fork_of_workers();
 void after_fork_of_workers(bool child);
+
+// The file of the OpenMP runtime that the workers are of.
+std::string openmp_runtime();
 
 // The threads of one call of the kernel.
 class Team {

@@ -217,6 +217,7 @@ NB_MODULE(_core, m) {
     m.def("open_embree", &open_embree, "path"_a, "options"_a, nb::call_guard<Unlocked>());
     m.def("embree_version", &embree_version);
     m.def("packet_width", &packet_width);
+    m.def("openmp_runtime", &openmp_runtime);
     // Without the interpreter's lock, for which a thread that holds the kernel's may wait.
     m.def("all_finite", &all_finite<float>, "array"_a.noconvert(), "threads"_a = 1);
     m.def("all_finite", &all_finite<double>, "array"_a.noconvert(), "threads"_a = 1);
