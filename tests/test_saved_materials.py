@@ -4,8 +4,8 @@ import warnings
 
 import pytest
 import torch
-from scenes import cube
 from lit_gltf import file
+from scenes import cube
 from trimesh.exchange.gltf import get_schema
 
 import edgegrad as eg
