@@ -159,7 +159,7 @@ every_view_and_filter = pytest.mark.parametrize(("view", "filter"), diagonal(VIE
 
 @every_view_and_filter
 def test_gradients_are_exact_derivatives(view: str, filter: str) -> None:
-    for name, (truth, found) in compared(view, filter, samples=20_000, seeds=8).items():
+    for name, (truth, found) in compared(view, filter, samples=30_000, seeds=12).items():
         check(name, truth, found)
         for factor in (0.95, 1.05):
             with pytest.raises(AssertionError, match=f"{name}: exact"):

@@ -26,14 +26,14 @@ def covered(view, image):
     return cover + (1.0 - cover) * image, 1.0 - cover
 
 
-@pytest.mark.parametrize("how", ["alone", pytest.param("weight", marks=pytest.mark.slow)])
-def test_a_quarter_covered(how):
+@pytest.mark.parametrize(("how", "steps"), [("alone", 12), pytest.param("weight", 40, marks=pytest.mark.slow)])
+def test_a_quarter_covered(how, steps):
     view = camera(64)
     image, free = covered(view, picture(view))
     told = {"background": BACKGROUND}
     if how == "weight":
         told["weight"] = free
-    fit = fit_pose(bracket(), image, view, init=START, steps=12, progress=False, **told)
+    fit = fit_pose(bracket(), image, view, init=START, steps=steps, progress=False, **told)
     degrees, percent = errors(fit)
     assert degrees < 1.0 and percent < 1.0, (degrees, percent)
     assert fit.converged and fit.explained > 0.5
