@@ -47,7 +47,10 @@ python_maximum_signature_line_length = 88
 python_use_unqualified_type_names = True
 # No inventories of other projects: the site builds without a network. So their types have nothing to link to.
 OTHERS = r"(torch|numpy|collections|os|pathlib|typing)\..*|Tensor|Vector|Figure|Path"
-nitpick_ignore_regex = [("py:.*", OTHERS), ("py:class", r"edgegrad\.(fit\.views\.View|camera\.fields\.CameraT|points\.steps\.Steps)|PoseTask")]
+nitpick_ignore_regex = [
+    ("py:.*", OTHERS),
+    ("py:class", r"edgegrad\.(fit\.views\.View|camera\.fields\.CameraT|points\.steps\.Steps)|PoseTask"),
+]
 # Nobody calls these: functions return them.
 RETURNED = {"Hits", "Plan", "Profile", "PrimaryHits", "SurfaceSamples", "EdgeSamples", "PoseFit", "CameraFit", "Fit"}
 
