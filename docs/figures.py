@@ -1,4 +1,4 @@
-"""Draws the figures of README and how-it-works.md:  python docs/figures.py [FOLDER]"""
+"""Draws the figures of concepts.md and how-it-works.md:  python docs/figures.py [FOLDER]"""
 
 from __future__ import annotations
 

@@ -10,16 +10,8 @@ from typing import Any
 from sphinx.errors import SphinxError
 
 # What a browser loads by itself; links that a reader follows (`a`) may lead anywhere.
-LOADED = {
-    "script": "src",
-    "img": "src",
-    "iframe": "src",
-    "source": "src",
-    "video": "src",
-    "audio": "src",
-    "embed": "src",
-}
-LOADED |= {"link": "href", "object": "data", "image": "href"}
+LOADED: dict[str, str] = dict.fromkeys(["script", "img", "iframe", "source", "video", "audio", "embed"], "src")
+LOADED.update({"link": "href", "object": "data", "image": "href"})
 NAMED_ONLY = {"canonical", "license", "author", "next", "prev"}
 HOST = re.compile(r"\s*(?:https?:)?//")
 IN_STYLE = re.compile(r"(?:url\(|@import)\s*['\"]?((?:https?:)?//[^'\")\s]+)")
