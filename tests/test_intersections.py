@@ -1,5 +1,5 @@
 """Lines where faces pass through each other: which there are, against exhaustion, and gradients along them, against exact
-images of the faces cut apart (edgegrad/report/crossing.py) and against finite differences."""
+images of the faces cut apart (edgegrad/report/stability/crossing.py) and against finite differences."""
 
 from __future__ import annotations
 

@@ -69,11 +69,16 @@ def test_one_runtime(order):
 
 def test_fewer_threads_than_asked_for():
     """The runtime may give fewer, here one beside the calling thread; the items are shared by those that there are."""
-    code = RENDER.format(imports=ORDERS["torch first"]) + "import hashlib; print(hashlib.sha256(expected.numpy()).hexdigest())"
+    code = (
+        RENDER.format(imports=ORDERS["torch first"])
+        + "import hashlib; print(hashlib.sha256(expected.numpy()).hexdigest())"
+    )
     assert lines_of(code)[-1] == lines_of(code, OMP_THREAD_LIMIT="2")[-1] == lines_of(code, OMP_DYNAMIC="true")[-1]
 
 
 def test_the_doctor_names_the_runtime():
-    found = subprocess.run([sys.executable, "-m", "edgegrad_cli", "doctor"], capture_output=True, text=True, timeout=120)
+    found = subprocess.run(
+        [sys.executable, "-m", "edgegrad_cli", "doctor"], capture_output=True, text=True, timeout=120
+    )
     (line,) = (line for line in found.stdout.splitlines() if line.startswith("OpenMP "))
     assert Path(line.split(maxsplit=1)[1]).is_file()

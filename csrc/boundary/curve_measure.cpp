@@ -242,7 +242,7 @@ class MeasuredEdges {
     }
 
     static constexpr double largest = 2;  // so that a bright face among dark ones does not take all samples
-    // Where samples alone find the jump: they look a little aside of the curve (contractions.h), and a texture may
+    // Where samples alone find the jump: they look a little aside of the curve (contractions.cpp), and a texture may
     // differ there where the faces of a crease are as good as coplanar. Such a sample must not stand for too much.
     static constexpr double least = 1.0 / 1024;
     const BackwardView<T>& view_;
