@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.ready
-	$(BIN)/edgegrad demo --out out/demo
+	$(BIN)/edgegrad demo --runs 4 --out out/demo
 
 # A worker for each processor, of one thread each (tests/conftest.py); a test may take so many seconds of processor time.
 WORKERS := -n logical --maxprocesses 8 --dist worksteal
