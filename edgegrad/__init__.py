@@ -36,6 +36,7 @@ from .scene.scene import Scene
 
 # What the classes of scenes can do with the help of packages above them.
 provided.from_trimesh, provided.to_trimesh, provided.thumbnail = from_trimesh, to_trimesh, thumbnail
+del from_trimesh, to_trimesh, thumbnail, provided  # names of the package are those below
 
 # What torch.load(weights_only=True) may make: dataclasses of tensors, which run nothing when they are loaded.
 torch.serialization.add_safe_globals(

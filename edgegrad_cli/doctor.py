@@ -43,13 +43,11 @@ def add(commands: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Shows versions, Embree, the processor's instructions and threads, and checks a gradient against its closed form. The exit
     code is 1 if that is wrong."""
-    start = time.perf_counter()
     import torch
 
     import edgegrad
     from edgegrad.library import core, embree_path
 
-    took = time.perf_counter() - start
     lines = {"edgegrad": edgegrad.__version__, "Python": f"{platform.python_version()} on {platform.platform()}"}
     lines |= {name: _version(name) or "not installed" for name in LIBRARIES}
     number = core.embree_version()
@@ -60,7 +58,6 @@ def run(args: argparse.Namespace) -> int:
         f"{torch.backends.cpu.get_cpu_capability()}; rays in packets of {core.packet_width()}, "
         f"{os.cpu_count()} processors, {torch.get_num_threads()} threads (torch.set_num_threads)"
     )
-    lines["import"] = f"{took:.1f} s, of which most is torch"
     for name, text in lines.items():
         print(f"{name:12} {text}")
     print("extras, pip install 'edgegrad[EXTRA]':")

@@ -237,3 +237,17 @@ def test_bytes_for_radiance_are_told(tmp_path) -> None:
         eg.write_image(tmp_path / "b.png", (image > 9).float())
     upside_down = np.zeros((8, 8, 3), np.float32)[::-1]
     eg.write_image(tmp_path / "c.png", upside_down)
+
+
+def test_a_quaternion_of_zeros_is_no_rotation() -> None:
+    with pytest.raises(ValueError, match="rotation: expected a quaternion w, x, y, z, got zeros"):
+        eg.Camera.from_colmap([0.0] * 4, [0.0, 0.0, 3.0], "PINHOLE", [100.0, 100.0, 32.0, 32.0], (64, 64))
+
+
+def test_cameras_of_a_class_of_ones_own_stay_of_it() -> None:
+    class Rig(eg.Camera):
+        pass
+
+    one = Rig.look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (8, 8))
+    batch = Rig.stack([one, one])
+    assert type(one) is type(one.resized((4, 4))) is type(batch) is type(batch[0]) is Rig

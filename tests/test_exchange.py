@@ -152,3 +152,8 @@ def test_a_headlight_shines_only_where_nothing_says_a_look() -> None:
     assert float(eg.render(under_headlight(dark, camera), camera, spp=1).max()) > 0.2
     sunny = dark.replace(lights=[eg.PointLight((0, 0, 9))])
     assert under_headlight(sunny, camera) is sunny
+
+
+def test_a_trimesh_without_faces_is_named() -> None:
+    with pytest.raises(ValueError, match=r"mesh: expected a trimesh\.Trimesh with faces"):
+        eg.Mesh.from_trimesh(trimesh.Trimesh())

@@ -64,3 +64,12 @@ def test_a_fit_imports_no_compiler() -> None:
     """torch's compiler takes longer to import than torch itself, and than a fit."""
     done = subprocess.run([sys.executable, "-c", FIRST_STEP], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_names_of_the_package_are_public() -> None:
+    """What is public, and the packages below: nothing that was imported on the way."""
+    import edgegrad as eg
+
+    inside = {name for floor in house.floors(house.imports()) for name in floor} | house.FACADES
+    found = {name for name in vars(eg) if not name.startswith("_")}
+    assert found - set(eg.__all__) - inside <= {"torch", "MeshLight"}, sorted(found - set(eg.__all__) - inside)

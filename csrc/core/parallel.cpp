@@ -112,7 +112,7 @@ class Pool {
 
     void start() {
         const std::lock_guard guard(mutex_);
-        start_workers(1);
+        start_workers(std::max(1, int(std::thread::hardware_concurrency()) - 1));
     }
 
     // No worker joins it from now on.
@@ -128,17 +128,18 @@ class Pool {
     void start_workers(int n) {
         if (workers_ >= n) return;
         try {
-            std::thread([this, more = n - workers_] { open_region(more); }).detach();
+            std::thread([this, more = n - workers_, first = workers_ == 0] { open_region(more, first); }).detach();
             workers_ = n;
         } catch (const std::system_error&) {  // the system gives no more: those that there are do the work
         }
     }
 
-    // Of at least as many threads as there are processors, for torch's sake. GNU's OpenMP lets threads that wait spin
-    // for milliseconds, and so take processors from other processes and from each other; but a hundred turns only where
-    // the process has more of them than processors, as its manual says of GOMP_SPINCOUNT.
-    EDGEGRAD_UNSEEN void open_region(int workers) {
-        const int threads = std::max({workers, int(std::thread::hardware_concurrency()), 2});
+    // The first region has no fewer threads than there are processors, for torch's sake: once a process has more
+    // threads of GNU's OpenMP than processors, those that wait spin a hundred times and then sleep (its manual of
+    // GOMP_SPINCOUNT); else they spin for milliseconds, and take processors from other processes and from each other.
+    // Where the system has not so many threads to give, the runtime ends the process.
+    EDGEGRAD_UNSEEN void open_region(int workers, bool first) {
+        const int threads = first ? std::max({workers, int(std::thread::hardware_concurrency()), 2}) : workers;
         release(this);
 #pragma omp parallel num_threads(threads)
         {

@@ -1,4 +1,5 @@
-// Loops over OpenMP's threads: how many a loop is worth, and what happens when one of them fails.
+// Loops over OpenMP's threads, which wait for them in a parallel region that stays open (parallel.cpp): how many a loop
+// is worth, and what happens when one of them fails.
 //
 // An exception must not leave a thread: the process would end. So bodies run under a guard, which keeps the first
 // exception, lets the others finish early, and hands it on when all have. The same way out serves whoever wants to stop

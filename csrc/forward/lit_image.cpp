@@ -77,6 +77,7 @@ struct RowInput {
     const uint8_t* only;  // pixels, null: all
     LitImage<T>& to;
     LampVisibility* visibility;  // null: not wanted
+    Team& team;
 };
 
 template <class T>
@@ -91,8 +92,10 @@ class LitRow : public RowVisitor {
     void visit(int y, std::vector<PixelHit>& hits) override {
         std::fill(sums_.begin(), sums_.end(), 0.0);
         among_ = 0;
-        for (size_t first = 0; first < hits.size(); first += shaded_at_once)
+        for (size_t first = 0; first < hits.size(); first += shaded_at_once) {
+            in_.team.check();  // with many points of lights a row takes long
             shade(hits, first, std::min(hits.size() - first, size_t(shaded_at_once)));
+        }
         const int C = in_.lit.channels;
         for (int x = 0; x < in_.width; ++x) {
             const int64_t pixel = int64_t(y) * in_.width + x;
@@ -150,7 +153,8 @@ LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Cam
         visibility = std::make_unique<LampVisibility>(camera.width, camera.height, light_samples(lit, options), lit);
     const auto shade_pixels = [&](const PixelChoice& choice, uint64_t seed) {
         const RowInput<T> rows{lit,         scene, caster,      options, camera.width,
-                               choice.most, seed,  choice.only, out,     choice.only ? nullptr : visibility.get()};
+                               choice.most, seed,  choice.only, out,     choice.only ? nullptr : visibility.get(),
+                               team};
         visit_pixel_hits(scene, camera, caster, image, choice, team, hits,
                          [&] { return std::make_unique<LitRow<T>>(rows); });
     };

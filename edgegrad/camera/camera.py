@@ -53,8 +53,8 @@ class Camera(Views, Conventions):
     the inverse of K. Raises TypeError for a wrong type, ValueError for a wrong shape or value.
     """
 
-    @staticmethod
-    def stack(cameras: Sequence[Camera]) -> Camera:
+    @classmethod
+    def stack(cls, cameras: Sequence[Camera]) -> Camera:
         """One batch from cameras of the same size and projection."""
         if isinstance(cameras, Camera):
             raise TypeError("cameras: expected a sequence of cameras, got one Camera; put it in a list")
@@ -72,7 +72,7 @@ class Camera(Views, Conventions):
                     + (f" with {_count(first)} coefficients of distortion" if _count(first) else "")
                     + f", got {camera!r}"
                 )
-        return Camera(
+        return cls(
             torch.stack([c.world_to_camera for c in cameras]),
             torch.stack([c.K for c in cameras]),
             first.size,

@@ -158,6 +158,10 @@ class Conventions(CameraFields):
         check_shape("rotation", pose, (4,), (3, 3))
         if pose.dim() == 1:
             check_finite("rotation", pose)
+            if values_visible(pose) and not bool(pose.detach().any()):
+                raise ValueError(
+                    "rotation: expected a quaternion w, x, y, z, got zeros; take (1, 0, 0, 0) for no rotation"
+                )
             pose = _rotation_of(pose)
         check_rotation("rotation", pose)
         shift = as_tensor("translation", translation, like=pose)

@@ -31,6 +31,10 @@ def from_trimesh(given: Any) -> Mesh:
         raise TypeError("mesh: expected a trimesh.Trimesh, got a Scene; take scene.to_mesh(), or one of scene.geometry")
     if not isinstance(given, trimesh.Trimesh):
         raise TypeError(f"mesh: expected a trimesh.Trimesh, got {type(given).__name__}")
+    if len(given.faces) == 0:
+        raise ValueError(
+            "mesh: expected a trimesh.Trimesh with faces, got one without; was it loaded from an empty file?"
+        )
     look: dict[str, Any] = {}
     visual = given.visual
     try:

@@ -126,9 +126,9 @@ def reference(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tenso
     surfaces = hits._surfaces
     meshes, C = surfaces.scene.meshes, surfaces.scene.channels
     total = hits._barycentrics.new_zeros((len(hits), C))
+    if len(meshes) == 1:
+        return _of_mesh(hits, 0, Lighting(shadows, light_samples)).expand(len(hits), C)
     for index in range(len(meshes)):
-        if len(meshes) == 1:
-            return _of_mesh(hits, index, Lighting(shadows, light_samples)).expand(len(hits), C)
         rows = (surfaces.mesh_of_face[hits._face] == index).nonzero()[:, 0]
         of_mesh = _of_mesh(hits.select(rows), index, Lighting(shadows, light_samples))
         total = total.index_copy(0, rows, of_mesh.expand(len(rows), C))

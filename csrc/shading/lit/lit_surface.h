@@ -71,7 +71,6 @@ void look_up_material(const LitScene& lit, Surface<S>& o) {
 struct SurfaceBar {
     Vec3 y, v, g, n;
     Scattering<double> scattering;
-    double emission[most_lit_channels];
     FaceFrame<Vec3> frame;
     double b[3] = {};
 

@@ -30,7 +30,7 @@ template <class S>
 struct Lobe {
     Vector<S> half, sine;
     S a2, nh, d, D;                    // α², n·h, |n × h|² + α² (n·h)², and the density of normals
-    S nv, nl, towards, back, masking;  // Smith's term over 4 (n·v)(n·l), 1 / (2 (towards + back))
+    S nv, nl, towards, back, masking;  // Smith's term over 4 (n·v)(n·l), 1 / (2 (n·l towards + n·v back))
     S grazing, grazing5;               // (1 − v·h)⁵
 
     S specular() const { return D * masking; }

@@ -93,9 +93,3 @@ class Comparison:
                 residual = torch.cat([residual, count.sqrt() * math.sqrt(PAYS) * c * self.open[k]], -1)
             found.append(residual)
         return found
-
-    def mean_square(self) -> float:
-        """The mean squared difference over pixels and channels."""
-        return sum(float(r.detach().square().sum()) for r in self.differences) / sum(
-            r.numel() for r in self.differences
-        )
