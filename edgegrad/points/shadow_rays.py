@@ -10,9 +10,8 @@ from torch import Tensor
 from ..scene.lights import Light, LightPoints
 from .surfaces import Surfaces
 
-THIN = (
-    2.0**-40
-)  # where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself
+# Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
+THIN = 2.0**-40
 
 
 class Forced(NamedTuple):

@@ -24,10 +24,8 @@ SMALLEST = 12  # pixels on the shorter side of the coarsest level
 BLURS = (1.5, 1.0)  # standard deviation in pixels on the coarsest levels; none on the finer ones
 MOST_SPP = 64  # samples a pixel on coarse levels
 FADED = 0.25  # of a picture behind the render, where the background is not known
-EVEN = (
-    0.1,
-    0.3,
-)  # a border is clutter when so large a share of it is farther from its median than this part of the range
+# A border is clutter when more than 0.3 of it is farther from its median than 0.1 of the range.
+EVEN = (0.1, 0.3)
 
 # A step has these entries: a rotation vector about the centre and a shift, both along the first camera's axes, logarithms
 # of scale and focal length, the principal point in widths of the image, and the lens's distortion. The first of each:
