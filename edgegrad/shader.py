@@ -1,11 +1,13 @@
 """Images of shaders written in PyTorch, with gradients of what moves at silhouettes and at declared steps.
 
 The value of the image and its gradient come from different samples. Those of the image are shaded without a graph, several of a
-face where borders of steps run through a pixel. To it
-terms are attached of which only the derivatives count (points/splat.py):
-samples inside faces, shaded with a graph at points that move with the scene while
-their pixel stays; samples on curves, shaded without one on both sides, whose jump multiplies the curve's velocity; and, where
-the shader declares steps, samples on these. All of it is PyTorch, so whatever the shader uses gets its gradient by itself.
+face where borders of steps run through a pixel. Terms are attached to it of which only the derivatives count (points/splat.py):
+
+- samples inside faces, shaded with a graph, at points that move with the scene while their pixel stays;
+- samples on curves, shaded without a graph on both sides; the jump multiplies the curve's velocity;
+- samples on the steps that the shader declares.
+
+All of it is PyTorch, so whatever the shader uses gets its gradient by itself.
 """
 
 from __future__ import annotations
@@ -61,8 +63,8 @@ class Effort(NamedTuple):
     blended: bool = False  # whether one may see through surfaces
     lit: bool = False  # whether the scene's materials and lights shade them
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
-    gives_derivatives: bool = False  # whether it leaves out values where only derivatives are wanted, see Hits.values
-    additive: bool = False  # whether it is a sum over lights, and gives one alone where Hits.only_light asks for it
+    gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
+    additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
 
     @property
     def at_once(self) -> int:
@@ -197,7 +199,7 @@ class _Image:
             def radiance(first: int = first) -> Tensor:
                 # Hits of its own each time, for these keep what was computed from them.
                 hits = samples.part(first, first + at_once).hits
-                hits.values = not self._effort.gives_derivatives
+                hits._needs_values = not self._effort.gives_derivatives
                 return self._shade(hits)
 
             # So that memory is that of some points, not of all.
@@ -238,7 +240,7 @@ class _Image:
             for first in range(0, len(samples.hits), at_once):
                 points = samples.hits
                 if len(points) > at_once:
-                    points = points.subset(slice(first, first + at_once))
+                    points = points._subset(slice(first, first + at_once))
                 parts.append(self._shade(points).detach())
             jump = samples.sum(torch.cat(parts[1:] or parts))
         return boundary(samples.x, samples.velocity, jump, samples.to_background, self._background)
@@ -348,7 +350,7 @@ class _Image:
     def _shade(self, hits: Hits) -> Tensor:
         """(N, C), checked."""
         radiance = self._checked(self._shader(hits), hits)
-        if not hits.only_light:  # for one light less may be looked up
+        if not hits._only_light:  # for one light less may be looked up
             kinds = list(hits._steps.kinds)
             if self._kinds not in (None, kinds):
                 raise ValueError(UNEQUAL)
@@ -357,7 +359,7 @@ class _Image:
             order = torch.randperm(len(hits), generator=torch.Generator().manual_seed(0)).to(radiance.device)
             order = order[: (len(hits) + 1) // 2]
             with torch.no_grad():
-                again = self._shader(hits.subset(order)).to(radiance.dtype)
+                again = self._shader(hits._subset(order)).to(radiance.dtype)
             if not torch.allclose(
                 again, radiance.detach()[order], rtol=1e-4, atol=1e-5 * float(radiance.detach().abs().max())
             ):
@@ -381,7 +383,7 @@ class _Image:
         if self._channels not in (None, radiance.shape[1]):
             raise ValueError(f"shader: expected {self._channels} channels as before, got {radiance.shape[1]}")
         self._channels = radiance.shape[1]
-        if hits.values and values_visible(radiance) and not all_finite(radiance.detach()):
+        if hits._needs_values and values_visible(radiance) and not all_finite(radiance.detach()):
             row = int((~torch.isfinite(radiance.detach())).any(1).nonzero()[0])
             name, hint = "shader", "divisions by zero and powers of negative numbers"
             if self._effort.lit:

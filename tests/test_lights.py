@@ -292,7 +292,7 @@ def test_forced_shadows():
     some = torch.tensor([True, False, True, False])
     hits._forced = Forced(1, drawn._replace(density=drawn.density * 7), vector(0, 0, 1, 1), some)
     order = torch.tensor([2, 1, 0])
-    part = hits.subset(order)
+    part = hits._subset(order)
     torch.testing.assert_close(part.light_points(light).density / drawn.density[order], vector(7, 1, 7))
     lit = part.visible_from(light, drawn.select(order))
     assert torch.equal(lit, vector(1, 1, 0))

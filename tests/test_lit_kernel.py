@@ -148,8 +148,8 @@ def test_values_and_cotangents(words: str, view: str) -> None:
     hits, found, expected, radiance = both(words, view, 2, leaves, w2c)
     assert len(hits) > 200 and float(expected.detach().abs().max()) > 0.05
     assert torch.allclose(radiance, expected, rtol=1e-12, atol=1e-12)
-    asked = [light for light in hits.lit if light in found.lit]
-    assert all(torch.equal(hits.lit[k], found.lit[k]) for k in asked)
+    asked = [light for light in hits._lit if light in found._lit]
+    assert all(torch.equal(hits._lit[k], found._lit[k]) for k in asked)
     assert hits._surfaces.shadowing == found._surfaces.shadowing
     bar = torch.randn(expected.shape, dtype=F64, generator=torch.Generator().manual_seed(1))
     tensors = {**leaves, "w2c": w2c}
@@ -377,7 +377,7 @@ def test_derivatives_without_values(known: bool) -> None:
     for values in (True, False):
         leaves = {name: value.clone().requires_grad_() for name, value in numbers_of(words).items()}
         hits = hits_of(scene_of(words, leaves), CAMERAS["perspective"])
-        hits.values = values
+        hits._needs_values = values
         lights = set(range(len(hits._surfaces.scene.casting)))
         hits._surfaces.shadowing.update(lights if known else ())
         radiance = in_kernel.radiance(hits, True, 1)

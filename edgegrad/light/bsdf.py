@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 DIELECTRIC = 0.04  # reflectance head-on, of an index of refraction of 1.5
-LEAST_ALPHA = 1e-4  # of the microfacets: a mirror has no density
+LEAST_ALPHA = 1e-4  # of the microfacet distribution: a perfect mirror has no density
 
 
 class Scattering(NamedTuple):
@@ -66,8 +66,8 @@ def masking(nv: Tensor, nl: Tensor, a2: Tensor) -> Tensor:
 
 
 def terminator(g: Tensor, n: Tensor, l: Tensor) -> Tensor:
-    """(N, 1): takes what light an interpolated normal n gives to zero where the light sinks behind the face, with the normal g
-    (Chiang, Li and Burley 2019, "Taming the Shadow Terminator"); both are on the light's side."""
+    """(N, 1): a factor that takes the light on an interpolated normal n smoothly to zero where the light sets behind the face,
+    whose normal is g (Chiang, Li and Burley 2019, "Taming the Shadow Terminator"). Both normals are on the light's side."""
     ratio = dot(g, l) / (dot(g, n).clamp(min=1e-6) * dot(n, l).clamp(min=1e-12))
     G = ratio.clamp(0, 1)
     return G + G * G - G * G * G

@@ -30,7 +30,7 @@ _64_BITS = 2**64 - 1
 
 
 def is_fused(scene: Scene) -> bool:
-    """Whether the kernel shades a scene: not where textures have borders of texels, or levels by their footprints."""
+    """Whether the kernel can shade a scene: all textures are bilinear, not nearest or mipmapped."""
     if scene.channels > core.MOST_LIT_CHANNELS:
         return False
     textures = [t for m in scene.meshes if m.material is not None for t in m.material.textures.values()]
@@ -39,8 +39,8 @@ def is_fused(scene: Scene) -> bool:
 
 
 def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
-    """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours; or zeros
-    with the same derivatives, for hits of which no more is wanted. What was found of shadows is noted in the hits."""
+    """(N, C) the radiance of meshes by their materials and the scene's lights; of meshes without a material their colours. Zeros
+    with the same derivatives, if the hits need no values. Which lights are seen is noted in the hits."""
     surfaces, view = hits._surfaces, hits._view
     assert isinstance(view, View)
     layout, tables = _layout(surfaces, view)
@@ -51,12 +51,12 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
         *((None,) * 4 if forced is None else _forced(forced.points, forced.lit)),
     )
     number = -1 if forced is None else forced.light
-    only = number if hits.only_light else -1
+    only = number if hits._only_light else -1
     samples = samples if only < 0 else 1
     casters = surfaces.casters
-    # Of the derivatives alone nothing is computed ahead of them, once it is known of which lights shadows are asked.
+    # Without values nothing is computed now; but once it must be, to note the lights whose shadows are asked for.
     known = not shadows or len(surfaces.shadowing) == len(surfaces.scene.casting)
-    values = hits.values or not known
+    values = hits._needs_values or not known
     shading = _Shading(
         layout=layout, tables=len(tables), forced=number, shadows=shadows, samples=samples, only=only, values=values,
         dtype=surfaces.verts.dtype, cutoffs=casters.cutoffs, spacing=casters.spacing,
@@ -74,13 +74,13 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
         if shadows and bool((own >= 0).any()):
             surfaces.shadowing.add(light)
             if casting.punctual:
-                hits.note_visibility(light, own)
+                hits._note_visibility(light, own)
         column += 1 if casting.punctual else samples
     return found.to(surfaces.verts)
 
 
 def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
-    """(H · W, C) of the scene's surfaces before black, without derivatives, at so many points of a face in a pixel."""
+    """(H · W, C) the scene's surfaces before black, without derivatives, with `points` of each face in a pixel shaded."""
     layout, tables = _layout(frame.fixed, frame.fixed_view)
     seed, again = (int(frame.seeds(kind, 1)) & _64_BITS for kind in ("image", "image again"))
 
@@ -105,8 +105,11 @@ def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
 def light_on_faces(
     verts: Tensor, faces: Tensor, view: View, infinite: list[bool], place: Tensor, power: Tensor
 ) -> Tensor:
-    """(F, 3, L) float64 by csrc/shading/lit/flat_light.h: E max(0, n·l) at the corners of flat faces, over the greatest of them,
-    of points of light at places (L, 3), with power (L,) in W/sr, or W/m² of what is infinitely far away."""
+    """(F, 3, L) float64: E max(0, n·l) at the corners of flat faces, divided by its maximum (csrc/shading/lit/flat_light.h).
+
+    place   (L, 3) positions of point lights, or directions to infinite ones
+    power   (L,) in W/sr, or in W/m² of infinite ones
+    """
 
     def compute(*tensors: Tensor) -> Sequence[Tensor]:
         verts, faces, eye, place, power = map(array, tensors)
@@ -123,18 +126,18 @@ def _forced(points: Any, lit: Tensor) -> tuple[Tensor, ...]:
 
 
 class _Points(NamedTuple):
-    """Tensors of points; their barycentrics are an argument of their own."""
+    """Tensors of points, but for their barycentrics."""
 
     face: Tensor  # (N,) int64
     seed: Tensor  # (N,) int64
-    index: Tensor | None  # pyright: ignore[reportIncompatibleMethodOverride]: those of a light whose shadow is known
+    index: Tensor | None  # pyright: ignore[reportIncompatibleMethodOverride]: points of a light whose shadow is known
     uv: Tensor | None
     density: Tensor | None
     lit: Tensor | None  # (N,) uint8
 
 
 class _Tables:
-    """Tensors of a scene as tables on the CPU, each of them once."""
+    """Tensors of a scene as tables on the CPU."""
 
     def __init__(self) -> None:
         self.tensors: list[Tensor] = []
@@ -150,12 +153,12 @@ class _Tables:
         return len(self.tensors) - 1
 
     def add_numbers(self, tensor: Tensor | float | None) -> int:
-        """All in one row."""
+        """A table of one row."""
         return -1 if tensor is None else self.add(tensor, torch.as_tensor(tensor).numel())
 
 
 class _Layout(NamedTuple):
-    """How the tables are a scene; all but the tables themselves."""
+    """How a scene is made of tables: which table holds what."""
 
     meshes: list[Any]
     lamps: list[Any]
@@ -189,7 +192,7 @@ class _Layout(NamedTuple):
 
 
 def _layout(surfaces: Surfaces, view: View) -> tuple[_Layout, list[Tensor]]:
-    """How surfaces and a view are tables, and these; the same for all points that have no derivatives."""
+    """The layout of surfaces and a view, and its tables; kept for points that have no derivatives."""
     if surfaces.layout is None or surfaces.layout[0] is not view:
         tables = _Tables()
         found = view, _Layout.of(surfaces, view, tables), tables.tensors
@@ -269,7 +272,7 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
     if isinstance(light, MeshLight):
         mesh = next(i for i, mesh in enumerate(scene.meshes) if mesh is light.mesh)
         running, density = values_of(*light._table)
-        # Where a ray meets a thin face, rounding in double is many times its spacing: a lamp must not hide itself.
+        # Where a ray meets a thin face, its rounding error is many times the spacing of doubles: a lamp must not hide itself.
         return lamp("mesh", mesh=mesh, running=running, density=density, eps=max(eps, 2.0**-40))
     if isinstance(light, Environment):
         running, density = values_of(*light._table)
@@ -308,15 +311,15 @@ def _rows(index: Tensor) -> np.ndarray:
 
 
 class _Shading(NamedTuple):
-    """csrc/shading/lit/lit.h, of the tensors (b, *points, *tables, *flat): the result is radiance (N, C) float64, and beside it
-    which samples of lights are seen, (N, K) int8, −1 where they are below the surface; or zeros with its derivatives alone."""
+    """csrc/shading/lit/lit.h, of the tensors (b, *points, *tables, *flat). The results are radiance (N, C) float64, and which
+    light samples are seen: (N, K) int8, −1 below the surface. Without `values`, zeros with the radiance's derivatives."""
 
     layout: _Layout
     tables: int  # how many
-    forced: int  # the light whose shadow is known, −1: none
+    forced: int  # the light whose visibility is given, −1: none
     shadows: bool
     samples: int
-    only: int  # the light of which alone radiance is wanted, −1: of all
+    only: int  # the light whose radiance alone is wanted, −1: all
     values: bool
     dtype: torch.dtype  # of the zeros
     cutoffs: list[float]  # of the flat scene, whose other fields are tensors

@@ -1,8 +1,8 @@
-"""Radiance of surfaces with materials in the light of a scene, as a shader of Hits:
+"""Radiance of surfaces by their materials and the scene's lights, as a shader of Hits:
 
-    L(y, v) = emission + Σ f(y, v, l) max(0, n·l) V(y, l) E(y) + irradiance without shadows · base / π
+    L(y, v) = emission + Σ f(y, v, l) max(0, n·l) V(y, l) E(y) + irradiance of spherical harmonics · diffuse / π
 
-with one point, or a few, of each light that has an extent.
+with one point, or a few, of each light that has an extent. Spherical harmonics cast no shadows.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from . import in_kernel
 from .bsdf import Scattering, dot, terminator
 from .in_kernel import is_fused
 
-FEWEST_IN_PENUMBRA = 4  # points of a face in a pixel that are shaded, at least; else a quarter of its samples
+FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
 
 
 class Lighting(NamedTuple):
@@ -63,7 +63,7 @@ class Lighting(NamedTuple):
                 "scene: no light falls on its materials, so they are black; give it lights=[…], such as "
                 "eg.Environment(torch.ones(3)), or leave the materials out: colours are then radiance",
             )
-        # Each point sees another one of a light with an extent.
+        # Each shaded point draws points of its own on extended lights.
         extended = any(not light.punctual for light in scene.casting)
         spp = request.image.spp
         points = max(FEWEST_IN_PENUMBRA, spp // 4) if extended else shaded_points(spp)
@@ -91,8 +91,8 @@ class Lighting(NamedTuple):
 
 
 def _kernel_image(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:
-    """(H · W, C) the radiance of surfaces before black, shaded at so many points of a face in a pixel. None where it is not
-    finite: shading points one by one then names the first that is not."""
+    """(H · W, C) the surfaces before black, with `points` of each face in a pixel shaded. None where it is not finite: then
+    points are shaded in PyTorch, which names the first that is not."""
     _note_jumps(frame.no_hits)
     found = in_kernel.image(frame, lighting.shadows, lighting.samples, points)
     return found if all_finite(found) else None
@@ -114,7 +114,7 @@ class _Surface(NamedTuple):
 
 
 def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tensor:
-    """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours."""
+    """(N, C): the radiance of meshes by their materials and the scene's lights; of meshes without a material their colours."""
     _note_jumps(hits)
     if isinstance(hits._view, View) and is_fused(hits._surfaces.scene):
         return in_kernel.radiance(hits, shadows, light_samples)
@@ -142,7 +142,7 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
     at = OnMesh(mesh, hits._face - surfaces.first_faces[index], hits._barycentrics, hits._look_up)
     base, material = at.base_color(), mesh.material
     if material is None:
-        return torch.zeros_like(base) if hits.only_light else base
+        return torch.zeros_like(base) if hits._only_light else base
     g, v = surfaces.face_normals(hits._face), hits.view
     front = dot(g.detach(), v.detach()) >= 0
     side = torch.where(front, 1.0, -1.0).to(g)
@@ -155,15 +155,15 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
     flat = mesh.normals is None and material.normal_map is None
     surface = _Surface(hits.position, v, side * g, side * n, Scattering(base, metallic, roughness), flat)
     total = g.new_zeros((len(hits), 1))
-    if material.emission is not None and not hits.only_light:
+    if material.emission is not None and not hits._only_light:
         total = total + at.value(material.emission)
     for light in scene.lights:
-        if isinstance(light, SphericalHarmonics) and not hits.only_light:
+        if isinstance(light, SphericalHarmonics) and not hits._only_light:
             total = total + surface.scattering.diffuse / math.pi * light.irradiance(surface.n)
     for light in scene.casting:
-        if hits.only_light and not hits.knows_light(light):
+        if hits._only_light and not hits._knows_light(light):
             continue
-        count = 1 if light.punctual or hits.only_light else lighting.samples
+        count = 1 if light.punctual or hits._only_light else lighting.samples
         for sample in range(count):
             total = total + _light_sample(hits, light, (sample, count), surface, lighting.shadows) / count
     return total if material.two_sided else torch.where(front, total, 0.0)
@@ -172,7 +172,7 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
 def _light_sample(hits: Hits, light: Light, sample: tuple[int, int], surface: _Surface, shadows: bool) -> Tensor:
     """(N, C): f max(0, n·l) V E of one point of a light, `sample` = (number, count)."""
     points = hits.light_points(light, *sample)
-    if isinstance(light, Environment) and not hits.knows_light(light):
+    if isinstance(light, Environment) and not hits._knows_light(light):
         points = light.above(points, surface.g)
     with torch.no_grad():
         l = _towards(light, points, surface.position)
@@ -188,7 +188,7 @@ def _light_sample(hits: Hits, light: Light, sample: tuple[int, int], surface: _S
     if not surface.flat:
         arriving = arriving * terminator(surface.g, surface.n, l)
     if shadows:
-        arriving = arriving * hits.subset(rows).visible_from(light, points)[:, None]
+        arriving = arriving * hits._subset(rows).visible_from(light, points)[:, None]
     scattered = surface.scattering.evaluate(surface.v, surface.n, l) * arriving
     return total.index_copy(0, rows, scattered.expand(len(rows), C))
 
@@ -206,22 +206,24 @@ def _note_jumps(hits: Hits) -> None:
     surfaces = hits._surfaces
     scene = surfaces.scene
     if len(scene.meshes) > 1:
-        hits.note_jump("mesh", lambda: surfaces.mesh_of_face[:, None, None].expand(-1, 3, 1))
+        hits._note_jump("mesh", lambda: surfaces.mesh_of_face[:, None, None].expand(-1, 3, 1))
     for index, mesh in enumerate(scene.meshes):
-        hits.note_jump(("appearance", index), _of_scene(surfaces, index, lambda mesh=mesh: jumps(mesh)))
+        hits._note_jump(("appearance", index), _of_scene(surfaces, index, lambda mesh=mesh: jumps(mesh)))
         if mesh.material is None or not (scene.lights or scene.casting):
             continue
         if mesh.normals is None:
             seen_by = hits._view
-            hits.note_jump(
+            hits._note_jump(
                 ("g", index), _of_scene(surfaces, index, lambda i=index, v=seen_by: _flat_radiance(surfaces, i, v))
             )
             continue
         if mesh.normal_faces is not None:
             normals, rows = mesh.normals, mesh.normal_faces
-            hits.note_jump(("n", index), _of_scene(surfaces, index, lambda n=normals, r=rows: n[r.long()]))
+            hits._note_jump(("n", index), _of_scene(surfaces, index, lambda n=normals, r=rows: n[r.long()]))
         if scene.casting:
-            hits.note_jump(("lit", index), _of_scene(surfaces, index, lambda i=index: _shadow_terminators(surfaces, i)))
+            hits._note_jump(
+                ("lit", index), _of_scene(surfaces, index, lambda i=index: _shadow_terminators(surfaces, i))
+            )
 
 
 def _of_scene(surfaces: Surfaces, index: int, of_mesh: Callable[[], Tensor]) -> Callable[[], Tensor]:
@@ -249,10 +251,12 @@ def _face_normals(surfaces: Surfaces, index: int) -> Tensor:
 
 
 def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
-    """(F, 3, K) of a mesh without shading normals: what of its radiance, besides colours, may jump at edges. That is the normal n
-    on the viewer's side. With punctual lights alone only faces that one of them lights count, and of Lambertian ones only
-    E max(0, n·l) of each light. Equal values at both ends of an edge are equal along all of it, for n·l |l| is a face's distance
-    to the light. The cone of a spot light, whose border may lie between the ends, is left out."""
+    """(F, 3, K) of a mesh without shading normals: what may jump at its edges, besides colours.
+
+    That is the face's normal on the viewer's side; if all lights are punctual, only of faces that one of them lights. Of
+    Lambertian faces it is E max(0, n·l) of each light: if both faces agree at the ends of an edge, they agree all along it, for
+    n·l |l| is the light's distance from the face's plane. The cone of a spot light may end between the ends, and is left out.
+    """
     scene, mesh = surfaces.scene, surfaces.scene.meshes[index]
     material = mesh.material
     assert material is not None
@@ -273,9 +277,11 @@ def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
 
 
 def _shadow_terminators(surfaces: Surfaces, index: int) -> Tensor:
-    """(F, 3, K): n·l at corners with interpolated normals n, times the shadow terminator, for each light. The face's normal g
-    comes in by the terminator alone, which is 1 where g·l ≥ (g·n)(n·l): so of a fine mesh only edges near the terminator are
-    creases. A light with an extent has a terminator for each of its points: then all edges between faces of other normals are."""
+    """(F, 3, K): n·l times the shadow terminator at corners, with interpolated normals n, for each light.
+
+    The face's normal g enters through the terminator alone, which is 1 where g·l ≥ (g·n)(n·l). So of a fine mesh only edges near
+    the terminator are creases. An extended light has a terminator for each of its points: then g itself is compared.
+    """
     mesh, lights = surfaces.scene.meshes[index], surfaces.scene.casting
     assert mesh.normals is not None
     of_faces = _face_normals(surfaces, index)

@@ -10,11 +10,11 @@ from ..kernel.derivatives import moves
 from ..scene.environment import Environment
 from .frame import Frame
 
-AT_ONCE = 1 << 16  # pixels whose rays are held at a time
+AT_ONCE = 1 << 16  # pixels whose rays are in memory at a time
 
 
 def environments(frame: Frame) -> Tensor | None:
-    """(H, W, C): the environments that are shown, each pixel the mean of four places in it; None where there are none."""
+    """(H, W, C): the visible environments, each pixel the mean of four rays; None if there are none, or a background."""
     scene = frame.surfaces.scene
     shown = [light for light in scene.lights if isinstance(light, Environment) and light.visible]
     if scene.background is not None or not shown:

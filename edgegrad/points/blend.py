@@ -13,11 +13,11 @@ from .frame import Frame
 from .hits import Hits
 from .records import trace
 
-MOST = 8  # surfaces in a row; what lies behind the last is left out
+MOST = 8  # surfaces along a ray; what lies behind the last is left out
 
 
 class Blended:
-    """A shader of all that is seen at a point: α L + (1 − α) L_behind (Porter and Duff 1984, "over")."""
+    """A shader that composes what is seen along a ray: α L + (1 − α) L_behind (Porter and Duff 1984, "over")."""
 
     def __init__(self, frame: Frame, shader: Callable[[Hits], Tensor], background: Callable[[], Tensor | None]) -> None:
         self._frame, self._shader, self._background = frame, shader, background
@@ -32,7 +32,7 @@ class Blended:
             through = (alpha < 1)[:, 0].nonzero()[:, 0]
         if left == 1 or len(through) == 0:
             return radiance
-        behind = self._behind(hits.subset(through), radiance.shape[1], left).to(radiance.dtype)
+        behind = self._behind(hits._subset(through), radiance.shape[1], left).to(radiance.dtype)
         return (alpha * radiance).index_add(0, through, (1 - alpha[through]) * behind)
 
     def _behind(self, hits: Hits, channels: int, left: int) -> Tensor:

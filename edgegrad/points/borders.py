@@ -1,9 +1,8 @@
 """Pixels that borders of a shader's steps, or of shadows, run through: there one point of a face is a poor estimate of the
 pixel.
 
-A pixel is one of them where a step is on different sides in the pixels around it. What was found in the pixel itself is not
-asked: whether it is shaded again, with other points, must not depend on the points that it then does without, or the mean
-over seeds would be off.
+A pixel counts as such if the eight pixels around it lie on different sides of a step. Its own points do not count: if they
+decided whether they are replaced by others, the mean over seeds would be biased.
 """
 
 from __future__ import annotations
@@ -15,13 +14,13 @@ from ..check import values_visible
 from .hits import Hits
 from .steps import FLOOR
 
-MOST = 8  # times the points of a face in a pixel
-SHARE = 4  # times the points of the first pass, in all
-LEVELS = 1 << 14  # after which the sides of a step repeat here, so that small integers hold them
+MOST = 8  # at most so many times the first pass's points of a face in a pixel
+SHARE = 4  # and so many times all of its points
+LEVELS = 1 << 14  # levels of a floor() are compared modulo this, so that int16 holds them
 
 
 class Borders:
-    """Of an image of `size` (height, width), from a first pass over all of its pixels, at so many points of a face in each."""
+    """Of an image of `size` (height, width), from a first pass with `points` of each face in a pixel."""
 
     def __init__(self, size: tuple[int, int], points: int) -> None:
         self._size, self._each = size, points
@@ -34,12 +33,12 @@ class Borders:
         """Points of the pixels (N,), after they were shaded."""
         steps = list(zip(hits._steps.kinds, hits._steps.values, strict=True))
         self._known = self._known and values_visible(*(values for _, values in steps if values is not None))
-        # Where a light has an extent each point sees another part of it, and what neighbours see says nothing of borders.
+        # Each point sees another part of a light with an extent, so its neighbours tell nothing of the shadow's border.
         lights = [k for k, light in enumerate(hits.lights) if light.punctual]
         if not self._known or not (steps or lights):
             return
         sides = [None if values is None else _sides(kind, values) for kind, values in steps]
-        sides += [hits.lit.get(k) for k in lights]
+        sides += [hits._lit.get(k) for k in lights]
         self._points += torch.bincount(pixel, minlength=len(self._points)).int()
         for k, side in enumerate(sides):
             if k == len(self._least):
@@ -52,7 +51,7 @@ class Borders:
             self._greatest[k].scatter_reduce_(0, pixel, side, "amax")
 
     def found(self) -> tuple[Tensor, int]:
-        """The pixels (H, W) bool, and how many points of each face in them are to be shaded."""
+        """The pixels (H, W) bool, and how many points of each face to shade in them."""
         differ = torch.zeros(self._size, dtype=torch.bool)
         if not self._known:
             return differ, 1
@@ -64,7 +63,7 @@ class Borders:
 
 
 def _sides(kind: str, values: Tensor) -> Tensor:
-    """(N,) int16: on which side of a step points are; −1 where it was not asked."""
+    """(N,) int16: on which side of a step points lie; −1 where the shader did not ask."""
     values = values.detach()
     side = values.double().nan_to_num().floor() % LEVELS if kind == FLOOR else values > 0
     return side.to(torch.int16).masked_fill(~torch.isfinite(values), -1)

@@ -25,24 +25,24 @@ class Footprints(NamedTuple):
     rays_at: Callable[[Tensor], RayRecords]
 
     def level(self, texture: Tensor, corner_uvs: Tensor) -> Tensor:
-        """(N,) the logarithm of how many texels neighbouring pixels are apart, at most, by the texture coordinates of the faces'
-        corners (N, 3, 2)."""
+        """(N,) the level: log2 of the distance in texels of neighbouring pixels, the larger of both directions. `corner_uvs`
+        (N, 3, 2) are the texture coordinates of the faces' corners."""
         rays_at, pixel, corners = self.rays_at, self.pixel, corner_uvs.double()
         size = torch.tensor([texture.shape[1], texture.shape[0]], dtype=torch.float64, device=corners.device)
-        step = 1 / 64  # px, within which the face's plane is as good as straight
+        step = 1 / 64  # px, so small that texture coordinates are nearly affine in the image
         rays = rays_at(pixel)
 
         def beside(axis: int, aside: float) -> Tensor:
             if not moves(rays.along):
                 return rays.along + aside * rays.along_by_x[:, :, axis]
-            # As functions of the intrinsics; where the lens shows nothing there, as if all were the same.
+            # As functions of the intrinsics. Where a lens shows nothing, the ray of the pixel itself stands for its neighbour.
             offset = torch.zeros(2, dtype=pixel.dtype, device=pixel.device)
             offset[axis] = aside
             along = rays_at(pixel + offset).along
             return torch.where(torch.isfinite(along), along, rays.along)
 
         def squared(axis: int) -> Tensor:
-            """How many texels a pixel is along an axis, squared."""
+            """The squared distance in texels of neighbouring pixels along an axis."""
             b = [self.view.barycentrics(self.surfaces, self.face, beside(axis, aside)) for aside in (step, -step)]
             texels = interpolated(b[0] - b[1], corners) * size / (2 * step)
             return (texels * texels).sum(1)

@@ -1,4 +1,4 @@
-"""One image of a scene: what all points in it share, whatever they are taken for."""
+"""What all samples of one image share: surfaces, view, seeds, and how they are summed in pixels."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .steps import Steps
 from .surfaces import Surfaces, View
 
 _Rays = TypeVar("_Rays", bound=RayRecords | SurfaceRecords)
-SAMPLES = ("image", "inside", "edges", "steps", "shadows", "image again")  # kinds that draw numbers of their own
+SAMPLES = ("image", "inside", "edges", "steps", "shadows", "image again")  # each kind has its own random numbers
 
 
 class Frame:
@@ -53,8 +53,8 @@ class Frame:
         return self.here(sample_seeds(seed, SAMPLES.index(kind), first, count))
 
     def seeds_of_pixels(self, kind: str, pixel: Tensor, each: int) -> Tensor:
-        """(N,) int64: of hits in the pixels (N,), in their order, about `each` in one. A pixel has the same ones whatever the
-        others see, so that the images of a scene and of one that is moved a little differ by little."""
+        """(N,) int64: of hits in the pixels (N,) in ascending order, about `each` in one. The seeds of a pixel do not depend on
+        what other pixels see, so a small motion changes the image by little."""
         row = torch.arange(len(pixel))
         begins = torch.ones(len(pixel), dtype=torch.bool)
         begins[1:] = pixel[1:] != pixel[:-1]
@@ -76,7 +76,7 @@ class Frame:
 
     @property
     def no_hits(self) -> Hits:
-        """None of them: for what a shader notes of the scene, such as where it jumps."""
+        """Hits without points, from which a shader still notes where it may jump."""
         none = torch.zeros(0, dtype=torch.int64)
         return self.fixed_hits(
             none, torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.float64), none
@@ -85,7 +85,7 @@ class Frame:
     def moving_hits(
         self, face: Tensor, rays: RayRecords | SurfaceRecords, x: Tensor, seed: Tensor | None = None
     ) -> Hits:
-        """Functions of vertices and camera, at fixed places in the image."""
+        """As differentiable functions of vertices and camera, at fixed places in the image."""
         face = self.here(face)
         b = self.view.barycentrics(self.surfaces, face, self.here(self._moving(rays).along))
         return Hits(
@@ -100,12 +100,12 @@ class Frame:
         return rays._replace(along=rays.along + moved)
 
     def image(self, pixel: Tensor, values: Tensor, pixels: range | None = None) -> Tensor:
-        """(H · W, C), or of these pixels: the sums of rows of values (N, C) by pixel."""
+        """(H · W, C), or of a range of pixels: the sum of the values (N, C) in each."""
         pixels = pixels or range(self.pixels)
         return values.new_zeros((len(pixels), values.shape[1])).index_add(0, self.here(pixel) - pixels.start, values)
 
     def attached(self, image: Tensor, terms: Sequence[Term]) -> Tensor:
-        """The image, and of terms (H · W, C) their derivatives."""
+        """The image, with the derivatives of the terms: see attached()."""
         return attached(image.reshape(self.pixels, -1), terms, self.request).reshape(image.shape)
 
     def composed(self, image: Tensor, background: Tensor | None) -> Tensor:

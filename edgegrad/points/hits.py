@@ -1,4 +1,4 @@
-"""Hits: what shaders written in PyTorch are given, points of surfaces and what is known there."""
+"""Hits: the points of surfaces that a shader written in PyTorch is given, and what it may ask of them."""
 
 from __future__ import annotations
 
@@ -25,14 +25,16 @@ from .surfaces import Rays, Surfaces, View, every_face
 
 
 class Hits:
-    """N points of surfaces as a shader sees them. Each property is made when it is asked for.
+    """N points of surfaces as a shader sees them.
 
-    Where the renderer differentiates a shader, they are differentiable functions of the vertices and the camera at fixed
+    Where the renderer differentiates a shader, properties are differentiable functions of the vertices and the camera at fixed
     places in the image; elsewhere they have no derivatives. A shader must be a function of each point by itself.
 
-    render() makes them for its shader, trace() for any rays, primary_hits() for those of an image. A property is kept once it
-    was asked for; under torch.utils.checkpoint of one's own, ask for those that are needed before.
+    render() makes hits for its shader, trace() for any rays, primary_hits() for those of an image. A property is computed when
+    it is first asked for, and kept. If you use torch.utils.checkpoint in a shader, ask for the properties before it.
     """
+
+    # What has an underscore is between the renderer and its own shader of lit scenes (edgegrad/light).
 
     def __init__(
         self,
@@ -47,15 +49,15 @@ class Hits:
         forced: Forced | None = None,
     ) -> None:
         self._surfaces, self._view, self._rays_at = surfaces, view, rays_at
-        self.values = True  # whether more than derivatives is wanted of what scenes are lit by (light/in_kernel.py)
+        self._needs_values = True  # False: radiance may be zeros that have its derivatives (light/in_kernel.py)
         self._seed = torch.arange(len(face), device=face.device) if seed is None else seed
         self._forced = forced
         self._face, self._exact = face, barycentrics
         self._barycentrics = barycentrics.to(surfaces.verts.dtype)
         self._pixel, self._steps = pixel, steps or Steps()
-        self._all: tuple[Hits, Tensor] | None = None  # the hits that these are a subset of, and the rows of these
-        # (N,) int8, by lights of scene.casting: visible_from(), −1 where it was not asked
-        self.lit: dict[int, Tensor] = {}
+        self._all: tuple[Hits, Tensor] | None = None  # the hits that these are a subset of, and their rows there
+        # What visible_from() found, by the light's place in scene.casting: (N,) int8, −1 where it was not asked.
+        self._lit: dict[int, Tensor] = {}
 
     def __len__(self) -> int:
         return len(self._face)
@@ -64,8 +66,8 @@ class Hits:
         return f"Hits({len(self)} points)"
 
     def select(self, index: Tensor) -> Hits:
-        """Some of the points, or all in another order: `index` (M,) of integers, each once, or a mask (N,). What is declared of
-        them by where() and floor() is declared of the whole. Raises TypeError or ValueError that names the argument."""
+        """Some of the points, or all in another order: `index` (M,) of integers, each once, or a mask (N,). Steps that where()
+        and floor() declare of them are steps of the whole. Raises TypeError or ValueError that names the argument."""
         index = as_tensor("index", index).to(self._face.device)
         count = len(self)
         if index.dtype == torch.bool:
@@ -78,10 +80,10 @@ class Hits:
         wrong = (index < -count) | (index >= count)
         if values_visible(index) and bool(wrong.any()):
             raise ValueError(f"index: expected numbers from {-count} to {count - 1}, got {int(index[wrong][0])}")
-        return self.subset(index, StepsOfSubset(self._steps, index % max(count, 1), count))
+        return self._subset(index, StepsOfSubset(self._steps, index % max(count, 1), count))
 
-    def subset(self, index: Tensor | slice, steps: Steps | None = None) -> Hits:
-        """Some of the points. Unlike select(), steps that are declared of them are not declared of all."""
+    def _subset(self, index: Tensor | slice, steps: Steps | None = None) -> Hits:
+        """Some of the points, with steps of their own, while select() passes them on to the whole."""
         view = self._view.select(index) if isinstance(self._view, Rays) else self._view
         pixel = None if self._pixel is None else self._pixel[index]
         forced = None if self._forced is None else self._forced.select(index)
@@ -108,13 +110,14 @@ class Hits:
             raise ValueError("hits.ray: expected hits of trace(), these are of a camera; see hits.pixel")
         return self._view.ray
 
-    def note_jump(self, key: Any, corners: Callable[[], Tensor]) -> None:
-        """That radiance depends on values at the corners of faces (F, 3, K): edges where these differ may be creases."""
+    def _note_jump(self, key: Any, corners: Callable[[], Tensor]) -> None:
+        """Radiance depends on these values at the corners of faces (F, 3, K): an edge on whose two sides they differ may be a
+        crease."""
         self._surfaces.jumping.setdefault(key, corners)
 
     def _note_faces(self) -> None:
         s = self._surfaces
-        self.note_jump("face", lambda: every_face(len(s.faces)).to(s.verts.device))
+        self._note_jump("face", lambda: every_face(len(s.faces)).to(s.verts.device))
 
     @property
     def face(self) -> Tensor:
@@ -126,7 +129,7 @@ class Hits:
     def mesh(self) -> Tensor:
         """(N,) int64: the mesh of the scene."""
         s = self._surfaces
-        self.note_jump("mesh", lambda: s.mesh_of_face[:, None, None].expand(-1, 3, 1))
+        self._note_jump("mesh", lambda: s.mesh_of_face[:, None, None].expand(-1, 3, 1))
         return s.mesh_of_face[self._face]
 
     @property
@@ -143,22 +146,22 @@ class Hits:
 
     @cached_property
     def depth(self) -> Tensor:
-        """(N,) along the camera's axis, world units; of trace(), how many times its direction a ray went."""
+        """(N,) along the camera's axis, world units; of trace(), along the ray, in lengths of its direction."""
         return self._view.depth(self.position).to(self.position.dtype)
 
     @cached_property
     def normal(self) -> Tensor:
-        """(N, 3) unit normal of the face, to the side from which its vertices run counter-clockwise."""
+        """(N, 3) unit normal of the face, on the side from which its vertices run counter-clockwise."""
         s = self._surfaces
         every = torch.arange(len(s.faces), device=s.verts.device)
-        self.note_jump("normal", lambda: s.face_normals(every)[:, None].expand(-1, 3, -1))
+        self._note_jump("normal", lambda: s.face_normals(every)[:, None].expand(-1, 3, -1))
         return s.face_normals(self._face)
 
     @cached_property
     def shading_normal(self) -> Tensor:
-        """(N, 3) unit normal, interpolated between those of the vertices: means of their faces' by area."""
+        """(N, 3) unit normal, interpolated between the vertices' normals: means of the faces' normals, weighted by area."""
         s = self._surfaces
-        self.note_jump("shading_normal", lambda: s.vertex_normals[s.faces])
+        self._note_jump("shading_normal", lambda: s.vertex_normals[s.faces])
         normals = rows_of(s.vertex_normals, rows_of(s.faces, self._face))
         return normalize(interpolated(self._barycentrics, normals), dim=-1)
 
@@ -166,7 +169,7 @@ class Hits:
     def uv(self) -> Tensor:
         """(N, 2) texture coordinates, v running up."""
         s = self._surfaces
-        self.note_jump("uv", lambda: s.corner_uvs)
+        self._note_jump("uv", lambda: s.corner_uvs)
         return interpolated(self._barycentrics, rows_of(s.corner_uvs, self._face))
 
     @cached_property
@@ -205,7 +208,7 @@ class Hits:
                 else attribute[:, None].expand(-1, 3, -1)
             )
 
-        self.note_jump(("attribute", id(attribute)), corners)
+        self._note_jump(("attribute", id(attribute)), corners)
         if per == "face":
             return rows_of(attribute, self._face)
         values = rows_of(attribute, rows_of(s.faces, self._face) if per == "vertex" else self._face)
@@ -277,9 +280,8 @@ class Hits:
 
         torch.where() gives the same image, but no gradient for the border. Borders are found along lines through the image,
         a pixel apart unless render() is given another step_spacing; two that lie closer may be missed. A shader must call
-        where(), floor() and nearest lookups equally often, in the same order, whatever its points. Outside of a shader that
-        render() was given there is no image, and it is torch.where(). Raises TypeError or
-        ValueError that names the argument.
+        where(), floor() and nearest lookups equally often, in the same order, whatever its points. For hits that are not of
+        render()'s shader, where() is torch.where(). Raises TypeError or ValueError that names the argument.
         """
         s = _function("s", s)
         check_shape("s", s, (len(self),), (len(self), 1))
@@ -314,9 +316,9 @@ class Hits:
     def visible(self, points: Tensor) -> Tensor:
         """(N,) bool: whether nothing lies between each point and another, `points` (N, 3) or (3,) in world coordinates.
 
-        Shadow rays: the face of the point itself hides nothing, nor does what touches either end as far as the numbers'
-        spacing tells. It has no derivative, and a shadow's border is not a step: what moves there has no gradient. Raises
-        TypeError or ValueError that names the argument.
+        A shadow ray ignores the face of its point, and what touches either end up to the rounding of the coordinates. There is
+        no derivative, and what moves the border of such a shadow has no gradient: see visible_from(). Raises TypeError or
+        ValueError that names the argument.
         """
         s = self._surfaces
         points = as_tensor("points", points, like=s.verts, floating=True)
@@ -332,57 +334,57 @@ class Hits:
 
     @property
     def lights(self) -> tuple[Light, ...]:
-        """The scene's lights that cast shadows, in a fixed order: those of scene.lights, then the meshes that emit."""
+        """The scene's lights that cast shadows: those of scene.lights, then the meshes that emit."""
         return self._surfaces.scene.casting
 
     def random(self, n: int, stream: int = 0, part: int = 0, parts: int = 1) -> Tensor:
-        """(N, n) float64, uniform in [0, 1): the same for what belongs to the same sample, without derivatives. Points that
-        follow one another, and the `parts` of one point, have numbers that fill the unit cube evenly (a Kronecker sequence
-        with the powers of the generalised golden ratio of three dimensions); `stream` gives others."""
+        """(N, n) float64, uniform in [0, 1), without derivatives. All points of one sample, such as both sides of an edge, get
+        the same numbers. Those of successive points, and of the `parts` of one point, fill the unit cube evenly (a Kronecker
+        sequence with the powers of the generalised golden ratio of three dimensions). Each `stream` gives other numbers."""
         return uniform(self._seed * parts + part, n, stream)
 
     def light_points(self, light: Light, sample: int = 0, samples: int = 1) -> LightPoints:
-        """A point of a light of `lights` for each of the N points, drawn by what the light emits, or one after another of so many
-        `samples`: light.place() and light.arriving() take them."""
+        """A point of a light of `lights` for each of the N points, drawn in proportion to what the light emits. With several
+        `samples` of a light, `sample` is the number of this one. light.place() and light.arriving() take the result."""
         index = self._index(light)
         points = light.draw(self.random(3, index, sample, samples))
         forced = self._forced
         return points if forced is None or forced.light != index else forced.among(points)
 
     def visible_from(self, light: Light, points: LightPoints) -> Tensor:
-        """(N,) 1 where nothing lies between the points and those of a light, else 0: see visible(). A border of its shadow is
-        a step: what moves there has a gradient, though this has none."""
+        """(N,) 1 where nothing lies between the points and those of a light, else 0: see visible(). It has no derivative, but
+        the renderer samples the borders of the light's shadow, so what moves them has a gradient."""
         index, s, forced = self._index(light), self._surfaces, self._forced
         s.shadowing.add(index)
         if forced is not None and forced.light == index and values_visible(forced.some) and bool(forced.some.all()):
             return forced.lit.to(self.position.dtype)
         place, near = seen_from(light, points, s, self.position.detach().double())
         lit = visible(s.casters, self._face, self._exact[:, 1:], place, near)
-        self.note_visibility(index, lit)
+        self._note_visibility(index, lit)
         lit = lit.to(self.position.dtype)
         if forced is None or forced.light != index:
             return lit
         return torch.where(forced.some, forced.lit.to(lit), lit)
 
-    def note_visibility(self, light: int, lit: Tensor) -> None:
-        """Kept with the hits that these are a subset of: 1 or 0, and −1 where it was not asked."""
+    def _note_visibility(self, light: int, lit: Tensor) -> None:
+        """Keeps (N,) 1 seen, 0 hidden, −1 not asked, with the hits that these are a subset of."""
         if not values_visible(lit):
             return
         lit = lit.to(torch.int8)
         if self._all is None:
-            self.lit[light] = lit
+            self._lit[light] = lit
             return
         every, rows = self._all
-        known = every.lit.setdefault(light, lit.new_full((len(every),), -1))
+        known = every._lit.setdefault(light, lit.new_full((len(every),), -1))
         known.index_copy_(0, rows, lit)
 
     @property
-    def only_light(self) -> bool:
-        """Whether nothing is wanted but what one light adds, whose points are given."""
+    def _only_light(self) -> bool:
+        """Whether only the radiance that one light adds is wanted."""
         return self._forced is not None and self._forced.only
 
-    def knows_light(self, light: Light) -> bool:
-        """Whether the points of a light are given here, for all the border of one shadow."""
+    def _knows_light(self, light: Light) -> bool:
+        """Whether the points of this light are given, for these hits lie on the border of its shadow."""
         return self._forced is not None and self._forced.light == self._index(light)
 
     def _index(self, light: Light) -> int:
@@ -393,7 +395,7 @@ class Hits:
 
 
 def _function(name: str, value: Tensor) -> Tensor:
-    """Of a step: finite, and not of the half precision that autocast gives. Raises TypeError or ValueError."""
+    """The function of a step: finite, and not in the half precision that autocast gives. Raises TypeError or ValueError."""
     value = as_tensor(name, value, floating=True)
     if value.dtype in (torch.float16, torch.bfloat16):
         value = value.float()

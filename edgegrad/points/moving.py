@@ -1,4 +1,4 @@
-"""What moves with the scene at fixed places in the image: barycentrics of hits, and curves across themselves."""
+"""How hits and curves move at fixed places in the image: barycentrics of hits, and the normal velocity of curves."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def barycentrics(
 def barycentrics_by(
     verts: Tensor, faces: Tensor, face: Tensor, world_to_camera: Tensor, along: Tensor, by: Tensor, perspective: bool
 ) -> tuple[Tensor, Tensor]:
-    """The same, and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K); neither has any of its own."""
+    """The same, and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K). Neither has a graph."""
     meeting = _Meeting(perspective)
 
     def compute(*tensors: Tensor) -> Sequence[Tensor]:
@@ -71,7 +71,7 @@ class _Meeting(NamedTuple):
 
 
 class Form(NamedTuple):
-    """Rows of a linear form of a table (R, K): Σ by · (table − its value)[row] for each sample."""
+    """For each sample a linear form of a table (R, K): Σ by · (table − its value)[row] over the entries of the sample."""
 
     sample: Tensor  # (P,) int64
     row: Tensor  # (P,) int64

@@ -21,8 +21,8 @@ def trace(scene: Scene | Mesh, origins: Tensor, directions: Tensor) -> Hits:
     origins, directions  (N, 3) or (3,) world coordinates, directions of any length
 
     Positions, normals, texture coordinates and the rest are differentiable functions of the vertices, the origins and the
-    directions, while each ray meets the same face; what moves at silhouettes is not in them. `hits.depth` is in lengths of the
-    direction; there is no `hits.pixel`. Raises TypeError or ValueError that names the argument.
+    directions, while each ray meets the same face: what moves at silhouettes has no gradient. `hits.depth` is in lengths of
+    the direction; there is no `hits.pixel`. Raises TypeError or ValueError that names the argument.
     """
     scene = as_scene(scene)
     like = scene.meshes[0].verts

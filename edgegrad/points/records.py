@@ -1,4 +1,4 @@
-"""The kernel's samples for shaders written in PyTorch, as records of tensors, whatever transforms of torch.func are under way."""
+"""The kernel's samples for shaders written in PyTorch, as records of tensors. They work under the transforms of torch.func."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ..scene.scene import Scene
 
 
 class PixelRecords(NamedTuple):
-    """Some of an image's hits: all samples of a pixel on one face, at one of them, or at several."""
+    """The image's hits: one, or several, of the samples of a pixel on one face stand for all of these."""
 
     pixel: Tensor  # (N,) int64, row by row
     face: Tensor  # (N,) int64
@@ -44,7 +44,7 @@ class SurfaceRecords(NamedTuple):
 
     face: Tensor  # (S,) int64
     x: Tensor  # (S, 2) float64, pixel positions
-    along: Tensor  # (S, 3) float64, where the ray goes in camera coordinates; in an orthographic view the place it goes through
+    along: Tensor  # (S, 3) float64, the ray's direction in camera coordinates; in an orthographic view a point on it
     along_by_k: Tensor  # (S, 3, 14) float64, its derivatives by K in rows and the distortion, at fixed x; empty where these stay
     weight: Tensor  # (S,) float64, px² that a sample stands for
 
@@ -54,9 +54,9 @@ class CurveRecords(NamedTuple):
 
     x: Tensor  # (S, 2) float64, pixel positions
     # N points of surfaces there, at most three a sample. The jump, times what a sample stands for, is Σ factor · radiance.
-    hit_sample: Tensor  # (N,) int64, whose each is
+    hit_sample: Tensor  # (N,) int64, the sample of each point
     hit_face: Tensor  # (N,) int64
-    hit_side: Tensor  # (N,) int64, which of the sample's it is
+    hit_side: Tensor  # (N,) int64, its number among the points of the sample
     hit_b: Tensor  # (N, 3) float64, barycentrics
     hit_x: Tensor  # (N, 2) float64, pixel position
     hit_factor: Tensor  # (N,) float64
@@ -71,7 +71,7 @@ class CurveRecords(NamedTuple):
     alpha_row_of: Tensor  # (Q,) int64, the sample of a row by texels of alpha
     alpha: Tensor  # (Q,) int64
     by_alpha: Tensor  # (Q,) float64
-    # Of borders of shadows, else no rows: the first surface is that in the light, the second that in the shadow.
+    # For borders of shadows alone: the first point is the one in the light, the second the one in the shadow.
     light: Tensor  # (S,) int64, the part of the light
     light_uv: Tensor  # (S, 2) float64, where on it
     by_light: (
@@ -80,11 +80,11 @@ class CurveRecords(NamedTuple):
 
 
 class LightParts(NamedTuple):
-    """A light as edges see it: a point, or triangles."""
+    """A light as one point, or as triangles."""
 
     corner: Tensor  # (L, 3, 3) float64: world coordinates, or, at infinity, directions towards it; a point thrice
-    chance: Tensor  # (L,) float64 above zero, that a point of the light is drawn there
-    face: Tensor  # (L,) int32 of the scene, that the part is; −1: none
+    chance: Tensor  # (L,) float64 above zero, the probability that a point of the light is drawn there
+    face: Tensor  # (L,) int32, the face of the scene; −1: none
     infinite: bool
     extended: bool
     two_sided: bool
@@ -94,7 +94,7 @@ class PlaceRecords(NamedTuple):
     """What is seen at places in the image."""
 
     face: Tensor  # (N,) int64, −1: none
-    part: Tensor  # (N,) int64 of the surface that is connected, −1: none
+    part: Tensor  # (N,) int64, the connected part of the surface, −1: none
     b: Tensor  # (N, 2) float64
 
 
@@ -118,8 +118,8 @@ SURFACE_BYTES, CURVE_BYTES = 8 * (1 + 2 + 3 + 3 * 14 + 1), 8 * (2 + 3 + 6 + 3 + 
 
 
 def shaded_room(request: Request, gradient: bool | None = None, textured: bool = False) -> AbstractContextManager[None]:
-    """Raises MemoryError before its block if the image of a shader does not fit, and if an allocation in it fails; what the
-    shader itself takes is not known before. With the samples of the `gradient`, by default where gradients are enabled."""
+    """Raises MemoryError before its block if the image of a shader does not fit, and if an allocation in it fails. What the
+    shader itself takes is not known. The samples of the `gradient` count too, by default where gradients are enabled."""
     size, options = pass_size(request), request.gradient
     pixels = request.camera.height * request.camera.width
     needs = core.image_bytes(size, request.cameras)
@@ -144,7 +144,7 @@ def _record(kind: Any, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def values_of(*tensors: Tensor) -> list[np.ndarray]:
-    """Of tensors, whatever transforms of torch.func are under way."""
+    """The values of tensors, also under transforms of torch.func."""
     found: list[np.ndarray] = []
 
     def keep(*values: Tensor) -> Sequence[Tensor]:
@@ -156,7 +156,7 @@ def values_of(*tensors: Tensor) -> list[np.ndarray]:
 
 
 def _of_values(packed: Sequence[Any], compute: Callable[..., Sequence[Tensor]], *more: Tensor) -> tuple[Tensor, ...]:
-    """compute(values, *more) of the values of tensors, in a list of these and others."""
+    """compute(packed, *more), with the values of tensors in place of these."""
     places = [i for i, value in enumerate(packed) if isinstance(value, Tensor)]
 
     def with_values(*tensors: Tensor) -> Sequence[Tensor]:
@@ -200,7 +200,7 @@ def without_colors(flat: Flat, attributes: Tensor | None = None) -> Flat:
 
 
 def trace(flat: Flat, origins: Tensor, directions: Tensor, ignored: Tensor | None = None) -> TraceRecords:
-    """The nearest hits of rays (N, 3), each but for one face, `ignored` (N,), −1: none."""
+    """The nearest hits of rays (N, 3); each passes through one face, `ignored` (N,), −1: none."""
 
     def compute(values: list[Any], origins: Tensor, directions: Tensor, *ignored: Tensor) -> Sequence[Tensor]:
         found = kernel_scene(Flat(*values)).trace(
@@ -216,7 +216,7 @@ def trace(flat: Flat, origins: Tensor, directions: Tensor, ignored: Tensor | Non
 
 
 def visible(flat: Flat, face: Tensor, b: Tensor, to: Tensor, contact: Tensor) -> Tensor:
-    """(N,) bool: whether nothing lies between points of faces and others (N, 3), further than `contact` (N,) from both."""
+    """(N,) bool: whether nothing lies between points of faces and the points `to` (N, 3), but within `contact` (N,) of either."""
 
     def compute(values: list[Any], face: Tensor, b: Tensor, to: Tensor, contact: Tensor) -> Sequence[Tensor]:
         found = kernel_scene(Flat(*values)).visible(
@@ -238,7 +238,7 @@ class Sampler:
     """The samples of one camera of a request."""
 
     def __init__(self, request: Request, camera: int, least: float) -> None:
-        """`least`: barycentrics of points on curves are no less."""
+        """`least`: the smallest barycentric of points on curves."""
         self._request, self._camera, self._least = request, camera, least
         self._kept: tuple[list[Any], Flat, Any] | None = None
         height, width, faces = request.camera.height, request.camera.width, len(request.scene.faces)
@@ -260,14 +260,14 @@ class Sampler:
         return camera_seed(self._request.gradient.grad_seed, self._camera)
 
     def _scene(self, flat: Flat) -> Any:
-        """The kernel's, checked once: most calls are given the same arrays."""
+        """The kernel's scene, checked once: most calls have the same arrays."""
         key = [part.data_ptr() if isinstance(part, Tensor) else part for part in flat]
         if self._kept is None or self._kept[0] != key:
-            self._kept = key, flat, kernel_scene(flat)  # with the tensors, so that no other ones come to lie there
+            self._kept = key, flat, kernel_scene(flat)  # `flat` too: else other tensors might get the same addresses
         return self._kept[2]
 
     def _compute(self, request: Request, compute: Callable[..., Sequence[Tensor]], *more: Tensor) -> tuple[Tensor, ...]:
-        """compute(request, camera of the kernel, *more) of values."""
+        """compute(request, the kernel's camera, *more), with the values of tensors."""
 
         def with_request(values: list[Any], *more: Tensor) -> Sequence[Tensor]:
             values_of = Request.unpack(values)
@@ -278,9 +278,10 @@ class Sampler:
     def pixel_hits(
         self, at_once: int, most: int = 1, only: Tensor | None = None
     ) -> Iterator[tuple[range, PixelRecords]]:
-        """Pixels, row by row, and what they hit, some `at_once` after another; at `most` samples of a pixel on one face each.
+        """Ranges of pixels, row by row, and their hits, about `at_once` together.
 
-        only   (H, W) bool: of these pixels, after those of all; which of their samples these are is drawn independently
+        most   hits of a pixel on one face
+        only   (H, W) bool: these pixels alone, in a second pass, with hits drawn anew
         """
         height, width = self._request.camera.height, self._request.camera.width
         rows = max(1, at_once // (width * min(self._request.image.spp, 4 * most)))
@@ -305,7 +306,7 @@ class Sampler:
             yield range(first * width, end * width), PixelRecords(*self._compute(self._request, compute, *places))
 
     def _image(self, request: Request, camera: Any) -> dict[str, Any]:
-        """What the kernel is told of the image."""
+        """The kernel's arguments for the image."""
         options = request.image._replace(seed=camera_seed(request.image.seed, self._camera))
         return {
             "camera": camera,
@@ -315,7 +316,7 @@ class Sampler:
         }
 
     def lit_image(self, compute: Callable[..., Sequence[Tensor]], *tables: Tensor) -> tuple[Tensor, ...]:
-        """compute(scene of the kernel, its faces, what the kernel is told of the image, *tables), instead of pixel hits."""
+        """compute(the kernel's scene, its faces, its arguments for the image, *tables), in place of pixel_hits()."""
 
         def with_request(request: Request, camera: Any, *tables: Tensor) -> Sequence[Tensor]:
             warn_of_ends([camera])
@@ -332,7 +333,7 @@ class Sampler:
         steps: bool = False,
         lit: Scene | None = None,
     ) -> tuple[SurfaceRecords, CurveRecords]:
-        """Of the gradient, after all pixel hits were taken; the scene of `request` has colours that jump where creases are.
+        """Of the gradient, to be called after pixel_hits(). The scene of `request` has colours that differ at creases.
         `lit`: the scene whose lights shade them."""
 
         def compute(request: Request, camera: Any) -> Sequence[Tensor]:
@@ -371,8 +372,8 @@ class Sampler:
         one: bool = False,
         casters: Flat | None = None,
     ) -> CurveRecords:
-        """On the borders of a light's shadows, after all pixel hits were taken; so many, or by default. `one`: with the point in
-        the light alone. `casters`: the same faces as shadow rays meet them, where these meet less than the camera's."""
+        """On the borders of a light's shadows, to be called after pixel_hits(). `samples`: how many, −1: the default. `one`: with
+        only the point in the light. `casters`: the faces that shadow rays meet, where they differ from what the camera sees."""
         parts, count = [part for part in casters or () if isinstance(part, Tensor)], len(light[:3])
 
         def with_values(values: Iterator[Tensor]) -> Any:

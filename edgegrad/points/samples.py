@@ -12,7 +12,7 @@ render(…, shader=fn) is made of them:
         jump = edges.jump(fn(edges.hits))
     image = attach_boundary(image, edges, jump, background)      # the gradient of what moves at silhouettes
 
-Or with less: the image of primary_hits with a graph has the gradient inside faces by itself.
+Shorter: without no_grad(), the image of primary_hits has the gradient inside faces already.
 """
 
 from __future__ import annotations
@@ -100,9 +100,8 @@ class SurfaceSamples:
         return self._hits
 
     def image(self, radiance: Tensor) -> Tensor:
-        """(H, W, C) from the radiance (S, C) of the samples: an estimate of the image before black whose gradient is that inside
-        faces, for its weights stand for areas of the image and not for shares of a pixel's samples. Raises TypeError or
-        ValueError that names the argument."""
+        """(H, W, C) from the radiance (S, C) of the samples: an estimate of the image before black. Its weights are areas, so
+        its gradient is the interior term. Raises TypeError or ValueError that names the argument."""
         radiance = _rows("radiance", radiance, len(self))
         weighted = self.weight.to(radiance.dtype)[:, None] * radiance
         return self.frame.composed(splat(self._records.x, weighted, self.frame.request), None)
@@ -117,19 +116,20 @@ class EdgeSamples:
     the rim where a lens folds or ends.
 
     hits      Hits, the N points on their surfaces, at most three a sample; without derivatives
-    sample    (N,) int64, whose each is
+    sample    (N,) int64, the sample of each point
     x         (S, 2) places in the image, px
-    velocity  (S,) of the curve across itself, times the length that a sample stands for: its value is zero, its derivative is
+    velocity  (S,) along the curve's normal, times the length that a sample stands for: its value is zero, its derivative is
               that of the place by vertices and camera
     """
 
     def __init__(
         self, frame: Frame, records: CurveRecords, light: ShadowLight | None = None, only: bool = False
     ) -> None:
-        """Of borders of the shadow of a light; `only`: the hits, those in the light alone, ask what it adds."""
+        """`light`: the samples lie on borders of its shadow. `only`: all hits are in the light, and what is wanted of them is the
+        radiance that it adds."""
         self.frame, self._records = frame, records
         self.x = frame.here(records.x)
-        self._in_order = only and len(records.hit_sample) == len(records.x)  # whether the i-th hit is the i-th sample's
+        self._in_order = only and len(records.hit_sample) == len(records.x)  # hit i belongs to sample i
         self.sample, self._factor = frame.here(records.hit_sample), frame.here(records.hit_factor)
         of_hits = slice(None) if self._in_order else self.sample
         self.to_background = frame.here(records.to_background)
@@ -137,7 +137,7 @@ class EdgeSamples:
         if light is not None:
             points, share = light.points(frame.here(records.light), frame.here(records.light_uv))
             self._factor, self.to_background = self._factor * share[of_hits], self.to_background * share
-        # All sides of a sample see the same points of lights.
+        # All sides of a sample draw the same points of lights.
         seed = frame.seeds("edges" if light is None else "shadows", len(self))[of_hits]
         forced = None
         if light is not None and points is not None:

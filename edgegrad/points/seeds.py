@@ -9,7 +9,7 @@ _MASK = 2**64 - 1
 
 
 def mixed_bits(value: int) -> int:
-    """64 bits, each of which depends on all of those of `value` (splitmix64; Steele, Lea and Flood 2014)."""
+    """64 bits, each of which depends on all bits of `value` (splitmix64; Steele, Lea and Flood 2014)."""
     value = (value + 0x9E3779B97F4A7C15) & _MASK
     value = ((value ^ (value >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
     value = ((value ^ (value >> 27)) * 0x94D049BB133111EB) & _MASK
@@ -34,14 +34,14 @@ STEPS = tuple(signed(int(_golden(3) ** -k * 2**64) | 1) for k in (1, 2, 3))
 
 
 def sample_seeds(seed: int, stream: int, first: int, count: int) -> Tensor:
-    """(count,) int64: of the samples from `first` on of a stream."""
+    """(count,) int64: the seeds of a stream's samples from `first` on."""
     start = mixed_bits(mixed_bits(seed) ^ mixed_bits(-1 - stream)) >> 1
     return torch.arange(first, first + count) + signed(start)
 
 
 def uniform(seed: Tensor, n: int, stream: int = 0) -> Tensor:
-    """(N, n) float64 in [0, 1) of seeds (N,): those of seeds that follow one another fill the unit cube evenly, a Kronecker
-    sequence with the powers of the generalised golden ratio of three dimensions; `stream` gives others."""
+    """(N, n) float64 in [0, 1) of seeds (N,). Successive seeds fill the unit cube evenly: a Kronecker sequence with the powers
+    of the generalised golden ratio of three dimensions. Each `stream` gives other numbers."""
     columns = []
     for k in range(n):
         mixed = seed * STEPS[k % 3] + signed(mixed_bits(stream * 0x10001 + k))

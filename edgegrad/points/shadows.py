@@ -1,4 +1,4 @@
-"""Lights as edges see them, for the samples on the borders of their shadows: points, or triangles."""
+"""Lights as points or triangles, for the samples on the borders of their shadows."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from .records import LightParts, barycentrics
 from .seeds import STEPS, mixed_bits, signed
 from .surfaces import Surfaces
 
-MOST_FACES = 4096  # of an emissive mesh that are its parts; of more as many are drawn, others with each seed
-DIRECTIONS, SHARES = 1 << 14, 12  # that say where an environment is bright: no part has more than one of so many shares
+MOST_FACES = 4096  # of an emissive mesh: if it has more, so many are drawn with each seed
+DIRECTIONS = 1 << 14  # drawn from an environment, to tell where it is bright
+SHARES = 12  # no part of an environment holds more than one in so many of these
 
 
 class ShadowLight(NamedTuple):
-    """A light as edges see it."""
+    """A light, and its parts."""
 
     number: int  # in scene.casting
     light: Light
@@ -48,7 +49,8 @@ class ShadowLight(NamedTuple):
         return moves(light.place(light.draw(torch.zeros((1, 3), dtype=torch.float64))))
 
     def points(self, part: Tensor, uv: Tensor) -> tuple[LightPoints, Tensor]:
-        """Those at the last two barycentrics (N, 2) of parts, and (N,) their density over that by which parts are drawn."""
+        """Those at the last two barycentrics uv (N, 2) of parts (N,), and (N,) the light's own density of points over that by
+        which the kernel draws them."""
         one = uv.new_ones(len(uv))
         if isinstance(self.light, MeshLight):
             face = self.faces.to(part.device)[part]
@@ -71,7 +73,7 @@ def _of_mesh(light: MeshLight, first_face: int, seed: int) -> tuple[LightParts, 
         faces = pick(chance.cumsum(0), _even(MOST_FACES, seed)[:, 0].to(chance))
         chance = torch.full_like(chance, 1 / MOST_FACES)
     corner = mesh.verts.detach()[mesh.faces[faces].long()].double().cpu()
-    # Neighbours follow one another, for edges are asked before some of many.
+    # In an order that keeps neighbours together, for the kernel tests edges against blocks of parts.
     order = z_order(corner.mean(1))
     faces = faces.cpu()[order]
     own = (faces + first_face).int()
@@ -79,8 +81,8 @@ def _of_mesh(light: MeshLight, first_face: int, seed: int) -> tuple[LightParts, 
 
 
 def triangles_of(directions: Tensor) -> tuple[Tensor, Tensor]:
-    """(L, 3, 3), (L,): triangles around the origin, the faces of an octahedron or parts of them, so small that few of the unit
-    directions (N, 3) go through each; and about the share of these that do."""
+    """(L, 3, 3), (L,): triangles around the origin, and about the share of the unit directions (N, 3) that goes through each.
+    They are the faces of an octahedron, divided until no share is large."""
     triangles, chances = [], []
     most = len(directions) / SHARES
     octant = (directions < 0).long() @ torch.tensor([1, 2, 4])
@@ -118,8 +120,8 @@ def z_order(place: Tensor) -> Tensor:
 
 
 def _even(count: int, seed: int) -> Tensor:
-    """(count, 3) float64 in [0, 1), moved at random: the first ascends in equal steps, the others follow a sequence that fills
-    the unit square evenly (Roberts 2018)."""
+    """(count, 3) float64 in [0, 1), with a random shift: the first column ascends in equal steps, the others fill the unit square
+    evenly (Roberts 2018)."""
     shift = [(mixed_bits(mixed_bits(seed) + k) >> 11) * 2.0**-53 for k in range(3)]
     rows = torch.arange(count)
     columns = [(rows.double() + shift[0]) / count]

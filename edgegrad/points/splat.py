@@ -1,4 +1,4 @@
-"""Points of an image seen through the filter of its pixels."""
+"""Splatting: samples at places in the image, weighted by the pixel filter k and summed in pixels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..library import core
 
 
 class Term(NamedTuple):
-    """Σ k(x − c) · weight · value over points of an image, or that times what is behind; its derivatives alone."""
+    """Σ k(x − c) · weight · value over samples, times what is behind, if anything; only its derivatives count."""
 
     x: Tensor  # (S, 2)
     values: Tensor  # (S, C), or (S, 1) if anything is behind
@@ -29,8 +29,8 @@ def splat(x: Tensor, values: Tensor, request: Request) -> Tensor:
 
 
 def attached(image: Tensor, terms: Sequence[Term], request: Request) -> Tensor:
-    """The image (H · W, C), with the derivatives of terms by their values; these have none of their own, for how samples'
-    places and their visibility change is not known."""
+    """The image (H · W, C), with the derivatives of terms by their values. It has no second derivatives, for how the samples'
+    places and visibility change is not known."""
     values = (term.values for term in terms)
     fixed = (part for term in terms for part in (term.x, term.weight, term.behind))
     return apply(_Attached(Film.of(request), len(terms)), [image, *values, *fixed])[0]
@@ -77,7 +77,7 @@ class _Splat(NamedTuple):
 
 
 class _Attached(NamedTuple):
-    """Of the tensors (image, *values, and x, weight and what is behind of each) of so many terms."""
+    """Its tensors: the image, the values of each term, then x, weight and what is behind of each term."""
 
     film: Film
     terms: int

@@ -1,13 +1,13 @@
 """Steps that a shader declares (hits.where, hits.floor), and where they lie in the image.
 
-Nothing is known of a step's function s but its values, so lines find it (Crofton). Points form a grid with one random shift; s is
-asked for at each, and between neighbours where it changes sign bisection finds where. A horizontal line crosses a curve with
+Only values of a step's function s are known, so lines find where it is zero (Crofton). s is evaluated on a grid of points with
+one random shift; between neighbours of different sign bisection finds the zero. A horizontal line crosses a curve with
 the unit normal n once in Δ / |n_x| of its length, a vertical one once in Δ / |n_y|, so that
 
     Σ_{horizontal crossings} Δ g |n_x|  +  Σ_{vertical crossings} Δ g |n_y|
 
-is an unbiased estimate of ∫ g dℓ with weights that no direction makes large. Where two crossings lie between neighbours
-they are missed: the spacing Δ is the one knob.
+is an unbiased estimate of ∫ g dℓ, and its weights are bounded. Two crossings between the same neighbours are missed; a
+smaller spacing Δ finds them.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from torch import Tensor
 
 SIGN, FLOOR = "sign", "floor"
 BISECTIONS = 12  # to 1/4096 of the spacing
-MOST_LEVELS = 4  # that are followed between two neighbours; more are drawn from
+MOST_LEVELS = 4  # of a floor() between two neighbours; if there are more, so many are drawn
 
 
 class Steps:
-    """The step functions that a shader asked for at some points, in the order in which it did.
+    """The values of the step functions that a shader declares at some points, in its order.
 
-    Where `states` (N, K) are given, the sides that a step is on are these, whatever its function says.
+    `states` (N, K), if given, are the sides that the steps are forced to, whatever the values say.
     """
 
     def __init__(self, states: Tensor | None = None) -> None:
         self.kinds: list[str] = []
-        self.values: list[Tensor] = []  # (N,) each; not numbers where it was not asked for
+        self.values: list[Tensor] = []  # (N,) each; NaN where the shader did not ask
         self._states = states
 
     @property
@@ -58,7 +58,7 @@ class Steps:
 
 
 class StepsOfSubset(Steps):
-    """Those of some of the points, which are steps of all of them."""
+    """Steps that are declared of some of the points, and noted as steps of all."""
 
     def __init__(self, steps: Steps, index: Tensor, count: int) -> None:
         super().__init__()
@@ -81,9 +81,9 @@ class Points(NamedTuple):
 
     x: Tensor  # (N, 2)
     face: Tensor  # (N,) int64, −1: none
-    part: Tensor  # (N,) int64 of the surface that is connected, −1: none
+    part: Tensor  # (N,) int64, the connected part of the surface, −1: none
     b: Tensor  # (N, 2)
-    values: Tensor  # (N, K) float64; not numbers where there is no face
+    values: Tensor  # (N, K) float64; NaN where there is no face
 
     def select(self, index: Tensor) -> Points:
         return Points(*(part[index] for part in self))
@@ -101,12 +101,12 @@ class Crossings(NamedTuple):
     x: Tensor  # (M, 2)
     face: Tensor  # (M,)
     b: Tensor  # (M, 2)
-    step: Tensor  # (M,) int64, which of the K
+    step: Tensor  # (M,) int64, the number of the step, below K
     axis: Tensor  # (M,) int64: 0 on horizontal lines, 1 on vertical ones
     weight: Tensor  # (M,) px of lines that it stands for
-    before: Tensor  # (M, K) on which sides steps are before it, on the line
-    after: Tensor  # (M, K)
-    rises: Tensor  # (M,) bool: whether the function grows there
+    before: Tensor  # (M, K) the sides of all steps just before it on the line
+    after: Tensor  # (M, K) and just after it
+    rises: Tensor  # (M,) bool: whether the function increases along the line
 
 
 At = Callable[[Tensor], Points]
@@ -128,18 +128,18 @@ class _Candidates(NamedTuple):
 
     line: Tensor  # (M,) int64
     step: Tensor
-    level: Tensor  # (M,) float64, what the function crosses
+    level: Tensor  # (M,) float64, the value that the function crosses
     weight: Tensor
 
 
 def find_crossings(
     at: At, kinds: list[str], size: tuple[int, int], margin: float, spacing: float, seed: int
 ) -> Crossings:
-    """Of an image of `size` (height, width), widened by `margin`. `at` tells what is at places (N, 2) of it."""
+    """Of an image of `size` (height, width), widened by `margin` px. at(x) gives the Points at places x (N, 2)."""
     generator = np.random.default_rng(seed)  # torch's own draws nothing under torch.vmap
     lines = _at_jumps(at, _grid(at, size, margin, spacing, generator))
     found = []
-    # A piece that turns out to have a jump within (one surface ends before another) is divided there and looked at again.
+    # If one surface ends before another within a piece, the piece is divided there and searched again.
     for last in (False, True):
         candidates = _candidates(lines, kinds, generator)
         low, high, good = _refine(at, lines, kinds, candidates)
@@ -158,7 +158,7 @@ def find_crossings(
 
 
 def _grid(at: At, size: tuple[int, int], margin: float, spacing: float, generator: np.random.Generator) -> _Lines:
-    """All pieces, to the border of the image: lines run through the points of a grid, and end in points on the border."""
+    """The pieces of all lines of the grid, up to the border of the image."""
     shift = torch.from_numpy(generator.random(2))
 
     def inner(length: int, shift: Tensor) -> Tensor:
@@ -184,9 +184,9 @@ def _grid(at: At, size: tuple[int, int], margin: float, spacing: float, generato
 
 
 def _at_jumps(at: At, lines: _Lines) -> _Lines:
-    """The pieces, divided where one surface ends and another, or the background, begins."""
+    """The pieces, divided where a surface ends before another or before the background."""
     differ = lines.low.part != lines.high.part
-    if int(differ.sum()) > len(differ) // 4:  # a soup of triangles: then only at the background
+    if int(differ.sum()) > len(differ) // 4:  # a triangle soup: only at the background
         differ = (lines.low.face < 0) != (lines.high.face < 0)
     if not bool(differ.any()):
         return lines
@@ -234,7 +234,7 @@ def _candidates(lines: _Lines, kinds: list[str], generator: np.random.Generator)
 
 
 def _refine(at: At, lines: _Lines, kinds: list[str], candidates: _Candidates) -> tuple[Points, Points, Tensor]:
-    """The ends of short pieces with the crossings in them, and whether the function tends to its level there."""
+    """Short pieces around the crossings, by their ends, and whether the function is continuous in each."""
     where, step, level = candidates.line, candidates.step, candidates.level
     signs = torch.tensor([kind == SIGN for kind in kinds])[step]
 
@@ -249,8 +249,8 @@ def _refine(at: At, lines: _Lines, kinds: list[str], candidates: _Candidates) ->
     whole = function(high) - function(low)
     low, high = _bisect(at, low, high, lambda mid, low: (above(mid) == above(low)) & (mid.face >= 0))
     rest = (function(high) - function(low)).abs()
-    # Of a smooth function 1/4096 is left, of one that jumps the jump. Both ends may lie on faces of their own: a border may run
-    # along an edge.
+    # A smooth function changes by 1/4096 of what it changed before, one that jumps by its jump. The ends may lie on two faces:
+    # a border may run along an edge.
     good = (low.part == high.part) & (low.face >= 0) & (rest <= 0.05 * whole.abs())
     return low, high, good
 
@@ -263,8 +263,8 @@ def _crossings(
     t = (f[0] / (f[0] - f[1]))[:, None].clamp(0, 1)
     signs = torch.tensor([kind == SIGN for kind in kinds])
     before, after = (torch.where(signs, (p.values > 0).double(), p.values.floor().nan_to_num()) for p in (low, high))
-    same = (low.face == high.face)[:, None]  # a place on two faces is taken on the first
-    # Of steps that lie on one another, the first stands for all.
+    same = (low.face == high.face)[:, None]  # else the crossing is put on the first face
+    # Where several steps change at once, the first stands for all.
     first = (before != after).double().argmax(1) == c.step
     found = Crossings(
         torch.lerp(low.x, high.x, t), low.face, torch.where(same, torch.lerp(low.b, high.b, t), low.b), c.step,

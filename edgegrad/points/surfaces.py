@@ -1,4 +1,4 @@
-"""The surfaces of a scene, and views of them by a camera or by rays, as functions of tensors: what hits are computed from."""
+"""The surfaces of a scene, and views of them by a camera or along rays: hits are computed from both."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from .records import bare
 class Surfaces:
     """Meshes laid end to end.
 
-    It also notes which properties that may jump at an edge a shader asks for, and which shadows: there it may jump too.
+    It also notes what a shader asks for: properties that may differ on the two sides of an edge, and shadows.
     """
 
     def __init__(self, scene: Scene, bare: Flat | None = None) -> None:
-        """`bare`: as bare() makes it, if that is there."""
+        """`bare`: of bare(), if it was made before."""
         meshes = scene.meshes
         first = [sum(len(m.verts) for m in meshes[:k]) for k in range(len(meshes))]
         dtype = max((m.verts.dtype for m in meshes), key=lambda t: torch.finfo(t).bits)
@@ -35,15 +35,15 @@ class Surfaces:
         self.mesh_of_face = torch.repeat_interleave(torch.arange(len(meshes)), counts).to(self.verts.device)
         self.scene = scene
         self._bare = bare
-        self.jumping: dict[Any, Callable[[], Tensor]] = {}  # (F, 3, K) at corners, of what may jump
-        self.shadowing: set[int] = set()  # lights, in scene.casting, of which a shader asks for shadows
+        self.jumping: dict[Any, Callable[[], Tensor]] = {}  # values (F, 3, K) at corners, of properties that may jump
+        self.shadowing: set[int] = set()  # lights, by their place in scene.casting, whose shadows a shader asks for
         self.pyramids: dict[int, tuple[Tensor, list[Tensor]]] = {}  # of textures, by their ids
-        self._moving: Surfaces | None = None  # of which these are the values
-        self.layout: Any = None  # as the kernel shades them, kept where nothing has derivatives (light/in_kernel.py)
+        self._moving: Surfaces | None = None  # the surfaces of which detach() made these
+        self.layout: Any = None  # of light/in_kernel.py, kept where nothing has derivatives
         self.has_derivatives = True
 
     def detach(self) -> Surfaces:
-        """The same without derivatives; what it notes is noted for both."""
+        """The same without derivatives; both share their notes."""
         other = Surfaces.__new__(Surfaces)
         other.__dict__.update(self.__dict__)
         for name in ("bare", "casters", "corner_uvs", "vertex_normals"):  # made of tensors that have derivatives
@@ -62,12 +62,12 @@ class Surfaces:
 
     @cached_property
     def bare(self) -> Flat:
-        """As the kernel reads them, without colours."""
+        """For the kernel, without colours."""
         return bare(self.scene) if self._bare is None else self._bare
 
     @cached_property
     def casters(self) -> Flat:
-        """The same as shadow rays meet them: what blends is cut out where its alpha is below ½."""
+        """The same for shadow rays: surfaces that blend are cut out where their alpha is below ½."""
         return bare(self.scene, blended=False) if self.scene.blends else self.bare
 
     @cached_property
@@ -75,7 +75,7 @@ class Surfaces:
         """A centre (3,) and a radius of a ball around all vertices, float64."""
         if self._moving is not None:
             return self._moving.ball
-        # By columns that are contiguous, which is four times as fast.
+        # Contiguous columns make this four times as fast.
         low, high = (bound.double() for bound in torch.aminmax(self.verts.detach().T.contiguous(), dim=1))
         return (low + high) / 2, float((high - low).norm()) / 2
 
@@ -94,14 +94,14 @@ class Surfaces:
 
     @cached_property
     def vertex_normals(self) -> Tensor:
-        """(V, 3) unit normals: the mean of the incident faces' by area, of vertices as they are indexed."""
+        """(V, 3) unit normals: means of the normals of the faces at each index, weighted by area."""
         corner = rows_of(self.verts, self.faces)
         area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         index = self.faces.reshape(-1)
         return normalize(torch.zeros_like(self.verts).index_add(0, index, area.repeat_interleave(3, 0)), dim=-1)
 
     def corners(self, face: Tensor) -> Tensor:
-        """(N, 3, 3) world coordinates of those of faces (N,)."""
+        """(N, 3, 3) world coordinates of the corners of faces (N,)."""
         return rows_of(self.verts, rows_of(self.faces, face))
 
     def face_normals(self, face: Tensor) -> Tensor:
@@ -109,14 +109,14 @@ class Surfaces:
         return normalize(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=-1)
 
     def crease_attributes(self) -> Tensor:
-        """(F, 3, K) of all that was asked for and may jump, each scaled to its largest number."""
+        """(F, 3, K): all properties that may jump and were asked for, each divided by its largest value."""
         parts = [corners().detach().to(self.verts.dtype) for corners in self.jumping.values()]
         attributes = columns([scaled(p) for p in parts if p.shape[-1]], len(self.faces), self.verts)
         return _Beside.apply(attributes) if transformed() else attributes
 
 
 class _Beside(torch.autograd.Function):
-    """Attributes (F, 3, K); under torch.vmap those of all elements side by side, for all share the samples of one image."""
+    """Attributes (F, 3, K). Under torch.vmap, those of all elements side by side: these share the samples of one image."""
 
     @staticmethod
     def forward(attributes: Tensor) -> Tensor:
@@ -141,12 +141,12 @@ class _Beside(torch.autograd.Function):
 
 
 def every_face(count: int) -> Tensor:
-    """(F, 3, 1): a number for each face, of which neighbours differ: multiples of the golden ratio, less their whole part."""
+    """(F, 3, 1): a number for each face, so that neighbours differ: the fractional parts of multiples of the golden ratio."""
     return (torch.arange(count).double() * 0.6180339887498949 % 1 + 0.5)[:, None, None].expand(-1, 3, 1)
 
 
 def meet(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
-    """(N, 3) barycentrics of where rays meet the planes of faces with corners (N, 3, 3) (Möller and Trumbore 1997)."""
+    """(N, 3) barycentrics where rays meet the planes of faces with corners (N, 3, 3) (Möller and Trumbore 1997)."""
     e1, e2, s = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
     p, q = torch.linalg.cross(direction, e2), torch.linalg.cross(s, e1)
     scale = 1 / dot(e1, p)
@@ -155,7 +155,7 @@ def meet(corners: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
 
 
 class View:
-    """Of a camera: where points are in its coordinates, and where its rays meet faces."""
+    """A camera's view: points in its coordinates, and where its rays meet faces."""
 
     def __init__(self, world_to_camera: Tensor, perspective: bool) -> None:
         self.world_to_camera, self.perspective = world_to_camera, perspective  # (4, 4) float64
@@ -178,7 +178,7 @@ class View:
         return barycentrics(bare.verts, bare.faces, face, self.world_to_camera, along, self.perspective)
 
     def barycentrics_by(self, surfaces: Surfaces, face: Tensor, along: Tensor, by: Tensor) -> tuple[Tensor, Tensor]:
-        """The same, and their derivatives (N, 3, K) by what `along` has the derivatives `by` (N, 3, K) by."""
+        """The same, and their derivatives (N, 3, K) where `along` has the derivatives `by` (N, 3, K)."""
         bare = surfaces.bare
         return barycentrics_by(bare.verts, bare.faces, face, self.world_to_camera, along, by, self.perspective)
 
@@ -198,7 +198,7 @@ class View:
 
 
 class Rays(NamedTuple):
-    """Of rays of the user, one for each point."""
+    """The user's rays, one for each point."""
 
     ray: Tensor  # (N,) int64, that of each point
     origin: Tensor  # (N, 3) world coordinates, float64
@@ -208,7 +208,7 @@ class Rays(NamedTuple):
         return Rays(*(part[index] for part in self))
 
     def barycentrics(self, corners: Tensor, b: Tensor) -> Tensor:
-        """Those of the hits b (N, 3), as functions of the corners (N, 3, 3) and the rays."""
+        """The barycentrics b (N, 3) of hits, as functions of the corners (N, 3, 3) and the rays."""
         moved = meet(corners, self.origin, self.direction)
         return b + (moved - moved.detach())
 
