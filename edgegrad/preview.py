@@ -1,4 +1,4 @@
-"""Pictures that nobody described: a view of the whole scene, plain meshes under a headlight, and small ones for notebooks."""
+"""Default pictures of a scene: a view of all of it, plain meshes under a headlight, small pictures for notebooks."""
 
 from __future__ import annotations
 

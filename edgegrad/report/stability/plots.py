@@ -172,10 +172,10 @@ def table(document: Document) -> str:
 ![Error of the gradient in extreme cases]({NAME}.png)
 
 Image and gradient of image · adjoint in {len(rows)} cases: {", ".join(f"{n} {v}" for v, n in counts.items() if n)}. Errors are
-‖mean over seeds − reference‖ / ‖reference‖ ± one standard error; of the gradient for each part by itself (the vertices of
-each mesh, its colours, the background, the camera's turn and shift, focal length, skew, principal point, or the motions
-of the whole), relative to that part's own size; the table has the part that is farthest off. The image's error is relative to
-what the scene adds to its background. Where a reference is zero, errors are relative to the norm of the adjoint.
+‖mean over seeds − reference‖ / ‖reference‖ ± one standard error. The gradient's error is computed for each of its parts (the
+vertices of each mesh, its colours, the background, the camera's rotation and translation, focal length, skew, principal point, or
+motions of the whole), and the table names the part with the largest. The image's error is relative to what the scene adds to its
+background. Where a reference is zero, errors are relative to the norm of the adjoint.
 
 *right*: within four standard errors and {percent(TOLERANCE)}, with a standard error below {percent(NOISE)}.
 *limit*: not right, of known cause and size; see below. *too noisy to tell* and *wrong* do not pass.
@@ -191,7 +191,7 @@ torch {now["torch"]}, embreex {now["embreex"]}, Python {now["python"]}, {now["sy
         lines += ["|---" * 7 + "|", *(_row(row) for row in rows if row["group"] == group), ""]
     limits = [row for row in rows if "limit" in row]
     if limits:
-        lines += ["## Limits\n", "Measured above, and not hidden by a clamp:\n"]
+        lines += ["## Limits\n", "Why these cases are not right:\n"]
         lines += [_limit(row) for row in limits] + [""]
     for name, write in (("statistics", _statistics), ("steps", _steps), ("fits", _fits)):
         if name in document["sections"]:
@@ -230,10 +230,10 @@ def _statistics(found: dict[str, Any]) -> list[str]:
     lines = [f"""## Unbiased
 
 Mean of {fair["seeds"]} seeds against exact integrals, few samples each: z = (mean − exact) / standard error for
-every component of every part and 16 random sums of all pixels; of lit scenes against finite differences, whose chance is in
-z. {fair["components"]} components in all, tested
-together by Holm's method at {percent(fair["alpha"])}, the chance of any false alarm in a run of all scenes,
-however their components hang together: {verdict}.
+every component of every part and 16 random sums of all pixels. Lit scenes are compared with finite differences, whose noise is
+in z. {fair["components"]} components in all, tested
+together by Holm's method at {percent(fair["alpha"])}, the probability of any false rejection in a run of all scenes,
+whatever the correlations: {verdict}.
 
 | scene | components | largest \\|z\\| | beyond 3 | expected, if independent | deviation of one seed | reference ± |
 |---|---|---|---|---|---|---|"""]  # fmt: skip
@@ -245,10 +245,10 @@ however their components hang together: {verdict}.
         f"""
 ## Tails
 
-Single samples of the vertices' gradient ({found["tails"][0]["samples"]:,} each). Share: of the largest in the sum of
-all sizes, and how many mean ones it is; in brackets its share in the sum of squares.
-Deviation: of one sample, over the gradient's size; n samples at random
-would have 1/√n of it, and those placed along curves and surfaces have less.
+Single samples of the vertices' gradient ({found["tails"][0]["samples"]:,} each). Largest share:
+the largest sample's share of the sum of all norms, its ratio to the mean norm, and in brackets its share of the sum of squares.
+Deviation: the standard deviation of one sample over the gradient's norm. That of n independent samples would be 1/√n of it;
+samples placed evenly along curves and surfaces have less.
 
 | scene | interior: largest share | deviation | boundary: largest share | deviation |
 |---|---|---|---|---|"""
@@ -259,10 +259,9 @@ would have 1/√n of it, and those placed along curves and surfaces have less.
         f"""
 ## A squared loss
 
-Σ (I − T)², {squared["seeds"]} seeds: distance of the mean to the exact value, relative, ± one standard error. The
-value of the loss is off by the variance of the image, which falls faster than 1/n. The gradient for what moves
-has samples of its own and no bias; that for the background is the derivative of the image as it was made, whose
-noise it shares.
+Σ (I − T)², {squared["seeds"]} seeds: relative error of the mean ± one standard error. The value of the loss is biased by
+the variance of the image, which falls faster than 1/n. The gradient for what moves has independent samples and no bias. That
+for the background is the derivative of the image as it was made, and shares its noise.
 
 | samples a pixel | {" | ".join(names)} |
 |{"---|" * (1 + len(names))}"""
@@ -285,10 +284,10 @@ def _steps(found: dict[str, Any]) -> list[str]:
 
 ![Error against the spacing of lines]({NAME}-steps.png)
 
-The derivative of a painted area by its size against what it should be: a disc 31 px wide, stripes of 3.2 px with gaps as
-wide, a checkerboard of texels of 3.2 px that lies askew, which grows as a whole. Declared by a shader, as alpha that cuts out
-and as nearest texels. Mean over {found["seeds"]} seeds ± its standard error, and the root mean square error of one image, with
-the default of everything but the spacing of the lines that find steps (`step_spacing`).
+The error of the derivative of a painted area by its size: a disc 31 px wide, stripes of 3.2 px with gaps as wide, and a
+rotated checkerboard of texels of 3.2 px. They are declared by a shader, or painted as alpha of a cut-out or nearest texels.
+Mean over {found["seeds"]} seeds ± its standard error, and the root mean square error of one image, with the default of everything
+but the spacing of the lines that find steps (`step_spacing`).
 
 | spacing, px | {" | ".join(names)} | an image and its gradient, ms |
 |---{"|---" * (len(names) + 1)}|"""]  # fmt: skip

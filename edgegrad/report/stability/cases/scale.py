@@ -108,7 +108,7 @@ def mixed() -> Problem:
     return Problem(parts, make, lambda parts: exact_image(in_view((view := make(parts))[0], view[1]), view[1]))
 
 
-FLOAT_FRAME = "one frame of floats holds both: Embree sees their vertices where floats are"
+FLOAT_FRAME = "both share one frame of floats, which are too coarse for either"
 
 
 @group.add("two-details", "two spheres of 5,120 faces, 1.5e4 times their size apart", 2e4, slow=True)
