@@ -65,6 +65,7 @@ class Effort(NamedTuple):
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
+    steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
 
     @property
     def at_once(self) -> int:
@@ -107,6 +108,10 @@ class _Image:
         image = self._values()
         if not differentiates():
             return image
+        if self._effort.steps is not None:
+            none = self._frame.no_hits
+            self._effort.steps(none)
+            self._kinds = list(none._steps.kinds)
         frame = self._frame
         visibility = frame.request.gradient.visibility
         moving = visibility and moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
@@ -332,7 +337,7 @@ class _Image:
 
     def _step_values(self, hits: Hits) -> Tensor:
         """(N, K) the functions of all steps."""
-        self._shade(hits)
+        (self._effort.steps or self._shade)(hits)
         return torch.stack([values.double() for values in hits._steps.values], 1)
 
     def _with_creases(self) -> Request:
@@ -350,7 +355,7 @@ class _Image:
     def _shade(self, hits: Hits) -> Tensor:
         """(N, C), checked."""
         radiance = self._checked(self._shader(hits), hits)
-        if not hits._only_light:  # for one light less may be looked up
+        if self._effort.steps is None and not hits._only_light:  # for one light less may be looked up
             kinds = list(hits._steps.kinds)
             if self._kinds not in (None, kinds):
                 raise ValueError(UNEQUAL)

@@ -15,7 +15,7 @@ import edgegrad as eg
 from edgegrad.kernel.derivatives import transformed
 from edgegrad.kernel.first_order import unreached
 from edgegrad.kernel.request import make_request
-from edgegrad.light import in_kernel, radiance
+from edgegrad.light import creases, in_kernel, radiance
 from edgegrad.points import borders
 from edgegrad.points.frame import Frame
 from edgegrad.points.hits import Hits
@@ -45,6 +45,7 @@ SCENES = [
     "area",
     "area one_sided normals microfacets",
     "base emission point",
+    "nearest texture normal_map base point directional",
     "texture normal_map normals microfacets base emission point directional spot harmonics environment area",
 ]
 
@@ -99,13 +100,19 @@ def scene_of(words: str, n: Leaves) -> eg.Scene:
     }
     if "uvs" in own:
         own["uv_faces"] = faces
+    filter = "nearest" if "nearest" in words else "linear"
     looks: dict[str, Any] = {name: n[name] for name in ("metallic", "roughness", "emission") if name in n}
     if "map" in n:
-        looks |= {"normal_map": eg.Texture(n["map"], factor=n["map_factor"]), "normal_scale": n["map_scale"]}
+        looks |= {
+            "normal_map": eg.Texture(n["map"], filter=filter, factor=n["map_factor"]), "normal_scale": n["map_scale"]
+        }  # fmt: skip
     if "base" in n:
         looks["base_color"] = eg.Texture(
-            n["base"], uvs=n["base_uvs"], uv_faces=faces, wrap=("mirror", "clamp"), factor=n["base_factor"]
-        )
+            n["base"], uvs=n["base_uvs"], uv_faces=faces, wrap=("mirror", "clamp"), factor=n["base_factor"],
+            filter=filter,
+        )  # fmt: skip
+    if "texture" in own:
+        own["filter"] = filter
     mesh = eg.Mesh(n["verts"], faces, material=eg.Material(two_sided="one_sided" not in words, **looks), **own)
     ground = eg.Mesh(n["ground"], torch.tensor([[0, 2, 1], [0, 3, 2]]), material=eg.Material(n["ground_color"]))
     lights: list[Any] = []
@@ -159,7 +166,9 @@ def test_values_and_cotangents(words: str, view: str) -> None:
     )
     for name, a, b in zip(tensors, wanted, got, strict=True):
         # Where one light comes from all around and nothing is interpolated, place and view do not matter.
-        assert float(a.abs().max()) > 0 or name in ("verts", "ground", "w2c"), name
+        # Nor do coordinates within a texel.
+        still = ("uvs", "base_uvs") if "nearest" in words else ()
+        assert float(a.abs().max()) > 0 or name in ("verts", "ground", "w2c", *still), name
         assert float((a - b).abs().max()) <= 1e-9 * float(a.abs().max()), name
 
 
@@ -265,10 +274,17 @@ AROUND = {
 
 @pytest.mark.parametrize("view", AROUND)
 @pytest.mark.parametrize(
-    "words", ["colors directional point spot", "normals area point", "environment", "base emission harmonics"]
+    "words",
+    [
+        "colors directional point spot",
+        "normals area point",
+        "environment",
+        "base emission harmonics",
+        "nearest texture point spot",
+    ],
 )
 def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As from hits that are shaded one by one, with the pixels that borders of shadows run through shaded again."""
+    """As from hits that are shaded one by one, with the pixels that borders of shadows and texels run through shaded again."""
     leaves = numbers_of(words)
     camera = AROUND[view].replace(world_to_camera=AROUND[view].world_to_camera.double())
     scenes = [scene_of(words, leaves), scene_of(words, leaves).replace(background=torch.rand(*camera.size, 3).double())]
@@ -280,6 +296,8 @@ def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatc
                 with monkeypatch.context() as patch:
                     if not whole:
                         patch.setattr(radiance, "_kernel_image", lambda *arguments: None)
+                        if "nearest" in words:  # whose borders only PyTorch tells
+                            patch.setattr(radiance, "is_fused", lambda scene: False)
                         keep = lambda self: (again.append(found := kept(self)), found)[1]  # noqa: E731
                         patch.setattr(borders.Borders, "found", keep)
                     found.append(eg.render(scene, camera, **options))
@@ -340,7 +358,7 @@ def test_light_on_flat_faces(view: str) -> None:
     leaves = numbers_of("point directional")
     scene = scene_of("point directional", leaves).replace(meshes=scene_of("point", leaves).meshes[:1])
     frame = Frame(scene, make_request(scene, CAMERAS[view], 2, 0))
-    found = radiance._flat_radiance(frame.fixed, 0, frame.fixed_view)
+    found = creases._flat_radiance(frame.fixed, 0, frame.fixed_view)
     (mesh,) = scene.meshes
     corner = mesh.verts[mesh.faces.long()]
     n = torch.nn.functional.normalize(
@@ -409,7 +427,10 @@ def test_which_scenes_the_kernel_shades() -> None:
     scene = scene_of("texture point", numbers_of("texture point"))
     mesh, ground = scene.meshes
     assert in_kernel.is_fused(scene)
-    assert not in_kernel.is_fused(scene.replace(meshes=[mesh.replace(filter="nearest"), ground]))
+    nearest = mesh.replace(filter="nearest")
+    assert in_kernel.is_fused(scene.replace(meshes=[nearest, ground]))
+    seen_through = nearest.replace(material=eg.Material(alpha_mode="BLEND"), alpha=torch.full((2, 2), 0.5, dtype=F64))
+    assert not in_kernel.is_fused(scene.replace(meshes=[seen_through, ground]))
     assert mesh.texture is not None
     levels = mesh.replace(material=eg.Material(eg.Texture(mesh.texture, filter="mipmap")))
     assert not in_kernel.is_fused(scene.replace(meshes=[levels, ground]))

@@ -4,66 +4,12 @@
 #include <atomic>
 #include <memory>
 
+#include "forward/image_borders.h"
 #include "forward/pixel_hits.h"
 
 namespace edgegrad {
 
 namespace {
-
-constexpr int most_again = 8;   // times the points of a face in a pixel, where it is shaded again
-constexpr int share_again = 4;  // times the points of the first pass, in all
-
-// What is seen of punctual lamps in the pixels of an image, and how many points were shaded there.
-class LampVisibility {
-   public:
-    LampVisibility(int width, int height, const std::vector<LightSample>& lights, const LitScene& lit)
-        : width_(width), height_(height), points_(int64_t(width) * height, 0) {
-        for (size_t k = 0; k < lights.size(); ++k)
-            if (lit.lamps[lights[k].lamp].is_punctual()) columns_.push_back(k);
-        seen_.assign(size_t(width + 2) * (height + 2) * columns_.size(), 0);
-    }
-
-    // Of one point.
-    void add(int x, int y, const int8_t* seen) {
-        ++points_[int64_t(y) * width_ + x];
-        uint8_t* here = seen_.data() + at(x, y);
-        for (size_t l = 0; l < columns_.size(); ++l)
-            if (const int8_t s = seen[columns_[l]]; s != not_asked) here[l] |= s ? visible : hidden;
-    }
-
-    // Pixels that borders run through, and how many times as many points of each face in them are to be shaded.
-    int borders(std::vector<uint8_t>& pixels, Team& team) const {
-        pixels.assign(points_.size(), 0);
-        if (columns_.empty()) return 0;
-        team.each(height_, [&](int64_t y) { mark(int(y), &pixels[y * width_]); });
-        int64_t first = 0, there = 0;
-        for (size_t i = 0; i < pixels.size(); ++i) first += points_[i], there += pixels[i] ? points_[i] : 0;
-        if (std::none_of(pixels.begin(), pixels.end(), [](uint8_t p) { return p != 0; })) return 0;
-        return int(std::clamp<int64_t>(share_again * first / std::max<int64_t>(there, 1), 2, most_again));
-    }
-
-   private:
-    enum : uint8_t { hidden = 1, visible = 2 };
-
-    // With a pixel around the image, of which nothing is known.
-    size_t at(int x, int y) const { return (size_t(y + 1) * (width_ + 2) + x + 1) * columns_.size(); }
-    void mark(int y, uint8_t* pixels) const {
-        const size_t L = columns_.size(), n = L * width_;
-        const uint8_t *above = seen_.data() + at(0, y - 1), *row = seen_.data() + at(0, y),
-                      *below = seen_.data() + at(0, y + 1);
-        std::vector<uint8_t> both(n);
-        for (size_t e = 0; e < n; ++e)
-            both[e] = (above + e)[-ptrdiff_t(L)] | above[e] | above[e + L] | (row + e)[-ptrdiff_t(L)] | row[e + L] |
-                      (below + e)[-ptrdiff_t(L)] | below[e] | below[e + L];
-        for (size_t e = 0; e < n; ++e)
-            if (both[e] == (hidden | visible)) pixels[e / L] = 1;
-    }
-
-    int width_, height_;
-    std::vector<int32_t> points_;
-    std::vector<size_t> columns_;  // of light samples, those of punctual lamps
-    std::vector<uint8_t> seen_;    // (H + 2, W + 2, those)
-};
 
 // What rows have in common.
 template <class T>
@@ -76,7 +22,7 @@ struct RowInput {
     uint64_t seed;
     const uint8_t* only;  // pixels, null: all
     LitImage<T>& to;
-    LampVisibility* visibility;  // null: not wanted
+    ImageBorders* borders;  // null: not wanted
     Team& team;
 };
 
@@ -122,7 +68,7 @@ class LitRow : public RowVisitor {
             double* sum = &sums_[int64_t(hit.pixel % in_.width) * C];
             for (int c = 0; c < C; ++c) sum[c] += hit.weight * radiance_[i * C + c];
             const int8_t* seen = seen_.data() + i * K;
-            if (in_.visibility) in_.visibility->add(hit.pixel % in_.width, hit.pixel / in_.width, seen);
+            if (in_.borders) in_.borders->add(hit.pixel, hit.face, &b_[3 * i], seen);
             for (size_t k = 0; k < K; ++k)
                 if (seen[k] != not_asked)
                     std::atomic_ref(in_.to.asked[lights_[k].lamp]).store(1, std::memory_order_relaxed);
@@ -147,22 +93,20 @@ LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Cam
                        const HitBuffers<T>& hits) {
     LitImage<T> out{Array<T>(int64_t(camera.width) * camera.height * lit.channels),
                     std::vector<uint8_t>(lit.lamps.size(), 0)};
-    const bool twice = options.shadows && image.spp > 1;
-    std::unique_ptr<LampVisibility> visibility;
-    if (twice)
-        visibility = std::make_unique<LampVisibility>(camera.width, camera.height, light_samples(lit, options), lit);
+    std::unique_ptr<ImageBorders> borders;
+    if (image.spp > 1) borders = std::make_unique<ImageBorders>(camera.width, camera.height, lit, options);
     const auto shade_pixels = [&](const PixelChoice& choice, uint64_t seed) {
         const RowInput<T> rows{lit,         scene, caster,      options, camera.width,
-                               choice.most, seed,  choice.only, out,     choice.only ? nullptr : visibility.get(),
+                               choice.most, seed,  choice.only, out,     choice.only ? nullptr : borders.get(),
                                team};
         visit_pixel_hits(scene, camera, caster, image, choice, team, hits,
                          [&] { return std::make_unique<LitRow<T>>(rows); });
     };
     shade_pixels({0, camera.height, sampling.points}, sampling.seed);
-    if (!twice) return out;
-    std::vector<uint8_t> borders;
-    if (const int times = visibility->borders(borders, team))
-        shade_pixels({0, camera.height, times * sampling.points, borders.data()}, sampling.again);
+    if (!borders) return out;
+    std::vector<uint8_t> pixels;
+    if (const int times = borders->find(pixels, team))
+        shade_pixels({0, camera.height, times * sampling.points, pixels.data()}, sampling.again);
     return out;
 }
 

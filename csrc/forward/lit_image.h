@@ -24,11 +24,8 @@ struct LitImage {
     std::vector<uint8_t> asked;
 };
 
-// Pixels that the border of a punctual lamp's shadow runs through are shaded again, at several points: there one point
-// of a face is a poor guess at the whole pixel. A pixel is one of them where the pixels around it see the lamp and do
-// not. What was found in the pixel itself is not asked: whether it is shaded again, with other points, must not depend
-// on the points that it then does without, or the mean over seeds would be off. edgegrad/points/borders.py has the same
-// rule for shaders.
+// Pixels that borders of shadows or of nearest texels run through are shaded again, at several points
+// (image_borders.h).
 template <class T>
 LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                        const ImageOptions& image, const LitOptions& options, const LitSampling& sampling, Team& team,

@@ -30,12 +30,24 @@ _64_BITS = 2**64 - 1
 
 
 def is_fused(scene: Scene) -> bool:
-    """Whether the kernel can shade a scene: all textures are bilinear, not nearest or mipmapped."""
+    """Whether the kernel can shade a scene: no texture is mipmapped; nor nearest where one sees through surfaces, for the kernel
+    declares no steps."""
     if scene.channels > core.MOST_LIT_CHANNELS:
         return False
     textures = [t for m in scene.meshes if m.material is not None for t in m.material.textures.values()]
     own = [mesh.filter for mesh in scene.meshes if mesh.texture is not None]
-    return all(filter == "linear" for filter in (*own, *(t.filter for t in textures)))
+    known = {"linear"} if scene.blends else {"linear", "nearest"}
+    return known.issuperset((*own, *(t.filter for t in textures)))
+
+
+def nearest_textures(mesh: Mesh) -> list[Texture]:
+    """Those of a mesh that give the nearest texel, in the order in which shading looks them up."""
+    found = [] if mesh.texture is None else [Texture(mesh.texture, wrap=mesh.wrap, filter=mesh.filter)]
+    if mesh.material is not None:
+        m = mesh.material
+        given = (m.base_color, m.normal_map, m.metallic, m.roughness, m.emission)
+        found += [texture for texture in given if isinstance(texture, Texture)]
+    return [texture for texture in found if texture.filter == "nearest"]
 
 
 def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
@@ -210,7 +222,7 @@ def _mesh(mesh: Mesh, first_face: int, first_vertex: int, tables: _Tables) -> An
 
     color = none
     if mesh.texture is not None:
-        color = _texture(mesh, Texture(mesh.texture, wrap=mesh.wrap), tables)
+        color = _texture(mesh, Texture(mesh.texture, wrap=mesh.wrap, filter=mesh.filter), tables)
     elif mesh.colors is not None:
         color = core.LitSource("vertex", tables.add(mesh.colors, mesh.colors.shape[1]))
     elif mesh.face_colors is not None:
@@ -259,7 +271,7 @@ def _texture(mesh: Mesh, texture: Texture, tables: _Tables) -> Any:
         _rows(uv_faces),
         height,
         width,
-        [*(WRAPS.index(wrap) for wrap in texture.wraps), FILTERS.index("linear")],
+        [*(WRAPS.index(wrap) for wrap in texture.wraps), FILTERS.index(texture.filter)],
     )
 
 

@@ -13,26 +13,30 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from ..camera.camera import Camera
 from ..check import all_finite, check_positive_int, values_visible
+from ..kernel.derivatives import differentiates, moves
 from ..kernel.first_order import unreached
 from ..kernel.flat import image_dtype
 from ..kernel.request import Request
 from ..points.frame import Frame
 from ..points.hits import Hits
-from ..points.surfaces import Rays, Surfaces, View
-from ..scene.appearance import OnMesh, jumps
+from ..points.surfaces import View
+from ..scene.appearance import OnMesh, coordinates
 from ..scene.environment import Environment
 from ..scene.lights import Light, LightPoints, SphericalHarmonics
+from ..scene.material import Material
+from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
+from ..scene.texel_borders import TexelBorders
 from ..scene.tree import tensors_in
 from ..shader import Effort, render_shaded, shaded_points
 from ..warnings import warn
 from . import in_kernel
 from .bsdf import Scattering, dot, terminator
-from .in_kernel import is_fused
+from .creases import note_jumps
+from .in_kernel import is_fused, nearest_textures
 
 FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
 
@@ -77,6 +81,7 @@ class Lighting(NamedTuple):
             keeps_little=fused,
             gives_derivatives=fused and additive,
             additive=additive,
+            steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
         )
         image = render_shaded(scene, camera, self, request, creases, False, effort)
         if not scene.is_lit:  # as the kernel has it where there are no mipmaps
@@ -93,7 +98,7 @@ class Lighting(NamedTuple):
 def _kernel_image(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:
     """(H · W, C) the surfaces before black, with `points` of each face in a pixel shaded. None where it is not finite: then
     points are shaded in PyTorch, which names the first that is not."""
-    _note_jumps(frame.no_hits)
+    note_jumps(frame.no_hits)
     found = in_kernel.image(frame, lighting.shadows, lighting.samples, points)
     return found if all_finite(found) else None
 
@@ -108,55 +113,101 @@ class _Surface(NamedTuple):
     scattering: Scattering
     flat: bool  # whether n is g
 
+    @classmethod
+    def of(cls, hits: Hits, at: OnMesh, material: Material) -> _Surface:
+        base = at.base_color()
+        g, v = hits._surfaces.face_normals(hits._face), hits.view
+        side = torch.where(_in_front(g, v), 1.0, -1.0).to(g)
+        n = at.shading_normal(g)
+        lambertian = material.metallic is None and material.roughness is None
+        metallic, roughness = (
+            None if lambertian else g.new_full((1, 1), default) if given is None else at.value(given)
+            for given, default in ((material.metallic, 0.0), (material.roughness, 1.0))
+        )
+        flat = at.mesh.normals is None and material.normal_map is None
+        return cls(hits.position, v, side * g, side * n, Scattering(base, metallic, roughness), flat)
+
     def select(self, rows: Tensor) -> _Surface:
         position, v, g, n = (part[rows] for part in (self.position, self.v, self.g, self.n))
         return _Surface(position, v, g, n, self.scattering.select(rows), self.flat)
 
 
+def _in_front(g: Tensor, v: Tensor) -> Tensor:
+    """(N, 1): whether points are seen from the front of their faces."""
+    return dot(g.detach(), v.detach()) >= 0
+
+
 def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tensor:
-    """(N, C): the radiance of meshes by their materials and the scene's lights; of meshes without a material their colours."""
-    _note_jumps(hits)
-    if isinstance(hits._view, View) and is_fused(hits._surfaces.scene):
-        return in_kernel.radiance(hits, shadows, light_samples)
-    return reference(hits, shadows, light_samples)
+    """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours."""
+    note_jumps(hits)
+    # The kernel knows of no texel but that in which a point lies.
+    in_kernel_ = isinstance(hits._view, View) and is_fused(hits._surfaces.scene) and not hits._steps.forced
+    L = in_kernel.radiance(hits, shadows, light_samples) if in_kernel_ else reference(hits, shadows, light_samples)
+    lamps = _moving_lamps(hits)
+    return L + _of_moving_borders(hits, lamps, Lighting(shadows, light_samples)) if lamps else L
 
 
 def reference(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tensor:
-    """The same in PyTorch."""
+    """The same in PyTorch, but for what borders between texels of lamps do elsewhere."""
+    lighting = Lighting(shadows, light_samples)
+    return _of_each_mesh(hits, lambda own, index: _of_mesh(own, index, lighting))
+
+
+def _has_moving_steps(scene: Scene, camera: Camera) -> bool:
+    """Whether borders of texels may move in the image."""
+    found = [(mesh, texture) for mesh in scene.meshes for texture in nearest_textures(mesh)]
+    uvs = [coordinates(mesh, texture)[0] for mesh, texture in found]
+    return bool(found) and moves(*tensors_in(camera), *uvs, *(mesh.verts for mesh, _ in found))
+
+
+def declare_steps(hits: Hits) -> None:
+    """Declares where textures give the nearest texel: as reference() does, in its order, and shades nothing."""
+
+    def declare(own: Hits, index: int) -> Tensor:
+        at = _on_mesh(own, index)
+        for texture in nearest_textures(at.mesh):
+            at.value(texture)
+        return own._barycentrics.new_zeros((len(own), 1))
+
+    _of_each_mesh(hits, declare)
+
+
+def _of_each_mesh(hits: Hits, of_mesh: Callable[[Hits, int], Tensor]) -> Tensor:
+    """(N, C) from what is found for the points of each mesh and its number."""
     surfaces = hits._surfaces
     meshes, C = surfaces.scene.meshes, surfaces.scene.channels
-    total = hits._barycentrics.new_zeros((len(hits), C))
     if len(meshes) == 1:
-        return _of_mesh(hits, 0, Lighting(shadows, light_samples)).expand(len(hits), C)
+        return of_mesh(hits, 0).expand(len(hits), C)
+    total = hits._barycentrics.new_zeros((len(hits), C))
     for index in range(len(meshes)):
         rows = (surfaces.mesh_of_face[hits._face] == index).nonzero()[:, 0]
-        of_mesh = _of_mesh(hits.select(rows), index, Lighting(shadows, light_samples))
-        total = total.index_copy(0, rows, of_mesh.expand(len(rows), C))
+        total = total.index_copy(0, rows, of_mesh(hits.select(rows), index).expand(len(rows), C))
     return total
+
+
+def _on_mesh(hits: Hits, index: int) -> OnMesh:
+    surfaces = hits._surfaces
+    return OnMesh(
+        surfaces.scene.meshes[index], hits._face - surfaces.first_faces[index], hits._barycentrics, hits._look_up
+    )
+
+
+def _emission(at: OnMesh, material: Material) -> Tensor | None:
+    return None if material.emission is None else at.value(material.emission)
 
 
 def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
     """(N, C) or (N, 1)."""
-    surfaces = hits._surfaces
-    scene, mesh = surfaces.scene, surfaces.scene.meshes[index]
-    at = OnMesh(mesh, hits._face - surfaces.first_faces[index], hits._barycentrics, hits._look_up)
-    base, material = at.base_color(), mesh.material
+    scene, at = hits._surfaces.scene, _on_mesh(hits, index)
+    material = at.mesh.material
     if material is None:
+        base = at.base_color()
         return torch.zeros_like(base) if hits._only_light else base
-    g, v = surfaces.face_normals(hits._face), hits.view
-    front = dot(g.detach(), v.detach()) >= 0
-    side = torch.where(front, 1.0, -1.0).to(g)
-    n = at.shading_normal(g)
-    lambertian = material.metallic is None and material.roughness is None
-    metallic, roughness = (
-        None if lambertian else g.new_full((1, 1), default) if given is None else at.value(given)
-        for given, default in ((material.metallic, 0.0), (material.roughness, 1.0))
-    )
-    flat = mesh.normals is None and material.normal_map is None
-    surface = _Surface(hits.position, v, side * g, side * n, Scattering(base, metallic, roughness), flat)
-    total = g.new_zeros((len(hits), 1))
-    if material.emission is not None and not hits._only_light:
-        total = total + at.value(material.emission)
+    surface = _Surface.of(hits, at, material)
+    total = surface.g.new_zeros((len(hits), 1))
+    emission = None if hits._only_light else _emission(at, material)
+    if emission is not None:
+        total = total + emission
     for light in scene.lights:
         if isinstance(light, SphericalHarmonics) and not hits._only_light:
             total = total + surface.scattering.diffuse / math.pi * light.irradiance(surface.n)
@@ -166,6 +217,12 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
         count = 1 if light.punctual or hits._only_light else lighting.samples
         for sample in range(count):
             total = total + _light_sample(hits, light, (sample, count), surface, lighting.shadows) / count
+    return _where_seen(hits, material, total)
+
+
+def _where_seen(hits: Hits, material: Material, total: Tensor) -> Tensor:
+    """Backs are black, unless the material is two-sided."""
+    front = _in_front(hits._surfaces.face_normals(hits._face), hits.view)
     return total if material.two_sided else torch.where(front, total, 0.0)
 
 
@@ -174,8 +231,20 @@ def _light_sample(hits: Hits, light: Light, sample: tuple[int, int], surface: _S
     points = hits.light_points(light, *sample)
     if isinstance(light, Environment) and not hits._knows_light(light):
         points = light.above(points, surface.g)
+    return _scattered(hits, light, points, surface, shadows, lambda rows, y: light.arriving(points.select(rows), y))
+
+
+def _scattered(
+    hits: Hits,
+    light: Light,
+    points: LightPoints,
+    surface: _Surface,
+    shadows: bool,
+    arriving: Callable[[Tensor, Tensor], Tensor],
+) -> Tensor:
+    """(N, C): f max(0, n·l) V E, with E by arriving(rows, places)."""
     with torch.no_grad():
-        l = _towards(light, points, surface.position)
+        l = light.incident(points, surface.position)
         facing = ((dot(surface.n, l) > 0) & (dot(surface.g, l) > 0))[:, 0]
     rows = facing.nonzero()[:, 0]
     C = hits._surfaces.scene.channels
@@ -183,121 +252,75 @@ def _light_sample(hits: Hits, light: Light, sample: tuple[int, int], surface: _S
     if len(rows) == 0:
         return total
     surface, points = surface.select(rows), points.select(rows)
-    l = _towards(light, points, surface.position)
-    arriving = light.arriving(points, surface.position) * dot(surface.n, l)
+    l = light.incident(points, surface.position)
+    arrived = arriving(rows, surface.position) * dot(surface.n, l)
     if not surface.flat:
-        arriving = arriving * terminator(surface.g, surface.n, l)
+        arrived = arrived * terminator(surface.g, surface.n, l)
     if shadows:
-        arriving = arriving * hits._subset(rows).visible_from(light, points)[:, None]
-    scattered = surface.scattering.evaluate(surface.v, surface.n, l) * arriving
+        arrived = arrived * hits._subset(rows).visible_from(light, points)[:, None]
+    scattered = surface.scattering.evaluate(surface.v, surface.n, l) * arrived
     return total.index_copy(0, rows, scattered.expand(len(rows), C))
 
 
-def _towards(light: Light, points: LightPoints, position: Tensor) -> Tensor:
-    """(N, 3) unit directions."""
-    place = light.place(points).to(position)
-    return place if light.infinite else normalize(place - position, dim=-1)
-
-
-# -- creases: edges at which radiance may jump --------------------------------------------------------------------------
-
-
-def _note_jumps(hits: Hits) -> None:
-    surfaces = hits._surfaces
-    scene = surfaces.scene
-    if len(scene.meshes) > 1:
-        hits._note_jump("mesh", lambda: surfaces.mesh_of_face[:, None, None].expand(-1, 3, 1))
-    for index, mesh in enumerate(scene.meshes):
-        hits._note_jump(("appearance", index), _of_scene(surfaces, index, lambda mesh=mesh: jumps(mesh)))
-        if mesh.material is None or not (scene.lights or scene.casting):
-            continue
-        if mesh.normals is None:
-            seen_by = hits._view
-            hits._note_jump(
-                ("g", index), _of_scene(surfaces, index, lambda i=index, v=seen_by: _flat_radiance(surfaces, i, v))
-            )
-            continue
-        if mesh.normal_faces is not None:
-            normals, rows = mesh.normals, mesh.normal_faces
-            hits._note_jump(("n", index), _of_scene(surfaces, index, lambda n=normals, r=rows: n[r.long()]))
-        if scene.casting:
-            hits._note_jump(
-                ("lit", index), _of_scene(surfaces, index, lambda i=index: _shadow_terminators(surfaces, i))
-            )
-
-
-def _of_scene(surfaces: Surfaces, index: int, of_mesh: Callable[[], Tensor]) -> Callable[[], Tensor]:
-    """(F, 3, K) of all faces from that of one mesh's; zero elsewhere."""
-
-    def corners() -> Tensor:
-        own = of_mesh().detach()
-        if len(own) == len(surfaces.faces):
-            return own
-        first = surfaces.first_faces[index]
-        after = len(surfaces.faces) - first - len(own)
-        before, behind = (own.new_zeros((count, *own.shape[1:])) for count in (first, after))
-        return torch.cat([before, own, behind])  # pad() of torch 2.4 refuses what has no columns
-
-    return corners
-
-
-def _faces_of(surfaces: Surfaces, index: int) -> Tensor:
-    first = surfaces.first_faces[index]
-    return torch.arange(first, first + len(surfaces.scene.meshes[index].faces), device=surfaces.verts.device)
-
-
-def _face_normals(surfaces: Surfaces, index: int) -> Tensor:
-    return surfaces.face_normals(_faces_of(surfaces, index))[:, None].expand(-1, 3, -1)
-
-
-def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
-    """(F, 3, K) of a mesh without shading normals: what may jump at its edges, besides colours.
-
-    That is the face's normal on the viewer's side; if all lights are punctual, only of faces that one of them lights. Of
-    Lambertian faces it is E max(0, n·l) of each light: if both faces agree at the ends of an edge, they agree all along it, for
-    n·l |l| is the light's distance from the face's plane. The cone of a spot light may end between the ends, and is left out.
-    """
-    scene, mesh = surfaces.scene, surfaces.scene.meshes[index]
-    material = mesh.material
-    assert material is not None
-    harmonics = any(isinstance(light, SphericalHarmonics) for light in scene.lights)
-    points_alone = not harmonics and all(light.punctual for light in scene.casting)
-    if not points_alone or material.normal_map is not None or not isinstance(view, View):
-        return _face_normals(surfaces, index)
-    verts = mesh.verts.detach().double()
-    places = [light.place(light.draw(verts[:1])).detach().to(verts) for light in scene.casting]
-    power = [light._power(verts).detach().abs().mean() for light in scene.casting]
-    infinite = [light.infinite for light in scene.casting]
-    found = in_kernel.light_on_faces(verts, mesh.faces, view, infinite, torch.cat(places), torch.stack(power))
-    if material.metallic is None and material.roughness is None:
+def _moving_lamps(hits: Hits) -> list[_Lamp]:
+    """The lamps whose borders of texels may move. Light samples have no derivative for these."""
+    found: list[_Lamp] = []
+    scene = hits._surfaces.scene
+    if not differentiates() or hits._forced is not None or len(hits) == 0:
         return found
-    g = _face_normals(surfaces, index)
-    away = dot(g[:, 0], view.to_viewer(verts[mesh.faces[:, 0].long()])) < 0
-    return torch.where(away[:, None], -g, g) * (found != 0).any(-1, keepdim=True)
+    for number, light in enumerate(scene.casting):
+        if not isinstance(light, MeshLight) or light.texture is None or light.texture.filter != "nearest":
+            continue
+        if not moves(coordinates(light.mesh, light.texture)[0]):
+            continue
+        stream = len(scene.casting) + number
+        first, second = hits.random(2, stream)[0].tolist()
+        borders = light.borders((first, second))
+        if borders is not None:
+            found.append(_Lamp(light, borders, stream))
+    return found
 
 
-def _shadow_terminators(surfaces: Surfaces, index: int) -> Tensor:
-    """(F, 3, K): n·l times the shadow terminator at corners, with interpolated normals n, for each light.
+class _Lamp(NamedTuple):
+    light: MeshLight
+    borders: TexelBorders
+    stream: int  # of random numbers
 
-    The face's normal g enters through the terminator alone, which is 1 where g·l ≥ (g·n)(n·l). So of a fine mesh only edges near
-    the terminator are creases. An extended light has a terminator for each of its points: then g itself is compared.
+
+def _of_moving_borders(hits: Hits, lamps: list[_Lamp], lighting: Lighting) -> Tensor:
+    """(N, C) zeros, with the derivative of what lamps give by where their texels end, as many points of borders as of light:
+
+    f max(0, n·l) V cos θ / r² · [E_i − E_{i−1}] δp / |∇p|        (scene/texel_borders.py)
     """
-    mesh, lights = surfaces.scene.meshes[index], surfaces.scene.casting
-    assert mesh.normals is not None
-    of_faces = _face_normals(surfaces, index)
-    found = [] if all(light.punctual for light in lights) else [of_faces]
-    g = of_faces.reshape(-1, 3)
-    rows = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
-    n = normalize(mesh.normals.detach().to(g), dim=-1)[rows.long()].reshape(-1, 3)
-    n = torch.where(dot(n, g) < 0, -n, n)
-    position = mesh.verts.detach().to(g)
-    for light in lights:
-        if light.punctual:
-            l = _towards(light, light.draw(position), position).detach()
-            l = l.expand(len(position), 3)[mesh.faces.long()].reshape(-1, 3)
-            side = torch.where(dot(n, l) < 0, -1.0, 1.0).to(g)
-            found.append((dot(n, l) * terminator(side * g, side * n, l)).reshape(-1, 3, 1))
-    return torch.cat(found, -1)
+
+    def of_mesh(own: Hits, index: int) -> Tensor:
+        total = own._barycentrics.new_zeros((len(own), 1))
+        at = _on_mesh(own, index)
+        material = at.mesh.material
+        if material is None:
+            return total
+        with torch.no_grad():
+            surface = _Surface.of(own, at, material)
+        for light, borders, stream in lamps:
+            for sample in range(lighting.samples):
+                drawn = borders.draw(own.random(2, stream, sample, lighting.samples))
+                with torch.no_grad():
+                    reaches = _scattered(
+                        own,
+                        light,
+                        LightPoints(drawn.face, drawn.b[:, 1:], torch.ones_like(drawn.b[:, 0])),
+                        surface,
+                        lighting.shadows,
+                        lambda rows, y, drawn=drawn, light=light: (
+                            light.facing(drawn.face[rows], drawn.b[rows], y) * drawn.weight[rows].to(y)
+                        ),
+                    )
+                    reaches = _where_seen(own, material, reaches / lighting.samples)
+                total = total + reaches * borders.motion(drawn).to(reaches)
+        return total
+
+    # Of other hits, which keep nothing that is computed here, and declare no steps.
+    return _of_each_mesh(hits._subset(slice(None)), of_mesh)
 
 
 def check_unlit(function: str, scene: Scene, instead: str) -> None:

@@ -75,6 +75,11 @@ class Light:
         Differentiable."""
         raise NotImplementedError
 
+    def incident(self, points: LightPoints, position: Tensor) -> Tensor:
+        """(N, 3) unit directions from positions (N, 3), or (1, 3) of what is the same for all. Differentiable."""
+        place = self.place(points).to(position)
+        return place if self.infinite else normalize(place - position, dim=-1)
+
     # -- what the classes share ---------------------------------------------------------------------------------------
 
     def _set(self, name: str, *shape: int | str, unit: bool = False) -> None:

@@ -11,7 +11,9 @@ from torch.nn.functional import normalize
 from .appearance import OnMesh
 from .environment import EVEN, pick
 from .lights import Light, LightPoints
+from .material import Texture
 from .mesh import Mesh
+from .texel_borders import TexelBorders
 
 
 class MeshLight(Light):
@@ -21,6 +23,7 @@ class MeshLight(Light):
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
+        self._borders: tuple[TexelBorders | None] | None = None  # once they were asked for
 
     def __repr__(self) -> str:
         return f"MeshLight({self.mesh!r})"
@@ -76,24 +79,50 @@ class MeshLight(Light):
         return torch.cat([1 - points.uv.sum(1, keepdim=True), points.uv], 1).to(self.mesh.verts.device)
 
     def place(self, points: LightPoints) -> Tensor:
+        return self._at(points.index, self._weights(points))
+
+    def _at(self, face: Tensor, weights: Tensor) -> Tensor:
         # In double: where the rest of the scene is, a point rounded to floats would lie behind its own face half of the time.
-        corners = self.mesh.verts[self.mesh.faces[points.index].long()].double()
-        return (self._weights(points)[:, :, None] * corners).sum(1)
+        corners = self.mesh.verts[self.mesh.faces[face].long()].double()
+        return (weights[:, :, None] * corners).sum(1)
 
     def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
         """L cos θ / r², over the density. Barycentrics stay while the faces move, so areas that grow count more."""
         material = self.mesh.material
         assert material is not None
-        radiance = self._emission(points.index, self._weights(points).to(self.mesh.verts)).to(position)
-        normal = self._area(points.index).to(position)
-        away = position - self.place(points).to(position)
+        weights = self._weights(points)
+        radiance = self._emission(points.index, weights.to(self.mesh.verts)).to(position)
+        density = points.density[:, None].to(position)
+        drawn = density > 0
+        return torch.where(
+            drawn, radiance * self.facing(points.index, weights, position) / torch.where(drawn, density, 1.0), 0.0
+        )
+
+    def facing(self, face: Tensor, weights: Tensor, position: Tensor) -> Tensor:
+        """(N, 1): cos θ / r² from places on faces, of barycentrics `weights` (N, 3), to `position` (N, 3), times how many times
+        as large as now the faces become; nothing from behind, unless the material is two-sided, nor from a face without area."""
+        material = self.mesh.material
+        assert material is not None
+        normal = self._area(face).to(position)
+        away = position - self._at(face, weights).to(position)
         squared = (away * away).sum(1, keepdim=True)
-        apart = squared > 0
-        squared = torch.where(apart, squared, 1.0)
-        # The normal is as long as the area: over its value, the cosine times the Jacobian of the barycentrics.
         area = normal.detach().norm(dim=1, keepdim=True)
-        facing = (normal * normalize(away, dim=1)).sum(1, keepdim=True)
-        facing = facing.abs() if material.two_sided else facing.clamp(min=0)
-        per_density = points.density[:, None].to(area) * area
-        some = apart & (per_density > 0)
-        return torch.where(some, radiance * facing / (squared * torch.where(some, per_density, 1.0)), 0.0)
+        some = (squared > 0) & (area > 0)
+        cosine = (normal * normalize(away, dim=1)).sum(1, keepdim=True) / torch.where(some, area, 1.0)
+        cosine = cosine.abs() if material.two_sided else cosine.clamp(min=0)
+        return torch.where(some, cosine / torch.where(some, squared, 1.0), 0.0)
+
+    @property
+    def texture(self) -> Texture | None:
+        """Of its emission."""
+        emission = None if self.mesh.material is None else self.mesh.material.emission
+        return emission if isinstance(emission, Texture) else None
+
+    def borders(self, u: tuple[float, float]) -> TexelBorders | None:
+        """Between the texels of its emission, where there are jumps; of too many those that u picks, the first time."""
+        if self._borders is None:
+            assert self.texture is not None
+            with torch.no_grad():
+                face = torch.arange(len(self.mesh.faces), device=self.mesh.verts.device)
+                self._borders = (TexelBorders.of(self.mesh, self.texture, self._area(face).double().norm(dim=1), u),)
+        return self._borders[0]
