@@ -13,6 +13,7 @@ from torch import Tensor
 from .camera.camera import Camera
 from .kernel import memory as memory
 from .kernel.counts import COUNTS, table
+from .kernel.derivatives import moves
 from .kernel.flat import Flat
 from .kernel.operators import Hits, backward_kernel, image_room, pass_size
 from .kernel.request import MOVING, SLOTS, Request, Work, label, make_request, required
@@ -23,6 +24,7 @@ from .points.shadows import ShadowLight
 from .points.surfaces import every_face
 from .render import SHADING, check_options
 from .scene.mesh import Mesh
+from .scene.mesh_light import MeshLight
 from .scene.scene import Scene, as_scene
 from .shader import AT_ONCE
 
@@ -141,7 +143,17 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     )
     terms["shadows"] = Term(lights > 0 and lighting.shadows, why if lights else "no lights", samples=lights * shaded)
     terms["shadow edges"] = _shadow_edges(scene, request, lighting)
+    terms["texels of lamps"] = _texels_of_lamps(scene, lighting)
     return terms
+
+
+def _texels_of_lamps(scene: Scene, lighting: Lighting) -> Term:
+    lamps = [light for light in scene.casting if isinstance(light, MeshLight) and light.has_borders]
+    moving = sum(moves(light.coordinates) for light in lamps)
+    if not moving:
+        return Term(False, "nothing that moves them" if lamps else "no emission is that of the nearest texel")
+    count = moving * lighting.samples
+    return Term(True, f"{count} point{'s' * (count > 1)} of their borders for each point of the interior")
 
 
 def _shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:

@@ -269,9 +269,7 @@ def _moving_lamps(hits: Hits) -> list[_Lamp]:
     if not differentiates() or hits._forced is not None or len(hits) == 0:
         return found
     for number, light in enumerate(scene.casting):
-        if not isinstance(light, MeshLight) or light.texture is None or light.texture.filter != "nearest":
-            continue
-        if not moves(coordinates(light.mesh, light.texture)[0]):
+        if not isinstance(light, MeshLight) or not light.has_borders or not moves(light.coordinates):
             continue
         stream = len(scene.casting) + number
         first, second = hits.random(2, stream)[0].tolist()

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from .appearance import OnMesh
+from .appearance import OnMesh, coordinates
 from .environment import EVEN, pick
 from .lights import Light, LightPoints
 from .material import Texture
@@ -117,6 +117,16 @@ class MeshLight(Light):
         """Of its emission."""
         emission = None if self.mesh.material is None else self.mesh.material.emission
         return emission if isinstance(emission, Texture) else None
+
+    @property
+    def has_borders(self) -> bool:
+        """Whether its emission is that of the nearest texel."""
+        return self.texture is not None and self.texture.filter == "nearest"
+
+    @property
+    def coordinates(self) -> Tensor:
+        """(T, 2) of its texture."""
+        return coordinates(self.mesh, self.texture)[0]
 
     def borders(self, u: tuple[float, float]) -> TexelBorders | None:
         """Between the texels of its emission, where there are jumps; of too many those that u picks, the first time."""
