@@ -18,6 +18,8 @@ from ..optional import require
 from .formats import gltf, gltf_material, obj, threemf
 from .formats.geometry import checked, place, shape, turned
 from .formats.gltf_nodes import cameras, lights
+from .formats.gltf_scene import instances
+from .formats.gltf_unread import note_unread
 from .formats.part import Fault, Model, Part, Wanted
 from .formats.source import Folder, Source, linear_colors, opened
 from .paths import PathLike, check_readable
@@ -52,7 +54,7 @@ def read_cameras(path: PathLike, size: tuple[int, int], dtype: torch.dtype) -> d
     """Those of a glTF or GLB file, by name. Raises Fault, FileNotFoundError or ValueError."""
     file = check_readable(path, GLTFS)
     with _as_fault(kind := file.suffix.lower()[1:]):
-        return cameras(gltf.read_tree(file.read_bytes(), kind), size, dtype)
+        return cameras(gltf.read(file.read_bytes(), kind).tree, size, dtype)
 
 
 @contextmanager
@@ -77,16 +79,14 @@ def _as_fault(kind: str) -> Iterator[None]:
 
 
 def _read_gltf(data: bytes, kind: str, source: Source) -> Model:
-    tree, wanted = gltf.read_tree(data, kind), source.wanted
-    loaded = _load(gltf.for_trimesh(data, kind, tree), kind, source)
-    primitives = gltf.primitives(tree, loaded["geometry"])
-    gltf.note_unsupported(tree, source)
+    file = gltf.read(data, kind)
+    note_unread(file.tree, source)
     known: dict[object, Any] = {}
 
     def look(name: str, raw: dict[str, Any], origin: np.ndarray) -> dict[str, object]:
-        return gltf_material.look(gltf_material.Primitive(tree, primitives[name], raw, source), known)
+        return gltf_material.look(raw["primitive"], known)
 
-    return Model(_parts(loaded, look), lights(tree, source) if wanted.lit else [])
+    return Model(_parts(instances(file, source), look), lights(file.tree, source) if source.wanted.lit else [])
 
 
 def _read_plain(data: bytes, kind: str, source: Source) -> Model:
@@ -122,7 +122,7 @@ def _read_plain(data: bytes, kind: str, source: Source) -> Model:
         found = _look(raw, origin, source)
         return found | _lit(raw, source, materials, has_uvs=found["uvs"] is not None) if wanted.lit else found
 
-    return Model(_parts(loaded, look), [])
+    return Model(_parts(place(loaded), look), [])
 
 
 def _load(data: bytes, kind: str, source: Source, **options: object) -> dict[str, Any]:
@@ -132,9 +132,12 @@ def _load(data: bytes, kind: str, source: Source, **options: object) -> dict[str
     return loader(file_obj=io.BytesIO(data), resolver=source.folder, **options)
 
 
-def _parts(loaded: dict[str, Any], look: Callable[[str, dict[str, Any], np.ndarray], dict[str, Any]]) -> list[Part]:
+def _parts(
+    placed: list[tuple[str, dict[str, Any], np.ndarray]],
+    look: Callable[[str, dict[str, Any], np.ndarray], dict[str, Any]],
+) -> list[Part]:
     """Parts in their places, with the fields that look() gives by name, arrays and the face that each triangle came from."""
-    placed = [p for p in place(loaded) if len(p[1].get("faces", ()))]  # the others: points and lines
+    placed = [p for p in placed if len(p[1].get("faces", ()))]  # the others: points and lines
     parts = []
     for name, raw, matrix in placed:
         try:
