@@ -18,7 +18,7 @@ from ..optional import require
 from .formats import gltf, gltf_material, obj, threemf
 from .formats.geometry import checked, place, shape, turned
 from .formats.gltf_nodes import cameras, lights
-from .formats.gltf_scene import instances
+from .formats.gltf_scene import instances as gltf_instances
 from .formats.gltf_unread import note_unread
 from .formats.part import Fault, Model, Part, Wanted
 from .formats.source import Folder, Source, linear_colors, opened
@@ -40,7 +40,10 @@ def read_model(path: PathLike, wanted: Wanted) -> Model:
     file = check_readable(path, MESHES)
     data, kind, source = file.read_bytes(), file.suffix.lower()[1:], Source.of(path, wanted)
     with _as_fault(kind):
-        model = _read_gltf(data, kind, source) if kind in ("gltf", "glb") else _read_plain(data, kind, source)
+        if kind == "3mf":
+            model = Model(_parts(threemf.instances(data, source), _plain_look(source)), [])
+        else:
+            model = _read_gltf(data, kind, source) if kind in ("gltf", "glb") else _read_plain(data, kind, source)
     if not model.parts:
         raise Fault("expected triangles, got none: the file is truncated, or was exported without faces")
     announced, found = _announced_faces(data, kind), sum(len(part.faces) for part in model.parts)
@@ -86,11 +89,11 @@ def _read_gltf(data: bytes, kind: str, source: Source) -> Model:
     def look(name: str, raw: dict[str, Any], origin: np.ndarray) -> dict[str, object]:
         return gltf_material.look(raw["primitive"], known)
 
-    return Model(_parts(instances(file, source), look), lights(file.tree, source) if source.wanted.lit else [])
+    return Model(_parts(gltf_instances(file, source), look), lights(file.tree, source) if source.wanted.lit else [])
 
 
 def _read_plain(data: bytes, kind: str, source: Source) -> Model:
-    """All formats but glTF."""
+    """All formats but glTF and 3MF."""
     wanted, folder = source.wanted, source.folder
     options: dict[str, object] = {}
     if kind == "obj":
@@ -100,7 +103,6 @@ def _read_plain(data: bytes, kind: str, source: Source) -> Model:
         # Without a texture, vertices must not be split at its seams: their colours would not follow.
         header = data.split(b"end_header")[0].lower()
         options["fix_texture"] = wanted.unwrap or (wanted.materials and b"texturefile" in header)
-    instances = threemf.instances(data) if kind == "3mf" else None
     with warnings.catch_warnings():  # after which Python says again what it said before, so not for a glTF
         # Where a text stops being numbers, NumPy drops the rest and only warns.
         warnings.filterwarnings("error", message="string or file could not be read", category=DeprecationWarning)
@@ -111,18 +113,18 @@ def _read_plain(data: bytes, kind: str, source: Source) -> Model:
             raise Fault(f"expected texture coordinates for its texture {next(iter(folder.contents))!r}, got none")
     if kind == "obj" and "geometry" in loaded:
         loaded["geometry"] = dict(reversed(loaded["geometry"].items()))  # trimesh turns their order round
-    if instances is not None and instances != len(loaded["graph"]):
-        raise Fault(
-            f"expected {instances} instances of objects, and {len(loaded['graph'])} could be read: components are nested "
-            "too often, or refer to objects that are not there; export it flat"
-        )
+    return Model(_parts(place(loaded), _plain_look(source)), [])
+
+
+def _plain_look(source: Source) -> Callable[[str, dict[str, Any], np.ndarray], dict[str, Any]]:
+    """What look() of _parts() is in all formats but glTF."""
     materials = obj.Materials()
 
     def look(name: str, raw: dict[str, Any], origin: np.ndarray) -> dict[str, object]:
         found = _look(raw, origin, source)
-        return found | _lit(raw, source, materials, has_uvs=found["uvs"] is not None) if wanted.lit else found
+        return found | _lit(raw, source, materials, has_uvs=found["uvs"] is not None) if source.wanted.lit else found
 
-    return Model(_parts(place(loaded), look), [])
+    return look
 
 
 def _load(data: bytes, kind: str, source: Source, **options: object) -> dict[str, Any]:
