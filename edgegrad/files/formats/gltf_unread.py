@@ -64,9 +64,11 @@ def _unknown(value: Any, schema: dict[str, Any], kind: str) -> Iterator[tuple[st
         for name, inner in value.items():
             if name == "extensions" and isinstance(inner, dict):
                 yield from (("extension", extension) for extension in inner)
+            elif name == "extras":  # anything, which nobody needs to know
+                continue
             elif name in known:
                 yield from _unknown(inner, known[name], name)
-            elif "additionalProperties" not in schema and known:
+            elif known and "additionalProperties" not in schema:
                 yield kind, name
 
 
