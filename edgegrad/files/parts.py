@@ -1,4 +1,5 @@
-"""Mesh files as plain arrays, through trimesh, and the faults that trimesh passes over without a word."""
+"""Mesh files as plain arrays: glTF and 3MF by what formats/ reads of them, others through trimesh, with the faults that it
+passes over without a word."""
 
 from __future__ import annotations
 
