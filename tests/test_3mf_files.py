@@ -185,6 +185,10 @@ def test_what_changes_no_picture_is_not_named(tmp_path):
         ),
         (model(GROUPS.replace("#FF0000", "red") + one(mesh()), '<item objectid="1"/>'), "#RRGGBB or #RRGGBBAA, got 'red'"),
         (model(one(mesh())), "expected triangles, got none"),
+        (
+            model(GROUPS + one(mesh(CORNERS, FACES - 1, ('pid="6" p1="0" p2="1"',) * 2)), '<item objectid="1"/>'),
+            "indices from 0 to 3, got -1",
+        ),
         (model(one(mesh()) * 2, '<item objectid="1"/>'), "an id for each object, got '1' for two in '3d/3dmodel.model'"),
         (model(one(mesh()), '<item objectid="1"/>', space='xmlns="a"'), "a model of 3MF in .*, got '{a}model'"),
     ],

@@ -26,7 +26,8 @@ class Arrays:
         self.tree, self.chunk, self.folder = file.tree, file.chunk, folder
         self.buffers: dict[int, bytes] = {}
         self.known: dict[int, np.ndarray] = {}
-        zeros = sum(accessor["count"] for accessor in self.tree.get("accessors", []) if "bufferView" not in accessor)
+        empty = [accessor for accessor in self.tree.get("accessors", []) if "bufferView" not in accessor]
+        zeros = sum(max(accessor["count"], 0) for accessor in empty)
         if zeros > MOST_ZEROS:
             raise Fault(f"expected accessors with data, got some without that would fill {zeros} rows; export it plain")
 
@@ -116,9 +117,10 @@ class Geometry:
         if index is None:
             flat = np.arange(len(self._get(self.given["attributes"]["POSITION"])))
         else:
-            flat = self._get(index).reshape(-1).astype(np.int64)
-            if self._get(index).dtype.kind != "u":
-                raise Fault("expected unsigned integers for indices, got others; export it again")
+            given = self._get(index)
+            if given.dtype.kind != "u":
+                raise Fault(f"expected unsigned integers for indices, got {given.dtype}; export it again")
+            flat = given.reshape(-1).astype(np.int64)
         if mode == TRIANGLES:
             if len(flat) % 3:
                 raise Fault(f"expected three indices a triangle, got {len(flat)} in all; it is truncated or damaged")
@@ -127,8 +129,8 @@ class Geometry:
             return np.zeros((0, 3), np.int64)
         if mode == FAN:
             return np.stack([flat[1:-1], flat[2:], np.full(len(flat) - 2, flat[0])], 1)
-        odd = np.arange(len(flat) - 2) % 2
         first = np.arange(len(flat) - 2)
+        odd = first % 2
         strip = np.stack([flat[first], flat[first + 1 + odd], flat[first + 2 - odd]], 1)
         # Triangles with a corner twice only lead from one strip to the next.
         return strip[(strip[:, 0] != strip[:, 1]) & (strip[:, 1] != strip[:, 2]) & (strip[:, 2] != strip[:, 0])]

@@ -17,7 +17,7 @@ from .source import Source
 from .threemf_unread import CORE, MATERIAL, NEEDED, PATH, note_unread
 
 MOST_INSTANCES = 100_000  # of the objects of a file: nested components multiply
-MOST_NESTED = 200
+MOST_NESTED = 64
 UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
 # No entity, other file or address is looked at, and trees are of bounded depth.
 SAFE = {"resolve_entities": False, "no_network": True, "load_dtd": False, "huge_tree": False}
@@ -35,14 +35,12 @@ class Object(NamedTuple):
     """Triangles or components."""
 
     name: str
-    vertices: np.ndarray  # (N, 3)
-    faces: np.ndarray  # (F, 3)
-    colors: np.ndarray | None  # (F, 3, 4) 8-bit sRGB of corners
+    arrays: dict[str, np.ndarray]  # `vertices`, `faces`, and `face_colors` or `vertex_colors` of 8-bit sRGB
     components: list[Reference]
 
 
-class Part(NamedTuple):
-    """A model part."""
+class ModelPart(NamedTuple):
+    """A model part of a package."""
 
     unit: float  # m
     objects: dict[str, Object]
@@ -50,8 +48,7 @@ class Part(NamedTuple):
 
 
 def instances(data: bytes, source: Source) -> list[tuple[str, dict[str, Any], np.ndarray]]:
-    """(name, arrays, matrix to the space of the build) of each mesh wherever it is placed, in the order of the build. The arrays
-    are `vertices` and `faces`, and `face_colors` or `vertex_colors` of 8-bit sRGB.
+    """(name, arrays, matrix to the space of the build) of each mesh wherever it is placed, in the order of the build.
 
     Raises Fault, also for an archive that would fill the memory and for XML that names other files.
     """
@@ -75,8 +72,8 @@ def instances(data: bytes, source: Source) -> list[tuple[str, dict[str, Any], np
 class _Package:
     def __init__(self, archive: zipfile.ZipFile, source: Source) -> None:
         self.archive, self.source = archive, source
-        self.names = {name.lower().lstrip("/"): name for name in archive.namelist()}
-        self.parts: dict[str, Part] = {}
+        self.names = {name.lower().replace("\\", "/").lstrip("/"): name for name in archive.namelist()}
+        self.parts: dict[str, ModelPart] = {}
         self.counts: dict[tuple[str, str], int] = {}
 
     def root(self) -> str:
@@ -93,7 +90,7 @@ class _Package:
             raise Fault("expected a 3MF file, got an archive without 3D/3dmodel.model; export it again")
         return found
 
-    def part(self, name: str) -> Part:
+    def part(self, name: str) -> ModelPart:
         if name not in self.parts:
             if name not in self.names:
                 raise Fault(f"expected the model part {name!r}, got none; export it again")
@@ -131,8 +128,8 @@ class _Package:
         if reference.part != part:
             world = world @ np.diag([*[self.part(reference.part).unit / self.part(part).unit] * 3, 1.0])
         shown = self.object(reference)
-        if len(shown.faces):
-            found.append((shown.name, _arrays(shown), world))
+        if len(shown.arrays["faces"]):
+            found.append((shown.name, shown.arrays, world))
         for component in shown.components:
             self.place(component, reference.part, world, found)
 
@@ -149,7 +146,7 @@ def _name(path: str) -> str:
     return unquote(path).lower().lstrip("/")
 
 
-def _read_part(name: str, root: Any, source: Source) -> Part:
+def _read_part(name: str, root: Any, source: Source) -> ModelPart:
     if root.tag != f"{{{CORE}}}model":
         raise Fault(f"expected a model of 3MF in {name!r}, got {root.tag!r}; export it again")
     unit = root.get("unit", "millimeter")
@@ -161,7 +158,7 @@ def _read_part(name: str, root: Any, source: Source) -> Part:
     for given in _core(root, "object"):
         if objects.setdefault(given.attrib["id"], found := _object(given, name, palettes, source)) is not found:
             raise Fault(f"expected an id for each object, got {given.get('id')!r} for two in {name!r}; export it again")
-    return Part(UNITS[unit], objects, [_reference(item, name) for item in _core(root, "item")])
+    return ModelPart(UNITS[unit], objects, [_reference(item, name) for item in _core(root, "item")])
 
 
 def _core(within: Any, name: str) -> Iterator[Any]:
@@ -183,9 +180,7 @@ def _object(given: Any, part: str, palettes: dict[str, list[tuple[int, ...]]], s
     faces = [f"{t.attrib['v1']} {t.attrib['v2']} {t.attrib['v3']}" for t in _core(given, "triangle")]
     return Object(
         given.get("name") or f"object {given.get('id')}",
-        _numbers(corners, np.float64),
-        _numbers(faces, np.int64),
-        _colors(given, palettes, source),
+        _arrays(_numbers(corners, np.float64), _numbers(faces, np.int64), _colors(given, palettes, source)),
         [_reference(component, part) for component in _core(given, "component")],
     )
 
@@ -235,11 +230,14 @@ def _color(given: Any) -> tuple[int, ...]:
     return tuple(bytes.fromhex(f"{text[1:]}FF"[:8]))
 
 
-def _arrays(shown: Object) -> dict[str, Any]:
-    if shown.colors is None:
-        return {"vertices": shown.vertices, "faces": shown.faces}
-    if bool((shown.colors == shown.colors[:, :1]).all()):
-        return {"vertices": shown.vertices, "faces": shown.faces, "face_colors": shown.colors[:, 0]}
-    corners = np.arange(shown.faces.size)
-    rows = shown.vertices[shown.faces.reshape(-1)]
-    return {"vertices": rows, "faces": corners.reshape(-1, 3), "vertex_colors": shown.colors.reshape(-1, 4)}
+def _arrays(vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None) -> dict[str, np.ndarray]:
+    """colors   (F, 3, 4), of corners; where those of a face differ, vertices are split"""
+    if colors is None:
+        return {"vertices": vertices, "faces": faces}
+    if bool((colors == colors[:, :1]).all()):
+        return {"vertices": vertices, "faces": faces, "face_colors": colors[:, 0]}
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        bad = faces.min() if faces.min() < 0 else faces.max()
+        raise Fault(f"expected vertex indices from 0 to {len(vertices) - 1}, got {bad}; repair the mesh")
+    apart = np.arange(faces.size).reshape(-1, 3)
+    return {"vertices": vertices[faces.reshape(-1)], "faces": apart, "vertex_colors": colors.reshape(-1, 4)}
