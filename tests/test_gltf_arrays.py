@@ -292,6 +292,11 @@ def extended(kind):
         (lambda tree: tree["meshes"][0]["primitives"][0].update(extensions={"ACME_new": {}}), "ACME_new", True),
         (lambda tree: tree.update(extensions={"ACME_new": {}}), "ACME_new", True),
         (lambda tree: tree.update(extensionsUsed=["ACME_new"]), "ACME_new", True),
+        (
+            lambda tree: tree.update(extensions={"KHR_lights_punctual": {"lights": [{"extensions": {"ACME_new": {}}}]}}),
+            "ACME_new",
+            True,
+        ),
         (lambda tree: tree["materials"][0].update(shininess=3), "'shininess' of materials", True),
         (lambda tree: tree["materials"][0]["pbrMetallicRoughness"].update(gloss=3), "'gloss' of pbrMetallicRoughness", True),
         (lambda tree: tree.update(camera={}), "'camera' of the file", True),

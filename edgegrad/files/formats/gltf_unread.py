@@ -63,13 +63,17 @@ def _unknown(value: Any, schema: dict[str, Any], kind: str) -> Iterator[tuple[st
         known = _properties(schema)
         for name, inner in value.items():
             if name == "extensions" and isinstance(inner, dict):
-                yield from (("extension", extension) for extension in inner)
+                for extension, held in inner.items():
+                    yield "extension", extension
+                    yield from _unknown(held, {}, extension)  # for others in it
             elif name == "extras":  # anything, which nobody needs to know
                 continue
             elif name in known:
                 yield from _unknown(inner, known[name], name)
             elif known and "additionalProperties" not in schema:
                 yield kind, name
+            else:
+                yield from _unknown(inner, {}, kind)
 
 
 def _properties(schema: dict[str, Any]) -> dict[str, Any]:
