@@ -148,6 +148,7 @@ def huge() -> dict[str, bytes | str]:
         "b.glb": changed(lambda tree: tree["accessors"][0].update(count=10**9)),
         "c.glb": changed(lambda tree: without_data(tree, 10**9)),
         "d.glb": changed(lambda tree: without_data(tree, 10**15)),
+        "h.glb": changed(lambda tree: (without_data(tree, 2**34), tree["accessors"].append({"count": -(2**34)}))),
         "e.glb": changed(lambda tree: tree["accessors"][0].update(byteOffset=10**9)),
         "f.glb": changed(lambda tree: tree["bufferViews"][0].update(byteOffset=-5)),
         "g.glb": changed(lambda tree: tree["bufferViews"][0].update(byteStride=10**6)),
@@ -356,6 +357,16 @@ def nested(depth: int) -> dict[str, str]:
     return {"</resources>": objects + "</resources>", 'item objectid="1"': f'item objectid="{depth + 1}"'}
 
 
+def chain(depth: int) -> dict[str, str]:
+    """Objects of one component each, the one below."""
+    objects = "".join(
+        f'<object id="{i}"><components><component objectid="{i - 1}"/></components></object>'
+        for i in range(2, depth + 1)
+    )
+    return {"</resources>": objects + "</resources>", 'item objectid="1"': f'item objectid="{depth}"'}
+
+
+PRODUCTION = "http://schemas.microsoft.com/3dmanufacturing/production/2015/06"
 LOL = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
 
 
@@ -365,15 +376,21 @@ LOL = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
         (model({"<model": f'<!DOCTYPE a [<!ENTITY l0 "0">{LOL}]><model', 'x="0"': 'x="&l9;"'}), "without a DOCTYPE"),
         (model({"<model": '<!DOCTYPE a [<!ENTITY s SYSTEM "file:///etc/passwd">]><model'}), "without a DOCTYPE"),
         (model({"<model": '<!DOCTYPE a SYSTEM "http://127.0.0.1:9/a.dtd"><model'}), "without a DOCTYPE"),
-        (model(extra={"3D/other.model": '<!DOCTYPE a SYSTEM "a.dtd"><model/>'}), r"in '3D/other\.model'"),
+        (
+            model(
+                {'item objectid="1"': f'item objectid="1" xmlns:p="{PRODUCTION}" p:path="/3D/other.model"'},
+                {"3D/other.model": '<!DOCTYPE a SYSTEM "a.dtd"><model/>'},
+            ),
+            r"in '3d/other\.model'",
+        ),
         (model(nested(38)), "at most 100000 instances of objects, got 274877906944"),
-        (model(nested(8)), "expected 256 instances of objects, and .* could be read"),
+        (model(chain(100)), "nested up to 64 times, got more"),
         (
             model({"</resources>": '<object id="2"><components><component objectid="2"/></components></object></resources>',
                    'item objectid="1"': 'item objectid="2"'}),
             "object 2 inside itself",
         ),
-        (model({'item objectid="1"': 'item objectid="7"'}), "expected 1 instances of objects, and 0"),
+        (model({'item objectid="1"': 'item objectid="7"'}), "an object with the id 7 in '3d/3dmodel.model', got none"),
         (model({'<vertex x="1"': '<vertex y="1"'}), "cannot be read"),
         (model({'v3="2"': 'v3="9"'}), "indices from 0 to 2, got 9"),
         (model({"</build>": ""}), "cannot be read"),

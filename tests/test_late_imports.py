@@ -38,7 +38,6 @@ def test_libraries_are_imported_late_and_missed_by_name(tmp_path):
     [
         ("PIL", ["a.glb", "a.obj"]),
         pytest.param("lxml", ["a.3mf"], marks=pytest.mark.slow),
-        pytest.param("networkx", ["a.3mf"], marks=pytest.mark.slow),
     ],
 )
 def test_missing_libraries_are_asked_for_by_their_extra(tmp_path, missing, names):

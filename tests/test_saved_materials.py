@@ -237,7 +237,7 @@ def test_the_file_is_a_gltf(tmp_path):
     for name in names:
         look, more = ALPHAS.get(name, ({}, {}))
         eg.save_mesh(tmp_path / "a.glb", box(MATERIALS.get(name) or eg.Material(**more), **look))
-        tree = gltf.read_tree((tmp_path / "a.glb").read_bytes(), "glb")
+        tree = gltf.read((tmp_path / "a.glb").read_bytes(), "glb").tree
         jsonschema.validate(tree, get_schema())
         used = {extension for material in tree["materials"] for extension in material.get("extensions", {})}
         assert set(tree.get("extensionsUsed", [])) == used

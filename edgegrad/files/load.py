@@ -1,6 +1,6 @@
 """Meshes and scenes from files; images come from image.py, cameras from cameras.py.
 
-What colours mean: vertex and face colours of OBJ and PLY files and the texels of textures of colour are sRGB on disk and
+What colours mean: vertex and face colours of OBJ, PLY and 3MF files and the texels of textures of colour are sRGB on disk and
 become linear; factors of materials (glTF baseColorFactor, emissiveFactor, OBJ Kd, Ke), vertex colours of glTF and textures of
 data (normals, metallic, roughness) are linear already. All become float32. A glTF multiplies the texture, the factor and the
 vertex colours; those that differ from vertex to vertex beside a texture need lit=True, for a mesh that is not lit has one kind of
@@ -25,8 +25,10 @@ lit=True takes them for base colours:
   dielectric, rough by Ns; with Pr or Pm metallic-roughness. vn are its normals.
 - other formats: Lambertian, with the normals of a PLY.
 
-What else a file asks for is said once, in one UserWarning that names it; without lit=True only what changes the shape of a glTF:
-animations, morph targets, skins (the transformation of a skinned node itself does not count), instancing.
+What else a file asks for is said once, in one UserWarning that names it: extensions, properties, elements and attributes
+that are not read, and of a glTF animations, morph targets, skins (the transformation of a skinned node itself does not
+count), instancing, points and lines. Without lit=True not what is of materials and lights alone. Nodes that
+KHR_node_visibility hides are not there.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ def load_mesh(
     Vertices that the file repeats (at texture seams, for normals, in triangle soups) are welded where their float32
     positions are equal; unused ones are left out; polygons become fans of triangles. Texture coordinates are indexed
     apart, v running up; an OBJ's and a glTF's are there without a texture too. Where welded vertices had different
-    colours, they become `corner_colors`. OFF and 3MF give the shape only. What colours mean stands at the top of this
+    colours, they become `corner_colors`. OFF gives the shape only. What colours mean stands at the top of this
     module. Parts that look alike (all plain, all with
     vertex colours, all with face colours, all on one texture; lit, all with one material) become one Mesh. Files that the
     file names are read from its folder and below, and from nowhere else.

@@ -1,4 +1,5 @@
-"""Mesh files as plain arrays, through trimesh, and the faults that trimesh passes over without a word."""
+"""Mesh files as plain arrays: glTF and 3MF by what formats/ reads of them, others through trimesh, with the faults that it
+passes over without a word."""
 
 from __future__ import annotations
 
@@ -18,6 +19,8 @@ from ..optional import require
 from .formats import gltf, gltf_material, obj, threemf
 from .formats.geometry import checked, place, shape, turned
 from .formats.gltf_nodes import cameras, lights
+from .formats.gltf_scene import instances as gltf_instances
+from .formats.gltf_unread import note_unread
 from .formats.part import Fault, Model, Part, Wanted
 from .formats.source import Folder, Source, linear_colors, opened
 from .paths import PathLike, check_readable
@@ -38,7 +41,10 @@ def read_model(path: PathLike, wanted: Wanted) -> Model:
     file = check_readable(path, MESHES)
     data, kind, source = file.read_bytes(), file.suffix.lower()[1:], Source.of(path, wanted)
     with _as_fault(kind):
-        model = _read_gltf(data, kind, source) if kind in ("gltf", "glb") else _read_plain(data, kind, source)
+        if kind == "3mf":
+            model = Model(_parts(threemf.instances(data, source), _plain_look(source)), [])
+        else:
+            model = _read_gltf(data, kind, source) if kind in ("gltf", "glb") else _read_plain(data, kind, source)
     if not model.parts:
         raise Fault("expected triangles, got none: the file is truncated, or was exported without faces")
     announced, found = _announced_faces(data, kind), sum(len(part.faces) for part in model.parts)
@@ -52,7 +58,7 @@ def read_cameras(path: PathLike, size: tuple[int, int], dtype: torch.dtype) -> d
     """Those of a glTF or GLB file, by name. Raises Fault, FileNotFoundError or ValueError."""
     file = check_readable(path, GLTFS)
     with _as_fault(kind := file.suffix.lower()[1:]):
-        return cameras(gltf.read_tree(file.read_bytes(), kind), size, dtype)
+        return cameras(gltf.read(file.read_bytes(), kind).tree, size, dtype)
 
 
 @contextmanager
@@ -77,20 +83,18 @@ def _as_fault(kind: str) -> Iterator[None]:
 
 
 def _read_gltf(data: bytes, kind: str, source: Source) -> Model:
-    tree, wanted = gltf.read_tree(data, kind), source.wanted
-    loaded = _load(gltf.for_trimesh(data, kind, tree), kind, source)
-    primitives = gltf.primitives(tree, loaded["geometry"])
-    gltf.note_unsupported(tree, source)
+    file = gltf.read(data, kind)
+    note_unread(file.tree, source)
     known: dict[object, Any] = {}
 
     def look(name: str, raw: dict[str, Any], origin: np.ndarray) -> dict[str, object]:
-        return gltf_material.look(gltf_material.Primitive(tree, primitives[name], raw, source), known)
+        return gltf_material.look(raw["primitive"], known)
 
-    return Model(_parts(loaded, look), lights(tree, source) if wanted.lit else [])
+    return Model(_parts(gltf_instances(file, source), look), lights(file.tree, source) if source.wanted.lit else [])
 
 
 def _read_plain(data: bytes, kind: str, source: Source) -> Model:
-    """All formats but glTF."""
+    """All formats but glTF and 3MF."""
     wanted, folder = source.wanted, source.folder
     options: dict[str, object] = {}
     if kind == "obj":
@@ -100,7 +104,6 @@ def _read_plain(data: bytes, kind: str, source: Source) -> Model:
         # Without a texture, vertices must not be split at its seams: their colours would not follow.
         header = data.split(b"end_header")[0].lower()
         options["fix_texture"] = wanted.unwrap or (wanted.materials and b"texturefile" in header)
-    instances = threemf.instances(data) if kind == "3mf" else None
     with warnings.catch_warnings():  # after which Python says again what it said before, so not for a glTF
         # Where a text stops being numbers, NumPy drops the rest and only warns.
         warnings.filterwarnings("error", message="string or file could not be read", category=DeprecationWarning)
@@ -111,18 +114,18 @@ def _read_plain(data: bytes, kind: str, source: Source) -> Model:
             raise Fault(f"expected texture coordinates for its texture {next(iter(folder.contents))!r}, got none")
     if kind == "obj" and "geometry" in loaded:
         loaded["geometry"] = dict(reversed(loaded["geometry"].items()))  # trimesh turns their order round
-    if instances is not None and instances != len(loaded["graph"]):
-        raise Fault(
-            f"expected {instances} instances of objects, and {len(loaded['graph'])} could be read: components are nested "
-            "too often, or refer to objects that are not there; export it flat"
-        )
+    return Model(_parts(place(loaded), _plain_look(source)), [])
+
+
+def _plain_look(source: Source) -> Callable[[str, dict[str, Any], np.ndarray], dict[str, Any]]:
+    """What look() of _parts() is in all formats but glTF."""
     materials = obj.Materials()
 
     def look(name: str, raw: dict[str, Any], origin: np.ndarray) -> dict[str, object]:
         found = _look(raw, origin, source)
-        return found | _lit(raw, source, materials, has_uvs=found["uvs"] is not None) if wanted.lit else found
+        return found | _lit(raw, source, materials, has_uvs=found["uvs"] is not None) if source.wanted.lit else found
 
-    return Model(_parts(loaded, look), [])
+    return look
 
 
 def _load(data: bytes, kind: str, source: Source, **options: object) -> dict[str, Any]:
@@ -132,9 +135,12 @@ def _load(data: bytes, kind: str, source: Source, **options: object) -> dict[str
     return loader(file_obj=io.BytesIO(data), resolver=source.folder, **options)
 
 
-def _parts(loaded: dict[str, Any], look: Callable[[str, dict[str, Any], np.ndarray], dict[str, Any]]) -> list[Part]:
+def _parts(
+    placed: list[tuple[str, dict[str, Any], np.ndarray]],
+    look: Callable[[str, dict[str, Any], np.ndarray], dict[str, Any]],
+) -> list[Part]:
     """Parts in their places, with the fields that look() gives by name, arrays and the face that each triangle came from."""
-    placed = [p for p in place(loaded) if len(p[1].get("faces", ()))]  # the others: points and lines
+    placed = [p for p in placed if len(p[1].get("faces", ()))]  # the others: points and lines
     parts = []
     for name, raw, matrix in placed:
         try:

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from ...scene.material import Material, Texture
-from .gltf import GLOSS, MATT, READ
-from .gltf_texture import Lookup, Place, coordinates
+from .gltf import GLOSS, MATT, entry
+from .gltf_arrays import Geometry
+from .gltf_texture import Images, Lookup, Place
 from .part import Fault
 from .source import Source, linear_colors
 
@@ -21,15 +22,29 @@ RAMP = torch.tensor([[0.0, 1.0]])  # alpha that is looked up where it is known
 class Primitive(NamedTuple):
     """A primitive of a file."""
 
-    tree: dict[str, Any]
-    given: dict[str, Any]  # as the file has it
-    raw: dict[str, Any]  # as trimesh has it
+    geometry: Geometry
+    positions: np.ndarray  # (N, 3)
+    triangles: np.ndarray  # (F, 3)
+    images: Images
     source: Source
+
+    @classmethod
+    def of(cls, geometry: Geometry, images: Images, source: Source) -> Primitive:
+        """Raises Fault or FileNotFoundError."""
+        positions = geometry.attribute("POSITION")
+        if positions is None:
+            raise Fault("expected the attribute POSITION, got none; export it again")
+        return cls(geometry, positions, geometry.triangles(), images, source)
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """As the file has it."""
+        return self.geometry.given
 
     @property
     def material(self) -> dict[str, Any]:
         """Without one, that of glTF: white, and a rough metal where it is lit."""
-        return self.tree["materials"][self.given["material"]] if "material" in self.given else {}
+        return entry(self.geometry.arrays.tree, "materials", self.given["material"]) if "material" in self.given else {}
 
     @property
     def base(self) -> dict[str, Any]:
@@ -43,39 +58,35 @@ class Primitive(NamedTuple):
     def lookup(self, field: str, within: dict[str, Any] | None = None) -> Lookup | None:
         """The texture of a field of the material."""
         reference = (self.material if within is None else within).get(field)
-        return None if reference is None else Lookup.of(self.tree, field, reference, self.raw, self.source)
+        return None if reference is None else Lookup.of(self.images, reference)
 
     def colors(self) -> Tensor | None:
         """(N, 3) of the vertices."""
-        values = self._color_values
+        values = self.geometry.attribute("COLOR_0")
         return None if values is None else linear_colors("vertex", values, srgb=False)
 
     def opacities(self) -> Tensor | None:
         """(N,) float32, the fourth number of the vertices' colours, if there is one. Raises Fault."""
-        values = self._color_values
+        values = self.geometry.attribute("COLOR_0")
         if values is None or values.shape[1] < 4:
             return None
-        alpha = values[:, 3] / (np.iinfo(values.dtype).max if values.dtype.kind in "iu" else 1.0)
+        alpha = values[:, 3]
         good = (alpha >= 0.0) & (alpha <= 1.0)
         if not good.all():
             bad = int(np.argwhere(~good)[0, 0])
             raise Fault(f"expected alpha of COLOR_0 from 0 to 1, got {alpha[bad]} at vertex {bad}; repair it")
-        return torch.from_numpy(alpha).float()
-
-    @property
-    def _color_values(self) -> np.ndarray | None:
-        if "COLOR_0" not in self.given["attributes"]:
-            return None
-        visual = self.raw.get("visual")
-        return np.asarray(self.raw["vertex_colors"] if visual is None else visual.vertex_attributes["color"])
+        return torch.from_numpy(np.array(alpha)).float()
 
     def uvs(self, place: Place, needed_by: str | None = None) -> np.ndarray | None:
         """(N, 2) float32, v running up. Raises Fault where something needs what is not there."""
-        own = coordinates(self.raw, place.set)
+        own = self.geometry.attribute(f"TEXCOORD_{place.set}")
         if own is None and needed_by is not None:
             raise Fault(
                 f"expected texture coordinates TEXCOORD_{place.set} for the texture of {needed_by}, got none; unwrap the mesh"
             )
+        if own is not None and own.shape != (len(self.positions), 2):
+            got = f"shape {own.shape}"
+            raise Fault(f"expected TEXCOORD_{place.set} for {len(self.positions)} vertices, got {got}; repair it")
         return None if own is None else place.moved(own)
 
 
@@ -88,7 +99,7 @@ def look(primitive: Primitive, known: dict[object, tuple[Material, dict[str, Pla
     found: dict[str, object] = {"uvs": primitive.uvs(Place()), "colors": colors}
     lit = wanted.lit and not ("KHR_materials_unlit" in material.get("extensions", {}) and wanted.materials)
     if lit:
-        found["normals"] = primitive.raw.get("vertex_normals")
+        found["normals"] = primitive.geometry.attribute("NORMAL")
     if not wanted.materials:
         return {**found, "material": known.setdefault(None, (Material(), {}))[0] if lit else None}
     if "material" not in primitive.given and not lit:
@@ -110,6 +121,8 @@ def _alpha(primitive: Primitive, texture: Lookup | None) -> dict[str, object]:
     """What is cut out or seen through: by the texture's alpha, or by that of the vertices, times the factor's."""
     material, source = primitive.material, primitive.source
     mode, cutoff = material.get("alphaMode", "OPAQUE"), float(material.get("alphaCutoff", 0.5))
+    if mode not in ("OPAQUE", "MASK", "BLEND"):
+        raise Fault(f"expected alphaMode OPAQUE, MASK or BLEND, got {mode!r}; export it again")
     blended = mode == "BLEND" and source.wanted.lit
     if mode != "MASK" and not blended:
         return {}
@@ -120,7 +133,7 @@ def _alpha(primitive: Primitive, texture: Lookup | None) -> dict[str, object]:
     own = None if texture is None else source.textures.alpha(texture.image, opacity)
     everywhere = blended and own is None and of_vertices is None
     if everywhere or (opacity < cutoff and not blended):  # the same, or cut out, whatever else there is
-        uvs = np.zeros((len(primitive.raw["vertices"]), 2), np.float32)
+        uvs = np.zeros((len(primitive.positions), 2), np.float32)
         return {"cutoff": cutoff, "alpha": torch.full((1, 1), opacity), "uvs": uvs}
     if of_vertices is None:
         return {"cutoff": cutoff, "alpha": own}
@@ -140,7 +153,7 @@ def _unlit(primitive: Primitive, texture: Lookup | None, colors: Tensor | None) 
     if texture is None:
         if colors is not None:
             return {"colors": colors * colors.new_tensor(factor)}
-        return {"face_colors": torch.tensor(factor, dtype=torch.float32).repeat(len(primitive.raw["faces"]), 1)}
+        return {"face_colors": torch.tensor(factor, dtype=torch.float32).repeat(len(primitive.triangles), 1)}
     if colors is not None:
         if not bool((colors == colors[0]).all()):
             lit = "" if primitive.source.wanted.lit else "lit=True, which multiplies them, or "
@@ -174,8 +187,8 @@ def _material(primitive: Primitive) -> tuple[Material, dict[str, Place]]:
     given, base, source = primitive.material, primitive.base, primitive.source
     extensions = given.get("extensions", {})
     matt = extensions.get(MATT, {}).get("specularFactor") == 0 and base.get("metallicFactor") == 0
-    for name in sorted(set(extensions) - READ - ({MATT} if matt else set())):
-        source.unsupported.note(name)
+    if MATT in extensions and not matt:
+        source.unsupported.note(MATT)
     places: dict[str, Place] = {}
 
     def textured(name: str, lookup: Lookup, image: Tensor, factor: Tensor | float | None = None) -> Texture:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,26 +13,51 @@ import torch
 from ...camera.camera import Camera
 from ...optional import require
 from ...scene.lights import DirectionalLight, Light, PointLight, SpotLight
+from .gltf import PUNCTUAL, VISIBILITY, entry
 from .part import Fault
 from .source import Source
 
-PUNCTUAL = "KHR_lights_punctual"
 INSTEAD_OF_RANGE = "light falls off with the square of the distance, without an end"
 
 
-def placed(tree: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """The nodes of the scene with their matrices (4, 4) to the world. Raises Fault where they are no tree."""
-    nodes, scenes = tree.get("nodes", []), tree.get("scenes", [])
-    waiting = [(root, np.eye(4)) for root in scenes[tree.get("scene", 0)].get("nodes", [])] if scenes else []
+class Placed(NamedTuple):
+    """A node of the scene in its place."""
+
+    node: dict[str, Any]
+    world: np.ndarray  # (4, 4), to the world
+    visible: bool  # it and all nodes above it (KHR_node_visibility)
+
+    @property
+    def of_mesh(self) -> np.ndarray:
+        """(4, 4) of the node's mesh: one with a skin stands where its joints do (glTF 2.0, section 3.7.3.3)."""
+        return np.eye(4) if "skin" in self.node else self.world
+
+
+def placed(tree: dict[str, Any]) -> Iterator[Placed]:
+    """The nodes of the scene, each before those below it; without scenes, of all nodes. Raises Fault where they are no tree."""
+    if tree.get("scenes"):
+        roots = entry(tree, "scenes", tree.get("scene", 0)).get("nodes", [])
+    else:
+        below = {child for node in tree.get("nodes", []) for child in node.get("children", [])}
+        roots = [index for index in range(len(tree.get("nodes", []))) if index not in below]
+    waiting = [(root, np.eye(4), True) for root in reversed(roots)]
     seen: set[int] = set()
     while waiting:
-        index, above = waiting.pop(0)
+        index, above, visible = waiting.pop()
         if index in seen:
             raise Fault("expected a tree of nodes, got some inside two others; export it again")
         seen.add(index)
-        world = above @ _matrix(nodes[index])
-        yield nodes[index], world
-        waiting[:0] = [(child, world) for child in nodes[index].get("children", [])]
+        node = entry(tree, "nodes", index)
+        found = Placed(node, above @ _matrix(node), visible and _is_visible(node))
+        yield found
+        waiting += [(child, found.world, found.visible) for child in reversed(node.get("children", []))]
+
+
+def _is_visible(node: dict[str, Any]) -> bool:
+    visible = node.get("extensions", {}).get(VISIBILITY, {}).get("visible", True)
+    if not isinstance(visible, bool):
+        raise Fault(f"expected true or false for visible of {VISIBILITY}, got {visible!r}; export it again")
+    return visible
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:
@@ -47,15 +72,15 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
 
 
 def lights(tree: dict[str, Any], source: Source) -> list[Light]:
-    """Those of KHR_lights_punctual. Scales of nodes change where they are, and nothing else of them. Raises Fault."""
-    given = tree.get("extensions", {}).get(PUNCTUAL, {}).get("lights", [])
+    """Those of KHR_lights_punctual at visible nodes. Scales of nodes change where they are, and nothing else of them. Raises
+    Fault."""
     found = []
-    for node, world in placed(tree):
+    for node, world, visible in placed(tree):
         reference = node.get("extensions", {}).get(PUNCTUAL)
-        if reference is not None:
-            light = given[reference["light"]]
+        if reference is not None and visible:
+            light = entry(tree.get("extensions", {}).get(PUNCTUAL, {}), "lights", reference["light"])
             try:
-                found.append(_light(light, world))
+                found.append(_light(light, world, source))
             except (TypeError, ValueError) as error:
                 raise Fault(f"light {str(light.get('name', reference['light']))[:60]!r}: {error}") from error
             if "range" in light:
@@ -63,31 +88,47 @@ def lights(tree: dict[str, Any], source: Source) -> list[Light]:
     return found
 
 
-def _light(given: dict[str, Any], world: np.ndarray) -> Light:
+def _light(given: dict[str, Any], world: np.ndarray, source: Source) -> Light:
     position, direction = (torch.tensor(v, dtype=torch.float32) for v in (world[:3, 3], -world[:3, 2]))
     intensity = float(given.get("intensity", 1.0))
     color = torch.tensor([float(c) for c in given["color"]]) if "color" in given else torch.ones(3)
-    kind, cone = given.get("type"), given.get("spot", {})
+    kind = given.get("type")
     if kind == "directional":
         return DirectionalLight(direction, intensity, color)
     if kind == "point":
         return PointLight(position, intensity, color)
     if kind == "spot":
-        inner, outer = float(cone.get("innerConeAngle", 0.0)), float(cone.get("outerConeAngle", math.pi / 4))
-        return SpotLight(position, direction, intensity, color, inner, outer)
+        return SpotLight(position, direction, intensity, color, *_cone(given, source))
     raise Fault(f"expected a light of type directional, point or spot, got {kind!r}; export it again")
+
+
+def _cone(light: dict[str, Any], source: Source) -> tuple[float, float]:
+    """The inner and outer angle of a spot light. Where they are not 0 ≤ inner < outer ≤ π/2, as the extension wants them, they
+    become so: the cosines differ by 0.001 at least, as in the formula of its text."""
+    given = light.get("spot", {})
+    inner, outer = float(given.get("innerConeAngle", 0.0)), float(given.get("outerConeAngle", math.pi / 4))
+    if 0.0 <= inner < outer <= math.pi / 2 or not 0.0 < outer < math.inf or not math.isfinite(inner):
+        return inner, outer  # what is no angle at all, SpotLight refuses
+    end = min(outer, math.pi / 2)
+    start = min(max(inner, 0.0), math.acos(min(math.cos(end) + 1e-3, 1.0)))
+    name = str(light.get("name", "without a name"))[:60]
+    source.unsupported.note(
+        f"spot light {name!r} with innerConeAngle {inner:.6g} and outerConeAngle {outer:.6g}",
+        f"shown with {start:.6g} and {end:.6g}",
+    )
+    return start, end
 
 
 def cameras(tree: dict[str, Any], size: tuple[int, int], dtype: torch.dtype) -> dict[str, Camera]:
     """By the names of their nodes and in their order, (H, W) pixels, which are square: of aspectRatio, yfov and ymag these give
     the height. Raises Fault, or ValueError about the size."""
     found: dict[str, Camera] = {}
-    for node, world in placed(tree):
+    for node, world, _ in placed(tree):  # also where nothing else of it is visible
         if "camera" not in node:
             continue
         name = str(node.get("name", f"camera {len(found)}"))
         name = f"{name} ({len(found)})" if name in found else name
-        given = tree["cameras"][node["camera"]]
+        given = entry(tree, "cameras", node["camera"])
         length = np.linalg.norm(world[:3, :3], axis=0)  # a camera has no scale
         pose = torch.tensor(world, dtype=dtype)
         pose[:3, :3] /= torch.tensor(np.where(length > 0.0, length, 1.0))

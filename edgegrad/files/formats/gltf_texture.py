@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .gltf import entry
+from .gltf_arrays import Arrays, content
 from .part import Fault
-from .source import Source, no_image
+from .source import opened
 
 # What a glTF calls its samplers' settings.
 WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
@@ -54,6 +56,33 @@ class Place(NamedTuple):
         return np.stack([moved[:, 0], 1.0 - moved[:, 1]], 1).astype(np.float32)
 
 
+class Images:
+    """The images of a file, each opened once. Raises Fault or FileNotFoundError, which name the image."""
+
+    def __init__(self, arrays: Arrays) -> None:
+        self.arrays = arrays
+        self.known: dict[int, Any] = {}
+
+    def get(self, texture: int) -> tuple[str, Any]:
+        """Its name, and an image of Pillow, of a texture by its number."""
+        given = entry(self.arrays.tree, "textures", texture)
+        extensions = given.get("extensions", {})
+        source = extensions.get("EXT_texture_webp", {}).get("source", given.get("source"))
+        if source is None:
+            name = str(given.get("name", texture))[:60]
+            held = f"none but in the extension {', '.join(sorted(extensions))}" if extensions else "none"
+            raise Fault(
+                f"expected a source, which is an image, in the texture {name!r}, got {held}; save it as PNG or JPEG"
+            )
+        described = entry(self.arrays.tree, "images", source)
+        uri = described.get("uri", "data:")
+        name = str(described.get("name") or (f"image {source}" if uri.startswith("data:") else uri))[:60]
+        if source not in self.known:
+            held = self.arrays.view(described["bufferView"]) if "bufferView" in described else None
+            self.known[source] = opened(name, content(uri, self.arrays.folder) if held is None else bytes(held))
+        return name, self.known[source]
+
+
 class Lookup(NamedTuple):
     """A texture as a material refers to it."""
 
@@ -65,22 +94,16 @@ class Lookup(NamedTuple):
     filter: str  # that of a Texture, which has mipmaps too
 
     @classmethod
-    def of(
-        cls, tree: dict[str, Any], field: str, reference: dict[str, Any], raw: dict[str, Any], source: Source
-    ) -> Lookup:
-        """A texture by the field of the material that refers to it. Raises Fault or FileNotFoundError."""
-        texture = tree["textures"][reference["index"]]
-        described = tree["images"][texture.get("source", 0)]
-        name = str(described.get("name") or described.get("uri") or field)[:60]
-        image = getattr(raw["visual"].material, field)
-        if image is None:
-            raise source.folder.failures.get(described.get("uri", ""), no_image(name))
-        return cls(name, image, Place.of(reference), *_sampler(tree, texture, name))
+    def of(cls, images: Images, reference: dict[str, Any]) -> Lookup:
+        """A texture by what a material says of it. Raises Fault or FileNotFoundError."""
+        tree, index = images.arrays.tree, reference["index"]
+        name, image = images.get(index)
+        return cls(name, image, Place.of(reference), *_sampler(tree, tree["textures"][index], name))
 
 
 def _sampler(tree: dict[str, Any], texture: dict[str, Any], name: str) -> tuple[tuple[str, str], str, str]:
     """Wraps, and the filters near and far. Where a file leaves the latter open, it is a mipmap."""
-    given = tree["samplers"][texture["sampler"]] if "sampler" in texture else {}
+    given = entry(tree, "samplers", texture["sampler"]) if "sampler" in texture else {}
     wraps, near, far = [given.get(k, 10497) for k in ("wrapS", "wrapT")], given.get("magFilter"), given.get("minFilter")
     if any(w not in WRAPS for w in wraps) or near not in (None, NEAREST, LINEAR) or far not in FARTHER:
         raise Fault(
@@ -89,16 +112,3 @@ def _sampler(tree: dict[str, Any], texture: dict[str, Any], name: str) -> tuple[
         )
     wrap = WRAPS[wraps[0]], WRAPS[wraps[1]]
     return (wrap, "nearest", "nearest") if near == NEAREST else (wrap, "linear", FARTHER[far])
-
-
-def coordinates(raw: dict[str, Any], which: int) -> np.ndarray | None:
-    """(N, 2) texture coordinates of a set, v running down; None where there are none."""
-    values = raw.get("vertex_attributes", {}).get(f"_TEXCOORD_{which}")
-    if values is None:
-        return None
-    values = np.asarray(values)
-    if values.shape != (len(raw["vertices"]), 2):
-        raise Fault(
-            f"expected TEXCOORD_{which} for {len(raw['vertices'])} vertices, got shape {values.shape}; repair it"
-        )
-    return values / np.float32(np.iinfo(values.dtype).max) if values.dtype.kind in "iu" else values

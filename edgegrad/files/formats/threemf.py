@@ -1,56 +1,243 @@
-"""What trimesh passes over without a word in 3MF files."""
+"""3MF packages: the objects of their model parts wherever the build places them, with their colours."""
 
 from __future__ import annotations
 
 import io
+import re
 import zipfile
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+from urllib.parse import unquote
+
+import numpy as np
 
 from ...optional import require
 from .part import Fault
+from .source import Source
+from .threemf_unread import CORE, MATERIAL, NEEDED, PATH, note_unread
 
-MOST_INSTANCES = 100_000  # of the parts of a file: nested components multiply
+MOST_INSTANCES = 100_000  # of the objects of a file: nested components multiply
+MOST_NESTED = 64
+UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
+# No entity, other file or address is looked at, and trees are of bounded depth.
+SAFE = {"resolve_entities": False, "no_network": True, "load_dtd": False, "huge_tree": False}
 
 
-def instances(data: bytes) -> int:
-    """How many parts a 3MF places. trimesh gives up without a word where many components are nested, and leaves out those that
-    are not defined. Raises Fault, also for an archive that would fill the memory and for XML that names other files."""
-    etree = require("lxml.etree", "edgegrad[files]", "reading 3MF")
-    require("networkx", "edgegrad[files]", "reading 3MF")
-    safe = require("trimesh.exchange.common", "trimesh", "reading meshes").XML_PARSER_OPTIONS
+class Reference(NamedTuple):
+    """An object where an item of the build, or a component, places it."""
+
+    part: str  # of the package, by its name there
+    id: str
+    matrix: np.ndarray  # (4, 4)
+
+
+class Object(NamedTuple):
+    """Triangles or components."""
+
+    name: str
+    arrays: dict[str, np.ndarray]  # `vertices`, `faces`, and `face_colors` or `vertex_colors` of 8-bit sRGB
+    components: list[Reference]
+
+
+class ModelPart(NamedTuple):
+    """A model part of a package."""
+
+    unit: float  # m
+    objects: dict[str, Object]
+    items: list[Reference]
+
+
+def instances(data: bytes, source: Source) -> list[tuple[str, dict[str, Any], np.ndarray]]:
+    """(name, arrays, matrix to the space of the build) of each mesh wherever it is placed, in the order of the build.
+
+    Raises Fault, also for an archive that would fill the memory and for XML that names other files.
+    """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         size = sum(member.file_size for member in archive.infolist())  # no reader goes beyond
         if size > max(100 * len(data), 64_000_000):
             raise Fault(
                 f"expected an archive that grows up to 100 times, got {size} bytes in {len(data)}; export it again"
             )
-        for member in archive.namelist():
-            if b"<!DOCTYPE" in archive.read(member).replace(b"\0", b""):  # without the zeros of UTF-16
-                raise Fault(
-                    f"expected XML without a DOCTYPE, which may name other files, got one in {member!r}; remove it"
-                )
-        name = next((name for name in archive.namelist() if "3d/3dmodel.model" in name.lower()), None)
-        if name is None:
+        package = _Package(archive, source)
+        root = package.root()
+        count = sum(package.count(item, ()) for item in package.part(root).items)
+        if count > MOST_INSTANCES:
+            raise Fault(f"expected at most {MOST_INSTANCES} instances of objects, got {count}; export it flat")
+        found: list[tuple[str, dict[str, Any], np.ndarray]] = []
+        for item in package.part(root).items:
+            package.place(item, root, np.eye(4), found)
+    return found
+
+
+class _Package:
+    def __init__(self, archive: zipfile.ZipFile, source: Source) -> None:
+        self.archive, self.source = archive, source
+        self.names = {name.lower().replace("\\", "/").lstrip("/"): name for name in archive.namelist()}
+        self.parts: dict[str, ModelPart] = {}
+        self.counts: dict[tuple[str, str], int] = {}
+
+    def root(self) -> str:
+        """The name of the part that says what is built."""
+        if "_rels/.rels" in self.names:
+            for relation in self._parsed("_rels/.rels").iter("{*}Relationship"):
+                if (
+                    relation.get("Type", "").endswith("/3dmodel")
+                    and (name := _name(relation.get("Target"))) in self.names
+                ):
+                    return name
+        found = next((name for name in self.names if "3d/3dmodel.model" in name), None)
+        if found is None:
             raise Fault("expected a 3MF file, got an archive without 3D/3dmodel.model; export it again")
-        model = io.BytesIO(archive.read(name))
-    components: dict[str, list[str]] = {}
-    items: list[str] = []
-    for _, element in etree.iterparse(model, tag=("{*}object", "{*}build"), **safe):
-        if element.tag.endswith("object"):
-            components[element.get("id")] = [child.get("objectid") for child in element.iter("{*}component")]
-        else:
-            items += [child.get("objectid") for child in element.iter("{*}item")]
-        element.clear()
-    counts: dict[str, int] = {}
+        return found
 
-    def leaves(index: str, above: tuple[str, ...]) -> int:
-        if index in above:
-            raise Fault(f"expected components inside one another, got object {index} inside itself; export it again")
-        if index not in counts:
-            inside = components.get(index, [])
-            counts[index] = sum(leaves(child, (*above, index)) for child in inside) if inside else 1
-        return counts[index]
+    def part(self, name: str) -> ModelPart:
+        if name not in self.parts:
+            if name not in self.names:
+                raise Fault(f"expected the model part {name!r}, got none; export it again")
+            root = self._parsed(name)
+            needed = [root.nsmap.get(p, p) for p in root.get("requiredextensions", "").split()]
+            if unknown := [uri for uri in needed if uri not in NEEDED]:
+                raise Fault(f"expected plain 3MF, got one that needs {', '.join(unknown)}; export it without")
+            note_unread(root, self.source)
+            self.parts[name] = _read_part(name, root, self.source)
+        return self.parts[name]
 
-    count = sum(leaves(index, ()) for index in items)
-    if count > MOST_INSTANCES:
-        raise Fault(f"expected at most {MOST_INSTANCES} instances of objects, got {count}; export it flat")
-    return count
+    def object(self, reference: Reference) -> Object:
+        found = self.part(reference.part).objects.get(reference.id)
+        if found is None:
+            raise Fault(
+                f"expected an object with the id {reference.id} in {reference.part!r}, got none; export it again"
+            )
+        return found
+
+    def count(self, reference: Reference, above: tuple[tuple[str, str], ...]) -> int:
+        """How many meshes a reference places."""
+        key = reference.part, reference.id
+        if key in above:
+            raise Fault(f"expected components inside one another, got object {key[1]} inside itself; export it again")
+        if len(above) > MOST_NESTED:
+            raise Fault(f"expected components nested up to {MOST_NESTED} times, got more; export it flat")
+        if key not in self.counts:
+            inside = self.object(reference).components
+            self.counts[key] = sum(self.count(one, (*above, key)) for one in inside) if inside else 1
+        return self.counts[key]
+
+    def place(self, reference: Reference, part: str, above: np.ndarray, found: list[Any]) -> None:
+        """Adds what a reference places, of a part whose matrix is given."""
+        world = above @ reference.matrix
+        if reference.part != part:
+            world = world @ np.diag([*[self.part(reference.part).unit / self.part(part).unit] * 3, 1.0])
+        shown = self.object(reference)
+        if len(shown.arrays["faces"]):
+            found.append((shown.name, shown.arrays, world))
+        for component in shown.components:
+            self.place(component, reference.part, world, found)
+
+    def _parsed(self, name: str) -> Any:
+        etree = require("lxml.etree", "edgegrad[files]", "reading 3MF")
+        content = self.archive.read(self.names[name])
+        if b"<!DOCTYPE" in content.replace(b"\0", b""):  # without the zeros of UTF-16
+            raise Fault(f"expected XML without a DOCTYPE, which may name other files, got one in {name!r}; remove it")
+        return etree.fromstring(content, etree.XMLParser(**SAFE))
+
+
+def _name(path: str) -> str:
+    """Of a part, by a path from the root of the package; case does not matter."""
+    return unquote(path).lower().lstrip("/")
+
+
+def _read_part(name: str, root: Any, source: Source) -> ModelPart:
+    if root.tag != f"{{{CORE}}}model":
+        raise Fault(f"expected a model of 3MF in {name!r}, got {root.tag!r}; export it again")
+    unit = root.get("unit", "millimeter")
+    if unit not in UNITS:
+        raise Fault(f"expected a unit of 3MF ({', '.join(UNITS)}), got {unit!r}; export it again")
+    groups = root.iter(f"{{{CORE}}}basematerials", f"{{{MATERIAL}}}colorgroup") if source.wanted.materials else ()
+    palettes = {group.get("id"): [_color(child) for child in group.iterchildren("{*}*")] for group in groups}
+    objects: dict[str, Object] = {}
+    for given in _core(root, "object"):
+        if objects.setdefault(given.attrib["id"], found := _object(given, name, palettes, source)) is not found:
+            raise Fault(f"expected an id for each object, got {given.get('id')!r} for two in {name!r}; export it again")
+    return ModelPart(UNITS[unit], objects, [_reference(item, name) for item in _core(root, "item")])
+
+
+def _core(within: Any, name: str) -> Iterator[Any]:
+    """Elements of the format itself; extensions may call theirs the same."""
+    return within.iter(f"{{{CORE}}}{name}")
+
+
+def _reference(given: Any, part: str) -> Reference:
+    numbers = given.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
+    if len(numbers) != 12:
+        raise Fault(f"expected 12 numbers for a transform, got {len(numbers)}; export it again")
+    matrix = np.eye(4)
+    matrix[:3] = np.array(numbers, np.float64).reshape(4, 3).T
+    return Reference(_name(given.get(PATH, part)), given.attrib["objectid"], matrix)
+
+
+def _object(given: Any, part: str, palettes: dict[str, list[tuple[int, ...]]], source: Source) -> Object:
+    corners = [f"{v.attrib['x']} {v.attrib['y']} {v.attrib['z']}" for v in _core(given, "vertex")]
+    faces = [f"{t.attrib['v1']} {t.attrib['v2']} {t.attrib['v3']}" for t in _core(given, "triangle")]
+    return Object(
+        given.get("name") or f"object {given.get('id')}",
+        _arrays(_numbers(corners, np.float64), _numbers(faces, np.int64), _colors(given, palettes, source)),
+        [_reference(component, part) for component in _core(given, "component")],
+    )
+
+
+def _numbers(rows: list[str], dtype: type) -> np.ndarray:
+    """(len(rows), 3). As one text, for a call for each number takes three times as long. Raises ValueError."""
+    flat = np.fromstring(" ".join(rows), dtype, sep=" ")
+    if len(flat) != 3 * len(rows):  # it ends at the first that is none
+        raise ValueError(f"{rows[len(flat) // 3]!r} is no three numbers")
+    return flat.reshape(-1, 3)
+
+
+def _colors(given: Any, palettes: dict[str, list[tuple[int, ...]]], source: Source) -> np.ndarray | None:
+    """Of the corners of triangles, by their own properties or those of the object; None where none has one that is read."""
+    own = given.get("pid"), given.get("pindex"), None, None
+    white, found, plain = (255,) * 4, [], 0
+    for triangle in _core(given, "triangle") if palettes else ():
+        pid, first, second, third = own
+        if triangle.get("p1") is not None:
+            pid, first = triangle.get("pid", pid), triangle.get("p1")
+            second, third = triangle.get("p2"), triangle.get("p3")
+        if pid not in palettes or first is None:
+            plain += 1
+            found.append((white,) * 3)
+            continue
+        indices = [int(first if index is None else index) for index in (first, second, third)]
+        if not all(0 <= index < len(palettes[pid]) for index in indices):
+            raise Fault(
+                f"expected colours from 0 to {len(palettes[pid]) - 1} of group {pid}, got {indices}; export it again"
+            )
+        found.append(tuple(palettes[pid][index] for index in indices))
+    if plain == len(found):
+        return None
+    if plain:
+        source.unsupported.note("triangles without a colour beside others with one", "white")
+    colors = np.array(found, np.uint8)
+    if (colors[..., 3] < 255).any():
+        source.unsupported.note("alpha of colours")
+    return colors
+
+
+def _color(given: Any) -> tuple[int, ...]:
+    """8-bit sRGB and alpha from #RRGGBB or #RRGGBBAA."""
+    text = given.get("color") or given.get("displaycolor", "")
+    if not re.fullmatch("#([0-9a-fA-F]{2}){3,4}", text):
+        raise Fault(f"expected a colour as #RRGGBB or #RRGGBBAA, got {text!r}; export it again")
+    return tuple(bytes.fromhex(f"{text[1:]}FF"[:8]))
+
+
+def _arrays(vertices: np.ndarray, faces: np.ndarray, colors: np.ndarray | None) -> dict[str, np.ndarray]:
+    """colors   (F, 3, 4), of corners; where those of a face differ, vertices are split"""
+    if colors is None:
+        return {"vertices": vertices, "faces": faces}
+    if bool((colors == colors[:, :1]).all()):
+        return {"vertices": vertices, "faces": faces, "face_colors": colors[:, 0]}
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        bad = faces.min() if faces.min() < 0 else faces.max()
+        raise Fault(f"expected vertex indices from 0 to {len(vertices) - 1}, got {bad}; repair the mesh")
+    apart = np.arange(faces.size).reshape(-1, 3)
+    return {"vertices": vertices[faces.reshape(-1)], "faces": apart, "vertex_colors": colors.reshape(-1, 4)}

@@ -1,0 +1,185 @@
+"""The numbers of glTF files: buffers, accessors, and the attributes and triangles of primitives."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+from urllib.parse import unquote_to_bytes
+
+import numpy as np
+
+from ...optional import require
+from .gltf import DRACO, QUANTIZED, READ, File, entry
+from .part import Fault
+from .source import Folder
+
+MOST_ZEROS = 1 << 24  # rows that a glTF may ask for without holding them
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+STRIP, FAN, TRIANGLES = 5, 6, 4
+
+
+class Arrays:
+    """The accessors of a file. Raises Fault or FileNotFoundError where one is asked for that is not there in full."""
+
+    def __init__(self, file: File, folder: Folder) -> None:
+        self.tree, self.chunk, self.folder = file.tree, file.chunk, folder
+        self.buffers: dict[int, bytes] = {}
+        self.known: dict[int, np.ndarray] = {}
+        empty = [accessor for accessor in self.tree.get("accessors", []) if "bufferView" not in accessor]
+        zeros = sum(max(accessor["count"], 0) for accessor in empty)
+        if zeros > MOST_ZEROS:
+            raise Fault(f"expected accessors with data, got some without that would fill {zeros} rows; export it plain")
+
+    def get(self, index: Any) -> np.ndarray:
+        """(count, K) in the type of the file, normalised or not. Without a view of a buffer these are zeros, beneath those that
+        are given one by one."""
+        accessor = entry(self.tree, "accessors", index)
+        if index not in self.known:
+            count, kind = accessor["count"], accessor["type"]
+            if not isinstance(count, int) or count < 1 or kind not in COLUMNS:
+                raise Fault(
+                    f"expected accessors of 1 to 4 numbers a row, got {count!r} rows of {kind!r}; export it again"
+                )
+            component, columns = accessor["componentType"], COLUMNS[kind]
+            if "bufferView" in accessor:
+                rows = self._rows(accessor, component, count, columns)
+            else:
+                rows = np.zeros((count, columns), _dtype(component))
+            if "sparse" in accessor:
+                rows, sparse = rows.copy(), accessor["sparse"]
+                where = self._rows(sparse["indices"], sparse["indices"]["componentType"], sparse["count"], 1)
+                rows[where[:, 0]] = self._rows(sparse["values"], component, sparse["count"], columns)
+            self.known[index] = rows
+        return self.known[index]
+
+    def view(self, index: Any) -> memoryview:
+        """The bytes of a view of a buffer."""
+        view = entry(self.tree, "bufferViews", index)
+        buffer = self._buffer(view["buffer"], set(view.get("extensions", {})) - READ)
+        start, size = view.get("byteOffset", 0), view["byteLength"]
+        if not 0 <= start <= start + size <= len(buffer):
+            raise ValueError(f"view {index} of {size} bytes at byte {start} of a buffer of {len(buffer)}")
+        return memoryview(buffer)[start : start + size]
+
+    def _rows(self, given: dict[str, Any], component: int, count: int, columns: int) -> np.ndarray:
+        dtype = _dtype(component)
+        stride = entry(self.tree, "bufferViews", given["bufferView"]).get("byteStride", columns * dtype.itemsize)
+        if stride < columns * dtype.itemsize:
+            raise ValueError(f"rows of {columns * dtype.itemsize} bytes, one every {stride}")
+        strides, start = (stride, dtype.itemsize), given.get("byteOffset", 0)
+        return np.ndarray((count, columns), dtype, self.view(given["bufferView"]), start, strides)
+
+    def _buffer(self, index: Any, extensions: set[str]) -> bytes:
+        """extensions   those of the view that asks for it"""
+        buffer = entry(self.tree, "buffers", index)
+        if index not in self.buffers:
+            if "uri" in buffer:
+                self.buffers[index] = content(buffer["uri"], self.folder)
+            elif index == 0 and self.chunk is not None:
+                self.buffers[index] = self.chunk
+            else:
+                held = sorted(extensions | set(buffer.get("extensions", {})) - READ)
+                where = f"the extension {', '.join(held)}, which is not read" if held else "no file"
+                raise Fault(f"expected the data of buffer {index}, got it in {where}; export it without compression")
+        return self.buffers[index]
+
+
+class Geometry:
+    """The attributes and triangles of a primitive."""
+
+    def __init__(self, arrays: Arrays, given: dict[str, Any]) -> None:
+        self.arrays, self.given = arrays, given
+        self.decoded = self._decoded()
+
+    def attribute(self, name: str) -> np.ndarray | None:
+        """(N, K) numbers, integers that the file calls normalised from −1 or 0 to 1; None without it. Raises Fault."""
+        index = self.given["attributes"].get(name)
+        if index is None:
+            return None
+        rows, accessor = self._get(index), self.arrays.tree["accessors"][index]
+        if rows.dtype.kind == "f":
+            return rows
+        tree = self.arrays.tree
+        quantized = QUANTIZED in tree.get("extensionsUsed", ()) or QUANTIZED in tree.get("extensionsRequired", ())
+        normalized = accessor.get("normalized", False) or name.startswith("COLOR_")  # which some writers do not say
+        if not quantized and not (normalized and name.startswith(("TEXCOORD_", "COLOR_"))):
+            raise Fault(f"expected {name} as floats, got integers without the extension {QUANTIZED}; export it plain")
+        if not normalized:
+            return rows.astype(np.float64)
+        return np.maximum(rows / np.float64(np.iinfo(rows.dtype).max), -1.0)
+
+    def triangles(self) -> np.ndarray:
+        """(F, 3) indices of vertices, from a list, strip or fan. Raises Fault."""
+        mode, index = self.given.get("mode", TRIANGLES), self.given.get("indices")
+        if DRACO in self.given.get("extensions", {}):
+            mode = TRIANGLES  # it holds no other
+        if index is None:
+            flat = np.arange(len(self._get(self.given["attributes"]["POSITION"])))
+        else:
+            given = self._get(index)
+            if given.dtype.kind != "u":
+                raise Fault(f"expected unsigned integers for indices, got {given.dtype}; export it again")
+            flat = given.reshape(-1).astype(np.int64)
+        if mode == TRIANGLES:
+            if len(flat) % 3:
+                raise Fault(f"expected three indices a triangle, got {len(flat)} in all; it is truncated or damaged")
+            return flat.reshape(-1, 3)
+        if len(flat) < 3:
+            return np.zeros((0, 3), np.int64)
+        if mode == FAN:
+            return np.stack([flat[1:-1], flat[2:], np.full(len(flat) - 2, flat[0])], 1)
+        first = np.arange(len(flat) - 2)
+        odd = first % 2
+        strip = np.stack([flat[first], flat[first + 1 + odd], flat[first + 2 - odd]], 1)
+        # Triangles with a corner twice only lead from one strip to the next.
+        return strip[(strip[:, 0] != strip[:, 1]) & (strip[:, 1] != strip[:, 2]) & (strip[:, 2] != strip[:, 0])]
+
+    def _get(self, index: Any) -> np.ndarray:
+        if index in self.decoded:
+            return self.decoded[index]
+        accessor, tree = entry(self.arrays.tree, "accessors", index), self.arrays.tree
+        held = ({*self.given.get("extensions", {})} | {*accessor.get("extensions", {})}) - READ
+        if index == self.given["attributes"].get("POSITION"):  # all in one point, they would be no shape
+            held |= {name for name in tree.get("extensionsUsed", ()) if name.endswith("compression")}
+        if held and "bufferView" not in accessor and "sparse" not in accessor:
+            listed = ", ".join(sorted(held))
+            raise Fault(f"expected accessors with data, got it in the extension {listed} alone; export it without")
+        return self.arrays.get(index)
+
+    def _decoded(self) -> dict[int, np.ndarray]:
+        """By accessor, what a compressed primitive holds. Raises Fault, or ImportError without the decoder."""
+        given = self.given.get("extensions", {}).get(DRACO)
+        if given is None:
+            return {}
+        require("DracoPy", "edgegrad[files]", f"reading glTF with {DRACO}")
+        decode = require("trimesh.exchange.gltf.extensions", "trimesh", "reading meshes").draco_decode
+        found: dict[int, np.ndarray] = {}
+        views = {given["bufferView"]: bytes(self.arrays.view(given["bufferView"]))}
+        decode({"data": given, "accessors": found, "views": views, "primitive": self.given})
+        for name in given["attributes"]:
+            index = self.given["attributes"][name]
+            accessor = entry(self.arrays.tree, "accessors", index)
+            announced, got = (accessor["count"], COLUMNS.get(accessor["type"])), np.shape(found.get(index, ()))
+            if got != announced:
+                raise Fault(f"expected {name} of shape {announced} in {DRACO}, got {got}; export it again")
+        if "indices" in self.given:
+            if self.given["indices"] not in found:
+                raise Fault(f"expected triangles in {DRACO}, got points; export it again")
+            found[self.given["indices"]] = np.reshape(found[self.given["indices"]], (-1, 1))
+        return found
+
+
+def content(uri: str, folder: Folder) -> bytes:
+    """The bytes of a URI: in itself, or in a file of the folder. Raises Fault or FileNotFoundError."""
+    if not uri.startswith("data:"):
+        return folder.get(uri)
+    head, _, text = uri.partition(",")
+    held = unquote_to_bytes(text)
+    return base64.b64decode(held) if head.endswith(";base64") else held
+
+
+def _dtype(component: Any) -> np.dtype:
+    if component not in COMPONENTS:
+        raise Fault(f"expected a componentType of glTF 2.0, got {component!r}; export it again")
+    return np.dtype(COMPONENTS[component])
