@@ -129,6 +129,79 @@ def test_transforms(tmp_path) -> None:
         agree(camera.project(POINTS) - 0.5, torch.from_numpy(theirs[:, 0]), 1e-8)
 
 
+LENS = {"fl_x": 60, "fl_y": 55, "w": W, "h": H}
+
+
+@pytest.mark.parametrize(
+    "frame, expected",
+    [
+        ({"camera_angle_x": 0.7}, {"fx": 0.5 * W / np.tan(0.35), "fy": 0.5 * W / np.tan(0.35) * 55 / 60}),
+        ({"camera_angle_y": 0.7}, {"fx": 0.5 * H / np.tan(0.35) * 60 / 55, "fy": 0.5 * H / np.tan(0.35)}),
+        ({"camera_angle_x": 0.7, "camera_angle_y": 0.6}, {"fx": 0.5 * W / np.tan(0.35), "fy": 0.5 * H / np.tan(0.3)}),
+        ({"fl_x": 90}, {"fx": 90, "fy": 82.5}),
+        ({"fl_x": 90, "camera_angle_x": 0.7, "fl_y": 80}, {"fx": 90, "fy": 80}),
+        ({"cx": 20, "cy": 21.5}, {"cx": 20, "cy": 21.5}),
+        ({"w": 2 * W, "h": 3 * H}, {"size": (3 * H, 2 * W), "cx": W, "cy": 1.5 * H}),
+        ({"k1": 0.25}, {"distortion": [0.25, 0.02, 0, 0]}),
+        ({"camera_model": "OPENCV_FISHEYE"}, {"projection": "fisheye"}),
+        ({"is_fisheye": True}, {"projection": "fisheye"}),
+        ({"fl_x": None, "camera_angle_x": None, "w": None, "k1": None, "camera_model": None}, {}),
+    ],
+)
+def test_what_a_frame_says_goes_first(tmp_path, frame, expected) -> None:
+    file = transforms(tmp_path, frame, camera_model="OPENCV", k1=0.1, k2=0.02, k3=None, **LENS)
+    camera = eg.load_cameras(file, dtype=F64)["./train/r_0"].camera
+    found = {
+        "fx": float(camera.K[0, 0]), "fy": float(camera.K[1, 1]), "cx": float(camera.K[0, 2]), "cy": float(camera.K[1, 2]),
+        "size": camera.size, "projection": camera.projection, "distortion": camera.distortion.tolist(),
+    }  # fmt: skip
+    usual = {"fx": 60, "fy": 55, "cx": W / 2, "cy": H / 2, "size": SIZE, "projection": "perspective"}
+    for key, value in {**usual, "distortion": [0.1, 0.02, 0, 0], **expected}.items():
+        assert found[key] == (pytest.approx(value) if not isinstance(value, str) else value), key
+
+
+def test_frames_of_a_file_that_says_one_focal_length(tmp_path) -> None:
+    for shared, own, focals in (
+        ({"camera_angle_x": 0.7}, {"fl_x": 80}, (80, 80)),
+        ({"fl_x": 60}, {"fl_y": 70}, (60, 70)),
+        ({"fl_y": 60}, {"camera_angle_x": 2 * np.arctan(0.5)}, (W, 60)),
+    ):
+        K = eg.load_cameras(transforms(tmp_path, own, w=W, h=H, **shared), dtype=F64)["./train/r_0"].camera.K
+        assert (float(K[0, 0]), float(K[1, 1])) == pytest.approx(focals)
+
+
+def test_names_of_frames(tmp_path) -> None:
+    """Backslashes lead to the image, and of frames with one name none is lost."""
+    (tmp_path / "train").mkdir()
+    eg.write_image(tmp_path / "train" / "r_0.png", torch.zeros(*SIZE, 3))
+    file = transforms(tmp_path, {"file_path": ".\\train\\r_0"}, camera_angle_x=0.7)
+    ((name, view),) = eg.load_cameras(file).items()
+    assert name == ".\\train\\r_0" and view.image.samefile(tmp_path / "train" / "r_0.png") and view.camera.size == SIZE
+    fields = json.loads(file.read_text())
+    fields["frames"] = [{**fields["frames"][0], "fl_x": f} for f in (60, 70)]
+    file.write_text(json.dumps(fields))
+    views = eg.load_cameras(file, dtype=F64)
+    assert [float(view.camera.K[0, 0]) for view in views.values()] == [60, 70]
+
+
+def test_keys_that_nobody_reads_are_named(tmp_path) -> None:
+    harmless = {"aabb_scale": 16, "scale": 0.3, "offset": [0, 0, 0], "ply_file_path": "sparse.ply"}
+    eg.load_cameras(transforms(tmp_path, {"sharpness": 9.0, "colmap_im_id": 1}, **LENS, **harmless))
+    frame = {"mask_path": "m.png", "rolling_shutter": [0, 0, 0, 1], "time": None}
+    file = transforms(tmp_path, frame, **LENS, applied_transform=[[1, 0, 0, 0]], k7=3)
+    with pytest.warns(UserWarning) as caught:
+        eg.load_cameras(file)
+    (text,) = (str(warning.message) for warning in caught)
+    for part in (
+        "mask_path (left out; read_mask",
+        "rolling_shutter (left out)",
+        "k7 (",
+        "applied_transform (cameras stay",
+    ):
+        assert part in text
+    assert "time" not in text and str(file) in text
+
+
 @pytest.mark.parametrize(
     "fields, fault",
     [

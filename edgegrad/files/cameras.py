@@ -12,6 +12,7 @@ from ..camera.camera import Camera
 from ..check import check_positive_int
 from .formats import calibration, colmap, transforms
 from .formats.part import Fault, naming
+from .formats.source import Unsupported
 from .formats.views import View
 from .parts import GLTFS, read_cameras
 from .paths import PathLike, check_readable, check_suffix, replacing
@@ -100,7 +101,8 @@ def load_cameras(
     """The cameras of a file or folder by name, each with its image: `View(camera, image)`.
 
     - a folder with COLMAP's cameras and images, text or binary, or with sparse/0 in it; names are the images'
-    - transforms.json of NeRF, instant-ngp and nerfstudio; names are the frames' file_path
+    - transforms.json of NeRF, instant-ngp and nerfstudio; names are the frames' file_path. What a frame says goes before what the
+      file says of all, whatever the key: its camera_angle_x before the file's fl_x. Keys that are null count as absent
     - .yml, .yaml or .xml of OpenCV's calibration: camera_matrix, distortion_coefficients, image_width, image_height,
       fisheye_model and extrinsic_parameters, as its calibration program has them
     - .gltf and .glb; names are the nodes'
@@ -138,7 +140,10 @@ def load_cameras(
             return calibration.read(file, whole, dtype)
         fields = json.loads(file.read_text(encoding="utf-8"))
         if isinstance(fields, dict) and "frames" in fields:
-            return transforms.read(fields, file.parent, whole, dtype)
+            unread = Unsupported()
+            views = transforms.read(fields, file.parent, whole, dtype, unread)
+            unread.say(path)
+            return views
         camera = load_camera(path, dtype)
         return {str(i): View(one, None) for i, one in enumerate(camera if camera.batch is not None else [camera])}
 
