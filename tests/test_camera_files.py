@@ -1,4 +1,4 @@
-"""Cameras of COLMAP, NeRF, OpenCV and glTF files: where points land, by those libraries themselves where they are installed."""
+"""Cameras of COLMAP, NeRF and our own files: where points land, by those libraries themselves where they are installed."""
 
 from __future__ import annotations
 
@@ -221,45 +221,7 @@ def test_faults_of_transforms_are_named(tmp_path, fields, fault) -> None:
         eg.load_cameras(transforms(tmp_path, **fields))
 
 
-# -- OpenCV, glTF, our own --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("ending", ["yml", "xml"])
-@pytest.mark.parametrize("fisheye", [0, 1])
-def test_opencv(tmp_path, ending, fisheye) -> None:
-    file = tmp_path / f"calibration.{ending}"
-    distortion = np.array([[0.05, -0.02, 0.01, -0.015]])
-    rvec = cv2.Rodrigues(R.numpy())[0]
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    for key, value in {
-        "image_width": W, "image_height": H, "camera_matrix": K, "distortion_coefficients": distortion,
-        "fisheye_model": fisheye, "extrinsic_parameters": np.array([[*rvec[:, 0], *SHIFT], [0, 0, 0, 0, 0, 9.0]]),
-    }.items():  # fmt: skip
-        storage.write(key, value)
-    storage.release()
-    views = eg.load_cameras(file, dtype=F64)
-    assert list(views) == ["view 0", "view 1"] and views["view 0"].camera.size == SIZE
-    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
-    theirs, _ = project(POINTS.numpy()[:, None], rvec, SHIFT.numpy(), K, distortion[0])
-    agree(views["view 0"].camera.project(POINTS) - 0.5, torch.from_numpy(theirs[:, 0]), 1e-8)
-
-
-def test_opencv_faults(tmp_path) -> None:
-    file = tmp_path / "a.yml"
-    for text, fault in (
-        ("nothing of the kind", "a.yml: expected YAML or XML|camera_matrix: expected this key"),
-        ("%YAML:1.0\n---\ncamera_matrix: 3\n", "camera_matrix: expected a matrix"),
-        ("%YAML:1.0\n---\nother: 3\n", "camera_matrix: expected this key"),
-    ):
-        file.write_text(text)
-        with pytest.raises(ValueError, match=fault):
-            eg.load_cameras(file)
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    storage.write("K", K)
-    storage.release()
-    with pytest.raises(ValueError, match=r"image_width: .* pass size="):
-        eg.load_cameras(file)
-    assert eg.load_cameras(file, size=SIZE)["camera"].camera.size == SIZE
+# -- our own ---------------------------------------------------------------------------------------------------------------
 
 
 def test_our_own(tmp_path) -> None:

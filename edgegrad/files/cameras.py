@@ -104,7 +104,10 @@ def load_cameras(
     - transforms.json of NeRF, instant-ngp and nerfstudio; names are the frames' file_path. What a frame says goes before what the
       file says of all, whatever the key: its camera_angle_x before the file's fl_x. Keys that are null count as absent
     - .yml, .yaml or .xml of OpenCV's calibration: camera_matrix, distortion_coefficients, image_width, image_height,
-      fisheye_model and extrinsic_parameters, as its calibration program has them
+      fisheye_model and extrinsic_parameters, as its calibration program has them. A stereo pair by the names of its matrices,
+      "M1" and "M2": the first at the origin, the second by R and T, which may stand in extrinsics.yml beside intrinsics.yml
+    - .yaml of ROS (camera_info), by camera_name; and of Kalibr (camchain), pinhole with radtan or equidistant: "cam0", "cam1" …,
+      the first at the origin
     - .gltf and .glb; names are the nodes'
     - .json of save_camera; names are numbers
 
@@ -113,7 +116,8 @@ def load_cameras(
     dtype   of the cameras
 
     Stack those of one size by Camera.stack. Distorted lenses are mapped to this library's; where one cannot be, the error names
-    it. Raises FileNotFoundError, TypeError, ValueError that names the file, or ImportError without OpenCV (edgegrad[cameras]).
+    it. One warning names what a file says and nobody reads, but what cameras do not depend on. Raises FileNotFoundError, TypeError, ValueError that names the file, or ImportError without OpenCV or PyYAML
+    (edgegrad[cameras]).
     """
     folder = Path(path) if isinstance(path, (str, os.PathLike)) else None
     if folder is not None and folder.is_dir():
@@ -128,7 +132,7 @@ def load_cameras(
         with naming(path):
             return _some(colmap.read(place, None if images is None else Path(images), dtype))
     file = check_readable(path, (".json", *CALIBRATIONS, *GLTFS))
-    whole = None if size is None else _whole(size)
+    whole, unread = None if size is None else _whole(size), Unsupported()
     with naming(path):
         if file.suffix.lower() in GLTFS:
             if whole is None:
@@ -137,10 +141,11 @@ def load_cameras(
                 )
             return _some({name: View(camera, None) for name, camera in read_cameras(path, whole, dtype).items()})
         if file.suffix.lower() in CALIBRATIONS:
-            return calibration.read(file, whole, dtype)
+            views = calibration.read(file, whole, dtype, unread)
+            unread.say(path)
+            return views
         fields = json.loads(file.read_text(encoding="utf-8"))
         if isinstance(fields, dict) and "frames" in fields:
-            unread = Unsupported()
             views = transforms.read(fields, file.parent, whole, dtype, unread)
             unread.say(path)
             return views

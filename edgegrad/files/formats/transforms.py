@@ -11,6 +11,7 @@ import torch
 
 from ...camera.camera import Camera
 from ..image import IMAGES, read_size
+from .keys import note_unread
 from .part import Fault
 from .source import Unsupported
 from .views import View
@@ -55,20 +56,14 @@ def read(
         except (TypeError, ValueError, KeyError) as error:
             raise Fault(f"frames[{i}], {name}: {error}") from error
         views[name if name not in views else f"{name} (frame {i})"] = view
-        _note_unread(own, unread)
-    _note_unread(shared, unread)
+        note_unread(own, READ | HARMLESS, unread, INSTEAD)
+    note_unread(shared, READ | HARMLESS, unread, INSTEAD)
     return views
 
 
 def _given(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Without those that are null."""
     return {key: value for key, value in fields.items() if value is not None}
-
-
-def _note_unread(fields: Mapping[str, Any], unread: Unsupported) -> None:
-    for key in fields:
-        if key not in READ and key not in HARMLESS:
-            unread.note(key, INSTEAD.get(key, "left out"))
 
 
 def _image(folder: Path, name: str) -> Path | None:
@@ -139,10 +134,10 @@ def _focals(own: Mapping[str, Any], shared: Mapping[str, Any], pixels: tuple[int
     )
     if fx is None and fy is None:
         fx, fy = file_x, file_y
-    elif file_x and file_y:
-        fx, fy = fy * file_x / file_y if fx is None else fx, fx * file_y / file_x if fy is None else fy
-    else:
-        fx, fy = file_x if fx is None else fx, file_y if fy is None else fy
+    elif fx is None and fy is not None:
+        fx = fy * file_x / file_y if file_x and file_y else file_x
+    elif fy is None and fx is not None:
+        fy = fx * file_y / file_x if file_x and file_y else file_y
     fx, fy = fy if fx is None else fx, fx if fy is None else fy  # pixels are square
     if fx is None or fy is None:
         raise ValueError("fl_x: expected this key or camera_angle_x, got neither; export it again")
