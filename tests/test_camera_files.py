@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import random
+import shutil
 from pathlib import Path
 
 import cv2
@@ -40,6 +42,7 @@ def reconstruction(tmp_path: Path):
     return pycolmap, folder
 
 
+@pytest.mark.filterwarnings("ignore:.*1 of 2 images")
 @pytest.mark.parametrize("binary", [False, True])
 def test_colmap(reconstruction, tmp_path, binary) -> None:
     pycolmap, folder = reconstruction
@@ -74,6 +77,40 @@ def test_colmap_faults(reconstruction, tmp_path) -> None:
         eg.load_cameras(tmp_path / "images")
 
 
+def test_nothing_of_a_reconstruction_is_lost_without_a_word(reconstruction, tmp_path) -> None:
+    pycolmap, folder = reconstruction
+    (folder.parent / "1").mkdir()
+    for name in ("cameras.txt", "images.txt"):
+        (folder.parent / "1" / name).write_bytes((folder / name).read_bytes())
+    with pytest.warns(
+        UserWarning, match=r"1 of 2 images, as 'a\.png' \(no such file.*; sparse/1 \(a reconstruction of its own"
+    ):
+        eg.load_cameras(tmp_path)
+    with pytest.warns(UserWarning, match=r"2 of 2 images"):
+        eg.load_cameras(folder, images=folder)
+    text = (folder / "images.txt").read_text()
+    (folder / "images.txt").write_text(text.replace("\n\n", "\n"))
+    with pytest.raises(ValueError, match="image 1 is not followed by a line of its points"):
+        eg.load_cameras(folder)
+    (folder / "images.txt").write_text(text.replace("a.png", "b.png"))
+    with pytest.raises(ValueError, match=r"'b\.png': expected one image of this name, got two"):
+        eg.load_cameras(folder)
+    (folder / "images.txt").write_text(
+        text.replace("\n\n", "\n10.5 3 -1 7 8.25 12\n").replace("a.png", "Jos\u00e9.png"), "latin-1"
+    )
+    shutil.copy(tmp_path / "images" / "b.png", os.fsencode(tmp_path / "images") + b"/Jos\xe9.png")
+    assert all(view.image.is_file() for view in eg.load_cameras(folder).values())
+    binary = tmp_path / "binary"
+    binary.mkdir()
+    (folder / "images.txt").write_text(text)
+    pycolmap.Reconstruction(str(folder)).write_binary(str(binary))
+    with (binary / "cameras.bin").open("ab") as file:
+        file.write(b"more")
+    with pytest.warns(UserWarning, match=r"4 bytes at the end of cameras\.bin \(left out\)"):
+        eg.load_cameras(binary)
+
+
+@pytest.mark.filterwarnings("ignore:.*not all of it is read")
 def test_damaged_reconstructions_are_refused(reconstruction, tmp_path) -> None:
     pycolmap, folder = reconstruction
     theirs, whole = pycolmap.Reconstruction(str(folder)), tmp_path / "whole"

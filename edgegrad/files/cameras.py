@@ -18,6 +18,7 @@ from .parts import GLTFS, read_cameras
 from .paths import PathLike, check_readable, check_suffix, replacing
 
 CALIBRATIONS = (".yml", ".yaml", ".xml")
+UNREAD = "not all of it is read"
 
 
 def save_camera(path: PathLike, camera: Camera) -> None:
@@ -116,12 +117,12 @@ def load_cameras(
     dtype   of the cameras
 
     Stack those of one size by Camera.stack. Distorted lenses are mapped to this library's; where one cannot be, the error names
-    it. One warning names what a file says and nobody reads, but what cameras do not depend on. Raises FileNotFoundError, TypeError, ValueError that names the file, or ImportError without OpenCV or PyYAML
-    (edgegrad[cameras]).
+    it. One warning names what a file says and nobody reads, unless cameras do not depend on it. Raises FileNotFoundError,
+    TypeError, ValueError that names the file, or ImportError without OpenCV or PyYAML (edgegrad[cameras]).
     """
     folder = Path(path) if isinstance(path, (str, os.PathLike)) else None
     if folder is not None and folder.is_dir():
-        place = colmap.find(folder)
+        place, unread = colmap.find(folder), Unsupported()
         if place is None and (folder / "transforms.json").is_file():
             return load_cameras(folder / "transforms.json", size, images, dtype)
         if place is None:
@@ -130,7 +131,10 @@ def load_cameras(
                 "name the one that has them"
             )
         with naming(path):
-            return _some(colmap.read(place, None if images is None else Path(images), dtype))
+            views = _some(colmap.read(place, None if images is None else Path(images), dtype, unread))
+        colmap.note_others(folder, place, unread)
+        unread.say(path, UNREAD)
+        return views
     file = check_readable(path, (".json", *CALIBRATIONS, *GLTFS))
     whole, unread = None if size is None else _whole(size), Unsupported()
     with naming(path):
@@ -142,12 +146,12 @@ def load_cameras(
             return _some({name: View(camera, None) for name, camera in read_cameras(path, whole, dtype).items()})
         if file.suffix.lower() in CALIBRATIONS:
             views = calibration.read(file, whole, dtype, unread)
-            unread.say(path)
+            unread.say(path, UNREAD)
             return views
         fields = json.loads(file.read_text(encoding="utf-8"))
         if isinstance(fields, dict) and "frames" in fields:
             views = transforms.read(fields, file.parent, whole, dtype, unread)
-            unread.say(path)
+            unread.say(path, UNREAD)
             return views
         camera = load_camera(path, dtype)
         return {str(i): View(one, None) for i, one in enumerate(camera if camera.batch is not None else [camera])}
