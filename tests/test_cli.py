@@ -126,7 +126,10 @@ def test_a_failed_write_still_prints_the_pose(files, capsys, monkeypatch):
         (["mesh.ply", "target.png", "--init", "none.json"], "none.json: expected a file"),
         (["mesh.ply", "target.png", "--init", "bad.json"], "bad.json: pose: expected JSON"),
         (["mesh.ply", "target.png", "--mask", "small.png"], "small.png: expected 48 × 48 pixels like"),
-        (["mesh.ply", "target.png", "--mask", "labels.png"], "got the labels 0, 2, 5; choose one with --label"),
+        (
+            ["mesh.ply", "target.png", "--mask", "labels.png"],
+            "(nothing reaches an eighth of white, so it is no coverage); choose one with --label",
+        ),
         (["mesh.ply", "target.png", "--mask", "target.png"], "target.png: expected a mask in grey"),
         (["mesh.ply", "target.png", "--label", "2"], "--label: expected --mask with it"),
         (["mesh.ply", "target.png", "--mask", "mask.png", "--background", "#102030"], "--background: expected none"),

@@ -110,7 +110,7 @@ def test_several_labels_are_named_and_chosen(tmp_path: Path, name: str, dtype: t
     tifffile.imwrite(path, LABELS.astype(dtype)) if name.endswith("tif") else Image.fromarray(
         LABELS.astype(dtype)
     ).save(path)
-    fault = "coverage from 0 to 1, got 0 to 7; .* label=" if dtype is np.float32 else "labels 0, 1, 3, 7; .* label="
+    fault = "coverage from 0 to 1, got 0 to 7; .* label=" if dtype is np.float32 else "labels 0, 1, 3, 7 .* label="
     with pytest.raises(ValueError, match=rf"{name}: expected .*{fault}"):
         eg.read_mask(path)
     for label in (0, 1, 3, 7, 9):
@@ -152,6 +152,16 @@ def test_two_colours_are_a_mask_and_a_photograph_is_none(tmp_path: Path) -> None
     red[LABELS == 1] = 200, 0, 0
     Image.fromarray(red).save(tmp_path / "red.png")
     agree(tmp_path / "red.png", LABELS == 1)
+    for dark in (1, 9):  # a number in one channel is no grey
+        Image.fromarray(np.where(red > 0, dark, red).astype(np.uint8)).save(tmp_path / "dark.png")
+        agree(tmp_path / "dark.png", LABELS == 1)
+    green = np.where(red[..., :1] > 0, (200, 0, 0), (0, 200, 0)).astype(np.uint8)
+    Image.fromarray(green).save(tmp_path / "green.png")
+    with pytest.raises(ValueError, match=r"green\.png: expected a mask in grey, .* got a picture of 2 colours"):
+        eg.read_mask(tmp_path / "green.png")
+    noisy = np.stack([np.full((3, 4), 200), np.full((3, 4), 203), np.full((3, 4), 198)], -1).astype(np.uint8)
+    Image.fromarray(noisy).save(tmp_path / "noisy.png")  # once a JPEG
+    np.testing.assert_allclose(eg.read_mask(tmp_path / "noisy.png").numpy(), 601 / 765, atol=1e-6)
     with pytest.raises(ValueError, match=r"red\.png: expected labels in grey or in a palette for label=, got colours"):
         eg.read_mask(tmp_path / "red.png", 1)
     photo = np.random.default_rng(1).integers(0, 256, (8, 8, 3), dtype=np.uint8)

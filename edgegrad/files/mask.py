@@ -13,7 +13,7 @@ from ..optional import require
 from .image import DISPLAY, read_stored
 from .paths import PathLike
 
-GREY = 8 / 255  # by which channels of a grey image may differ: JPEG does not keep them equal
+GREY = 8 / 255  # by which channels of a grey image may differ, for JPEG does not keep them equal; unless all are faint
 FAINT = 1 / 8  # whole numbers below this share of their range are labels: no mask covers so little at most
 LOSSY = (".jpg", ".jpeg")  # whose black is noise, and no label
 ROUNDING = 1e-3  # of coverage outside 0 … 1
@@ -30,7 +30,7 @@ def read_mask(path: PathLike, label: int | None = None) -> Tensor:
     - the alpha channel, unless it is 1 everywhere
     - grey: 1, 8 and 16 bit from black to white, floating point (EXR, float TIFF) from 0 to 1. Whole numbers of which the
       largest is 1 are labels: 0 beside the object, 1 on it
-    - two colours, one of them black (or number 0 of a palette): 1 where it is the other
+    - black and one other colour, or of a palette number 0 and another: 1 where it is the other
 
     label  the number of the object in an image of labels: grey of whole numbers, or a palette's numbers. 1 where the image has
            it, 0 elsewhere, also if it is nowhere. The mask of several is the sum of theirs
@@ -55,14 +55,14 @@ def read_mask(path: PathLike, label: int | None = None) -> Tensor:
     if largest is None or float(grey.max()) >= FAINT or Path(path).suffix.lower() in LOSSY:
         return _coverage(path, grey)
     numbers = _whole(grey, largest)
-    labels = numbers.unique().tolist()
-    if max(labels) > 1:
-        raise _several(path, labels)
+    if int(numbers.max()) > 1:
+        raise _several(path, numbers.unique().tolist(), " (nothing reaches an eighth of white, so it is no coverage)")
     return numbers.float()
 
 
 def _is_grey(color: Tensor) -> bool:
-    return not float((color.amax(-1) - color.amin(-1)).max()) > GREY  # also where it is NaN, which is no colour
+    apart = float((color.amax(-1) - color.amin(-1)).max())
+    return not apart > (GREY if float(color.max()) >= FAINT else 0.0)  # also where it is NaN, which is no colour
 
 
 def _coverage(path: PathLike, values: Tensor) -> Tensor:
@@ -94,11 +94,11 @@ def _two_colors(path: PathLike, color: Tensor) -> Tensor:
     """1 where the image is not its background. Raises ValueError or ImportError."""
     indexed = _indexed(path)
     if indexed is None:
-        codes = (color.double() * 255.0).round().long()
-        numbers, black = codes[..., 0] << 16 | codes[..., 1] << 8 | codes[..., 2], [0]
+        red, green, blue = (color.clamp(0.0, 1.0) * 255.0).round().long().unbind(-1)
+        numbers, black = red << 16 | green << 8 | blue, [0]
     else:
         numbers, black = indexed
-    used = numbers.unique().tolist()
+    used = torch.bincount(numbers.flatten()).nonzero().flatten().tolist()  # far faster than unique()
     # Number 0 of most palettes is black.
     background = [0] if 0 in black else [number for number in used if number in black] or [0]
     labels = [number for number in used if number not in background]
@@ -106,15 +106,15 @@ def _two_colors(path: PathLike, color: Tensor) -> Tensor:
         raise _several(path, [*background, *labels])
     if len(labels) > 1:
         raise ValueError(
-            f"{path}: expected a mask in grey, in two colours or in an alpha channel, got a picture of {len(used)} colours; make "
-            "its mask first"
+            f"{path}: expected a mask in grey, in black and one colour, or in an alpha channel, got a picture of {len(used)} "
+            "colours; make its mask first"
         )
     return (numbers == labels[0]).float() if labels else torch.zeros(numbers.shape)
 
 
-def _several(path: PathLike, labels: list[int]) -> ValueError:
+def _several(path: PathLike, labels: list[int], why: str = "") -> ValueError:
     shown = ", ".join(map(str, sorted(labels)[:LISTED])) + ", …" * (len(labels) > LISTED)
-    return ValueError(f"{path}: expected a mask of one object, got the labels {shown}; choose one with label=")
+    return ValueError(f"{path}: expected a mask of one object, got the labels {shown}{why}; choose one with label=")
 
 
 def _indexed(path: PathLike) -> tuple[Tensor, list[int]] | None:
