@@ -16,7 +16,7 @@ import edgegrad_cli as cli
 from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
 from edgegrad.fit import PoseFit
-from edgegrad_cli import doctor, outputs
+from edgegrad_cli import doctor, inputs, outputs
 
 
 @pytest.fixture
@@ -156,6 +156,13 @@ def test_errors_are_one_line(files, capsys, monkeypatch, change, message):
     said = capsys.readouterr().err
     assert code == 2
     assert said.startswith("edgegrad: error: ") and said.count("\n") == 1 and message in said
+
+
+def test_a_label_is_chosen(files):
+    labels = np.zeros((4, 4), np.uint8)
+    labels[1:3], labels[3] = 5, 2
+    Image.fromarray(labels).save(files / "labels.png")
+    assert inputs.read_coverage(files / "labels.png", 5).tolist() == (labels == 5).tolist()
 
 
 def test_render_frames_the_mesh(files):
