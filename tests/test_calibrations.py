@@ -197,7 +197,7 @@ def test_kalibr(tmp_path) -> None:
         ),
         ({"intrinsics": None}, "cam2: intrinsics: expected this key, got only"),
         ({"intrinsics": [1.0, 2.0]}, "cam2: intrinsics: expected 1 × 4 numbers, got 1 × 2"),
-        ({"resolution": [float("inf"), 3]}, "size: expected whole numbers of pixels, got width inf"),
+        ({"resolution": [float("inf"), 3]}, "cam2: size: expected whole numbers of pixels, got width inf"),
         ({"resolution": "wide"}, "cam2: resolution: expected a matrix"),
         ({"T_cn_cnm1": np.diag([2.0, 2, 2, 1]).tolist()}, "cam2: R: expected a rotation"),
     ],

@@ -247,6 +247,12 @@ def test_keys_that_nobody_reads_are_named(tmp_path) -> None:
         ({"w": W, "h": H, "fl_x": 60, "camera_model": "EQUIRECTANGULAR"}, "camera_model: expected .* got 'EQUI"),
         ({"w": W, "h": H, "fl_x": 60, "k4": 0.1}, "k4: expected 0"),
         (
+            {"w": float("inf"), "h": H, "fl_x": 60},
+            r"frames\[0\], ./train/r_0: size: expected whole numbers of pixels, got width inf",
+        ),
+        ({"w": W, "h": H, "fl_x": 10**400}, "int too large"),
+        ({"fl_x": 60, "frame": {"file_path": "long" * 1000}}, "w and h: expected the image's size"),
+        (
             {"w": W, "h": H, "fl_x": 60, "frame": {"transform_matrix": [[1, 0], [0, 1]]}},
             "camera_to_world: expected shape",
         ),

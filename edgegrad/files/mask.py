@@ -129,7 +129,12 @@ def _indexed(path: PathLike) -> tuple[Tensor, list[int]] | None:
             if stored.mode not in ("P", "1"):
                 return None
             image = turned(stored)
-    except (pillow.UnidentifiedImageError, pillow.DecompressionBombError):  # a TIFF of kinds that Pillow does not know
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        pillow.DecompressionBombError,
+    ):  # Pillow does not know all that OpenImageIO does
         return None
     numbers = torch.from_numpy(np.array(image, np.int64))
     if image.mode == "1":

@@ -9,6 +9,7 @@ import os
 import struct
 from collections.abc import Iterator
 from itertools import zip_longest
+from os.path import isfile  # False also of names that no file can have
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import NamedTuple
 
@@ -99,7 +100,7 @@ def _file(places: list[Path], name: str) -> Path | None:
     """The image's file, below one of the folders."""
     if PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or ".." in PurePosixPath(name).parts:
         return None
-    return next((place / name for place in places if (place / name).is_file()), None)
+    return next((place / name for place in places if isfile(place / name)), None)
 
 
 # -- binary: little-endian -------------------------------------------------------------------------------------------------

@@ -36,34 +36,32 @@ def read(fields: Mapping[str, Any], dtype: torch.dtype, unread: Unsupported) -> 
         if not isinstance(given, dict):
             raise Fault(f"{name}: expected the keys of a camera of Kalibr, got {type(given).__name__}")
         given = {key: value for key, value in given.items() if value is not None}
-        if "T_cn_cnm1" in given:
-            pose = _matrix(name, given, "T_cn_cnm1", (4, 4)) @ pose
-        elif views:
-            unread.note(f"{name} without T_cn_cnm1", f"it stands where {list(views)[-1]} does")
         try:
-            views[name] = View(_camera(name, given, pose, dtype), None)
-        except ValueError as error:
+            if "T_cn_cnm1" in given:
+                pose = _matrix(given, "T_cn_cnm1", (4, 4)) @ pose
+            elif views:
+                unread.note(f"{name} without T_cn_cnm1", f"it stands where {list(views)[-1]} does")
+            views[name] = View(_camera(given, pose, dtype), None)
+        except (Fault, ValueError) as error:
             raise Fault(f"{name}: {error}") from error
         note_unread(given, READ | HARMLESS, unread, INSTEAD)
     note_unread(fields, names, unread)
     return views
 
 
-def _camera(name: str, given: Mapping[str, Any], pose: np.ndarray, dtype: torch.dtype) -> Camera:
+def _camera(given: Mapping[str, Any], pose: np.ndarray, dtype: torch.dtype) -> Camera:
     """Raises Fault or ValueError."""
     model, bend = given.get("camera_model", "pinhole"), given.get("distortion_model", "none")
     if model != "pinhole":
-        raise Fault(
-            f"{name}: camera_model: expected pinhole, got {model!r}; undistort the images, or calibrate as pinhole"
-        )
+        raise Fault(f"camera_model: expected pinhole, got {model!r}; undistort the images, or calibrate as pinhole")
     if bend not in BROWN_CONRADY + EQUIDISTANT:
         known = ", ".join(BROWN_CONRADY + EQUIDISTANT)
-        raise Fault(f"{name}: distortion_model: expected one of {known}, got {bend!r}; undistort the images")
-    fx, fy, cx, cy = _matrix(name, given, "intrinsics", (1, 4))[0]
-    width, height = _matrix(name, given, "resolution", (1, 2))[0]
+        raise Fault(f"distortion_model: expected one of {known}, got {bend!r}; undistort the images")
+    fx, fy, cx, cy = _matrix(given, "intrinsics", (1, 4))[0]
+    width, height = _matrix(given, "resolution", (1, 2))[0]
     coefficients = None
     if bend != "none":
-        coefficients = torch.tensor(_matrix(name, given, "distortion_coeffs", (1, 4))[0], dtype=dtype)
+        coefficients = torch.tensor(_matrix(given, "distortion_coeffs", (1, 4))[0], dtype=dtype)
     R, t, K = (
         torch.tensor(values, dtype=dtype)
         for values in (pose[:3, :3], pose[:3, 3], np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
@@ -72,10 +70,10 @@ def _camera(name: str, given: Mapping[str, Any], pose: np.ndarray, dtype: torch.
     return make(R, t, K, image_size(width, height), coefficients)
 
 
-def _matrix(name: str, given: Mapping[str, Any], key: str, shape: tuple[int, int]) -> np.ndarray:
+def _matrix(given: Mapping[str, Any], key: str, shape: tuple[int, int]) -> np.ndarray:
     if key not in given:
-        raise Fault(f"{name}: {key}: expected this key, got only {', '.join(map(str, given)) or 'none'}")
-    found = matrix(f"{name}: {key}", given[key])
+        raise Fault(f"{key}: expected this key, got only {', '.join(map(str, given)) or 'none'}")
+    found = matrix(key, given[key])
     if found.shape != shape:
-        raise Fault(f"{name}: {key}: expected {shape[0]} × {shape[1]} numbers, got {found.shape[0]} × {found.shape[1]}")
+        raise Fault(f"{key}: expected {shape[0]} × {shape[1]} numbers, got {found.shape[0]} × {found.shape[1]}")
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from os.path import isfile  # False also of names that no file can have
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 
 from ...camera.camera import Camera
 from ..image import IMAGES, read_size
-from .keys import note_unread
+from .keys import image_size, note_unread
 from .part import Fault
 from .source import Unsupported
 from .views import View
@@ -53,7 +54,7 @@ def read(
         try:
             image = _image(folder, name) if "file_path" in own else None
             view = View(_camera(own, shared, image, size, dtype), image)
-        except (TypeError, ValueError, KeyError) as error:
+        except (Fault, TypeError, ValueError, KeyError, OverflowError) as error:
             raise Fault(f"frames[{i}], {name}: {error}") from error
         views[name if name not in views else f"{name} (frame {i})"] = view
         note_unread(own, READ | HARMLESS, unread, INSTEAD)
@@ -71,7 +72,7 @@ def _image(folder: Path, name: str) -> Path | None:
     for stem in dict.fromkeys((name, name.replace("\\", "/"))):
         for ending in ("", *IMAGES):
             file = folder / f"{stem}{ending}"
-            if file.is_file() and file.resolve().is_relative_to(folder.resolve()):
+            if isfile(file) and file.resolve().is_relative_to(folder.resolve()):
                 return file
     return None
 
@@ -85,7 +86,7 @@ def _camera(
 ) -> Camera:
     given = {**shared, **own}
     if "w" in given and "h" in given:
-        H, W = int(given["h"]), int(given["w"])
+        H, W = image_size(float(given["w"]), float(given["h"]))
     elif size is not None:
         H, W = size
     elif image is not None:
