@@ -141,6 +141,13 @@ def test_cmyk_jpeg_and_exif_orientation(tmp_path):
     np.testing.assert_allclose(read_image(tmp_path / "turned.png").numpy(), expected, atol=1e-6)
 
 
+def test_further_images_of_a_file_are_named(tmp_path):
+    pages = np.stack([np.full((2, 3), value, np.uint8) for value in (255, 0, 0)])
+    tifffile.imwrite(tmp_path / "a.tif", pages, photometric="minisblack")
+    with pytest.warns(UserWarning, match=r"a\.tif: the first of its images is read"):
+        assert read_image(tmp_path / "a.tif").tolist() == np.ones((2, 3, 1)).tolist()
+
+
 def test_channels_convert(tmp_path):
     write_image(tmp_path / "rgb.exr", torch.tensor([[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.5, 0.5]]]))
     grey = read_image(tmp_path / "rgb.exr", channels=1)

@@ -11,11 +11,13 @@ from torch import Tensor
 from ..camera.mistakes import warn_of_bytes
 from ..check import as_tensor, check_finite, check_not_meta, check_shape
 from ..optional import require
+from ..warnings import warn
 from .paths import PathLike, check_readable, check_suffix, replacing
 
 DISPLAY = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # 8 bit, sRGB
 RADIANCE = (".exr", ".hdr")  # floating point, linear
 IMAGES = (*DISPLAY, *RADIANCE)
+SEVERAL = (".tif", ".tiff", ".exr")  # may hold more images than one
 MOST_NUMBERS = 1 << 30  # pixels times channels, four bytes each; a small file may announce more
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec. 709 primaries, which sRGB shares
 
@@ -61,6 +63,10 @@ def read_stored(path: PathLike) -> Stored:
     pixels = None if upright is None else upright.get_pixels(oiio.FLOAT, upright.roi_full)
     if pixels is None or (stored.file_format_name == "jpeg" and not _jpeg_ends(file.read_bytes())):
         raise ValueError(f"{path}: expected a whole image, got one that cannot be read ({_reason(stored)})")
+    if file.suffix.lower() in SEVERAL and (opened := oiio.ImageInput.open(str(file))) is not None:
+        if opened.seek_subimage(1, 0):
+            warn(f"images of {path}", f"{path}: the first of its images is read; save the others as files of their own")
+        opened.close()
     image = torch.from_numpy(np.ascontiguousarray(pixels))
     native = stored.nativespec().format
     largest = None
