@@ -13,6 +13,7 @@ from test_conventions import POINTS, SHIFT, SIZE, R, agree
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # those that are expected are caught
 F64 = torch.float64
 K = np.array([[60.0, 0, 30], [0, 55, 25], [0, 0, 1]])
 H, W = SIZE
@@ -165,7 +166,9 @@ def chain(tmp_path: Path, **changes: object) -> Path:
         "distortion_coeffs": [0.05, -0.02, 0.01, -0.015],
     }
     second = {**first, "intrinsics": [70.0, 65.0, 28.0, 27.0], "T_cn_cnm1": step.tolist(), **changes}
-    third = {**first, "distortion_model": "equidistant", "T_cn_cnm1": step.tolist()}
+    aside = np.eye(4)
+    aside[:3, :3], aside[:3, 3] = R.numpy().T, [0.1, 0.2, 0.3]
+    third = {**first, "distortion_model": "equidistant", "T_cn_cnm1": aside.tolist()}
     file = tmp_path / "camchain.yaml"
     cameras = {"cam0": first, "cam10": third, "cam2": second}
     file.write_text(
@@ -180,7 +183,7 @@ def test_kalibr(tmp_path) -> None:
     shift = np.array([-0.3, 0.02, 0.01])
     lands(views["cam0"].camera, np.eye(3), np.zeros(3), K, BENT[:, :4])
     lands(views["cam2"].camera, R.numpy(), shift, SECOND, BENT[:, :4])
-    lands(views["cam10"].camera, R.numpy() @ R.numpy(), R.numpy() @ shift + shift, K, BENT[:, :4], True)
+    lands(views["cam10"].camera, np.eye(3), R.numpy().T @ shift + [0.1, 0.2, 0.3], K, BENT[:, :4], True)
     with pytest.warns(UserWarning, match=r"T_cam_imu \(poses are those to the first camera\)$"):
         eg.load_cameras(chain(tmp_path, T_cam_imu=np.eye(4).tolist()))
     with pytest.warns(UserWarning, match=r"cam2 without T_cn_cnm1 \(it stands where cam0 does\)"):

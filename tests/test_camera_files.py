@@ -207,6 +207,7 @@ def test_frames_of_a_file_that_says_one_focal_length(tmp_path) -> None:
         assert (float(K[0, 0]), float(K[1, 1])) == pytest.approx(focals)
 
 
+@pytest.mark.filterwarnings("error::UserWarning")  # those that are expected are caught
 def test_names_of_frames(tmp_path) -> None:
     """Backslashes lead to the image, and of frames with one name none is lost."""
     (tmp_path / "train").mkdir()
@@ -221,6 +222,7 @@ def test_names_of_frames(tmp_path) -> None:
     assert [float(view.camera.K[0, 0]) for view in views.values()] == [60, 70]
 
 
+@pytest.mark.filterwarnings("error::UserWarning")  # those that are expected are caught
 def test_keys_that_nobody_reads_are_named(tmp_path) -> None:
     harmless = {"aabb_scale": 16, "scale": 0.3, "offset": [0, 0, 0], "ply_file_path": "sparse.ply"}
     eg.load_cameras(transforms(tmp_path, {"sharpness": 9.0, "colmap_im_id": 1}, **LENS, **harmless))

@@ -94,6 +94,10 @@ def test_colours_of_a_tiff_are_not_multiplied_by_alpha(tmp_path, dtype, planes):
         np.testing.assert_allclose(image[..., :3], curve(straight[..., :3]), rtol=0, atol=rounding)
         np.testing.assert_allclose(image[..., 3], straight[..., 3], rtol=0, atol=rounding)
         np.testing.assert_allclose(image[0, 0], [1, 0, 0, half], rtol=0, atol=1e-6)
+    # More than alpha allows is white.
+    over = np.array([[[one, 0.25 * one, 0, 0.5 * one]]])
+    tifffile.imwrite(tmp_path / "a.tif", over.astype(dtype), photometric="rgb", extrasamples=["assocalpha"])
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif")[0, 0, 0], 2.0 if one == 1.0 else 1.0, atol=4e-3)
     # Light where nothing covers the pixel: there is nothing to divide by.
     glow = np.full((2, 2, 4), 0.25 * one)
     glow[..., 3] = 0

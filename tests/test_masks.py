@@ -11,6 +11,7 @@ from PIL import Image
 
 import edgegrad as eg
 
+pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # those that are expected are caught
 SHARES = np.array([[0, 51, 128], [204, 255, 1]], np.uint8)
 LABELS = np.array([[0, 0, 1, 1], [0, 3, 1, 1], [0, 7, 7, 0]], np.uint8)
 
@@ -141,6 +142,10 @@ def test_palettes(tmp_path: Path) -> None:
         eg.read_mask(path)
     for label in (0, 1, 3, 7):
         agree(path, np.equal(LABELS, label), label)
+    two = np.where(LABELS == 3, 2, one)
+    palette(two, (0, 0, 0), (0, 0, 0), (128, 0, 0)).save(path)  # a second black is a label
+    with pytest.raises(ValueError, match=r"got the labels 0, 1, 2; choose"):
+        eg.read_mask(path)
     palette(LABELS, *[(0, 0, 0)] * 8).save(path)  # labels that no colour tells apart
     agree(path, LABELS == 3, 3)
     Image.fromarray(LABELS == 1).save(path)
