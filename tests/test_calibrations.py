@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import cv2
@@ -225,6 +226,17 @@ def test_yaml_of_python(tmp_path) -> None:
         eg.load_cameras(storage(tmp_path / "tilt.yml", K=K, tilt=np.ones(2)), size=SIZE)
     with pytest.raises(ValueError, match=r"xi: expected none, got a lens of cv2\.omnidir"):
         eg.load_cameras(storage(tmp_path / "omni.yml", K=K, xi=1.2), size=SIZE)
+
+
+@pytest.mark.parametrize("name, missing", [("a.yaml", "yaml"), ("a.yml", "cv2")])
+def test_missing_libraries_are_asked_for(tmp_path, monkeypatch, name, missing) -> None:
+    (tmp_path / "a.yaml").write_text(yaml.safe_dump({"K": K.tolist(), "size": [W, H], "resolution": 0.1}))
+    storage(tmp_path / "a.yml", K=K)
+    with pytest.warns(UserWarning, match=r"resolution \(left out\)$"):
+        assert eg.load_cameras(tmp_path / "a.yaml")["camera"].camera.size == SIZE
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(ImportError, match=r"pip install 'edgegrad\[cameras\]'"):
+        eg.load_cameras(tmp_path / name, size=SIZE)
 
 
 @pytest.mark.parametrize(

@@ -59,9 +59,11 @@ class _Fields:
     def size(self, otherwise: tuple[int, int] | None) -> tuple[int, int]:
         """(H, W). Raises Fault."""
         height, width = self.number("image_height", "height"), self.number("image_width", "width")
-        pair = self.matrix(*SIZES)
-        if pair is not None and pair.size == 2:
-            width, height = width or pair.flat[0], height or pair.flat[1]
+        for name in SIZES:
+            pair = self.values.get(name)
+            if isinstance(pair, list) and len(pair) == 2 and all(isinstance(side, (int, float)) for side in pair):
+                self.read.add(name)
+                width, height = width or pair[0], height or pair[1]
         if height and width:
             return image_size(width, height)
         if otherwise is None:
