@@ -9,7 +9,18 @@ from . import lights as lights
 from .aovs import render_aovs
 from .camera.camera import Camera
 from .files.save import from_trimesh, to_trimesh
-from .io import View, load_camera, load_cameras, load_mesh, load_scene, read_image, save_camera, save_mesh, write_image
+from .io import (
+    View,
+    load_camera,
+    load_cameras,
+    load_mesh,
+    load_scene,
+    read_image,
+    read_mask,
+    save_camera,
+    save_mesh,
+    write_image,
+)
 from .live import viewer
 from .plan import Plan, plan
 from .points.hits import Hits
@@ -79,6 +90,7 @@ __all__ = [
     "primary_hits",
     "profile",
     "read_image",
+    "read_mask",
     "render",
     "render_aovs",
     "save_camera",

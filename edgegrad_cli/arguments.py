@@ -73,6 +73,10 @@ def add_views(parser: argparse.ArgumentParser, images: str) -> None:
     )  # fmt: skip
 
 
+def add_label(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--label", type=number, metavar="N", help="the object's number in a mask of several labels")
+
+
 def add_descent(parser: argparse.ArgumentParser, result: str) -> None:
     """What fits by descent have in common; inputs.descent reads it."""
     parser.add_argument("--steps", type=count, default=150, help="most steps; of fit-shape on each level (%(default)s)")

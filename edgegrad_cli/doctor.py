@@ -12,10 +12,11 @@ from typing import Any
 LIBRARIES = ("torch", "numpy", "embreex", "trimesh", "OpenImageIO")
 # Which extra brings what, and what for.
 OPTIONAL = {
-    "pillow": "files, figures: textures of meshes, animations",
+    "pillow": "files, figures: textures of meshes, labels of masks, animations",
     "lxml": "files: 3MF",
     "networkx": "files: 3MF",
     "opencv-python-headless": "cameras: OpenCV's calibrations",
+    "pyyaml": "cameras: calibrations of ROS and Kalibr",
     "matplotlib": "figures: of fits and reports",
     "pyvista": "demo",
     "mitsuba": "peers: compared in edgegrad report",

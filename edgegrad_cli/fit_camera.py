@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         K = fit.camera.K.tolist()
         print(f"focal length {K[0][0]:.6g} px, principal point {K[0][2]:.6g}, {K[1][2]:.6g} px", flush=True)
         save_camera(args.out / "camera.json", fit.camera)
-        names = ["camera.json", fit.write_history(args.out), *write_outputs(args.out, fit.search)]
+        names = ["camera.json", fit.write_history(args.out), *write_outputs(args.out, fit.search), CHECKPOINT]
         print(f"wrote {', '.join(names)} in {args.out}")
         linger(view, fit)
     return INTERRUPTED if fit.interrupted else 0

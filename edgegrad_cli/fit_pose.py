@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
-from .arguments import CHECKPOINT, add_live, add_mesh, add_resume, add_view, count, number
-from .inputs import check_size, read_background, read_mask, read_picture, read_pose, read_scene, read_view
+from .arguments import CHECKPOINT, add_label, add_live, add_mesh, add_resume, add_view, count, number
+from .inputs import check_size, read_background, read_coverage, read_picture, read_pose, read_scene, read_view
 
 if TYPE_CHECKING:
     from edgegrad.fit import PoseFit
@@ -19,7 +19,8 @@ def add(commands: Any) -> None:
     parser = commands.add_parser("fit-pose", help="find a mesh in a picture", description=run.__doc__)
     add_mesh(parser)
     parser.add_argument("image", type=Path, metavar="IMAGE", help="the picture; an alpha channel is taken as the mask")
-    parser.add_argument("--mask", type=Path, help="image of the picture's size, white on the object")
+    parser.add_argument("--mask", type=Path, help="image of the picture's size, white on the object, or of labels")
+    add_label(parser)
     add_view(parser)
     parser.add_argument(
         "--init", type=Path, metavar="POSE.json", help="pose to start from; as in the mesh file when left out"
@@ -54,14 +55,16 @@ def run(args: argparse.Namespace) -> int:
 
     from . import INTERRUPTED
 
+    if args.label is not None and args.mask is None:
+        raise ValueError("--label: expected --mask with it, an image that has labels, got none; name it")
     scene = read_scene(args)
     picture, mask = read_picture(args.image)
     if args.mask is not None:
-        mask = read_mask(args.mask)
+        mask = read_coverage(args.mask, args.label)
         check_size(mask, picture, args.mask, args.image)
     weight = None
     if args.weight is not None:
-        weight = read_mask(args.weight)
+        weight = read_coverage(args.weight)
         check_size(weight, picture, args.weight, args.image)
     if mask is not None and args.background is not None:
         raise ValueError("--background: expected none with a mask (or an image with alpha), got both; leave one out")
@@ -89,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         try:
             _print_fit(fit, args.fit_focal)
         finally:
-            written = outputs.write_outputs(args.out, fit)
+            written = [*outputs.write_outputs(args.out, fit), CHECKPOINT]
         print(f"wrote {', '.join(written)} in {args.out}")
         outputs.linger(view, fit)
     return INTERRUPTED if fit.interrupted else 0

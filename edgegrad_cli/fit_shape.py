@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from .arguments import add_descent, add_live, add_views, count
-from .inputs import descent, read_mask, read_views
+from .arguments import add_descent, add_label, add_live, add_views, count
+from .inputs import descent, read_coverage, read_views
 from .outputs import finish, linger, live, make_folder
 
 
@@ -15,6 +15,7 @@ def add(commands: Any) -> None:
     parser = commands.add_parser("fit-shape", help="find a shape from masks", description=run.__doc__)
     parser.add_argument("mesh", type=Path, metavar="MESH", help="where to begin; its look does not count")
     add_views(parser, "masks, white on the object, or pictures whose alpha is one")
+    add_label(parser)
     parser.add_argument("--levels", type=count, default=3, help="from coarse to fine (%(default)s)")
     parser.add_argument("--faces", type=count, help="about so many at the end (four times as many on each level)")
     add_descent(parser, "mesh.ply")
@@ -29,9 +30,8 @@ def run(args: argparse.Namespace) -> int:
     from edgegrad.fit import fit_shape
 
     mesh = load_mesh(args.mesh, materials=False)
-    cameras, _, alphas = read_views(args)
-    # A picture without alpha is a mask itself.
-    masks = [read_mask(path) if alpha is None else alpha for path, alpha in zip(args.images, alphas, strict=True)]
+    cameras, _, _ = read_views(args)
+    masks = [read_coverage(path, args.label) for path in args.images]
     make_folder(args.out)
     with live(args) as view:
         fit = fit_shape(

@@ -40,7 +40,10 @@ def _in_words_of_the_shell() -> Iterator[None]:
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
-        raise type(error)(str(error).replace("pass materials=False", "pass --no-materials")) from error
+        text = str(error)
+        for ours, theirs in (("pass materials=False", "pass --no-materials"), ("with label=", "with --label")):
+            text = text.replace(ours, theirs)
+        raise type(error)(text) from error
 
 
 def read_picture(path: Path) -> tuple[Tensor, Tensor | None]:
@@ -52,12 +55,12 @@ def read_picture(path: Path) -> tuple[Tensor, Tensor | None]:
     return image[..., :3].contiguous(), alpha if bool((alpha < 1.0).any()) else None
 
 
-def read_mask(path: Path) -> Tensor:
-    """(H, W). A mask's greys are coverage as they are, not sRGB."""
-    from edgegrad.files.image import DISPLAY, linear_to_srgb, read_image
+def read_coverage(path: Path, label: int | None = None) -> Tensor:
+    """(H, W) as edgegrad.read_mask reads it. Raises what that raises, in words of the command line."""
+    from edgegrad import read_mask
 
-    mask = read_image(path, channels=1)[..., 0]
-    return linear_to_srgb(mask) if path.suffix.lower() in DISPLAY else mask
+    with _in_words_of_the_shell():
+        return read_mask(path, label)
 
 
 def check_size(image: Tensor, picture: Tensor, path: Path, like: Path) -> None:

@@ -82,9 +82,11 @@ def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
 def finish(fit: Fit, folder: Path) -> int:
     """Says how a fit by descent ended and writes it all; the exit code. Raises OSError."""
     from . import INTERRUPTED
+    from .arguments import CHECKPOINT
 
     print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.state}", flush=True)
-    print(f"wrote {', '.join(fit.save(folder, figures=_can_draw()))} in {folder}")
+    written = [*fit.save(folder, figures=_can_draw()), CHECKPOINT]
+    print(f"wrote {', '.join(written)} in {folder}")
     return INTERRUPTED if fit.interrupted else 0
 
 

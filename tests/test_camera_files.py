@@ -1,10 +1,12 @@
-"""Cameras of COLMAP, NeRF, OpenCV and glTF files: where points land, by those libraries themselves where they are installed."""
+"""Cameras of COLMAP, NeRF and our own files: where points land, by those libraries themselves where they are installed."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
 import random
+import shutil
 from pathlib import Path
 
 import cv2
@@ -40,6 +42,7 @@ def reconstruction(tmp_path: Path):
     return pycolmap, folder
 
 
+@pytest.mark.filterwarnings("ignore:.*1 of 2 images")
 @pytest.mark.parametrize("binary", [False, True])
 def test_colmap(reconstruction, tmp_path, binary) -> None:
     pycolmap, folder = reconstruction
@@ -74,6 +77,40 @@ def test_colmap_faults(reconstruction, tmp_path) -> None:
         eg.load_cameras(tmp_path / "images")
 
 
+def test_nothing_of_a_reconstruction_is_lost_without_a_word(reconstruction, tmp_path) -> None:
+    pycolmap, folder = reconstruction
+    (folder.parent / "1").mkdir()
+    for name in ("cameras.txt", "images.txt"):
+        (folder.parent / "1" / name).write_bytes((folder / name).read_bytes())
+    with pytest.warns(
+        UserWarning, match=r"1 of 2 images, as 'a\.png' \(no such file.*; sparse/1 \(a reconstruction of its own"
+    ):
+        eg.load_cameras(tmp_path)
+    with pytest.warns(UserWarning, match=r"2 of 2 images"):
+        eg.load_cameras(folder, images=folder)
+    text = (folder / "images.txt").read_text()
+    (folder / "images.txt").write_text(text.replace("\n\n", "\n"))
+    with pytest.raises(ValueError, match="image 1 is not followed by a line of its points"):
+        eg.load_cameras(folder)
+    (folder / "images.txt").write_text(text.replace("a.png", "b.png"))
+    with pytest.raises(ValueError, match=r"'b\.png': expected one image of this name, got two"):
+        eg.load_cameras(folder)
+    (folder / "images.txt").write_text(
+        text.replace("\n\n", "\n10.5 3 -1 7 8.25 12\n").replace("a.png", "Jos\u00e9.png"), "latin-1"
+    )
+    shutil.copy(tmp_path / "images" / "b.png", os.fsencode(tmp_path / "images") + b"/Jos\xe9.png")
+    assert all(view.image.is_file() for view in eg.load_cameras(folder).values())
+    binary = tmp_path / "binary"
+    binary.mkdir()
+    (folder / "images.txt").write_text(text)
+    pycolmap.Reconstruction(str(folder)).write_binary(str(binary))
+    with (binary / "cameras.bin").open("ab") as file:
+        file.write(b"more")
+    with pytest.warns(UserWarning, match=r"4 bytes at the end of cameras\.bin \(left out\)"):
+        eg.load_cameras(binary)
+
+
+@pytest.mark.filterwarnings("ignore:.*not all of it is read")
 def test_damaged_reconstructions_are_refused(reconstruction, tmp_path) -> None:
     pycolmap, folder = reconstruction
     theirs, whole = pycolmap.Reconstruction(str(folder)), tmp_path / "whole"
@@ -129,6 +166,81 @@ def test_transforms(tmp_path) -> None:
         agree(camera.project(POINTS) - 0.5, torch.from_numpy(theirs[:, 0]), 1e-8)
 
 
+LENS = {"fl_x": 60, "fl_y": 55, "w": W, "h": H}
+
+
+@pytest.mark.parametrize(
+    "frame, expected",
+    [
+        ({"camera_angle_x": 0.7}, {"fx": 0.5 * W / np.tan(0.35), "fy": 0.5 * W / np.tan(0.35) * 55 / 60}),
+        ({"camera_angle_y": 0.7}, {"fx": 0.5 * H / np.tan(0.35) * 60 / 55, "fy": 0.5 * H / np.tan(0.35)}),
+        ({"camera_angle_x": 0.7, "camera_angle_y": 0.6}, {"fx": 0.5 * W / np.tan(0.35), "fy": 0.5 * H / np.tan(0.3)}),
+        ({"fl_x": 90}, {"fx": 90, "fy": 82.5}),
+        ({"fl_x": 90, "camera_angle_x": 0.7, "fl_y": 80}, {"fx": 90, "fy": 80}),
+        ({"cx": 20, "cy": 21.5}, {"cx": 20, "cy": 21.5}),
+        ({"w": 2 * W, "h": 3 * H}, {"size": (3 * H, 2 * W), "cx": W, "cy": 1.5 * H}),
+        ({"k1": 0.25}, {"distortion": [0.25, 0.02, 0, 0]}),
+        ({"camera_model": "OPENCV_FISHEYE"}, {"projection": "fisheye"}),
+        ({"is_fisheye": True}, {"projection": "fisheye"}),
+        ({"fl_x": None, "camera_angle_x": None, "w": None, "k1": None, "camera_model": None}, {}),
+    ],
+)
+def test_what_a_frame_says_goes_first(tmp_path, frame, expected) -> None:
+    file = transforms(tmp_path, frame, camera_model="OPENCV", k1=0.1, k2=0.02, k3=None, **LENS)
+    camera = eg.load_cameras(file, dtype=F64)["./train/r_0"].camera
+    found = {
+        "fx": float(camera.K[0, 0]), "fy": float(camera.K[1, 1]), "cx": float(camera.K[0, 2]), "cy": float(camera.K[1, 2]),
+        "size": camera.size, "projection": camera.projection, "distortion": camera.distortion.tolist(),
+    }  # fmt: skip
+    usual = {"fx": 60, "fy": 55, "cx": W / 2, "cy": H / 2, "size": SIZE, "projection": "perspective"}
+    for key, value in {**usual, "distortion": [0.1, 0.02, 0, 0], **expected}.items():
+        assert found[key] == (pytest.approx(value) if not isinstance(value, str) else value), key
+
+
+def test_frames_of_a_file_that_says_one_focal_length(tmp_path) -> None:
+    for shared, own, focals in (
+        ({"camera_angle_x": 0.7}, {"fl_x": 80}, (80, 80)),
+        ({"fl_x": 60}, {"fl_y": 70}, (60, 70)),
+        ({"fl_y": 60}, {"camera_angle_x": 2 * np.arctan(0.5)}, (W, 60)),
+    ):
+        K = eg.load_cameras(transforms(tmp_path, own, w=W, h=H, **shared), dtype=F64)["./train/r_0"].camera.K
+        assert (float(K[0, 0]), float(K[1, 1])) == pytest.approx(focals)
+
+
+@pytest.mark.filterwarnings("error::UserWarning")  # those that are expected are caught
+def test_names_of_frames(tmp_path) -> None:
+    """Backslashes lead to the image, and of frames with one name none is lost."""
+    (tmp_path / "train").mkdir()
+    eg.write_image(tmp_path / "train" / "r_0.png", torch.zeros(*SIZE, 3))
+    file = transforms(tmp_path, {"file_path": ".\\train\\r_0"}, camera_angle_x=0.7)
+    ((name, view),) = eg.load_cameras(file).items()
+    assert name == ".\\train\\r_0" and view.image.samefile(tmp_path / "train" / "r_0.png") and view.camera.size == SIZE
+    fields = json.loads(file.read_text())
+    fields["frames"] = [{**fields["frames"][0], "fl_x": f} for f in (60, 70)]
+    file.write_text(json.dumps(fields))
+    views = eg.load_cameras(file, dtype=F64)
+    assert [float(view.camera.K[0, 0]) for view in views.values()] == [60, 70]
+
+
+@pytest.mark.filterwarnings("error::UserWarning")  # those that are expected are caught
+def test_keys_that_nobody_reads_are_named(tmp_path) -> None:
+    harmless = {"aabb_scale": 16, "scale": 0.3, "offset": [0, 0, 0], "ply_file_path": "sparse.ply"}
+    eg.load_cameras(transforms(tmp_path, {"sharpness": 9.0, "colmap_im_id": 1}, **LENS, **harmless))
+    frame = {"mask_path": "m.png", "rolling_shutter": [0, 0, 0, 1], "time": None}
+    file = transforms(tmp_path, frame, **LENS, applied_transform=[[1, 0, 0, 0]], k7=3)
+    with pytest.warns(UserWarning) as caught:
+        eg.load_cameras(file)
+    (text,) = (str(warning.message) for warning in caught)
+    for part in (
+        "mask_path (left out; read_mask",
+        "rolling_shutter (left out)",
+        "k7 (",
+        "applied_transform (cameras stay",
+    ):
+        assert part in text
+    assert "time" not in text and str(file) in text
+
+
 @pytest.mark.parametrize(
     "fields, fault",
     [
@@ -136,6 +248,12 @@ def test_transforms(tmp_path) -> None:
         ({"w": W, "h": H}, "fl_x: expected this key or camera_angle_x"),
         ({"w": W, "h": H, "fl_x": 60, "camera_model": "EQUIRECTANGULAR"}, "camera_model: expected .* got 'EQUI"),
         ({"w": W, "h": H, "fl_x": 60, "k4": 0.1}, "k4: expected 0"),
+        (
+            {"w": float("inf"), "h": H, "fl_x": 60},
+            r"frames\[0\], ./train/r_0: size: expected whole numbers of pixels, got width inf",
+        ),
+        ({"w": W, "h": H, "fl_x": 10**400}, "int too large"),
+        ({"fl_x": 60, "frame": {"file_path": "long" * 1000}}, "w and h: expected the image's size"),
         (
             {"w": W, "h": H, "fl_x": 60, "frame": {"transform_matrix": [[1, 0], [0, 1]]}},
             "camera_to_world: expected shape",
@@ -148,45 +266,7 @@ def test_faults_of_transforms_are_named(tmp_path, fields, fault) -> None:
         eg.load_cameras(transforms(tmp_path, **fields))
 
 
-# -- OpenCV, glTF, our own --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("ending", ["yml", "xml"])
-@pytest.mark.parametrize("fisheye", [0, 1])
-def test_opencv(tmp_path, ending, fisheye) -> None:
-    file = tmp_path / f"calibration.{ending}"
-    distortion = np.array([[0.05, -0.02, 0.01, -0.015]])
-    rvec = cv2.Rodrigues(R.numpy())[0]
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    for key, value in {
-        "image_width": W, "image_height": H, "camera_matrix": K, "distortion_coefficients": distortion,
-        "fisheye_model": fisheye, "extrinsic_parameters": np.array([[*rvec[:, 0], *SHIFT], [0, 0, 0, 0, 0, 9.0]]),
-    }.items():  # fmt: skip
-        storage.write(key, value)
-    storage.release()
-    views = eg.load_cameras(file, dtype=F64)
-    assert list(views) == ["view 0", "view 1"] and views["view 0"].camera.size == SIZE
-    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
-    theirs, _ = project(POINTS.numpy()[:, None], rvec, SHIFT.numpy(), K, distortion[0])
-    agree(views["view 0"].camera.project(POINTS) - 0.5, torch.from_numpy(theirs[:, 0]), 1e-8)
-
-
-def test_opencv_faults(tmp_path) -> None:
-    file = tmp_path / "a.yml"
-    for text, fault in (
-        ("nothing of the kind", "a.yml: expected YAML or XML|camera_matrix: expected this key"),
-        ("%YAML:1.0\n---\ncamera_matrix: 3\n", "camera_matrix: expected a matrix"),
-        ("%YAML:1.0\n---\nother: 3\n", "camera_matrix: expected this key"),
-    ):
-        file.write_text(text)
-        with pytest.raises(ValueError, match=fault):
-            eg.load_cameras(file)
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    storage.write("K", K)
-    storage.release()
-    with pytest.raises(ValueError, match=r"image_width: .* pass size="):
-        eg.load_cameras(file)
-    assert eg.load_cameras(file, size=SIZE)["camera"].camera.size == SIZE
+# -- our own ---------------------------------------------------------------------------------------------------------------
 
 
 def test_our_own(tmp_path) -> None:

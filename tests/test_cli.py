@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 import trimesh
@@ -15,7 +16,7 @@ import edgegrad_cli as cli
 from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
 from edgegrad.fit import PoseFit
-from edgegrad_cli import doctor, outputs
+from edgegrad_cli import doctor, inputs, outputs
 
 
 @pytest.fixture
@@ -51,9 +52,9 @@ def test_fit_pose(files, capsys):
     assert (
         "converged" in said.out
         and "mesh to world:" in said.out
-        and "pose.json, fit.png, loss.png, fit.webp" in said.out
+        and "wrote pose.json, fit.png, loss.png, fit.webp, checkpoint.pt in" in said.out
     )
-    assert "loss" in said.err  # the progress bar
+    assert "loss" in said.err and "100%" not in said.err  # the progress bar, which does not know its end
     assert sorted(p.name for p in out.iterdir()) == [
         "checkpoint.pt", "fit.png", "fit.webp", "loss.png", "pose.json"
     ]  # fmt: skip
@@ -67,7 +68,7 @@ def test_fit_pose(files, capsys):
     # What render makes of the pose is the target.
     assert run("render", files / "mesh.ply", "--pose", out / "pose.json", "--out", files / "again.exr") == 0
     again = read_image(files / "again.exr")
-    covered = read_image(files / "mask.png", channels=1) > 0.99
+    covered = eg.read_mask(files / "mask.png")[..., None] > 0.99
     assert again.shape == (48, 48, 3)
     assert float(((again - picture(camera(48))).abs() * covered).mean()) < 0.01
 
@@ -125,6 +126,12 @@ def test_a_failed_write_still_prints_the_pose(files, capsys, monkeypatch):
         (["mesh.ply", "target.png", "--init", "none.json"], "none.json: expected a file"),
         (["mesh.ply", "target.png", "--init", "bad.json"], "bad.json: pose: expected JSON"),
         (["mesh.ply", "target.png", "--mask", "small.png"], "small.png: expected 48 × 48 pixels like"),
+        (
+            ["mesh.ply", "target.png", "--mask", "labels.png"],
+            "(nothing reaches an eighth of white, so it is no coverage); choose one with --label",
+        ),
+        (["mesh.ply", "target.png", "--mask", "target.png"], "target.png: expected a mask in grey"),
+        (["mesh.ply", "target.png", "--label", "2"], "--label: expected --mask with it"),
         (["mesh.ply", "target.png", "--mask", "mask.png", "--background", "#102030"], "--background: expected none"),
         (["mesh.ply", "target.png", "--background", "#1020"], "--background: expected #rrggbb"),
         (["mesh.ply", "target.png", "--background", "small.png"], "small.png: expected 48 × 48 pixels"),
@@ -139,6 +146,9 @@ def test_errors_are_one_line(files, capsys, monkeypatch, change, message):
     (files / "bad.json").write_text("{")
     save_camera(files / "wide.json", camera(48).replace(size=(48, 96)))
     write_image(files / "small.png", torch.ones(8, 8, 3))
+    labels = np.zeros((48, 48), np.uint8)
+    labels[20:30, 20:30], labels[30:32] = 5, 2
+    Image.fromarray(labels).save(files / "labels.png")
     try:
         code = run("fit-pose", *change, *(() if "--out" in change else ("--out", "out")))
     except SystemExit as stop:  # from argparse
@@ -146,6 +156,13 @@ def test_errors_are_one_line(files, capsys, monkeypatch, change, message):
     said = capsys.readouterr().err
     assert code == 2
     assert said.startswith("edgegrad: error: ") and said.count("\n") == 1 and message in said
+
+
+def test_a_label_is_chosen(files):
+    labels = np.zeros((4, 4), np.uint8)
+    labels[1:3], labels[3] = 5, 2
+    Image.fromarray(labels).save(files / "labels.png")
+    assert inputs.read_coverage(files / "labels.png", 5).tolist() == (labels == 5).tolist()
 
 
 def test_render_frames_the_mesh(files):

@@ -77,7 +77,7 @@ def test_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = edgegrad.Camera.look_at(eye=(0, 0, 3), target=(0, 0, 0), up=(0, 1, 0), fov_y=40, size=(32, 32))
     shown = edgegrad.render_aovs(model, camera, ["image", "alpha"], spp=64)
     edgegrad.write_image("photo.png", shown["image"])
-    edgegrad.write_image("mask.png", shown["alpha"])
+    edgegrad.write_image("mask.png", edgegrad.image.srgb_to_linear(shown["alpha"]))
     names: dict[str, object] = {}
     text = (FOLDER.parent / "README.md").read_text(encoding="utf-8")
     blocks = [source for kind, source in FENCE.findall(text) if kind == "python"]

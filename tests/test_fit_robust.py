@@ -296,6 +296,25 @@ def test_pictures_and_masks_of_bytes_are_named():
         fit_scene(bracket(), [view], None, {"meshes[0].verts": 0.01}, masks=masks, progress=False)
 
 
+def test_faint_masks_are_named():
+    def stop(_):
+        raise KeyboardInterrupt
+
+    view, other = camera(16), camera(16, distance=2.6)
+    mask, options = silhouette(view), {"callback": stop, "progress": False}
+    with pytest.warns(
+        UserWarning, match=r"mask: expected 1 where the object covers .* got at most 0\.216; .* read_mask"
+    ):
+        fit_pose(bracket(), picture(view), view, 0.216 * mask, init=START, **options)
+    what = {"verts": 0.01}
+    with pytest.warns(UserWarning, match=r"masks: expected 1 where the object covers .* got at most 0\.00392"):
+        fit_scene(bracket(), view, None, what, masks=mask / 255, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # In one of two views the object is hardly seen.
+        fit_scene(bracket(), [view, other], None, what, masks=[mask, 0.1 * silhouette(other)], **options)
+
+
 @pytest.mark.slow
 def test_a_rig_of_cameras(tmp_path):
     """Two cameras that keep their places to one another find where they are, and the lens that they share."""

@@ -3,7 +3,9 @@
 import os
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
+import tifffile
 import torch
 from mesh_files import linear
 from PIL import Image
@@ -73,6 +75,48 @@ def test_alpha_is_kept_apart(tmp_path):
     np.testing.assert_allclose(read_image(tmp_path / "la.png").numpy(), grey.numpy(), atol=5e-3)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float16, np.float32])
+@pytest.mark.parametrize("planes", ["contig", "separate"])
+def test_colours_of_a_tiff_are_not_multiplied_by_alpha(tmp_path, dtype, planes):
+    """By the definition of associated alpha in TIFF 6.0: what is stored is the stored colour times alpha."""
+    one = 1.0 if np.dtype(dtype).kind == "f" else float(np.iinfo(dtype).max)
+    half = round(one / 2) / one if one > 1 else 0.5
+    straight = np.array([[[1.0, 0, 0, half], [0.2, 0.6, 1, 0.8]], [[0, 0, 0, 0], [0.5, 0.25, 0.75, 1]]])
+    associated = straight.copy()
+    associated[..., :3] *= straight[..., 3:]
+    curve = (lambda x: x) if one == 1.0 else (lambda x: linear(255.0 * x))
+    for name, stored in (("assocalpha", associated), ("unassalpha", straight)):
+        numbers = (stored if one == 1.0 else np.round(stored * one)).astype(dtype)
+        numbers = np.moveaxis(numbers, -1, 0) if planes == "separate" else numbers
+        tifffile.imwrite(tmp_path / "a.tif", numbers, photometric="rgb", extrasamples=[name], planarconfig=planes)
+        image = read_image(tmp_path / "a.tif").numpy()
+        rounding = 2 / min(one, 2048) if one == 1.0 else 2 / one
+        np.testing.assert_allclose(image[..., :3], curve(straight[..., :3]), rtol=0, atol=rounding)
+        np.testing.assert_allclose(image[..., 3], straight[..., 3], rtol=0, atol=rounding)
+        np.testing.assert_allclose(image[0, 0], [1, 0, 0, half], rtol=0, atol=1e-6)
+    # More than alpha allows is white.
+    over = np.array([[[one, 0.25 * one, 0, 0.5 * one]]])
+    tifffile.imwrite(tmp_path / "a.tif", over.astype(dtype), photometric="rgb", extrasamples=["assocalpha"])
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif")[0, 0, 0], 2.0 if one == 1.0 else 1.0, atol=4e-3)
+    # Light where nothing covers the pixel: there is nothing to divide by.
+    glow = np.full((2, 2, 4), 0.25 * one)
+    glow[..., 3] = 0
+    tifffile.imwrite(tmp_path / "a.tif", glow.astype(dtype), photometric="rgb", extrasamples=["assocalpha"])
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif")[..., 0].numpy(), curve(0.25), atol=4e-3)
+
+
+def test_an_exr_stays_multiplied_and_alpha_alone_is_an_image(tmp_path):
+    values = torch.tensor([[[0.5, 0.0, 0.0, 0.5], [0.1, 0.2, 0.3, 0.0]]])
+    write_image(tmp_path / "a.exr", values)
+    assert torch.equal(read_image(tmp_path / "a.exr"), values)
+    spec = oiio.ImageSpec(2, 1, 1, oiio.FLOAT)
+    spec.channelnames, spec.alpha_channel = ("A",), 0
+    output = oiio.ImageOutput.create(str(tmp_path / "b.exr"))
+    assert output.open(str(tmp_path / "b.exr"), spec) and output.write_image(np.array([[[0.25], [0.5]]], np.float32))
+    output.close()
+    assert read_image(tmp_path / "b.exr").tolist() == [[[0.25], [0.5]]]
+
+
 def test_kinds_of_png(tmp_path):
     stored = np.random.default_rng(2).integers(0, 256, (4, 5, 3), dtype=np.uint8)
     palette = Image.fromarray(stored).convert("P")
@@ -99,6 +143,13 @@ def test_cmyk_jpeg_and_exif_orientation(tmp_path):
     wide.save(tmp_path / "turned.png", exif=exif)
     expected = linear(np.rot90(np.asarray(wide), -1))
     np.testing.assert_allclose(read_image(tmp_path / "turned.png").numpy(), expected, atol=1e-6)
+
+
+def test_further_images_of_a_file_are_named(tmp_path):
+    pages = np.stack([np.full((2, 3), value, np.uint8) for value in (255, 0, 0)])
+    tifffile.imwrite(tmp_path / "a.tif", pages, photometric="minisblack")
+    with pytest.warns(UserWarning, match=r"a\.tif: the first of its images is read"):
+        assert read_image(tmp_path / "a.tif").tolist() == np.ones((2, 3, 1)).tolist()
 
 
 def test_channels_convert(tmp_path):

@@ -239,7 +239,8 @@ def _from_opencv(
     check_float("R", R)
     t = as_tensor("t", t, like=R)
     K = as_tensor("K", K, like=R)
-    check_shape("R", R, (3, 3))
+    vector = "of a rotation vector take cv2.Rodrigues(R)[0]" if R.numel() == 3 else ""
+    check_shape("R", R, (3, 3), fix=vector)
     check_shape("K", K, (3, 3))
     check_float("t", t)
     if t.numel() != 3:

@@ -12,11 +12,13 @@ from ..camera.camera import Camera
 from ..check import check_positive_int
 from .formats import calibration, colmap, transforms
 from .formats.part import Fault, naming
+from .formats.source import Unsupported
 from .formats.views import View
 from .parts import GLTFS, read_cameras
 from .paths import PathLike, check_readable, check_suffix, replacing
 
 CALIBRATIONS = (".yml", ".yaml", ".xml")
+UNREAD = "not all of it is read"
 
 
 def save_camera(path: PathLike, camera: Camera) -> None:
@@ -100,9 +102,13 @@ def load_cameras(
     """The cameras of a file or folder by name, each with its image: `View(camera, image)`.
 
     - a folder with COLMAP's cameras and images, text or binary, or with sparse/0 in it; names are the images'
-    - transforms.json of NeRF, instant-ngp and nerfstudio; names are the frames' file_path
+    - transforms.json of NeRF, instant-ngp and nerfstudio; names are the frames' file_path. What a frame says goes before what the
+      file says of all, whatever the key: its camera_angle_x before the file's fl_x. Keys that are null count as absent
     - .yml, .yaml or .xml of OpenCV's calibration: camera_matrix, distortion_coefficients, image_width, image_height,
-      fisheye_model and extrinsic_parameters, as its calibration program has them
+      fisheye_model and extrinsic_parameters, as its calibration program has them. A stereo pair by the names of its matrices,
+      "M1" and "M2": the first at the origin, the second by R and T, which may stand in extrinsics.yml beside intrinsics.yml
+    - .yaml of ROS (camera_info), by camera_name; and of Kalibr (camchain), pinhole with radtan or equidistant: "cam0", "cam1" …,
+      the first at the origin
     - .gltf and .glb; names are the nodes'
     - .json of save_camera; names are numbers
 
@@ -111,11 +117,12 @@ def load_cameras(
     dtype   of the cameras
 
     Stack those of one size by Camera.stack. Distorted lenses are mapped to this library's; where one cannot be, the error names
-    it. Raises FileNotFoundError, TypeError, ValueError that names the file, or ImportError without OpenCV (edgegrad[cameras]).
+    it. One warning names what a file says and nobody reads, unless cameras do not depend on it. Raises FileNotFoundError,
+    TypeError, ValueError that names the file, or ImportError without OpenCV or PyYAML (edgegrad[cameras]).
     """
     folder = Path(path) if isinstance(path, (str, os.PathLike)) else None
     if folder is not None and folder.is_dir():
-        place = colmap.find(folder)
+        place, unread = colmap.find(folder), Unsupported()
         if place is None and (folder / "transforms.json").is_file():
             return load_cameras(folder / "transforms.json", size, images, dtype)
         if place is None:
@@ -124,9 +131,12 @@ def load_cameras(
                 "name the one that has them"
             )
         with naming(path):
-            return _some(colmap.read(place, None if images is None else Path(images), dtype))
+            views = _some(colmap.read(place, None if images is None else Path(images), dtype, unread))
+        colmap.note_others(folder, place, unread)
+        unread.say(path, UNREAD)
+        return views
     file = check_readable(path, (".json", *CALIBRATIONS, *GLTFS))
-    whole = None if size is None else _whole(size)
+    whole, unread = None if size is None else _whole(size), Unsupported()
     with naming(path):
         if file.suffix.lower() in GLTFS:
             if whole is None:
@@ -135,10 +145,14 @@ def load_cameras(
                 )
             return _some({name: View(camera, None) for name, camera in read_cameras(path, whole, dtype).items()})
         if file.suffix.lower() in CALIBRATIONS:
-            return calibration.read(file, whole, dtype)
+            views = calibration.read(file, whole, dtype, unread)
+            unread.say(path, UNREAD)
+            return views
         fields = json.loads(file.read_text(encoding="utf-8"))
         if isinstance(fields, dict) and "frames" in fields:
-            return transforms.read(fields, file.parent, whole, dtype)
+            views = transforms.read(fields, file.parent, whole, dtype, unread)
+            unread.say(path, UNREAD)
+            return views
         camera = load_camera(path, dtype)
         return {str(i): View(one, None) for i, one in enumerate(camera if camera.batch is not None else [camera])}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,11 +11,13 @@ from torch import Tensor
 from ..camera.mistakes import warn_of_bytes
 from ..check import as_tensor, check_finite, check_not_meta, check_shape
 from ..optional import require
+from ..warnings import warn
 from .paths import PathLike, check_readable, check_suffix, replacing
 
 DISPLAY = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # 8 bit, sRGB
 RADIANCE = (".exr", ".hdr")  # floating point, linear
 IMAGES = (*DISPLAY, *RADIANCE)
+SEVERAL = (".tif", ".tiff", ".exr")  # may hold more images than one
 MOST_NUMBERS = 1 << 30  # pixels times channels, four bytes each; a small file may announce more
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec. 709 primaries, which sRGB shares
 
@@ -31,22 +35,16 @@ def linear_to_srgb(values: Tensor) -> Tensor:
     return torch.where(values <= 0.0031308, values * 12.92, curve)
 
 
-def read_image(path: PathLike, channels: int | None = None) -> Tensor:
-    """(H, W, C) float32 from an image file: linear radiance, row 0 on top, upright as its EXIF orientation says.
+class Stored(NamedTuple):
+    """An image upright, with the numbers that are in its file."""
 
-    Integer pixels (PNG, JPEG, BMP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1;
-    floating-point pixels (EXR, HDR, float TIFF) are linear as they are. Alpha is the last channel, not gamma-corrected
-    and not multiplied into the colours (EXR files hold them multiplied; they stay so). At most 2³⁰ pixels times channels.
+    color: Tensor  # (H, W, C) float32, not multiplied by alpha unless the file is an EXR; integers are from 0 to 1
+    alpha: Tensor | None  # (H, W, 1)
+    largest: int | None  # the integer that became 1; None for floating point
 
-    channels  None keeps what the file has. 1 gives the luminance and 3 the colours, both without alpha;
-              4 adds an alpha of 1 where the file has none
 
-    Raises FileNotFoundError, PermissionError, TypeError, ValueError (another kind of file, damaged, too large, colours that
-    do not convert)
-    or ImportError without OpenImageIO.
-    """
-    if channels not in (None, 1, 3, 4):
-        raise ValueError(f"channels: expected None, 1, 3 or 4, got {channels!r}")
+def read_stored(path: PathLike) -> Stored:
+    """Raises what read_image does."""
     file = check_readable(path, IMAGES)
     oiio = require("OpenImageIO", "OpenImageIO", "reading images")
     hint = oiio.ImageSpec()
@@ -65,12 +63,47 @@ def read_image(path: PathLike, channels: int | None = None) -> Tensor:
     pixels = None if upright is None else upright.get_pixels(oiio.FLOAT, upright.roi_full)
     if pixels is None or (stored.file_format_name == "jpeg" and not _jpeg_ends(file.read_bytes())):
         raise ValueError(f"{path}: expected a whole image, got one that cannot be read ({_reason(stored)})")
+    if file.suffix.lower() in SEVERAL and (opened := oiio.ImageInput.open(str(file))) is not None:
+        if opened.seek_subimage(1, 0):
+            warn(f"images of {path}", f"{path}: the first of its images is read; save the others as files of their own")
+        opened.close()
     image = torch.from_numpy(np.ascontiguousarray(pixels))
+    native = stored.nativespec().format
+    largest = None
+    if native.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
+        signed = native.basetype in (oiio.INT8, oiio.INT16, oiio.INT32, oiio.INT64)
+        largest = 2 ** (8 * native.basesize() - signed) - 1
     a = stored.spec().alpha_channel
-    alpha = None if a < 0 else image[..., a : a + 1]
-    color = image if a < 0 else torch.cat([image[..., :a], image[..., a + 1 :]], -1)
+    if a < 0 or image.shape[-1] == 1:
+        return Stored(image, None, largest)
+    alpha, color = image[..., a : a + 1], torch.cat([image[..., :a], image[..., a + 1 :]], -1)
+    # OpenImageIO divides only where it is told that the numbers may be unassociated, which a TIFF says of itself.
+    if stored.file_format_name == "tiff" and not stored.spec().getattribute("oiio:UnassociatedAlpha"):
+        color = torch.where(alpha > 0.0, color / alpha, color)
+        color = color if largest is None else color.clamp(max=1.0)
+    return Stored(color, alpha, largest)
+
+
+def read_image(path: PathLike, channels: int | None = None) -> Tensor:
+    """(H, W, C) float32 from an image file: linear radiance, row 0 on top, upright as its EXIF orientation says.
+
+    Integer pixels (PNG, JPEG, BMP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1;
+    floating-point pixels (EXR, HDR, float TIFF) are linear as they are. Alpha is the last channel, not gamma-corrected and
+    not multiplied into the colours: those of a TIFF with associated alpha are divided by it, where it is above 0. EXR files
+    hold colours times alpha, and these stay so. At most 2³⁰ pixels times channels. read_mask() reads masks.
+
+    channels  None keeps what the file has. 1 gives the luminance and 3 the colours, both without alpha;
+              4 adds an alpha of 1 where the file has none
+
+    Raises FileNotFoundError, PermissionError, TypeError, ValueError (another kind of file, damaged, too large, colours that
+    do not convert)
+    or ImportError without OpenImageIO.
+    """
+    if channels not in (None, 1, 3, 4):
+        raise ValueError(f"channels: expected None, 1, 3 or 4, got {channels!r}")
+    color, alpha, largest = read_stored(path)
     # Not OpenImageIO's own conversion: what it does depends on the OCIO configuration that it finds.
-    if stored.nativespec().format.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
+    if largest is not None:
         for rows in color.split(
             max(1, (1 << 20) // color[0].numel())
         ):  # in place: doubles of all would be twice the image

@@ -18,6 +18,7 @@ from ..warnings import warn
 Images = Tensor | Sequence[Tensor]
 FULL = 0.98  # a mask of more covers the whole pixel
 REACH = 8  # pixels
+FAINT = 0.5  # a mask that covers no pixel by more was read by another curve, or holds labels
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +97,7 @@ def views_of(
             raise ValueError(
                 f"{name}: expected numbers above 0 somewhere, got zero in every pixel; there is nothing to fit"
             )
+    warn_of_faint("masks", [mask for mask in shapes if mask is not None])
     return views
 
 
@@ -168,6 +170,17 @@ def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
             "as of a picture of 8 bits; take srgb_to_linear(x / 255), or read it with read_image",
         )
     return image.float()
+
+
+def warn_of_faint(name: str, masks: Sequence[Tensor]) -> None:
+    """Where no pixel of any mask is nearly covered."""
+    most = max((float(mask.max()) for mask in masks), default=0.0)
+    if 0.0 < most < FAINT:
+        warn(
+            f"faint {name}",
+            f"{name}: expected 1 where the object covers the pixel, got at most {most:.3g}; read the file with read_mask(path), "
+            "which undoes no sRGB curve and knows labels, or divide by the largest number",
+        )
 
 
 def _is_of_bytes(image: Tensor) -> bool:

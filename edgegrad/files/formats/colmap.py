@@ -5,8 +5,11 @@ Read here rather than by pycolmap, which ends the process where a file is damage
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
+from itertools import zip_longest
+from os.path import isfile  # False also of names that no file can have
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import NamedTuple
 
@@ -14,6 +17,7 @@ import torch
 
 from ...camera.camera import Camera
 from .part import Fault
+from .source import Unsupported
 from .views import View
 
 # Models by their number in binary files, with how many parameters they have.
@@ -45,13 +49,25 @@ def find(folder: Path) -> Path | None:
     return None
 
 
-def read(folder: Path, images: Path | None, dtype: torch.dtype) -> dict[str, View]:
+def note_others(folder: Path, place: Path, unread: Unsupported) -> None:
+    """Reconstructions beside sparse/0: COLMAP makes several where it finds no way from some images to others."""
+    if place == folder / "sparse" / "0":
+        for other in sorted(place.parent.iterdir()):
+            if other != place and other.is_dir() and find(other) == other:
+                unread.note(f"sparse/{other.name}", "a reconstruction of its own; load it by its folder")
+
+
+def read(folder: Path, images: Path | None, dtype: torch.dtype, unread: Unsupported) -> dict[str, View]:
     """By the names of the images that have a pose, in their order. Raises Fault."""
-    binary = (folder / "cameras.bin").is_file()
+    binary = all((folder / f"{name}.bin").is_file() for name in ("cameras", "images"))
     cameras_file, images_file = (folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images"))
     try:
         if binary:
-            lenses, found = _lenses(_Bytes(cameras_file)), list(_images(_Bytes(images_file)))
+            cameras_data, images_data = _Bytes(cameras_file), _Bytes(images_file)
+            lenses, found = _lenses(cameras_data), list(_images(images_data))
+            for file, data in ((cameras_file, cameras_data), (images_file, images_data)):
+                if left := len(data.data) - data.at:
+                    unread.note(f"{left} bytes at the end of {file.name}")
         else:
             lenses, found = _lenses_of_text(_lines(cameras_file)), list(_images_of_text(_lines(images_file)))
     except (struct.error, ValueError, IndexError) as error:
@@ -59,7 +75,7 @@ def read(folder: Path, images: Path | None, dtype: torch.dtype) -> dict[str, Vie
             f"expected a reconstruction of COLMAP, got one that cannot be read ({error}); export it again"
         ) from error
     places = [images] if images else [folder / "images", folder.parent / "images", folder.parent.parent / "images"]
-    views = {}
+    views: dict[str, View] = {}
     for image in sorted(found, key=lambda image: image.name):
         try:
             lens = lenses[image.camera]
@@ -71,7 +87,12 @@ def read(folder: Path, images: Path | None, dtype: torch.dtype) -> dict[str, Vie
             raise Fault(f"{image.name!r}: expected its camera {image.camera}, got none; export it again") from None
         except ValueError as error:
             raise Fault(f"camera {image.camera} of {image.name!r}: {error}") from error
+        if image.name in views:
+            raise Fault(f"{image.name!r}: expected one image of this name, got two; export it again")
         views[image.name] = View(camera, _file(places, image.name))
+    lost = [name for name, view in views.items() if view.image is None]
+    if lost and (images is not None or len(lost) < len(views)):
+        unread.note(f"{len(lost)} of {len(views)} images, as {lost[0]!r}", "no such file: its View.image is None")
     return views
 
 
@@ -79,7 +100,7 @@ def _file(places: list[Path], name: str) -> Path | None:
     """The image's file, below one of the folders."""
     if PurePosixPath(name).is_absolute() or PureWindowsPath(name).drive or ".." in PurePosixPath(name).parts:
         return None
-    return next((place / name for place in places if (place / name).is_file()), None)
+    return next((place / name for place in places if isfile(place / name)), None)
 
 
 # -- binary: little-endian -------------------------------------------------------------------------------------------------
@@ -97,7 +118,7 @@ class _Bytes:
     def text(self) -> str:
         end = self.data.index(b"\0", self.at)
         start, self.at = self.at, end + 1
-        return self.data[start:end].decode()
+        return os.fsdecode(self.data[start:end])
 
 
 def _lenses(data: _Bytes) -> dict[int, Lens]:
@@ -125,7 +146,7 @@ def _images(data: _Bytes) -> Iterator[Image]:
 
 
 def _lines(file: Path) -> list[str]:
-    return [line for line in file.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    return [line for line in os.fsdecode(file.read_bytes()).splitlines() if not line.startswith("#")]
 
 
 def _lenses_of_text(lines: list[str]) -> dict[int, Lens]:
@@ -139,6 +160,8 @@ def _images_of_text(lines: list[str]) -> Iterator[Image]:
     """Each has two lines; the second, its points, may be empty."""
     while lines and not lines[-1].strip():
         lines.pop()
-    for line in lines[::2]:
-        _, *numbers, name = line.split(maxsplit=9)
+    for line, points in zip_longest(lines[::2], lines[1::2], fillvalue=""):
+        index, *numbers, name = line.split(maxsplit=9)
+        if len(places := points.split()) % 3 or (places and not places[-1].lstrip("-").isdecimal()):
+            raise ValueError(f"image {index} is not followed by a line of its points, which may be empty")
         yield Image([float(value) for value in numbers[:7]], int(numbers[7]), name)

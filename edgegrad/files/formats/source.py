@@ -127,11 +127,11 @@ class Unsupported:
     def note(self, name: str, instead: str = "left out") -> None:
         self.names[name] = instead
 
-    def say(self, path: PathLike) -> None:
+    def say(self, path: PathLike, what: str = "not rendered as the file asks") -> None:
         """One warning for a file."""
         if self.names:
             listed = "; ".join(f"{name} ({instead})" for name, instead in self.names.items())
-            warn(f"{path}: {listed}", f"{path}: not rendered as the file asks: {listed}")
+            warn(f"{path}: {listed}", f"{path}: {what}: {listed}")
 
 
 class Source(NamedTuple):

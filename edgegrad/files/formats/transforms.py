@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from os.path import isfile  # False also of names that no file can have
 from pathlib import Path
 from typing import Any
 
@@ -11,42 +12,81 @@ import torch
 
 from ...camera.camera import Camera
 from ..image import IMAGES, read_size
+from .keys import image_size, note_unread
 from .part import Fault
+from .source import Unsupported
 from .views import View
 
 PINHOLES, FISHEYES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV"), ("OPENCV_FISHEYE",)
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+READ = {
+    "frames", "file_path", "transform_matrix", "w", "h", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy",
+    "camera_model", "is_fisheye", *COEFFICIENTS,
+}  # fmt: skip
+# What cameras and images do not depend on: how instant-ngp trains, where nerfstudio's points and lists of images are.
+HARMLESS = {
+    "aabb", "aabb_scale", "scale", "offset", "up", "sharpness", "n_frames", "n_extra_learnable_dims", "render_aabb",
+    "enable_depth_loading", "enable_ray_loading", "integer_depth_scale", "white_transparent", "black_transparent", "fix_premult",
+    "colmap_im_id", "ply_file_path", "train_filenames", "val_filenames", "test_filenames", "depth_file_path", "depth_path",
+    "rotation", "orientation_override", "camera_label", "bounding_box",
+}  # fmt: skip
+INSTEAD = {
+    "applied_transform": "cameras stay in the world that it made, not in that from before",
+    "applied_scale": "cameras stay in the world that it made, not in that from before",
+    "mask_path": "left out; read_mask() reads it",
+}
 
 
-def read(fields: Mapping[str, Any], folder: Path, size: tuple[int, int] | None, dtype: torch.dtype) -> dict[str, View]:
+def read(
+    fields: Mapping[str, Any], folder: Path, size: tuple[int, int] | None, dtype: torch.dtype, unread: Unsupported
+) -> dict[str, View]:
     """By the frames' file_path. What a frame says goes before what the file says of all. Raises Fault."""
     frames = fields["frames"]
     if not isinstance(frames, list) or not frames:
         raise Fault("frames: expected a list of frames, got none; export it again")
+    shared = _given(fields)
     views: dict[str, View] = {}
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict) or "transform_matrix" not in frame:
             raise Fault(f"frames[{i}]: expected transform_matrix, 4 × 4, got none; export it again")
-        name = str(frame.get("file_path", i))
+        own = _given(frame)
+        name = str(own.get("file_path", i))
         try:
-            image = _image(folder, name) if "file_path" in frame else None
-            views[name] = View(_camera({**fields, **frame}, image, size, dtype), image)
-        except (TypeError, ValueError, KeyError) as error:
+            image = _image(folder, name) if "file_path" in own else None
+            view = View(_camera(own, shared, image, size, dtype), image)
+        except (Fault, TypeError, ValueError, KeyError, OverflowError) as error:
             raise Fault(f"frames[{i}], {name}: {error}") from error
+        views[name if name not in views else f"{name} (frame {i})"] = view
+        note_unread(own, READ | HARMLESS, unread, INSTEAD)
+    note_unread(shared, READ | HARMLESS, unread, INSTEAD)
     return views
 
 
+def _given(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Without those that are null."""
+    return {key: value for key, value in fields.items() if value is not None}
+
+
 def _image(folder: Path, name: str) -> Path | None:
-    """Beside the file or below it; the synthetic scenes leave out the ending."""
-    for ending in ("", *IMAGES):
-        file = folder / f"{name}{ending}"
-        if file.is_file() and file.resolve().is_relative_to(folder.resolve()):
-            return file
+    """Beside the file or below it; the synthetic scenes leave out the ending, and Windows writes backslashes."""
+    for stem in dict.fromkeys((name, name.replace("\\", "/"))):
+        for ending in ("", *IMAGES):
+            file = folder / f"{stem}{ending}"
+            if isfile(file) and file.resolve().is_relative_to(folder.resolve()):
+                return file
     return None
 
 
-def _camera(given: Mapping[str, Any], image: Path | None, size: tuple[int, int] | None, dtype: torch.dtype) -> Camera:
+def _camera(
+    own: Mapping[str, Any],
+    shared: Mapping[str, Any],
+    image: Path | None,
+    size: tuple[int, int] | None,
+    dtype: torch.dtype,
+) -> Camera:
+    given = {**shared, **own}
     if "w" in given and "h" in given:
-        H, W = int(given["h"]), int(given["w"])
+        H, W = image_size(float(given["w"]), float(given["h"]))
     elif size is not None:
         H, W = size
     elif image is not None:
@@ -56,26 +96,56 @@ def _camera(given: Mapping[str, Any], image: Path | None, size: tuple[int, int] 
             "w and h: expected the image's size, or the image itself, got neither; pass size=(height, width)"
         )
     pose = torch.tensor(given["transform_matrix"], dtype=dtype)
-    model = given.get("camera_model", "OPENCV_FISHEYE" if given.get("is_fisheye") else "OPENCV")
-    if model not in PINHOLES + FISHEYES:
-        raise ValueError(
-            f"camera_model: expected one of {', '.join(PINHOLES + FISHEYES)}, got {model!r}; undistort the images"
-        )
-    focals: list[float] = []
-    for key, angle, pixels in (("fl_x", "camera_angle_x", W), ("fl_y", "camera_angle_y", H)):
-        if key in given:
-            focals.append(float(given[key]))
-        elif angle in given:
-            focals.append(0.5 * pixels / math.tan(0.5 * float(given[angle])))
-    if not focals:
-        raise ValueError("fl_x: expected this key or camera_angle_x, got neither; export it again")
+    model = _model(own, shared)
+    fx, fy = _focals(own, shared, (W, H))
     cx, cy = float(given.get("cx", 0.5 * W)), float(given.get("cy", 0.5 * H))
-    K = torch.tensor([[focals[0], 0.0, cx], [0.0, focals[-1], cy], [0.0, 0.0, 1.0]], dtype=dtype)
-    k1, k2, k3, k4, p1, p2 = (float(given.get(key, 0.0)) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
+    k1, k2, k3, k4, p1, p2 = (float(given.get(key, 0.0)) for key in COEFFICIENTS)
     camera = Camera.from_opengl(pose, (H, W), K=K)
     if model in FISHEYES:
+        if p1 or p2:
+            raise ValueError(f"p1, p2: expected 0 of a fisheye, got {p1:g} and {p2:g}; undistort the images")
         return camera.replace(projection="fisheye", distortion=torch.tensor([k1, k2, k3, k4], dtype=dtype))
     if k4 != 0.0:
         raise ValueError(f"k4: expected 0 of a lens that is no fisheye, got {k4:g}; undistort the images")
     coefficients = [k1, k2, p1, p2, k3] if k3 else [k1, k2, p1, p2]
     return camera.replace(distortion=torch.tensor(coefficients, dtype=dtype)) if any(coefficients) else camera
+
+
+def _model(own: Mapping[str, Any], shared: Mapping[str, Any]) -> str:
+    """Raises ValueError."""
+    for fields in (own, shared):
+        if "camera_model" in fields or "is_fisheye" in fields:
+            model = fields.get("camera_model", "OPENCV_FISHEYE" if fields.get("is_fisheye") else "OPENCV")
+            break
+    else:
+        model = "OPENCV"
+    if model not in PINHOLES + FISHEYES:
+        raise ValueError(
+            f"camera_model: expected one of {', '.join(PINHOLES + FISHEYES)}, got {model!r}; undistort the images"
+        )
+    return model
+
+
+def _focals(own: Mapping[str, Any], shared: Mapping[str, Any], pixels: tuple[int, int]) -> tuple[float, float]:
+    """Of x and y, in pixels. Where a frame has one of them alone, the file's pixels keep their shape. Raises ValueError."""
+    (fx, fy), (file_x, file_y) = (
+        (_focal(fields, "fl_x", "camera_angle_x", pixels[0]), _focal(fields, "fl_y", "camera_angle_y", pixels[1]))
+        for fields in (own, shared)
+    )
+    if fx is None and fy is None:
+        fx, fy = file_x, file_y
+    elif fx is None and fy is not None:
+        fx = fy * file_x / file_y if file_x and file_y else file_x
+    elif fy is None and fx is not None:
+        fy = fx * file_y / file_x if file_x and file_y else file_y
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy  # pixels are square
+    if fx is None or fy is None:
+        raise ValueError("fl_x: expected this key or camera_angle_x, got neither; export it again")
+    return fx, fy
+
+
+def _focal(fields: Mapping[str, Any], key: str, angle: str, pixels: int) -> float | None:
+    if key in fields:
+        return float(fields[key])
+    return 0.5 * pixels / math.tan(0.5 * float(fields[angle])) if angle in fields else None

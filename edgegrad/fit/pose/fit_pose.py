@@ -62,10 +62,11 @@ def fit_pose(
     target      (H, W, C) linear radiance, as read_image gives it, with the mesh's channels; or a list of pictures
     camera      the camera of the picture, of size (H, W), or a list of them; with fit_focal, its focal length is where the fit
                 starts
-    mask        (H, W) or (H, W, 1), 1 on the object and 0 elsewhere. Then the colours inside the mask and the mask itself
-                are compared; a plain mesh, which has no colours to compare, is fitted to the mask alone. At the border of
-                a soft mask the colour beside it counts, times the mask: what the picture has there, before black, a
-                photograph's background or straight alpha, makes no difference
+    mask        (H, W) or (H, W, 1), 1 on the object and 0 elsewhere, as read_mask gives it. Then the colours inside the mask
+                and the mask itself are compared; a plain mesh, which has no colours to compare, is fitted to the mask alone.
+                At the border of a soft mask the colour beside it counts, times the mask: what the picture has there, before
+                black, a photograph's background or straight alpha, makes no difference. A mask that nowhere reaches 0.5 is
+                warned of
     init        the pose to start from, within about 30° and 15 % of the object's size of the true one: an earlier fit, or
                 mesh to world as a matrix (4, 4) for column vectors. When None, where the mesh file puts the object, if the
                 camera sees it there (and the mask agrees); else in the middle of the mask, or of the picture
@@ -159,7 +160,8 @@ def search_pose(
     def after_step() -> None:
         last = search.history[-1]
         bar.set_postfix_str(f"{last.size[1]} × {last.size[0]} px, loss {last.loss:.2e}", refresh=False)
-        bar.total = max(bar.total, bar.n + 1)
+        if bar.total is not None and bar.n + 1 >= bar.total:
+            bar.total = None  # how many steps the later passes take is not known
         bar.update()
         if callback is not None:
             callback(result())

@@ -16,7 +16,7 @@ from ...camera.camera import Camera
 from ...check import as_tensor, check_finite, check_float, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
-from ..views import area_mean, before_black, check_image
+from ..views import area_mean, before_black, check_image, warn_of_faint
 from .pose import Pose, rotation
 
 COARSEST = 24  # pixels across the object where the fit begins: 15 % of its size is then a few pixels
@@ -108,7 +108,7 @@ class PoseTask:
         plain = all(part.channels is None for part in scene.meshes)
         if mask is not None and background is not None:
             raise ValueError("background: expected None with a mask, got both; the mask leaves no background")
-        shots, clutter = [], False
+        shots, masks, clutter = [], [], False
         for name, view, picture, shape, count in _shots(camera, target, mask, weight, names):
             image = check_image(f"{names.target}{name}", picture, view.size)
             C = image.shape[-1] if plain else scene.channels
@@ -126,6 +126,7 @@ class PoseTask:
             if mask is not None:
                 shape = check_image(f"mask{name}", shape, view.size)
                 check_shape(f"mask{name}", shape, (*view.size, 1))
+                masks.append(shape)
                 image = shape if plain else torch.cat([before_black(image, shape)[0], shape], -1)
             else:
                 behind = background if background is not None else scene.background
@@ -133,6 +134,7 @@ class PoseTask:
                     clutter = clutter or is_clutter(image)
                 behind = _background(behind, image)
             shots.append(Shot(view.to("cpu", torch.float64, copy=True), image, behind, count))
+        warn_of_faint("mask", masks)
         if clutter:
             shots = [shot._replace(background=None) for shot in shots]
         aovs = ("image", "alpha") if clutter or (mask is not None and not plain) else ("image",)

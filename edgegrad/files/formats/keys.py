@@ -1,0 +1,97 @@
+"""Files of keys and values: OpenCV's YAML and XML by OpenCV, other YAML by PyYAML; and what nobody read of them."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...optional import require
+from .part import Fault
+from .source import Unsupported
+
+MOST_NUMBERS = 1 << 20  # of a matrix; YAML's references announce more than they hold
+MOST_PIXELS = 1 << 24  # on a side
+OPENCV = ("%YAML:", "opencv-matrix", "opencv_storage")  # in files of cv2.FileStorage
+
+
+def read_keys(file: Path) -> dict[str, Any]:
+    """Numbers, text, lists, dicts and, of OpenCV, arrays. Raises Fault or ImportError."""
+    text = file.read_text(encoding="utf-8", errors="replace")
+    if file.suffix.lower() == ".xml" or any(mark in text for mark in OPENCV):
+        return _of_opencv(file)
+    yaml = require("yaml", "edgegrad[cameras]", "reading YAML")
+    try:
+        found = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise Fault(f"expected YAML, got a file that PyYAML does not read ({' '.join(str(error).split())})") from error
+    if not isinstance(found, dict):
+        raise Fault(f"expected YAML or XML of keys and values, got {type(found).__name__}")
+    return {str(key): value for key, value in found.items() if value is not None}
+
+
+def _of_opencv(file: Path) -> dict[str, Any]:
+    cv2: Any = require("cv2", "edgegrad[cameras]", "reading OpenCV's calibrations")
+    try:
+        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+        root = storage.root()
+        return _value(root, cv2.error) if root.isMap() else {}
+    except (cv2.error, SystemError) as error:
+        raise Fault("expected YAML or XML of cv2.FileStorage, got a file that OpenCV does not read") from error
+
+
+def _value(node: Any, error: type[Exception]) -> Any:
+    if node.isSeq():
+        return [_value(node.at(i), error) for i in range(node.size())]
+    if node.isMap():
+        try:
+            matrix = node.mat()
+            return np.zeros((0, 0)) if matrix is None else matrix
+        except error:  # no matrix of OpenCV
+            names = node.keys()
+            return {name: _value(node.getNode(name), error) for name in names}
+    return node.string() if node.isString() else node.real() if node.isInt() or node.isReal() else None
+
+
+def matrix(name: str, value: object) -> np.ndarray:
+    """(rows, columns) float64 from OpenCV's or ROS's matrices, or from lists; a single list is a row. Raises Fault."""
+    try:
+        if isinstance(value, np.ndarray):
+            return value.astype(np.float64)
+        if isinstance(value, dict):
+            flat, shape = value["data"], (int(value["rows"]), int(value["cols"]))
+            return np.array([float(x) for x in flat]).reshape(shape)
+        rows: Any = value if isinstance(value, list) and value and isinstance(value[0], list) else [value]
+        if sum(map(len, rows)) > MOST_NUMBERS:
+            raise ValueError("too many numbers")
+        return np.array([[float(x) for x in row] for row in rows])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise Fault(
+            f"{name}: expected a matrix of OpenCV, or rows, cols and data, or a list of rows, got something else ({error})"
+        ) from error
+
+
+def image_size(width: float, height: float) -> tuple[int, int]:
+    """(H, W). Raises Fault."""
+    if not all(0 < side <= MOST_PIXELS and side == round(side) for side in (width, height)):  # nor NaN
+        raise Fault(f"size: expected whole numbers of pixels, got width {width:g} and height {height:g}")
+    return round(height), round(width)
+
+
+def note_unread(
+    fields: Mapping[str, Any], known: Container[str], unread: Unsupported, instead: Mapping[str, str] | None = None
+) -> None:
+    """Notes the keys that are not known, unless they say nothing: null, zeros, nothing at all."""
+    for key, value in fields.items():
+        if key not in known and not _says_nothing(value):
+            unread.note(key, (instead or {}).get(key, "left out"))
+
+
+def _says_nothing(value: object) -> bool:
+    if isinstance(value, np.ndarray):
+        return not value.any()
+    if isinstance(value, dict):
+        return all(_says_nothing(one) for one in value.values())
+    return all(_says_nothing(one) for one in value) if isinstance(value, list) else not value
