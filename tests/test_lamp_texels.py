@@ -231,3 +231,25 @@ def test_steps_are_declared_as_shading_looks_them_up() -> None:
     for a, b in zip(whole._steps.values, alone._steps.values, strict=True):
         assert torch.equal(a.isnan(), b.isnan())
         assert torch.equal(a.nan_to_num(), b.nan_to_num())
+
+
+def test_a_lamp_that_is_cut_out_gives_no_light_there() -> None:
+    """By the kernel and in PyTorch, cut out or blending: that of the half which is left, in closed form."""
+    alpha = torch.tensor([[0.2, 0.9]])
+    uvs = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64)
+    left = (SQUARE[[1, 2]] + SQUARE[[0, 3]]) / 2
+    exact = float(
+        polygon_irradiance(torch.stack([left[0], SQUARE[1], SQUARE[2], left[1]]), PLACE, vector(0, 0, 1)).abs()
+    )
+    camera = eg.Camera.look_at((0.3, -2.0, 1.0), PLACE.tolist(), fov_y=2.0, size=(1, 1))
+    for mode in ("MASK", "BLEND"):
+        glow = eg.Material(0.0, emission=1.0, alpha_mode=mode)
+        lamp = eg.Mesh(SQUARE, FACES, uvs=uvs, uv_faces=FACES, alpha=alpha, filter="nearest", material=glow)
+        lit = eg.Scene([plane(4.0, material=eg.Material(torch.pi * vector(1, 1, 1) / 4)), lamp])
+        with torch.no_grad():
+            found = [
+                torch.stack([eg.render(lit, camera, 1024, seed=s, light_samples=16) for s in range(4)]),
+                reference(hits_of(lit, 20_000, PLACE, BESIDE)),
+            ]
+        for values in found:
+            assert abs(4 * float(values.mean()) - exact) < 0.02 * exact, (mode, values.mean(), exact)

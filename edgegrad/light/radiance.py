@@ -246,6 +246,7 @@ def _scattered(
     with torch.no_grad():
         l = light.incident(points, surface.position)
         facing = ((dot(surface.n, l) > 0) & (dot(surface.g, l) > 0))[:, 0]
+        facing &= light.shows(points)
     rows = facing.nonzero()[:, 0]
     C = hits._surfaces.scene.channels
     total = surface.position.new_zeros((len(hits), C))

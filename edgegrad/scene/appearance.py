@@ -72,6 +72,20 @@ class OnMesh(NamedTuple):
         factor = self.value(of_material)
         return factor if own is None else own * factor
 
+    def shows(self) -> Tensor:
+        """(N,) bool: whether the mesh is there, for what light meets: not where it is cut out, nor where it blends below ½."""
+        mesh = self.mesh
+        if mesh.alpha is None:
+            return torch.ones(len(self.face), dtype=torch.bool, device=self.face.device)
+        uvs, uv_faces = coordinates(mesh, None)
+        alpha = look_up(
+            mesh.alpha.detach().to(self.b.device)[..., None],
+            self.interpolated(uvs, uv_faces).detach(),
+            mesh.wraps,
+            mesh.filter,
+        )
+        return alpha[:, 0] >= (0.5 if mesh.blends else mesh.alpha_cutoff)
+
     def corners(self) -> Tensor:
         """(N, 3, 3) positions of the corners of the faces."""
         return self.mesh.verts.to(self.b)[self.mesh.faces[self.face].long()]

@@ -66,6 +66,10 @@ class Light:
         one = torch.ones(count, dtype=torch.float64, device=u.device)
         return LightPoints(torch.zeros(count, dtype=torch.int64, device=u.device), one[:, None].expand(-1, 2) * 0, one)
 
+    def shows(self, points: LightPoints) -> Tensor:
+        """(N,) bool: whether the light is there, not cut out."""
+        return torch.ones(len(points.index), dtype=torch.bool, device=points.index.device)
+
     def place(self, points: LightPoints) -> Tensor:
         """(N, 3) where they are; if the light is infinite, the unit directions towards them. Differentiable."""
         raise NotImplementedError

@@ -78,6 +78,9 @@ class MeshLight(Light):
         """(N, 3) float64."""
         return torch.cat([1 - points.uv.sum(1, keepdim=True), points.uv], 1).to(self.mesh.verts.device)
 
+    def shows(self, points: LightPoints) -> Tensor:
+        return OnMesh(self.mesh, points.index, self._weights(points)).shows()
+
     def place(self, points: LightPoints) -> Tensor:
         return self._at(points.index, self._weights(points))
 

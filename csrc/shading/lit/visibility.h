@@ -9,6 +9,7 @@
 #include "forward/trace.h"
 #include "rays/raycast.h"
 #include "scene/scene.h"
+#include "shading/cut_outs.h"
 #include "shading/lit/light_sample.h"
 
 namespace edgegrad {
@@ -63,8 +64,11 @@ void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayC
             const Surface<double>& o = buffers.surfaces[i];
             int8_t& found = seen[i * K + k] = not_asked;
             if (!o.mesh->has_material || o.is_black()) continue;
-            const Vec3 there =
-                lamp.is_punctual() ? only_place : place(lit, lamp, light_point(lit, points, i, lights[k], o.g));
+            const LightPoint point = light_point(lit, points, i, lights[k], o.g);
+            if (lamp.kind == Lamp::Kind::mesh &&
+                !shows(scene, lit.emitter(lamp).first + point.index, {point.u, point.v}))
+                continue;  // the lamp is cut out there
+            const Vec3 there = lamp.is_punctual() ? only_place : place(lit, lamp, point);
             const Vec3 l = lamp.is_infinite() ? there : unit(there - o.y);
             if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
             found = 1;
