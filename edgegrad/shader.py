@@ -222,8 +222,8 @@ class _Image:
         if frame.surfaces.shadowing and _has_rims(flat) and moves(frame.surfaces.verts, flat.alphas, flat.uvs):
             warn(
                 "shadows of cut-outs",
-                "alpha: the rims of what alpha cuts out cast shadows, and end lamps; how that moves on what is lit has no gradient "
-                "yet, by alpha, uvs and verts; leave it out with shadows=False, or model the shape as faces",
+                "alpha: the rims of what alpha cuts out cast shadows, and end lamps; how that moves on what is lit has no "
+                "gradient yet, by alpha, uvs and verts; leave it out with shadows=False, or model the shape as faces",
             )
         for index in sorted(frame.surfaces.shadowing):
             seed = derived_seed(frame.sampler.grad_seed, index + 2)
