@@ -14,7 +14,7 @@ LIBRARIES = ("torch", "numpy", "embreex", "trimesh", "OpenImageIO")
 OPTIONAL = {
     "pillow": "files, figures: textures of meshes, labels of masks, animations",
     "lxml": "files: 3MF",
-    "networkx": "files: 3MF",
+    "DracoPy": "files: compressed glTF",
     "opencv-python-headless": "cameras: OpenCV's calibrations",
     "pyyaml": "cameras: calibrations of ROS and Kalibr",
     "matplotlib": "figures: of fits and reports",

@@ -165,7 +165,7 @@ import json, pathlib, sys
 import torch
 import edgegrad as eg
 from edgegrad.files.parts import MESHES
-import lxml.etree, networkx, OpenImageIO, PIL.Image, trimesh.exchange.load
+import lxml.etree, OpenImageIO, PIL.Image, trimesh.exchange.load
 
 sys.path.insert(0, sys.argv[1])
 from test_bad_files import load
