@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import re
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -15,11 +13,12 @@ import torch
 
 from ..camera.camera import Camera
 from ..optional import require
-from .formats import gltf, gltf_material, obj, threemf
-from .formats.geometry import checked, place, shape, turned
+from ..scene.material import Material
+from .formats import gltf, gltf_material, obj, off, ply, stl, threemf
+from .formats.geometry import checked, place, shape, turned, typed
 from .formats.gltf_nodes import cameras, lights
 from .formats.part import Fault, Model, Part, Wanted
-from .formats.source import Folder, Source, linear_colors, opened
+from .formats.source import Source
 from .paths import PathLike, check_readable
 
 GLTFS = (".gltf", ".glb")
@@ -38,14 +37,12 @@ def read_model(path: PathLike, wanted: Wanted) -> Model:
     file = check_readable(path, MESHES)
     data, kind, source = file.read_bytes(), file.suffix.lower()[1:], Source.of(path, wanted)
     with _as_fault(kind):
-        model = _read_gltf(data, kind, source) if kind in ("gltf", "glb") else _read_plain(data, kind, source)
+        model = READERS[kind](data, kind, source)
     if not model.parts:
         raise Fault("expected triangles, got none: the file is truncated, or was exported without faces")
-    announced, found = _announced_faces(data, kind), sum(len(part.faces) for part in model.parts)
-    if found < announced:
-        raise Fault(f"expected the {announced} faces that the file announces, got {found}; it is truncated or damaged")
+    parts, dtype = typed(model.parts, wanted.dtype, source)
     source.unsupported.say(path)
-    return model
+    return model._replace(parts=parts, dtype=dtype)
 
 
 def read_cameras(path: PathLike, size: tuple[int, int], dtype: torch.dtype) -> dict[str, Camera]:
@@ -89,40 +86,25 @@ def _read_gltf(data: bytes, kind: str, source: Source) -> Model:
     return Model(_parts(loaded, look), lights(tree, source) if wanted.lit else [])
 
 
-def _read_plain(data: bytes, kind: str, source: Source) -> Model:
-    """All formats but glTF."""
-    wanted, folder = source.wanted, source.folder
-    options: dict[str, object] = {}
-    if kind == "obj":
-        data = obj.tidy(data)
-        options["split_objects"] = wanted.split
-    elif kind == "ply":
-        # Without a texture, vertices must not be split at its seams: their colours would not follow.
-        header = data.split(b"end_header")[0].lower()
-        options["fix_texture"] = wanted.unwrap or (wanted.materials and b"texturefile" in header)
-    instances = threemf.instances(data) if kind == "3mf" else None
-    with warnings.catch_warnings():  # after which Python says again what it said before, so not for a glTF
-        # Where a text stops being numbers, NumPy drops the rest and only warns.
-        warnings.filterwarnings("error", message="string or file could not be read", category=DeprecationWarning)
-        loaded = _load(data, kind, source, **options)
-    if wanted.materials:
-        _check_folder(folder)
-        if kind == "ply" and folder.contents and "visual" not in loaded:
-            raise Fault(f"expected texture coordinates for its texture {next(iter(folder.contents))!r}, got none")
-    if kind == "obj" and "geometry" in loaded:
-        loaded["geometry"] = dict(reversed(loaded["geometry"].items()))  # trimesh turns their order round
-    if instances is not None and instances != len(loaded["graph"]):
+def _read_3mf(data: bytes, kind: str, source: Source) -> Model:
+    instances = threemf.instances(data)
+    loaded = _load(data, kind, source)
+    if instances != len(loaded["graph"]):
         raise Fault(
             f"expected {instances} instances of objects, and {len(loaded['graph'])} could be read: components are nested "
             "too often, or refer to objects that are not there; export it flat"
         )
-    materials = obj.Materials()
+    material = Material() if source.wanted.lit else None
+    return Model(_parts(loaded, lambda name, raw, origin: {"material": material}), [])
 
-    def look(name: str, raw: dict[str, Any], origin: np.ndarray) -> dict[str, object]:
-        found = _look(raw, origin, source)
-        return found | _lit(raw, source, materials, has_uvs=found["uvs"] is not None) if wanted.lit else found
 
-    return Model(_parts(loaded, look), [])
+def _read_plain(data: bytes, kind: str, source: Source) -> Model:
+    """OBJ, PLY, STL and OFF."""
+    found, parts = PLAIN[kind](data, source), []
+    for part in found:
+        with _naming(part.name, alone=len(found) == 1):
+            parts.append(_finished(part, np.eye(4)))
+    return Model(parts, [])
 
 
 def _load(data: bytes, kind: str, source: Source, **options: object) -> dict[str, Any]:
@@ -137,74 +119,25 @@ def _parts(loaded: dict[str, Any], look: Callable[[str, dict[str, Any], np.ndarr
     placed = [p for p in place(loaded) if len(p[1].get("faces", ()))]  # the others: points and lines
     parts = []
     for name, raw, matrix in placed:
-        try:
+        with _naming(name, alone=len(placed) == 1):
             part, origin = shape(name, raw, matrix)
-            part = part._replace(**look(name, raw, origin))
-            parts.append(checked(part._replace(normals=turned(part, matrix))))
-        except Fault as fault:
-            raise Fault(f"part {name!r}: {fault}" if len(placed) > 1 else str(fault)) from fault.__cause__
+            parts.append(_finished(part._replace(**look(name, raw, origin)), matrix))
     return parts
 
 
-def _look(raw: dict[str, Any], origin: np.ndarray, source: Source) -> dict[str, Any]:
-    """The fields of a part that say what it looks like, in all formats but glTF."""
-    visual, wanted = raw.get("visual"), source.wanted
-    look: dict[str, Any] = {"uvs": _uvs(visual)}
-    image = getattr(getattr(visual, "material", None), "image", None)
-    diffuse = _mtl(visual).get("kd")
-    if (
-        wanted.materials and image is not None and image.format
-    ):  # the grey image that trimesh makes up comes from no format
-        look["texture"] = source.textures.get(image.info.get("file_path") or next(iter(source.folder.contents)), image)
-    elif raw.get("vertex_colors") is not None:
-        look["colors"] = linear_colors("vertex", raw["vertex_colors"], srgb=True)
-    elif raw.get("face_colors") is not None:
-        colors = linear_colors("face", raw["face_colors"], srgb=True)
-        # Polygons of mixed sizes come split already, and no longer say which face a triangle is from.
-        look["face_colors"] = colors[torch.from_numpy(origin)] if len(colors) == origin[-1] + 1 else colors
-    elif wanted.materials and diffuse is not None:
-        look["face_colors"] = torch.tensor(np.broadcast_to(diffuse, 3), dtype=torch.float32).repeat(len(origin), 1)
-    return look
+def _finished(part: Part, matrix: np.ndarray) -> Part:
+    """With its normals in the world. Raises Fault."""
+    return checked(part._replace(normals=turned(part, matrix)))
 
 
-def _lit(raw: dict[str, Any], source: Source, materials: obj.Materials, has_uvs: bool) -> dict[str, Any]:
-    """The fields of a part that say how it scatters light, in all formats but glTF."""
-    given = _mtl(raw.get("visual")) if source.wanted.materials else {}
-    look: dict[str, Any] = {"material": materials.get(given, source), "normals": raw.get("vertex_normals")}
-    look["alpha"] = obj.alpha(given, source)
-    if look["alpha"] is not None and look["alpha"].numel() == 1 and not has_uvs:
-        look["uvs"] = np.zeros((len(raw["vertices"]), 2), np.float32)  # one number for all
-    return look
+@contextmanager
+def _naming(name: str, alone: bool) -> Iterator[None]:
+    """Names the part at fault, unless it is the only one."""
+    try:
+        yield
+    except Fault as fault:
+        raise Fault(str(fault) if alone else f"part {name!r}: {fault}") from fault.__cause__
 
 
-def _mtl(visual: object) -> dict[str, Any]:
-    """What an MTL file says of a part."""
-    return getattr(getattr(visual, "material", None), "kwargs", {})
-
-
-def _uvs(visual: object) -> np.ndarray | None:
-    uvs = getattr(visual, "uv", None)
-    return None if uvs is None or len(uvs) == 0 else np.asarray(uvs, np.float32)
-
-
-def _check_folder(folder: Folder) -> None:
-    """Every file that an OBJ or PLY names was found, and every one that is not a material library is an image."""
-    for failure in folder.failures.values():
-        raise failure
-    for name, content in folder.contents.items():
-        if not name.strip().lower().endswith(".mtl"):
-            opened(name, content)
-
-
-def _announced_faces(data: bytes, kind: str) -> int:
-    """How many faces a text says that it holds: where it ends early, trimesh gives fewer and says nothing."""
-    if kind == "obj":
-        return len(re.findall(rb"(?m)^f ", data))
-    if kind == "stl" and data[:5].lower() == b"solid":
-        return len(re.findall(rb"(?im)^[ \t]*facet[ \t]", data))
-    found = None
-    if kind == "ply":
-        found = re.search(rb"element\s+face\s+(\d+)", data.split(b"end_header")[0])
-    elif kind == "off":
-        found = re.search(rb"OFF\s+\d+\s+(\d+)", re.sub(rb"#.*", b"", data))
-    return int(found[1]) if found else 0
+PLAIN = {"obj": obj.read, "ply": ply.read, "stl": stl.read, "off": off.read}
+READERS = {"gltf": _read_gltf, "glb": _read_gltf, "3mf": _read_3mf, **dict.fromkeys(PLAIN, _read_plain)}

@@ -67,7 +67,10 @@ def to_trimesh(mesh: Mesh, faces_colored: bool = True) -> Any:
         )
         pillow = require("PIL.Image", "edgegrad[files]", "saving textures")
         material = trimesh.visual.material.PBRMaterial(
-            baseColorTexture=pillow.fromarray(to_bytes(mesh.texture)), metallicFactor=0.0, roughnessFactor=1.0
+            baseColorTexture=pillow.fromarray(to_bytes(mesh.texture)),
+            baseColorFactor=[255] * 4,
+            metallicFactor=0.0,
+            roughnessFactor=1.0,
         )
         visual = trimesh.visual.TextureVisuals(uv=_array(mesh.uvs)[pairs[:, 1]], material=material)
         faces = index.reshape(-1, 3)

@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 
 from ...optional import require
+from ...scene.tree import moved
 from .part import Fault, Part
+from .source import Source
 
 
 def place(loaded: dict[str, Any]) -> list[tuple[str, dict[str, Any], np.ndarray]]:
@@ -51,7 +54,7 @@ def shape(name: str, raw: dict[str, Any], matrix: np.ndarray) -> tuple[Part, np.
     with np.errstate(over="ignore", invalid="ignore"):
         # Elementwise: a matrix product may round equal rows differently, and they would not be welded.
         v = v[:, 0:1] * matrix[:3, 0] + v[:, 1:2] * matrix[:3, 1] + v[:, 2:3] * matrix[:3, 2] + matrix[:3, 3]
-        verts = np.ascontiguousarray(v, np.float32)
+        verts = np.ascontiguousarray(v)
     corners = faces.shape[1]
     fans = np.stack([faces[:, [0] * (corners - 2)], faces[:, 1:-1], faces[:, 2:]], -1).reshape(-1, 3).astype(np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0.0:
@@ -64,8 +67,9 @@ def turned(part: Part, matrix: np.ndarray) -> np.ndarray | None:
     if part.normals is None:
         return None
     n = np.asarray(part.normals, np.float64)
-    if n.shape != part.verts.shape or not np.isfinite(n).all():
-        got = f"shape {n.shape}" if n.shape != part.verts.shape else "some that are not finite"
+    fits = n.shape == part.verts.shape or part.normal_faces is not None
+    if not fits or not np.isfinite(n).all():
+        got = "some that are not finite" if fits else f"shape {n.shape}"
         raise Fault(f"expected a finite normal for each of {len(part.verts)} vertices, got {got}; export it again")
     a, b, c = matrix[:3, :3]
     # The inverse transpose times the determinant's size: it is there for any matrix.
@@ -79,9 +83,13 @@ def turned(part: Part, matrix: np.ndarray) -> np.ndarray | None:
 def checked(part: Part) -> Part:
     """The part itself, when positions are finite, indices in range and colours as many as they should be."""
     N, F = len(part.verts), len(part.faces)
-    if not np.isfinite(part.verts).all():
-        bad = int(np.argwhere(~np.isfinite(part.verts))[0, 0])
-        raise Fault(f"expected finite positions (float32), got {part.verts[bad].tolist()} at vertex {bad}; repair it")
+    with np.errstate(over="ignore"):
+        finite = np.isfinite(part.verts.astype(np.float32))
+    if not finite.all():
+        bad = int(np.argwhere(~finite)[0, 0])
+        raise Fault(
+            f"expected finite positions, as far as float32 reaches, got {part.verts[bad].tolist()} at vertex {bad}; repair it"
+        )
     low, high = int(part.faces.min()), int(part.faces.max())
     if low < 0 or high >= N:
         raise Fault(f"expected vertex indices from 0 to {N - 1}, got {low if low < 0 else high}; repair the mesh")
@@ -89,3 +97,55 @@ def checked(part: Part) -> Part:
         if colors is not None and len(colors) != count:
             raise Fault(f"expected {count} colours for {count} {what}, got {len(colors)}; export triangles only")
     return part
+
+
+def compact(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows that an index of any shape uses, ascending, and the index into these."""
+    low, high = int(index.min()), int(index.max())
+    if high - low > 16 * index.size:  # few of many
+        used, inverse = np.unique(index, return_inverse=True)
+        return used, inverse.reshape(index.shape)
+    there = np.zeros(high - low + 1, bool)
+    there[index - low] = True
+    return np.flatnonzero(there) + low, (np.cumsum(there) - 1)[index - low]
+
+
+def typed(parts: list[Part], wanted: torch.dtype | None, source: Source) -> tuple[list[Part], torch.dtype]:
+    """The parts with positions in the type that they are welded in, and the type of their meshes, unless one is wanted: float64
+    where float32 would cost more than a millionth of the extent, else float32."""
+    low = np.min([part.verts.min(0) for part in parts], 0)
+    high = np.max([part.verts.max(0) for part in parts], 0)
+    extent = float((high.astype(np.float64) - low).max())
+    cost = max(float(np.abs(part.verts - part.verts.astype(np.float32)).max()) for part in parts)
+    precise = cost > 1e-6 * extent
+    if precise and wanted is torch.float32:
+        source.unsupported.note(
+            "positions in float64",
+            f"rounded by up to {cost:.2g}, which is {cost / extent:.1g} of the extent, as dtype says",
+        )
+    dtype = wanted or (torch.float64 if precise else torch.float32)
+    if not precise and dtype is torch.float32:
+        return [part._replace(verts=part.verts.astype(np.float32, copy=False)) for part in parts], dtype
+    parts = [part._replace(verts=part.verts.astype(np.float64)) for part in parts]
+    return (parts if dtype is torch.float32 else _in_double(parts)), dtype
+
+
+def _in_double(parts: list[Part]) -> list[Part]:
+    """With all that goes with positions in float64, what parts share once."""
+    known: dict[int, Any] = {}
+
+    def double(value: Any) -> Any:
+        if value is None or isinstance(value, np.ndarray):
+            return None if value is None else value.astype(np.float64)
+        if id(value) not in known:
+            known[id(value)] = moved(value, torch.float64)
+        return known[id(value)]
+
+    names = ("uvs", "texture", "colors", "face_colors", "alpha", "normals", "material")
+    return [
+        part._replace(
+            material_uvs={name: double(uvs) for name, uvs in part.material_uvs.items()},
+            **{name: double(getattr(part, name)) for name in names},
+        )
+        for part in parts
+    ]

@@ -30,16 +30,14 @@ class Folder:
     def __init__(self, path: PathLike) -> None:
         self.path = path
         self.root = Path(path).absolute().parent.resolve()
-        self.contents: dict[str, bytes] = {}
         self.failures: dict[str, Exception] = {}
 
     def get(self, name: str) -> bytes:
         try:
-            self.contents[name] = self._read(name)
+            return self._read(name)
         except Exception as error:
             self.failures[name] = error
             raise
-        return self.contents[name]
 
     __getitem__ = get
 
@@ -54,6 +52,12 @@ class Folder:
             f"{self.path}: names {name!r}, and there is no such file in {self.root}; put it there, "
             "or pass materials=False where only its look is missing"
         )
+
+    def holds(self, name: str) -> bool:
+        try:
+            return bool(self._read(name))
+        except (Fault, FileNotFoundError):
+            return False
 
     def image(self, name: str) -> Any:
         """A Pillow image, not yet decoded. Raises Fault or FileNotFoundError."""
@@ -118,8 +122,11 @@ def _texels(name: str, image: Any) -> Tensor:
     return texels[..., None].expand(-1, -1, 3) if texels.dim() == 2 else texels
 
 
+MOST_SAID = 20  # names in one warning
+
+
 class Unsupported:
-    """What a file asks for and does not get, by name, and what is done instead."""
+    """What a file holds or asks for and nobody reads, by name, and what is done instead."""
 
     def __init__(self) -> None:
         self.names: dict[str, str] = {}
@@ -130,7 +137,9 @@ class Unsupported:
     def say(self, path: PathLike) -> None:
         """One warning for a file."""
         if self.names:
-            listed = "; ".join(f"{name} ({instead})" for name, instead in self.names.items())
+            said = [f"{name} ({instead})" for name, instead in self.names.items()]
+            more = [f"{len(said) - MOST_SAID} more"] if len(said) > MOST_SAID else []
+            listed = "; ".join(said[:MOST_SAID] + more)
             warn(f"{path}: {listed}", f"{path}: not rendered as the file asks: {listed}")
 
 

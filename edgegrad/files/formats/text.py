@@ -1,0 +1,71 @@
+"""Text of mesh files: its encoding, and the numbers in it."""
+
+from __future__ import annotations
+
+import codecs
+import warnings
+
+import numpy as np
+
+from .part import Fault
+
+
+def as_utf8(data: bytes) -> bytes:
+    """Text in UTF-8 with newlines alone: names and comments may be in Latin-1, files of Windows in UTF-16."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        data = data.decode("utf-16", errors="replace").encode()
+    data = data.removeprefix(codecs.BOM_UTF8)
+    if not data.isascii():
+        try:
+            data.decode()
+        except UnicodeDecodeError:
+            data = data.decode("latin-1").encode()
+    return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+
+
+def numbers(text: bytes, what: str, kind: type = np.float64) -> np.ndarray:
+    """All numbers of a text, parted by white space. Raises Fault where it holds anything else."""
+    with warnings.catch_warnings():  # where the text stops being numbers, NumPy drops the rest and only warns
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            return np.fromstring(text, dtype=kind, sep=" ") if text and not text.isspace() else np.empty(0, kind)
+        except (DeprecationWarning, ValueError):
+            raise Fault(
+                f"expected numbers alone in {what}, got {_no_number(text, kind)!r}; it may be truncated, or damaged"
+            ) from None
+
+
+def table(lines: list[bytes], what: str, least: int) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers of each line in a row (N, most of them), zeros after the last; and how many there are (N,), `least` or more.
+
+    Raises Fault.
+    """
+    text = b"\n".join(lines) + b"\n"
+    values = numbers(text, what)
+    space = np.frombuffer(text, np.uint8) <= 32
+    starts = ~space
+    starts[1:] &= space[:-1]
+    ends = np.frombuffer(text, np.uint8) == 10
+    counts = np.diff(np.cumsum(starts, dtype=np.int64)[ends], prepend=0) if lines else np.empty(0, np.int64)
+    if counts.sum() != len(values):  # NumPy parts 1-2 into 1 and -2
+        raise Fault(f"expected numbers parted by spaces in {what}, got some that are not; it may be damaged")
+    if len(counts) and counts.min() < least:
+        bad = int(np.argmax(counts < least))
+        raise Fault(
+            f"expected {least} numbers in {what}, got {lines[bad].decode(errors='replace').strip()!r}; repair it"
+        )
+    width = int(counts.max(initial=least))
+    if (counts == width).all():
+        return values.reshape(len(lines), width), counts
+    rows = np.zeros((len(lines), width))
+    rows[np.arange(width) < counts[:, None]] = values
+    return rows, counts
+
+
+def _no_number(text: bytes, kind: type) -> str:
+    for word in text.split():
+        try:
+            kind(word)
+        except ValueError:
+            return word[:40].decode(errors="replace")
+    return "numbers that are not parted"
