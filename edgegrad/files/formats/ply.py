@@ -53,7 +53,8 @@ def read(data: bytes, source: Source) -> list[Part]:
     if not source.wanted.lit:
         del look["normals"]
     for element in (vertex, face, strips):
-        if left := [name for name in element.columns if name not in HARMLESS]:
+        left = [name for name in element.columns if name not in HARMLESS]
+        if left and element.size:
             source.unsupported.note(f"{', '.join(left)} of {element.name}", "not read")
     return [Part("", verts, index[triangles], material=Material() if source.wanted.lit else None, **look)]
 

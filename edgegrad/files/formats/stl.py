@@ -8,7 +8,7 @@ from ...scene.material import Material
 from .part import Fault, Part
 from .polygons import triangulate
 from .source import Source
-from .text import as_utf8, table
+from .text import MARKS, as_utf8, table
 
 HEADER = 84  # bytes of a binary file before its faces
 FACE = np.dtype([("normal", "<f4", 3), ("verts", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -18,6 +18,8 @@ WORDS = (b"facet", b"outer", b"endfacet", b"color")
 def read(data: bytes, source: Source) -> list[Part]:
     """A part for each solid of a text. Raises Fault."""
     material = Material() if source.wanted.lit else None
+    if data.startswith(MARKS):
+        data = as_utf8(data)
     count = int.from_bytes(data[80:HEADER], "little")
     exact = len(data) == HEADER + count * FACE.itemsize
     text = data[:200].lstrip()[:5].lower() == b"solid" and b"\0" not in data  # a binary one has zeros somewhere

@@ -9,10 +9,13 @@ import numpy as np
 
 from .part import Fault
 
+UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+MARKS = (codecs.BOM_UTF8, *UTF16)  # what tells the encoding, before a text
+
 
 def as_utf8(data: bytes) -> bytes:
     """Text in UTF-8 with newlines alone: names and comments may be in Latin-1, files of Windows in UTF-16."""
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+    if data.startswith(UTF16):
         data = data.decode("utf-16", errors="replace").encode()
     data = data.removeprefix(codecs.BOM_UTF8)
     if not data.isascii():
