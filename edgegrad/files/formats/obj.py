@@ -98,7 +98,7 @@ def read(data: bytes, source: Source) -> list[Part]:
 
 def _lines(text: bytes) -> Lines:
     if b"#" in text:  # names may hold one
-        text = re.sub(rb"(?m)^([ \t]*|[ \t]*(?:v|vt|vn|f)[ \t][^#\n]*)#.*$", rb"\1", text)
+        text = re.sub(rb"(?m)^([ \t]*|[ \t]*(?:v|vt|vn|f)[ \t][^#\n]*(?:(?<=\\)\n[^#\n]*)*)#.*$", rb"\1", text)
     v, vt, vn, faces = list[bytes](), list[bytes](), list[bytes](), list[bytes]()
     counted, libraries, unread = [], [], Counter[bytes]()
     thing = material = None
