@@ -61,7 +61,8 @@ def test_float32_where_it_is_asked_for_welds_first_and_warns(tmp_path, kind):
     """In float32 no two vertices of the north that lie within half a metre differ."""
     verts, faces = sphere()
     with pytest.warns(
-        UserWarning, match=r"positions in float64 \(rounded by up to 0\.2\d, which is 0\.1 of the extent"
+        UserWarning,
+        match=r"positions in float64 \(rounded by up to 0\.2\d, more than a millionth of the extent, as dtype says\)",
     ):
         mesh = eg.load_mesh(write(tmp_path, kind, *soup(verts, faces)), dtype=torch.float32)
     assert mesh.verts.dtype == torch.float32 and mesh.verts.shape == (162, 3)
@@ -102,6 +103,18 @@ def test_all_tensors_of_a_mesh_are_of_one_type(tmp_path):
         eg.render(scene, eg.Camera.look_at((4600000.6, 0.5, 3), (4600000.6, 0.5, 0), size=(4, 4)), spp=1).dtype
         == torch.float64
     )
+
+
+@pytest.mark.parametrize("kind", ["ply", "stl", "glb", "obj", "off"])
+def test_formats_of_float32_say_that_they_round(tmp_path, kind):
+    verts, faces = sphere()
+    mesh = eg.Mesh(verts, faces)
+    if kind in ("ply", "stl", "glb"):
+        with pytest.warns(UserWarning, match=rf"a\.{kind} holds no positions beyond float32; torch\.save"):
+            eg.save_mesh(tmp_path / f"a.{kind}", mesh)
+        return
+    eg.save_mesh(tmp_path / f"a.{kind}", mesh)
+    np.testing.assert_allclose(eg.load_mesh(tmp_path / f"a.{kind}").verts, verts, rtol=0, atol=1e-7)
 
 
 def test_another_dtype_is_refused(tmp_path):

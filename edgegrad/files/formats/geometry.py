@@ -110,18 +110,21 @@ def compact(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(there) + low, (np.cumsum(there) - 1)[index - low]
 
 
+def rounding(*positions: np.ndarray) -> tuple[float, bool]:
+    """By how much float32 moves positions (N, 3), at most; and whether this is more than a millionth of their extent."""
+    cost = max(float(np.abs(verts - verts.astype(np.float32)).max()) for verts in positions)
+    low, high = np.min([verts.min(0) for verts in positions], 0), np.max([verts.max(0) for verts in positions], 0)
+    return cost, cost > 1e-6 * float((high.astype(np.float64) - low).max())
+
+
 def typed(parts: list[Part], wanted: torch.dtype | None, source: Source) -> tuple[list[Part], torch.dtype]:
     """The parts with positions in the type that they are welded in, and the type of their meshes, unless one is wanted: float64
     where float32 would cost more than a millionth of the extent, else float32."""
-    low = np.min([part.verts.min(0) for part in parts], 0)
-    high = np.max([part.verts.max(0) for part in parts], 0)
-    extent = float((high.astype(np.float64) - low).max())
-    cost = max(float(np.abs(part.verts - part.verts.astype(np.float32)).max()) for part in parts)
-    precise = cost > 1e-6 * extent
+    cost, precise = rounding(*[part.verts for part in parts])
     if precise and wanted is torch.float32:
         source.unsupported.note(
             "positions in float64",
-            f"rounded by up to {cost:.2g}, which is {cost / extent:.1g} of the extent, as dtype says",
+            f"rounded by up to {cost:.2g}, more than a millionth of the extent, as dtype says",
         )
     dtype = wanted or (torch.float64 if precise else torch.float32)
     if not precise and dtype is torch.float32:
