@@ -19,7 +19,7 @@ from .mtl import Library
 from .part import Fault, Part
 from .polygons import triangulate
 from .source import Source, linear_colors
-from .text import as_utf8, numbers, table
+from .text import as_utf8, numbers, per_line, table, word_starts
 
 KINDS = {b"v": "vertices (v)", b"vt": "texture coordinates (vt)", b"vn": "normals (vn)"}
 # Keywords without a shape or a colour: groups, and hints on how to show curves.
@@ -149,17 +149,15 @@ def _corners(lines: Lines, sizes: dict[bytes, int], source: Source) -> Corners:
     values = numbers(text.replace(b"/", b" "), "the faces", np.int64)
     letters = np.frombuffer(text, np.uint8)
     space, slash = letters <= 32, letters == ord("/")
-    corner_starts = _starts(~space)
-    counts = np.diff(np.cumsum(corner_starts, dtype=np.int64)[letters == ord("\n")], prepend=0)
-    number_starts = _starts(~(space | slash))
-    if np.count_nonzero(number_starts) != len(values):
+    corner_at, number_at = word_starts(~space), word_starts(~(space | slash))
+    counts = per_line(corner_at, letters)
+    if len(number_at) != len(values):
         raise Fault("expected numbers parted by spaces and slashes in the faces, got others; the file cannot be read")
     index = np.full((int(counts.sum()), 3), -1)
     if slash.any():
-        at = np.flatnonzero(number_starts)
-        corner = np.cumsum(corner_starts, dtype=np.int64)[at] - 1
-        slashes = np.cumsum(slash, dtype=np.int64)
-        kind = slashes[at] - slashes[np.flatnonzero(corner_starts)][corner]
+        corner = np.searchsorted(corner_at, number_at, side="right") - 1
+        slash_at = np.flatnonzero(slash)
+        kind = np.searchsorted(slash_at, number_at) - np.searchsorted(slash_at, corner_at)[corner]
         if kind.max() > 2:
             raise Fault("expected up to three numbers in a corner, as in 1/1/1, got more; the file cannot be read")
     else:
@@ -185,13 +183,6 @@ def _corners(lines: Lines, sizes: dict[bytes, int], source: Source) -> Corners:
     return Corners(index, counts)
 
 
-def _starts(inside: np.ndarray) -> np.ndarray:
-    """Where words begin."""
-    starts = inside.copy()
-    starts[1:] &= ~inside[:-1]
-    return starts
-
-
 def _colors(rows: np.ndarray, widths: np.ndarray, source: Source) -> torch.Tensor | None:
     """Those after the positions of vertices, if all have some."""
     if widths.min() >= 6:
@@ -204,13 +195,14 @@ def _colors(rows: np.ndarray, widths: np.ndarray, source: Source) -> torch.Tenso
 def _groups(lines: Lines, origin: np.ndarray, source: Source) -> Iterator[tuple[str, str | None, np.ndarray]]:
     """Name, material and triangles of each part."""
     several = len({material for _, _, material in lines.runs if material is not None}) > 1
-    parts: dict[tuple[str | None, str | None], int] = {}
-    starts = [start for start, _, _ in lines.runs]
-    part_of_run = []
-    for _, thing, material in lines.runs:
-        part_of_run.append(parts.setdefault((thing if source.wanted.split else None, material), len(parts)))
+    starts = np.array([start for start, _, _ in lines.runs])
     run = np.searchsorted(starts, np.arange(len(lines.faces)), side="right") - 1
-    part = np.array(part_of_run)[run][origin]
+    parts: dict[tuple[str | None, str | None], int] = {}
+    of_run = np.zeros(len(starts), np.int64)
+    for i in np.unique(run):  # those that have faces, in the order of the file
+        _, thing, material = lines.runs[i]
+        of_run[i] = parts.setdefault((thing if source.wanted.split else None, material), len(parts))
+    part = of_run[run][origin]
     order = np.argsort(part, kind="stable")
     ends = np.cumsum(np.bincount(part, minlength=len(parts)))
     used: Counter[str] = Counter()

@@ -12,7 +12,8 @@ from .text import MARKS, as_utf8, table
 
 HEADER = 84  # bytes of a binary file before its faces
 FACE = np.dtype([("normal", "<f4", 3), ("verts", "<f4", (3, 3)), ("attribute", "<u2")])
-WORDS = (b"facet", b"outer", b"endfacet", b"color")
+SILENT = {b"facet", b"outer", b"endfacet"}  # with the normals of faces, which their corners say too
+WORDS = SILENT | {b"vertex", b"endloop"}
 
 
 def read(data: bytes, source: Source) -> list[Part]:
@@ -54,9 +55,11 @@ def _read_text(text: bytes, source: Source) -> list[Part]:
         words = line.split(None, 1)
         if not words:
             continue
-        word = words[0].lower()
+        word = words[0] if words[0] in WORDS else words[0].lower()
         if word == b"vertex":
-            corners.append(words[1] if len(words) > 1 else b"")
+            corners.append(words[-1])
+        elif word in SILENT:
+            continue
         elif word == b"endloop":
             solids[-1][2].append(len(corners) - start)
             start = len(corners)
@@ -65,7 +68,7 @@ def _read_text(text: bytes, source: Source) -> list[Part]:
             solids.append((words[1].strip().decode() if len(words) > 1 else "", corners, []))
         elif word == b"endsolid":
             ended = True
-        elif word not in WORDS:
+        else:
             source.unsupported.note(word.decode(errors="replace")[:40], "not read")
     if not ended or start < len(corners):
         raise Fault("expected endsolid at the end of the file, got none: it is truncated or damaged; export it again")

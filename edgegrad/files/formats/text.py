@@ -45,11 +45,8 @@ def table(lines: list[bytes], what: str, least: int) -> tuple[np.ndarray, np.nda
     """
     text = b"\n".join(lines) + b"\n"
     values = numbers(text, what)
-    space = np.frombuffer(text, np.uint8) <= 32
-    starts = ~space
-    starts[1:] &= space[:-1]
-    ends = np.frombuffer(text, np.uint8) == 10
-    counts = np.diff(np.cumsum(starts, dtype=np.int64)[ends], prepend=0) if lines else np.empty(0, np.int64)
+    letters = np.frombuffer(text, np.uint8)
+    counts = per_line(word_starts(letters > 32), letters) if lines else np.empty(0, np.int64)
     if counts.sum() != len(values):  # NumPy parts 1-2 into 1 and -2
         raise Fault(f"expected numbers parted by spaces in {what}, got some that are not; it may be damaged")
     if len(counts) and counts.min() < least:
@@ -63,6 +60,18 @@ def table(lines: list[bytes], what: str, least: int) -> tuple[np.ndarray, np.nda
     rows = np.zeros((len(lines), width))
     rows[np.arange(width) < counts[:, None]] = values
     return rows, counts
+
+
+def word_starts(inside: np.ndarray) -> np.ndarray:
+    """Where runs of True begin."""
+    starts = inside.copy()
+    starts[1:] &= ~inside[:-1]
+    return np.flatnonzero(starts)
+
+
+def per_line(places: np.ndarray, letters: np.ndarray) -> np.ndarray:
+    """How many of some places, ascending, lie in each line of a text that ends in a newline."""
+    return np.diff(np.searchsorted(places, np.flatnonzero(letters == ord("\n"))), prepend=0)
 
 
 def _no_number(text: bytes, kind: type) -> str:
