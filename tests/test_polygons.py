@@ -2,6 +2,7 @@
 
 import math
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -107,6 +108,21 @@ def test_corners_of_180_degrees_and_bent_quads_stay_fans(tmp_path):
     assert eg.load_mesh(written(tmp_path, "obj", [flat])).faces.tolist() == [[0, i, i + 1] for i in range(1, 5)]
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0.4\nv 1 1 0\nv 0 1 0.4\nf 1 2 3 4\n")
     assert eg.load_mesh(tmp_path / "a.obj").faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
+@pytest.mark.parametrize("kind", ["obj", "off"])
+def test_one_face_of_many_corners_among_many(tmp_path, kind):
+    """A table of all faces, as wide as the widest, would take 128 MB."""
+    circle = [[math.cos(2 * math.pi * i / 4000), math.sin(2 * math.pi * i / 4000)] for i in range(4000)]
+    path = written(tmp_path, kind, [C, circle] + [[corner[:2] for corner in SQUARE]] * 4000)
+    tracemalloc.start()
+    try:
+        mesh = eg.load_mesh(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert float(covered(mesh)[:, 2].sum()) == pytest.approx(area(C) + area(circle) + 4000, rel=1e-6)
+    assert peak < 40e6
 
 
 def test_without_earcut_only_concave_faces_of_many_corners_fail(tmp_path, monkeypatch):

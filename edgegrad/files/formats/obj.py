@@ -60,7 +60,7 @@ def read(data: bytes, source: Source) -> list[Part]:
         source.unsupported.note("s", "flat faces, for there are no normals (vn)")
     if not lines.faces or not lines.rows[b"v"]:
         return []
-    rows = {name: table(lines.rows[name], what, 1 if name == b"vt" else 3) for name, what in KINDS.items()}
+    rows = {name: table(lines.rows[name], what, 1 if name == b"vt" else 3, 8) for name, what in KINDS.items()}
     corners = _corners(lines, {name: len(found) for name, (found, _) in rows.items()}, source)
     triangles, origin = triangulate(rows[b"v"][0][:, :3], corners.rows[:, 0], corners.counts, source)
     index = corners.rows[triangles]  # (T, 3, 3): corner, kind

@@ -15,7 +15,7 @@ from ...scene.material import Material
 from .part import Fault, Part
 from .polygons import triangulate
 from .source import Source, linear_colors
-from .text import as_utf8, numbers, table
+from .text import as_utf8, numbers, ragged, table
 
 
 def read(data: bytes, source: Source) -> list[Part]:
@@ -49,35 +49,36 @@ def read(data: bytes, source: Source) -> list[Part]:
     if not n or not f:
         return []
     size = 4 if four else 3
-    rows, counts = table(lines[1 : n + 1], "the vertices", size + (3 if has_normals else 0))
+    rows, counts = table(lines[1 : n + 1], "the vertices", size + (3 if has_normals else 0), 16)
     if four and (rows[:, 3] != 1.0).any():
         rows[:, :3] /= rows[:, 3:4]
     look, at = dict[str, Any](), size
     if has_normals:
         look["normals"] = rows[:, at : at + 3] if source.wanted.lit else None
         at += 3
-    last = int(counts.min()) - (2 if has_uvs else 0)
+    last = min(int(counts.min()), rows.shape[1]) - (2 if has_uvs else 0)
     if has_uvs and last >= at:
         look["uvs"] = rows[:, last : last + 2].astype(np.float32)
     if has_colors and last - at >= 3:
         look["colors"] = linear_colors("vertex", rows[:, at : at + 3], srgb=True)
     elif last > at or counts.min() < counts.max():
         source.unsupported.note(f"{counts.max() - at} more numbers of each vertex", "not read")
-    faces, many = table(lines[n + 1 : n + 1 + f], "the faces", 1)
-    corners = faces[:, 0].astype(np.int64)
-    if (corners != faces[:, 0]).any() or (corners > many - 1).any():
+    values, many = ragged(lines[n + 1 : n + 1 + f], "the faces")
+    starts = np.cumsum(many) - many
+    corners = values[starts].astype(np.int64)
+    if (corners != values[starts]).any() or (corners > many - 1).any():
         raise Fault(
             "expected the number of its corners before each face, got another; the file cannot be read as a whole"
         )
-    used = np.arange(faces.shape[1] - 1) < corners[:, None]
-    index = faces[:, 1:][used]
+    place = np.arange(len(values)) - starts.repeat(many)  # in the line
+    index = values[(place >= 1) & (place <= corners.repeat(many))]
     if (index != np.floor(index)).any():
         raise Fault("expected whole numbers in the faces, got others; the file cannot be read as a whole")
     index = index.astype(np.int64)
     triangles, origin = triangulate(rows[:, :3], index, corners, source)
     more = many - 1 - corners
     if more.min() >= 3 and more.max() <= 4 and "colors" not in look:
-        colors = np.take_along_axis(faces, corners[:, None] + 1 + np.arange(3), 1)
+        colors = values[(starts + 1 + corners)[:, None] + np.arange(3)]
         look["face_colors"] = linear_colors("face", colors, srgb=True)[torch.from_numpy(origin)]
     elif more.any():
         source.unsupported.note("colours of faces", "not read")

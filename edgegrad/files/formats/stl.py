@@ -75,7 +75,7 @@ def _read_text(text: bytes, source: Source) -> list[Part]:
     parts = []
     for name, rows, counts in solids:
         if counts:
-            verts = table(rows, "the vertices", 3)[0][:, :3]
+            verts = table(rows, "the vertices", 3, 3)[0]
             index = np.arange(len(verts))
             triangles, _ = triangulate(verts, index, np.array(counts), source)
             parts.append(Part(name, verts, triangles))

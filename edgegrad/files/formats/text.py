@@ -38,27 +38,32 @@ def numbers(text: bytes, what: str, kind: type = np.float64) -> np.ndarray:
             ) from None
 
 
-def table(lines: list[bytes], what: str, least: int) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers of each line in a row (N, most of them), zeros after the last; and how many there are (N,), `least` or more.
-
-    Raises Fault.
-    """
+def ragged(lines: list[bytes], what: str) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers of all lines, one after the other; and how many each has (N,). Raises Fault."""
+    if not lines:
+        return np.empty(0), np.empty(0, np.int64)
     text = b"\n".join(lines) + b"\n"
-    values = numbers(text, what)
-    letters = np.frombuffer(text, np.uint8)
-    counts = per_line(word_starts(letters > 32), letters) if lines else np.empty(0, np.int64)
+    values, letters = numbers(text, what), np.frombuffer(text, np.uint8)
+    counts = per_line(word_starts(letters > 32), letters)
     if counts.sum() != len(values):  # NumPy parts 1-2 into 1 and -2
         raise Fault(f"expected numbers parted by spaces in {what}, got some that are not; it may be damaged")
-    if len(counts) and counts.min() < least:
-        bad = int(np.argmax(counts < least))
-        raise Fault(
-            f"expected {least} numbers in {what}, got {lines[bad].decode(errors='replace').strip()!r}; repair it"
-        )
+    return values, counts
+
+
+def table(lines: list[bytes], what: str, least: int, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """The first numbers of each line in a row (N, up to `most`), zeros where there are fewer; and how many the line has (N,),
+    `least` or more. Raises Fault."""
+    values, counts = ragged(lines, what)
+    if counts.min(initial=least) < least:
+        bad = lines[int(np.argmax(counts < least))].decode(errors="replace").strip()[:40]
+        raise Fault(f"expected {least} numbers for each of {what}, got {bad!r}; the file may be truncated or damaged")
     width = int(counts.max(initial=least))
     if (counts == width).all():
-        return values.reshape(len(lines), width), counts
-    rows = np.zeros((len(lines), width))
-    rows[np.arange(width) < counts[:, None]] = values
+        return values.reshape(len(lines), width)[:, :most], counts
+    column = np.arange(min(width, most))
+    there = column < counts[:, None]
+    rows = np.zeros(there.shape)
+    rows[there] = values[((np.cumsum(counts) - counts)[:, None] + column)[there]]
     return rows, counts
 
 
