@@ -138,6 +138,9 @@ def test_mtl_options_that_nothing_follows(tmp_path):
     said = r"map_Kd -mm 0\.1 2 \(.*map_Kd -t 1 1 1 \(.*map_Kd -type cube_top \(.*map_Kd -cc on \("
     with pytest.warns(UserWarning, match=said):
         assert eg.load_mesh(write_obj(tmp_path, mtl=mtl)).texture is not None
+    (tmp_path / "skin.png").rename(tmp_path / "my 3 skins.png")
+    write(tmp_path, "quad.mtl", "newmtl skin\nmap_Kd -s 1 my 3 skins.png\n")
+    assert quietly(tmp_path / "quad.obj").texture is not None
     with pytest.raises(ValueError, match=r"expected the name of an image after map_Kd '-s 1 1 1', got none"):
         eg.load_mesh(write_obj(tmp_path, mtl="newmtl skin\nmap_Kd -s 1 1 1\n"))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from mesh_files import write_obj
+from mesh_files import glb, write_obj
 
 import edgegrad as eg
 
@@ -103,6 +103,20 @@ def test_all_tensors_of_a_mesh_are_of_one_type(tmp_path):
         eg.render(scene, eg.Camera.look_at((4600000.6, 0.5, 3), (4600000.6, 0.5, 0), size=(4, 4)), spp=1).dtype
         == torch.float64
     )
+
+
+def test_a_gltf_whose_nodes_are_far_away(tmp_path):
+    """Its own numbers are float32, and their sum with the translation is not."""
+    verts, faces = (v - UTM if i == 0 else v for i, v in enumerate(sphere()))
+    own = verts.astype("<f4")
+    tree = {
+        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "translation": UTM.tolist()}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    }  # fmt: skip
+    (tmp_path / "a.glb").write_bytes(glb(tree, own, faces.reshape(-1).astype("<u4")))
+    mesh = eg.load_mesh(tmp_path / "a.glb")
+    assert mesh.verts.dtype == torch.float64 and mesh.verts.shape == (162, 3)
+    np.testing.assert_array_equal(mesh.verts[mesh.faces], own.astype(np.float64)[faces] + UTM)
 
 
 @pytest.mark.parametrize("kind", ["ply", "stl", "glb", "obj", "off"])

@@ -1,4 +1,4 @@
-"""Mesh files as plain arrays, through trimesh, and the faults that trimesh passes over without a word."""
+"""Mesh files as parts: what each format holds, in its place and checked, and what nobody reads of it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ logging.getLogger("trimesh").addHandler(logging.NullHandler())
 def read_model(path: PathLike, wanted: Wanted) -> Model:
     """The parts of a mesh file, and its lights.
 
-    Raises Fault, FileNotFoundError, ValueError (see check_readable) or ImportError. Warns of what a lit scene asks for in vain.
+    Raises Fault, FileNotFoundError, ValueError (see check_readable) or ImportError. Warns of what nobody reads.
     """
     file = check_readable(path, MESHES)
     data, kind, source = file.read_bytes(), file.suffix.lower()[1:], Source.of(path, wanted)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
@@ -32,8 +33,8 @@ class Texture(NamedTuple):
         while (option := rest.split(None, 1)[0].lower() if rest else "") in OPTIONS:
             words = rest.split(None, OPTIONS[option] + 1)[1:]
             values = words[: OPTIONS[option]]
-            while option in FEWER and values and not _is_number(values[-1]):
-                del values[-1]
+            if option in FEWER:
+                values = list(takewhile(_is_number, values))
             options[option] = tuple(value.lower() for value in values)
             rest = rest.split(None, len(values) + 1)[-1] if len(words) > len(values) else ""
         if not rest:
