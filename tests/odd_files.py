@@ -65,6 +65,17 @@ def fans(faces: list[list[Any]]) -> list[list[Any]]:
     return [triangle for corners in faces for triangle in fan(corners)]
 
 
+def stripped(strips: list[list[int]]) -> list[list[int]]:
+    """Triangles of strips, every other one turned round, without those that are none."""
+    found = []
+    for strip in strips:
+        for i in range(len(strip) - 2):
+            a, b, c = strip[i : i + 3]
+            if len({a, b, c}) == 3:
+                found.append([b, a, c] if i % 2 else [a, b, c])
+    return found
+
+
 def number(draw: Any, value: float) -> str:
     """A decimal as some program or other writes it."""
     plain = repr(float(value))
@@ -200,7 +211,8 @@ def ply_files(draw: Any) -> File:
     index = draw(st.sampled_from(["char", "uchar", "short", "int", "uint", "int32"]))
     face.append([(f"list {draw(st.sampled_from(['uchar', 'char', 'int', 'uint8', 'ushort']))} {index}",
                   draw(st.sampled_from(["vertex_indices", "vertex_index"])), faces)])  # fmt: skip
-    triangles = np.array(fans(faces))
+    strips = draw(st.lists(st.lists(st.integers(0, n - 1), max_size=6), max_size=3)) if draw(st.booleans()) else None
+    triangles = np.array(fans(faces) + stripped(strips or []))
     uvs = normals = look = None
     if draw(st.booleans()):
         rows = [[draw(EIGHTHS), draw(EIGHTHS), 1.0] for _ in range(n)]
@@ -215,7 +227,8 @@ def ply_files(draw: Any) -> File:
         vertex.append([(kind, name, [row[i] for row in rows]) for i, name in enumerate(names)])
     if draw(st.booleans()):
         rows = [[[draw(EIGHTHS), draw(EIGHTHS)] for _ in corners] for corners in faces]
-        uvs = np.array(fans(rows))
+        if len(triangles) == len(fans(faces)):  # else those of the strips would have none
+            uvs = np.array(fans(rows))
         flat = [[value for pair in row for value in pair] for row in rows]
         face.append([(f"list uchar {draw(real)}", "texcoord", flat)])
     on = draw(st.sampled_from(["vertex", "face", None]))
@@ -230,7 +243,10 @@ def ply_files(draw: Any) -> File:
         )
         shade = linear(rows)
         many = [len(corners) - 2 for corners in faces]
-        look = shade[triangles] if on == "vertex" else np.repeat(shade.repeat(many, 0)[:, None], 3, 1)
+        if on == "vertex":
+            look = shade[triangles]
+        elif strips is None:
+            look = np.repeat(shade.repeat(many, 0)[:, None], 3, 1)
 
     def others(count: int) -> list[list[tuple[str, str, list]]]:
         """A number and a list that nothing reads."""
@@ -244,6 +260,10 @@ def ply_files(draw: Any) -> File:
         "vertex": (n, [p for group in draw(st.permutations(vertex + others(n))) for p in group]),
         "face": (f, [p for group in draw(st.permutations(face + others(f))) for p in group]),
     }
+    if strips is not None:
+        joined = [i for strip in strips for i in [*strip, -1]]
+        joined = joined[:-1] if draw(st.booleans()) else joined
+        elements["tristrips"] = (1, [("list int int", "vertex_indices", [joined])])
     for name in draw(st.lists(st.sampled_from(["edge", "camera", "thing"]), unique=True, max_size=2)):
         count = draw(st.integers(0, 3))
         properties = [p for group in others(count) for p in group]
