@@ -4,6 +4,7 @@ import math
 import sys
 import tracemalloc
 
+import mapbox_earcut
 import numpy as np
 import pytest
 import torch
@@ -78,6 +79,18 @@ def test_in_any_plane_of_space(tmp_path):
         areas = covered(eg.load_mesh(path)).numpy()
         np.testing.assert_allclose(areas.sum(0), area(C) * R[:, 2], atol=1e-6)
         assert np.linalg.norm(areas, axis=1).sum() == pytest.approx(abs(area(C)), rel=1e-6)
+
+
+def test_the_side_of_a_face_does_not_depend_on_earcut(tmp_path, monkeypatch):
+    """Which promises none."""
+    split = mapbox_earcut.triangulate_float64
+    monkeypatch.setattr(
+        mapbox_earcut, "triangulate_float64", lambda *given: split(*given).reshape(-1, 3)[:, ::-1].reshape(-1)
+    )
+    for polygon in (C, C[::-1]):
+        assert float(covered(eg.load_mesh(written(tmp_path, "obj", [polygon])))[:, 2].sum()) == pytest.approx(
+            area(polygon)
+        )
 
 
 def test_texture_coordinates_follow_their_corners(tmp_path):

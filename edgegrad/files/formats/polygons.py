@@ -115,4 +115,5 @@ def _earcut(points: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray | None, 
     x, y = flat.T
     whole = float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
     simple = abs(float(np.abs(areas).sum()) - whole) <= SLACK * whole and len(found) <= len(flat) - 2
+    # Their side is not promised.
     return np.where((areas < 0.0)[:, None], found[:, ::-1], found), simple
