@@ -95,7 +95,7 @@ def test_obj_continued_lines_and_several_libraries(tmp_path):
 def test_mtl_colour_times_texture(tmp_path, lit):
     mesh = quietly(write_obj(tmp_path, mtl="newmtl skin\nKd 0.5 0.25 1 # red, green, blue\nmap_Kd skin.png\n"), lit=lit)
     np.testing.assert_allclose(mesh.texture, linear(TEXELS) * [0.5, 0.25, 1], atol=1e-6)
-    mesh = quietly(write_obj(tmp_path, mtl="newmtl skin\nKd 0.5\n"), lit=lit)
+    mesh = quietly(write_obj(tmp_path, mtl="newmtl skin\nKd 0.5\nmap_Kd \nmap_d\n"), lit=lit)
     assert mesh.face_colors.tolist() == [[0.5] * 3] * 2
     with pytest.warns(UserWarning, match=r"map_Kd times a Kd of 0 \(black, as the format says; set Kd to 1 1 1\)"):
         assert (

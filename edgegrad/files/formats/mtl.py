@@ -41,7 +41,7 @@ class Library:
             keyword, rest = [*line.strip().split(None, 1), "", ""][:2]
             if keyword.lower() == "newmtl":
                 current = self.materials[rest] = {}
-            elif keyword and not keyword.startswith("#"):
+            elif rest and not keyword.startswith("#"):  # some programs write keywords with nothing after them
                 current[keyword.lower()] = rest
 
     def look(self, name: str | None, uvs: np.ndarray | None, count: int) -> dict[str, Any]:
