@@ -48,7 +48,7 @@ WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points
 WATCHED_TESTS := $(WATCHED:%=tests/test_%.py)
 # Of all that `make test` has, files, pictures, whole fits and long statistics call the kernel as the other tests do, only for
 # longer; tests of load measure memory and time, of which the sanitizers take more, and fork() takes minutes with them.
-WITHOUT := 3mf_files bad_files browser cli derivatives distributed docs fit fit_faults late_imports mesh_files mesh_file_faults gltf_arrays gltf_files images saved_cameras load notebooks odd_scenes oracles report viewer
+WITHOUT := 3mf_files bad_files browser cli derivatives dialects distributed docs fit fit_faults late_imports mesh_files mesh_file_faults gltf_arrays gltf_files images saved_cameras load notebooks odd_files odd_scenes oracles polygons report viewer world_coordinates
 sanitize-all: WATCHED_TESTS := $(WITHOUT:%=--ignore=tests/test_%.py)
 PRELOAD := $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so 2>/dev/null))
 sanitize sanitize-all: $(VENV)/.ready

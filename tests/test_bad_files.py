@@ -319,8 +319,8 @@ def test_postscript_is_no_texture(tmp_path, monkeypatch, kind, gloss):
         "ply": TEXT.decode()
         .replace("element face", uvs, 1)
         .replace("ply\nformat ascii 1.0\n", "ply\nformat ascii 1.0\ncomment TextureFile skin.png\n")
-        .replace("0 0 0\n", "0 0 0 0 0\n").replace("1 0 0\n", "1 0 0 1 0\n").replace("1 1 0\n", "1 1 0 1 1\n")
-        .replace("0 1 0\n", "0 1 0 0 1\n"),
+        .replace("\n0 0 0\n", "\n0 0 0 0 0\n").replace("\n1 0 0\n", "\n1 0 0 1 0\n").replace("\n1 1 0\n", "\n1 1 0 1 1\n")
+        .replace("\n0 1 0\n", "\n0 1 0 0 1\n"),
         "glb": content,
         "gltf": json.dumps({**gltf_tree(content), "buffers": [{"uri": "a.bin", "byteLength": len(content)}]}),
     }  # fmt: skip

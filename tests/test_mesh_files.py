@@ -100,7 +100,7 @@ def test_textured_obj_and_glb_made_by_trimesh_agree(tmp_path):
     image = Image.fromarray(TEXELS)
     for name, material in (
         ("a.glb", trimesh.visual.material.PBRMaterial(baseColorTexture=image)),
-        ("a.obj", trimesh.visual.material.SimpleMaterial(image=image)),
+        ("a.obj", trimesh.visual.material.SimpleMaterial(image=image, diffuse=[255] * 4)),
     ):
         visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
         trimesh.Trimesh(SQUARE, TRIANGLES, visual=visual, process=False).export(tmp_path / name)

@@ -14,6 +14,7 @@ from torch import Tensor
 from ..optional import require
 from ..scene.mesh import Mesh
 from ..warnings import warn
+from .formats.geometry import rounding
 from .formats.gltf_write import to_glb
 from .formats.part import Fault, Part
 from .formats.source import Textures, linear_colors
@@ -67,7 +68,10 @@ def to_trimesh(mesh: Mesh, faces_colored: bool = True) -> Any:
         )
         pillow = require("PIL.Image", "edgegrad[files]", "saving textures")
         material = trimesh.visual.material.PBRMaterial(
-            baseColorTexture=pillow.fromarray(to_bytes(mesh.texture)), metallicFactor=0.0, roughnessFactor=1.0
+            baseColorTexture=pillow.fromarray(to_bytes(mesh.texture)),
+            baseColorFactor=[255] * 4,
+            metallicFactor=0.0,
+            roughnessFactor=1.0,
         )
         visual = trimesh.visual.TextureVisuals(uv=_array(mesh.uvs)[pairs[:, 1]], material=material)
         faces = index.reshape(-1, 3)
@@ -92,8 +96,8 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     `load_scene(path, lit=True)` reads them: factors and colours of vertices in full, textures in 8 bit (sRGB those of
     colour), clipped to 0 … 1. Metallic, roughness and emission of vertices become their mean, for glTF has none. A
     Lambertian material is one without a highlight (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an
-    OBJ also a texture, which lies beside it with its .mtl; STL and OFF the shape alone. A warning names what is left out
-    or clipped.
+    OBJ also a texture, which lies beside it with its .mtl; STL and OFF the shape alone. Positions in PLY, STL and GLB are
+    float32. A warning names what is left out, rounded or clipped.
 
     Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
     """
@@ -112,6 +116,8 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
             content, beside = export(made, return_texture=True, mtl_name=f"{file.stem}.mtl")
         else:
             content = made.export(file_type=kind)
+    if kind in ("ply", "stl", "glb") and rounding(mesh.verts.detach().cpu().numpy())[1]:
+        lost = [*lost, "positions beyond float32"]
     if lost:
         warn(
             f"left out of {kind}",

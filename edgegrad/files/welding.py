@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..scene.mesh import LARGEST_UV, Mesh
+from .formats.geometry import compact
 from .formats.part import Fault, Part
 
 
@@ -36,22 +37,35 @@ def merge(parts: list[Part]) -> Part:
         found = [getattr(part, name) for part in parts]
         return None if any(value is None for value in found) else join(found)
 
-    start = np.cumsum([0] + [len(part.verts) for part in parts])
+    def indices(rows: str, name: str) -> np.ndarray | None:
+        """Those into joined rows; None where these are the vertices', or missing."""
+        given = [getattr(part, rows) for part in parts]
+        if any(value is None for value in given) or (name != "faces" and all(getattr(p, name) is None for p in parts)):
+            return None
+        starts = np.cumsum([0] + [len(value) for value in given])
+        own = [part.faces if getattr(part, name) is None else getattr(part, name) for part in parts]
+        return np.concatenate([index + n for index, n in zip(own, starts, strict=False)])
+
+    faces = indices("verts", "faces")
+    assert faces is not None
     return parts[0]._replace(
         name="",
         verts=joined("verts"),
-        faces=np.concatenate([part.faces + n for part, n in zip(parts, start, strict=False)]),
+        faces=faces,
         uvs=joined("uvs"),
+        uv_faces=indices("uvs", "uv_faces"),
         colors=joined("colors", torch.cat),
         face_colors=joined("face_colors", torch.cat),
         normals=joined("normals"),
+        normal_faces=indices("normals", "normal_faces"),
         material_uvs={k: np.concatenate([part.material_uvs[k] for part in parts]) for k in parts[0].material_uvs},
     )
 
 
-def to_mesh(part: Part) -> Mesh:
-    """Raises Fault."""
+def to_mesh(part: Part, dtype: torch.dtype = torch.float32) -> Mesh:
+    """Vertices are welded in the type of the part, and then get theirs. Raises Fault."""
     verts, faces = _weld(part.verts, part.faces)
+    verts = verts.to(dtype)
     images: dict[str, Any] = {**_material(part), "name": part.name or None}
     shared = part.material is not None and set(part.material.textures) - set(part.material_uvs)
     textured = part.texture is not None or part.alpha is not None or bool(shared)
@@ -59,17 +73,18 @@ def to_mesh(part: Part) -> Mesh:
         raise Fault(f"part {part.name!r}: expected texture coordinates for its texture, got none; unwrap the mesh")
     # Those that nothing of the file needs are for textures to come, and for shaders.
     if part.uvs is not None and (textured or bool((np.abs(part.uvs) <= LARGEST_UV).all())):
-        images["uvs"], images["uv_faces"] = _weld(part.uvs, part.faces)
+        images["uvs"], images["uv_faces"] = _weld(part.uvs, part.faces if part.uv_faces is None else part.uv_faces)
     if textured:
         wrap = part.wrap[0] if part.wrap[0] == part.wrap[1] else part.wrap
         images |= {"texture": part.texture, "wrap": wrap, "filter": part.filter}
     if part.alpha is not None:
         images |= {"alpha": part.alpha, "alpha_cutoff": part.cutoff}
     if part.normals is not None:
-        corners = torch.from_numpy(part.normals)[torch.from_numpy(part.faces)]
+        index = part.faces if part.normal_faces is None else part.normal_faces
+        corners = torch.from_numpy(part.normals)[torch.from_numpy(index)]
         normals = _of_vertices(corners, faces, len(verts))
         if normals is None:
-            normals, images["normal_faces"] = _weld(part.normals, part.faces)
+            normals, images["normal_faces"] = _weld(part.normals, index)
         images["normals"] = normals
     if part.colors is None or part.texture is not None:
         return Mesh(verts, faces, face_colors=part.face_colors if part.texture is None else None, **images)
@@ -98,7 +113,7 @@ def _of_vertices(corners: Tensor, faces: Tensor, count: int) -> Tensor | None:
 
 def _weld(rows: np.ndarray, index: np.ndarray) -> tuple[Tensor, Tensor]:
     """The rows that `index` (F, 3) uses, equal ones once, in the order of the file; and the index into them."""
-    used, flat = np.unique(index, return_inverse=True)
+    used, flat = compact(index)
     rows = rows[used]
     order = np.lexsort(rows.T)
     starts = np.concatenate([[True], (rows[order[1:]] != rows[order[:-1]]).any(1)])

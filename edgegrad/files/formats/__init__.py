@@ -1,1 +1,1 @@
-"""What mesh files hold, format by format, as trimesh reads them and where it does not."""
+"""What mesh and camera files hold, format by format."""

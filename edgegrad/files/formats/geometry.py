@@ -5,58 +5,25 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 
-from ...optional import require
+from ...scene.tree import moved
 from .part import Fault, Part
+from .source import Source
 
 
-def place(loaded: dict[str, Any]) -> list[tuple[str, dict[str, Any], np.ndarray]]:
-    """(name, arrays, matrix to world) of each part in the order of the file; one part may stand in several places."""
-    if "geometry" not in loaded:
-        return [("", loaded, np.eye(4))]
-    geometry, edges = loaded["geometry"], loaded.get("graph")
-    if edges is None:
-        return [(name, raw, np.eye(4)) for name, raw in geometry.items()]
-    # Node by node, from matrices that are known: trimesh looks for the way to each node anew, which takes minutes where
-    # thousands are nested.
-    to_matrix = require("trimesh.scene.transforms", "trimesh", "reading meshes").kwargs_to_matrix
-    parent = {edge["frame_to"]: edge for edge in edges}
-    if len(parent) < len(edges):
-        raise Fault("expected a tree of nodes, got some inside two others; export it again")
-    base = loaded.get("base_frame", "world")
-    world = {base: np.eye(4)}
-
-    def matrix(node: str) -> np.ndarray:
-        way = []
-        while node not in world:
-            if len(way) > len(parent) or node not in parent:
-                raise Fault("expected a tree of nodes, got some that no root leads to; export it again")
-            way.append(parent[node])
-            node = parent[node].get("frame_from", base)
-        for edge in reversed(way):
-            world[edge["frame_to"]] = world[edge.get("frame_from", base)] @ to_matrix(**edge)
-        return world[way[0]["frame_to"]] if way else world[node]
-
-    order = {name: i for i, name in enumerate(geometry)}
-    nodes = [(edge["geometry"], edge["frame_to"]) for edge in edges if edge.get("geometry") in order]
-    return [(name, geometry[name], matrix(node)) for name, node in sorted(nodes, key=lambda n: order[n[0]])]
-
-
-def shape(name: str, raw: dict[str, Any], matrix: np.ndarray) -> tuple[Part, np.ndarray]:
-    """Vertices in their place, and triangles; and for each triangle the number of the face it came from."""
-    v, faces = np.asarray(raw["vertices"], np.float64), np.asarray(raw["faces"])
-    if v.ndim != 2 or v.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] < 3:
+def shape(name: str, raw: dict[str, Any], matrix: np.ndarray) -> Part:
+    """Vertices in their place, and triangles."""
+    v, faces = np.asarray(raw["vertices"], np.float64), np.asarray(raw["faces"], np.int64)
+    if v.ndim != 2 or v.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         got = f"{v.shape} and {faces.shape}"
-        raise Fault(f"expected positions (N, 3) and faces with three corners, got {got}; it may be truncated")
+        raise Fault(f"expected positions (N, 3) and triangles (F, 3), got {got}; it may be truncated")
     with np.errstate(over="ignore", invalid="ignore"):
         # Elementwise: a matrix product may round equal rows differently, and they would not be welded.
         v = v[:, 0:1] * matrix[:3, 0] + v[:, 1:2] * matrix[:3, 1] + v[:, 2:3] * matrix[:3, 2] + matrix[:3, 3]
-        verts = np.ascontiguousarray(v, np.float32)
-    corners = faces.shape[1]
-    fans = np.stack([faces[:, [0] * (corners - 2)], faces[:, 1:-1], faces[:, 2:]], -1).reshape(-1, 3).astype(np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0.0:
-        fans = fans[:, ::-1]  # in a mirror the front of a face stays its front
-    return Part(name, verts, np.ascontiguousarray(fans)), np.arange(len(faces)).repeat(corners - 2)
+        faces = faces[:, ::-1]  # in a mirror the front of a face stays its front
+    return Part(name, np.ascontiguousarray(v), np.ascontiguousarray(faces))
 
 
 def turned(part: Part, matrix: np.ndarray) -> np.ndarray | None:
@@ -64,8 +31,9 @@ def turned(part: Part, matrix: np.ndarray) -> np.ndarray | None:
     if part.normals is None:
         return None
     n = np.asarray(part.normals, np.float64)
-    if n.shape != part.verts.shape or not np.isfinite(n).all():
-        got = f"shape {n.shape}" if n.shape != part.verts.shape else "some that are not finite"
+    fits = n.shape == part.verts.shape or part.normal_faces is not None
+    if not fits or not np.isfinite(n).all():
+        got = "some that are not finite" if fits else f"shape {n.shape}"
         raise Fault(f"expected a finite normal for each of {len(part.verts)} vertices, got {got}; export it again")
     a, b, c = matrix[:3, :3]
     # The inverse transpose times the determinant's size: it is there for any matrix.
@@ -79,9 +47,13 @@ def turned(part: Part, matrix: np.ndarray) -> np.ndarray | None:
 def checked(part: Part) -> Part:
     """The part itself, when positions are finite, indices in range and colours as many as they should be."""
     N, F = len(part.verts), len(part.faces)
-    if not np.isfinite(part.verts).all():
-        bad = int(np.argwhere(~np.isfinite(part.verts))[0, 0])
-        raise Fault(f"expected finite positions (float32), got {part.verts[bad].tolist()} at vertex {bad}; repair it")
+    with np.errstate(over="ignore"):
+        finite = np.isfinite(part.verts.astype(np.float32))
+    if not finite.all():
+        bad = int(np.argwhere(~finite)[0, 0])
+        raise Fault(
+            f"expected finite positions, as far as float32 reaches, got {part.verts[bad].tolist()} at vertex {bad}; repair it"
+        )
     low, high = int(part.faces.min()), int(part.faces.max())
     if low < 0 or high >= N:
         raise Fault(f"expected vertex indices from 0 to {N - 1}, got {low if low < 0 else high}; repair the mesh")
@@ -89,3 +61,58 @@ def checked(part: Part) -> Part:
         if colors is not None and len(colors) != count:
             raise Fault(f"expected {count} colours for {count} {what}, got {len(colors)}; export triangles only")
     return part
+
+
+def compact(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows that an index of any shape uses, ascending, and the index into these."""
+    low, high = int(index.min()), int(index.max())
+    if high - low > 16 * index.size:  # few of many
+        used, inverse = np.unique(index, return_inverse=True)
+        return used, inverse.reshape(index.shape)
+    there = np.zeros(high - low + 1, bool)
+    there[index - low] = True
+    return np.flatnonzero(there) + low, (np.cumsum(there) - 1)[index - low]
+
+
+def rounding(*positions: np.ndarray) -> tuple[float, bool]:
+    """By how much float32 moves positions (N, 3), at most; and whether this is more than a millionth of their extent."""
+    cost = max(float(np.abs(verts - verts.astype(np.float32)).max()) for verts in positions)
+    low, high = np.min([verts.min(0) for verts in positions], 0), np.max([verts.max(0) for verts in positions], 0)
+    return cost, cost > 1e-6 * float((high.astype(np.float64) - low).max())
+
+
+def typed(parts: list[Part], wanted: torch.dtype | None, source: Source) -> tuple[list[Part], torch.dtype]:
+    """The parts with positions in the type that they are welded in, and the type of their meshes, unless one is wanted: float64
+    where float32 would cost more than a millionth of the extent, else float32."""
+    cost, precise = rounding(*[part.verts for part in parts])
+    if precise and wanted is torch.float32:
+        source.unsupported.note(
+            "positions in float64",
+            f"rounded by up to {cost:.2g}, more than a millionth of the extent, as dtype says",
+        )
+    dtype = wanted or (torch.float64 if precise else torch.float32)
+    if not precise and dtype is torch.float32:
+        return [part._replace(verts=part.verts.astype(np.float32, copy=False)) for part in parts], dtype
+    parts = [part._replace(verts=part.verts.astype(np.float64)) for part in parts]
+    return (parts if dtype is torch.float32 else _in_double(parts)), dtype
+
+
+def _in_double(parts: list[Part]) -> list[Part]:
+    """With all that goes with positions in float64, what parts share once."""
+    known: dict[int, Any] = {}
+
+    def double(value: Any) -> Any:
+        if value is None or isinstance(value, np.ndarray):
+            return None if value is None else value.astype(np.float64)
+        if id(value) not in known:
+            known[id(value)] = moved(value, torch.float64)
+        return known[id(value)]
+
+    names = ("uvs", "texture", "colors", "face_colors", "alpha", "normals", "material")
+    return [
+        part._replace(
+            material_uvs={name: double(uvs) for name, uvs in part.material_uvs.items()},
+            **{name: double(getattr(part, name)) for name in names},
+        )
+        for part in parts
+    ]

@@ -1,97 +1,214 @@
-"""What trimesh passes over in OBJ files, and materials of MTL files that scatter light."""
+"""OBJ files, with their materials.
+
+trimesh takes the first face of a material for how all of them are written, so that normals may become texture coordinates, does
+not keep polygons, and drops what it does not know.
+"""
 
 from __future__ import annotations
 
 import re
-from typing import Any
+from collections import Counter
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from ...scene.material import Material
-from .part import Fault
-from .source import Source
+from .geometry import compact
+from .mtl import Library
+from .part import Fault, Part
+from .polygons import triangulate
+from .source import Source, linear_colors
+from .text import as_utf8, numbers, per_line, table, word_starts
 
-# Of MTL, and of its extension for metallic-roughness: maps that nothing reads.
-MAPS = (
-    "map_ka", "map_ks", "map_ns", "map_ke", "map_pr", "map_pm", "map_ps", "map_bump", "bump", "norm", "disp", "decal",
-    "refl", "map_aat", "map_refl",
-)  # fmt: skip
+KINDS = {b"v": "vertices (v)", b"vt": "texture coordinates (vt)", b"vn": "normals (vn)"}
+# Keywords without a shape or a colour: groups, and hints on how to show curves.
+HARMLESS = {b"g", b"mg", b"bevel", b"c_interp", b"d_interp", b"lod"}
 
 
-def tidy(data: bytes) -> bytes:
-    """OBJ text as trimesh expects it: one space after a keyword, none before it, no comments (it looks into them)."""
-    text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    text = re.sub(rb"(?m)^([ \t]*|[vf][^#\n]*)#.*$", rb"\1", text)
-    text = re.sub(rb"(?m)^[ \t]*(v|vt|vn|f|o|g|s|usemtl|mtllib)[ \t]+", rb"\1 ", text)
-    if len(set(re.findall(rb"(?m)^mtllib (.*?)[ \t]*$", text))) > 1:
-        raise Fault("expected one mtllib, got several, and only one would be read; join the .mtl files")
-    if re.search(rb"(?m)^f .*?(?<=[ /])0+(?=[ /]|$)", text):
+class Lines(NamedTuple):
+    """The lines of a file by keyword, without it."""
+
+    rows: dict[bytes, list[bytes]]  # of v, vt and vn
+    faces: list[bytes]
+    counted: list[
+        tuple[int, int, int, int]
+    ]  # of each face that counts backwards: which, and how many v, vt and vn so far
+    runs: list[tuple[int, str | None, str | None]]  # the first face with an object and a material
+    libraries: list[str]
+    smooth: bool  # in groups of smoothing
+    unread: Counter[bytes]
+
+
+class Corners(NamedTuple):
+    """Of all faces, one after the other."""
+
+    rows: np.ndarray  # (C, 3) int64, of v, vt and vn, from 0; -1 for none
+    counts: np.ndarray  # (F,) how many a face has
+
+
+def read(data: bytes, source: Source) -> list[Part]:
+    """A part for each material, and, where objects are wanted apart, for each object. Raises Fault or FileNotFoundError."""
+    lines = _lines(as_utf8(data))
+    for keyword, count in lines.unread.items():
+        source.unsupported.note(f"{count} × {keyword.decode(errors='replace')[:40]}", "not read")
+    library = Library(source)
+    if source.wanted.materials:
+        for name in dict.fromkeys(lines.libraries):
+            _read_library(name, library, source)
+    if lines.smooth and source.wanted.lit and not lines.rows[b"vn"]:
+        source.unsupported.note("s", "flat faces, for there are no normals (vn)")
+    if not lines.faces or not lines.rows[b"v"]:
+        return []
+    rows = {name: table(lines.rows[name], what, 1 if name == b"vt" else 3, 8) for name, what in KINDS.items()}
+    corners = _corners(lines, {name: len(found) for name, (found, _) in rows.items()}, source)
+    triangles, origin = triangulate(rows[b"v"][0][:, :3], corners.rows[:, 0], corners.counts, source)
+    index = corners.rows[triangles]  # (T, 3, 3): corner, kind
+    verts, normals = rows[b"v"][0][:, :3], rows[b"vn"][0][:, :3]
+    uvs = np.pad(rows[b"vt"][0], ((0, 0), (0, 1)))[:, :2].astype(np.float32)  # v is 0 where there is u alone
+    colors = _colors(*rows[b"v"], source)
+
+    def has(name: bytes, index: np.ndarray) -> bool:
+        there = index >= 0
+        if there.any() and not there.all():
+            source.unsupported.note(f"{KINDS[name]} that only some corners of a part have")
+        return bool(there.all())
+
+    parts = []
+    for name, material, mine in _groups(lines, origin, source):
+        own = index[mine]
+        used, faces = compact(own[..., 0])
+        part = Part(name, verts[used], faces)
+        if has(b"vt", own[..., 1]):
+            rows_used, uv_faces = compact(own[..., 1])
+            part = part._replace(uvs=uvs[rows_used], uv_faces=uv_faces)
+        if source.wanted.lit and has(b"vn", own[..., 2]):
+            rows_used, normal_faces = compact(own[..., 2])
+            part = part._replace(normals=normals[rows_used], normal_faces=normal_faces)
+        if material and lines.libraries and source.wanted.materials and material not in library.materials:
+            source.unsupported.note(f"usemtl {material}", "not in the material library")
+        look = library.look(material, part.uvs, len(faces))
+        if colors is not None and look.get("texture") is None:
+            look |= {"colors": colors[torch.from_numpy(used)], "face_colors": None}
+        elif colors is not None:
+            source.unsupported.note("colours of vertices beside a texture")
+        parts.append(part._replace(**look))
+    return parts
+
+
+def _lines(text: bytes) -> Lines:
+    if b"#" in text:  # names may hold one
+        text = re.sub(rb"(?m)^([ \t]*|[ \t]*(?:v|vt|vn|f)[ \t][^#\n]*(?:(?<=\\)\n[^#\n]*)*)#.*$", rb"\1", text)
+    v, vt, vn, faces = list[bytes](), list[bytes](), list[bytes](), list[bytes]()
+    counted, libraries, unread = [], [], Counter[bytes]()
+    thing = material = None
+    smooth = False
+    runs: list[tuple[int, str | None, str | None]] = [(0, None, None)]
+    for line in text.replace(b"\\\n", b" ").split(b"\n"):
+        words = line.split(None, 1)
+        if not words:
+            continue
+        keyword, rest = words[0], words[1] if len(words) > 1 else b""
+        if keyword == b"v":
+            v.append(rest)
+        elif keyword == b"f":
+            if b"-" in rest:
+                counted.append((len(faces), len(v), len(vt), len(vn)))
+            faces.append(rest)
+        elif keyword == b"vt":
+            vt.append(rest)
+        elif keyword == b"vn":
+            vn.append(rest)
+        elif keyword in (b"usemtl", b"o"):
+            if keyword == b"o":
+                thing = rest.decode().strip()
+            else:
+                material = rest.decode().strip()
+            runs.append((len(faces), thing, material))
+        elif keyword == b"mtllib":
+            libraries.append(rest.decode().strip())
+        elif keyword == b"s":
+            smooth = smooth or rest.strip().lower() not in (b"", b"0", b"off")
+        elif keyword not in HARMLESS:
+            unread[keyword] += 1
+    return Lines({b"v": v, b"vt": vt, b"vn": vn}, faces, counted, runs, libraries, smooth, unread)
+
+
+def _read_library(name: str, library: Library, source: Source) -> None:
+    """One file, whose name may hold spaces, or several. Raises Fault or FileNotFoundError."""
+    names = name.split()
+    several = len(names) > 1 and all(word.lower().endswith(".mtl") for word in names) and not source.folder.holds(name)
+    for each in names if several else [name]:
+        library.read(source.folder.get(each))
+
+
+def _corners(lines: Lines, sizes: dict[bytes, int], source: Source) -> Corners:
+    """What the corners of faces refer to, as in `1 2 3`, `1/1 2/2 3/3`, `1//1 2//2 3//3` and `1/1/1 2/2/2 3/3/3`, mixed in any
+    way; below zero counted from the last so far. Raises Fault."""
+    text = b"\n".join(lines.faces) + b"\n"
+    values = numbers(text.replace(b"/", b" "), "the faces", np.int64)
+    letters = np.frombuffer(text, np.uint8)
+    space, slash = letters <= 32, letters == ord("/")
+    corner_at, number_at = word_starts(~space), word_starts(~(space | slash))
+    counts = per_line(corner_at, letters)
+    if len(number_at) != len(values):
+        raise Fault("expected numbers parted by spaces and slashes in the faces, got others; the file cannot be read")
+    index = np.full((int(counts.sum()), 3), -1)
+    if slash.any():
+        corner = np.searchsorted(corner_at, number_at, side="right") - 1
+        slash_at = np.flatnonzero(slash)
+        kind = np.searchsorted(slash_at, number_at) - np.searchsorted(slash_at, corner_at)[corner]
+        if kind.max() > 2:
+            raise Fault("expected up to three numbers in a corner, as in 1/1/1, got more; the file cannot be read")
+    else:
+        corner, kind = np.arange(len(values)), np.zeros(len(values), np.int64)
+    if not values.all():
         raise Fault("expected indices that count from 1, got 0 in a face; repair the mesh")
-    if re.search(rb"(?m)^f .*-", text) and text.rfind(b"\nv ") > text.find(b"\nf "):
-        raise Fault("expected all vertices before faces with negative indices, got some after; export it otherwise")
-    return text
+    if lines.counted:
+        so_far = np.array(lines.counted)
+        face = np.arange(len(counts)).repeat(counts)[corner]
+        back = np.flatnonzero(values < 0)
+        values[back] += so_far[np.searchsorted(so_far[:, 0], face[back]), kind[back] + 1] + 1
+    for which, (name, what) in enumerate(KINDS.items()):
+        mine = values[kind == which] if slash.any() else values if which == 0 else values[:0]
+        if len(mine) and which and not sizes[name]:
+            source.unsupported.note(f"{what} of faces", "left out, for there are none")
+            values, corner, kind = values[kind != which], corner[kind != which], kind[kind != which]
+        elif len(mine) and (mine.min() < 1 or mine.max() > sizes[name]):
+            bad = int(mine.min() if mine.min() < 1 else mine.max())
+            raise Fault(f"expected indices of {what} from 1 to {sizes[name]}, got {bad}; repair the mesh")
+    index[corner, kind] = values - 1
+    if (index[:, 0] < 0).any():
+        raise Fault("expected a vertex at each corner of a face, got none; the file cannot be read")
+    return Corners(index, counts)
 
 
-class Materials:
-    """Materials of an MTL file that scatter light; base colours stay with the parts, which share the rest where it is equal."""
-
-    def __init__(self) -> None:
-        self.known: dict[object, Material] = {}
-
-    def get(self, given: Any, source: Source) -> Material:
-        """By what trimesh read of one, {} if there is none.
-
-        Lambertian, or, where it has highlights, a dielectric whose roughness says by Ns how sharp they are. Phong's exponent Ns
-        is as wide as a lobe of α² = 2 / (Ns + 2), and α = roughness² (Walter et al. 2007, section 5.2).
-        """
-        for name in MAPS:
-            if name in given:
-                source.unsupported.note(name)
-        metallic, roughness = _number(given, "pm"), _number(given, "pr")
-        shiny = _number(given, "illum", 2.0) not in (0.0, 1.0) and any(_numbers(given, "ks"))
-        if metallic is None and roughness is None and shiny:
-            source.unsupported.note("Ks", "a dielectric of 4 %, by Ns")
-            exponent = _number(given, "ns", 0.0)
-            assert exponent is not None
-            roughness = (2.0 / (max(exponent, 0.0) + 2.0)) ** 0.25
-        emission = tuple(_numbers(given, "ke"))
-        key = metallic, roughness, emission if any(emission) else None
-        if key not in self.known:
-            glow = torch.tensor(np.broadcast_to(emission, 3).copy(), dtype=torch.float32) if any(emission) else None
-            self.known[key] = Material(metallic=metallic, roughness=roughness, emission=glow)
-        return self.known[key]
+def _colors(rows: np.ndarray, widths: np.ndarray, source: Source) -> torch.Tensor | None:
+    """Those after the positions of vertices, if all have some."""
+    if widths.min() >= 6:
+        return linear_colors("vertex", rows[:, 3:6], srgb=True)
+    if widths.max() >= 5:
+        source.unsupported.note("what stands after the positions of some vertices")
+    return None
 
 
-def alpha(given: Any, source: Source) -> Tensor | None:
-    """(h, w) float32: d times map_d, the alpha of an image or else its grey, where either is less than one."""
-    opacity = _number(given, "d", 1.0)
-    assert opacity is not None
-    if _number(given, "tr", 0.0):
-        source.unsupported.note("Tr", "left out, for writers differ in what 1 means; d says it")
-    if opacity < 1.0:
-        source.unsupported.note("d", "shown where it is 0.5 or more, cut out elsewhere")
-    if "map_d" not in given:
-        return torch.full((1, 1), opacity) if opacity < 0.5 else None
-    name = " ".join(given["map_d"])
-    image = source.folder.image(name)
-    grey = source.textures.data(name, image, slice(0, 1))[..., 0]
-    own = source.textures.alpha(image, opacity)
-    return opacity * grey if own is None else own
-
-
-def _numbers(given: Any, name: str) -> list[float]:
-    """trimesh gives numbers, lists of numbers, or lists of words."""
-    try:
-        values = [float(v) for v in np.atleast_1d(given.get(name, []))]
-    except ValueError as error:
-        raise Fault(f"expected numbers for {name} in the material, got {given[name]}; repair it") from error
-    if not np.isfinite(values).all():
-        raise Fault(f"expected finite numbers for {name} in the material, got {values}; repair it")
-    return values
-
-
-def _number(given: Any, name: str, default: float | None = None) -> float | None:
-    values = _numbers(given, name)
-    return values[0] if values else default
+def _groups(lines: Lines, origin: np.ndarray, source: Source) -> Iterator[tuple[str, str | None, np.ndarray]]:
+    """Name, material and triangles of each part."""
+    several = len({material for _, _, material in lines.runs if material is not None}) > 1
+    starts = np.array([start for start, _, _ in lines.runs])
+    run = np.searchsorted(starts, np.arange(len(lines.faces)), side="right") - 1
+    parts: dict[tuple[str | None, str | None], int] = {}
+    of_run = np.zeros(len(starts), np.int64)
+    for i in np.unique(run):  # those that have faces, in the order of the file
+        _, thing, material = lines.runs[i]
+        of_run[i] = parts.setdefault((thing if source.wanted.split else None, material), len(parts))
+    part = of_run[run][origin]
+    order = np.argsort(part, kind="stable")
+    ends = np.cumsum(np.bincount(part, minlength=len(parts)))
+    used: Counter[str] = Counter()
+    for (thing, material), mine in zip(parts, np.split(order, ends[:-1]), strict=True):
+        if len(mine):
+            words = [word for word in (thing, material if several else None) if word]
+            name = "_".join(words) or "geometry"
+            used[name] += 1
+            yield name if used[name] == 1 else f"{name}_{used[name] - 1}", material, mine

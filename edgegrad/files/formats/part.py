@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ...scene.lights import Light
@@ -23,9 +24,10 @@ class Part(NamedTuple):
     """A part of a file as it stands there; colours are linear."""
 
     name: str
-    verts: np.ndarray  # (N, 3) float32, transformations applied
+    verts: np.ndarray  # (N, 3) float32, or float64 where the file says more; transformations applied
     faces: np.ndarray  # (F, 3) int64
     uvs: np.ndarray | None = None  # (N, 2) float32, v running up
+    uv_faces: np.ndarray | None = None  # (F, 3) int64, indices into uvs; those of `faces` when None
     texture: Tensor | None = None  # (h, w, 3) float32
     colors: Tensor | None = None  # (N, 3) float32
     face_colors: Tensor | None = None  # (F, 3) float32
@@ -34,6 +36,7 @@ class Part(NamedTuple):
     wrap: tuple[str, str] = ("repeat", "repeat")  # of u and v
     filter: str = "linear"
     normals: np.ndarray | None = None  # (N, 3) float32, of any length
+    normal_faces: np.ndarray | None = None  # (F, 3) int64, indices into normals; those of `faces` when None
     material: Material | None = None  # one for all parts that the file gives it to; None: not lit
     material_uvs: Mapping[str, np.ndarray] = MappingProxyType({})  # (N, 2) of those of its textures that have their own
 
@@ -43,6 +46,7 @@ class Model(NamedTuple):
 
     parts: list[Part]  # at least one, each with at least one triangle
     lights: list[Light]
+    dtype: torch.dtype = torch.float32  # of the meshes
 
 
 class Wanted(NamedTuple):
@@ -51,7 +55,7 @@ class Wanted(NamedTuple):
     materials: bool = True  # textures and material colours
     lit: bool = False  # materials that scatter light, normals and lights
     split: bool = False  # the objects of an OBJ file apart
-    unwrap: bool = False  # texture coordinates also where the file has no texture
+    dtype: torch.dtype | None = None  # of the meshes; None: as precise as the file needs
 
 
 @contextmanager

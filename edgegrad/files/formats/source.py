@@ -22,28 +22,14 @@ TEXTURES = ("PNG", "JPEG", "MPO", "JPEG2000", "WEBP", "BMP", "TIFF", "TGA", "GIF
 
 
 class Folder:
-    """The folder of a mesh file, from which trimesh gets the files that the mesh names, and from nowhere else.
-
-    Where one fails, trimesh goes on without the material or texture; `failures` remembers why.
-    """
+    """The folder of a mesh file, from which those that the mesh names are read, and from nowhere else."""
 
     def __init__(self, path: PathLike) -> None:
         self.path = path
         self.root = Path(path).absolute().parent.resolve()
-        self.contents: dict[str, bytes] = {}
-        self.failures: dict[str, Exception] = {}
 
     def get(self, name: str) -> bytes:
-        try:
-            self.contents[name] = self._read(name)
-        except Exception as error:
-            self.failures[name] = error
-            raise
-        return self.contents[name]
-
-    __getitem__ = get
-
-    def _read(self, name: str) -> bytes:
+        """Raises Fault or FileNotFoundError."""
         for text in (name.strip(), unquote(name.strip())):  # glTF writes names as URIs
             file = (self.root / text.replace("\\", "/")).resolve()
             if PureWindowsPath(text).drive or Path(text).is_absolute() or not file.is_relative_to(self.root):
@@ -54,6 +40,12 @@ class Folder:
             f"{self.path}: names {name!r}, and there is no such file in {self.root}; put it there, "
             "or pass materials=False where only its look is missing"
         )
+
+    def holds(self, name: str) -> bool:
+        try:
+            return bool(self.get(name))
+        except (Fault, FileNotFoundError):
+            return False
 
     def image(self, name: str) -> Any:
         """A Pillow image, not yet decoded. Raises Fault or FileNotFoundError."""
@@ -118,8 +110,11 @@ def _texels(name: str, image: Any) -> Tensor:
     return texels[..., None].expand(-1, -1, 3) if texels.dim() == 2 else texels
 
 
+MOST_SAID = 20  # names in one warning
+
+
 class Unsupported:
-    """What a file asks for and does not get, by name, and what is done instead."""
+    """What a file holds or asks for and nobody reads, by name, and what is done instead."""
 
     def __init__(self) -> None:
         self.names: dict[str, str] = {}
@@ -130,7 +125,9 @@ class Unsupported:
     def say(self, path: PathLike, what: str = "not rendered as the file asks") -> None:
         """One warning for a file."""
         if self.names:
-            listed = "; ".join(f"{name} ({instead})" for name, instead in self.names.items())
+            said = [f"{name} ({instead})" for name, instead in self.names.items()]
+            more = [f"{len(said) - MOST_SAID} more"] if len(said) > MOST_SAID else []
+            listed = "; ".join(said[:MOST_SAID] + more)
             warn(f"{path}: {listed}", f"{path}: {what}: {listed}")
 
 

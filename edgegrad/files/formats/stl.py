@@ -1,0 +1,82 @@
+"""STL files, in text and binary. trimesh refuses binary ones whose length is odd, and takes words of names for keywords."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...scene.material import Material
+from .part import Fault, Part
+from .polygons import triangulate
+from .source import Source
+from .text import MARKS, as_utf8, table
+
+HEADER = 84  # bytes of a binary file before its faces
+FACE = np.dtype([("normal", "<f4", 3), ("verts", "<f4", (3, 3)), ("attribute", "<u2")])
+SILENT = {b"facet", b"outer", b"endfacet"}  # with the normals of faces, which their corners say too
+WORDS = SILENT | {b"vertex", b"endloop"}
+
+
+def read(data: bytes, source: Source) -> list[Part]:
+    """A part for each solid of a text. Raises Fault."""
+    material = Material() if source.wanted.lit else None
+    if data.startswith(MARKS):
+        data = as_utf8(data)
+    count = int.from_bytes(data[80:HEADER], "little")
+    exact = len(data) == HEADER + count * FACE.itemsize
+    text = data[:200].lstrip()[:5].lower() == b"solid" and b"\0" not in data  # a binary one has zeros somewhere
+    parts = _read_text(as_utf8(data), source) if text and not exact else _read_binary(data, count, source)
+    return [part._replace(material=material) for part in parts]
+
+
+def _read_binary(data: bytes, count: int, source: Source) -> list[Part]:
+    if len(data) < HEADER:
+        raise Fault(f"expected an STL file, got {len(data)} bytes that cannot be read as one; export it again")
+    there = (len(data) - HEADER) // FACE.itemsize
+    if there < count:
+        raise Fault(
+            f"expected the {count} faces that the file announces, got {max(there, 0)}; it is truncated or damaged"
+        )
+    rest = len(data) - HEADER - count * FACE.itemsize
+    if rest:
+        source.unsupported.note(f"{rest} bytes after the last of {count} faces", "not read")
+    faces = np.frombuffer(data, FACE, count, HEADER)
+    if faces["attribute"].any():
+        source.unsupported.note("the attributes of faces, where some writers keep colours", "not read")
+    if not count:
+        return []
+    return [Part("", faces["verts"].reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))]
+
+
+def _read_text(text: bytes, source: Source) -> list[Part]:
+    solids: list[tuple[str, list[bytes], list[int]]] = []  # name, positions, and how many of them a face has
+    corners, start = list[bytes](), 0
+    ended = True
+    for line in text.split(b"\n"):
+        words = line.split(None, 1)
+        if not words:
+            continue
+        word = words[0] if words[0] in WORDS else words[0].lower()
+        if word == b"vertex":
+            corners.append(words[-1])
+        elif word in SILENT:
+            continue
+        elif word == b"endloop":
+            solids[-1][2].append(len(corners) - start)
+            start = len(corners)
+        elif word == b"solid":
+            corners, start, ended = [], 0, False
+            solids.append((words[1].strip().decode() if len(words) > 1 else "", corners, []))
+        elif word == b"endsolid":
+            ended = True
+        else:
+            source.unsupported.note(word.decode(errors="replace")[:40], "not read")
+    if not ended or start < len(corners):
+        raise Fault("expected endsolid at the end of the file, got none: it is truncated or damaged; export it again")
+    parts = []
+    for name, rows, counts in solids:
+        if counts:
+            verts = table(rows, "the vertices", 3, 3)[0]
+            index = np.arange(len(verts))
+            triangles, _ = triangulate(verts, index, np.array(counts), source)
+            parts.append(Part(name, verts, triangles))
+    return parts
