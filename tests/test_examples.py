@@ -21,7 +21,7 @@ def example(name: str, size: int | None = None) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     if size is not None:
-        assert module.SIZE > size
+        assert size < module.SIZE
         vars(module)["SIZE"] = size
     return module
 

@@ -318,7 +318,9 @@ def test_scene_of_several_meshes_moves_together():
 
 def test_a_picture_larger_than_max_size_is_reduced():
     view = camera(96)
-    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, max_size=32, steps=12, progress=False)
+    fit = fit_pose(
+        bracket(), picture(view), view, init=START, background=BACKGROUND, max_size=32, steps=12, progress=False
+    )
     assert max(max(step.size) for step in fit.history) == 32
     assert max(errors(fit)) < 1.5
     assert fit.camera is view
