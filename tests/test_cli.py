@@ -13,6 +13,7 @@ from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, p
 
 import edgegrad as eg
 import edgegrad_cli as cli
+from edgegrad import demo
 from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
 from edgegrad.fit import PoseFit
@@ -196,8 +197,9 @@ def test_render_with_a_pose_by_hand(files):
     assert float((b - expected).abs().mean()) < 0.005
 
 
-def test_demo_prints_errors_and_writes_pictures(tmp_path, capsys):
+def test_demo_prints_errors_and_writes_pictures(tmp_path, capsys, monkeypatch):
     pytest.importorskip("pyvista", reason="needs the extra edgegrad[demo]")
+    monkeypatch.setattr(demo, "SIZE", 96)
     assert run("demo", "--runs", 1, "--out", tmp_path / "demo") == 0
     said = capsys.readouterr().out
     assert "1 of 1 within 0.5° and 0.5 %" in said
@@ -285,14 +287,14 @@ def views_of(files):
 
 def test_fit_shape(sphere, capsys):
     out = sphere / "out"
-    options = ["--levels", 1, "--steps", 20, "--out", out]
+    options = ["--levels", 1, "--steps", 16, "--out", out]
     assert run("fit-shape", sphere / "sphere.ply", *views_of(sphere), *options) == 0
     found = eg.load_mesh(out / "mesh.ply")
     assert 1.1 < float(found.verts.norm(dim=1).mean()) < 1.3
     assert "not converged: the loss still falls" in capsys.readouterr().out
-    options[3] = 25
+    options[3] = 18
     assert run("fit-shape", sphere / "sphere.ply", *views_of(sphere), *options, "--resume") == 0
-    assert json.loads((out / "fit.json").read_text())["steps"] == 25
+    assert json.loads((out / "fit.json").read_text())["steps"] == 18
 
 
 def test_fit_texture(sphere, capsys):

@@ -1,4 +1,4 @@
-"""The examples find what they look for, in fewer steps than they take."""
+"""The examples find what they look for, in fewer steps than they take, some from smaller pictures."""
 
 from __future__ import annotations
 
@@ -14,11 +14,15 @@ FOLDER = Path(__file__).parents[1] / "examples"
 sys.path.append(str(FOLDER))  # where they find one another
 
 
-def example(name: str) -> ModuleType:
+def example(name: str, size: int | None = None) -> ModuleType:
+    """The example's module, with pictures of `size` pixels in place of its own."""
     spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    if size is not None:
+        assert size < module.SIZE
+        vars(module)["SIZE"] = size
     return module
 
 
@@ -29,13 +33,13 @@ def test_a_texture_and_its_light() -> None:
 
 
 def test_a_network_and_the_shape_under_it() -> None:
-    network = example("network")
+    network = example("network", size=48)
     _, tube = network.fit(steps=60)
     assert abs(tube - network.TRUE_TUBE) < 0.5 * abs(network.FIRST_TUBE - network.TRUE_TUBE)
 
 
 def test_steps() -> None:
-    step = example("step")
+    step = example("step", size=64)
     _, found = step.fit(steps=50)
     assert torch.allclose(found.centre, step.TRUTH.centre, atol=0.02)
     assert abs(found.radius - step.TRUTH.radius) < 0.02

@@ -124,7 +124,7 @@ def test_the_pose_on_disk_follows_the_search(files, monkeypatch):
         return FIT_POSE(*args, callback=watch, **options)
 
     monkeypatch.setattr(edgegrad.fit, "fit_pose", watched)
-    assert cli.main(arguments(files, steps=3)) == 0
+    assert cli.main(arguments(files, steps=2)) == 0
     assert [pose.steps for pose in poses] == list(range(1, len(poses) + 1))
     assert len(poses) > 10 and len({str(pose.matrix) for pose in poses}) > 5
 
@@ -149,7 +149,7 @@ def test_a_fit_that_cannot_be_written_is_printed(files, code, monkeypatch, capsy
 
     monkeypatch.setattr(os, "replace", replace)
     with pytest.warns(UserWarning, match=rf"checkpoint\.pt, got: {os.strerror(code)}; the fit goes on without"):
-        assert cli.main(arguments(files, steps=3)) == 2
+        assert cli.main(arguments(files, steps=1)) == 2
     said = capsys.readouterr()
     assert is_a_result(said.out)
     last = said.err.splitlines()[-1]
@@ -169,7 +169,7 @@ def test_a_folder_that_vanishes_during_the_fit(files, monkeypatch, capsys):
         return search(*args, callback=after_step, **options)
 
     monkeypatch.setattr(edgegrad.fit, "fit_pose", vanishing)
-    assert cli.main(arguments(files, steps=3)) == 0  # it is made again
+    assert cli.main(arguments(files, steps=1)) == 0  # it is made again
     assert is_a_result(capsys.readouterr().out) and (files / "out" / "pose.json").exists()
 
 
@@ -196,7 +196,7 @@ def test_a_file_that_cannot_grow(files, limit, file):
     def fit():
         # Python ignores SIGXFSZ, so writing fails as on a full disk.
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-        return cli.main(arguments(files, steps=3))
+        return cli.main(arguments(files, steps=1))
 
     run = Forked(fit)
     said = run.out.read()
@@ -207,17 +207,17 @@ def test_a_file_that_cannot_grow(files, limit, file):
     left = sorted(path.name for path in (files / "out").iterdir())
     assert left == ([] if file == "pose.json" else ["pose.json"])
     if left:
-        assert PoseFit.from_json((files / "out" / "pose.json").read_text()).steps > 10
+        assert PoseFit.from_json((files / "out" / "pose.json").read_text()).steps > 5
 
 
 @linux
 def test_a_result_that_cannot_be_printed_is_written(files, monkeypatch, capsys):
     with open("/dev/full", "w") as full:
         monkeypatch.setattr(sys, "stdout", full)
-        assert cli.main(arguments(files, steps=3)) == 2
+        assert cli.main(arguments(files, steps=1)) == 2
         monkeypatch.undo()
         # Closing would fail again on what is still to be written.
         os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())
     assert "No space left on device" in capsys.readouterr().err.splitlines()[-1]
-    assert PoseFit.from_json((files / "out" / "pose.json").read_text()).steps > 10
+    assert PoseFit.from_json((files / "out" / "pose.json").read_text()).steps > 5
     assert (files / "out" / "fit.png").exists()

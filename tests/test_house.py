@@ -55,6 +55,7 @@ def stop(*fit):
     raise KeyboardInterrupt
 fit = eg.fit.fit_pose(mesh, target, camera, init=torch.eye(4), callback=stop, progress=False)
 assert fit.interrupted and fit.steps
+eg.fit.fit_scene(mesh, camera, [target], {"verts": 1e-3}, steps=1, progress=False)
 slow = sorted({"torch._dynamo", "torch._inductor", "roma", "trimesh", "matplotlib", "OpenImageIO"} & set(sys.modules))
 assert not slow, slow
 """

@@ -1,5 +1,9 @@
-"""One OpenMP runtime in the process, torch's, whichever is imported first; in forked children, too."""
+"""One OpenMP runtime in the process, torch's, whichever is imported first; in forked children, too.
 
+Processes take longer to import torch than to render, so each answers several questions.
+"""
+
+import functools
 import os
 import subprocess
 import sys
@@ -7,13 +11,18 @@ from pathlib import Path
 
 import pytest
 
+import edgegrad_cli as cli
+
 TESTS = Path(__file__).parent
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="mapped files as on Linux")
 
-# Renders with three threads and torch's own operators, then prints each mapped OpenMP runtime, and the kernel's own word.
+# Renders with three threads and torch's own operators, then prints the gradient's bits, whether the environment is as it
+# was, each mapped OpenMP runtime, and the kernel's own word.
 RENDER = """
 import os, sys
+before = dict(os.environ)
+import hashlib
 from pathlib import Path
 {imports}
 from edgegrad.library import core
@@ -35,7 +44,11 @@ def show():
         print(os.path.realpath(file))
     print(os.path.realpath(core.openmp_runtime()), flush=True)
 
+def bits():
+    return hashlib.sha256(render().numpy()).hexdigest()
+
 expected = render()
+print(bits(), dict(os.environ) == before)
 show()
 """
 # The child renders with threads of its own, and has them.
@@ -49,6 +62,15 @@ if child == 0:
 assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 assert torch.equal(render(), expected)
 """
+# The same as OMP_DYNAMIC=true, from here on.
+DYNAMIC = """
+import ctypes
+runtime = ctypes.CDLL(core.openmp_runtime())
+assert runtime.omp_get_dynamic() == 0
+runtime.omp_set_dynamic(1)
+assert runtime.omp_get_dynamic() == 1
+print(bits())
+"""
 ORDERS = {"torch first": "import torch\nimport edgegrad as eg", "edgegrad first": "import edgegrad as eg\nimport torch"}
 
 
@@ -59,26 +81,34 @@ def lines_of(code: str, **variables: str) -> list[str]:
     return run.stdout.split()
 
 
+@functools.cache
+def whole(order: str) -> list[str]:
+    """What a process prints that imports in this order."""
+    return lines_of(RENDER.format(imports=ORDERS[order]) + FORK + DYNAMIC)
+
+
 @pytest.mark.parametrize("order", ORDERS)
 def test_one_runtime(order):
     """Also in a forked child. A second one would keep threads of its own beside torch's."""
-    parent, own, *child = lines_of(RENDER.format(imports=ORDERS[order]) + FORK)
+    _, _, parent, own, *child, _ = whole(order)
     assert parent == own and child == [parent, own]
     assert Path(own).name.startswith(("libgomp", "libomp", "libiomp"))
 
 
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_environment_stays_as_it_is(order):
+    """How threads wait is the kernel's own matter, whatever was imported first: it asks for no variable."""
+    assert whole(order)[1] == "True"
+
+
 def test_fewer_threads_than_asked_for():
     """The runtime may give fewer, here one beside the calling thread; the items are shared by those that there are."""
-    code = (
-        RENDER.format(imports=ORDERS["torch first"])
-        + "import hashlib; print(hashlib.sha256(expected.numpy()).hexdigest())"
-    )
-    assert lines_of(code)[-1] == lines_of(code, OMP_THREAD_LIMIT="2")[-1] == lines_of(code, OMP_DYNAMIC="true")[-1]
+    code = RENDER.format(imports=ORDERS["torch first"])
+    bits, *_, dynamic = whole("torch first")
+    assert bits == dynamic == lines_of(code, OMP_THREAD_LIMIT="2")[0]
 
 
-def test_the_doctor_names_the_runtime():
-    found = subprocess.run(
-        [sys.executable, "-m", "edgegrad_cli", "doctor"], capture_output=True, text=True, timeout=120
-    )
-    (line,) = (line for line in found.stdout.splitlines() if line.startswith("OpenMP "))
+def test_the_doctor_names_the_runtime(capsys):
+    assert cli.main(["doctor"]) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("OpenMP "))
     assert Path(line.split(maxsplit=1)[1]).is_file()

@@ -18,7 +18,7 @@ from ..warnings import warn
 from .options import Options, Parameter
 from .views import View
 
-FORMAT = 4
+FORMAT = 5
 SAME = (
     "loss",
     "mask_loss",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -29,10 +30,17 @@ def render_image(request: Request, batched: bool) -> Tensor:
     return image
 
 
+def _known_signature(function: Callable[..., Any]) -> Callable[..., Any]:
+    """torch looks for the signature of forward() at every call, for a tenth of a millisecond unless it is written down."""
+    setattr(function, "__signature__", inspect.signature(function))  # noqa: B010  no attribute that type checkers know
+    return function
+
+
 class _Render(torch.autograd.Function):
     """edgegrad::render, differentiated by edgegrad::render_backward. The image of a single camera loses its batch axis."""
 
     @staticmethod
+    @_known_signature
     def forward(batched: bool, *args: Any) -> tuple[Tensor, ...]:
         image, *hits = torch.ops.edgegrad.render(*args)
         return image if batched else image.squeeze(0), *hits
@@ -49,7 +57,8 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Any) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         coverage, depth, hit, seen, *tensors = ctx.saved_tensors
-        wanted = [ctx.needs_input_grad[1 + i] for i in POSITIONS]
+        needed = ctx.needs_input_grad  # torch builds it at each access
+        wanted = [needed[1 + i] for i in POSITIONS]
         packed = join(tensors, ctx.others)
         arguments = (grad_outputs[0], coverage, depth, hit, seen, *packed)
         if torch.compiler.is_compiling():  # which refuses second derivatives itself
@@ -90,6 +99,7 @@ class _RenderJvp(torch.autograd.Function):
     """edgegrad::render_jvp in one direction; torch.vmap over tangents takes all of theirs in one pass."""
 
     @staticmethod
+    @_known_signature
     def forward(*args: Any) -> Tensor:
         *rest, tangents = _with_tangents(args)
         tangents = [None if t is None else t[None] for t in tangents]
@@ -129,6 +139,7 @@ class _FacesAtCenters(torch.autograd.Function):
     """edgegrad::faces_at_centers, which has no derivative."""
 
     @staticmethod
+    @_known_signature
     def forward(batched: bool, *args: Any) -> Tensor:
         faces = torch.ops.edgegrad.faces_at_centers(*args)
         return faces if batched else faces.squeeze(0)
@@ -156,6 +167,7 @@ class _RenderBackward(torch.autograd.Function):
     once_differentiable takes it for zero where the adjoint is a constant, as it is for a loss linear in the image."""
 
     @staticmethod
+    @_known_signature
     def forward(*args: Any) -> tuple[Tensor, ...]:
         many = len(SLOTS)
         return torch.ops.edgegrad.render_backward(*args[:-many], list(args[-many:]))

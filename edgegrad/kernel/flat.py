@@ -39,7 +39,9 @@ class Flat(NamedTuple):
     @property
     def has_steps(self) -> bool:
         """Whether something jumps within a face: it is cut out, or its texels are."""
-        return len(self.cut_outs) > 0 or bool((self.textures[:, 5] == FILTERS.index("nearest")).any())
+        if len(self.cut_outs) > 0 or len(self.textures) == 0:
+            return len(self.cut_outs) > 0
+        return bool((self.textures[:, 5] == FILTERS.index("nearest")).any())
 
 
 def _rows(index: Tensor, count: int, offset: int, alone: bool) -> Tensor:

@@ -92,12 +92,13 @@ class Request(NamedTuple):
 
     def slot(self, name: str) -> Tensor:
         """The tensor of a gradient slot."""
-        return getattr(next(record for record in self if name in record._fields), name)
+        return getattr(self[_RECORD_OF[name]], name)
 
 
 RECORDS: tuple[Any, ...] = (Flat, PackedCamera, Channels, ImageOptions, GradientOptions)
 FIELDS = tuple(field for record in RECORDS for field in record._fields)
 _TYPES = tuple(get_type_hints(record)[field] for record in RECORDS for field in record._fields)
+_RECORD_OF = {field: place for place, record in enumerate(RECORDS) for field in record._fields}
 IS_TENSOR = tuple(kind is Tensor for kind in _TYPES)
 _NAMES = {Tensor: "Tensor", bool: "bool", int: "int", float: "float", str: "str", list[float]: "float[]"}
 # The arguments of the operators.

@@ -58,12 +58,9 @@ def opened(name: str, content: bytes) -> Any:
     try:
         return pillow.open(io.BytesIO(content))
     except (OSError, pillow.DecompressionBombError) as error:
-        raise no_image(name) from error
-
-
-def no_image(name: str) -> Fault:
-    require("PIL.Image", "edgegrad[files]", "reading textures")  # without it trimesh finds none and says nothing
-    return Fault(f"expected an image in the texture {name!r}, got none that Pillow reads; save it as PNG or JPEG")
+        raise Fault(
+            f"expected an image in the texture {name!r}, got none that Pillow reads; save it as PNG or JPEG"
+        ) from error
 
 
 class Textures:

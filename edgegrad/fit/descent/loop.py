@@ -90,9 +90,8 @@ class _Loop:
     def __init__(self, parameters: Mapping[str, Parameter], options: Options) -> None:
         self.parameters, self.options = parameters, options
         self.values = {name: p.value.clone().requires_grad_() for name, p in parameters.items() if p.value is not None}
-        self.optimizer = Adam(
-            {"params": [self.values[name]], "lr": p.lr, "uniform": p.uniform} for name, p in parameters.items()
-        )
+        rates = {name: p.lr for name, p in parameters.items()}
+        self.optimizer = Adam(self.values, rates, {name for name, p in parameters.items() if p.uniform})
         self.best = {name: value.detach().clone() for name, value in self.values.items()}
         self.history: list[Record] = []
         self.step = self.cuts = self.since = 0  # `since`: the step of the last cut
@@ -111,7 +110,7 @@ class _Loop:
         if not math.isfinite(number + sum(norms.values())):
             # Too far: back to the best values, with shorter steps.
             self._cut()
-            self.optimizer.state.clear()
+            self.optimizer.forget()
             with torch.no_grad():
                 for name, value in self.values.items():
                     value.copy_(self.best[name])
@@ -121,9 +120,7 @@ class _Loop:
         if mean <= self.least:
             self.least = mean
             self.best = {name: value.detach().clone() for name, value in self.values.items()}
-        for value, gradient in zip(self.values.values(), gradients, strict=True):
-            value.grad = gradient
-        self.optimizer.step()
+        self.optimizer.step(dict(zip(self.values, gradients, strict=True)))
         with torch.no_grad():
             for name, value in self.values.items():
                 value.copy_(self.parameters[name].within(value))
@@ -143,20 +140,19 @@ class _Loop:
     def _cut(self) -> None:
         self.flat = self.cuts == CUTS
         self.cuts, self.since = self.cuts + 1, self.step
-        for group in self.optimizer.param_groups:
-            group["lr"] *= CUT
+        self.optimizer.shorten(CUT)
 
     def state(self) -> dict[str, Any]:
         plain = {name: getattr(self, name) for name in _PLAIN}
         values = {name: value.detach() for name, value in self.values.items()}
         history = [tuple(record) for record in self.history]
-        return {**plain, "values": values, "history": history, "optimizer": self.optimizer.state_dict()}
+        return {**plain, "values": values, "history": history, "optimizer": self.optimizer.state()}
 
     def load(self, saved: dict[str, Any]) -> None:
         for name in _PLAIN:
             setattr(self, name, saved[name])
         self.history = [Record(*record) for record in saved["history"]]
-        self.optimizer.load_state_dict(saved["optimizer"])
+        self.optimizer.load(saved["optimizer"])
         with torch.no_grad():
             for name, value in self.values.items():
                 value.copy_(saved["values"][name])

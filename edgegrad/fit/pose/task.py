@@ -365,6 +365,9 @@ def blurred(image: Tensor, sigma: float) -> Tensor:
     radius = math.ceil(3.0 * sigma)
     kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1).to(image) / sigma) ** 2)
     kernel = kernel / kernel.sum()
-    rows = F.pad(image.movedim(-1, 0)[:, None], (radius, radius, radius, radius), mode="replicate")
-    rows = F.conv2d(F.conv2d(rows, kernel.reshape(1, 1, -1, 1)), kernel.reshape(1, 1, 1, -1))
-    return rows[:, 0].movedim(0, -1)
+    # Channels as groups of one image: as images of a batch, their backward pass takes up to seven times as long.
+    rows, channels = image.movedim(-1, 0)[None], image.shape[-1]
+    rows = F.pad(rows, (radius, radius, radius, radius), mode="replicate")
+    for shape in ((-1, 1), (1, -1)):
+        rows = F.conv2d(rows, kernel.reshape(1, 1, *shape).expand(channels, -1, -1, -1), groups=channels)
+    return rows[0].movedim(0, -1)
