@@ -121,25 +121,26 @@ def fit(
     """The mesh, and how fast views were rendered. Goes on from `checkpoint`, if there is one, which must be of the same task."""
     module = Loss(Pictures(task), task)
     loss = DistributedDataParallel(module) if dist.is_initialized() else module
-    optimizer = Adam([{"params": [module.coordinates], "lr": task.rate, "uniform": True}])
+    values = dict(module.named_parameters())
+    optimizer = Adam(values, dict.fromkeys(values, task.rate), uniform=values)
     first, (rank, processes) = 0, _place()
     file = Checkpoint(checkpoint, True, task._asdict())
     saved = _shared(file.read)
     if saved is not None:
         first = saved["step"]
         module.load_state_dict(saved["module"])
-        optimizer.load_state_dict(saved["optimizer"])
+        optimizer.load(saved["optimizer"])
     for view in sorted({v for step in range(first, task.steps) for v in views_of(step, task)[rank::processes]}):
         module.pictures.picture(view)  # not in the time of the fit
     if dist.is_initialized():
         dist.barrier()
     wall, work = time.perf_counter(), time.process_time()
     for step in range(first, task.steps):
-        optimizer.param_groups[0]["lr"] = task.rate * 0.5 * (1.0 + math.cos(math.pi * step / task.steps))
+        optimizer.rates = dict.fromkeys(values, task.rate * 0.5 * (1.0 + math.cos(math.pi * step / task.steps)))
         number = gradient(loss, step, task)
-        optimizer.step()
+        optimizer.step({name: value.grad for name, value in values.items()})
         if rank == 0 and (step + 1) % every == 0:
-            state = {"step": step + 1, "module": module.state_dict(), "optimizer": optimizer.state_dict()}
+            state = {"step": step + 1, "module": module.state_dict(), "optimizer": optimizer.state()}
             file.write(state)
         if callback is not None:
             callback(step, number)

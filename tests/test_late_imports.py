@@ -16,12 +16,12 @@ trimesh = pytest.importorskip("trimesh")
 
 def test_libraries_are_imported_late_and_missed_by_name(tmp_path):
     write_image(tmp_path / "a.png", torch.zeros(1, 1, 3))
-    (tmp_path / "a.3mf").write_text("PK")
     code = (
-        "import sys, edgegrad.io as io\n"
+        "import sys, edgegrad as eg, edgegrad.io as io\n"
         "print({'trimesh', 'OpenImageIO', 'PIL', 'roma', 'viser', 'matplotlib', 'torch._dynamo'} & set(sys.modules))\n"
         "sys.modules.update({'OpenImageIO': None, 'trimesh': None, 'trimesh.exchange.load': None})\n"
-        "for name, read in (('a.png', io.read_image), ('a.3mf', io.load_mesh)):\n"
+        "save = lambda name: io.save_mesh(name, eg.Mesh([[0., 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]))\n"
+        "for name, read in (('a.png', io.read_image), ('a.ply', save)):\n"
         "    try: read(name)\n"
         "    except ImportError as error: print(error)\n"
     )

@@ -648,7 +648,7 @@ def test_shadows_of_cut_outs_are_said_to_lack_a_gradient() -> None:
     leaf = plane(0.5, material=eg.Material(), alpha=torch.eye(4, dtype=F64)).transformed(t=vector(0, 0, 1))
     scene = eg.Scene([plane(material=eg.Material()), leaf], lights=[eg.PointLight(vector(0.3, 0.2, 3))])
     moving = leaf.replace(verts=leaf.verts.clone().requires_grad_())
-    with pytest.warns(UserWarning, match="cast shadows whose borders have no gradient"):
+    with pytest.warns(UserWarning, match="cast shadows, and end lamps; how that moves .* has no gradient"):
         eg.render(scene.replace(meshes=[scene.meshes[0], moving]), from_above())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
