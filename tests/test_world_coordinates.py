@@ -5,6 +5,7 @@ import pytest
 import torch
 import trimesh
 from mesh_files import glb, write_obj
+from PIL import Image
 
 import edgegrad as eg
 
@@ -134,3 +135,14 @@ def test_formats_of_float32_say_that_they_round(tmp_path, kind):
 def test_another_dtype_is_refused(tmp_path):
     with pytest.raises(TypeError, match=r"dtype: expected torch\.float32, torch\.float64 or None, got torch\.float16"):
         eg.load_mesh(write_obj(tmp_path), dtype=torch.float16)
+
+
+def test_from_trimesh():
+    verts, faces = sphere()
+    texture = trimesh.visual.TextureVisuals(uv=np.zeros((len(verts), 2)), image=Image.new("RGB", (2, 2)))
+    far = eg.Mesh.from_trimesh(trimesh.Trimesh(verts, faces, visual=texture, process=False))
+    assert {far.verts.dtype, far.uvs.dtype, far.texture.dtype} == {torch.float64}
+    assert np.array_equal(far.verts[far.faces].numpy(), verts[faces])
+    near = eg.Mesh.from_trimesh(trimesh.Trimesh(verts - UTM, faces, process=False))
+    assert near.verts.dtype is torch.float32
+    assert len(near.verts) == len(far.verts) == 162

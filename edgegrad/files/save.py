@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ..optional import require
 from ..scene.mesh import Mesh
 from ..warnings import warn
-from .formats.geometry import rounding
+from .formats.geometry import in_double, rounding
 from .formats.gltf_write import to_glb
 from .formats.part import Fault, Part
 from .formats.source import Textures, linear_colors
@@ -50,7 +51,11 @@ def from_trimesh(given: Any) -> Mesh:
             if image is not None:
                 image.format = image.format or "PNG"  # one that was made, not read
                 look["texture"] = Textures().get("texture", image)
-        return to_mesh(Part("", np.asarray(given.vertices, np.float32), np.asarray(given.faces, np.int64), **look))
+        verts = np.asarray(given.vertices, np.float64)
+        if rounding(verts)[1]:
+            (part,) = in_double([Part("", verts, np.asarray(given.faces, np.int64), **look)])
+            return to_mesh(part, torch.float64)
+        return to_mesh(Part("", verts.astype(np.float32), np.asarray(given.faces, np.int64), **look))
     except Fault as fault:
         raise ValueError(f"mesh: {fault}") from fault.__cause__
 

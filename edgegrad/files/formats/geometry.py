@@ -94,11 +94,11 @@ def typed(parts: list[Part], wanted: torch.dtype | None, source: Source) -> tupl
     if not precise and dtype is torch.float32:
         return [part._replace(verts=part.verts.astype(np.float32, copy=False)) for part in parts], dtype
     parts = [part._replace(verts=part.verts.astype(np.float64)) for part in parts]
-    return (parts if dtype is torch.float32 else _in_double(parts)), dtype
+    return (parts if dtype is torch.float32 else in_double(parts)), dtype
 
 
-def _in_double(parts: list[Part]) -> list[Part]:
-    """With all that goes with positions in float64, what parts share once."""
+def in_double(parts: list[Part]) -> list[Part]:
+    """With all that goes with positions in float64; what parts share is converted once."""
     known: dict[int, Any] = {}
 
     def double(value: Any) -> Any:
