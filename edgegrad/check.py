@@ -15,12 +15,13 @@ from .library import core
 # Numbers beyond the range of float32, in float64: the kernel multiplies up to seven of them (a triple product of positions
 # by two focal lengths, by colour and adjoint), which must stay below 1e308.
 LARGEST = torch.finfo(torch.float32).max
+UNSIGNED = (torch.uint16, torch.uint32, torch.uint64)  # for which torch has few operations
 MOST_ROWS = 2**31 - 1  # of any array that is referred to by index: inside, indices have 32 bits
 
 
 def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating: bool = False) -> Tensor:
     """`value` as a tensor: tensors pass unchanged, numbers, sequences and NumPy arrays are converted, to the device of
-    `like` and, if `like` is floating-point, to a floating-point dtype; with `floating` always to one.
+    `like` and, if `like` is floating-point, to a floating-point dtype; with `floating` always to one. UNSIGNED become int64.
 
     Raises TypeError when `value` is none of these, a sparse tensor, or a sequence of tensors whose gradients would be lost.
     """
@@ -29,6 +30,8 @@ def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating:
             kind = "a nested one" if value.is_nested else f"one of layout {value.layout}"
             raise TypeError(f"{name}: expected a dense tensor, got {kind}; use .to_dense() or pad it")
         _check_real(name, value)
+        if value.dtype in UNSIGNED:
+            return value.to(torch.int64)
         return value.resolve_neg()  # itself, unless it is a view that says only that its numbers are negated
     if _needs_gradient(value):
         raise TypeError(
@@ -46,6 +49,8 @@ def as_tensor(name: str, value: object, *, like: Tensor | None = None, floating:
             f"convert it with torch.as_tensor ({error})"
         ) from None
     _check_real(name, tensor)
+    if tensor.dtype in UNSIGNED:
+        tensor = tensor.to(torch.int64)
     if not tensor.is_floating_point() and like is not None and like.is_floating_point():
         tensor = tensor.to(like.dtype)
     elif floating and not tensor.is_floating_point():

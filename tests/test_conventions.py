@@ -192,6 +192,21 @@ def test_opencv_pixel_centres() -> None:
     agree(eg.Camera.from_opencv(R, SHIFT, K, SIZE).project(POINTS) - 0.5, torch.from_numpy(theirs[:, 0]))
 
 
+def test_opencv_rotation_vectors() -> None:
+    """As cv2.Rodrigues has them, in any shape, with the derivative of the matrix."""
+    K = np.array([[60.0, 0, 30], [0, 55, 25], [0, 0, 1]])
+    rvec = np.array([0.3, -0.2, 2.9])
+    wanted, by_vector = cv2.Rodrigues(rvec)  # (3, 9): of the rows' numbers
+    for vector in (rvec, rvec[:, None], rvec.tolist()):
+        found = eg.Camera.from_opencv(vector, SHIFT, K, SIZE).world_to_camera
+        assert np.abs(found[:3, :3].double().numpy() - wanted).max() < (1e-6 if found.dtype == torch.float32 else 1e-12)
+    leaf = torch.from_numpy(rvec).requires_grad_()
+    weights = torch.arange(9.0, dtype=F64).reshape(3, 3)
+    turned = eg.Camera.fisheye(leaf, SHIFT, K, SIZE).world_to_camera[:3, :3]
+    (gradient,) = torch.autograd.grad((turned * weights).sum(), leaf)
+    assert torch.allclose(gradient, torch.from_numpy(by_vector) @ weights.reshape(9), atol=1e-9)
+
+
 # -- mistakes -------------------------------------------------------------------------------------------------------------
 
 

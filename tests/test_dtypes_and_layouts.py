@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from scenes import smooth_adjoint, smooth_colors
@@ -165,3 +166,11 @@ def test_cuda_tensors_come_back():
     assert same_bits([tensor.cpu() for tensor in found], expected)
     # A camera on the CPU looks at it all the same, and the image is where the scene is.
     assert eg.render(scene, CAMERA, 4).device.type == "cuda"
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "uint32", "uint64"])
+def test_faces_of_unsigned_integers(dtype: str) -> None:
+    faces = np.array([[0, 1, 2]], dtype)
+    for given in (faces, torch.from_numpy(faces)):
+        mesh = eg.Mesh(torch.eye(3), given)
+        assert mesh.faces.long().tolist() == [[0, 1, 2]]

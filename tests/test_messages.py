@@ -304,11 +304,6 @@ CAMERAS = {
         V,
         "R: expected shape (3, 3), got (4, 4)",
     ),
-    "OpenCV, rotation vector": (
-        lambda: eg.Camera.from_opencv([0.1, 0.2, 0.3], [0.0, 0.0, 4.0], K, (8, 8)),
-        V,
-        "R: expected shape (3, 3), got (3,); of a rotation vector take cv2.Rodrigues(R)[0]",
-    ),
     "OpenCV, t": (
         lambda: eg.Camera.from_opencv(POSE[:3, :3], POSE[3], K, (8, 8)),
         V,

@@ -20,6 +20,7 @@ from .poses import (  # fmt: skip
     intrinsics,
     intrinsics_of_view,
     rigid,
+    rotation,
 )
 
 # Of COLMAP (src/colmap/sensor/models.h): projection, number of focal lengths, number of coefficients after the principal point.
@@ -49,8 +50,8 @@ class Conventions(CameraFields):
     def from_opencv(
         cls: type[CameraT], R: Vector, t: Vector, K: Vector, size: tuple[int, int], distortion: Vector | None = None
     ) -> CameraT:
-        """From OpenCV's extrinsics: R (3, 3) and t (3,) with `q = R p + t`, K (3, 3) in pixels, and, of a lens that distorts,
-        k1, k2, p1, p2[, k3[, k4, k5, k6]], as cv2.calibrateCamera returns them.
+        """From OpenCV's extrinsics: R (3, 3), or a rotation vector (3,) in radians, and t (3,) with `q = R p + t`, K (3, 3) in
+        pixels, and, of a lens that distorts, k1, k2, p1, p2[, k3[, k4, k5, k6]], as cv2.calibrateCamera returns them.
 
         OpenCV puts the centre of the first pixel at 0, edgegrad at 0.5: K's principal point is shifted by half a pixel.
         """
@@ -60,8 +61,8 @@ class Conventions(CameraFields):
     def fisheye(
         cls: type[CameraT], R: Vector, t: Vector, K: Vector, size: tuple[int, int], distortion: Vector | None = None
     ) -> CameraT:
-        """A fisheye from OpenCV's R (3, 3), t (3,), K (3, 3) in pixels and k1, k2, k3, k4, as cv2.fisheye.calibrate returns
-        them; see from_opencv. It may show more than a half space, up to 180° from the axis."""
+        """A fisheye from OpenCV's R (3, 3) or (3,), t (3,), K (3, 3) in pixels and k1, k2, k3, k4, as cv2.fisheye.calibrate
+        returns them; see from_opencv. It may show more than a half space, up to 180° from the axis."""
         return _from_opencv(cls, R, t, K, size, "fisheye", distortion)
 
     @classmethod
@@ -239,8 +240,10 @@ def _from_opencv(
     check_float("R", R)
     t = as_tensor("t", t, like=R)
     K = as_tensor("K", K, like=R)
-    vector = "of a rotation vector take cv2.Rodrigues(R)[0]" if R.numel() == 3 else ""
-    check_shape("R", R, (3, 3), fix=vector)
+    if R.numel() == 3:
+        check_finite("R", R)
+        R = rotation(R.reshape(3))
+    check_shape("R", R, (3, 3), fix="or a rotation vector (3,)")
     check_shape("K", K, (3, 3))
     check_float("t", t)
     if t.numel() != 3:

@@ -39,6 +39,13 @@ def check_last_row(name: str, matrix: Tensor, expected: list[float], fix: str = 
         raise ValueError(f"{name}: expected the last row {expected}, got {got}; {fix}")
 
 
+def rotation(vector: Tensor) -> Tensor:
+    """(3, 3) by a rotation vector (3,), radians, differentiable: the exponential of its cross-product matrix."""
+    x, y, z = vector.unbind()
+    o = torch.zeros_like(x)
+    return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o]).reshape(3, 3))
+
+
 def check_rotation(name: str, matrix: Tensor) -> None:
     """`matrix` (…, 3, 3) is a rotation. Raises ValueError."""
     check_finite(name, matrix)

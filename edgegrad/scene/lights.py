@@ -90,7 +90,8 @@ class Light:
         value = numbers(name, getattr(self, name))
         if shape == ():
             if value.numel() != 1:
-                raise ValueError(f"{name}: expected one number, got shape {tuple(value.shape)}")
+                color = "; give the colour as color=" if name == "intensity" and value.dim() == 1 else ""
+                raise ValueError(f"{name}: expected one number, got shape {tuple(value.shape)}{color}")
             value = value if value.dim() == 0 else value.reshape(())  # a leaf stays one
         else:
             check_shape(name, value, shape)

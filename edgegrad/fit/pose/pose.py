@@ -66,13 +66,6 @@ def pose_from_matrix(name: str, matrix: object) -> Pose:
     return Pose(U @ Vh, M[:3, 3].clone(), scale * one, one)
 
 
-def rotation(vector: Tensor) -> Tensor:
-    """(3, 3) by a rotation vector (3,), radians, differentiable: the exponential of its cross-product matrix."""
-    x, y, z = vector.unbind()
-    o = torch.zeros_like(x)
-    return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o]).reshape(3, 3))
-
-
 def angle(A: Tensor, B: Tensor) -> float:
     """Radians of the rotation that takes A (3, 3) to B. By the sine and the cosine, for the cosine alone has no digits near 0."""
     R = A.T @ B

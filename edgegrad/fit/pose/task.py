@@ -13,11 +13,12 @@ from torch import Tensor
 
 from ...aovs import render_aovs
 from ...camera.camera import Camera
+from ...camera.poses import rotation
 from ...check import as_tensor, check_finite, check_float, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..views import area_mean, before_black, check_image, warn_of_faint
-from .pose import Pose, rotation
+from .pose import Pose
 
 COARSEST = 24  # pixels across the object where the fit begins: 15 % of its size is then a few pixels
 SMALLEST = 12  # pixels on the shorter side of the coarsest level
