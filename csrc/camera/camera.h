@@ -200,35 +200,27 @@ inline void to_pixels_vjp(const Camera& c, Vec2 m, Vec2 bar, Vec2& m_bar, double
     m_bar += Vec2{c.k[0] * bar.x + c.k[3] * bar.y, c.k[1] * bar.x + c.k[4] * bar.y};
 }
 
+// Through a lens that is not straight (through_lens.cpp; few cameras have one, and it is much code): backwards,
+// to_pixels of n bent to m; and n of m, alone or with m itself and the lens's coefficients, of a cotangent m_bar of A⁻¹
+// x.
+void bent_to_pixels_vjp(const Camera& c, Vec2 n, Vec2 bar, Vec2& n_bar, IntrinsicsGrad& intrinsics);
+Vec2 straightened_vjp(const Camera& c, Vec2 n, Vec2 n_bar);
+void straightened_vjp(const Camera& c, Vec2 n, Vec2& m, Vec2& m_bar, IntrinsicsGrad& intrinsics);
+
 // Of bend(project(q)): the pixel position of q.
+Vec2 project_jvp(const Camera& c, Vec3 q, Vec3 q_dot, const IntrinsicsGrad& intrinsics);
 inline void project_vjp(const Camera& c, Vec3 q, Vec2 bar, Vec3& q_bar, IntrinsicsGrad& intrinsics) {
     const double w = 1.0 / c.depth_weight(q);
     const Vec2 n{q.x * w, q.y * w};
     Vec2 n_bar;
-    if (c.is_straight()) {
-        to_pixels_vjp(c, n, bar, n_bar, intrinsics.k);
-    } else {
-        Vec2 m_bar;
-        with_lens(c.lens, [&](const auto& lens) {
-            to_pixels_vjp(c, lens.bend(n), bar, m_bar, intrinsics.k);
-            lens.bend_vjp(n, m_bar, n_bar, intrinsics.distortion);
-        });
-    }
+    if (c.is_straight()) to_pixels_vjp(c, n, bar, n_bar, intrinsics.k);
+    else bent_to_pixels_vjp(c, n, bar, n_bar, intrinsics);
     const double w_bar = -(n_bar.x * n.x + n_bar.y * n.y) * w;
     q_bar += Vec3{n_bar.x * w, n_bar.y * w, c.projection([&](auto p) { return p.weight_vjp(w_bar); })};
 }
 
 // Tangents of the coefficients, as those of m at fixed n: the rows of what bend_vjp is the adjoint of.
-inline Vec2 bend_by_coefficients(const Camera& c, Vec2 n, const double* distortion_dot) {
-    const auto along = [&](Vec2 bar) {
-        Vec2 ignored;
-        double c_bar[most_parameters] = {}, sum = 0;
-        with_lens(c.lens, [&](const auto& lens) { lens.bend_vjp(n, bar, ignored, c_bar); });
-        for (int i = 0; i < most_parameters; ++i) sum += c_bar[i] * distortion_dot[i];
-        return sum;
-    };
-    return {along({1, 0}), along({0, 1})};
-}
+Vec2 bend_by_coefficients(const Camera& c, Vec2 n, const double* distortion_dot);
 
 // δA m + δc, and A δm.
 inline Vec2 to_pixels_by_k(Vec2 m, const double k_dot[6]) {
@@ -236,17 +228,6 @@ inline Vec2 to_pixels_by_k(Vec2 m, const double k_dot[6]) {
 }
 inline Vec2 scaled_to_pixels(const Camera& c, Vec2 m_dot) {
     return {c.k[0] * m_dot.x + c.k[1] * m_dot.y, c.k[3] * m_dot.x + c.k[4] * m_dot.y};
-}
-
-inline Vec2 project_jvp(const Camera& c, Vec3 q, Vec3 q_dot, const IntrinsicsGrad& intrinsics) {
-    const double w = 1.0 / c.depth_weight(q);
-    const Vec2 n{q.x * w, q.y * w};
-    const double w_dot = c.projection([&](auto p) { return p.weight_jvp(q_dot); });
-    const Vec2 n_dot{(q_dot.x - w_dot * n.x) * w, (q_dot.y - w_dot * n.y) * w};
-    if (c.is_straight()) return scaled_to_pixels(c, n_dot) + to_pixels_by_k(n, intrinsics.k);
-    Vec2 m, m_dot = bend_by_coefficients(c, n, intrinsics.distortion);
-    with_lens(c.lens, [&](const auto& lens) { m = lens.bend(n), m_dot += lens.jacobian(n) * n_dot; });
-    return scaled_to_pixels(c, m_dot) + to_pixels_by_k(m, intrinsics.k);
 }
 
 // n = A⁻¹ (u − c) of a place in the straight image, with A the 2 × 2 part of K and c its last column.
@@ -260,14 +241,7 @@ inline Vec2 normalised(const Camera& c, Vec2 u) {
 //     δn = −J⁻¹ (A⁻¹ (δA m + δc) + ∂m/∂d δd).
 inline void normalised_vjp(const Camera& c, Vec2 n, Vec2 bar, IntrinsicsGrad& intrinsics) {
     Vec2 m = n, m_bar{-bar.x, -bar.y};
-    if (!c.is_straight())
-        with_lens(c.lens, [&](const auto& lens) {
-            m = lens.bend(n);
-            const Mat2 inverse = edgegrad::inverse(lens.jacobian(n));
-            m_bar = transposed_times(inverse, m_bar);
-            Vec2 ignored;
-            lens.bend_vjp(n, m_bar, ignored, intrinsics.distortion);
-        });
+    if (!c.is_straight()) straightened_vjp(c, n, m, m_bar, intrinsics);
     const double *A = c.k_inverse, x = A[0] * m_bar.x + A[2] * m_bar.y, y = A[1] * m_bar.x + A[3] * m_bar.y;  // A⁻ᵀ m̄
     double* k_bar = intrinsics.k;
     k_bar[0] += x * m.x, k_bar[1] += x * m.y, k_bar[2] += x;
@@ -279,21 +253,13 @@ struct Bent {
     Vec2 x;
     double area_scale = 1;
 };
-inline Bent bend(const Camera& c, Vec2 u) {
-    if (c.is_straight()) return {u};
-    const Vec2 n = normalised(c, u);
-    if (!(length(n) < c.lens_view.disc.fold)) return {u, 0};
-    return with_lens(c.lens,
-                     [&](const auto& lens) { return Bent{to_pixels(c, lens.bend(n)), determinant(lens.jacobian(n))}; });
-}
+Bent bend_by_lens(const Camera& c, Vec2 u);
+inline Bent bend(const Camera& c, Vec2 u) { return c.is_straight() ? Bent{u} : bend_by_lens(c, u); }
 
 // ∂x/∂u · tangent, at the place n: A J A⁻¹.
+Vec2 bend_jvp_by_lens(const Camera& c, Vec2 n, Vec2 tangent);
 inline Vec2 bend_jvp(const Camera& c, Vec2 n, Vec2 tangent) {
-    if (c.is_straight()) return tangent;
-    const double *A = c.k, *I = c.k_inverse;
-    const Vec2 along{I[0] * tangent.x + I[1] * tangent.y, I[2] * tangent.x + I[3] * tangent.y};
-    const Vec2 m = with_lens(c.lens, [&](const auto& lens) { return lens.jacobian(n) * along; });
-    return {A[0] * m.x + A[1] * m.y, A[3] * m.x + A[4] * m.y};
+    return c.is_straight() ? tangent : bend_jvp_by_lens(c, n, tangent);
 }
 
 // The place in the straight image of what is seen at x; not numbers where nothing is.
@@ -304,16 +270,7 @@ inline Vec2 straighten(const Camera& c, Vec2 x) {
     return n ? to_pixels(c, *n) : Vec2{nan, nan};
 }
 
-inline Vec2 normalised_jvp(const Camera& c, Vec2 n, const IntrinsicsGrad& intrinsics) {
-    const double* A = c.k_inverse;
-    const auto by_pixel = [&](Vec2 x) { return Vec2{A[0] * x.x + A[1] * x.y, A[2] * x.x + A[3] * x.y}; };
-    if (c.is_straight()) return -1 * by_pixel(to_pixels_by_k(n, intrinsics.k));
-    return with_lens(c.lens, [&](const auto& lens) {
-        const Vec2 m_dot =
-            by_pixel(to_pixels_by_k(lens.bend(n), intrinsics.k)) + bend_by_coefficients(c, n, intrinsics.distortion);
-        return -1 * (inverse(lens.jacobian(n)) * m_dot);
-    });
-}
+Vec2 normalised_jvp(const Camera& c, Vec2 n, const IntrinsicsGrad& intrinsics);
 
 // ∂n/∂u, backwards: A⁻ᵀ n̄, the cotangent of the place in the straight image; and that of the pixel position.
 inline Vec2 place_vjp(const Camera& c, Vec2 n_bar) {
@@ -321,9 +278,7 @@ inline Vec2 place_vjp(const Camera& c, Vec2 n_bar) {
     return {A[0] * n_bar.x + A[2] * n_bar.y, A[1] * n_bar.x + A[3] * n_bar.y};
 }
 inline Vec2 pixel_vjp(const Camera& c, Vec2 n, Vec2 n_bar) {
-    if (c.is_straight()) return place_vjp(c, n_bar);
-    return place_vjp(
-        c, with_lens(c.lens, [&](const auto& lens) { return transposed_times(inverse(lens.jacobian(n)), n_bar); }));
+    return place_vjp(c, c.is_straight() ? n_bar : straightened_vjp(c, n, n_bar));
 }
 
 }  // namespace edgegrad

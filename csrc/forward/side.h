@@ -1,13 +1,11 @@
 // One of the sides that a camera's rays go through (windows.h).
 #pragma once
 
-#include <cmath>
 #include <deque>
 #include <variant>
 
 #include "camera/camera_rays.h"
-#include "camera/vertices.h"
-#include "camera/windows.h"
+#include "core/array.h"
 #include "forward/forward.h"
 #include "shading/cut_outs.h"
 
@@ -16,13 +14,7 @@ namespace edgegrad {
 // What a side of the camera has of its own: the vertices in its frame, and its rays.
 struct Side {
     template <class T>
-    Side(const SceneView<T>& scene, const Camera& camera_, const RayCaster& caster, const ImageOptions& o, Team& team)
-        : camera(camera_),
-          q(camera_vertices(camera, scene.verts, scene.n_verts, team)),
-          frame(caster, camera, see_through(scene)),
-          pixel_rays(camera, o),
-          reach{o.filter.radius() * (std::fabs(camera.k_inverse[0]) + std::fabs(camera.k_inverse[1])),
-                o.filter.radius() * (std::fabs(camera.k_inverse[2]) + std::fabs(camera.k_inverse[3]))} {}
+    Side(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o, Team& team);
     Side(const Side&) = delete;  // its parts point to its camera
 
     const Camera camera;
@@ -34,17 +26,11 @@ struct Side {
 
    private:
     template <class T>
-    const SeenThrough* see_through(const SceneView<T>& scene) {
-        return scene.cut_outs.face ? &cut_outs.template emplace<CutOuts<T>>(scene, camera, q.data()) : nullptr;
-    }
+    const SeenThrough* see_through(const SceneView<T>& scene);
 };
 
 template <class T>
 std::deque<Side> make_sides(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
-                            const ImageOptions& o, Team& team) {
-    std::deque<Side> sides;
-    for (const Camera& side : sides_of(camera)) sides.emplace_back(scene, side, caster, o, team);
-    return sides;
-}
+                            const ImageOptions& o, Team& team);
 
 }  // namespace edgegrad

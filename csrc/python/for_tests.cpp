@@ -238,13 +238,13 @@ void bind_for_tests(nb::module_& m) {
 
     using Texels = nb::ndarray<const double, nb::numpy, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
     p.def("texture_eval", [](Texels texels, A2 uv) {
-        const Texture<double> t{texels.data(), 0, int64_t(texels.shape(0)), int64_t(texels.shape(1))};
+        const Texture<double> t{{0, int64_t(texels.shape(0)), int64_t(texels.shape(1))}, texels.data()};
         std::vector<double> out(texels.shape(2));
         eval<0>(t, footprint(t, vec(uv)), int(texels.shape(2)), out.data());
         return out;
     });
     p.def("texture_eval_vjp", [](Texels texels, A2 uv, std::vector<double> bar) {
-        const Texture<double> t{texels.data(), 0, int64_t(texels.shape(0)), int64_t(texels.shape(1))};
+        const Texture<double> t{{0, int64_t(texels.shape(0)), int64_t(texels.shape(1))}, texels.data()};
         const Footprint f = footprint(t, vec(uv));
         std::array<int64_t, 4> texel;
         std::array<double, 4> weight;

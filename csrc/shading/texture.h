@@ -10,9 +10,8 @@
 
 namespace edgegrad {
 
-template <class T>
-struct Texture {
-    const T* texels;
+// Where the texels of a texture lie, whatever they are.
+struct TexelGrid {
     int64_t first;  // row of the first texel among all texels
     int64_t height, width;
     Sampler sampler = {};
@@ -21,11 +20,16 @@ struct Texture {
     Vec2 place(Vec2 uv) const { return {uv.x * width, (1 - uv.y) * height}; }
 };
 
+template <class T>
+struct Texture : TexelGrid {
+    const T* texels;
+};
+
 // Row `index` of a table of textures.
 template <class T>
 Texture<T> texture_at(const T* texels, const int64_t* table, int64_t index) {
     const int64_t* row = table + texture_columns * index;
-    return {texels, row[0], row[1], row[2], {Wrap(row[3]), Wrap(row[4]), TextureFilter(row[5])}};
+    return {{row[0], row[1], row[2], {Wrap(row[3]), Wrap(row[4]), TextureFilter(row[5])}}, texels};
 }
 
 // The texel from 0 to n − 1 that stands at i, an integer. Reduced in floating point: it may lie so far out that an
@@ -47,8 +51,7 @@ struct Footprint {
 };
 
 // The four texels around the corner (i, j) of texels, integers, with the fractions that are given.
-template <class T>
-Footprint footprint_at(const Texture<T>& t, double i, double j, double a, double b) {
+inline Footprint footprint_at(const TexelGrid& t, double i, double j, double a, double b) {
     const auto [u, v, filter] = t.sampler;
     const int64_t i0 = wrapped(i, t.width, u), i1 = wrapped(i + 1, t.width, u);
     const int64_t top = t.first + wrapped(j, t.height, v) * t.width,
@@ -58,23 +61,15 @@ Footprint footprint_at(const Texture<T>& t, double i, double j, double a, double
 
 // The texel (i, j), integers, as four of which it has all the weight: what is computed of its weights' derivatives is
 // zero.
-template <class T>
-Footprint texel_at(const Texture<T>& t, double i, double j) {
+inline Footprint texel_at(const TexelGrid& t, double i, double j) {
     const int64_t texel = t.first + wrapped(j, t.height, t.sampler.v) * t.width + wrapped(i, t.width, t.sampler.u);
     return {{texel, texel, texel, texel}, 0, 0};
 }
 
 // Where the sampler is not that of most textures.
-template <class T>
-[[gnu::noinline]] Footprint footprint_of_sampler(const Texture<T>& t, Vec2 uv) {
-    const Vec2 p = t.place(uv);
-    if (t.sampler.filter == TextureFilter::nearest) return texel_at(t, std::floor(p.x), std::floor(p.y));
-    const double i = std::floor(p.x - 0.5), j = std::floor(p.y - 0.5);
-    return footprint_at(t, i, j, p.x - 0.5 - i, p.y - 0.5 - j);
-}
+Footprint footprint_of_sampler(const TexelGrid& t, Vec2 uv);
 
-template <class T>
-Footprint footprint(const Texture<T>& t, Vec2 uv) {
+inline Footprint footprint(const TexelGrid& t, Vec2 uv) {
     if (t.sampler != Sampler()) [[unlikely]]
         return footprint_of_sampler(t, uv);
     const double x = uv.x * t.width - 0.5, y = (1 - uv.y) * t.height - 0.5;

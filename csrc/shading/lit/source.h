@@ -21,7 +21,7 @@ struct Source {
 
     bool exists() const { return value != no_table; }
     // The texels are rows of the table.
-    Texture<float> texture() const { return {nullptr, 0, height, width, sampler}; }
+    TexelGrid grid() const { return {0, height, width, sampler}; }
 };
 
 // A point on a face of a mesh.
@@ -53,7 +53,7 @@ Uv<S> interpolated_uv(const std::vector<Table>& tables, const Source& source, co
     }
     return uv;
 }
-inline Footprint footprint(const Source& source, Vec2 uv) { return footprint(source.texture(), uv); }
+inline Footprint footprint(const Source& source, Vec2 uv) { return footprint(source.grid(), uv); }
 
 // A fraction between texels, whose derivative is that of the coordinate times the texels in it.
 inline double fraction(double value, double, double) { return value; }
