@@ -23,13 +23,14 @@ namespace edgegrad {
 namespace {
 
 // Of a sample it only matters whether it is visible.
-struct Witness {
-    bool& visible;
-    bool wants(int, Vec2) const { return true; }
-    template <CurveSource Source>
-    void add(int, Source&, typename Source::Sample&) {
-        visible = true;
-    }
+class Witness final : public CurveContraction {
+   public:
+    bool visible = false;
+
+    bool wants(int, Vec2) override { return true; }
+
+   private:
+    void contract(int, MovingSample&) override { visible = true; }
 };
 
 // Edges, lines where faces pass through each other, and the rim of a lens, in their order as primitives.
@@ -88,10 +89,10 @@ bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const Ord
     const CoincidentCurves alone({}, draws.systematic(), view.team);
     std::vector<uint8_t> found((n + scatter_chunk - 1) / scatter_chunk, 0);
     view.team.each(int64_t(found.size()), [&](int64_t chunk) {
-        bool visible = false;
-        Witness witness{visible};
+        Witness witness;
+        CurveContraction& contraction = witness;
         EdgeSource<T> source(view, curves.finder, alone);
-        CurveSamples samples(view, source, witness);
+        CurveSamples samples(view, source, contraction);
         Curve curve;
         const Drawn drawn{draws, chunk * scatter_chunk, std::min(n, (chunk + 1) * scatter_chunk)};
         drawn.each([&](int64_t k, double s, double weight) {
@@ -100,7 +101,7 @@ bool any_visible(const BackwardView<T>& view, const Curves<T>& curves, const Ord
             samples.add(curve, kept_off_ends(curve, s), weight);
         });
         samples.cast();
-        found[chunk] = visible;
+        found[chunk] = witness.visible;
     });
     return std::find(found.begin(), found.end(), 1) != found.end();
 }

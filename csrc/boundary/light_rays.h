@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <functional>
 #include <vector>
 
 #include "backward/view.h"
@@ -64,8 +65,7 @@ class LightRays {
 
     // Calls body(ShadowPoint, weight) for each face to which light goes on past them: the first that casts a shadow,
     // and those before it that let light through.
-    template <class Body>
-    void cast(Body body) {
+    void cast(const std::function<void(const ShadowPoint&, double)>& body) {
         while (count_ > 0) {
             int32_t face[RayBatch::size];
             Meeting met[RayBatch::size];

@@ -16,6 +16,8 @@ Side::Side(const SceneView<T>& scene, const Camera& camera_, const RayCaster& ca
       reach{o.filter.radius() * (std::fabs(camera.k_inverse[0]) + std::fabs(camera.k_inverse[1])),
             o.filter.radius() * (std::fabs(camera.k_inverse[2]) + std::fabs(camera.k_inverse[3]))} {}
 
+Side::~Side() = default;
+
 template <class T>
 const SeenThrough* Side::see_through(const SceneView<T>& scene) {
     return scene.cut_outs.face ? &cut_outs.template emplace<CutOuts<T>>(scene, camera, q.data()) : nullptr;

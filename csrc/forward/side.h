@@ -16,6 +16,7 @@ struct Side {
     template <class T>
     Side(const SceneView<T>& scene, const Camera& camera, const RayCaster& caster, const ImageOptions& o, Team& team);
     Side(const Side&) = delete;  // its parts point to its camera
+    ~Side();
 
     const Camera camera;
     const Array<Vec3> q;
