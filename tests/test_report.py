@@ -201,7 +201,7 @@ def test_sweep_stops_where_the_next_point_would_cost_too_much():
 )
 def test_lit_scenes(scene, tmp_path):
     """From a reference that is computed anew. Their terms are not timed alone."""
-    document, _ = error_time(tmp_path, [scene], ["edgegrad", "boundary"], size=16, seeds=2, limit=1.0, quick=True)
+    document, _ = error_time(tmp_path, [scene], ["edgegrad", "boundary"], size=16, seeds=2, limit=60.0, quick=True)
     of_scene = document["scenes"][scene]
     assert "not timed apart" in of_scene["left_out"]["boundary"]
     assert 0 < of_scene["reference"]["error"]["boundary"]["translation"] < 0.5
