@@ -40,9 +40,9 @@ def read_model(path: PathLike, wanted: Wanted) -> Model:
         model = READERS[kind](data, kind, source)
     if not model.parts:
         raise Fault("expected triangles, got none: the file is truncated, or was exported without faces")
-    parts, dtype = typed(model.parts, wanted.dtype, source)
+    model = typed(model, wanted.dtype, source)
     source.unsupported.say(path)
-    return model._replace(parts=parts, dtype=dtype)
+    return model
 
 
 def read_cameras(path: PathLike, size: tuple[int, int], dtype: torch.dtype) -> dict[str, Camera]:
