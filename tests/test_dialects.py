@@ -168,6 +168,35 @@ def test_ply_colours_by_any_name_and_type(tmp_path, names, kind, scale):
     np.testing.assert_allclose(mesh.face_colors, linear(values[:1]), atol=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["obj", "ply"])
+@pytest.mark.parametrize(
+    "red, expected",
+    [(1.0000001, 1.0), (1.009, 1.0), (-1e-7, 0.0), (0.999, 0.999), (2.0, 2 / 255), (255.0, 1.0), (1.02, None), (1.9, None)],
+)  # fmt: skip
+def test_float_colours_near_one(tmp_path, kind, red, expected):
+    """What rounding moves past 1 is 1, and the others stay what they were; what is neither up to 1 nor to 255 is refused."""
+    other = 0.5 if red < 2.0 else 127.5
+    rows = [f"0 0 0 {red} {other} 0", f"1 0 0 {other} 0 0", f"0 1 0 0 0 {other}"]
+    if kind == "obj":
+        path = write(tmp_path, "a.obj", "".join(f"v {row}\n" for row in rows) + "f 1 2 3\n")
+    else:
+        properties = "".join(f"property float {name}\n" for name in NAMES[0])
+        path = write(tmp_path, "a.ply", header(properties) + "\n".join(rows) + "\n3 0 1 2\n")
+    if expected is None:
+        with pytest.raises(ValueError, match=rf"expected vertex colours from 0 to 1, or to 255, got \[{red:.3g}"):
+            eg.load_mesh(path)
+        return
+    np.testing.assert_allclose(quietly(path).colors[0], linear([expected * 255, 127.5, 0]), atol=1e-6)
+
+
+def test_ushort_colours_of_eight_bits_are_said(tmp_path):
+    properties = "".join(f"property ushort {name}\n" for name in NAMES[0])
+    path = write(tmp_path, "a.ply", header(properties) + "0 0 0 255 128 0\n1 0 0 0 0 0\n0 1 0 3 3 3\n3 0 1 2\n")
+    with pytest.warns(UserWarning, match=r"ushort colours of vertex up to 255 \(taken for 0 to 255, not 65535\)"):
+        mesh = eg.load_mesh(path)
+    np.testing.assert_allclose(mesh.colors[0], linear([255, 128, 0]), atol=1e-6)
+
+
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("count", ["uchar", "int"])
 def test_ply_lists_of_mixed_lengths(tmp_path, form, count):

@@ -142,16 +142,20 @@ class Source(NamedTuple):
 
 
 def linear_colors(what: str, values: np.ndarray, srgb: bool) -> Tensor:
-    """Linear float32 colours (N, 3) from integers of any width, or from floats; sRGB floats reach up to 1 or 255."""
+    """Linear float32 colours (N, 3) from integers of any width, or from floats. sRGB floats reach up to 1, beyond which rounding
+    may bring them by a hundredth, or, where one is 2 or more, up to 255. Raises Fault."""
     values = np.asarray(values)
     colors = values[:, :3].astype(np.float64)
     if values.dtype.kind in "iu":
         colors /= np.iinfo(values.dtype).max
-    elif srgb and colors.size and colors.max() > 1.0:
+    elif srgb and colors.size and colors.max() >= 2.0:
         colors /= 255.0
+    elif srgb:
+        colors = np.where((colors > -0.01) & (colors < 1.01), np.clip(colors, 0.0, 1.0), colors)
     good = (colors >= 0.0) & (colors <= (1.0 if srgb else np.finfo(np.float32).max))
     if not good.all():
         bad = int(np.argwhere(~good)[0, 0])
-        raise Fault(f"expected {what} colours from 0 to 1, got {values[bad].tolist()} at {what} {bad}; repair it")
+        wanted = "from 0 to 1, or to 255" if srgb else "from 0 to 1"
+        raise Fault(f"expected {what} colours {wanted}, got {values[bad].tolist()} at {what} {bad}; repair it")
     linear = torch.from_numpy(colors)
     return (srgb_to_linear(linear) if srgb else linear).float()
