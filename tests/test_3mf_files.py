@@ -143,6 +143,19 @@ def test_colours_of_corners(tmp_path):
             model(GROUPS + one(mesh(of_faces=('pid="5" p1="0"', ""))), '<item objectid="1"/>'),
             "triangles without a colour beside others with one (white)",
         ),
+        (model(one(mesh(), more='pid="7" pindex="0"'), '<item objectid="1"/>'), "pid 7 (no such group)"),
+        (
+            model(GROUPS + one(mesh(), more='pid="5"'), '<item objectid="1"/>'),
+            "pid of an object without pindex (left out)",
+        ),
+        (
+            model(GROUPS + one(mesh(of_faces=('pid="5"', ""))), '<item objectid="1"/>'),
+            "pid of a triangle without p1 (left out)",
+        ),
+        (
+            model(GROUPS + one(mesh(of_faces=('p1="0"', ""))), '<item objectid="1"/>'),
+            "p1 of a triangle without pid (left out)",
+        ),
         (
             model(
                 GROUPS.replace("#00FF00", "#00FF0080") + one(mesh(), more='pid="6" pindex="0"'), '<item objectid="1"/>'

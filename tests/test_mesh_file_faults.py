@@ -1,5 +1,6 @@
 """What is wrong in a file of a mesh is named."""
 
+import gzip
 import os
 import struct
 
@@ -24,7 +25,28 @@ from edgegrad.files.load import load_mesh, load_scene
         ("a.obj", GOOD + "f 0 1 2\n", "count from 1, got 0"),
         ("a.obj", GOOD + "f 1 2 -7\n", r"indices of vertices \(v\) from 1 to 3, got -3"),
         ("a.obj", GOOD + "f 1 x 3\nf 1 2 3\n", "numbers alone in the faces, got 'x'"),
-        ("a.obj", GOOD + "f 1 2\n", "faces of three corners or more, got 2 at face 1"),
+        ("a.obj", GOOD.replace("f 1 2 3", "f 1 2"), "expected triangles, got none"),
+        ("a.ply", ply(SQUARE, [[0, 1]]), "expected triangles, got none"),
+        (
+            "a.ply",
+            ply(SQUARE, [[0, 1, 2]]).replace(b"uchar int", b"uchar float").replace(b"3 0 1 2", b"3 0 1.5 2"),
+            "whole numbers for vertex_indices in face, got 1.5",
+        ),
+        ("a.stl", "o part\n" + GOOD, "expected an STL file, got text without solid or facet at its start"),
+        (
+            "a.obj",
+            "version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 1\n",
+            "a pointer of git-lfs .* git lfs pull",
+        ),
+        (
+            "a.glb",
+            "version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 1\n",
+            "a pointer of git-lfs .* git lfs pull",
+        ),
+        ("a.stl", "<!DOCTYPE html><html>404</html>", "a page of the web"),
+        ("a.ply", "\n <HTML>404</HTML>", "a page of the web"),
+        ("a.off", gzip.compress(OFF.encode()), "data compressed by gzip; unpack"),
+        ("a.gltf", b"PK\x03\x04" + bytes(30), "an archive of zip; unpack"),
         ("a.obj", GOOD.replace("v 0 1 0", "v 0 nan 0"), "finite positions.* at vertex 2"),
         ("a.obj", GOOD.replace("v 0 1 0", "v 0 1e99 0"), "finite positions.* at vertex 2"),
         ("a.obj", "v 0 0 0 0 0 0\nv 1 0 0 0 nan 0\nv 0 1 0 1 1 1\nf 1 2 3\n", "vertex colours.*nan.* at vertex 1"),
@@ -110,6 +132,30 @@ def test_texture_faults(tmp_path):
             load_mesh(path)
     path = write_obj(tmp_path, body="mtllib quad.mtl\nusemtl skin\n" + GOOD)
     with pytest.raises(ValueError, match=r"quad\.obj.*expected texture coordinates"):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("statements", "fault"),
+    [
+        ("Kd 1 x 0", "expected numbers for kd in the material, got '1 x 0'"),
+        ("Kd -1 0 0", "expected numbers from 0 on for Kd in the material, got '-1 0 0'"),
+        (
+            "map_Kd -foo 1 skin.png",
+            r"expected options of a texture \(-blendu, .*\), got -foo in map_Kd '-foo 1 skin\.png'",
+        ),
+    ],
+)
+def test_faults_of_a_material_name_it_and_its_file(tmp_path, statements, fault):
+    path = write_obj(tmp_path, mtl=f"newmtl other\nKd 1 1 1\nnewmtl skin\n{statements}\n")
+    with pytest.raises(ValueError, match=rf"quad\.obj: newmtl skin in quad\.mtl: {fault}"):
+        load_mesh(path)
+
+
+def test_a_texture_that_is_a_pointer_of_git_lfs(tmp_path):
+    path = write_obj(tmp_path)
+    (tmp_path / "skin.png").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 1\n")
+    with pytest.raises(ValueError, match=r"image in the texture 'skin\.png', got a pointer of git-lfs"):
         load_mesh(path)
 
 

@@ -13,6 +13,7 @@ import torch
 from ..camera.camera import Camera
 from ..scene.material import Material
 from .formats import gltf, gltf_material, obj, off, ply, stl, threemf
+from .formats.disguised import check_disguised
 from .formats.geometry import checked, shape, turned, typed
 from .formats.gltf_nodes import cameras, lights
 from .formats.gltf_scene import instances as gltf_instances
@@ -36,6 +37,8 @@ def read_model(path: PathLike, wanted: Wanted) -> Model:
     """
     file = check_readable(path, MESHES)
     data, kind, source = file.read_bytes(), file.suffix.lower()[1:], Source.of(path, wanted)
+    if kind != "3mf" or not data.startswith(b"PK"):  # which is an archive itself
+        check_disguised(data, f"{'an' if kind in ('obj', 'off', 'stl') else 'a'} {kind.upper()} file")
     with _as_fault(kind):
         model = READERS[kind](data, kind, source)
     if not model.parts:
@@ -100,7 +103,7 @@ def _read_3mf(data: bytes, kind: str, source: Source) -> Model:
 
 def _read_plain(data: bytes, kind: str, source: Source) -> Model:
     """OBJ, PLY, STL and OFF."""
-    found, parts = PLAIN[kind](data, source), []
+    found, parts = [part for part in PLAIN[kind](data, source) if len(part.faces)], []
     for part in found:
         with _naming(part.name, alone=len(found) == 1):
             parts.append(_finished(part, np.eye(4)))

@@ -80,7 +80,11 @@ def _corners(element: Element) -> Lists:
             f"expected a list vertex_indices in {element.name}, got {', '.join(element.columns)}; export it again"
         )
     del element.columns[name]
-    return Lists(lists[name].counts, lists[name].values.astype(np.int64))
+    index = lists[name].values.astype(np.int64)
+    if (bad := np.flatnonzero(index != lists[name].values)).size:
+        got = lists[name].values[bad[0]]
+        raise Fault(f"expected whole numbers for {name} in {element.name}, got {got:g}; export it again")
+    return Lists(lists[name].counts, index)
 
 
 def _strips(index: np.ndarray) -> np.ndarray:

@@ -23,6 +23,9 @@ UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254,
 SAFE = {"resolve_entities": False, "no_network": True, "load_dtd": False, "huge_tree": False}
 
 
+Palettes = dict[str | None, list[tuple[int, ...]] | None]  # colours of groups by id; None: of a group that is not read
+
+
 class Reference(NamedTuple):
     """An object where an item of the build, or a component, places it."""
 
@@ -153,7 +156,8 @@ def _read_part(name: str, root: Any, source: Source) -> ModelPart:
     if unit not in UNITS:
         raise Fault(f"expected a unit of 3MF ({', '.join(UNITS)}), got {unit!r}; export it again")
     groups = root.iter(f"{{{CORE}}}basematerials", f"{{{MATERIAL}}}colorgroup") if source.wanted.materials else ()
-    palettes = {group.get("id"): [_color(child) for child in group.iterchildren("{*}*")] for group in groups}
+    palettes: Palettes = {given.get("id"): None for given in root.iterfind(f"{{{CORE}}}resources/*[@id]")}
+    palettes |= {group.get("id"): [_color(child) for child in group.iterchildren("{*}*")] for group in groups}
     objects: dict[str, Object] = {}
     for given in _core(root, "object"):
         if objects.setdefault(given.attrib["id"], found := _object(given, name, palettes, source)) is not found:
@@ -175,7 +179,7 @@ def _reference(given: Any, part: str) -> Reference:
     return Reference(_name(given.get(PATH, part)), given.attrib["objectid"], matrix)
 
 
-def _object(given: Any, part: str, palettes: dict[str, list[tuple[int, ...]]], source: Source) -> Object:
+def _object(given: Any, part: str, palettes: Palettes, source: Source) -> Object:
     corners = [f"{v.attrib['x']} {v.attrib['y']} {v.attrib['z']}" for v in _core(given, "vertex")]
     faces = [f"{t.attrib['v1']} {t.attrib['v2']} {t.attrib['v3']}" for t in _core(given, "triangle")]
     return Object(
@@ -193,25 +197,35 @@ def _numbers(rows: list[str], dtype: type) -> np.ndarray:
     return flat.reshape(-1, 3)
 
 
-def _colors(given: Any, palettes: dict[str, list[tuple[int, ...]]], source: Source) -> np.ndarray | None:
+def _colors(given: Any, palettes: Palettes, source: Source) -> np.ndarray | None:
     """Of the corners of triangles, by their own properties or those of the object; None where none has one that is read."""
     own = given.get("pid"), given.get("pindex"), None, None
+    of_faces = given.xpath("boolean(.//c:triangle[@pid or @p1])", namespaces={"c": CORE})
+    if not source.wanted.materials or (own[0] is None and not of_faces):
+        return None
+    if own[0] is not None and own[1] is None:
+        source.unsupported.note("pid of an object without pindex")
     white, found, plain = (255,) * 4, [], 0
-    for triangle in _core(given, "triangle") if palettes else ():
+    for triangle in _core(given, "triangle"):
         pid, first, second, third = own
         if triangle.get("p1") is not None:
             pid, first = triangle.get("pid", pid), triangle.get("p1")
             second, third = triangle.get("p2"), triangle.get("p3")
-        if pid not in palettes or first is None:
+        elif triangle.get("pid") is not None:
+            source.unsupported.note("pid of a triangle without p1")
+        if first is not None and pid is None:
+            source.unsupported.note("p1 of a triangle without pid")
+        elif first is not None and pid not in palettes:
+            source.unsupported.note(f"pid {pid}", "no such group")
+        palette = palettes.get(pid)
+        if palette is None or first is None:
             plain += 1
             found.append((white,) * 3)
             continue
         indices = [int(first if index is None else index) for index in (first, second, third)]
-        if not all(0 <= index < len(palettes[pid]) for index in indices):
-            raise Fault(
-                f"expected colours from 0 to {len(palettes[pid]) - 1} of group {pid}, got {indices}; export it again"
-            )
-        found.append(tuple(palettes[pid][index] for index in indices))
+        if not all(0 <= index < len(palette) for index in indices):
+            raise Fault(f"expected colours from 0 to {len(palette) - 1} of group {pid}, got {indices}; export it again")
+        found.append(tuple(palette[index] for index in indices))
     if plain == len(found):
         return None
     if plain:
