@@ -197,7 +197,7 @@ def test_what_changes_no_picture_is_not_named(tmp_path):
             r"colours from 0 to 1 of group 5, got \[2, 2, 2\]",
         ),
         (model(GROUPS.replace("#FF0000", "red") + one(mesh()), '<item objectid="1"/>'), "#RRGGBB or #RRGGBBAA, got 'red'"),
-        (model(one(mesh())), "expected triangles, got none"),
+        (model(one(mesh())), "expected items in the build, which say what is shown, got none"),
         (
             model(GROUPS + one(mesh(CORNERS, FACES - 1, ('pid="6" p1="0" p2="1"',) * 2)), '<item objectid="1"/>'),
             "indices from 0 to 3, got -1",

@@ -1,6 +1,8 @@
 """What is wrong in a file of a mesh is named."""
 
+import base64
 import gzip
+import json
 import os
 import struct
 
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 from mesh_files import GOOD, OFF, SQUARE, STL, TRIANGLES, ply, png_bytes, square_glb, write_obj
 from PIL import Image
+from test_bad_files import changed, gltf_tree
 
 from edgegrad.files.load import load_mesh, load_scene
 
@@ -75,7 +78,7 @@ from edgegrad.files.load import load_mesh, load_scene
         ("a.glb", square_glb()[:-8], "cannot be read"),
         ("a.glb", square_glb(scenes=[{"nodes": []}]), "expected triangles, got none"),
         ("a.glb", square_glb(extensionsRequired=["EXT_meshopt_compression"]), "EXT_meshopt_compression"),
-        ("a.glb", square_glb(meshes=5), "cannot be read"),
+        ("a.glb", square_glb(meshes=5), "expected an array at meshes, got 5"),
         (
             "a.glb",
             square_glb(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]}]),
@@ -157,6 +160,81 @@ def test_a_texture_that_is_a_pointer_of_git_lfs(tmp_path):
     (tmp_path / "skin.png").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 1\n")
     with pytest.raises(ValueError, match=r"image in the texture 'skin\.png', got a pointer of git-lfs"):
         load_mesh(path)
+
+
+def without(*place):
+    def change(tree):
+        *way, last = place
+        for step in way:
+            tree = tree[step]
+        del tree[last]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (without("accessors", 0, "count"), r"expected integer at accessors\[0\]\.count, got none"),
+        (without("accessors", 1, "componentType"), r"expected .* at accessors\[1\]\.componentType, got none"),
+        (without("meshes", 0, "primitives"), r"expected array at meshes\[0\]\.primitives, got none"),
+        (without("meshes", 0, "primitives", 0, "attributes"), r"at meshes\[0\]\.primitives\[0\]\.attributes, got none"),
+        (without("bufferViews", 0, "byteLength"), r"expected integer at bufferViews\[0\]\.byteLength, got none"),
+        (lambda tree: tree["nodes"].__setitem__(0, [1]), r"expected an object at nodes\[0\], got \[1\]"),
+        (lambda tree: tree.update(meshes=5), "expected an array at meshes, got 5"),
+        (lambda tree: tree["nodes"][0].update(mesh=[0]), r"expected an integer at nodes\[0\]\.mesh, got \[0\]"),
+        (
+            lambda tree: tree["bufferViews"][0].update(byteOffset=40),
+            r"bytes 40 to 88 of buffer 0 for bufferViews\[0\], got 60 bytes",
+        ),
+        (
+            lambda tree: tree["bufferViews"][0].update(byteStride=8),
+            "a byteStride of 12 or more for rows of 12 bytes, got 8",
+        ),
+        (
+            lambda tree: tree["accessors"][0].update(count=5),
+            r"5 rows of 3 × float32 from byte 0 to 60 of bufferViews\[0\], got 48 bytes",
+        ),
+        (lambda tree: tree["buffers"][0].update(uri="x.bin"), r"names 'x\.bin', and .* put it there$"),
+    ],
+)
+def test_gltf_faults_name_their_place_in_the_json(tmp_path, change, fault):
+    (tmp_path / "a.glb").write_bytes(changed(change, square_glb()))
+    with pytest.raises((ValueError, FileNotFoundError), match=rf"a\.glb: .*{fault}") as caught:
+        load_mesh(tmp_path / "a.glb")
+    assert "Error:" not in str(caught.value)
+
+
+def test_a_gltf_whose_buffer_is_nowhere(tmp_path):
+    (tmp_path / "a.gltf").write_text(json.dumps(gltf_tree(square_glb())))
+    with pytest.raises(
+        ValueError, match="expected the data of buffer 0 by a uri, got none; export it again, or as GLB"
+    ):
+        load_mesh(tmp_path / "a.gltf")
+
+
+def test_glb_by_the_name_of_gltf_and_the_other_way_round(tmp_path):
+    whole = square_glb()
+    (tmp_path / "a.gltf").write_bytes(whole)
+    tree = gltf_tree(whole)
+    chunk = whole[-tree["buffers"][0]["byteLength"] :]
+    tree["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(chunk).decode()
+    (tmp_path / "b.glb").write_text("\n " + json.dumps(tree))
+    for name in ("a.gltf", "b.glb"):
+        mesh = load_mesh(tmp_path / name)
+        assert mesh.verts.tolist() == SQUARE and mesh.faces.tolist() == TRIANGLES
+
+
+def test_the_material_beside_specular_glossiness_is_shown(tmp_path):
+    gloss = {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [0, 1, 0, 1]}}
+    base = {"baseColorFactor": [1.0, 0.5, 0.25, 1.0]}
+    used = {"extensionsUsed": list(gloss)}
+    (tmp_path / "a.glb").write_bytes(square_glb({"extensions": gloss, "pbrMetallicRoughness": base}, **used))
+    with pytest.warns(UserWarning, match=r"SpecularGlossiness \(shown in the metallic-roughness material beside it\)"):
+        assert load_mesh(tmp_path / "a.glb").face_colors[0].tolist() == [1.0, 0.5, 0.25]
+    (tmp_path / "a.glb").write_bytes(square_glb({"extensions": gloss}, **used))
+    with pytest.raises(ValueError, match="expected a metallic-roughness material, got specular-glossiness alone"):
+        load_mesh(tmp_path / "a.glb")
 
 
 def test_a_link_out_of_the_folder_is_not_followed(tmp_path):

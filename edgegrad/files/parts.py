@@ -17,6 +17,7 @@ from .formats.disguised import check_disguised
 from .formats.geometry import checked, shape, turned, typed
 from .formats.gltf_nodes import cameras, lights
 from .formats.gltf_scene import instances as gltf_instances
+from .formats.gltf_schema import explained
 from .formats.gltf_unread import note_unread
 from .formats.part import Fault, Model, Part, Wanted
 from .formats.source import Source, linear_colors
@@ -51,8 +52,12 @@ def read_model(path: PathLike, wanted: Wanted) -> Model:
 def read_cameras(path: PathLike, size: tuple[int, int], dtype: torch.dtype) -> dict[str, Camera]:
     """Those of a glTF or GLB file, by name. Raises Fault, FileNotFoundError or ValueError."""
     file = check_readable(path, GLTFS)
-    with _as_fault(kind := file.suffix.lower()[1:]):
-        return cameras(gltf.read(file.read_bytes(), kind).tree, size, dtype)
+    data, kind = file.read_bytes(), file.suffix.lower()[1:]
+    check_disguised(data, f"a {kind.upper()} file")
+    with _as_fault(kind):
+        tree = gltf.read(data, kind).tree
+        with explained(tree):
+            return cameras(tree, size, dtype)
 
 
 @contextmanager
@@ -78,13 +83,14 @@ def _as_fault(kind: str) -> Iterator[None]:
 
 def _read_gltf(data: bytes, kind: str, source: Source) -> Model:
     file = gltf.read(data, kind)
-    note_unread(file.tree, source)
     known: dict[object, Any] = {}
 
     def look(raw: dict[str, Any]) -> dict[str, object]:
         return gltf_material.look(raw["primitive"], known)
 
-    return Model(_parts(gltf_instances(file, source), look), lights(file.tree, source) if source.wanted.lit else [])
+    with explained(file.tree):
+        note_unread(file.tree, source)
+        return Model(_parts(gltf_instances(file, source), look), lights(file.tree, source) if source.wanted.lit else [])
 
 
 def _read_3mf(data: bytes, kind: str, source: Source) -> Model:

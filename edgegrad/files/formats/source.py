@@ -22,6 +22,9 @@ from .part import Fault, Wanted
 TEXTURES = ("PNG", "JPEG", "MPO", "JPEG2000", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "DDS")
 
 
+WITHOUT_LOOK = ", or pass materials=False where only its look is missing"
+
+
 class Folder:
     """The folder of a mesh file, from which those that the mesh names are read, and from nowhere else."""
 
@@ -29,7 +32,7 @@ class Folder:
         self.path, self.unsupported = path, unsupported
         self.root = Path(path).absolute().parent.resolve()
 
-    def get(self, name: str, advice: str = ", or pass materials=False where only its look is missing") -> bytes:
+    def get(self, name: str, advice: str = WITHOUT_LOOK) -> bytes:
         """Raises Fault or FileNotFoundError."""
         for text in (name.strip(), unquote(name.strip())):  # glTF writes names as URIs
             file = (self.root / text.replace("\\", "/")).resolve()

@@ -14,6 +14,7 @@ import numpy as np
 from ...optional import require
 from .part import Fault
 from .source import Source
+from .text import numbers
 from .threemf_unread import CORE, MATERIAL, NEEDED, PATH, note_unread
 
 MOST_INSTANCES = 100_000  # of the objects of a file: nested components multiply
@@ -63,6 +64,8 @@ def instances(data: bytes, source: Source) -> list[tuple[str, dict[str, Any], np
             )
         package = _Package(archive, source)
         root = package.root()
+        if package.part(root).objects and not package.part(root).items:
+            raise Fault("expected items in the build, which say what is shown, got none; export it again")
         count = sum(package.count(item, ()) for item in package.part(root).items)
         if count > MOST_INSTANCES:
             raise Fault(f"expected at most {MOST_INSTANCES} instances of objects, got {count}; export it flat")
@@ -171,29 +174,40 @@ def _core(within: Any, name: str) -> Iterator[Any]:
 
 
 def _reference(given: Any, part: str) -> Reference:
-    numbers = given.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
-    if len(numbers) != 12:
-        raise Fault(f"expected 12 numbers for a transform, got {len(numbers)}; export it again")
+    values = numbers(given.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").encode(), "a transform")
+    if len(values) != 12:
+        raise Fault(f"expected 12 numbers for a transform, got {len(values)}; export it again")
     matrix = np.eye(4)
-    matrix[:3] = np.array(numbers, np.float64).reshape(4, 3).T
+    matrix[:3] = values.reshape(4, 3).T
+    if "objectid" not in given.attrib:
+        raise Fault("expected the attribute objectid of each item and component, got one without; export it again")
     return Reference(_name(given.get(PATH, part)), given.attrib["objectid"], matrix)
 
 
 def _object(given: Any, part: str, palettes: Palettes, source: Source) -> Object:
-    corners = [f"{v.attrib['x']} {v.attrib['y']} {v.attrib['z']}" for v in _core(given, "vertex")]
-    faces = [f"{t.attrib['v1']} {t.attrib['v2']} {t.attrib['v3']}" for t in _core(given, "triangle")]
+    vertices, faces = _rows(given, "vertex", "x", "y", "z"), _rows(given, "triangle", "v1", "v2", "v3")
     return Object(
         given.get("name") or f"object {given.get('id')}",
-        _arrays(_numbers(corners, np.float64), _numbers(faces, np.int64), _colors(given, palettes, source)),
+        _arrays(vertices, faces, _colors(given, palettes, source)),
         [_reference(component, part) for component in _core(given, "component")],
     )
 
 
-def _numbers(rows: list[str], dtype: type) -> np.ndarray:
-    """(len(rows), 3). As one text, for a call for each number takes three times as long. Raises ValueError."""
-    flat = np.fromstring(" ".join(rows), dtype, sep=" ")
-    if len(flat) != 3 * len(rows):  # it ends at the first that is none
-        raise ValueError(f"{rows[len(flat) // 3]!r} is no three numbers")
+def _rows(given: Any, element: str, *names: str) -> np.ndarray:
+    """(N, 3) attributes of the elements of an object. As one text, for a call for each number takes three times as long. Raises
+    Fault."""
+    a, b, c = names
+    where = f"each {element} of object {given.get('id')}"
+    kind = np.float64 if element == "vertex" else np.int64
+    try:
+        rows = [f"{one.attrib[a]} {one.attrib[b]} {one.attrib[c]}" for one in _core(given, element)]
+    except KeyError as error:
+        raise Fault(
+            f"expected the attributes {a}, {b} and {c} of {where}, got one without {error}; export it again"
+        ) from None
+    flat = numbers(" ".join(rows).encode(), f"{a}, {b} and {c} of {where}", kind)
+    if len(flat) != 3 * len(rows):
+        raise Fault(f"expected one number for each of {a}, {b} and {c} of {where}, got others; export it again")
     return flat.reshape(-1, 3)
 
 
