@@ -197,6 +197,12 @@ def test_what_changes_no_picture_is_not_named(tmp_path):
             r"colours from 0 to 1 of group 5, got \[2, 2, 2\]",
         ),
         (model(GROUPS.replace("#FF0000", "red") + one(mesh()), '<item objectid="1"/>'), "#RRGGBB or #RRGGBBAA, got 'red'"),
+        (
+            model(GROUPS + one(mesh(), more='pid="5" pindex="x"'), '<item objectid="1"/>'),
+            "whole numbers for colours of group 5, got x, x, x",
+        ),
+        (model(one(mesh()).replace('id="1"', ""), '<item objectid="1"/>'), "attribute id of each object in .*, got one without"),
+        (model(one(mesh()), "<item/>"), "attribute objectid of each item and component, got one without"),
         (model(one(mesh())), "expected items in the build, which say what is shown, got none"),
         (
             model(GROUPS + one(mesh(CORNERS, FACES - 1, ('pid="6" p1="0" p2="1"',) * 2)), '<item objectid="1"/>'),

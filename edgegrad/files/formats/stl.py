@@ -16,7 +16,7 @@ HEADER = 84  # bytes of a binary file before its faces
 FACE = np.dtype([("normal", "<f4", 3), ("verts", "<f4", (3, 3)), ("attribute", "<u2")])
 SILENT = {b"facet", b"outer", b"endfacet"}  # with the normals of faces, which their corners say too
 WORDS = SILENT | {b"vertex", b"endloop"}
-TEXT = re.compile(rb"\s*((#|//)[^\r\n]*\s+)*(solid|facet)", re.IGNORECASE)
+TEXT = re.compile(rb"\s*((#|//)[^\r\n]*[\r\n]\s*)*(solid|facet)", re.IGNORECASE)
 
 
 def read(data: bytes, source: Source) -> list[Part]:

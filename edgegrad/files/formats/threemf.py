@@ -163,6 +163,8 @@ def _read_part(name: str, root: Any, source: Source) -> ModelPart:
     palettes |= {group.get("id"): [_color(child) for child in group.iterchildren("{*}*")] for group in groups}
     objects: dict[str, Object] = {}
     for given in _core(root, "object"):
+        if "id" not in given.attrib:
+            raise Fault(f"expected the attribute id of each object in {name!r}, got one without; export it again")
         if objects.setdefault(given.attrib["id"], found := _object(given, name, palettes, source)) is not found:
             raise Fault(f"expected an id for each object, got {given.get('id')!r} for two in {name!r}; export it again")
     return ModelPart(UNITS[unit], objects, [_reference(item, name) for item in _core(root, "item")])
@@ -236,7 +238,10 @@ def _colors(given: Any, palettes: Palettes, source: Source) -> np.ndarray | None
             plain += 1
             found.append((white,) * 3)
             continue
-        indices = [int(first if index is None else index) for index in (first, second, third)]
+        indices = [first if index is None else index for index in (first, second, third)]
+        if not all(index.strip().isdecimal() for index in indices):
+            raise Fault(f"expected whole numbers for colours of group {pid}, got {', '.join(indices)}; export it again")
+        indices = [int(index) for index in indices]
         if not all(0 <= index < len(palette) for index in indices):
             raise Fault(f"expected colours from 0 to {len(palette) - 1} of group {pid}, got {indices}; export it again")
         found.append(tuple(palette[index] for index in indices))
