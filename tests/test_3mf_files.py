@@ -143,6 +143,19 @@ def test_colours_of_corners(tmp_path):
             model(GROUPS + one(mesh(of_faces=('pid="5" p1="0"', ""))), '<item objectid="1"/>'),
             "triangles without a colour beside others with one (white)",
         ),
+        (model(one(mesh(), more='pid="7" pindex="0"'), '<item objectid="1"/>'), "pid 7 (no such group)"),
+        (
+            model(GROUPS + one(mesh(), more='pid="5"'), '<item objectid="1"/>'),
+            "pid of an object without pindex (left out)",
+        ),
+        (
+            model(GROUPS + one(mesh(of_faces=('pid="5"', ""))), '<item objectid="1"/>'),
+            "pid of a triangle without p1 (left out)",
+        ),
+        (
+            model(GROUPS + one(mesh(of_faces=('p1="0"', ""))), '<item objectid="1"/>'),
+            "p1 of a triangle without pid (left out)",
+        ),
         (
             model(
                 GROUPS.replace("#00FF00", "#00FF0080") + one(mesh(), more='pid="6" pindex="0"'), '<item objectid="1"/>'
@@ -184,7 +197,13 @@ def test_what_changes_no_picture_is_not_named(tmp_path):
             r"colours from 0 to 1 of group 5, got \[2, 2, 2\]",
         ),
         (model(GROUPS.replace("#FF0000", "red") + one(mesh()), '<item objectid="1"/>'), "#RRGGBB or #RRGGBBAA, got 'red'"),
-        (model(one(mesh())), "expected triangles, got none"),
+        (
+            model(GROUPS + one(mesh(), more='pid="5" pindex="x"'), '<item objectid="1"/>'),
+            "whole numbers for colours of group 5, got x, x, x",
+        ),
+        (model(one(mesh()).replace('id="1"', ""), '<item objectid="1"/>'), "attribute id of each object in .*, got one without"),
+        (model(one(mesh()), "<item/>"), "attribute objectid of each item and component, got one without"),
+        (model(one(mesh())), "expected items in the build, which say what is shown, got none"),
         (
             model(GROUPS + one(mesh(CORNERS, FACES - 1, ('pid="6" p1="0" p2="1"',) * 2)), '<item objectid="1"/>'),
             "indices from 0 to 3, got -1",

@@ -133,6 +133,12 @@ def test_mtl_options_of_textures(tmp_path, options, scale, offset, wrap):
     np.testing.assert_allclose(mesh.uvs[mesh.uv_faces], expected, atol=1e-6)
 
 
+def test_quoted_names(tmp_path):
+    write_obj(tmp_path, mtl='newmtl skin\nmap_Kd -s 1 1 1 "skin.png"\n')
+    path = write(tmp_path, "quad.obj", (tmp_path / "quad.obj").read_text().replace("quad.mtl", '"quad.mtl"'))
+    assert quietly(path).texture is not None
+
+
 def test_mtl_options_that_nothing_follows(tmp_path):
     mtl = "newmtl skin\nmap_Kd -mm 0.1 2 -t 1 1 1 -type cube_top -cc on skin.png\n"
     said = r"map_Kd -mm 0\.1 2 \(.*map_Kd -t 1 1 1 \(.*map_Kd -type cube_top \(.*map_Kd -cc on \("
@@ -166,6 +172,35 @@ def test_ply_colours_by_any_name_and_type(tmp_path, names, kind, scale):
     rows = VERTS + "3 0 1 2 {} {} {}\n".format(*given[0])
     mesh = quietly(write(tmp_path, "b.ply", header("", face) + rows))
     np.testing.assert_allclose(mesh.face_colors, linear(values[:1]), atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply"])
+@pytest.mark.parametrize(
+    "red, expected",
+    [(1.0000001, 1.0), (1.009, 1.0), (-1e-7, 0.0), (0.999, 0.999), (2.0, 2 / 255), (255.0, 1.0), (1.02, None), (1.9, None)],
+)  # fmt: skip
+def test_float_colours_near_one(tmp_path, kind, red, expected):
+    """What rounding moves past 1 is 1, and the others stay what they were; what is neither up to 1 nor to 255 is refused."""
+    other = 0.5 if red < 2.0 else 127.5
+    rows = [f"0 0 0 {red} {other} 0", f"1 0 0 {other} 0 0", f"0 1 0 0 0 {other}"]
+    if kind == "obj":
+        path = write(tmp_path, "a.obj", "".join(f"v {row}\n" for row in rows) + "f 1 2 3\n")
+    else:
+        properties = "".join(f"property float {name}\n" for name in NAMES[0])
+        path = write(tmp_path, "a.ply", header(properties) + "\n".join(rows) + "\n3 0 1 2\n")
+    if expected is None:
+        with pytest.raises(ValueError, match=rf"expected vertex colours from 0 to 1, or to 255, got \[{red:.3g}"):
+            eg.load_mesh(path)
+        return
+    np.testing.assert_allclose(quietly(path).colors[0], linear([expected * 255, 127.5, 0]), atol=1e-6)
+
+
+def test_ushort_colours_of_eight_bits_are_said(tmp_path):
+    properties = "".join(f"property ushort {name}\n" for name in NAMES[0])
+    path = write(tmp_path, "a.ply", header(properties) + "0 0 0 255 128 0\n1 0 0 0 0 0\n0 1 0 3 3 3\n3 0 1 2\n")
+    with pytest.warns(UserWarning, match=r"ushort colours of vertex up to 255 \(taken for 0 to 255, not 65535\)"):
+        mesh = eg.load_mesh(path)
+    np.testing.assert_allclose(mesh.colors[0], linear([255, 128, 0]), atol=1e-6)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
@@ -234,12 +269,31 @@ def test_binary_stl_of_another_length(tmp_path):
             eg.load_mesh(write(tmp_path, "a.stl", whole[:-fewer]))
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        STL.replace("\n", " "), "# by hand\n// and so\n" + STL, STL.split("\n", 1)[1], "\n" + STL.replace("\n", "\r"),
+        STL.replace("solid a\n", "", 1).replace("endsolid a\n", ""),
+    ],
+)  # fmt: skip
+def test_text_stl_of_other_lines(tmp_path, text):
+    """In one line; after comments; without solid."""
+    mesh = quietly(write(tmp_path, "a.stl", text))
+    assert mesh.verts[mesh.faces].tolist() == [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]
+
+
 def test_text_stl_whose_names_are_keywords(tmp_path):
     names = ["vertex normal", "endsolid", "solid", "", "facet"]
     text = "".join(STL.upper().replace("SOLID A", f"SOLID {name}") for name in names)
     scene = eg.load_scene(write(tmp_path, "a.stl", text))
     assert [mesh.name for mesh in scene.meshes] == ["vertex normal", "endsolid", "solid", None, "facet"]
     assert all(mesh.verts[mesh.faces].tolist() == [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]] for mesh in scene.meshes)
+
+
+def test_off_with_numbers_right_after_the_word(tmp_path):
+    """As in ModelNet."""
+    mesh = quietly(write(tmp_path, "a.off", OFF.replace("OFF\n", "OFF")))
+    assert mesh.verts.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]] and mesh.faces.tolist() == [[0, 1, 2]]
 
 
 def test_off_with_colours_normals_and_texture_coordinates(tmp_path):
@@ -272,6 +326,20 @@ UNREAD = {
     "OBJ, a curve": ("a.obj", GOOD + "cstype bezier\ncurv 0 1 1 2 3\nend\n", r"1 × cstype .*; 1 × curv .*; 1 × end "),
     "OBJ, colours of some": ("a.obj", "v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "after the positions of some vertices"),
     "OBJ, no vt": ("a.obj", GOOD.replace("1 2 3", "1/1 2/2 3/3"), r"texture coordinates \(vt\) of faces \(left out, for"),
+    "OBJ, colours by ZBrush": ("a.obj", "#MRGB ffff0000\n" + GOOD + "#MRGB ffff0000\n", "2 × #MRGB "),
+    "OBJ, no mtllib": ("a.obj", GOOD.replace("f 1", "usemtl red\nf 1"), r"usemtl without a mtllib \(no materials\)"),
+    "OBJ, Kd and colours": (
+        "quad.obj",
+        lambda folder: write_obj(
+            folder, mtl="newmtl red\nKd 1 0 0\n",
+            body="mtllib quad.mtl\nusemtl red\nv 0 0 0 1 1 1\nv 1 0 0 1 1 1\nv 0 1 0 1 1 1\nf 1 2 3\n",
+        ),
+        "Kd beside colours of vertices",
+    ),
+    "OBJ, faces of two": ("a.obj", GOOD + "f 1 2\nf 3\n", r"2 faces of fewer than three corners \(left out\)"),
+    "OFF, faces of two": ("a.off", OFF.replace("3 1 0", "3 2 0") + "2 0 1\n", "1 faces of fewer than three corners"),
+    "PLY, faces of two": ("a.ply", ply(SQUARE, [[0, 1], [0, 1, 2]], binary=True), "1 faces of fewer than three corners"),
+    "MTL, another case": ("quad.obj", textured("newmtl skin\nmap_Kd SKIN.png\n"), r"'SKIN\.png' \(skin\.png in its place\)"),
     "PLY, vertex": (
         "a.ply", header("property float intensity\n") + "0 0 0 1\n1 0 0 1\n0 1 0 1\n3 0 1 2\n", "intensity of vertex",
     ),
@@ -292,6 +360,10 @@ UNREAD = {
     "PLY, numbers": ("a.ply", header("") + VERTS + "3 0 1 2\n7 8\n", r"2 numbers after the last element \(not read\)"),
     "PLY, bytes": ("a.ply", ply(SQUARE, TRIANGLES, binary=True) + b"abc", r"3 bytes after the last element \(not read\)"),
     "STL, attributes": ("a.stl", binary_stl(CORNERS, 31), r"the attributes of faces, where some writers keep colours"),
+    "STL, a colour": ("a.stl", binary_stl(CORNERS, name=b"COLOR=\xff\0\0\xff"), r"COLOR= of the header \(a colour by Mat"),
+    "STL, no number": (
+        "a.stl", binary_stl(CORNERS)[:80] + bytes(4) + binary_stl(CORNERS)[84:], r"0 as the number of faces \(2, by the length",
+    ),
     "STL, bytes": ("a.stl", binary_stl(CORNERS) + b"a", r"1 bytes after the last of 2 faces"),
     "STL, keyword": ("a.stl", STL.replace("endfacet", "tint 3\nendfacet"), r"tint \(not read\)"),
     "OFF, vertex": ("a.off", OFF.replace("0 0 0", "0 0 0 9").replace("1 0 0", "1 0 0 9"), "1 more numbers of each vertex"),

@@ -96,6 +96,21 @@ def test_save_shapes_and_faults(tmp_path: Path) -> None:
         eg.save_mesh(tmp_path / "a.ply", eg.Scene([mesh]))
 
 
+@pytest.mark.parametrize("ending", ["obj", "off"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("scale", [1e-30, 1e-6, 1.0, 1e12])
+def test_text_keeps_every_number(tmp_path: Path, ending: str, dtype: torch.dtype, scale: float) -> None:
+    """Of any size: vertices come back as they were, and so do texture coordinates."""
+    mesh = eg.Mesh((torch.rand(8, 3, generator=torch.Generator().manual_seed(5)).double() * scale).to(dtype), FACES)
+    if ending == "obj":
+        mesh = mesh.replace(**LOOKS["texture"])
+    eg.save_mesh(tmp_path / f"a.{ending}", mesh)
+    back = eg.load_mesh(tmp_path / f"a.{ending}", dtype=dtype)
+    assert torch.equal(back.verts[back.faces.long()], mesh.verts[mesh.faces.long()])
+    if ending == "obj":
+        assert torch.equal(back.uvs[back.uv_faces.long()].float(), mesh.uvs[mesh.uv_faces.long()].float())
+
+
 def test_what_a_file_does_not_hold_is_said(tmp_path: Path) -> None:
     look = {"colors": torch.full((8, 3), 2.0), "material": eg.Material(0.5), "normals": torch.ones(8, 3)}
     for ending in ("ply", "obj"):

@@ -67,7 +67,8 @@ def test_lights_stand_where_their_nodes_do(tmp_path):
     assert float(sun.intensity) == 1.0 and sun.color.tolist() == [1, 1, 1]
     np.testing.assert_allclose(spot.position, [5, 6, 7])
     np.testing.assert_allclose(spot.direction / spot.direction.norm(), [0, 0, -1], atol=1e-6)
-    assert (float(spot.inner_angle), float(spot.outer_angle), float(spot.intensity)) == (0.1, 0.6, 2.0)
+    numbers = float(spot.inner_angle), float(spot.outer_angle), float(spot.intensity)
+    assert numbers == pytest.approx((0.1, 0.6, 2.0), rel=1e-7)
     assert second.position.tolist() == [0, 0, 0]
     lights[2].pop("spot")
     spot = eg.load_scene(file(tmp_path, nodes=nodes, roots=[0, 3, 4], lights=lights), lit=True).lights[2]

@@ -1,5 +1,8 @@
 """What is wrong in a file of a mesh is named."""
 
+import base64
+import gzip
+import json
 import os
 import struct
 
@@ -7,6 +10,7 @@ import numpy as np
 import pytest
 from mesh_files import GOOD, OFF, SQUARE, STL, TRIANGLES, ply, png_bytes, square_glb, write_obj
 from PIL import Image
+from test_bad_files import changed, gltf_tree
 
 from edgegrad.files.load import load_mesh, load_scene
 
@@ -24,7 +28,28 @@ from edgegrad.files.load import load_mesh, load_scene
         ("a.obj", GOOD + "f 0 1 2\n", "count from 1, got 0"),
         ("a.obj", GOOD + "f 1 2 -7\n", r"indices of vertices \(v\) from 1 to 3, got -3"),
         ("a.obj", GOOD + "f 1 x 3\nf 1 2 3\n", "numbers alone in the faces, got 'x'"),
-        ("a.obj", GOOD + "f 1 2\n", "faces of three corners or more, got 2 at face 1"),
+        ("a.obj", GOOD.replace("f 1 2 3", "f 1 2"), "expected triangles, got none"),
+        ("a.ply", ply(SQUARE, [[0, 1]]), "expected triangles, got none"),
+        (
+            "a.ply",
+            ply(SQUARE, [[0, 1, 2]]).replace(b"uchar int", b"uchar float").replace(b"3 0 1 2", b"3 0 1.5 2"),
+            "whole numbers for vertex_indices in face, got 1.5",
+        ),
+        ("a.stl", "o part\n" + GOOD, "expected an STL file, got text without solid or facet at its start"),
+        (
+            "a.obj",
+            "version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 1\n",
+            "a pointer of git-lfs .* git lfs pull",
+        ),
+        (
+            "a.glb",
+            "version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 1\n",
+            "a pointer of git-lfs .* git lfs pull",
+        ),
+        ("a.stl", "<!DOCTYPE html><html>404</html>", "a page of the web"),
+        ("a.ply", "\n <HTML>404</HTML>", "a page of the web"),
+        ("a.off", gzip.compress(OFF.encode()), "data compressed by gzip; unpack"),
+        ("a.gltf", b"PK\x03\x04" + bytes(30), "an archive of zip; unpack"),
         ("a.obj", GOOD.replace("v 0 1 0", "v 0 nan 0"), "finite positions.* at vertex 2"),
         ("a.obj", GOOD.replace("v 0 1 0", "v 0 1e99 0"), "finite positions.* at vertex 2"),
         ("a.obj", "v 0 0 0 0 0 0\nv 1 0 0 0 nan 0\nv 0 1 0 1 1 1\nf 1 2 3\n", "vertex colours.*nan.* at vertex 1"),
@@ -53,7 +78,7 @@ from edgegrad.files.load import load_mesh, load_scene
         ("a.glb", square_glb()[:-8], "cannot be read"),
         ("a.glb", square_glb(scenes=[{"nodes": []}]), "expected triangles, got none"),
         ("a.glb", square_glb(extensionsRequired=["EXT_meshopt_compression"]), "EXT_meshopt_compression"),
-        ("a.glb", square_glb(meshes=5), "cannot be read"),
+        ("a.glb", square_glb(meshes=5), "expected an array at meshes, got 5"),
         (
             "a.glb",
             square_glb(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 4}]}]),
@@ -111,6 +136,105 @@ def test_texture_faults(tmp_path):
     path = write_obj(tmp_path, body="mtllib quad.mtl\nusemtl skin\n" + GOOD)
     with pytest.raises(ValueError, match=r"quad\.obj.*expected texture coordinates"):
         load_mesh(path)
+
+
+@pytest.mark.parametrize(
+    ("statements", "fault"),
+    [
+        ("Kd 1 x 0", "expected numbers for kd in the material, got '1 x 0'"),
+        ("Kd -1 0 0", "expected numbers from 0 on for Kd in the material, got '-1 0 0'"),
+        (
+            "map_Kd -foo 1 skin.png",
+            r"expected options of a texture \(-blendu, .*\), got -foo in map_Kd '-foo 1 skin\.png'",
+        ),
+    ],
+)
+def test_faults_of_a_material_name_it_and_its_file(tmp_path, statements, fault):
+    path = write_obj(tmp_path, mtl=f"newmtl other\nKd 1 1 1\nnewmtl skin\n{statements}\n")
+    with pytest.raises(ValueError, match=rf"quad\.obj: newmtl skin in quad\.mtl: {fault}"):
+        load_mesh(path)
+
+
+def test_a_texture_that_is_a_pointer_of_git_lfs(tmp_path):
+    path = write_obj(tmp_path)
+    (tmp_path / "skin.png").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:ab\nsize 1\n")
+    with pytest.raises(ValueError, match=r"image in the texture 'skin\.png', got a pointer of git-lfs"):
+        load_mesh(path)
+
+
+def without(*place):
+    def change(tree):
+        *way, last = place
+        for step in way:
+            tree = tree[step]
+        del tree[last]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (without("accessors", 0, "count"), r"expected integer at accessors\[0\]\.count, got none"),
+        (without("accessors", 1, "componentType"), r"expected .* at accessors\[1\]\.componentType, got none"),
+        (without("meshes", 0, "primitives"), r"expected array at meshes\[0\]\.primitives, got none"),
+        (without("meshes", 0, "primitives", 0, "attributes"), r"at meshes\[0\]\.primitives\[0\]\.attributes, got none"),
+        (without("bufferViews", 0, "byteLength"), r"expected integer at bufferViews\[0\]\.byteLength, got none"),
+        (lambda tree: tree["nodes"].__setitem__(0, [1]), r"expected an object at nodes\[0\], got \[1\]"),
+        (lambda tree: tree.update(meshes=5), "expected an array at meshes, got 5"),
+        (lambda tree: tree["nodes"][0].update(mesh=[0]), r"expected an integer at nodes\[0\]\.mesh, got \[0\]"),
+        (
+            lambda tree: tree["bufferViews"][0].update(byteOffset=40),
+            r"bytes 40 to 88 of buffer 0 for bufferViews\[0\], got 60 bytes",
+        ),
+        (
+            lambda tree: tree["bufferViews"][0].update(byteStride=8),
+            "a byteStride of 12 or more for rows of 12 bytes, got 8",
+        ),
+        (
+            lambda tree: tree["accessors"][0].update(count=5),
+            r"5 rows of 3 × float32 from byte 0 to 60 of bufferViews\[0\], got 48 bytes",
+        ),
+        (lambda tree: tree["buffers"][0].update(uri="x.bin"), r"names 'x\.bin', and .* put it there$"),
+    ],
+)
+def test_gltf_faults_name_their_place_in_the_json(tmp_path, change, fault):
+    (tmp_path / "a.glb").write_bytes(changed(change, square_glb()))
+    with pytest.raises((ValueError, FileNotFoundError), match=rf"a\.glb: .*{fault}") as caught:
+        load_mesh(tmp_path / "a.glb")
+    assert "Error:" not in str(caught.value)
+
+
+def test_a_gltf_whose_buffer_is_nowhere(tmp_path):
+    (tmp_path / "a.gltf").write_text(json.dumps(gltf_tree(square_glb())))
+    with pytest.raises(
+        ValueError, match="expected the data of buffer 0 by a uri, got none; export it again, or as GLB"
+    ):
+        load_mesh(tmp_path / "a.gltf")
+
+
+def test_glb_by_the_name_of_gltf_and_the_other_way_round(tmp_path):
+    whole = square_glb()
+    (tmp_path / "a.gltf").write_bytes(whole)
+    tree = gltf_tree(whole)
+    chunk = whole[-tree["buffers"][0]["byteLength"] :]
+    tree["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(chunk).decode()
+    (tmp_path / "b.glb").write_text("\n " + json.dumps(tree))
+    for name in ("a.gltf", "b.glb"):
+        mesh = load_mesh(tmp_path / name)
+        assert mesh.verts.tolist() == SQUARE and mesh.faces.tolist() == TRIANGLES
+
+
+def test_the_material_beside_specular_glossiness_is_shown(tmp_path):
+    gloss = {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [0, 1, 0, 1]}}
+    base = {"baseColorFactor": [1.0, 0.5, 0.25, 1.0]}
+    used = {"extensionsUsed": list(gloss)}
+    (tmp_path / "a.glb").write_bytes(square_glb({"extensions": gloss, "pbrMetallicRoughness": base}, **used))
+    with pytest.warns(UserWarning, match=r"SpecularGlossiness \(shown in the metallic-roughness material beside it\)"):
+        assert load_mesh(tmp_path / "a.glb").face_colors[0].tolist() == [1.0, 0.5, 0.25]
+    (tmp_path / "a.glb").write_bytes(square_glb({"extensions": gloss}, **used))
+    with pytest.raises(ValueError, match="expected a metallic-roughness material, got specular-glossiness alone"):
+        load_mesh(tmp_path / "a.glb")
 
 
 def test_a_link_out_of_the_folder_is_not_followed(tmp_path):

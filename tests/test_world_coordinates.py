@@ -1,5 +1,7 @@
 """Positions that float32 cannot tell apart, as in coordinates of a map, stay double; others are float32 as ever."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -120,6 +122,36 @@ def test_a_gltf_whose_nodes_are_far_away(tmp_path):
     np.testing.assert_array_equal(mesh.verts[mesh.faces], own.astype(np.float64)[faces] + UTM)
 
 
+@pytest.mark.parametrize("dtype", [None, torch.float32, torch.float64])
+@pytest.mark.parametrize("place, double", [((500000.30, 4600000.24, 2.7), True), ((0.3, 0.1, 1e7), False)])
+def test_lights_are_as_precise_as_meshes(tmp_path, dtype, place, double):
+    """The mesh's numbers are round here, so that only the light needs float64; one that is far from all may be rounded."""
+    faces = np.array([0, 1, 2], "<u4")
+    tree = {
+        "nodes": [
+            {"mesh": 0, "translation": [round(x) if double else 0 for x in place[:2]] + [0]},
+            *({"extensions": {"KHR_lights_punctual": {"light": i}}, "translation": place} for i in range(3)),
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "extensionsUsed": ["KHR_lights_punctual"],
+        "extensions": {"KHR_lights_punctual": {"lights": [
+            {"type": "point", "color": [0.1, 0.2, 0.3]}, {"type": "spot", "spot": {}}, {"type": "directional"},
+        ]}},
+    }  # fmt: skip
+    (tmp_path / "a.glb").write_bytes(glb(tree, np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4"), faces))
+    with warnings.catch_warnings(record=True) as caught:
+        loaded = eg.load_scene(tmp_path / "a.glb", lit=True, dtype=dtype)
+    assert len(caught) == (double and dtype == torch.float32)
+    expected = dtype or (torch.float64 if double else torch.float32)
+    point, spot, sun = loaded.lights
+    for tensor in (loaded.meshes[0].verts, point.position, point.color, spot.position, spot.direction, sun.direction):
+        assert tensor.dtype == expected
+    assert torch.equal(point.position, torch.tensor(place, dtype=expected)) and torch.equal(
+        spot.position, point.position
+    )
+    assert torch.equal(point.color, torch.tensor([0.1, 0.2, 0.3], dtype=expected))
+
+
 @pytest.mark.parametrize("kind", ["ply", "stl", "glb", "obj", "off"])
 def test_formats_of_float32_say_that_they_round(tmp_path, kind):
     verts, faces = sphere()
@@ -129,7 +161,7 @@ def test_formats_of_float32_say_that_they_round(tmp_path, kind):
             eg.save_mesh(tmp_path / f"a.{kind}", mesh)
         return
     eg.save_mesh(tmp_path / f"a.{kind}", mesh)
-    np.testing.assert_allclose(eg.load_mesh(tmp_path / f"a.{kind}").verts, verts, rtol=0, atol=1e-7)
+    np.testing.assert_array_equal(eg.load_mesh(tmp_path / f"a.{kind}").verts, verts)
 
 
 def test_another_dtype_is_refused(tmp_path):

@@ -2,11 +2,11 @@
 
 What colours mean: vertex and face colours of OBJ, PLY and 3MF files and the texels of textures of colour are sRGB on disk and
 become linear; factors of materials (glTF baseColorFactor, emissiveFactor, OBJ Kd, Ke), vertex colours of glTF and textures of
-data (normals, metallic, roughness) are linear already. Integers of a PLY reach up to 255, or 65535 where one is larger or the
-type is ushort; floats up to 1, or 255. A glTF multiplies the texture, the factor and the vertex colours; those that differ from
-vertex to vertex beside a texture need lit=True, for a mesh that is not lit has one kind of colour. An OBJ multiplies map_Kd and
-Kd. Elsewhere, where a file gives several looks, the first of these is taken: texture, vertex colours, face colours, the
-material's colour.
+data (normals, metallic, roughness) are linear already. Integers of a PLY reach up to 255, or 65535 where one is larger; floats
+up to 1, which rounding may pass by 0.01, or, where one is 2 or more, up to 255; between is an error. A glTF multiplies the
+texture, the factor and the vertex colours; those that differ from vertex to vertex beside a texture need lit=True, for a mesh
+that is not lit has one kind of colour. An OBJ multiplies map_Kd and Kd. Elsewhere, where a file gives several looks, the first
+of these is taken: texture, vertex colours, face colours, the material's colour.
 
 lit=False, the default, takes these colours for radiance. Lights are dropped, as are normals and everything of a material but its
 base colour. Alpha is dropped, but where a material of a glTF has the alphaMode MASK: the alpha of its texture, or of its

@@ -13,9 +13,11 @@ import torch
 from ..camera.camera import Camera
 from ..scene.material import Material
 from .formats import gltf, gltf_material, obj, off, ply, stl, threemf
+from .formats.disguised import check_disguised
 from .formats.geometry import checked, shape, turned, typed
 from .formats.gltf_nodes import cameras, lights
 from .formats.gltf_scene import instances as gltf_instances
+from .formats.gltf_schema import explained
 from .formats.gltf_unread import note_unread
 from .formats.part import Fault, Model, Part, Wanted
 from .formats.source import Source, linear_colors
@@ -36,20 +38,26 @@ def read_model(path: PathLike, wanted: Wanted) -> Model:
     """
     file = check_readable(path, MESHES)
     data, kind, source = file.read_bytes(), file.suffix.lower()[1:], Source.of(path, wanted)
+    if kind != "3mf" or not data.startswith(b"PK"):  # which is an archive itself
+        check_disguised(data, f"{'an' if kind in ('obj', 'off', 'stl') else 'a'} {kind.upper()} file")
     with _as_fault(kind):
         model = READERS[kind](data, kind, source)
     if not model.parts:
         raise Fault("expected triangles, got none: the file is truncated, or was exported without faces")
-    parts, dtype = typed(model.parts, wanted.dtype, source)
+    model = typed(model, wanted.dtype, source)
     source.unsupported.say(path)
-    return model._replace(parts=parts, dtype=dtype)
+    return model
 
 
 def read_cameras(path: PathLike, size: tuple[int, int], dtype: torch.dtype) -> dict[str, Camera]:
     """Those of a glTF or GLB file, by name. Raises Fault, FileNotFoundError or ValueError."""
     file = check_readable(path, GLTFS)
-    with _as_fault(kind := file.suffix.lower()[1:]):
-        return cameras(gltf.read(file.read_bytes(), kind).tree, size, dtype)
+    data, kind = file.read_bytes(), file.suffix.lower()[1:]
+    check_disguised(data, f"a {kind.upper()} file")
+    with _as_fault(kind):
+        tree = gltf.read(data, kind).tree
+        with explained(tree):
+            return cameras(tree, size, dtype)
 
 
 @contextmanager
@@ -75,13 +83,14 @@ def _as_fault(kind: str) -> Iterator[None]:
 
 def _read_gltf(data: bytes, kind: str, source: Source) -> Model:
     file = gltf.read(data, kind)
-    note_unread(file.tree, source)
     known: dict[object, Any] = {}
 
     def look(raw: dict[str, Any]) -> dict[str, object]:
         return gltf_material.look(raw["primitive"], known)
 
-    return Model(_parts(gltf_instances(file, source), look), lights(file.tree, source) if source.wanted.lit else [])
+    with explained(file.tree):
+        note_unread(file.tree, source)
+        return Model(_parts(gltf_instances(file, source), look), lights(file.tree, source) if source.wanted.lit else [])
 
 
 def _read_3mf(data: bytes, kind: str, source: Source) -> Model:
@@ -100,7 +109,7 @@ def _read_3mf(data: bytes, kind: str, source: Source) -> Model:
 
 def _read_plain(data: bytes, kind: str, source: Source) -> Model:
     """OBJ, PLY, STL and OFF."""
-    found, parts = PLAIN[kind](data, source), []
+    found, parts = [part for part in PLAIN[kind](data, source) if len(part.faces)], []
     for part in found:
         with _naming(part.name, alone=len(found) == 1):
             parts.append(_finished(part, np.eye(4)))

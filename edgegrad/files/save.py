@@ -19,6 +19,7 @@ from .formats.geometry import in_double, rounding
 from .formats.gltf_write import to_glb
 from .formats.part import Fault, Part
 from .formats.source import Textures, linear_colors
+from .formats.text_write import to_obj, to_off
 from .image import to_bytes
 from .paths import PathLike, check_suffix, replacing
 from .welding import to_mesh
@@ -102,7 +103,7 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     colour), clipped to 0 … 1. Metallic, roughness and emission of vertices become their mean, for glTF has none. A
     Lambertian material is one without a highlight (KHR_materials_specular). PLY and OBJ hold colours in 8-bit sRGB, an
     OBJ also a texture, which lies beside it with its .mtl; STL and OFF the shape alone. Positions in PLY, STL and GLB are
-    float32. A warning names what is left out, rounded or clipped.
+    float32; those in OBJ and OFF have all digits of the mesh's type. A warning names what is left out, rounded or clipped.
 
     Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
     """
@@ -116,11 +117,11 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
         content, lost = to_glb(mesh)
     else:
         made, lost = to_trimesh(mesh, faces_colored=kind != "obj"), _left_out(mesh, kind)
+        dtype = _array(mesh.verts).dtype
         if kind == "obj":
-            export = require("trimesh.exchange.obj", "trimesh", "saving meshes").export_obj
-            content, beside = export(made, return_texture=True, mtl_name=f"{file.stem}.mtl")
+            content, beside = to_obj(made, dtype, f"{file.stem}.mtl")
         else:
-            content = made.export(file_type=kind)
+            content = to_off(made, dtype) if kind == "off" else made.export(file_type=kind)
     if kind in ("ply", "stl", "glb") and rounding(mesh.verts.detach().cpu().numpy())[1]:
         lost = [*lost, "positions beyond float32"]
     if lost:

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from ...scene.lights import PointLight, SpotLight
 from ...scene.tree import moved
-from .part import Fault, Part
+from .part import Fault, Model, Part
 from .source import Source
 
 
@@ -81,20 +82,25 @@ def rounding(*positions: np.ndarray) -> tuple[float, bool]:
     return cost, cost > 1e-6 * float((high.astype(np.float64) - low).max())
 
 
-def typed(parts: list[Part], wanted: torch.dtype | None, source: Source) -> tuple[list[Part], torch.dtype]:
-    """The parts with positions in the type that they are welded in, and the type of their meshes, unless one is wanted: float64
-    where float32 would cost more than a millionth of the extent, else float32."""
-    cost, precise = rounding(*[part.verts for part in parts])
+def typed(model: Model, wanted: torch.dtype | None, source: Source) -> Model:
+    """The parts with positions in the type that they are welded in, lights in the type of the meshes, and this type, unless one
+    is wanted: float64 where float32 would cost more than a millionth of the extent, else float32."""
+    verts = [part.verts for part in model.parts]
+    cost, precise = rounding(*verts)
+    places = [light.position.numpy()[None] for light in model.lights if isinstance(light, (PointLight, SpotLight))]
+    if places and not precise:  # the extent of the whole scene, for what is far from all may be rounded
+        cost, precise = rounding(*verts, *places)
     if precise and wanted is torch.float32:
         source.unsupported.note(
             "positions in float64",
             f"rounded by up to {cost:.2g}, more than a millionth of the extent, as dtype says",
         )
     dtype = wanted or (torch.float64 if precise else torch.float32)
+    model = model._replace(dtype=dtype, lights=[moved(light, dtype) for light in model.lights])
     if not precise and dtype is torch.float32:
-        return [part._replace(verts=part.verts.astype(np.float32, copy=False)) for part in parts], dtype
-    parts = [part._replace(verts=part.verts.astype(np.float64)) for part in parts]
-    return (parts if dtype is torch.float32 else in_double(parts)), dtype
+        return model._replace(parts=[p._replace(verts=p.verts.astype(np.float32, copy=False)) for p in model.parts])
+    parts = [part._replace(verts=part.verts.astype(np.float64)) for part in model.parts]
+    return model._replace(parts=parts if dtype is torch.float32 else in_double(parts))
 
 
 def in_double(parts: list[Part]) -> list[Part]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import re
 from typing import Any, NamedTuple
 
+from .gltf_schema import explained
 from .part import Fault
 
 GLOSS = "KHR_materials_pbrSpecularGlossiness"
@@ -24,6 +26,10 @@ NEEDLESS = re.compile(
 )  # of lit materials: a file may not require what is left out
 
 
+GLB = b"glTF"  # its first bytes
+MARK = codecs.BOM_UTF8 + b" \t\r\n"
+
+
 class File(NamedTuple):
     """A file before its arrays are looked at."""
 
@@ -32,16 +38,18 @@ class File(NamedTuple):
 
 
 def read(data: bytes, kind: str) -> File:
-    """A glTF or GLB file. Raises Fault where it is of another version or requires an extension that is not read, and ValueError
-    where it ends early."""
-    text, chunk = _chunks(data) if kind == "glb" else (data, None)
+    """A glTF or GLB file, whichever of both its name says. Raises Fault where it is of another version or requires an
+    extension that is not read, and ValueError where it ends early."""
+    is_text = data[:4] != GLB and (kind == "gltf" or data.lstrip(MARK)[:1] == b"{")
+    text, chunk = (data, None) if is_text else _chunks(data)
     tree = json.loads(text)
     if not isinstance(tree, dict):
         raise Fault(f"expected a JSON object, got {type(tree).__name__}; export it again")
-    asset = tree.get("asset", {})
-    version = asset.get("version", "1.0" if isinstance(tree.get("meshes"), dict) else "2.0")
-    _check_version(str(asset.get("minVersion", version)))
-    needed = [name for name in tree.get("extensionsRequired", []) if name not in READ and not NEEDLESS.match(name)]
+    with explained(tree):
+        asset = tree.get("asset", {})
+        version = asset.get("version", "1.0" if isinstance(tree.get("meshes"), dict) else "2.0")
+        _check_version(str(asset.get("minVersion", version)))
+        needed = [name for name in tree.get("extensionsRequired", []) if name not in READ and not NEEDLESS.match(name)]
     if needed:
         raise Fault(f"expected plain glTF 2.0, got one that needs {', '.join(needed)}; export it without")
     return File(tree, chunk)
@@ -60,7 +68,7 @@ def _check_version(version: str) -> None:
 
 def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
     """The JSON and the buffer, if there is one, of a GLB file. Chunks of other types are left out, as its specification asks."""
-    if data[:4] != b"glTF" or len(data) < 20:
+    if data[:4] != GLB or len(data) < 20:
         raise Fault("expected a GLB file, got something else; export it again")
     version = int.from_bytes(data[4:8], "little")
     if version != 2:

@@ -11,7 +11,7 @@ import numpy as np
 from ...optional import require
 from .gltf import DRACO, QUANTIZED, READ, File, entry
 from .part import Fault
-from .source import Folder
+from .source import WITHOUT_LOOK, Folder
 
 MOST_ZEROS = 1 << 24  # rows that a glTF may ask for without holding them
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -59,28 +59,42 @@ class Arrays:
         buffer = self._buffer(view["buffer"], set(view.get("extensions", {})) - READ)
         start, size = view.get("byteOffset", 0), view["byteLength"]
         if not 0 <= start <= start + size <= len(buffer):
-            raise ValueError(f"view {index} of {size} bytes at byte {start} of a buffer of {len(buffer)}")
+            raise Fault(
+                f"expected bytes {start} to {start + size} of buffer {view['buffer']} for bufferViews[{index}], "
+                f"got {len(buffer)} bytes; the file is truncated or damaged"
+            )
         return memoryview(buffer)[start : start + size]
 
     def _rows(self, given: dict[str, Any], component: int, count: int, columns: int) -> np.ndarray:
         dtype = _dtype(component)
         stride = entry(self.tree, "bufferViews", given["bufferView"]).get("byteStride", columns * dtype.itemsize)
         if stride < columns * dtype.itemsize:
-            raise ValueError(f"rows of {columns * dtype.itemsize} bytes, one every {stride}")
-        strides, start = (stride, dtype.itemsize), given.get("byteOffset", 0)
-        return np.ndarray((count, columns), dtype, self.view(given["bufferView"]), start, strides)
+            least = columns * dtype.itemsize
+            raise Fault(
+                f"expected a byteStride of {least} or more for rows of {least} bytes, got {stride}; export it again"
+            )
+        strides, start, view = (stride, dtype.itemsize), given.get("byteOffset", 0), self.view(given["bufferView"])
+        end = start + (count - 1) * stride + columns * dtype.itemsize
+        if not 0 <= start <= end <= len(view):
+            raise Fault(
+                f"expected {count} rows of {columns} × {dtype.name} from byte {start} to {end} of "
+                f"bufferViews[{given['bufferView']}], got {len(view)} bytes; the file is truncated or damaged"
+            )
+        return np.ndarray((count, columns), dtype, view, start, strides)
 
     def _buffer(self, index: Any, extensions: set[str]) -> bytes:
         """extensions   those of the view that asks for it"""
         buffer = entry(self.tree, "buffers", index)
         if index not in self.buffers:
             if "uri" in buffer:
-                self.buffers[index] = content(buffer["uri"], self.folder)
+                self.buffers[index] = content(buffer["uri"], self.folder, "")
             elif index == 0 and self.chunk is not None:
                 self.buffers[index] = self.chunk
             else:
                 held = sorted(extensions | set(buffer.get("extensions", {})) - READ)
-                where = f"the extension {', '.join(held)}, which is not read" if held else "no file"
+                if not held:
+                    raise Fault(f"expected the data of buffer {index} by a uri, got none; export it again, or as GLB")
+                where = f"the extension {', '.join(held)}, which is not read"
                 raise Fault(f"expected the data of buffer {index}, got it in {where}; export it without compression")
         return self.buffers[index]
 
@@ -170,10 +184,10 @@ class Geometry:
         return found
 
 
-def content(uri: str, folder: Folder) -> bytes:
-    """The bytes of a URI: in itself, or in a file of the folder. Raises Fault or FileNotFoundError."""
+def content(uri: str, folder: Folder, advice: str = WITHOUT_LOOK) -> bytes:
+    """The bytes of a URI: in itself, or in a file of the folder. Raises Fault or FileNotFoundError, with more advice."""
     if not uri.startswith("data:"):
-        return folder.get(uri)
+        return folder.get(uri, advice)
     head, _, text = uri.partition(",")
     held = unquote_to_bytes(text)
     return base64.b64decode(held) if head.endswith(";base64") else held

@@ -105,7 +105,10 @@ def look(primitive: Primitive, known: dict[object, tuple[Material, dict[str, Pla
     if "material" not in primitive.given and not lit:
         return found
     if GLOSS in material.get("extensions", {}):
-        raise Fault("expected a metallic-roughness material, got specular-glossiness; convert it")
+        if primitive.base:
+            primitive.source.unsupported.note(GLOSS, "shown in the metallic-roughness material beside it")
+        else:
+            raise Fault("expected a metallic-roughness material, got specular-glossiness alone; convert it")
     texture = primitive.lookup("baseColorTexture", primitive.base)
     place = Place() if texture is None else texture.place
     if texture is not None:

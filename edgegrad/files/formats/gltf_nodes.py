@@ -72,8 +72,8 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
 
 
 def lights(tree: dict[str, Any], source: Source) -> list[Light]:
-    """Those of KHR_lights_punctual at visible nodes. Scales of nodes change where they are, and nothing else of them. Raises
-    Fault."""
+    """Those of KHR_lights_punctual at visible nodes, in float64. Scales of nodes change where they are, and nothing else
+    of them. Raises Fault."""
     found = []
     for node, world, visible in placed(tree):
         reference = node.get("extensions", {}).get(PUNCTUAL)
@@ -89,9 +89,9 @@ def lights(tree: dict[str, Any], source: Source) -> list[Light]:
 
 
 def _light(given: dict[str, Any], world: np.ndarray, source: Source) -> Light:
-    position, direction = (torch.tensor(v, dtype=torch.float32) for v in (world[:3, 3], -world[:3, 2]))
+    position, direction = (torch.tensor(v, dtype=torch.float64) for v in (world[:3, 3], -world[:3, 2]))
     intensity = float(given.get("intensity", 1.0))
-    color = torch.tensor([float(c) for c in given["color"]]) if "color" in given else torch.ones(3)
+    color = torch.tensor([float(c) for c in given.get("color", (1.0, 1.0, 1.0))], dtype=torch.float64)
     kind = given.get("type")
     if kind == "directional":
         return DirectionalLight(direction, intensity, color)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Iterator
 from typing import Any
 
-from ...optional import require
 from .gltf import MATT, READ
+from .gltf_schema import properties, schema
 from .source import Source
 
 INSTEAD = {
@@ -25,7 +24,7 @@ ATTRIBUTES = re.compile(r"POSITION|NORMAL|TANGENT|COLOR_0|TEXCOORD_0|(JOINTS|WEI
 
 def note_unread(tree: dict[str, Any], source: Source) -> None:
     """Notes it all, but what has no effect on a picture, and without lit=True what is of light."""
-    lit, found = source.wanted.lit, list(_unknown(tree, _schema(), "the file"))
+    lit, found = source.wanted.lit, list(_unknown(tree, schema(), "the file"))
     extensions = {name for kind, name in found if kind == "extension"} | set(tree.get("extensionsUsed", []))
     for name in sorted(extensions - READ - COPIES - {MATT}):  # MATT by material
         if name in INSTEAD or lit or not OF_LIGHT.match(name):
@@ -47,12 +46,6 @@ def note_unread(tree: dict[str, Any], source: Source) -> None:
         source.unsupported.note("points and lines")
 
 
-@functools.cache
-def _schema() -> dict[str, Any]:
-    """That of glTF 2.0, by Khronos."""
-    return require("trimesh.exchange.gltf", "trimesh", "reading meshes").get_schema()
-
-
 def _unknown(value: Any, schema: dict[str, Any], kind: str) -> Iterator[tuple[str, str]]:
     """Where and by what name there is something that the format does not know: ("extension", its name), or the name of the
     list that it stands in."""
@@ -60,7 +53,7 @@ def _unknown(value: Any, schema: dict[str, Any], kind: str) -> Iterator[tuple[st
         for element in value:
             yield from _unknown(element, schema.get("items", {}), kind)
     elif isinstance(value, dict):
-        known = _properties(schema)
+        known = properties(schema)
         for name, inner in value.items():
             if name == "extensions" and isinstance(inner, dict):
                 for extension, held in inner.items():
@@ -74,14 +67,6 @@ def _unknown(value: Any, schema: dict[str, Any], kind: str) -> Iterator[tuple[st
                 yield kind, name
             else:
                 yield from _unknown(inner, {}, kind)
-
-
-def _properties(schema: dict[str, Any]) -> dict[str, Any]:
-    found = dict(schema.get("properties", {}))
-    for base in schema.get("allOf", ()):
-        for name, inner in _properties(base).items():
-            found[name] = found.get(name) or inner  # a property that is only repeated is empty
-    return found
 
 
 def _values(thing: Any, name: str) -> Iterator[Any]:

@@ -32,21 +32,30 @@ class Library:
     def __init__(self, source: Source) -> None:
         self.source = source
         self.materials: dict[str, dict[str, str]] = {}  # what follows each keyword, which is in lower case
+        self.files: dict[str, str] = {}  # by material
         self.images: dict[str, Any] = {}
         self.scattering: dict[object, Material] = {}
 
-    def read(self, data: bytes) -> None:
+    def read(self, data: bytes, file: str) -> None:
         current: dict[str, str] = {}
         for line in as_utf8(data).decode().split("\n"):
             keyword, rest = [*line.strip().split(None, 1), "", ""][:2]
             if keyword.lower() == "newmtl":
                 current = self.materials[rest] = {}
+                self.files[rest] = file
             elif rest and not keyword.startswith("#"):  # some programs write keywords with nothing after them
                 current[keyword.lower()] = rest
 
     def look(self, name: str | None, uvs: np.ndarray | None, count: int) -> dict[str, Any]:
-        """The fields of a part of `count` triangles that say what it looks like; without a material, those of none."""
+        """The fields of a part of `count` triangles that say what it looks like; without a material, those of none. Raises Fault,
+        which names the material, or FileNotFoundError."""
         given = self.materials.get(name or "", {})
+        try:
+            return self._look(given, uvs, count)
+        except Fault as fault:
+            raise Fault(f"newmtl {name} in {self.files.get(name or '')}: {fault}") from fault.__cause__
+
+    def _look(self, given: Mapping[str, str], uvs: np.ndarray | None, count: int) -> dict[str, Any]:
         look = self._base(given, uvs, count)
         self._note_unread(given)
         if self.source.wanted.lit:
@@ -63,6 +72,8 @@ class Library:
         elif color := _numbers(given, "kd"):
             if len(color) not in (1, 3):
                 raise Fault(f"expected one number or three for Kd in the material, got {given['kd']!r}; repair it")
+            if min(color) < 0.0:
+                raise Fault(f"expected numbers from 0 on for Kd in the material, got {given['kd']!r}; repair it")
             color = np.broadcast_to(color, 3).tolist()
         if "map_kd" in given:
             if color and not any(color):

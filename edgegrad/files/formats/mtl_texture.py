@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import takewhile
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from .part import Fault
 from .source import Source
+from .text import unquoted
 
 # How many words follow an option, at most; those of -o, -s and -t are numbers, of which the last may be missing.
 OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-bm": 1, "-type": 1,
@@ -37,6 +39,10 @@ class Texture(NamedTuple):
                 values = list(takewhile(_is_number, values))
             options[option] = tuple(value.lower() for value in values)
             rest = rest.split(None, len(values) + 1)[-1] if len(words) > len(values) else ""
+        rest = unquoted(rest)
+        if re.match("-[a-z]", option) and not source.folder.holds(rest):
+            known = ", ".join(sorted(OPTIONS))
+            raise Fault(f"expected options of a texture ({known}), got {option} in {keyword} {statement!r}; remove it")
         if not rest:
             raise Fault(f"expected the name of an image after {keyword} {statement!r}, got none; repair the material")
         for option, values in options.items():

@@ -19,7 +19,7 @@ from .mtl import Library
 from .part import Fault, Part
 from .polygons import triangulate
 from .source import Source, linear_colors
-from .text import as_utf8, numbers, per_line, table, word_starts
+from .text import as_utf8, numbers, per_line, table, unquoted, word_starts
 
 KINDS = {b"v": "vertices (v)", b"vt": "texture coordinates (vt)", b"vn": "normals (vn)"}
 # Keywords without a shape or a colour: groups, and hints on how to show curves.
@@ -49,13 +49,18 @@ class Corners(NamedTuple):
 
 def read(data: bytes, source: Source) -> list[Part]:
     """A part for each material, and, where objects are wanted apart, for each object. Raises Fault or FileNotFoundError."""
-    lines = _lines(as_utf8(data))
+    text = as_utf8(data)
+    lines = _lines(text)
+    if painted := len(re.findall(rb"(?m)^#MRGB[ \t]", text)):
+        source.unsupported.note(f"{painted} × #MRGB", "colours of vertices by ZBrush are not read")
     for keyword, count in lines.unread.items():
         source.unsupported.note(f"{count} × {keyword.decode(errors='replace')[:40]}", "not read")
     library = Library(source)
     if source.wanted.materials:
         for name in dict.fromkeys(lines.libraries):
             _read_library(name, library, source)
+        if not lines.libraries and any(material for _, _, material in lines.runs):
+            source.unsupported.note("usemtl without a mtllib", "no materials")
     if lines.smooth and source.wanted.lit and not lines.rows[b"vn"]:
         source.unsupported.note("s", "flat faces, for there are no normals (vn)")
     if not lines.faces or not lines.rows[b"v"]:
@@ -89,6 +94,8 @@ def read(data: bytes, source: Source) -> list[Part]:
             source.unsupported.note(f"usemtl {material}", "not in the material library")
         look = library.look(material, part.uvs, len(faces))
         if colors is not None and look.get("texture") is None:
+            if (own_color := look.get("face_colors")) is not None and bool((own_color != 1.0).any()):
+                source.unsupported.note("Kd beside colours of vertices")
             look |= {"colors": colors[torch.from_numpy(used)], "face_colors": None}
         elif colors is not None:
             source.unsupported.note("colours of vertices beside a texture")
@@ -138,8 +145,8 @@ def _read_library(name: str, library: Library, source: Source) -> None:
     """One file, whose name may hold spaces, or several. Raises Fault or FileNotFoundError."""
     names = name.split()
     several = len(names) > 1 and all(word.lower().endswith(".mtl") for word in names) and not source.folder.holds(name)
-    for each in names if several else [name]:
-        library.read(source.folder.get(each))
+    for each in names if several else [unquoted(name)]:
+        library.read(source.folder.get(each), each)
 
 
 def _corners(lines: Lines, sizes: dict[bytes, int], source: Source) -> Corners:

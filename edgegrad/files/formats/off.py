@@ -21,7 +21,8 @@ from .text import as_utf8, numbers, ragged, table
 def read(data: bytes, source: Source) -> list[Part]:
     """One part, or none. Raises Fault."""
     text = re.sub(rb"#.*", b"", as_utf8(data))
-    head = re.match(rb"\s*(ST)?(C)?(N)?(4)?(n)?OFF\b[ \t]*(BINARY)?", text)
+    # Some files have their numbers right after the word.
+    head = re.match(rb"\s*(ST)?(C)?(N)?(4)?(n)?OFF(?![A-Za-z_])[ \t]*(BINARY)?", text)
     if head is None:
         raise Fault("expected an OFF file, got one that cannot be read, without OFF at its start; export it again")
     has_uvs, has_colors, has_normals, four, any_size, binary = head.groups()

@@ -47,8 +47,8 @@ def read(data: bytes, source: Source) -> list[Part]:
     look: dict[str, Any] = {"normals": _take(vertex, ("nx", "ny", "nz"))} | _uvs(vertex, face, corners, triangles)
     look |= _texture(header.comments, face, look, source)
     if look["texture"] is None:
-        look["colors"] = _colors(vertex)
-        if look["colors"] is None and not strips.size and (colors := _colors(face)) is not None:
+        look["colors"] = _colors(vertex, source)
+        if look["colors"] is None and not strips.size and (colors := _colors(face, source)) is not None:
             look["face_colors"] = colors[torch.from_numpy(origin)]
     if not source.wanted.lit:
         del look["normals"]
@@ -80,7 +80,11 @@ def _corners(element: Element) -> Lists:
             f"expected a list vertex_indices in {element.name}, got {', '.join(element.columns)}; export it again"
         )
     del element.columns[name]
-    return Lists(lists[name].counts, lists[name].values.astype(np.int64))
+    index = lists[name].values.astype(np.int64)
+    if (bad := np.flatnonzero(index != lists[name].values)).size:
+        got = lists[name].values[bad[0]]
+        raise Fault(f"expected whole numbers for {name} in {element.name}, got {got:g}; export it again")
+    return Lists(lists[name].counts, index)
 
 
 def _strips(index: np.ndarray) -> np.ndarray:
@@ -124,15 +128,19 @@ def _texture(comments: list[str], face: Element, look: dict[str, Any], source: S
     return {"texture": source.textures.get(names[0], image)}
 
 
-def _colors(element: Element) -> Tensor | None:
-    """Linear (n, 3). Integers are of 8 bits, or as many as they need."""
+def _colors(element: Element, source: Source) -> Tensor | None:
+    """Linear (n, 3). Integers are of 8 bits, or as many as they need. Raises Fault."""
     for names in COLORS:
         if (values := _take(element, names)) is None:
             continue
         if values.dtype == np.int8:
             values = values.view(np.uint8)
-        elif values.dtype.kind in "iu" and values.dtype.itemsize > 1 and values.dtype.name != "uint16":
+        elif values.dtype.kind in "iu" and values.dtype.itemsize > 1:
             most = values.max(initial=0)
+            if values.dtype.name == "uint16" and 0 < most <= 255:
+                source.unsupported.note(
+                    f"ushort colours of {element.name} up to {most}", "taken for 0 to 255, not 65535"
+                )
             kind = next((k for k in (np.uint8, np.uint16) if most <= np.iinfo(k).max), values.dtype.type)
             values = values / float(np.iinfo(kind).max)
         return linear_colors(element.name, values, srgb=True)

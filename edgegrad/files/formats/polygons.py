@@ -16,18 +16,20 @@ def triangulate(
     verts: np.ndarray, index: np.ndarray, counts: np.ndarray, source: Source
 ) -> tuple[np.ndarray, np.ndarray]:
     """Triangles (T, 3) as positions in `index`, which names the vertices of the corners of all faces one after the other; and
-    the face (T,) that each is from. `counts` (F,) says how many corners a face has: three or more.
+    the face (T,) that each is from. `counts` (F,) says how many corners a face has; those of fewer than three are left out.
 
     A face is a fan around its first corner where this covers it once, as it does every convex one; a quad is then split along
     its other diagonal, and what is left goes to earcut, all in Newell's plane. Faces that cross themselves are noted.
 
     Raises Fault, or ImportError without mapbox_earcut, which only concave faces with more than four corners need.
     """
-    if counts.min() < 3:
-        bad = int(counts.argmin())
-        raise Fault(
-            f"expected faces of three corners or more, got {counts[bad]} at face {bad}, counted from 0; repair it"
-        )
+    if not (whole := counts >= 3).all():
+        source.unsupported.note(f"{np.count_nonzero(~whole)} faces of fewer than three corners")
+        if not whole.any():
+            return np.empty((0, 3), np.int64), np.empty(0, np.int64)
+        rows = np.flatnonzero(whole.repeat(counts))
+        triangles, origin = triangulate(verts, index[rows], counts[whole], source)
+        return rows[triangles], np.flatnonzero(whole)[origin]
     low, high = int(index.min()), int(index.max())
     if low < 0 or high >= len(verts):
         raise Fault(

@@ -15,20 +15,24 @@ from ...optional import require
 from ...warnings import warn
 from ..image import srgb_to_linear
 from ..paths import PathLike
+from .disguised import check_disguised
 from .part import Fault, Wanted
 
 # What Pillow is let loose on. Not EPS, above all, for which it runs another program.
 TEXTURES = ("PNG", "JPEG", "MPO", "JPEG2000", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "DDS")
 
 
+WITHOUT_LOOK = ", or pass materials=False where only its look is missing"
+
+
 class Folder:
     """The folder of a mesh file, from which those that the mesh names are read, and from nowhere else."""
 
-    def __init__(self, path: PathLike) -> None:
-        self.path = path
+    def __init__(self, path: PathLike, unsupported: Unsupported) -> None:
+        self.path, self.unsupported = path, unsupported
         self.root = Path(path).absolute().parent.resolve()
 
-    def get(self, name: str) -> bytes:
+    def get(self, name: str, advice: str = WITHOUT_LOOK) -> bytes:
         """Raises Fault or FileNotFoundError."""
         for text in (name.strip(), unquote(name.strip())):  # glTF writes names as URIs
             file = (self.root / text.replace("\\", "/")).resolve()
@@ -36,10 +40,25 @@ class Folder:
                 raise Fault(f"names {name!r}, outside its folder, which is not read; copy it beside the mesh")
             if file.is_file():
                 return file.read_bytes()
+            similar = self._in_other_case(file)
+            if similar is not None:
+                self.unsupported.note(repr(name), f"{similar.relative_to(self.root).as_posix()} in its place")
+                return similar.read_bytes()
         raise FileNotFoundError(
-            f"{self.path}: names {name!r}, and there is no such file in {self.root}; put it there, "
-            "or pass materials=False where only its look is missing"
+            f"{self.path}: names {name!r}, and there is no such file in {self.root}; put it there{advice}"
         )
+
+    def _in_other_case(self, file: Path) -> Path | None:
+        """A file whose name differs in upper and lower case alone, as programs of Windows write them."""
+        found = self.root
+        for word in file.relative_to(self.root).parts:
+            names = (
+                sorted(path for path in found.iterdir() if path.name.lower() == word.lower()) if found.is_dir() else []
+            )
+            if not names:
+                return None
+            found = names[0].resolve()
+        return found if found.is_file() and found.is_relative_to(self.root) else None
 
     def holds(self, name: str) -> bool:
         try:
@@ -55,6 +74,7 @@ class Folder:
 def opened(name: str, content: bytes) -> Any:
     """A Pillow image, not yet decoded. Raises Fault."""
     pillow = require("PIL.Image", "edgegrad[files]", "reading textures")
+    check_disguised(content, f"an image in the texture {name!r}")
     try:
         return pillow.open(io.BytesIO(content))
     except (OSError, pillow.DecompressionBombError) as error:
@@ -138,20 +158,25 @@ class Source(NamedTuple):
 
     @classmethod
     def of(cls, path: PathLike, wanted: Wanted) -> Source:
-        return cls(Folder(path), Textures(), wanted, Unsupported())
+        unsupported = Unsupported()
+        return cls(Folder(path, unsupported), Textures(), wanted, unsupported)
 
 
 def linear_colors(what: str, values: np.ndarray, srgb: bool) -> Tensor:
-    """Linear float32 colours (N, 3) from integers of any width, or from floats; sRGB floats reach up to 1 or 255."""
+    """Linear float32 colours (N, 3) from integers of any width, or from floats. sRGB floats reach up to 1, beyond which rounding
+    may bring them by a hundredth, or, where one is 2 or more, up to 255. Raises Fault."""
     values = np.asarray(values)
     colors = values[:, :3].astype(np.float64)
     if values.dtype.kind in "iu":
         colors /= np.iinfo(values.dtype).max
-    elif srgb and colors.size and colors.max() > 1.0:
+    elif srgb and colors.size and colors.max() >= 2.0:
         colors /= 255.0
+    elif srgb:
+        colors = np.where((colors > -0.01) & (colors < 1.01), np.clip(colors, 0.0, 1.0), colors)
     good = (colors >= 0.0) & (colors <= (1.0 if srgb else np.finfo(np.float32).max))
     if not good.all():
         bad = int(np.argwhere(~good)[0, 0])
-        raise Fault(f"expected {what} colours from 0 to 1, got {values[bad].tolist()} at {what} {bad}; repair it")
+        wanted = "from 0 to 1, or to 255" if srgb else "from 0 to 1"
+        raise Fault(f"expected {what} colours {wanted}, got {values[bad].tolist()} at {what} {bad}; repair it")
     linear = torch.from_numpy(colors)
     return (srgb_to_linear(linear) if srgb else linear).float()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from ...scene.material import Material
@@ -14,6 +16,7 @@ HEADER = 84  # bytes of a binary file before its faces
 FACE = np.dtype([("normal", "<f4", 3), ("verts", "<f4", (3, 3)), ("attribute", "<u2")])
 SILENT = {b"facet", b"outer", b"endfacet"}  # with the normals of faces, which their corners say too
 WORDS = SILENT | {b"vertex", b"endloop"}
+TEXT = re.compile(rb"\s*((#|//)[^\r\n]*[\r\n]\s*)*(solid|facet)", re.IGNORECASE)
 
 
 def read(data: bytes, source: Source) -> list[Part]:
@@ -23,15 +26,20 @@ def read(data: bytes, source: Source) -> list[Part]:
         data = as_utf8(data)
     count = int.from_bytes(data[80:HEADER], "little")
     exact = len(data) == HEADER + count * FACE.itemsize
-    text = data[:200].lstrip()[:5].lower() == b"solid" and b"\0" not in data  # a binary one has zeros somewhere
+    text = TEXT.match(data[:1000]) and b"\0" not in data  # a binary one has zeros somewhere
     parts = _read_text(as_utf8(data), source) if text and not exact else _read_binary(data, count, source)
     return [part._replace(material=material) for part in parts]
 
 
 def _read_binary(data: bytes, count: int, source: Source) -> list[Part]:
+    if b"\0" not in data and data[:HEADER].isascii():
+        raise Fault("expected an STL file, got text without solid or facet at its start; export it again")
     if len(data) < HEADER:
         raise Fault(f"expected an STL file, got {len(data)} bytes that cannot be read as one; export it again")
-    there = (len(data) - HEADER) // FACE.itemsize
+    there, odd = divmod(len(data) - HEADER, FACE.itemsize)
+    if not count and there and not odd:
+        source.unsupported.note("0 as the number of faces", f"{there}, by the length of the file")
+        count = there
     if there < count:
         raise Fault(
             f"expected the {count} faces that the file announces, got {max(there, 0)}; it is truncated or damaged"
@@ -42,6 +50,8 @@ def _read_binary(data: bytes, count: int, source: Source) -> list[Part]:
     faces = np.frombuffer(data, FACE, count, HEADER)
     if faces["attribute"].any():
         source.unsupported.note("the attributes of faces, where some writers keep colours", "not read")
+    if b"COLOR=" in data[:80]:
+        source.unsupported.note("COLOR= of the header", "a colour by Materialise is not read")
     if not count:
         return []
     return [Part("", faces["verts"].reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))]
@@ -51,11 +61,17 @@ def _read_text(text: bytes, source: Source) -> list[Part]:
     solids: list[tuple[str, list[bytes], list[int]]] = []  # name, positions, and how many of them a face has
     corners, start = list[bytes](), 0
     ended = True
+    if b"\n" not in text.strip():
+        text = re.sub(rb"\s(facet|outer|vertex|endloop|endfacet|endsolid)\b", rb"\n\1", text)
     for line in text.split(b"\n"):
         words = line.split(None, 1)
         if not words:
             continue
         word = words[0] if words[0] in WORDS else words[0].lower()
+        if word.startswith((b"#", b"//")):
+            continue
+        if word in WORDS and not solids:  # without solid before it
+            solids.append(("", corners, []))
         if word == b"vertex":
             corners.append(words[-1])
         elif word in SILENT:

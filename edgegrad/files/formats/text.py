@@ -67,6 +67,11 @@ def table(lines: list[bytes], what: str, least: int, most: int) -> tuple[np.ndar
     return rows, counts
 
 
+def unquoted(name: str) -> str:
+    """Without the quotes that some programs write around names of files."""
+    return name[1:-1] if len(name) > 2 and name[0] == name[-1] == '"' else name
+
+
 def word_starts(inside: np.ndarray) -> np.ndarray:
     """Where runs of True begin."""
     starts = inside.copy()

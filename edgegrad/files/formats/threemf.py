@@ -14,6 +14,7 @@ import numpy as np
 from ...optional import require
 from .part import Fault
 from .source import Source
+from .text import numbers
 from .threemf_unread import CORE, MATERIAL, NEEDED, PATH, note_unread
 
 MOST_INSTANCES = 100_000  # of the objects of a file: nested components multiply
@@ -21,6 +22,9 @@ MOST_NESTED = 64
 UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
 # No entity, other file or address is looked at, and trees are of bounded depth.
 SAFE = {"resolve_entities": False, "no_network": True, "load_dtd": False, "huge_tree": False}
+
+
+Palettes = dict[str | None, list[tuple[int, ...]] | None]  # colours of groups by id; None: of a group that is not read
 
 
 class Reference(NamedTuple):
@@ -60,6 +64,8 @@ def instances(data: bytes, source: Source) -> list[tuple[str, dict[str, Any], np
             )
         package = _Package(archive, source)
         root = package.root()
+        if package.part(root).objects and not package.part(root).items:
+            raise Fault("expected items in the build, which say what is shown, got none; export it again")
         count = sum(package.count(item, ()) for item in package.part(root).items)
         if count > MOST_INSTANCES:
             raise Fault(f"expected at most {MOST_INSTANCES} instances of objects, got {count}; export it flat")
@@ -153,9 +159,12 @@ def _read_part(name: str, root: Any, source: Source) -> ModelPart:
     if unit not in UNITS:
         raise Fault(f"expected a unit of 3MF ({', '.join(UNITS)}), got {unit!r}; export it again")
     groups = root.iter(f"{{{CORE}}}basematerials", f"{{{MATERIAL}}}colorgroup") if source.wanted.materials else ()
-    palettes = {group.get("id"): [_color(child) for child in group.iterchildren("{*}*")] for group in groups}
+    palettes: Palettes = {given.get("id"): None for given in root.iterfind(f"{{{CORE}}}resources/*[@id]")}
+    palettes |= {group.get("id"): [_color(child) for child in group.iterchildren("{*}*")] for group in groups}
     objects: dict[str, Object] = {}
     for given in _core(root, "object"):
+        if "id" not in given.attrib:
+            raise Fault(f"expected the attribute id of each object in {name!r}, got one without; export it again")
         if objects.setdefault(given.attrib["id"], found := _object(given, name, palettes, source)) is not found:
             raise Fault(f"expected an id for each object, got {given.get('id')!r} for two in {name!r}; export it again")
     return ModelPart(UNITS[unit], objects, [_reference(item, name) for item in _core(root, "item")])
@@ -167,51 +176,75 @@ def _core(within: Any, name: str) -> Iterator[Any]:
 
 
 def _reference(given: Any, part: str) -> Reference:
-    numbers = given.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
-    if len(numbers) != 12:
-        raise Fault(f"expected 12 numbers for a transform, got {len(numbers)}; export it again")
+    values = numbers(given.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").encode(), "a transform")
+    if len(values) != 12:
+        raise Fault(f"expected 12 numbers for a transform, got {len(values)}; export it again")
     matrix = np.eye(4)
-    matrix[:3] = np.array(numbers, np.float64).reshape(4, 3).T
+    matrix[:3] = values.reshape(4, 3).T
+    if "objectid" not in given.attrib:
+        raise Fault("expected the attribute objectid of each item and component, got one without; export it again")
     return Reference(_name(given.get(PATH, part)), given.attrib["objectid"], matrix)
 
 
-def _object(given: Any, part: str, palettes: dict[str, list[tuple[int, ...]]], source: Source) -> Object:
-    corners = [f"{v.attrib['x']} {v.attrib['y']} {v.attrib['z']}" for v in _core(given, "vertex")]
-    faces = [f"{t.attrib['v1']} {t.attrib['v2']} {t.attrib['v3']}" for t in _core(given, "triangle")]
+def _object(given: Any, part: str, palettes: Palettes, source: Source) -> Object:
+    vertices, faces = _rows(given, "vertex", "x", "y", "z"), _rows(given, "triangle", "v1", "v2", "v3")
     return Object(
         given.get("name") or f"object {given.get('id')}",
-        _arrays(_numbers(corners, np.float64), _numbers(faces, np.int64), _colors(given, palettes, source)),
+        _arrays(vertices, faces, _colors(given, palettes, source)),
         [_reference(component, part) for component in _core(given, "component")],
     )
 
 
-def _numbers(rows: list[str], dtype: type) -> np.ndarray:
-    """(len(rows), 3). As one text, for a call for each number takes three times as long. Raises ValueError."""
-    flat = np.fromstring(" ".join(rows), dtype, sep=" ")
-    if len(flat) != 3 * len(rows):  # it ends at the first that is none
-        raise ValueError(f"{rows[len(flat) // 3]!r} is no three numbers")
+def _rows(given: Any, element: str, *names: str) -> np.ndarray:
+    """(N, 3) attributes of the elements of an object. As one text, for a call for each number takes three times as long. Raises
+    Fault."""
+    a, b, c = names
+    where = f"each {element} of object {given.get('id')}"
+    kind = np.float64 if element == "vertex" else np.int64
+    try:
+        rows = [f"{one.attrib[a]} {one.attrib[b]} {one.attrib[c]}" for one in _core(given, element)]
+    except KeyError as error:
+        raise Fault(
+            f"expected the attributes {a}, {b} and {c} of {where}, got one without {error}; export it again"
+        ) from None
+    flat = numbers(" ".join(rows).encode(), f"{a}, {b} and {c} of {where}", kind)
+    if len(flat) != 3 * len(rows):
+        raise Fault(f"expected one number for each of {a}, {b} and {c} of {where}, got others; export it again")
     return flat.reshape(-1, 3)
 
 
-def _colors(given: Any, palettes: dict[str, list[tuple[int, ...]]], source: Source) -> np.ndarray | None:
+def _colors(given: Any, palettes: Palettes, source: Source) -> np.ndarray | None:
     """Of the corners of triangles, by their own properties or those of the object; None where none has one that is read."""
     own = given.get("pid"), given.get("pindex"), None, None
+    of_faces = given.xpath("boolean(.//c:triangle[@pid or @p1])", namespaces={"c": CORE})
+    if not source.wanted.materials or (own[0] is None and not of_faces):
+        return None
+    if own[0] is not None and own[1] is None:
+        source.unsupported.note("pid of an object without pindex")
     white, found, plain = (255,) * 4, [], 0
-    for triangle in _core(given, "triangle") if palettes else ():
+    for triangle in _core(given, "triangle"):
         pid, first, second, third = own
         if triangle.get("p1") is not None:
             pid, first = triangle.get("pid", pid), triangle.get("p1")
             second, third = triangle.get("p2"), triangle.get("p3")
-        if pid not in palettes or first is None:
+        elif triangle.get("pid") is not None:
+            source.unsupported.note("pid of a triangle without p1")
+        if first is not None and pid is None:
+            source.unsupported.note("p1 of a triangle without pid")
+        elif first is not None and pid not in palettes:
+            source.unsupported.note(f"pid {pid}", "no such group")
+        palette = palettes.get(pid)
+        if palette is None or first is None:
             plain += 1
             found.append((white,) * 3)
             continue
-        indices = [int(first if index is None else index) for index in (first, second, third)]
-        if not all(0 <= index < len(palettes[pid]) for index in indices):
-            raise Fault(
-                f"expected colours from 0 to {len(palettes[pid]) - 1} of group {pid}, got {indices}; export it again"
-            )
-        found.append(tuple(palettes[pid][index] for index in indices))
+        indices = [first if index is None else index for index in (first, second, third)]
+        if not all(index.strip().isdecimal() for index in indices):
+            raise Fault(f"expected whole numbers for colours of group {pid}, got {', '.join(indices)}; export it again")
+        indices = [int(index) for index in indices]
+        if not all(0 <= index < len(palette) for index in indices):
+            raise Fault(f"expected colours from 0 to {len(palette) - 1} of group {pid}, got {indices}; export it again")
+        found.append(tuple(palette[index] for index in indices))
     if plain == len(found):
         return None
     if plain:
