@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -247,6 +249,7 @@ def test_missing_libraries_are_asked_for(tmp_path, monkeypatch, name, missing) -
         ("a: " + "[" * 500, "expected YAML, got a file that PyYAML does not read"),
         ("camera_matrix: {rows: 3, cols: 3, data: [1, 2]}", "camera_matrix: expected a matrix"),
         ("camera_matrix: {rows: .inf, cols: 3, data: [1, 2]}", "camera_matrix: expected a matrix"),
+        ("camera_matrix: {rows: 3, cols: -3, data: [1, 0, 2, 0, 1, 2, 0, 0, 1]}", "camera_matrix: expected a matrix"),
         ("camera_matrix: [[1, x, 3]]", "camera_matrix: expected a matrix"),
         ("camera_matrix: [1, 2, 3]\nimage_size: [4, 5]", "K: expected shape"),
         ("camera_matrix: [1, 0, 2, 0, 1, 2, 0, 0, 1]\nimage_size: [4, .nan]", "size: expected whole numbers"),
@@ -280,3 +283,44 @@ def test_opencv_faults(tmp_path) -> None:
     with pytest.raises(ValueError, match=r"image_width: .* pass size="):
         eg.load_cameras(file)
     assert eg.load_cameras(file, size=SIZE)["camera"].camera.size == SIZE
+
+
+CHILD = """
+import sys
+import edgegrad as eg
+for path in sys.argv[1:]:
+    for _ in range(20):
+        try:
+            eg.load_cameras(path)
+        except ValueError as error:
+            said = str(error)
+            [b"a" * i for i in range(1, 400, 7)]  # finds a heap that is no longer one
+    print(said)
+"""
+
+
+def test_matrices_whose_numbers_do_not_match_end_no_process(tmp_path) -> None:
+    """OpenCV reads them past the end of its memory, which ends the process, and so they are read in one of their own."""
+    storage(tmp_path / "whole.yml", image_width=W, image_height=H, camera_matrix=K)
+    storage(tmp_path / "whole.xml", image_width=W, image_height=H, camera_matrix=K)
+    files = []
+    for i, (field, value) in enumerate(
+        [
+            (field, value)
+            for field in ("rows", "cols")
+            for value in (None, ".Nan", "-3", "3000000", "4294967297", "1e99", "'3'")
+        ]
+        + [("dt", value) for value in ("x", "2d", "99d", "-1d", "7")]
+    ):
+        for ending in ("yml", "xml"):
+            text = (tmp_path / f"whole.{ending}").read_text()
+            line = re.compile(rf"( *{field}:).*\n" if ending == "yml" else rf"( *<{field}>).*\n")
+            end = "" if ending == "yml" else f"</{field}>"
+            spoilt = line.sub("" if value is None else rf"\1 {value}{end}\n", text, count=1)
+            assert spoilt != text
+            files.append(tmp_path / f"{i}.{ending}")
+            files[-1].write_text(spoilt)
+    done = subprocess.run([sys.executable, "-c", CHILD, *map(str, files)], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+    for file, said in zip(files, done.stdout.splitlines(), strict=True):
+        assert re.match(rf"{re.escape(str(file))}: (camera_matrix: expected |expected YAML or XML of cv2)", said), said
