@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import torch
 
 from ..camera.camera import Camera
 from ..scene.material import Material
@@ -45,11 +44,11 @@ def read_model(path: PathLike, wanted: Wanted) -> Model:
     return model._replace(parts=parts, dtype=dtype)
 
 
-def read_cameras(path: PathLike, size: tuple[int, int], dtype: torch.dtype) -> dict[str, Camera]:
-    """Those of a glTF or GLB file, by name. Raises Fault, FileNotFoundError or ValueError."""
+def read_cameras(path: PathLike, size: tuple[int, int]) -> dict[str, Camera]:
+    """Those in float64 of a glTF or GLB file, by name. Raises Fault, FileNotFoundError or ValueError."""
     file = check_readable(path, GLTFS)
     with _as_fault(kind := file.suffix.lower()[1:]):
-        return cameras(gltf.read(file.read_bytes(), kind).tree, size, dtype)
+        return cameras(gltf.read(file.read_bytes(), kind).tree, size)
 
 
 @contextmanager

@@ -37,9 +37,7 @@ INSTEAD = {
 }
 
 
-def read(
-    fields: Mapping[str, Any], folder: Path, size: tuple[int, int] | None, dtype: torch.dtype, unread: Unsupported
-) -> dict[str, View]:
+def read(fields: Mapping[str, Any], folder: Path, size: tuple[int, int] | None, unread: Unsupported) -> dict[str, View]:
     """By the frames' file_path. What a frame says goes before what the file says of all. Raises Fault."""
     frames = fields["frames"]
     if not isinstance(frames, list) or not frames:
@@ -53,7 +51,7 @@ def read(
         name = str(own.get("file_path", i))
         try:
             image = _image(folder, name) if "file_path" in own else None
-            view = View(_camera(own, shared, image, size, dtype), image)
+            view = View(_camera(own, shared, image, size), image)
         except (Fault, TypeError, ValueError, KeyError, OverflowError) as error:
             raise Fault(f"frames[{i}], {name}: {error}") from error
         views[name if name not in views else f"{name} (frame {i})"] = view
@@ -82,7 +80,6 @@ def _camera(
     shared: Mapping[str, Any],
     image: Path | None,
     size: tuple[int, int] | None,
-    dtype: torch.dtype,
 ) -> Camera:
     given = {**shared, **own}
     if "w" in given and "h" in given:
@@ -95,21 +92,21 @@ def _camera(
         raise ValueError(
             "w and h: expected the image's size, or the image itself, got neither; pass size=(height, width)"
         )
-    pose = torch.tensor(given["transform_matrix"], dtype=dtype)
+    pose = torch.tensor(given["transform_matrix"], dtype=torch.float64)
     model = _model(own, shared)
     fx, fy = _focals(own, shared, (W, H))
     cx, cy = float(given.get("cx", 0.5 * W)), float(given.get("cy", 0.5 * H))
-    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
     k1, k2, k3, k4, p1, p2 = (float(given.get(key, 0.0)) for key in COEFFICIENTS)
     camera = Camera.from_opengl(pose, (H, W), K=K)
     if model in FISHEYES:
         if p1 or p2:
             raise ValueError(f"p1, p2: expected 0 of a fisheye, got {p1:g} and {p2:g}; undistort the images")
-        return camera.replace(projection="fisheye", distortion=torch.tensor([k1, k2, k3, k4], dtype=dtype))
+        return camera.replace(projection="fisheye", distortion=torch.tensor([k1, k2, k3, k4], dtype=torch.float64))
     if k4 != 0.0:
         raise ValueError(f"k4: expected 0 of a lens that is no fisheye, got {k4:g}; undistort the images")
     coefficients = [k1, k2, p1, p2, k3] if k3 else [k1, k2, p1, p2]
-    return camera.replace(distortion=torch.tensor(coefficients, dtype=dtype)) if any(coefficients) else camera
+    return camera.replace(distortion=torch.tensor(coefficients, dtype=torch.float64)) if any(coefficients) else camera
 
 
 def _model(own: Mapping[str, Any], shared: Mapping[str, Any]) -> str:
