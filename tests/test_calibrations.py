@@ -150,8 +150,11 @@ def test_camera_info_as_a_topic_prints_it(tmp_path) -> None:
     matrices = "K: [60, 0, 30, 0, 55, 25, 0, 0, 1]\nR: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nP: [60, 0, 30, 0, 0, 55, 25, 0, 0, 0, 1, 0]\n"
     roi = "binning_x: 0\nroi: {x_offset: 0, do_rectify: false}\n"
     head = f"header: {{seq: 3}}\nheight: {H}\nwidth: {W}\ndistortion_model: plumb_bob\nD: {BENT[0].tolist()}\n"
-    file.write_text(head + matrices + roi)
-    lands(eg.load_cameras(file, dtype=F64)["camera"].camera, np.eye(3), np.zeros(3), K, BENT)
+    whole = head + matrices + roi
+    # `ros2 topic echo` ends each message by ---, and is ended by Ctrl-C in the middle of one.
+    for text in (whole, f"{whole}---\n", f"---\n{whole}---\n{whole.replace('60', '70')}---\nheader: {{seq"):
+        file.write_text(text)
+        lands(eg.load_cameras(file, dtype=F64)["camera"].camera, np.eye(3), np.zeros(3), K, BENT)
     file.write_text(head + matrices + roi.replace("binning_x: 0", "binning_x: 2"))
     with pytest.warns(UserWarning, match=r"binning_x \(left out\)$"):
         eg.load_cameras(file)

@@ -82,7 +82,7 @@ def written(folder, kind, eyes):
     poses = np.stack([np.eye(4)] * len(eyes))
     poses[:, :3, 3] = eyes
     if kind == "transforms.json":
-        frames = [{"file_path": str(i), "transform_matrix": pose.tolist()} for i, pose in enumerate(poses)]
+        frames = [{"transform_matrix": pose.tolist()} for pose in poses]
         (folder / kind).write_text(json.dumps({"w": 64, "h": 48, "fl_x": 60, "frames": frames}))
         return folder / kind
     if kind == "glTF":

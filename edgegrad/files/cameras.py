@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -63,17 +64,32 @@ def load_camera(
             f"{path}: expected neither size nor index for a JSON file, which says its size; leave them out"
         )
     with naming(path):
-        camera = _our_camera(file)
+        camera = _our_camera(_json(file))
     return _typed(path, [camera], dtype, Unsupported())[0]
 
 
-def _our_camera(file: Path) -> Camera:
+def _json(file: Path) -> Any:
+    """Raises Fault."""
+    try:
+        return json.loads(file.read_bytes())  # in UTF-8, UTF-16 or UTF-32, with a byte order mark or without
+    except UnicodeDecodeError as error:
+        raise Fault(f"expected JSON in UTF-8, got text in another encoding ({error}); save it as UTF-8") from error
+    except (ValueError, RecursionError) as error:
+        raise Fault(f"expected JSON, got something else ({error}); export it again") from error
+
+
+def _our_camera(fields: Any) -> Camera:
     """In float64. Raises Fault."""
     known = {"world_to_camera", "K", "size", "projection", "distortion"}
     try:
-        fields = json.loads(file.read_text(encoding="utf-8"))
-        if not isinstance(fields, dict):
-            raise ValueError(f"expected a JSON object with {', '.join(sorted(known))}, got {type(fields).__name__}")
+        if isinstance(fields, dict) and "frames" in fields:
+            raise ValueError("expected one camera, got the frames of a transforms.json; read it by load_cameras()")
+        if not isinstance(fields, dict) or not known & set(fields):
+            got = ", ".join(sorted(fields)) or "an empty object" if isinstance(fields, dict) else type(fields).__name__
+            raise ValueError(
+                f"expected a JSON object with {', '.join(sorted(known))}, as save_camera writes it, or with frames, as a "
+                f"transforms.json, which load_cameras reads; got {got}"
+            )
         for key in sorted(known - {"projection", "distortion"} - set(fields)):
             raise ValueError(f"{key}: expected this key, got only {', '.join(sorted(fields)) or 'an empty object'}")
         for key in sorted(set(fields) - known):
@@ -86,7 +102,7 @@ def _our_camera(file: Path) -> Camera:
         if not isinstance(fields["size"], list):
             raise ValueError(f"size: expected [height, width], got {fields['size']!r}")
         return Camera(**fields)
-    except (TypeError, ValueError) as error:  # what json and UTF-8 raise are ValueErrors too
+    except (TypeError, ValueError) as error:
         raise Fault(str(error)) from error
 
 
@@ -122,7 +138,8 @@ def load_cameras(
     - .json of save_camera; names are numbers
 
     size    (H, W) pixels, where the file does not say it
-    images  the folder of COLMAP's images; else `images` beside the reconstruction or up to two folders above
+    images  the folder of COLMAP's images; else `images` beside the reconstruction or up to two folders above. Or that of a
+            transforms.json's images, by as much of the end of file_path as leads to one; else they are beside the file or below
     dtype   torch.float32 or torch.float64, of the cameras. None: float64 where float32 would move an eye by more than a millionth
             of the extent of all eyes, as in coordinates of a map, or where all are at one place by more than 1e-4 units; else
             float32. A warning tells where cameras are rounded to less than that, as dtype says
@@ -158,6 +175,8 @@ def _views(
     file = check_readable(path, (".json", *CALIBRATIONS, *GLTFS))
     whole = None if size is None else _whole(size)
     with naming(path):
+        if file.suffix.lower() != ".json":
+            _check_no_images(images)
         if file.suffix.lower() in GLTFS:
             if whole is None:
                 raise ValueError(
@@ -166,10 +185,11 @@ def _views(
             return _some({name: View(camera, None) for name, camera in read_cameras(path, whole).items()})
         if file.suffix.lower() in CALIBRATIONS:
             return calibration.read(file, whole, unread)
-        fields = json.loads(file.read_text(encoding="utf-8"))
+        fields = _json(file)
         if isinstance(fields, dict) and "frames" in fields:
-            return transforms.read(fields, file.parent, whole, unread)
-        camera = _our_camera(file)
+            return transforms.read(fields, file.parent, None if images is None else Path(images), whole, unread)
+        _check_no_images(images)
+        camera = _our_camera(fields)
         return {str(i): View(one, None) for i, one in enumerate(camera if camera.batch is not None else [camera])}
 
 
@@ -189,6 +209,11 @@ def _typed(path: PathLike, cameras: list[Camera], dtype: torch.dtype | None, unr
         cameras = cameras if precise and dtype is None else rounded
     unread.say(path, UNREAD)
     return cameras
+
+
+def _check_no_images(images: PathLike | None) -> None:
+    if images is not None:
+        raise Fault("images: expected none for a file that names no images, got a folder; leave it out")
 
 
 def _some(views: dict[str, View]) -> dict[str, View]:

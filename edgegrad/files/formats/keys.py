@@ -27,7 +27,8 @@ def read_keys(file: Path) -> dict[str, Any]:
         return _of_opencv(file)
     yaml = require("yaml", "edgegrad[cameras]", "reading YAML")
     try:
-        found = yaml.safe_load(text)
+        # Of several documents the first: a message of ROS, which `ros2 topic echo` ends by ---.
+        found = next((document for document in yaml.safe_load_all(text) if document is not None), None)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise Fault(f"expected YAML, got a file that PyYAML does not read ({' '.join(str(error).split())})") from error
     if not isinstance(found, dict):
