@@ -16,6 +16,8 @@ from .source import Unsupported
 
 MOST_NUMBERS = 1 << 20  # of a matrix; YAML's references announce more than they hold
 MOST_PIXELS = 1 << 24  # on a side
+DEEP = 1000
+INDENT = re.compile(rb"(?<![ \t?-])[ \t?-]{1000}")
 ELEMENT = re.compile(r"([1-4]?)[ucwsifdh]")  # of OpenCV's matrices: how many channels, and their type
 OPENCV = ("%YAML:", "opencv-matrix", "opencv_storage")  # in files of cv2.FileStorage
 
@@ -24,6 +26,8 @@ def read_keys(file: Path) -> dict[str, Any]:
     """Numbers, text, lists, dicts and, of OpenCV, arrays. Raises Fault or ImportError."""
     text = file.read_text(encoding="utf-8", errors="replace")
     if file.suffix.lower() == ".xml" or any(mark in text for mark in OPENCV):
+        if _is_deep(text.encode()):  # on which OpenCV ends the process
+            raise Fault(f"expected a calibration, got lists or keys inside one another more than {DEEP} times")
         return _of_opencv(file)
     yaml = require("yaml", "edgegrad[cameras]", "reading YAML")
     try:
@@ -42,8 +46,19 @@ def _of_opencv(file: Path) -> dict[str, Any]:
         storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
         root = storage.root()
         return _value(root) if root.isMap() else {}
-    except (cv2.error, SystemError) as error:
+    except (cv2.error, SystemError, RecursionError) as error:
         raise Fault("expected YAML or XML of cv2.FileStorage, got a file that OpenCV does not read") from error
+
+
+def _is_deep(text: bytes) -> bool:
+    """By brackets, by tags, or by what YAML begins a line with."""
+    letters = np.frombuffer(text + b" ", np.uint8)
+    first, second = letters[:-1], letters[1:]
+    brackets = np.isin(first, list(b"[{")).astype(np.int64) - np.isin(first, list(b"]}"))
+    tag, slash = first == ord("<"), ord("/")
+    tags = (tag & ~np.isin(second, list(b"/!?"))).astype(np.int64) - (tag & (second == slash))
+    tags -= (first == slash) & (second == ord(">"))
+    return max(brackets.cumsum().max(), tags.cumsum().max()) > DEEP or INDENT.search(text) is not None
 
 
 def _value(node: Any) -> Any:
