@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 from . import outputs
 from .arguments import CHECKPOINT, add_label, add_live, add_mesh, add_resume, add_view, count, number
-from .inputs import check_size, read_background, read_coverage, read_picture, read_pose, read_scene, read_view
+from .inputs import (
+    check_size,
+    read_background,
+    read_coverage,
+    read_picture,
+    read_pose,
+    read_scene,
+    read_view,
+    read_weight,
+)
 
 if TYPE_CHECKING:
     from edgegrad.fit import PoseFit
@@ -64,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         check_size(mask, picture, args.mask, args.image)
     weight = None
     if args.weight is not None:
-        weight = read_coverage(args.weight)
+        weight = read_weight(args.weight)
         check_size(weight, picture, args.weight, args.image)
     if mask is not None and args.background is not None:
         raise ValueError("--background: expected none with a mask (or an image with alpha), got both; leave one out")

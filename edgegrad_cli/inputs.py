@@ -63,6 +63,13 @@ def read_coverage(path: Path, label: int | None = None) -> Tensor:
         return read_mask(path, label)
 
 
+def read_weight(path: Path) -> Tensor:
+    """(H, W), how much a pixel counts. Raises what edgegrad.read_mask raises."""
+    from edgegrad.files.mask import read_weight
+
+    return read_weight(path)
+
+
 def check_size(image: Tensor, picture: Tensor, path: Path, like: Path) -> None:
     """Raises ValueError."""
     if image.shape[:2] != picture.shape[:2]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -148,8 +150,11 @@ def test_camera_info_as_a_topic_prints_it(tmp_path) -> None:
     matrices = "K: [60, 0, 30, 0, 55, 25, 0, 0, 1]\nR: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nP: [60, 0, 30, 0, 0, 55, 25, 0, 0, 0, 1, 0]\n"
     roi = "binning_x: 0\nroi: {x_offset: 0, do_rectify: false}\n"
     head = f"header: {{seq: 3}}\nheight: {H}\nwidth: {W}\ndistortion_model: plumb_bob\nD: {BENT[0].tolist()}\n"
-    file.write_text(head + matrices + roi)
-    lands(eg.load_cameras(file, dtype=F64)["camera"].camera, np.eye(3), np.zeros(3), K, BENT)
+    whole = head + matrices + roi
+    # `ros2 topic echo` ends each message by ---, and is ended by Ctrl-C in the middle of one.
+    for text in (whole, f"{whole}---\n", f"---\n{whole}---\n{whole.replace('60', '70')}---\nheader: {{seq"):
+        file.write_text(text)
+        lands(eg.load_cameras(file, dtype=F64)["camera"].camera, np.eye(3), np.zeros(3), K, BENT)
     file.write_text(head + matrices + roi.replace("binning_x: 0", "binning_x: 2"))
     with pytest.warns(UserWarning, match=r"binning_x \(left out\)$"):
         eg.load_cameras(file)
@@ -247,6 +252,7 @@ def test_missing_libraries_are_asked_for(tmp_path, monkeypatch, name, missing) -
         ("a: " + "[" * 500, "expected YAML, got a file that PyYAML does not read"),
         ("camera_matrix: {rows: 3, cols: 3, data: [1, 2]}", "camera_matrix: expected a matrix"),
         ("camera_matrix: {rows: .inf, cols: 3, data: [1, 2]}", "camera_matrix: expected a matrix"),
+        ("camera_matrix: {rows: 3, cols: -3, data: [1, 0, 2, 0, 1, 2, 0, 0, 1]}", "camera_matrix: expected a matrix"),
         ("camera_matrix: [[1, x, 3]]", "camera_matrix: expected a matrix"),
         ("camera_matrix: [1, 2, 3]\nimage_size: [4, 5]", "K: expected shape"),
         ("camera_matrix: [1, 0, 2, 0, 1, 2, 0, 0, 1]\nimage_size: [4, .nan]", "size: expected whole numbers"),
@@ -280,3 +286,57 @@ def test_opencv_faults(tmp_path) -> None:
     with pytest.raises(ValueError, match=r"image_width: .* pass size="):
         eg.load_cameras(file)
     assert eg.load_cameras(file, size=SIZE)["camera"].camera.size == SIZE
+
+
+CHILD = """
+import sys
+import edgegrad as eg
+for path in sys.argv[1:]:
+    for _ in range(5):
+        try:
+            eg.load_cameras(path)
+        except ValueError as error:
+            said = str(error)
+            [b"a" * i for i in range(1, 400, 7)]  # finds a heap that is no longer one
+    print(said)
+"""
+
+
+def test_what_opencv_does_not_survive_ends_no_process(tmp_path) -> None:
+    """Numbers that do not match are read past the end of its memory, deep files past that of its stack; so in a process apart."""
+    storage(tmp_path / "whole.yml", image_width=W, image_height=H, camera_matrix=K)
+    storage(tmp_path / "whole.xml", image_width=W, image_height=H, camera_matrix=K)
+    files = []
+    for i, (field, value) in enumerate(
+        [
+            (field, value)
+            for field in ("rows", "cols")
+            for value in (None, ".Nan", "-3", "3000000", "4294967297", "1e99", "'3'")
+        ]
+        + [("dt", value) for value in ("x", "2d", "99d", "-1d", "7")]
+    ):
+        for ending in ("yml", "xml"):
+            text = (tmp_path / f"whole.{ending}").read_text()
+            line = re.compile(rf"( *{field}:).*\n" if ending == "yml" else rf"( *<{field}>).*\n")
+            end = "" if ending == "yml" else f"</{field}>"
+            spoilt = line.sub("" if value is None else rf"\1 {value}{end}\n", text, count=1)
+            assert spoilt != text
+            files.append(tmp_path / f"{i}.{ending}")
+            files[-1].write_text(spoilt)
+    for i, deep in enumerate(
+        ("[" * 200000, "{a: " * 200000, "- " * 200000, "\n" + "\n".join(" " * i + "a:" for i in range(2000)))
+    ):
+        files.append(tmp_path / f"deep{i}.yml")
+        files[-1].write_text(f"%YAML:1.0\n---\ncamera_matrix: {deep}")
+    for i, depth in enumerate((700, 200000)):  # deeper than Python goes, and than OpenCV
+        files.append(tmp_path / f"deep{i}.xml")
+        files[-1].write_text(
+            "<?xml version='1.0'?><opencv_storage>" + "<a>" * depth + "</a>" * depth + "</opencv_storage>"
+        )
+    done = subprocess.run([sys.executable, "-c", CHILD, *map(str, files)], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+    for file, said in zip(files, done.stdout.splitlines(), strict=True):
+        assert re.match(
+            rf"{re.escape(str(file))}: (camera_matrix: expected |expected YAML or XML of cv2|expected a calibration)",
+            said,
+        ), said

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import random
+import re
 import shutil
 from pathlib import Path
 
@@ -169,6 +170,7 @@ def test_transforms(tmp_path) -> None:
 LENS = {"fl_x": 60, "fl_y": 55, "w": W, "h": H}
 
 
+@pytest.mark.filterwarnings("ignore:.*1 of 1 images")
 @pytest.mark.parametrize(
     "frame, expected",
     [
@@ -197,6 +199,7 @@ def test_what_a_frame_says_goes_first(tmp_path, frame, expected) -> None:
         assert found[key] == (pytest.approx(value) if not isinstance(value, str) else value), key
 
 
+@pytest.mark.filterwarnings("ignore:.*1 of 1 images")
 def test_frames_of_a_file_that_says_one_focal_length(tmp_path) -> None:
     for shared, own, focals in (
         ({"camera_angle_x": 0.7}, {"fl_x": 80}, (80, 80)),
@@ -224,6 +227,8 @@ def test_names_of_frames(tmp_path) -> None:
 
 @pytest.mark.filterwarnings("error::UserWarning")  # those that are expected are caught
 def test_keys_that_nobody_reads_are_named(tmp_path) -> None:
+    (tmp_path / "train").mkdir()
+    eg.write_image(tmp_path / "train" / "r_0.png", torch.zeros(*SIZE, 3))
     harmless = {"aabb_scale": 16, "scale": 0.3, "offset": [0, 0, 0], "ply_file_path": "sparse.ply"}
     eg.load_cameras(transforms(tmp_path, {"sharpness": 9.0, "colmap_im_id": 1}, **LENS, **harmless))
     frame = {"mask_path": "m.png", "rolling_shutter": [0, 0, 0, 1], "time": None}
@@ -245,6 +250,15 @@ def test_keys_that_nobody_reads_are_named(tmp_path) -> None:
     "fields, fault",
     [
         ({"camera_angle_x": 0.7}, r"frames\[0\], \./train/r_0: w and h: expected"),
+        (
+            {"w": W, "h": H, "camera_angle_x": 0},
+            r"r_0: camera_angle_x: expected radians between 0 and π, got 0; of degrees",
+        ),
+        (
+            {"w": W, "h": H, "frame": {"camera_angle_y": 49.1}},
+            "camera_angle_y: expected radians between 0 and π, got 49.1",
+        ),
+        ({"w": W, "h": H, "camera_angle_x": float("nan")}, "camera_angle_x: expected radians"),
         ({"w": W, "h": H}, "fl_x: expected this key or camera_angle_x"),
         ({"w": W, "h": H, "fl_x": 60, "camera_model": "EQUIRECTANGULAR"}, "camera_model: expected .* got 'EQUI"),
         ({"w": W, "h": H, "fl_x": 60, "k4": 0.1}, "k4: expected 0"),
@@ -264,6 +278,73 @@ def test_keys_that_nobody_reads_are_named(tmp_path) -> None:
 def test_faults_of_transforms_are_named(tmp_path, fields, fault) -> None:
     with pytest.raises(ValueError, match=fault):
         eg.load_cameras(transforms(tmp_path, **fields))
+
+
+@pytest.mark.filterwarnings("error::UserWarning")  # those that are expected are caught
+def test_images_that_are_not_there_are_named(tmp_path) -> None:
+    matrix = torch.linalg.inv(FLIP @ pose()).tolist()
+    (tmp_path / "nerf").mkdir()
+    (tmp_path / "photos" / "left").mkdir(parents=True)
+    for place in ("nerf/a.png", "photos/b.png", "photos/left/0.png"):
+        eg.write_image(tmp_path / place, torch.zeros(*SIZE, 3))
+
+    def load(*names: str, images: Path | None = None, **fields: object) -> list[Path | None]:
+        frames = [{"file_path": name, "transform_matrix": matrix} for name in names]
+        (tmp_path / "nerf" / "transforms.json").write_text(json.dumps({**fields, "frames": frames}))
+        views = eg.load_cameras(tmp_path / "nerf", images=images)
+        assert list(views) == list(names)
+        return [view.image for view in views.values()]
+
+    with pytest.warns(UserWarning, match=r"1 of 2 images, as 'c\.png' \(View\.image is None: no such file\)"):
+        assert load("a.png", "c.png", **LENS) == [tmp_path / "nerf" / "a.png", None]
+    photos, absolute = tmp_path / "photos", str(tmp_path / "photos" / "b.png")
+    for name in ("../photos/b.png", "..\\photos\\b.png", absolute, "x/../../photos/b", "C:\\photos\\b.png"):
+        said = rf"1 of 2 images, as {re.escape(repr(name))} \(View\.image is None: outside of the file's folder, .* images="
+        with pytest.warns(UserWarning, match=said):
+            assert load(name, "a.png", **LENS) == [None, tmp_path / "nerf" / "a.png"]
+        assert load(name, "./left/0", images=photos, **LENS) == [photos / "b.png", photos / "left" / "0.png"]
+        with pytest.raises(
+            ValueError, match=r"w and h: .* got neither: it is outside of the file's folder, .* images="
+        ):
+            load(name, fl_x=60)
+        assert load(name, fl_x=60, images=photos) == [photos / "b.png"]
+    with pytest.warns(UserWarning, match=r"1 of 1 images, as 'c\.png'"):
+        assert load("c.png", images=photos, **LENS) == [None]
+    with pytest.raises(
+        ValueError, match=r"images: expected a folder that has 'left/0' and 'right/0' apart, .* both are 0\.png"
+    ):
+        load("left/0", "right/0", images=photos / "left", **LENS)
+    eg.save_camera(tmp_path / "one.json", eg.Camera(pose(), torch.from_numpy(K), SIZE))
+    with pytest.raises(ValueError, match=r"one\.json: images: expected none"):
+        eg.load_cameras(tmp_path / "one.json", images=photos)
+
+
+@pytest.mark.filterwarnings("ignore:.*1 of 1 images")
+def test_encodings_and_kinds_of_json(tmp_path) -> None:
+    file = transforms(tmp_path, {"file_path": "grün"}, **LENS)
+    text, expected = file.read_text(), eg.load_cameras(file)["grün"].camera
+    eg.save_camera(tmp_path / "one.json", expected)
+    for encoding in ("utf-8-sig", "utf-16"):
+        file.write_text(json.dumps(json.loads(text), ensure_ascii=False), encoding=encoding)
+        assert torch.equal(eg.load_cameras(file)["grün"].camera.K, expected.K)
+        (tmp_path / "b.json").write_text((tmp_path / "one.json").read_text(), encoding=encoding)
+        assert torch.equal(eg.load_camera(tmp_path / "b.json").world_to_camera, expected.world_to_camera)
+    file.write_text(json.dumps(json.loads(text), ensure_ascii=False), encoding="latin-1")
+    with pytest.raises(
+        ValueError, match=r"transforms\.json: expected JSON in UTF-8, got text in another encoding .* save it"
+    ):
+        eg.load_cameras(file)
+    file.write_text(text)
+    with pytest.raises(ValueError, match=r"the frames of a transforms\.json; read it by load_cameras\(\)"):
+        eg.load_camera(file)
+    for content, got in (("[1]", "list"), ('{"w": 3, "h": 4}', "h, w"), ("{}", "an empty object"), ("3", "int")):
+        file.write_text(content)
+        with pytest.raises(ValueError, match=rf"json: expected a JSON object with .* or with frames, .*; got {got}$"):
+            eg.load_cameras(file)
+    for content in ("{", "[" * 100000):
+        file.write_text(content)
+        with pytest.raises(ValueError, match=r"transforms\.json: expected JSON, got something else"):
+            eg.load_cameras(file)
 
 
 # -- our own ---------------------------------------------------------------------------------------------------------------

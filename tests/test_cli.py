@@ -132,6 +132,10 @@ def test_a_failed_write_still_prints_the_pose(files, capsys, monkeypatch):
             "(nothing reaches an eighth of white, so it is no coverage); choose one with --label",
         ),
         (["mesh.ply", "target.png", "--mask", "target.png"], "target.png: expected a mask in grey"),
+        (
+            ["mesh.ply", "target.png", "--mask", "labels.png", "--label", "9"],
+            "labels.png: expected label 9 in it, got the labels 0, 2, 5; choose one with --label",
+        ),
         (["mesh.ply", "target.png", "--label", "2"], "--label: expected --mask with it"),
         (["mesh.ply", "target.png", "--mask", "mask.png", "--background", "#102030"], "--background: expected none"),
         (["mesh.ply", "target.png", "--background", "#1020"], "--background: expected #rrggbb"),
@@ -164,6 +168,13 @@ def test_a_label_is_chosen(files):
     labels[1:3], labels[3] = 5, 2
     Image.fromarray(labels).save(files / "labels.png")
     assert inputs.read_coverage(files / "labels.png", 5).tolist() == (labels == 5).tolist()
+
+
+def test_weights_of_three_levels_are_no_labels(files):
+    levels = np.repeat(np.uint8([0, 128, 255]), 16)[:, None].repeat(48, 1)
+    Image.fromarray(levels).save(files / "weight.png")
+    np.testing.assert_allclose(inputs.read_weight(files / "weight.png").numpy(), levels / 255, atol=1e-6)
+    assert fit(files, "--weight", files / "weight.png", "--steps", 1, "--size", 12, "--out", files / "out") == 0
 
 
 def test_render_frames_the_mesh(files):

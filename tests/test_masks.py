@@ -1,5 +1,6 @@
 """Masks: the coverage of every kind of file, against the numbers that were written to it."""
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import OpenImageIO as oiio
 import pytest
 import tifffile
 import torch
-from PIL import Image
+from PIL import Image, ImageFilter
 
 import edgegrad as eg
 
@@ -114,8 +115,116 @@ def test_several_labels_are_named_and_chosen(tmp_path: Path, name: str, dtype: t
     fault = "coverage from 0 to 1, got 0 to 7; .* label=" if dtype is np.float32 else "labels 0, 1, 3, 7 .* label="
     with pytest.raises(ValueError, match=rf"{name}: expected .*{fault}"):
         eg.read_mask(path)
-    for label in (0, 1, 3, 7, 9):
+    for label in (0, 1, 3, 7):
         agree(path, np.equal(LABELS, label), label)
+    with pytest.raises(
+        ValueError, match=rf"{name}: expected label 9 in it, got the labels 0(\.0)?, 1.*, 7(\.0)?; choose one"
+    ):
+        eg.read_mask(path, 9)
+
+
+def regions(*numbers: int) -> np.ndarray:
+    """The last on a disc, the others in bands."""
+    y, x = np.mgrid[:48, :64]
+    image = np.array(numbers[:-1])[y * (len(numbers) - 1) // 48]
+    image[(x - 30) ** 2 + (y - 25) ** 2 < 150] = numbers[-1]
+    return image
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        (0, 7, 33, 26),
+        (0, 1, 18, 90, 255),
+        (0, 12, 150),
+        (0, 255, 1),
+        (255, 0, 1),
+        (0, 128, 255),
+        (26, 33),
+        (*range(0, 256, 51),),
+    ],
+)
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_labels_that_reach_beyond_an_eighth_of_white(tmp_path: Path, numbers: tuple[int, ...], dtype: type) -> None:
+    """Of Cityscapes, COCO, ADE, and a void of 255."""
+    labels = regions(*numbers)
+    stored = (labels * (1 if dtype is np.uint8 else 257)).astype(dtype)
+    Image.fromarray(stored).save(tmp_path / "a.png")
+    listed = ", ".join(map(str, np.unique(stored)[:8]))
+    with pytest.raises(
+        ValueError, match=rf"a\.png: expected a mask of one object, got the labels {listed}.* label=, or save cov"
+    ):
+        eg.read_mask(tmp_path / "a.png")
+    for label in np.unique(stored):
+        agree(tmp_path / "a.png", stored == label, int(label))
+    rgb = np.stack([labels.astype(np.uint8)] * 3, -1)
+    Image.fromarray(rgb).save(tmp_path / "b.png")
+    with pytest.raises(ValueError, match=r"b\.png: expected a mask of one object"):
+        eg.read_mask(tmp_path / "b.png")
+
+
+def test_borders_that_are_smooth_are_coverage(tmp_path: Path) -> None:
+    fine = Image.fromarray(np.kron(regions(0, 1), np.ones((8, 8), np.int64)).astype(np.uint8) * 255)
+    exact = fine.resize((64, 48), Image.Resampling.BOX)
+    jpeg = io.BytesIO()
+    fine.save(jpeg, "jpeg", quality=75)
+    spot = np.array(exact)
+    spot[0, 0] = 1
+    blurred = [
+        image.filter(ImageFilter.GaussianBlur(r)) for image in (fine, exact.point(lambda x: x // 4)) for r in (1, 4)
+    ]
+    several = [
+        exact,
+        exact.resize((128, 96), Image.Resampling.NEAREST),
+        Image.open(jpeg),
+        Image.fromarray(spot),
+        *blurred,
+    ]
+    for i, image in enumerate([*several, Image.fromarray(regions(0, 128).astype(np.uint8))]):
+        image.save(tmp_path / f"{i}.png")
+        agree(tmp_path / f"{i}.png", np.array(image) / 255)
+    tifffile.imwrite(tmp_path / "three.tif", regions(0, 128, 255) / np.float32(255))  # floats are no labels
+    agree(tmp_path / "three.tif", regions(0, 128, 255) / 255)
+
+
+def test_labels_beyond_what_float32_holds(tmp_path: Path) -> None:
+    many = np.array([[0, 1, 16777216], [16777217, 4294967294, 4294967295]], np.uint32)
+    tifffile.imwrite(tmp_path / "a.tif", many)
+    for label in many.ravel().tolist():
+        agree(tmp_path / "a.tif", many == label, label)
+    spec = oiio.ImageSpec(3, 2, 1, oiio.UINT32)
+    output = oiio.ImageOutput.create(str(tmp_path / "a.exr"))
+    assert output.open(str(tmp_path / "a.exr"), spec) and output.write_image(many[..., None])
+    output.close()
+    for label in many.ravel().tolist():
+        agree(tmp_path / "a.exr", many == label, label)
+    tifffile.imwrite(tmp_path / "b.tif", (many > 1).astype(np.uint32))
+    agree(tmp_path / "b.tif", many > 1)
+    for dtype in (np.int64, np.uint64):
+        tifffile.imwrite(tmp_path / "c.tif", many.astype(dtype))
+        with pytest.raises(ValueError, match=r"c\.tif: .* 64 bits per sample.*; save it as 8, 16 or 32 bit"):
+            eg.read_mask(tmp_path / "c.tif")
+
+
+def test_eight_bits_in_sixteen_are_named(tmp_path: Path) -> None:
+    Image.fromarray(np.uint16([[0, 255], [255, 0]])).save(tmp_path / "a.png")
+    with pytest.raises(
+        ValueError, match=r"labels 0, 255 \(coverage of 16 bits goes up to 65535: is it 8 bits, saved in more"
+    ):
+        eg.read_mask(tmp_path / "a.png")
+
+
+def test_inverted_masks_are_named(tmp_path: Path) -> None:
+    for name, numbers in (("object", (0, 255)), ("inverted", (255, 0)), ("all", (255, 255))):
+        Image.fromarray(regions(*numbers).astype(np.uint8)).save(tmp_path / f"{name}.png")
+    eg.read_mask(tmp_path / "object.png")
+    eg.read_mask(tmp_path / "all.png")
+    left = (regions(1, 0)[12:36, 16:48]).mean()
+    with pytest.warns(
+        UserWarning, match=rf"inverted\.png: the mask covers the border .* and {left:.0%} of its middle; .* 1 - mask"
+    ):
+        agree(tmp_path / "inverted.png", regions(1, 0))
+    agree(tmp_path / "inverted.png", regions(1, 0), 255)  # as was asked for
 
 
 def test_palettes(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -19,6 +20,7 @@ from .paths import PathLike, check_readable, check_suffix, replacing
 
 CALIBRATIONS = (".yml", ".yaml", ".xml")
 UNREAD = "not all of it is read"
+ALONE = 1e-4  # units by which float32 may move the eyes of cameras that have no distance to compare with
 
 
 def save_camera(path: PathLike, camera: Camera) -> None:
@@ -43,11 +45,12 @@ def save_camera(path: PathLike, camera: Camera) -> None:
 
 
 def load_camera(
-    path: PathLike, dtype: torch.dtype = torch.float32, size: tuple[int, int] | None = None, index: int = 0
+    path: PathLike, dtype: torch.dtype | None = None, size: tuple[int, int] | None = None, index: int = 0
 ) -> Camera:
     """A camera as save_camera writes it; "projection" may be left out (perspective), and "distortion" (none). Or one of a glTF or
     GLB file, where it stands in the scene.
 
+    dtype  as in load_cameras
     size   (H, W) of a glTF's camera, which has none; pixels are square, and its height of view counts, not its aspectRatio
     index  which of a glTF's, in the order of their nodes
 
@@ -55,39 +58,61 @@ def load_camera(
     """
     file = check_readable(path, (".json", *GLTFS))
     if file.suffix.lower() in GLTFS:
-        return _gltf_camera(path, dtype, size, index)
+        return _typed(path, [_gltf_camera(path, size, index)], dtype, Unsupported())[0]
     if size is not None or index != 0:
         raise ValueError(
             f"{path}: expected neither size nor index for a JSON file, which says its size; leave them out"
         )
+    with naming(path):
+        camera = _our_camera(_json(file))
+    return _typed(path, [camera], dtype, Unsupported())[0]
+
+
+def _json(file: Path) -> Any:
+    """Raises Fault."""
+    try:
+        return json.loads(file.read_bytes())  # in UTF-8, UTF-16 or UTF-32, with a byte order mark or without
+    except UnicodeDecodeError as error:
+        raise Fault(f"expected JSON in UTF-8, got text in another encoding ({error}); save it as UTF-8") from error
+    except (ValueError, RecursionError) as error:
+        raise Fault(f"expected JSON, got something else ({error}); export it again") from error
+
+
+def _our_camera(fields: Any) -> Camera:
+    """In float64. Raises Fault."""
     known = {"world_to_camera", "K", "size", "projection", "distortion"}
     try:
-        fields = json.loads(file.read_text(encoding="utf-8"))
-        if not isinstance(fields, dict):
-            raise ValueError(f"expected a JSON object with {', '.join(sorted(known))}, got {type(fields).__name__}")
+        if isinstance(fields, dict) and "frames" in fields:
+            raise ValueError("expected one camera, got the frames of a transforms.json; read it by load_cameras()")
+        if not isinstance(fields, dict) or not known & set(fields):
+            got = ", ".join(sorted(fields)) or "an empty object" if isinstance(fields, dict) else type(fields).__name__
+            raise ValueError(
+                f"expected a JSON object with {', '.join(sorted(known))}, as save_camera writes it, or with frames, as a "
+                f"transforms.json, which load_cameras reads; got {got}"
+            )
         for key in sorted(known - {"projection", "distortion"} - set(fields)):
             raise ValueError(f"{key}: expected this key, got only {', '.join(sorted(fields)) or 'an empty object'}")
         for key in sorted(set(fields) - known):
             raise ValueError(f"{key}: expected only the keys {', '.join(sorted(known))}; remove it")
         for key in ("world_to_camera", "K", "distortion")[: 3 if "distortion" in fields else 2]:
             try:
-                fields[key] = torch.tensor(fields[key], dtype=dtype)
+                fields[key] = torch.tensor(fields[key], dtype=torch.float64)
             except (TypeError, ValueError) as error:
                 raise ValueError(f"{key}: expected rows of numbers ({error})") from error
         if not isinstance(fields["size"], list):
             raise ValueError(f"size: expected [height, width], got {fields['size']!r}")
         return Camera(**fields)
-    except (TypeError, ValueError) as error:  # what json and UTF-8 raise are ValueErrors too
-        raise ValueError(f"{path}: {error}") from error
+    except (TypeError, ValueError) as error:
+        raise Fault(str(error)) from error
 
 
-def _gltf_camera(path: PathLike, dtype: torch.dtype, size: tuple[int, int] | None, index: int) -> Camera:
+def _gltf_camera(path: PathLike, size: tuple[int, int] | None, index: int) -> Camera:
     if size is None:
         raise ValueError(
             f"{path}: size: expected (height, width) in pixels for the camera of a glTF, got None; pass size="
         )
     with naming(path):
-        found = read_cameras(path, _whole(size), dtype)
+        found = read_cameras(path, _whole(size))
         if not isinstance(index, int) or not 0 <= index < len(found):
             raise ValueError(f"index: expected that of one of {len(found)} cameras in the file, from 0, got {index!r}")
         return list(found.values())[index]
@@ -97,7 +122,7 @@ def load_cameras(
     path: PathLike,
     size: tuple[int, int] | None = None,
     images: PathLike | None = None,
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | None = None,
 ) -> dict[str, View]:
     """The cameras of a file or folder by name, each with its image: `View(camera, image)`.
 
@@ -113,48 +138,82 @@ def load_cameras(
     - .json of save_camera; names are numbers
 
     size    (H, W) pixels, where the file does not say it
-    images  the folder of COLMAP's images; else `images` beside the reconstruction or up to two folders above
-    dtype   of the cameras
+    images  the folder of COLMAP's images; else `images` beside the reconstruction or up to two folders above. Or that of a
+            transforms.json's images, by as much of the end of file_path as leads to one; else they are beside the file or below
+    dtype   torch.float32 or torch.float64, of the cameras. None: float64 where float32 would move an eye by more than a millionth
+            of the extent of all eyes, as in coordinates of a map, or where all are at one place by more than 1e-4 units; else
+            float32. A warning tells where cameras are rounded to less than that, as dtype says
 
     Stack those of one size by Camera.stack. Distorted lenses are mapped to this library's; where one cannot be, the error names
     it. One warning names what a file says and nobody reads, unless cameras do not depend on it. Raises FileNotFoundError,
     TypeError, ValueError that names the file, or ImportError without OpenCV or PyYAML (edgegrad[cameras]).
     """
+    unread = Unsupported()
+    views = _views(path, size, images, unread)
+    cameras = _typed(path, [view.camera for view in views.values()], dtype, unread)
+    return {name: View(c, view.image) for (name, view), c in zip(views.items(), cameras, strict=True)}
+
+
+def _views(
+    path: PathLike, size: tuple[int, int] | None, images: PathLike | None, unread: Unsupported
+) -> dict[str, View]:
+    """In float64."""
     folder = Path(path) if isinstance(path, (str, os.PathLike)) else None
     if folder is not None and folder.is_dir():
-        place, unread = colmap.find(folder), Unsupported()
+        place = colmap.find(folder)
         if place is None and (folder / "transforms.json").is_file():
-            return load_cameras(folder / "transforms.json", size, images, dtype)
+            return _views(folder / "transforms.json", size, images, unread)
         if place is None:
             raise FileNotFoundError(
                 f"{path}: expected cameras and images of COLMAP (.bin or .txt) or transforms.json, got a folder without; "
                 "name the one that has them"
             )
         with naming(path):
-            views = _some(colmap.read(place, None if images is None else Path(images), dtype, unread))
+            views = _some(colmap.read(place, None if images is None else Path(images), unread))
         colmap.note_others(folder, place, unread)
-        unread.say(path, UNREAD)
         return views
     file = check_readable(path, (".json", *CALIBRATIONS, *GLTFS))
-    whole, unread = None if size is None else _whole(size), Unsupported()
+    whole = None if size is None else _whole(size)
     with naming(path):
+        if file.suffix.lower() != ".json":
+            _check_no_images(images)
         if file.suffix.lower() in GLTFS:
             if whole is None:
                 raise ValueError(
                     "size: expected (height, width) in pixels for the cameras of a glTF, got None; pass size="
                 )
-            return _some({name: View(camera, None) for name, camera in read_cameras(path, whole, dtype).items()})
+            return _some({name: View(camera, None) for name, camera in read_cameras(path, whole).items()})
         if file.suffix.lower() in CALIBRATIONS:
-            views = calibration.read(file, whole, dtype, unread)
-            unread.say(path, UNREAD)
-            return views
-        fields = json.loads(file.read_text(encoding="utf-8"))
+            return calibration.read(file, whole, unread)
+        fields = _json(file)
         if isinstance(fields, dict) and "frames" in fields:
-            views = transforms.read(fields, file.parent, whole, dtype, unread)
-            unread.say(path, UNREAD)
-            return views
-        camera = load_camera(path, dtype)
+            return transforms.read(fields, file.parent, None if images is None else Path(images), whole, unread)
+        _check_no_images(images)
+        camera = _our_camera(fields)
         return {str(i): View(one, None) for i, one in enumerate(camera if camera.batch is not None else [camera])}
+
+
+def _typed(path: PathLike, cameras: list[Camera], dtype: torch.dtype | None, unread: Unsupported) -> list[Camera]:
+    """In the type that is wanted, else in float64 where float32 would move eyes too far. Says what there is to say."""
+    if dtype not in (None, torch.float32, torch.float64):
+        raise TypeError(f"dtype: expected torch.float32, torch.float64 or None, got {dtype!r}")
+    if dtype is not torch.float64:
+        with naming(path):  # numbers beyond the range of float32
+            rounded = [camera.to(torch.float32) for camera in cameras]
+        eyes = torch.cat([camera.eye.reshape(-1, 3) for camera in cameras])
+        moved = float((torch.cat([c.to(torch.float64).eye.reshape(-1, 3) for c in rounded]) - eyes).abs().max())
+        extent = float((eyes.amax(0) - eyes.amin(0)).max())
+        precise = moved > (1e-6 * extent if extent > 0.0 else ALONE)
+        if precise and dtype is torch.float32:
+            unread.note("eyes in float64", f"moved by up to {moved:.2g}, for they are rounded to float32 as dtype says")
+        cameras = cameras if precise and dtype is None else rounded
+    unread.say(path, UNREAD)
+    return cameras
+
+
+def _check_no_images(images: PathLike | None) -> None:
+    if images is not None:
+        raise Fault("images: expected none for a file that names no images, got a folder; leave it out")
 
 
 def _some(views: dict[str, View]) -> dict[str, View]:

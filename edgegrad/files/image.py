@@ -38,13 +38,14 @@ def linear_to_srgb(values: Tensor) -> Tensor:
 class Stored(NamedTuple):
     """An image upright, with the numbers that are in its file."""
 
-    color: Tensor  # (H, W, C) float32, not multiplied by alpha unless the file is an EXR; integers are from 0 to 1
+    # (H, W, C) float32 or, where asked for, float64; not multiplied by alpha unless the file is an EXR; integers are from 0 to 1
+    color: Tensor
     alpha: Tensor | None  # (H, W, 1)
     largest: int | None  # the integer that became 1; None for floating point
 
 
-def read_stored(path: PathLike) -> Stored:
-    """Raises what read_image does."""
+def read_stored(path: PathLike, exact: bool = False) -> Stored:
+    """`exact`: integers of 32 bits in float64, which holds them all. Raises what read_image does."""
     file = check_readable(path, IMAGES)
     oiio = require("OpenImageIO", "OpenImageIO", "reading images")
     hint = oiio.ImageSpec()
@@ -59,20 +60,24 @@ def read_stored(path: PathLike) -> Stored:
             f"{path}: expected at most {MOST_NUMBERS} pixels times channels, got {spec.full_height} × {spec.full_width} × "
             f"{spec.nchannels}; make it smaller"
         )
-    upright = oiio.ImageBufAlgo.reorient(stored) if stored.read(0, 0, True, oiio.FLOAT) else None
-    pixels = None if upright is None else upright.get_pixels(oiio.FLOAT, upright.roi_full)
+    native = stored.nativespec().format
+    deep = exact and native.basetype in (oiio.UINT32, oiio.INT32)  # even to doubles OpenImageIO converts them by floats
+    kind = native.basetype if deep else oiio.FLOAT
+    upright = oiio.ImageBufAlgo.reorient(stored) if stored.read(0, 0, True, kind) else None
+    pixels = None if upright is None else upright.get_pixels(kind, upright.roi_full)
     if pixels is None or (stored.file_format_name == "jpeg" and not _jpeg_ends(file.read_bytes())):
-        raise ValueError(f"{path}: expected a whole image, got one that cannot be read ({_reason(stored)})")
+        reason = _reason(stored)
+        fix = "; save it as 8, 16 or 32 bit, by array.astype(numpy.uint16)" * ("64 bits per sample" in reason)
+        raise ValueError(f"{path}: expected a whole image, got one that cannot be read ({reason}){fix}")
     if file.suffix.lower() in SEVERAL and (opened := oiio.ImageInput.open(str(file))) is not None:
         if opened.seek_subimage(1, 0):
             warn(f"images of {path}", f"{path}: the first of its images is read; save the others as files of their own")
         opened.close()
-    image = torch.from_numpy(np.ascontiguousarray(pixels))
-    native = stored.nativespec().format
     largest = None
     if native.basetype not in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE):
         signed = native.basetype in (oiio.INT8, oiio.INT16, oiio.INT32, oiio.INT64)
         largest = 2 ** (8 * native.basesize() - signed) - 1
+    image = torch.from_numpy(np.ascontiguousarray(pixels / np.float64(largest) if deep else pixels))
     a = stored.spec().alpha_channel
     if a < 0 or image.shape[-1] == 1:
         return Stored(image, None, largest)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..check import check_int
 from ..optional import require
+from ..warnings import warn
 from .image import DISPLAY, read_stored
 from .paths import PathLike
 
@@ -17,6 +18,9 @@ GREY = 8 / 255  # by which channels of a grey image may differ, for JPEG does no
 FAINT = 1 / 8  # whole numbers below this share of their range are labels: no mask covers so little at most
 LOSSY = (".jpg", ".jpeg")  # whose black is noise, and no label
 ROUNDING = 1e-3  # of coverage outside 0 … 1
+FLAT = 0.5  # of pixels of labels that have the same all around; of those of a smooth border there are far fewer
+MOST_LABELS = 64
+BYTE = 255
 LISTED = 8  # labels in an error
 
 
@@ -29,20 +33,45 @@ def read_mask(path: PathLike, label: int | None = None) -> Tensor:
 
     - the alpha channel, unless it is 1 everywhere
     - grey: 1, 8 and 16 bit from black to white, floating point (EXR, float TIFF) from 0 to 1. Whole numbers of which the
-      largest is 1 are labels: 0 beside the object, 1 on it
+      largest is 1 are labels: 0 beside the object, 1 on it. Several are labels where few of them, none of which is 0 or the
+      largest, fill areas, as the greys of a smooth border do not
     - black and one other colour, or of a palette number 0 and another: 1 where it is the other
 
     label  the number of the object in an image of labels: grey of whole numbers, or a palette's numbers. 1 where the image has
-           it, 0 elsewhere, also if it is nowhere. The mask of several is the sum of theirs
+           it, 0 elsewhere. The mask of several is the sum of theirs
 
-    Raises ValueError where it is none of these: several labels without label=, which are named, or a picture in colours; and what
-    read_image() raises. Palettes need Pillow (edgegrad[files]).
+    Raises ValueError where it is none of these: several labels without label=, or none that is this one, which are named, or a
+    picture in colours; and what read_image() raises. Warns of what looks like an inverted mask. Palettes need Pillow
+    (edgegrad[files]).
     """
     if label is not None:
         check_int("label", label, 0, 2**32 - 1)
-    color, alpha, largest = read_stored(path)
+    color, alpha, largest = read_stored(path, exact=True)
     if label is not None:
-        return (_numbers(path, color, largest) == label).float()
+        numbers = _numbers(path, color, largest)
+        chosen = (numbers == label).float()
+        if not bool(chosen.any()):
+            raise ValueError(
+                f"{path}: expected label {label} in it, got {_listed(_used(numbers))}; choose one with label="
+            )
+        return chosen
+    mask = _covered(path, color, alpha, largest)
+    _warn_of_inverted(path, mask)
+    return mask
+
+
+def read_weight(path: PathLike) -> Tensor:
+    """(H, W) float32 from an image file, from 0 to 1 without the sRGB curve: alpha unless it is 1 everywhere, else grey. Whole
+    numbers are no labels here. Raises what read_mask() raises."""
+    color, alpha, _ = read_stored(path)
+    if alpha is not None and bool((alpha != 1.0).any()):
+        return _coverage(path, alpha[..., 0])
+    if color.shape[-1] not in (1, 3) or not _is_grey(color):
+        raise ValueError(f"{path}: expected weights in grey or in an alpha channel, got colours; save them as one")
+    return _coverage(path, color.mean(-1))
+
+
+def _covered(path: PathLike, color: Tensor, alpha: Tensor | None, largest: int | None) -> Tensor:
     if alpha is not None and bool((alpha != 1.0).any()):
         return _coverage(path, alpha[..., 0])
     if color.shape[-1] not in (1, 3):
@@ -52,12 +81,57 @@ def read_mask(path: PathLike, label: int | None = None) -> Tensor:
     if not _is_grey(color):
         return _two_colors(path, color)
     grey = color.mean(-1)
-    if largest is None or float(grey.max()) >= FAINT or Path(path).suffix.lower() in LOSSY:
+    if largest is None or Path(path).suffix.lower() in LOSSY:
+        return _coverage(path, grey)
+    if float(grey.max()) >= FAINT:
+        if (labels := _areas(grey, largest)) is not None:
+            raise _several(
+                path,
+                labels,
+                " (greys between fill areas, as at no smooth border)",
+                ", or save coverage as floating point",
+            )
         return _coverage(path, grey)
     numbers = _whole(grey, largest)
-    if int(numbers.max()) > 1:
-        raise _several(path, numbers.unique().tolist(), " (nothing reaches an eighth of white, so it is no coverage)")
+    most = int(numbers.max())
+    if most > 1:
+        why = " (nothing reaches an eighth of white, so it is no coverage)"
+        if largest > BYTE and BYTE // 2 <= most <= BYTE:
+            why = f" (coverage of {8 * (largest.bit_length() // 8)} bits goes up to {largest}: is it 8 bits, saved in more?)"
+        raise _several(path, _used(numbers), why)
     return numbers.float()
+
+
+def _areas(grey: Tensor, largest: int) -> list[int] | None:
+    """The numbers of an image (H, W) where they look like labels, else None.
+
+    A smooth border is one to a few pixels wide, and its greys are different from one pixel to the next: nearly none has the
+    same grey all around, as nearly all inside of a label have."""
+    between = (grey > 0.0) & (grey < grey.max())
+    count = int(between.sum())
+    if count == 0 or min(grey.shape) < 3:
+        return None
+    low, high = (
+        sign * torch.nn.functional.max_pool2d((sign * grey)[None, None], 3, stride=1)[0, 0] for sign in (-1.0, 1.0)
+    )
+    if int(((low == high) & between[1:-1, 1:-1]).sum()) < FLAT * count:
+        return None
+    numbers = _used(_whole(grey, largest))
+    return numbers if len(numbers) <= MOST_LABELS else None
+
+
+def _warn_of_inverted(path: PathLike, mask: Tensor) -> None:
+    height, width = mask.shape
+    if min(height, width) < 8:
+        return
+    border = torch.cat([mask[0], mask[-1], mask[1:-1, 0], mask[1:-1, -1]])
+    middle = mask[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    if float(border.mean()) > 0.95 and float(middle.mean()) < 0.9:
+        warn(
+            f"inverted {path}",
+            f"{path}: the mask covers the border of the image and {float(middle.mean()):.0%} of its middle; if the object is "
+            "what it leaves out, invert it: 1 - mask",
+        )
 
 
 def _is_grey(color: Tensor) -> bool:
@@ -72,7 +146,7 @@ def _coverage(path: PathLike, values: Tensor) -> Tensor:
             f"{path}: expected coverage from 0 to 1, got {float(values.min()):g} to {float(values.max()):g}; of an image of "
             "labels choose one with label="
         )
-    return values.clamp(0.0, 1.0).contiguous()
+    return values.clamp(0.0, 1.0).float().contiguous()
 
 
 def _numbers(path: PathLike, color: Tensor, largest: int | None) -> Tensor:
@@ -98,7 +172,7 @@ def _two_colors(path: PathLike, color: Tensor) -> Tensor:
         numbers, black = red << 16 | green << 8 | blue, [0]
     else:
         numbers, black = indexed
-    used = torch.bincount(numbers.flatten()).nonzero().flatten().tolist()  # far faster than unique()
+    used = _used(numbers)
     # Number 0 of most palettes is black.
     background = [0] if 0 in black else [number for number in used if number in black] or [0]
     labels = [number for number in used if number not in background]
@@ -112,9 +186,20 @@ def _two_colors(path: PathLike, color: Tensor) -> Tensor:
     return (numbers == labels[0]).float() if labels else torch.zeros(numbers.shape)
 
 
-def _several(path: PathLike, labels: list[int], why: str = "") -> ValueError:
-    shown = ", ".join(map(str, sorted(labels)[:LISTED])) + ", …" * (len(labels) > LISTED)
-    return ValueError(f"{path}: expected a mask of one object, got the labels {shown}{why}; choose one with label=")
+def _several(path: PathLike, labels: list[int], why: str = "", otherwise: str = "") -> ValueError:
+    return ValueError(
+        f"{path}: expected a mask of one object, got {_listed(labels)}{why}; choose one with label={otherwise}"
+    )
+
+
+def _listed(labels: list[int]) -> str:
+    return "the labels " + ", ".join(map(str, sorted(labels)[:LISTED])) + ", …" * (len(labels) > LISTED)
+
+
+def _used(numbers: Tensor) -> list[int]:
+    if numbers.is_floating_point() or int(numbers.min()) < 0 or int(numbers.max()) > 65535:
+        return numbers.unique().tolist()
+    return torch.bincount(numbers.flatten()).nonzero().flatten().tolist()  # far faster
 
 
 def _indexed(path: PathLike) -> tuple[Tensor, list[int]] | None:

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import torch
 
 from ..camera.camera import Camera
 from ..scene.material import Material
@@ -49,15 +48,15 @@ def read_model(path: PathLike, wanted: Wanted) -> Model:
     return model
 
 
-def read_cameras(path: PathLike, size: tuple[int, int], dtype: torch.dtype) -> dict[str, Camera]:
-    """Those of a glTF or GLB file, by name. Raises Fault, FileNotFoundError or ValueError."""
+def read_cameras(path: PathLike, size: tuple[int, int]) -> dict[str, Camera]:
+    """Those in float64 of a glTF or GLB file, by name. Raises Fault, FileNotFoundError or ValueError."""
     file = check_readable(path, GLTFS)
     data, kind = file.read_bytes(), file.suffix.lower()[1:]
     check_disguised(data, f"a {kind.upper()} file")
     with _as_fault(kind):
         tree = gltf.read(data, kind).tree
         with explained(tree):
-            return cameras(tree, size, dtype)
+            return cameras(tree, size)
 
 
 @contextmanager

@@ -178,8 +178,8 @@ def warn_of_faint(name: str, masks: Sequence[Tensor]) -> None:
     if 0.0 < most < FAINT:
         warn(
             f"faint {name}",
-            f"{name}: expected 1 where the object covers the pixel, got at most {most:.3g}; read the file with read_mask(path), "
-            "which undoes no sRGB curve and knows labels, or divide by the largest number",
+            f"{name}: expected 1 where the object covers the pixel, got at most {most:.3g}; divide by that number, or choose the "
+            "object's label if the file has labels. read_image() is not for masks, for it undoes an sRGB curve: read_mask() is",
         )
 
 

@@ -71,16 +71,16 @@ class _Fields:
         return otherwise
 
 
-def read(file: Path, size: tuple[int, int] | None, dtype: torch.dtype, unread: Unsupported) -> dict[str, View]:
+def read(file: Path, size: tuple[int, int] | None, unread: Unsupported) -> dict[str, View]:
     """By name: that of a matrix of a pair, of a camera of ROS or Kalibr, else "camera", or "view 0" … where the file has several
     poses. Raises Fault, or ImportError without OpenCV or PyYAML."""
     values = read_keys(file)
     if kalibr.is_chain(values):
-        return kalibr.read(values, dtype, unread)
+        return kalibr.read(values, unread)
     fields = _Fields(values)
     pair = next((pair for pair in PAIRS if all(name in values for name in pair)), None)
     try:
-        views = _single(fields, size, dtype) if pair is None else _stereo(fields, pair, file, size, dtype, unread)
+        views = _single(fields, size) if pair is None else _stereo(fields, pair, file, size, unread)
     except ValueError as error:
         raise Fault(str(error)) from error
     known = fields.read | HARMLESS
@@ -95,7 +95,7 @@ def read(file: Path, size: tuple[int, int] | None, dtype: torch.dtype, unread: U
     return views
 
 
-def _single(fields: _Fields, size: tuple[int, int] | None, dtype: torch.dtype) -> dict[str, View]:
+def _single(fields: _Fields, size: tuple[int, int] | None) -> dict[str, View]:
     K, distortion = _lens(fields, MATRICES, COEFFICIENTS)
     poses = fields.matrix("extrinsic_parameters")
     poses = np.zeros((1, 6)) if poses is None else poses
@@ -107,7 +107,7 @@ def _single(fields: _Fields, size: tuple[int, int] | None, dtype: torch.dtype) -
     named = fields.values.get("camera_name")
     name = named if isinstance(named, str) and named else "camera"
     return {
-        name if len(poses) == 1 else f"view {i}": _view(pose[:3], pose[3:], K, distortion, whole, fisheye, dtype)
+        name if len(poses) == 1 else f"view {i}": _view(pose[:3], pose[3:], K, distortion, whole, fisheye)
         for i, pose in enumerate(poses)
     }
 
@@ -117,7 +117,6 @@ def _stereo(
     pair: tuple[str, str],
     file: Path,
     size: tuple[int, int] | None,
-    dtype: torch.dtype,
     unread: Unsupported,
 ) -> dict[str, View]:
     """The first camera at the origin, the second by R and T: of this file, or of extrinsics beside intrinsics, as OpenCV's
@@ -136,7 +135,7 @@ def _stereo(
     views = {}
     for name, coefficients, turn, shift in zip(pair, PAIRS[pair], (np.zeros(3), R), (np.zeros(3), T), strict=True):
         K, distortion = _lens(fields, (name,), (coefficients,))
-        views[name] = _view(turn, shift, K, distortion, whole, fisheye, dtype)
+        views[name] = _view(turn, shift, K, distortion, whole, fisheye)
     return views
 
 
@@ -170,7 +169,6 @@ def _is_fisheye(fields: _Fields) -> bool:
 
 def _view(
     turn: np.ndarray, shift: np.ndarray, K: np.ndarray, distortion: np.ndarray | None, size: tuple[int, int], fisheye: bool,
-    dtype: torch.dtype,
 ) -> View:  # fmt: skip
     """`turn` is a rotation matrix or vector."""
     if turn.size == 9:
@@ -180,7 +178,7 @@ def _view(
         turn = cv2.Rodrigues(turn.reshape(3))[0]
     else:
         turn = np.eye(3)
-    R, t, k = (torch.tensor(values, dtype=dtype) for values in (turn, shift.reshape(3), K))
-    coefficients = None if distortion is None else torch.tensor(distortion.reshape(-1), dtype=dtype)
+    R, t, k = (torch.tensor(values, dtype=torch.float64) for values in (turn, shift.reshape(3), K))
+    coefficients = None if distortion is None else torch.tensor(distortion.reshape(-1), dtype=torch.float64)
     make = Camera.fisheye if fisheye else Camera.from_opencv
     return View(make(R, t, k, size, coefficients), None)

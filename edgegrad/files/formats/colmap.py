@@ -57,7 +57,7 @@ def note_others(folder: Path, place: Path, unread: Unsupported) -> None:
                 unread.note(f"sparse/{other.name}", "a reconstruction of its own; load it by its folder")
 
 
-def read(folder: Path, images: Path | None, dtype: torch.dtype, unread: Unsupported) -> dict[str, View]:
+def read(folder: Path, images: Path | None, unread: Unsupported) -> dict[str, View]:
     """By the names of the images that have a pose, in their order. Raises Fault."""
     binary = all((folder / f"{name}.bin").is_file() for name in ("cameras", "images"))
     cameras_file, images_file = (folder / f"{name}.{'bin' if binary else 'txt'}" for name in ("cameras", "images"))
@@ -79,9 +79,9 @@ def read(folder: Path, images: Path | None, dtype: torch.dtype, unread: Unsuppor
     for image in sorted(found, key=lambda image: image.name):
         try:
             lens = lenses[image.camera]
-            pose = torch.tensor(image.pose, dtype=dtype)
+            pose = torch.tensor(image.pose, dtype=torch.float64)
             camera = Camera.from_colmap(
-                pose[:4], pose[4:], lens.model, torch.tensor(lens.params, dtype=dtype), lens.size
+                pose[:4], pose[4:], lens.model, torch.tensor(lens.params, dtype=torch.float64), lens.size
             )
         except KeyError:
             raise Fault(f"{image.name!r}: expected its camera {image.camera}, got none; export it again") from None

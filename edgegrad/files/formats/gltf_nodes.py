@@ -119,9 +119,9 @@ def _cone(light: dict[str, Any], source: Source) -> tuple[float, float]:
     return start, end
 
 
-def cameras(tree: dict[str, Any], size: tuple[int, int], dtype: torch.dtype) -> dict[str, Camera]:
-    """By the names of their nodes and in their order, (H, W) pixels, which are square: of aspectRatio, yfov and ymag these give
-    the height. Raises Fault, or ValueError about the size."""
+def cameras(tree: dict[str, Any], size: tuple[int, int]) -> dict[str, Camera]:
+    """In float64, by the names of their nodes and in their order, (H, W) pixels, which are square: of aspectRatio, yfov and
+    ymag these give the height. Raises Fault, or ValueError about the size."""
     found: dict[str, Camera] = {}
     for node, world, _ in placed(tree):  # also where nothing else of it is visible
         if "camera" not in node:
@@ -130,14 +130,14 @@ def cameras(tree: dict[str, Any], size: tuple[int, int], dtype: torch.dtype) -> 
         name = f"{name} ({len(found)})" if name in found else name
         given = entry(tree, "cameras", node["camera"])
         length = np.linalg.norm(world[:3, :3], axis=0)  # a camera has no scale
-        pose = torch.tensor(world, dtype=dtype)
+        pose = torch.tensor(world, dtype=torch.float64)
         pose[:3, :3] /= torch.tensor(np.where(length > 0.0, length, 1.0))
         kind = given.get("type")
         if kind == "perspective":
             found[name] = Camera.from_opengl(pose, size, math.degrees(given["perspective"]["yfov"]))
         elif kind == "orthographic":
             scale = size[0] / (2.0 * given["orthographic"]["ymag"])
-            K = [[scale, 0.0, size[1] / 2], [0.0, scale, size[0] / 2], [0.0, 0.0, 1.0]]
+            K = pose.new_tensor([[scale, 0.0, size[1] / 2], [0.0, scale, size[0] / 2], [0.0, 0.0, 1.0]])
             found[name] = dataclasses.replace(Camera.from_opengl(pose, size, K=K), projection="orthographic")
         else:
             raise Fault(f"expected a camera of type perspective or orthographic, got {kind!r}; export it again")

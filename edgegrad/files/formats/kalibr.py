@@ -26,7 +26,7 @@ def is_chain(fields: Mapping[str, Any]) -> bool:
     return any(NAME.fullmatch(name) and isinstance(value, dict) for name, value in fields.items())
 
 
-def read(fields: Mapping[str, Any], dtype: torch.dtype, unread: Unsupported) -> dict[str, View]:
+def read(fields: Mapping[str, Any], unread: Unsupported) -> dict[str, View]:
     """By the chain's names. The world is the first camera's: it stands at the origin. Raises Fault."""
     names = sorted(filter(NAME.fullmatch, fields), key=lambda name: int(name[3:]))
     views: dict[str, View] = {}
@@ -41,7 +41,7 @@ def read(fields: Mapping[str, Any], dtype: torch.dtype, unread: Unsupported) -> 
                 pose = _matrix(given, "T_cn_cnm1", (4, 4)) @ pose
             elif views:
                 unread.note(f"{name} without T_cn_cnm1", f"it stands where {list(views)[-1]} does")
-            views[name] = View(_camera(given, pose, dtype), None)
+            views[name] = View(_camera(given, pose), None)
         except (Fault, ValueError) as error:
             raise Fault(f"{name}: {error}") from error
         note_unread(given, READ | HARMLESS, unread, INSTEAD)
@@ -49,7 +49,7 @@ def read(fields: Mapping[str, Any], dtype: torch.dtype, unread: Unsupported) -> 
     return views
 
 
-def _camera(given: Mapping[str, Any], pose: np.ndarray, dtype: torch.dtype) -> Camera:
+def _camera(given: Mapping[str, Any], pose: np.ndarray) -> Camera:
     """Raises Fault or ValueError."""
     model, bend = given.get("camera_model", "pinhole"), given.get("distortion_model", "none")
     if model != "pinhole":
@@ -61,9 +61,9 @@ def _camera(given: Mapping[str, Any], pose: np.ndarray, dtype: torch.dtype) -> C
     width, height = _matrix(given, "resolution", (1, 2))[0]
     coefficients = None
     if bend != "none":
-        coefficients = torch.tensor(_matrix(given, "distortion_coeffs", (1, 4))[0], dtype=dtype)
+        coefficients = torch.tensor(_matrix(given, "distortion_coeffs", (1, 4))[0], dtype=torch.float64)
     R, t, K = (
-        torch.tensor(values, dtype=dtype)
+        torch.tensor(values, dtype=torch.float64)
         for values in (pose[:3, :3], pose[:3, 3], np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     )
     make = Camera.fisheye if bend in EQUIDISTANT else Camera.from_opencv

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Container, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,9 @@ from .source import Unsupported
 
 MOST_NUMBERS = 1 << 20  # of a matrix; YAML's references announce more than they hold
 MOST_PIXELS = 1 << 24  # on a side
+DEEP = 1000
+INDENT = re.compile(rb"(?<![ \t?-])[ \t?-]{1000}")
+ELEMENT = re.compile(r"([1-4]?)[ucwsifdh]")  # of OpenCV's matrices: how many channels, and their type
 OPENCV = ("%YAML:", "opencv-matrix", "opencv_storage")  # in files of cv2.FileStorage
 
 
@@ -21,10 +26,13 @@ def read_keys(file: Path) -> dict[str, Any]:
     """Numbers, text, lists, dicts and, of OpenCV, arrays. Raises Fault or ImportError."""
     text = file.read_text(encoding="utf-8", errors="replace")
     if file.suffix.lower() == ".xml" or any(mark in text for mark in OPENCV):
+        if _is_deep(text.encode()):  # on which OpenCV ends the process
+            raise Fault(f"expected a calibration, got lists or keys inside one another more than {DEEP} times")
         return _of_opencv(file)
     yaml = require("yaml", "edgegrad[cameras]", "reading YAML")
     try:
-        found = yaml.safe_load(text)
+        # Of several documents the first: a message of ROS, which `ros2 topic echo` ends by ---.
+        found = next((document for document in yaml.safe_load_all(text) if document is not None), None)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise Fault(f"expected YAML, got a file that PyYAML does not read ({' '.join(str(error).split())})") from error
     if not isinstance(found, dict):
@@ -37,22 +45,45 @@ def _of_opencv(file: Path) -> dict[str, Any]:
     try:
         storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
         root = storage.root()
-        return _value(root, cv2.error) if root.isMap() else {}
-    except (cv2.error, SystemError) as error:
+        return _value(root) if root.isMap() else {}
+    except (cv2.error, SystemError, RecursionError) as error:
         raise Fault("expected YAML or XML of cv2.FileStorage, got a file that OpenCV does not read") from error
 
 
-def _value(node: Any, error: type[Exception]) -> Any:
+def _is_deep(text: bytes) -> bool:
+    """By brackets, by tags, or by what YAML begins a line with."""
+    letters = np.frombuffer(text + b" ", np.uint8)
+    first, second = letters[:-1], letters[1:]
+    brackets = np.isin(first, list(b"[{")).astype(np.int64) - np.isin(first, list(b"]}"))
+    tag, slash = first == ord("<"), ord("/")
+    tags = (tag & ~np.isin(second, list(b"/!?"))).astype(np.int64) - (tag & (second == slash))
+    tags -= (first == slash) & (second == ord(">"))
+    return max(brackets.cumsum().max(), tags.cumsum().max()) > DEEP or INDENT.search(text) is not None
+
+
+def _value(node: Any) -> Any:
     if node.isSeq():
-        return [_value(node.at(i), error) for i in range(node.size())]
+        return [_value(node.at(i)) for i in range(node.size())]
     if node.isMap():
-        try:
-            matrix = node.mat()
-            return np.zeros((0, 0)) if matrix is None else matrix
-        except error:  # no matrix of OpenCV
-            names = node.keys()
-            return {name: _value(node.getNode(name), error) for name in names}
+        names = node.keys()
+        return _matrix(node) if {"dt", "data"} <= set(names) else {n: _value(node.getNode(n)) for n in names}
     return node.string() if node.isString() else node.real() if node.isInt() or node.isReal() else None
+
+
+def _matrix(node: Any) -> np.ndarray:
+    """Raises Fault, or cv2.error. Checked before OpenCV reads it, which writes past its memory where numbers do not match."""
+    shape, data, dt = node.getNode("sizes"), node.getNode("data"), node.getNode("dt")
+    sides = [shape.at(i) for i in range(shape.size())] if shape.isSeq() else [node.getNode(n) for n in ("rows", "cols")]
+    known = ELEMENT.fullmatch(dt.string()) if dt.isString() else None
+    count = data.size() if data.isSeq() else int(data.isInt() or data.isReal())
+    sizes = [node.real() if node.isInt() else -1.0 for node in sides]
+    if known is None or min(sizes, default=-1.0) < 0 or math.prod(sizes) * int(known[1] or 1) != count:
+        shown = " × ".join(f"{size:g}" if size >= 0 else "?" for size in sizes)
+        raise Fault(
+            f"{node.name()}: expected rows, cols and dt of a matrix of OpenCV and as many numbers, got {shown}, dt "
+            f"{dt.string() if dt.isString() else 'none'!r} and {count} numbers; save it again by cv2.FileStorage"
+        )
+    return node.mat() if count else np.zeros((0, 0))
 
 
 def matrix(name: str, value: object) -> np.ndarray:
@@ -62,6 +93,8 @@ def matrix(name: str, value: object) -> np.ndarray:
             return value.astype(np.float64)
         if isinstance(value, dict):
             flat, shape = value["data"], (int(value["rows"]), int(value["cols"]))
+            if min(shape) < 0:  # which reshape() would choose
+                raise ValueError(f"{shape[0]} rows and {shape[1]} columns")
             return np.array([float(x) for x in flat]).reshape(shape)
         rows: Any = value if isinstance(value, list) and value and isinstance(value[0], list) else [value]
         if sum(map(len, rows)) > MOST_NUMBERS:

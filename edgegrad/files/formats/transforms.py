@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from os.path import isfile  # False also of names that no file can have
-from pathlib import Path
-from typing import Any
+from os.path import isfile, normpath  # isfile: False also of names that no file can have
+from pathlib import Path, PureWindowsPath
+from typing import Any, NamedTuple
 
 import torch
 
@@ -37,29 +37,63 @@ INSTEAD = {
 }
 
 
+class Found(NamedTuple):
+    """What a file_path leads to."""
+
+    file: Path | None
+    outside: bool  # of the folder, so that nobody looks there
+
+
 def read(
-    fields: Mapping[str, Any], folder: Path, size: tuple[int, int] | None, dtype: torch.dtype, unread: Unsupported
+    fields: Mapping[str, Any], folder: Path, images: Path | None, size: tuple[int, int] | None, unread: Unsupported
 ) -> dict[str, View]:
-    """By the frames' file_path. What a frame says goes before what the file says of all. Raises Fault."""
+    """By the frames' file_path. What a frame says goes before what the file says of all. Images lie in `folder`, that of the
+    file, or below it; or in `images` or below it. Raises Fault."""
     frames = fields["frames"]
     if not isinstance(frames, list) or not frames:
         raise Fault("frames: expected a list of frames, got none; export it again")
     shared = _given(fields)
     views: dict[str, View] = {}
+    lost: list[str] = []
+    outside: list[str] = []
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict) or "transform_matrix" not in frame:
             raise Fault(f"frames[{i}]: expected transform_matrix, 4 × 4, got none; export it again")
         own = _given(frame)
         name = str(own.get("file_path", i))
         try:
-            image = _image(folder, name) if "file_path" in own else None
-            view = View(_camera(own, shared, image, size, dtype), image)
+            found = Found(None, False)
+            if "file_path" in own:
+                found = _beside(folder, name) if images is None else Found(_below(images, name), False)
+                if found.file is None:
+                    (outside if found.outside else lost).append(name)
+            view = View(_camera(own, shared, found, size), found.file)
         except (Fault, TypeError, ValueError, KeyError, OverflowError) as error:
             raise Fault(f"frames[{i}], {name}: {error}") from error
         views[name if name not in views else f"{name} (frame {i})"] = view
         note_unread(own, READ | HARMLESS, unread, INSTEAD)
     note_unread(shared, READ | HARMLESS, unread, INSTEAD)
+    for names, why in (
+        (lost, "no such file"),
+        (outside, "outside of the file's folder, where nobody looks; pass their folder as images="),
+    ):
+        if names:
+            unread.note(f"{len(names)} of {len(frames)} images, as {names[0]!r}", f"View.image is None: {why}")
+    _check_apart(views, images)
     return views
+
+
+def _check_apart(views: Mapping[str, View], images: Path | None) -> None:
+    """No two paths lead to one file. Raises Fault."""
+    known: dict[Path, tuple[str, tuple[str, ...]]] = {}
+    for name, view in views.items():
+        if images is not None and view.image is not None:
+            other, parts = known.setdefault(view.image, (name, _parts(name)))
+            if parts != _parts(name) and " (frame " not in name:
+                raise Fault(
+                    f"images: expected a folder that has {other!r} and {name!r} apart, got {images}, where both are "
+                    f"{view.image.name}; pass the one above"
+                )
 
 
 def _given(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -67,49 +101,69 @@ def _given(fields: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in fields.items() if value is not None}
 
 
-def _image(folder: Path, name: str) -> Path | None:
+def _beside(folder: Path, name: str) -> Found:
     """Beside the file or below it; the synthetic scenes leave out the ending, and Windows writes backslashes."""
+    inside = folder.resolve()
+    outside = PureWindowsPath(name).is_absolute() or normpath(name.replace("\\", "/")).startswith(("..", "/"))
     for stem in dict.fromkeys((name, name.replace("\\", "/"))):
         for ending in ("", *IMAGES):
             file = folder / f"{stem}{ending}"
-            if isfile(file) and file.resolve().is_relative_to(folder.resolve()):
+            if isfile(file):
+                if file.resolve().is_relative_to(inside):
+                    return Found(file, False)
+                outside = True
+    return Found(None, outside)
+
+
+def _below(images: Path, name: str) -> Path | None:
+    """By as much of the path's end as leads to a file."""
+    parts = _parts(name)
+    for first in range(len(parts)):
+        for ending in ("", *IMAGES):
+            file = images.joinpath(*parts[first:-1], f"{parts[-1]}{ending}")
+            if isfile(file):
                 return file
     return None
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    return tuple(part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..") and ":" not in part)
 
 
 def _camera(
     own: Mapping[str, Any],
     shared: Mapping[str, Any],
-    image: Path | None,
+    found: Found,
     size: tuple[int, int] | None,
-    dtype: torch.dtype,
 ) -> Camera:
     given = {**shared, **own}
     if "w" in given and "h" in given:
         H, W = image_size(float(given["w"]), float(given["h"]))
     elif size is not None:
         H, W = size
-    elif image is not None:
-        H, W = read_size(image)
+    elif found.file is not None:
+        H, W = read_size(found.file)
     else:
+        why = ": it is outside of the file's folder, where nobody looks" * found.outside
         raise ValueError(
-            "w and h: expected the image's size, or the image itself, got neither; pass size=(height, width)"
+            f"w and h: expected the image's size, or the image itself, got neither{why}; pass size=(height, width), or the "
+            "images' folder as images="
         )
-    pose = torch.tensor(given["transform_matrix"], dtype=dtype)
+    pose = torch.tensor(given["transform_matrix"], dtype=torch.float64)
     model = _model(own, shared)
     fx, fy = _focals(own, shared, (W, H))
     cx, cy = float(given.get("cx", 0.5 * W)), float(given.get("cy", 0.5 * H))
-    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=dtype)
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
     k1, k2, k3, k4, p1, p2 = (float(given.get(key, 0.0)) for key in COEFFICIENTS)
     camera = Camera.from_opengl(pose, (H, W), K=K)
     if model in FISHEYES:
         if p1 or p2:
             raise ValueError(f"p1, p2: expected 0 of a fisheye, got {p1:g} and {p2:g}; undistort the images")
-        return camera.replace(projection="fisheye", distortion=torch.tensor([k1, k2, k3, k4], dtype=dtype))
+        return camera.replace(projection="fisheye", distortion=torch.tensor([k1, k2, k3, k4], dtype=torch.float64))
     if k4 != 0.0:
         raise ValueError(f"k4: expected 0 of a lens that is no fisheye, got {k4:g}; undistort the images")
     coefficients = [k1, k2, p1, p2, k3] if k3 else [k1, k2, p1, p2]
-    return camera.replace(distortion=torch.tensor(coefficients, dtype=dtype)) if any(coefficients) else camera
+    return camera.replace(distortion=torch.tensor(coefficients, dtype=torch.float64)) if any(coefficients) else camera
 
 
 def _model(own: Mapping[str, Any], shared: Mapping[str, Any]) -> str:
@@ -148,4 +202,8 @@ def _focals(own: Mapping[str, Any], shared: Mapping[str, Any], pixels: tuple[int
 def _focal(fields: Mapping[str, Any], key: str, angle: str, pixels: int) -> float | None:
     if key in fields:
         return float(fields[key])
-    return 0.5 * pixels / math.tan(0.5 * float(fields[angle])) if angle in fields else None
+    if angle not in fields:
+        return None
+    if not 0.0 < (given := float(fields[angle])) < math.pi:  # nor NaN
+        raise ValueError(f"{angle}: expected radians between 0 and π, got {given:g}; of degrees take math.radians()")
+    return 0.5 * pixels / math.tan(0.5 * given)

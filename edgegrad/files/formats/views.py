@@ -12,4 +12,4 @@ class View(NamedTuple):
     """What load_cameras() finds of each image."""
 
     camera: Camera
-    image: Path | None  # the image's file; None where none is named, or it is not there
+    image: Path | None  # the image's file; None where none is named, or none found: see load_cameras
