@@ -121,7 +121,7 @@ def test_a_failed_write_still_prints_the_pose(files, capsys, monkeypatch):
         (["mesh.ply", "none.png"], "none.png: expected a file"),
         (["mesh.ply", "mesh.ply"], "mesh.ply: expected a file name that ends in"),
         (["mesh.ply", "target.png", "--camera", "bad.json"], "bad.json: "),
-        (["mesh.ply", "target.png", "--camera", "init.json"], "init.json: K: expected"),
+        (["mesh.ply", "target.png", "--camera", "init.json"], "init.json: expected a JSON object with K"),
         (["mesh.ply", "target.png", "--camera", "camera.json", "--fov", "30"], "--camera: expected none of --fov"),
         (["mesh.ply", "target.png", "--camera", "wide.json"], "wide.json: expected a camera for 48 × 48 pixels"),
         (["mesh.ply", "target.png", "--init", "none.json"], "none.json: expected a file"),
