@@ -172,3 +172,12 @@ def test_a_headlight_shines_only_where_nothing_says_a_look() -> None:
 def test_a_trimesh_without_faces_is_named() -> None:
     with pytest.raises(ValueError, match=r"mesh: expected a trimesh\.Trimesh with faces"):
         eg.Mesh.from_trimesh(trimesh.Trimesh())
+
+
+def test_two_textured_objs_in_one_folder(tmp_path):
+    uvs, faces = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), torch.tensor([[0, 1, 2]])
+    names = ("a.obj", "b c.obj")
+    for name, value in zip(names, (0.0, 1.0), strict=True):
+        texture = torch.full((2, 2, 3), value)
+        eg.save_mesh(tmp_path / name, eg.Mesh(torch.eye(3), faces, uvs=uvs, uv_faces=faces, texture=texture))
+    assert [float(eg.load_mesh(tmp_path / name).texture.mean()) for name in names] == [0.0, 1.0]

@@ -119,7 +119,7 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
         made, lost = to_trimesh(mesh, faces_colored=kind != "obj"), _left_out(mesh, kind)
         dtype = _array(mesh.verts).dtype
         if kind == "obj":
-            content, beside = to_obj(made, dtype, f"{file.stem}.mtl")
+            content, beside = to_obj(made, dtype, file.stem)
         else:
             content = to_off(made, dtype) if kind == "off" else made.export(file_type=kind)
     if kind in ("ply", "stl", "glb") and rounding(mesh.verts.detach().cpu().numpy())[1]:

@@ -18,14 +18,17 @@ def to_off(made: Any, dtype: np.dtype) -> str:
     return f"OFF\n{len(verts)} {len(faces)} 0\n{_rows('', verts, dtype)}{_rows('3 ', faces, faces.dtype)}"
 
 
-def to_obj(made: Any, dtype: np.dtype, name: str) -> tuple[str, dict[str, bytes]]:
-    """The file, and those that lie beside it: the material library of this name, and the image."""
+def to_obj(made: Any, dtype: np.dtype, stem: str) -> tuple[str, dict[str, bytes]]:
+    """The file, and those that lie beside it: the material library of this stem, and the image, so that two files in one folder
+    have their own."""
     faces, rows, visual = made.faces + 1, made.vertices, made.visual
     if visual.kind != "texture":
         if visual.kind is not None:
             rows = np.column_stack([rows, visual.vertex_colors[:, :3] / 255.0])
         return _rows("v ", rows, dtype) + _rows("f ", faces, faces.dtype), {}
-    beside, material = visual.material.to_simple().to_obj(name="material_0")
+    # Names of materials and images end at a space for many readers.
+    beside, material = visual.material.to_simple().to_obj(name="_".join(stem.split()))
+    name = f"{stem}.mtl"
     beside[name] = beside.pop(f"{material}.mtl")
     corners = np.repeat(faces, 2, axis=1)  # a vertex has one texture coordinate
     text = (
