@@ -140,9 +140,9 @@ def _in_front(g: Tensor, v: Tensor) -> Tensor:
 def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tensor:
     """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours."""
     note_jumps(hits)
-    # The kernel knows of no texel but that in which a point lies.
-    in_kernel_ = isinstance(hits._view, View) and is_fused(hits._surfaces.scene) and not hits._steps.forced
-    L = in_kernel.radiance(hits, shadows, light_samples) if in_kernel_ else reference(hits, shadows, light_samples)
+    # Where steps are forced to a side PyTorch shades, for the kernel looks up the texel in which a point lies.
+    fused = isinstance(hits._view, View) and is_fused(hits._surfaces.scene) and not hits._steps.forced
+    L = in_kernel.radiance(hits, shadows, light_samples) if fused else reference(hits, shadows, light_samples)
     lamps = _moving_lamps(hits)
     return L + _of_moving_borders(hits, lamps, Lighting(shadows, light_samples)) if lamps else L
 
