@@ -90,14 +90,25 @@ def render_aovs(
     )
     if any(name in IDS for name in names):
         found |= {name: ids.to(device) for name, ids in _ids(scene, faces_at_centers(request, batched)).items()}
-    rendered = [name for name in AOVS if name in names and name not in (*IDS, *found)]
+    rendered = [name for name in names if name not in (*IDS, *found)]
     if rendered:
-        if rendered != ["image"]:
-            request = _with_channels(request, rendered)
-        widths = [{"image": scene.channels, "alpha": 1, "depth": 1, "uv": 2}.get(n, 3) for n in rendered]
-        parts = render_image(request, batched).to(device).split(widths, dim=-1)
-        found |= dict(zip(rendered, parts, strict=True))
+        image = render_image(with_channels(request, rendered), batched).to(device)
+        found |= by_name(scene, rendered, image)
     return {name: found[name] for name in names}
+
+
+def aovs_request(scene: Scene, camera: Camera, aovs: Sequence[str], spp: int, seed: int) -> Request:
+    """What the kernel is asked for channels that it makes alone: no ids, and of a scene that is lit no image."""
+    radiance = "image" in aovs
+    request = make_request(scene if radiance else _without_radiance(scene), camera, spp, seed, all_uvs="uv" in aovs)
+    return with_channels(request, aovs)
+
+
+def by_name(scene: Scene, aovs: Sequence[str], image: Tensor) -> dict[str, Tensor]:
+    """The parts (…, c) of what the kernel makes of with_channels()."""
+    rendered = [name for name in AOVS if name in aovs]
+    widths = [{"image": scene.channels, "alpha": 1, "depth": 1, "uv": 2}.get(n, 3) for n in rendered]
+    return dict(zip(rendered, image.split(widths, dim=-1), strict=True))
 
 
 def check_aovs(aovs: Sequence[str]) -> list[str]:
@@ -135,8 +146,10 @@ def _without_radiance(scene: Scene) -> Scene:
     return Scene([bare(mesh) for mesh in scene.meshes])
 
 
-def _with_channels(request: Request, names: Sequence[str]) -> Request:
-    """The request of an image with these channels, in the order of AOVS."""
+def with_channels(request: Request, names: Sequence[str]) -> Request:
+    """The request of an image with these channels, in the order of AOVS; so are those of vertices: position, depth, normal."""
+    if list(names) == ["image"]:
+        return request
     flat, camera = request.scene, request.camera
     if "image" not in names:
         flat = flat._replace(colors=flat.colors[:, :0], texels=flat.texels[:, :0], background=flat.background[..., :0])

@@ -7,7 +7,7 @@ import torch
 from torch_scenes import ADJOINT, CAMERA, F32, F64, SIZE, TRIANGLE, mixed_scene
 
 import edgegrad as eg
-from edgegrad.aovs import _with_channels
+from edgegrad.aovs import with_channels
 from edgegrad.kernel.request import SLOTS, make_request
 
 
@@ -21,7 +21,7 @@ SCENES = {"colors": lambda: TRIANGLE, "mixed": mixed_scene, "float32": lambda: T
 @pytest.mark.parametrize("wanted", ["11111111111", "10000110000"])
 def test_opcheck_of_channels_beside_the_image(wanted):
     names = ["image", "alpha", "position", "depth", "shading_normal", "normal", "barycentrics"]
-    inputs = _with_channels(make_request(TRIANGLE, CAMERA, 4, surface_samples=200, edge_samples=200), names).pack()
+    inputs = with_channels(make_request(TRIANGLE, CAMERA, 4, surface_samples=200, edge_samples=200), names).pack()
     image, *forward = torch.ops.edgegrad.render(*inputs)
     assert image.shape == (1, SIZE, SIZE, 17)
     torch.library.opcheck(torch.ops.edgegrad.render.default, inputs)

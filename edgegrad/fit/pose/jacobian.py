@@ -1,0 +1,99 @@
+"""Derivatives of renders as a scene and the lens that sees it move, in all directions of one pass of forward mode.
+
+A point x of a scene that turns, grows and shifts has the tangent A x + b with A = [ω]ₓ + s 1, and a direction n the tangent
+[ω]ₓ n. That is all the kernel needs to know, so nothing here is differentiated by torch: its own forward mode would load rules
+for seconds at its first call in a process.
+
+What comes out is an estimate from samples that are independent of those of the image: J, and Jᵀr with any function r of the
+image, are unbiased; JᵀJ is higher than its limit by the variance of J.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...aovs import IDS, aovs_request, by_name, check_aovs
+from ...camera.camera import Camera
+from ...camera.lens import MOST
+from ...kernel.operators import forward_kernel, jvp_kernel
+from ...scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How a scene and its camera move in D directions. float64."""
+
+    linear: Tensor  # (D, 3, 3), [ω]ₓ + s 1: a point x of the world moves by linear x + shift
+    shift: Tensor  # (D, 3)
+    K: Tensor | None = None  # (D, 3, 3), of the camera's K
+    distortion: Tensor | None = None  # (D, n), of the first n of the camera's coefficients
+
+    def __len__(self) -> int:
+        return len(self.linear)
+
+    @staticmethod
+    def about(center: Tensor, axes: Tensor | None = None, size: float = 1.0) -> Motion:
+        """Six directions: turns in radians about a centre (3,) around the axes, the rows of (3, 3), those of the world when None,
+        and shifts along them in units of `size`."""
+        along = torch.eye(3, dtype=torch.float64) if axes is None else axes.double()
+        turns = crossed(along)
+        return Motion(torch.cat([turns, torch.zeros_like(turns)]), torch.cat([-turns @ center.double(), size * along]))
+
+    def of_points(self, points: Tensor) -> Tensor:
+        """(D, n, 3) of points (n, 3) of the world."""
+        return points @ self.linear.transpose(1, 2) + self.shift[:, None]
+
+    def of_directions(self, directions: Tensor) -> Tensor:
+        """(D, n, 3) of unit vectors (n, 3): what turns them alone."""
+        turn = 0.5 * (self.linear - self.linear.transpose(1, 2))
+        return directions @ turn.transpose(1, 2)
+
+
+def derivatives(
+    scene: Scene, camera: Camera, aovs: Sequence[str], motion: Motion, spp: int = 16, seed: int = 0
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Channels (H, W, c) by name, as render_aovs() gives them to the bit, and their derivatives (D, H, W, c) by the motion.
+
+    aovs    names among those of render_aovs(), but for ids, and for "image" where the scene is lit: there the radiance changes
+            in ways that the kernel alone does not know
+
+    Nothing of it is in torch's graph. Raises ValueError for other names, and what render_aovs() raises.
+    """
+    lit = scene.is_shaded and "image" in aovs
+    if unknown := [name for name in check_aovs(aovs) if name in IDS or (lit and name == "image")]:
+        why = "of a scene that is lit" if lit else "that has derivatives"
+        raise ValueError(f"aovs: expected a channel {why} among those of the kernel, got {unknown[0]!r}")
+    with torch.no_grad():
+        request = aovs_request(scene, camera, aovs, spp, seed)
+        image, hits, _ = forward_kernel(request)
+        flat, beside = request.scene, request.beside
+        points = motion.of_points(flat.verts)
+        tangents = {"verts": points}
+        if motion.K is not None:
+            tangents["K"] = motion.K[:, None]
+        if motion.distortion is not None:
+            given = motion.distortion
+            tangents["distortion"] = torch.nn.functional.pad(given, (0, MOST - given.shape[1]))[:, None]
+        parts = []
+        if "position" in aovs:
+            parts.append(points)
+        if "depth" in aovs:
+            parts.append(points @ request.camera.world_to_camera[0, 2, :3, None])
+        if "shading_normal" in aovs:
+            parts.append(motion.of_directions(beside.vertex_attributes[0, :, -3:]))
+        if parts:
+            tangents["vertex_attributes"] = torch.cat(parts, -1)[:, None]
+        if "normal" in aovs:
+            tangents["face_attributes"] = motion.of_directions(beside.face_attributes)
+        dots = jvp_kernel(hits, request, tangents, len(motion))[:, 0]
+        return by_name(scene, aovs, image[0]), by_name(scene, aovs, dots)
+
+
+def crossed(vectors: Tensor) -> Tensor:
+    """(n, 3, 3) matrices of ω × for (n, 3)."""
+    basis = torch.eye(3, dtype=torch.float64)
+    return torch.linalg.cross(vectors[:, None], basis[None], dim=-1).transpose(1, 2)

@@ -1,0 +1,76 @@
+"""Derivatives of renders by a motion, against those of torch.func."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from test_fit import BACKGROUND, bracket, camera
+
+import edgegrad as eg
+from edgegrad.fit.pose.jacobian import Motion, derivatives
+
+CENTER = torch.tensor([1.0, 0.75, 0.4], dtype=torch.float64)
+CHANNELS = ["image", "alpha", "position", "depth", "shading_normal", "normal"]
+
+
+def smooth():
+    verts = bracket().verts
+    return bracket().replace(face_colors=None, colors=(0.5 + 0.5 * torch.sin(3.0 * verts)).float())
+
+
+def test_derivatives_by_a_rigid_motion():
+    """The same as torch.func's from the same samples, of all channels."""
+    view, scene = camera(24), eg.Scene([smooth()], BACKGROUND)
+    axes = camera().world_to_camera[:3, :3]
+    motion = Motion.about(CENTER, axes, size=2.0)
+    images, found = derivatives(scene, view, CHANNELS, motion, spp=16, seed=3)
+    verts = scene.meshes[0].verts
+    turns = torch.stack([torch.linalg.cross(axis.expand_as(verts), verts - CENTER) for axis in axes.double()])
+    shifts = 2.0 * axes.double()[:, None].expand(-1, len(verts), -1)
+    rendered, expected = eg.jvp(scene, view, {verts: torch.cat([turns, shifts])}, 16, 3, aovs=CHANNELS)
+    for name in CHANNELS:
+        assert torch.equal(images[name], rendered[name])
+        torch.testing.assert_close(
+            found[name], expected[name], rtol=1e-4, atol=1e-4 * float(expected[name].abs().max())
+        )
+
+
+def test_derivatives_by_the_lens():
+    true = camera(24)
+    dK = torch.zeros(2, 3, 3, dtype=torch.float64)
+    dK[0, 0, 0] = dK[0, 1, 1] = 24.0
+    dK[1, 0, 2] = 24.0
+    bend = torch.zeros(3, 4, dtype=torch.float64)
+    bend[2, 0] = 1.0
+    dK = torch.cat([dK, torch.zeros(1, 3, 3, dtype=torch.float64)])
+    motion = Motion(torch.zeros(3, 3, 3, dtype=torch.float64), torch.zeros(3, 3, dtype=torch.float64), dK, bend)
+    view = true.replace(distortion=torch.zeros(4, dtype=true.K.dtype))
+    scene = eg.Scene([smooth()], BACKGROUND)
+    found = derivatives(scene, view, ["image"], motion, 16, 3)[1]["image"]
+    _, expected = eg.jvp(scene, view, {view.K: dK, view.distortion: bend}, 16, 3)
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
+
+
+def test_other_channels_are_refused():
+    motion = Motion.about(CENTER)
+    with pytest.raises(ValueError, match=r"aovs: expected a channel that has derivatives .*'face_id'"):
+        derivatives(eg.Scene([smooth()]), camera(8), ["face_id"], motion)
+    lit = eg.Scene([smooth()], lights=[eg.PointLight((0.0, 0.0, 9.0), 100.0)])
+    with pytest.raises(ValueError, match=r"aovs: expected a channel of a scene that is lit .*'image'"):
+        derivatives(lit, camera(8), ["image"], motion)
+    assert derivatives(lit, camera(8), ["alpha"], motion)[1]["alpha"].shape == (6, 8, 8, 1)
+
+
+def test_no_rules_of_forward_mode_are_loaded():
+    """They take torch up to seconds, once in every process."""
+    code = (
+        "import sys, torch, edgegrad as eg\n"
+        "from edgegrad.fit.pose.jacobian import Motion, derivatives\n"
+        "mesh = eg.Mesh(torch.eye(3), torch.tensor([[0, 1, 2]]), colors=torch.rand(3, 3))\n"
+        "view = eg.Camera.look_at((3, 3, 3), (0, 0, 0), size=(8, 8))\n"
+        "derivatives(eg.Scene([mesh]), view, ['image', 'alpha', 'normal'], Motion.about(torch.zeros(3)))\n"
+        "print('torch._decomp.decompositions_for_jvp' in sys.modules)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "False"
