@@ -15,6 +15,7 @@ from torch import Tensor
 ENOUGH = 0.6  # a smaller share is a wrong place, or a picture of something else
 DEVIATIONS = 3.0  # of the noise
 WILDEST = -1.0, 2.0  # of one pixel
+BLOCK = 16  # pixels: those of JPEG with colours at half the resolution
 DISPLAY = 0.01  # of the picture's range: what eight bits and a display's curve leave
 
 
@@ -72,6 +73,32 @@ def noise_of(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> float
         total += float((w * (0.5 * (render - again).square() + even)).sum())
         count += float(w.sum()) * render.shape[-1]
     return total / max(count, 1e-30)
+
+
+def coherent(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> float:
+    """How far renders are from pictures, as explained() takes them, where blocks are compared by their means: the root of the mean
+    square, as a part of the pictures' range, over the blocks that the render's edges are in, by their strength.
+
+    A mean leaves out what blur, compression and noise do to a picture, all of which keep it, and what a pose that is a part of a
+    pixel off does; not what covers the object, or is of another colour.
+    """
+    total = count = 0.0
+    for render, again, picture, weight in pairs:
+        picture = picture.to(render)
+        w = torch.ones_like(render[..., :1]) if weight is None else weight
+        mean = 0.5 * (render + again)
+        extent = (picture.amax((0, 1)) - picture.amin((0, 1))).clamp(min=1e-30)
+        r = _blocks(w * (mean - picture) / extent) / _blocks(w).clamp(min=1e-6)
+        edges = _blocks(w * _gradient(mean).norm(dim=0) / extent)
+        total += float((edges * r.square()).sum())
+        count += float(edges.sum())
+    return (total / max(count, 1e-30)) ** 0.5
+
+
+def _blocks(image: Tensor) -> Tensor:
+    """(h, w, C), means over BLOCK × BLOCK pixels."""
+    size = [max(1, round(n / BLOCK)) for n in image.shape[:2]]
+    return F.adaptive_avg_pool2d(image.movedim(-1, 0)[None], size)[0].movedim(0, -1)
 
 
 def _gradient(image: Tensor) -> Tensor:

@@ -53,44 +53,62 @@ class Motion:
         return directions @ turn.transpose(1, 2)
 
 
-def derivatives(
-    scene: Scene, camera: Camera, aovs: Sequence[str], motion: Motion, spp: int = 16, seed: int = 0
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Channels (H, W, c) by name, as render_aovs() gives them to the bit, and their derivatives (D, H, W, c) by the motion.
+class Rendered:
+    """Channels of a scene, as render_aovs() gives them to the bit, and then their derivatives by motions.
 
     aovs    names among those of render_aovs(), but for ids, and for "image" where the scene is lit: there the radiance changes
             in ways that the kernel alone does not know
 
     Nothing of it is in torch's graph. Raises ValueError for other names, and what render_aovs() raises.
     """
-    lit = scene.is_shaded and "image" in aovs
-    if unknown := [name for name in check_aovs(aovs) if name in IDS or (lit and name == "image")]:
-        why = "of a scene that is lit" if lit else "that has derivatives"
-        raise ValueError(f"aovs: expected a channel {why} among those of the kernel, got {unknown[0]!r}")
-    with torch.no_grad():
-        request = aovs_request(scene, camera, aovs, spp, seed)
-        image, hits, _ = forward_kernel(request)
-        flat, beside = request.scene, request.beside
+
+    def __init__(self, scene: Scene, camera: Camera, aovs: Sequence[str], spp: int = 16, seed: int = 0) -> None:
+        lit = scene.is_shaded and "image" in aovs
+        if unknown := [name for name in check_aovs(aovs) if name in IDS or (lit and name == "image")]:
+            why = "of a scene that is lit" if lit else "that has derivatives"
+            raise ValueError(f"aovs: expected a channel {why} among those of the kernel, got {unknown[0]!r}")
+        self.scene, self.aovs = scene, aovs
+        with torch.no_grad():
+            self._request = aovs_request(scene, camera, aovs, spp, seed)
+            image, self._hits, _ = forward_kernel(self._request)
+        self.images = by_name(scene, aovs, image[0])  # (H, W, c) by name
+
+    def derivatives(self, motion: Motion) -> dict[str, Tensor]:
+        """(D, H, W, c) by name."""
+        with torch.no_grad():
+            dots = jvp_kernel(self._hits, self._request, self._tangents(motion), len(motion))
+        return by_name(self.scene, self.aovs, dots[:, 0])
+
+    def _tangents(self, motion: Motion) -> dict[str, Tensor]:
+        """Of what the kernel is given."""
+        flat, camera, beside = self._request.scene, self._request.camera, self._request.beside
         points = motion.of_points(flat.verts)
         tangents = {"verts": points}
         if motion.K is not None:
             tangents["K"] = motion.K[:, None]
         if motion.distortion is not None:
-            given = motion.distortion
-            tangents["distortion"] = torch.nn.functional.pad(given, (0, MOST - given.shape[1]))[:, None]
+            unsought = MOST - motion.distortion.shape[1]
+            tangents["distortion"] = torch.nn.functional.pad(motion.distortion, (0, unsought))[:, None]
         parts = []
-        if "position" in aovs:
+        if "position" in self.aovs:
             parts.append(points)
-        if "depth" in aovs:
-            parts.append(points @ request.camera.world_to_camera[0, 2, :3, None])
-        if "shading_normal" in aovs:
+        if "depth" in self.aovs:
+            parts.append(points @ camera.world_to_camera[0, 2, :3, None])
+        if "shading_normal" in self.aovs:
             parts.append(motion.of_directions(beside.vertex_attributes[0, :, -3:]))
         if parts:
             tangents["vertex_attributes"] = torch.cat(parts, -1)[:, None]
-        if "normal" in aovs:
+        if "normal" in self.aovs:
             tangents["face_attributes"] = motion.of_directions(beside.face_attributes)
-        dots = jvp_kernel(hits, request, tangents, len(motion))[:, 0]
-        return by_name(scene, aovs, image[0]), by_name(scene, aovs, dots)
+        return tangents
+
+
+def derivatives(
+    scene: Scene, camera: Camera, aovs: Sequence[str], motion: Motion, spp: int = 16, seed: int = 0
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Channels (H, W, c) by name, and their derivatives (D, H, W, c) by the motion: see Rendered."""
+    rendered = Rendered(scene, camera, aovs, spp, seed)
+    return rendered.images, rendered.derivatives(motion)
 
 
 def crossed(vectors: Tensor) -> Tensor:

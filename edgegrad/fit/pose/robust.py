@@ -81,15 +81,43 @@ class Comparison:
                 paid += float((w * (1.0 - self.open[k].detach().square())).sum()) * PAYS * c**2
         return (total - paid) / self.count, NOISE * (near + FAINT * paid) / self.count
 
+    def matched(self, c):
+        total = paid = 0.0
+        for k, r in enumerate(self.differences):
+            square = r.detach().square().sum(-1, keepdim=True)
+            weight = self.level.shots[k].weight
+            w = torch.ones_like(square) if weight is None else weight
+            total += float((w * square / (1.0 + square / c**2)).sum())
+            paid += float((w * (1.0 - self.open[k].detach().square())).sum()) * PAYS * c**2
+        return total / max(paid, 1e-30)
+
     def residuals(self, c: float) -> list[Tensor]:
         """Whose squares sum up to the loss's approximation for one step."""
         found = []
-        for k, r in enumerate(self.differences):
-            w = (1.0 + r.detach().square().sum(-1, keepdim=True) / c**2).pow(-2)
-            weight = self.level.shots[k].weight
-            count = torch.ones_like(w) if weight is None else weight
-            residual = (w * count).sqrt() * r
+        for k, (r, (w, open_)) in enumerate(zip(self.differences, self._factors(c), strict=True)):
+            residual = w * r
             if self.open:
-                residual = torch.cat([residual, count.sqrt() * math.sqrt(PAYS) * c * self.open[k]], -1)
+                residual = torch.cat([residual, open_ * self.open[k]], -1)
             found.append(residual)
+        return found
+
+    def tangents(self, c: float, dots: list[Tensor]) -> list[Tensor]:
+        """Of the residuals, from those (D, h, w, C) of the renders."""
+        found = []
+        for shot, dot, (w, open_) in zip(self.level.shots, dots, self._factors(c), strict=True):
+            if self.open:
+                image, alpha = dot[..., :-1], dot[..., -1:]
+                dot = torch.cat([w * (image - alpha * shot.target), -open_ * alpha], -1)
+            else:
+                dot = w * dot
+            found.append(dot)
+        return found
+
+    def _factors(self, c: float) -> list[tuple[Tensor, Tensor]]:
+        """Of the difference and of what is open, in the residual of each picture."""
+        found = []
+        for r, shot in zip(self.differences, self.level.shots, strict=True):
+            w = (1.0 + r.detach().square().sum(-1, keepdim=True) / c**2).pow(-2)
+            count = torch.ones_like(w) if shot.weight is None else shot.weight
+            found.append(((w * count).sqrt(), count.sqrt() * math.sqrt(PAYS) * c))
         return found

@@ -9,28 +9,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..verdict import ENOUGH, explained, noise_of
-from .gauss_newton import GaussNewton
+from ..verdict import ENOUGH, coherent, explained, noise_of
+from .gauss_newton import MEMORY, PROBES_MEMORY, GaussNewton
 from .journal import Journal, Way
+from .observed import Observed
 from .pose import Pose, angle
 from .result import Step
 from .robust import NARROWEST, NOISE, Comparison
-from .task import GROW, PARTS, SHIFT, TURN, Level, PoseTask
+from .soft import softness
+from .task import GROW, PARTS, SHIFT, TURN, Level, PoseTask, blurred
 
 ASIDE, ASIDE_STEPS = 0.2, 20  # radians between the starts on the coarsest level, and steps from each
 FINAL_SPP = 64  # samples a pixel when ends are compared
 ROUNDS = 2  # of second opinions at most
-FAR_ABOVE = 4.0  # the noise: a loss that this does not explain, beside what is covered, may be that of a place nearby
+APART = 0.03  # of the pictures' range: where blocks' means differ more, something covers the object, or a place nearby looks alike,
+CLEAR = 0.9  # unless as much of the render's edges is in the pictures
 # Of a second opinion: poses that are compared, how many of them take a few steps, and how many are followed further.
 COMPARED, KEPT, FOLLOWED = 150, 4, 3
 COMMON = 0.2  # c of losses that are compared, as a part of the pictures' range
 FARTHEST, FARTHEST_SHIFT = 0.7, 0.15  # radians and object sizes of these from the start or the best pose
+SOFTER = 0.25  # pixels: with a blur that is so far from the true one, the last level is followed again
 
 
 class _End(NamedTuple):
@@ -39,6 +44,8 @@ class _End(NamedTuple):
     loss: float  # on the finest level, with many samples
     explained: float  # the share of the render's edges that the pictures show
     noise: float  # the loss that the noise of pictures and samples explains
+    apart: float
+    soft: float
     pose: Pose
     short: bool  # the last step
 
@@ -49,10 +56,11 @@ class Search:
 
     def __init__(
         self, task: PoseTask, levels: list[Level], start: Pose, steps: int, tolerance: float, seed: int,
-        journal: Journal | None = None,
+        journal: Journal | None = None, further: bool = True,
     ) -> None:  # fmt: skip
+        """`further`: whether other starts follow where the way down from the given one does not end well."""
         self.task, self.levels, self.start = task, levels, start
-        self.steps, self.tolerance, self.seed = steps, tolerance, seed
+        self.steps, self.tolerance, self.seed, self.further = steps, tolerance, seed, further
         self.generator = torch.Generator().manual_seed(seed)
         self.best, self.loss, self.converged, self.explained = start, math.nan, False, math.nan
         self.history: list[Step] = []
@@ -62,40 +70,68 @@ class Search:
 
     @property
     def planned(self) -> int:
-        """Steps of the first pass at most."""
-        return 5 * min(self.steps, ASIDE_STEPS) + self.steps * (len(self.levels) - 1)
+        """Steps of the first way at most."""
+        return self.steps * len(self.levels)
 
     def run(self) -> None:
         """Raises ValueError when nothing in the pictures depends on the pose."""
         coarse, *finer = self.levels
-        ends = self._ranked(coarse, self._tilted(self.start))
+        near, *_ = self._follow(coarse, self.start, self.steps, math.inf)
+        found = self._judge(*self._down(near, finer))
         if not self.history:
             raise ValueError(
                 f"{self.task.names.init}: expected a pose at which the picture changes when the object moves, got one at which "
                 "it does not; is the object out of view, or of the background's colour?"
             )
         # The same many samples for all: a fit never ends at a worse pose than its start.
-        found = self._judge(*self._down(ends[0], finer))
         stays = found.short and len(_distinct([found.pose, self.start], 2)) == 1  # the start was the answer already
-        best = min(found, self._judge(self.start, stays), key=lambda end: end.loss)
+        start = self._judge(self.start, stays)
+        best = found if _beats(found, start) else start
+        print("  E1", *(f"{x:.4g}" for x in found[:5]), "|", *(f"{x:.4g}" for x in start[:5]))
         self._take(best)
+        if self.further and best.explained < ENOUGH:
+            best = self._from_afar(best, near)
+        deep = self.further and self.steps > ASIDE_STEPS
+        if deep and best.explained >= ENOUGH and best.apart > APART and best.explained < CLEAR:
+            # Something covers the object, or a place nearby looks alike.
+            begins = len(self.history)
+            ends = self._ranked(finer[0], self._tilted(best.pose))
+            found = self._judge(*self._down(ends[0], finer[1:]))
+            best = self._better(best, found, begins)
+        self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
+
+    def _from_afar(self, best: _End, near: Pose) -> _End:
+        """Ways from other starts, until one ends where the pictures show the render's edges. `near` is where the way from the
+        start led on the coarsest level."""
+        coarse, *finer = self.levels
+        begins = len(self.history)
+        ends = self._ranked(coarse, self._tilted(self.start)[1:], near)
+        if ends[0] is not near:
+            best = self._better(best, self._judge(*self._down(ends[0], finer)), begins)
         for _ in range(ROUNDS if self.steps > ASIDE_STEPS else 0):
             if best.explained >= ENOUGH:
                 break
             begins = len(self.history)
             ends = _distinct(self._ranked(coarse, [*self._others(best.pose), *ends[1:]]), FOLLOWED)
+            print("GAIN", self._gain(best.pose), [self._gain(e) for e in ends])
             ends = self._ranked(finer[0], ends)
-            found = self._judge(*self._down(ends[0], finer))
-            best = self._better(best, found, found.loss < best.loss, begins)
-        if self.steps > ASIDE_STEPS and best.explained >= ENOUGH and best.loss > FAR_ABOVE * best.noise:
-            # Something covers the object, or a place nearby looks alike. Where much is covered, a wrong place may have a lower
-            # loss: a better one has more of its edges in the pictures as well.
-            begins = len(self.history)
-            near = self._ranked(finer[0], self._tilted(best.pose))
-            found = self._judge(*self._down(near[0], finer[1:]))
-            won = found.loss < best.loss and found.explained > best.explained
-            best = self._better(best, found, won, begins)
-        self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
+            best = self._better(best, self._judge(*self._down(ends[0], finer)), begins)
+        return best
+
+    def _gain(self, pose):
+        level = self.levels[0]
+        c = COMMON * self.task.extent
+        here = Observed(self.task, level, pose, level.spp, self.seed).compared
+        if self.task.clutter:
+            return 1 - here.matched(c)
+        r = []
+        for shot in level.shots:
+            b = shot.background
+            if self.task.aovs != ("image",): img = torch.zeros_like(shot.target)
+            else: img = blurred(b.expand(*shot.target.shape).to(shot.target), level.blur)
+            r.append(img)
+        there = Comparison(self.task, level, r)
+        return 1 - here.loss(c)[0] / there.loss(c)[0]
 
     def first_end(self) -> float:
         """The share of the render's edges that the pictures show where the way down from the start alone ends."""
@@ -106,8 +142,10 @@ class Search:
         tilts = ASIDE * torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=torch.float64)
         return [pose, *(self.task.moved(pose, [TURN, TURN + 1], tilt) for tilt in tilts)]
 
-    def _better(self, best: _End, found: _End, won: bool, begins: int) -> _End:
+    def _better(self, best: _End, found: _End, begins: int) -> _End:
         """Which of both is the answer. `best` marks the way to it in the history, where that to `found` begins at `begins`."""
+        print("  E2", *(f"{x:.4g}" for x in found[:5]))
+        won = _beats(found, best)
         lost = slice(0, begins) if won else slice(begins, None)
         self.history[lost] = [step._replace(best=False) for step in self.history[lost]]
         if won:
@@ -118,26 +156,33 @@ class Search:
         self.loss, self.explained, self.best, self._answered = end.loss, end.explained, end.pose, True
         self.converged = end.short and end.explained >= ENOUGH
 
-    def _ranked(self, level: Level, starts: list[Pose]) -> list[Pose]:
-        """Where a few steps lead from each start, the best first."""
-        ends, lowest = [], math.inf
+    def _ranked(self, level: Level, starts: list[Pose], *ends: Pose) -> list[Pose]:
+        """Where a few steps lead from each start, and ends of such, the best first."""
+        found, lowest = list(ends), math.inf
         for origin in starts:
             end, loss, _ = self._follow(level, origin, min(self.steps, ASIDE_STEPS), lowest)
-            ends.append(end)
+            found.append(end)
             lowest = min(lowest, loss)
         # Each followed a loss of its own width: here all have one.
-        return self._sorted(level, ends, level.spp)
+        return self._sorted(level, found, level.spp)
 
     def _down(self, pose: Pose, levels: list[Level]) -> tuple[Pose, bool]:
         """Through the levels; the pose, and whether the last step was short."""
-        short = False
-        for level in levels:
-            pose, _, short = self._follow(level, pose, self.steps, math.inf)
+        *coarser, last = levels
+        for level in coarser:
+            pose, *_ = self._follow(level, pose, self.steps, math.inf)
+        (soft,) = self.journal.numbers(lambda: [self._softness(pose)])
+        pose, _, short = self._follow(last._replace(soft=soft), pose, self.steps, math.inf)
+        (softer,) = self.journal.numbers(lambda: [self._softness(pose)])
+        if abs(softer - soft) > SOFTER:  # it was looked for at another place
+            pose, _, short = self._follow(last._replace(soft=softer), pose, self.steps, math.inf)
         return pose, short
 
     def _follow(self, level: Level, origin: Pose, most: int, lowest: float) -> tuple[Pose, float, bool]:
         """Steps on one level; the pose, its loss, and whether the last step was short."""
-        task, search = self.task, GaussNewton(self.generator)
+        task = self.task
+        search = GaussNewton(PROBES_MEMORY if task.reverse_alone else MEMORY)
+        last = level._replace(soft=0.0) == self.levels[-1]
         if (way := self.journal.entered()) is None:
             way = Way(origin, origin, lowest)
         else:
@@ -146,24 +191,23 @@ class Search:
             for step in way.steps:
                 self._note(step)
         while not way.done:
-            p = torch.zeros(len(level.free), dtype=torch.float64, requires_grad=True)
             seed = (self.seed + len(self.history)) % 2**32
-            compared = Comparison(task, level, task.images(level, task.moved(way.pose, level.free, p), level.spp, seed))
-            c = compared.scale() if way.c == math.inf else way.c
-            loss, slack = compared.loss(c)
+            seen = Observed(task, level, way.pose, level.spp, seed, self.generator)
+            c = seen.compared.scale() if way.c == math.inf else way.c
+            loss, slack = seen.compared.loss(c)
             norms = {}
-            if taken := search.observe(p, compared.residuals(c), loss, slack):
+            if taken := search.observe(loss, partial(seen.equations, c, first=not search.accepted), slack):
                 way = way._replace(here=way.pose)
-                norms = _norms(level.free, 2.0 / compared.count * search.gradient)
-                c = min(c, compared.scale())
-                search.loss = loss = compared.loss(c)[0]
+                norms = _norms(level.free, 2.0 / seen.compared.count * search.gradient)
+                c = min(c, seen.compared.scale())
+                search.loss = loss = seen.compared.loss(c)[0]
             way = way._replace(c=c, search=search.state(), random=self.generator.get_state())
             if search.flat:
                 self.journal.keep(way := way._replace(done=True))
                 break
             move = search.step()
             short = float(move.abs().max()) < self.tolerance * level.coarseness
-            settled = search.settled and level is not self.levels[-1]
+            settled = search.settled and not last
             good = taken and loss <= way.lowest + NOISE * abs(way.lowest)
             step = Step(level.size, loss, way.pose, good, norms)
             way = way._replace(
@@ -180,21 +224,27 @@ class Search:
             self.best, self.loss = step.pose, step.loss
         self.history.append(step)
 
-    def _compare(self, level: Level, pose: Pose, spp: int, seed: int) -> Comparison:
-        with torch.no_grad():
-            return Comparison(self.task, level, self.task.images(level, pose, spp, seed))
+    def _softness(self, pose: Pose) -> float:
+        renders = [Observed(self.task, self.levels[-1], pose, FINAL_SPP, seed).compared.renders for seed in self._seeds]
+        return softness(self.task, self.levels[-1], *renders)
+
+    @property
+    def _seeds(self) -> tuple[int, int]:
+        """Of renders that are compared at an end."""
+        return self.seed, (self.seed + 1) % 2**32
 
     def _judge(self, pose: Pose, short: bool) -> _End:
         """With many samples on the finest level."""
-        loss, share, noise = self.journal.numbers(lambda: self._judged(pose))
-        return _End(loss, share, noise, pose, short)
+        return _End(*self.journal.numbers(lambda: self._judged(pose)), pose, short)
 
     def _judged(self, pose: Pose) -> list[float]:
         """The loss, the share of the render's edges, and the loss that noise explains."""
-        final = self.levels[-1]
-        first, second = (self._compare(final, pose, FINAL_SPP, (self.seed + k) % 2**32) for k in (0, 1))
+        task, final = self.task, self.levels[-1]
+        sharp = [Observed(task, final, pose, FINAL_SPP, seed).compared.renders for seed in self._seeds]
+        soft = softness(task, final, *sharp)
+        first, second = ([blurred(image, soft) for image in images] for images in sharp)
         pairs = []
-        for shot, a, b in zip(final.shots, first.renders, second.renders, strict=True):
+        for shot, a, b in zip(final.shots, first, second, strict=True):
             weight = shot.weight
             if self.task.clutter:
                 outside = (a[..., -1] < 0.999).to(a)  # and what lies beside it, whose gradient reaches there
@@ -202,7 +252,8 @@ class Search:
                 weight = inside if weight is None else weight * inside
                 a, b = a[..., :-1], b[..., :-1]
             pairs.append((a, b, shot.target, weight))
-        return [first.loss(NARROWEST * self.task.extent)[0], explained(pairs), noise_of(pairs)]
+        loss = Comparison(task, final, first).loss(NARROWEST * task.extent)[0]
+        return [loss, explained(pairs), noise_of(pairs), coherent(pairs), soft]
 
     def _others(self, best: Pose) -> list[Pose]:
         """The few best of many poses around the start and the best one, by their loss on the coarsest level."""
@@ -218,7 +269,9 @@ class Search:
     def _sorted(self, level: Level, poses: list[Pose], spp: int) -> list[Pose]:
         """By their loss, the least first."""
         c = COMMON * self.task.extent
-        losses = self.journal.numbers(lambda: [self._compare(level, pose, spp, self.seed).loss(c)[0] for pose in poses])
+        losses = self.journal.numbers(
+            lambda: [Observed(self.task, level, pose, spp, self.seed).compared.loss(c)[0] for pose in poses]
+        )
         return [poses[k] for k in sorted(range(len(poses)), key=losses.__getitem__)]
 
     def _ball(self) -> Tensor:
@@ -233,6 +286,15 @@ def _norms(free: list[int], gradient: Tensor) -> dict[str, float]:
     squares = dict(zip(free, gradient.square().tolist(), strict=True))
     sums = {name: [squares[entry] for entry in entries if entry in squares] for name, entries in PARTS.items()}
     return {name: math.sqrt(sum(part)) for name, part in sums.items() if part}
+
+
+def _beats(found: _End, best: _End) -> bool:
+    """Whether an end is the better answer. Its loss must be lower; and a place far off whose loss is a little lower does not win
+    with fewer of its edges in the pictures."""
+    if not found.loss < best.loss:
+        return False
+    # The loss counts what is covered, which shows no edges, and may be below zero where the background is not known.
+    return found.explained >= best.explained or False
 
 
 def _distinct(poses: list[Pose], most: int) -> list[Pose]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -64,6 +64,7 @@ class Level(NamedTuple):
     coarseness: float  # size of a pixel, relative to the finest level's
     spp: int
     free: list[int]  # entries of a step that are sought
+    soft: float = 0.0  # pixels: the blur of the pictures themselves, which the renders are given
 
     @property
     def size(self) -> tuple[int, int]:
@@ -262,17 +263,30 @@ class PoseTask:
             fields["distortion"] = bend if given is None else bend + F.pad(given, (0, len(bend) - len(given)))
         return camera.replace(**fields)
 
+    @property
+    def reverse_alone(self) -> bool:
+        """Whether renders have no forward mode: radiance of a lit scene changes in ways that torch alone knows."""
+        return self.scene.is_shaded and "image" in self.aovs
+
+    def views(self, level: Level, pose: Pose, seed: int) -> list[tuple[Scene, Camera, int]]:
+        """The scene, the camera and the seed of each render."""
+        moved = self.scene.transformed(pose.R, pose.t, pose.scale)
+        return [
+            (moved.replace(background=shot.background), self.lens(shot.camera, pose), (seed + 977 * k) % 2**32)
+            for k, shot in enumerate(level.shots)
+        ]
+
+    def compared(self, level: Level, channels: Mapping[str, Tensor]) -> Tensor:
+        """(…, h, w, C): one after the other, blurred like the pictures; so of their derivatives."""
+        image = torch.cat([channels[name] for name in self.aovs], -1)
+        return blurred(image, math.hypot(level.blur, level.soft))
+
     def images(self, level: Level, pose: Pose, spp: int, seed: int) -> list[Tensor]:
         """The renders (h, w, C), blurred like the pictures, differentiable in the pose."""
-        moved = self.scene.transformed(pose.R, pose.t, pose.scale)
-        images = []
-        for k, shot in enumerate(level.shots):
-            scene = moved.replace(background=shot.background)
-            channels = render_aovs(
-                scene, self.lens(shot.camera, pose), self.aovs, spp=spp, seed=(seed + 977 * k) % 2**32
-            )
-            images.append(blurred(torch.cat([channels[name] for name in self.aovs], -1), level.blur))
-        return images
+        return [
+            self.compared(level, render_aovs(scene, camera, self.aovs, spp=spp, seed=at))
+            for scene, camera, at in self.views(level, pose, seed)
+        ]
 
     def pictures(self, level: Level, pose: Pose, seed: int = 0) -> list[Tensor]:
         """The renders as pictures: over the background where that is known, else over the faded target; without an alpha that
@@ -360,15 +374,16 @@ def zoomed(K: Tensor, factor: Tensor) -> Tensor:
 
 
 def blurred(image: Tensor, sigma: float) -> Tensor:
-    """Gaussian blur by `sigma` pixels; the border's pixels are repeated outwards."""
+    """Gaussian blur of (…, h, w, C) by `sigma` pixels; the border's pixels are repeated outwards."""
     if sigma == 0.0:
         return image
     radius = math.ceil(3.0 * sigma)
     kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1).to(image) / sigma) ** 2)
     kernel = kernel / kernel.sum()
     # Channels as groups of one image: as images of a batch, their backward pass takes up to seven times as long.
-    rows, channels = image.movedim(-1, 0)[None], image.shape[-1]
+    rows = image.movedim(-1, -3).flatten(0, -3)[None]
+    count = rows.shape[1]
     rows = F.pad(rows, (radius, radius, radius, radius), mode="replicate")
     for shape in ((-1, 1), (1, -1)):
-        rows = F.conv2d(rows, kernel.reshape(1, 1, *shape).expand(channels, -1, -1, -1), groups=channels)
-    return rows[0].movedim(0, -1)
+        rows = F.conv2d(rows, kernel.reshape(1, 1, *shape).expand(count, -1, -1, -1), groups=count)
+    return rows[0].reshape(*image.movedim(-1, -3).shape).movedim(-3, -1)
