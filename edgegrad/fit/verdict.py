@@ -61,23 +61,19 @@ def explained(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> floa
     return max(0.0, min(1.0, alike / edges)) if edges > 1e-4 * pixels else same / max(pixels, 1e-30)
 
 
-def noise_of(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> float:
-    """The mean squared difference of renders to pictures, as explained() takes them, that noise explains: that of the renders'
-    samples, that of the pictures, and what eight bits leave."""
-    total = count = 0.0
+def edges_of(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> float:
+    """How much of edges there is in renders that explained() takes: pixels long, times their contrast by the pictures' range."""
+    total = 0.0
     for render, again, picture, weight in pairs:
-        picture = picture.to(render)
-        w = torch.ones_like(render[..., :1]) if weight is None else weight
-        rounding = DISPLAY / DEVIATIONS * (picture.amax((0, 1)) - picture.amin((0, 1)))
-        even = picture_noise(picture).square() + rounding.square()
-        total += float((w * (0.5 * (render - again).square() + even)).sum())
-        count += float(w.sum()) * render.shape[-1]
-    return total / max(count, 1e-30)
+        extent = (picture.amax((0, 1)) - picture.amin((0, 1))).clamp(min=1e-30)
+        edges = _gradient(0.5 * (render + again)).norm(dim=0) / extent
+        total += float((edges if weight is None else weight * edges).sum())
+    return total
 
 
 def coherent(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> float:
-    """How far renders are from pictures, as explained() takes them, where blocks are compared by their means: the root of the mean
-    square, as a part of the pictures' range, over the blocks that the render's edges are in, by their strength.
+    """How far renders are from pictures, as explained() takes them, where blocks are compared by their means: the root of the
+    mean square, as a part of the pictures' range, over the blocks that the render's edges are in, by their strength.
 
     A mean leaves out what blur, compression and noise do to a picture, all of which keep it, and what a pose that is a part of a
     pixel off does; not what covers the object, or is of another colour.
@@ -97,8 +93,8 @@ def coherent(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> float
 
 def _blocks(image: Tensor) -> Tensor:
     """(h, w, C), means over BLOCK × BLOCK pixels."""
-    size = [max(1, round(n / BLOCK)) for n in image.shape[:2]]
-    return F.adaptive_avg_pool2d(image.movedim(-1, 0)[None], size)[0].movedim(0, -1)
+    H, W = (max(1, round(n / BLOCK)) for n in image.shape[:2])
+    return F.adaptive_avg_pool2d(image.movedim(-1, 0)[None], (H, W))[0].movedim(0, -1)
 
 
 def _gradient(image: Tensor) -> Tensor:

@@ -144,6 +144,7 @@ def fit_camera(
     spp: int = 16,
     tolerance: float = 3e-4,
     seed: int = 0,
+    search: bool = True,
     progress: bool = True,
     callback: Callable[[CameraFit], None] | None = None,
     checkpoint: PathLike | None = None,
@@ -161,7 +162,7 @@ def fit_camera(
     distortion  also find so many coefficients (0, 4, 5 or 8; of a fisheye 4), the first of those of OpenCV's model (k1, k2, p1,
                 p2, k3, …) or a fisheye's, as a Camera has them; those that the camera has beyond stay
 
-    mask, weight, background, checkpoint, resume and the rest are as for fit_pose(), whose search this is. What a
+    mask, weight, background, search, checkpoint, resume and the rest are as for fit_pose(), whose search this is. What a
     picture does not show stays uncertain: focal length against distance where there is hardly any perspective, the
     principal point against a turn of the camera. Raises TypeError or ValueError that names the argument.
     """
@@ -200,7 +201,7 @@ def fit_camera(
     start = torch.eye(4, dtype=torch.float64)
     found = search_pose(
         scene, target, camera, mask, start, lens, background, weight, names, max_size=max_size, steps=steps, spp=spp,
-        tolerance=tolerance, seed=seed, progress=progress, callback=None if callback is None else step,
+        tolerance=tolerance, seed=seed, search=search, progress=progress, callback=None if callback is None else step,
         checkpoint=checkpoint, checkpoint_every=checkpoint_every, resume=resume,
     )  # fmt: skip
     return result(found)

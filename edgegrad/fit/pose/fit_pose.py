@@ -50,6 +50,7 @@ def fit_pose(
     spp: int = 16,
     tolerance: float = 3e-4,
     seed: int = 0,
+    search: bool = True,
     progress: bool = True,
     callback: Callable[[PoseFit], None] | None = None,
     checkpoint: PathLike | None = None,
@@ -82,23 +83,27 @@ def fit_pose(
     tolerance   a step on the finest level is short when it is below this: in radians, object sizes (the diagonal of the bounding
                 box), and logarithms of scale and focal length
     seed        the same seed gives the same fit
+    search      False for a start near the answer: one way down from there, whatever it ends at
     progress    show a bar with the loss on standard error
     callback    called after each step with the best fit so far
     checkpoint  a file that holds the fit's state, written every `checkpoint_every` steps and at the end, never in part
     resume      go on from the checkpoint, if there is one: the fit ends as if it had never stopped. One of a fit that
                 was given something else is refused
 
-    About a quarter of the object may be covered. The fit is `converged` when its last step was short and the pictures show at
-    least 60 % of the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few
-    times as long; where they do, but noise does not explain the loss, as when something covers the object, nearby, in about the
-    same time again. KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set.
+    About a quarter of the object may be covered. The picture may be blurred by up to 2 pixels and compressed: renders are blurred
+    alike. The start is followed first. The fit is `converged` when its last step was short and the pictures show at least 60 % of
+    the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few times as long,
+    less where nothing in the picture looks like the object; where they do, but something covers the object or it is of another
+    colour, nearby, in about the same time again. Another pose is the answer only if its loss is lower than that of `init` in the
+    final comparison, and its edges are as well in the picture. KeyboardInterrupt, also from the callback, ends the fit and
+    returns the best so far with `interrupted` set.
     Works in torch.no_grad() and torch.inference_mode() too. Raises TypeError or ValueError that names the argument, also when
     the object leaves no trace in the picture at the start.
     """
     lens = Lens(check_flag("fit_scale", fit_scale), check_flag("fit_focal", fit_focal))
     return search_pose(
         mesh, target, camera, mask, init, lens, background, weight, Names(), max_size=max_size, steps=steps, spp=spp,
-        tolerance=tolerance, seed=seed, progress=progress, callback=callback, checkpoint=checkpoint,
+        tolerance=tolerance, seed=seed, search=search, progress=progress, callback=callback, checkpoint=checkpoint,
         checkpoint_every=checkpoint_every, resume=resume,
     )  # fmt: skip
 
@@ -108,7 +113,7 @@ def fit_pose(
 def search_pose(
     mesh: Mesh | Scene, target: object, camera: object, mask: object, init: object, lens: Lens,
     background: Tensor | float | None, weight: object, names: Names, *, max_size: int, steps: int, spp: int, tolerance: float,
-    seed: int, progress: bool, callback: Callable[[PoseFit], None] | None, checkpoint: PathLike | None,
+    seed: int, search: bool, progress: bool, callback: Callable[[PoseFit], None] | None, checkpoint: PathLike | None,
     checkpoint_every: int, resume: bool,
 ) -> PoseFit:  # fmt: skip
     """fit_pose(), with whatever is sought of the lens."""
@@ -131,11 +136,11 @@ def search_pose(
         names.init: None if init is None else given.matrix, names.mesh: mesh, names.target: target, "mask": mask,
         "weight": weight, "camera": [traits(one) for one in given_cameras], "background": background,
         **dict(zip(names.lens, lens, strict=False)), "max_size": max_size, "steps": steps, "spp": spp,
-        "tolerance": tolerance, "seed": seed,
+        "tolerance": tolerance, "seed": seed, "search": check_flag("search", search),
     })  # fmt: skip
     saved = file.read()
     journal, earlier = (Journal(), 0.0) if saved is None else (Journal(saved["journal"]), saved["seconds"])
-    search = Search(task, task.pyramid(start, max_size, spp), start, steps, tolerance, seed, journal)
+    ways = Search(task, task.pyramid(start, max_size, spp), start, steps, tolerance, seed, journal, search)
     interrupted = False
 
     def seconds() -> float:
@@ -146,19 +151,19 @@ def search_pose(
             file.write({"journal": journal.state(), "seconds": seconds()})
 
     def result() -> PoseFit:
-        best: Pose = search.best
-        history = list(search.history)
+        best: Pose = ways.best
+        history = list(ways.history)
         cameras = [task.lens(one, best) for one in given_cameras]
         return PoseFit(
-            best.R, best.t, float(best.scale), cameras[0], search.loss, len(history), seconds(),
-            search.converged and not interrupted, interrupted, search.explained, history, task, cameras,
+            best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), seconds(),
+            ways.converged and not interrupted, interrupted, ways.explained, history, task, cameras,
         )  # fmt: skip
 
-    total = max(search.planned, journal.steps)
+    total = max(ways.planned, journal.steps)
     bar = tqdm(total=total, initial=journal.steps, desc="fit", unit="step", disable=not progress, leave=False)
 
     def after_step() -> None:
-        last = search.history[-1]
+        last = ways.history[-1]
         bar.set_postfix_str(f"{last.size[1]} × {last.size[0]} px, loss {last.loss:.2e}", refresh=False)
         if bar.total is not None and bar.n + 1 >= bar.total:
             bar.total = None  # how many steps the later passes take is not known
@@ -168,11 +173,11 @@ def search_pose(
         if journal.steps % checkpoint_every == 0:
             keep()
 
-    search.after_step = after_step
+    ways.after_step = after_step
     try:
-        search.run()
-        if search.explained < ENOUGH:
-            _warn_if_upside_down(task, search, init is None, max_size, spp)
+        ways.run()
+        if search and ways.explained < ENOUGH:
+            _warn_if_upside_down(task, ways, init is None, max_size, spp)
     except KeyboardInterrupt:
         interrupted = True
     finally:

@@ -25,7 +25,9 @@ class Observed:
             self.p = torch.zeros(len(level.free), dtype=torch.float64, requires_grad=True)
             images = task.images(level, task.moved(pose, level.free, self.p), spp, seed)
         elif generator is not None:
-            self.rendered = [Rendered(*view, task.aovs, spp, at) for *view, at in task.views(level, pose, seed)]
+            self.rendered = [
+                Rendered(scene, camera, task.aovs, spp, at) for scene, camera, at in task.views(level, pose, seed)
+            ]
             images = [task.compared(level, one.images) for one in self.rendered]
         else:
             with torch.no_grad():

@@ -81,16 +81,6 @@ class Comparison:
                 paid += float((w * (1.0 - self.open[k].detach().square())).sum()) * PAYS * c**2
         return (total - paid) / self.count, NOISE * (near + FAINT * paid) / self.count
 
-    def matched(self, c):
-        total = paid = 0.0
-        for k, r in enumerate(self.differences):
-            square = r.detach().square().sum(-1, keepdim=True)
-            weight = self.level.shots[k].weight
-            w = torch.ones_like(square) if weight is None else weight
-            total += float((w * square / (1.0 + square / c**2)).sum())
-            paid += float((w * (1.0 - self.open[k].detach().square())).sum()) * PAYS * c**2
-        return total / max(paid, 1e-30)
-
     def residuals(self, c: float) -> list[Tensor]:
         """Whose squares sum up to the loss's approximation for one step."""
         found = []

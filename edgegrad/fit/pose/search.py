@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ..verdict import ENOUGH, coherent, explained, noise_of
+from ..verdict import ENOUGH, coherent, edges_of, explained
 from .gauss_newton import MEMORY, PROBES_MEMORY, GaussNewton
 from .journal import Journal, Way
 from .observed import Observed
@@ -29,8 +29,12 @@ from .task import GROW, PARTS, SHIFT, TURN, Level, PoseTask, blurred
 ASIDE, ASIDE_STEPS = 0.2, 20  # radians between the starts on the coarsest level, and steps from each
 FINAL_SPP = 64  # samples a pixel when ends are compared
 ROUNDS = 2  # of second opinions at most
-APART = 0.03  # of the pictures' range: where blocks' means differ more, something covers the object, or a place nearby looks alike,
-CLEAR = 0.9  # unless as much of the render's edges is in the pictures
+# Where the means of blocks differ by more of the pictures' range, something covers the object, or a place nearby looks alike; but
+# not where so much of the render's edges is in the pictures.
+APART, CLEAR = 0.03, 0.9
+FEWEST = 0.25  # of the edges that the render of the best pose has: with fewer, the object is hardly in view
+MUCH = 0.75  # of the share of its edges, where the pictures show few of them at all: they are there by chance
+HOPE = 0.4  # share of the edges on the second level, below which another way does not go on
 # Of a second opinion: poses that are compared, how many of them take a few steps, and how many are followed further.
 COMPARED, KEPT, FOLLOWED = 150, 4, 3
 COMMON = 0.2  # c of losses that are compared, as a part of the pictures' range
@@ -38,14 +42,27 @@ FARTHEST, FARTHEST_SHIFT = 0.7, 0.15  # radians and object sizes of these from t
 SOFTER = 0.25  # pixels: with a blur that is so far from the true one, the last level is followed again
 
 
+class _Judged(NamedTuple):
+    """A pose, by renders with many samples that are as soft as the pictures."""
+
+    loss: float
+    explained: float  # the share of the render's edges that the pictures show
+    apart: float  # the means of blocks, as coherent() has them
+    edges: float  # of the render, all together
+
+    def beats(self, best: _Judged) -> bool:
+        """Whether this is the better answer: its loss is lower, and not a little lower with fewer of its edges in the pictures.
+        What covers the object, or lights it, has a part in the loss that another place may lower; edges are not found by chance.
+        """
+        if not self.loss < best.loss or self.edges < FEWEST * best.edges:
+            return False
+        return self.explained >= best.explained or (best.explained < ENOUGH and self.explained > MUCH * best.explained)
+
+
 class _End(NamedTuple):
     """Where a way down ended."""
 
-    loss: float  # on the finest level, with many samples
-    explained: float  # the share of the render's edges that the pictures show
-    noise: float  # the loss that the noise of pictures and samples explains
-    apart: float
-    soft: float
+    judged: _Judged  # on the finest level
     pose: Pose
     short: bool  # the last step
 
@@ -86,56 +103,47 @@ class Search:
         # The same many samples for all: a fit never ends at a worse pose than its start.
         stays = found.short and len(_distinct([found.pose, self.start], 2)) == 1  # the start was the answer already
         start = self._judge(self.start, stays)
-        best = found if _beats(found, start) else start
-        print("  E1", *(f"{x:.4g}" for x in found[:5]), "|", *(f"{x:.4g}" for x in start[:5]))
+        best = found if found.judged.beats(start.judged) else start
         self._take(best)
-        if self.further and best.explained < ENOUGH:
+        if self.further and best.judged.explained < ENOUGH:
             best = self._from_afar(best, near)
         deep = self.further and self.steps > ASIDE_STEPS
-        if deep and best.explained >= ENOUGH and best.apart > APART and best.explained < CLEAR:
-            # Something covers the object, or a place nearby looks alike.
+        if deep and ENOUGH <= best.judged.explained < CLEAR and best.judged.apart > APART:
             begins = len(self.history)
             ends = self._ranked(finer[0], self._tilted(best.pose))
-            found = self._judge(*self._down(ends[0], finer[1:]))
-            best = self._better(best, found, begins)
+            self._better(best, self._judge(*self._down(ends[0], finer[1:])), begins)
         self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
 
     def _from_afar(self, best: _End, near: Pose) -> _End:
         """Ways from other starts, until one ends where the pictures show the render's edges. `near` is where the way from the
         start led on the coarsest level."""
-        coarse, *finer = self.levels
+        coarse, second, *_ = self.levels
         begins = len(self.history)
         ends = self._ranked(coarse, self._tilted(self.start)[1:], near)
         if ends[0] is not near:
-            best = self._better(best, self._judge(*self._down(ends[0], finer)), begins)
+            best = self._on(best, self._ranked(second, ends[:1]), begins)
         for _ in range(ROUNDS if self.steps > ASIDE_STEPS else 0):
-            if best.explained >= ENOUGH:
+            if best.judged.explained >= ENOUGH:
                 break
             begins = len(self.history)
             ends = _distinct(self._ranked(coarse, [*self._others(best.pose), *ends[1:]]), FOLLOWED)
-            print("GAIN", self._gain(best.pose), [self._gain(e) for e in ends])
-            ends = self._ranked(finer[0], ends)
-            best = self._better(best, self._judge(*self._down(ends[0], finer)), begins)
+            ends = self._ranked(second, ends)
+            best = self._on(best, ends, begins)
         return best
 
-    def _gain(self, pose):
-        level = self.levels[0]
-        c = COMMON * self.task.extent
-        here = Observed(self.task, level, pose, level.spp, self.seed).compared
-        if self.task.clutter:
-            return 1 - here.matched(c)
-        r = []
-        for shot in level.shots:
-            b = shot.background
-            if self.task.aovs != ("image",): img = torch.zeros_like(shot.target)
-            else: img = blurred(b.expand(*shot.target.shape).to(shot.target), level.blur)
-            r.append(img)
-        there = Comparison(self.task, level, r)
-        return 1 - here.loss(c)[0] / there.loss(c)[0]
+    def _on(self, best: _End, ends: list[Pose], begins: int) -> _End:
+        """The answer, after a way further down from the best of the ends on the second level, if there is hope. Finer levels take
+        the most time, and turn no wrong place into the right one."""
+        _, second, *finest = self.levels
+        (share,) = self.journal.numbers(lambda: [self._judged(ends[0], second).explained])
+        if share >= HOPE:
+            return self._better(best, self._judge(*self._down(ends[0], finest)), begins)
+        self._forget(slice(begins, None))
+        return best
 
     def first_end(self) -> float:
         """The share of the render's edges that the pictures show where the way down from the start alone ends."""
-        return self._judge(*self._down(self.start, self.levels)).explained
+        return self._judge(*self._down(self.start, self.levels)).judged.explained
 
     def _tilted(self, pose: Pose) -> list[Pose]:
         """The pose, and others turned aside from it."""
@@ -144,17 +152,18 @@ class Search:
 
     def _better(self, best: _End, found: _End, begins: int) -> _End:
         """Which of both is the answer. `best` marks the way to it in the history, where that to `found` begins at `begins`."""
-        print("  E2", *(f"{x:.4g}" for x in found[:5]))
-        won = _beats(found, best)
-        lost = slice(0, begins) if won else slice(begins, None)
-        self.history[lost] = [step._replace(best=False) for step in self.history[lost]]
+        won = found.judged.beats(best.judged)
+        self._forget(slice(0, begins) if won else slice(begins, None))
         if won:
             self._take(found)
         return found if won else best
 
+    def _forget(self, lost: slice) -> None:
+        self.history[lost] = [step._replace(best=False) for step in self.history[lost]]
+
     def _take(self, end: _End) -> None:
-        self.loss, self.explained, self.best, self._answered = end.loss, end.explained, end.pose, True
-        self.converged = end.short and end.explained >= ENOUGH
+        self.loss, self.explained, self.best, self._answered = end.judged.loss, end.judged.explained, end.pose, True
+        self.converged = end.short and end.judged.explained >= ENOUGH
 
     def _ranked(self, level: Level, starts: list[Pose], *ends: Pose) -> list[Pose]:
         """Where a few steps lead from each start, and ends of such, the best first."""
@@ -182,7 +191,7 @@ class Search:
         """Steps on one level; the pose, its loss, and whether the last step was short."""
         task = self.task
         search = GaussNewton(PROBES_MEMORY if task.reverse_alone else MEMORY)
-        last = level._replace(soft=0.0) == self.levels[-1]
+        last = level.shots is self.levels[-1].shots
         if (way := self.journal.entered()) is None:
             way = Way(origin, origin, lowest)
         else:
@@ -224,27 +233,25 @@ class Search:
             self.best, self.loss = step.pose, step.loss
         self.history.append(step)
 
-    def _softness(self, pose: Pose) -> float:
-        renders = [Observed(self.task, self.levels[-1], pose, FINAL_SPP, seed).compared.renders for seed in self._seeds]
-        return softness(self.task, self.levels[-1], *renders)
+    def _sharp(self, pose: Pose, level: Level) -> list[list[Tensor]]:
+        """Renders of two seeds with many samples."""
+        seeds = self.seed, (self.seed + 1) % 2**32
+        return [Observed(self.task, level, pose, FINAL_SPP, seed).compared.renders for seed in seeds]
 
-    @property
-    def _seeds(self) -> tuple[int, int]:
-        """Of renders that are compared at an end."""
-        return self.seed, (self.seed + 1) % 2**32
+    def _softness(self, pose: Pose) -> float:
+        return softness(self.task, self.levels[-1], *self._sharp(pose, self.levels[-1]))
 
     def _judge(self, pose: Pose, short: bool) -> _End:
         """With many samples on the finest level."""
-        return _End(*self.journal.numbers(lambda: self._judged(pose)), pose, short)
+        numbers = self.journal.numbers(lambda: list(self._judged(pose, self.levels[-1])))
+        return _End(_Judged(*numbers), pose, short)
 
-    def _judged(self, pose: Pose) -> list[float]:
-        """The loss, the share of the render's edges, and the loss that noise explains."""
-        task, final = self.task, self.levels[-1]
-        sharp = [Observed(task, final, pose, FINAL_SPP, seed).compared.renders for seed in self._seeds]
-        soft = softness(task, final, *sharp)
+    def _judged(self, pose: Pose, level: Level) -> _Judged:
+        task, sharp = self.task, self._sharp(pose, level)
+        soft = softness(task, level, *sharp)
         first, second = ([blurred(image, soft) for image in images] for images in sharp)
         pairs = []
-        for shot, a, b in zip(final.shots, first, second, strict=True):
+        for shot, a, b in zip(level.shots, first, second, strict=True):
             weight = shot.weight
             if self.task.clutter:
                 outside = (a[..., -1] < 0.999).to(a)  # and what lies beside it, whose gradient reaches there
@@ -252,8 +259,8 @@ class Search:
                 weight = inside if weight is None else weight * inside
                 a, b = a[..., :-1], b[..., :-1]
             pairs.append((a, b, shot.target, weight))
-        loss = Comparison(task, final, first).loss(NARROWEST * task.extent)[0]
-        return [loss, explained(pairs), noise_of(pairs), coherent(pairs), soft]
+        loss = Comparison(task, level, first).loss(NARROWEST * task.extent)[0]
+        return _Judged(loss, explained(pairs), coherent(pairs), edges_of(pairs))
 
     def _others(self, best: Pose) -> list[Pose]:
         """The few best of many poses around the start and the best one, by their loss on the coarsest level."""
@@ -286,15 +293,6 @@ def _norms(free: list[int], gradient: Tensor) -> dict[str, float]:
     squares = dict(zip(free, gradient.square().tolist(), strict=True))
     sums = {name: [squares[entry] for entry in entries if entry in squares] for name, entries in PARTS.items()}
     return {name: math.sqrt(sum(part)) for name, part in sums.items() if part}
-
-
-def _beats(found: _End, best: _End) -> bool:
-    """Whether an end is the better answer. Its loss must be lower; and a place far off whose loss is a little lower does not win
-    with fewer of its edges in the pictures."""
-    if not found.loss < best.loss:
-        return False
-    # The loss counts what is covered, which shows no edges, and may be below zero where the background is not known.
-    return found.explained >= best.explained or False
 
 
 def _distinct(poses: list[Pose], most: int) -> list[Pose]:
