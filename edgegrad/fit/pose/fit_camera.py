@@ -200,7 +200,7 @@ def fit_camera(
 
     start = torch.eye(4, dtype=torch.float64)
     found = search_pose(
-        scene, target, camera, mask, start, lens, background, weight, names, max_size=max_size, steps=steps, spp=spp,
+        scene, target, camera, mask, start, lens, background, weight, None, names, max_size=max_size, steps=steps, spp=spp,
         tolerance=tolerance, seed=seed, search=search, progress=progress, callback=None if callback is None else step,
         checkpoint=checkpoint, checkpoint_every=checkpoint_every, resume=resume,
     )  # fmt: skip

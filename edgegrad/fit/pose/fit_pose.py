@@ -16,7 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...camera.camera import Camera
-from ...check import check_flag, check_int, check_positive_int
+from ...check import as_tensor, check_flag, check_float, check_int, check_positive_int, check_shape
 from ...files.paths import PathLike
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
@@ -25,6 +25,7 @@ from ..options import check_checkpoint
 from ..upside_down import BETTER, say_upside_down
 from ..verdict import ENOUGH
 from .journal import Journal
+from .photo.search import PhotoSearch
 from .place import placed
 from .pose import Pose, pose_from_matrix
 from .result import PoseFit
@@ -45,6 +46,7 @@ def fit_pose(
     fit_focal: bool = False,
     background: Tensor | float | None = None,
     weight: Tensor | Sequence[Tensor] | None = None,
+    depth: Tensor | Sequence[Tensor] | None = None,
     max_size: int = 256,
     steps: int = 40,
     spp: int = 16,
@@ -102,7 +104,7 @@ def fit_pose(
     """
     lens = Lens(check_flag("fit_scale", fit_scale), check_flag("fit_focal", fit_focal))
     return search_pose(
-        mesh, target, camera, mask, init, lens, background, weight, Names(), max_size=max_size, steps=steps, spp=spp,
+        mesh, target, camera, mask, init, lens, background, weight, depth, Names(), max_size=max_size, steps=steps, spp=spp,
         tolerance=tolerance, seed=seed, search=search, progress=progress, callback=callback, checkpoint=checkpoint,
         checkpoint_every=checkpoint_every, resume=resume,
     )  # fmt: skip
@@ -112,7 +114,7 @@ def fit_pose(
 @torch.enable_grad()
 def search_pose(
     mesh: Mesh | Scene, target: object, camera: object, mask: object, init: object, lens: Lens,
-    background: Tensor | float | None, weight: object, names: Names, *, max_size: int, steps: int, spp: int, tolerance: float,
+    background: Tensor | float | None, weight: object, depth: object, names: Names, *, max_size: int, steps: int, spp: int, tolerance: float,
     seed: int, search: bool, progress: bool, callback: Callable[[PoseFit], None] | None, checkpoint: PathLike | None,
     checkpoint_every: int, resume: bool,
 ) -> PoseFit:  # fmt: skip
@@ -136,11 +138,16 @@ def search_pose(
         names.init: None if init is None else given.matrix, names.mesh: mesh, names.target: target, "mask": mask,
         "weight": weight, "camera": [traits(one) for one in given_cameras], "background": background,
         **dict(zip(names.lens, lens, strict=False)), "max_size": max_size, "steps": steps, "spp": spp,
-        "tolerance": tolerance, "seed": seed, "search": check_flag("search", search),
+        "tolerance": tolerance, "seed": seed, "depth": depth, "search": check_flag("search", search),
     })  # fmt: skip
     saved = file.read()
     journal, earlier = (Journal(), 0.0) if saved is None else (Journal(saved["journal"]), saved["seconds"])
-    ways = Search(task, task.pyramid(start, max_size, spp), start, steps, tolerance, seed, journal, search)
+    depths = _depths(depth, task)
+    ways: Search | PhotoSearch
+    if task.aovs == ("alpha",) and depth is None:
+        ways = Search(task, task.pyramid(start, max_size, spp), start, steps, tolerance, seed, journal, search)
+    else:
+        ways = PhotoSearch(task, start, depths, max_size, spp, steps, tolerance, seed, journal, search)
     interrupted = False
 
     def seconds() -> float:
@@ -186,7 +193,31 @@ def search_pose(
     return result()
 
 
-def _warn_if_upside_down(task: PoseTask, search: Search, place: bool, max_size: int, spp: int) -> None:
+def _depths(depth: object, task: PoseTask) -> list[Tensor | None]:
+    """Of each picture (H, W), NaN where it was not measured. Raises TypeError or ValueError."""
+    count = len(task.shots)
+    if depth is None:
+        return [None] * count
+    several = isinstance(depth, (list, tuple))
+    given = list(depth) if isinstance(depth, (list, tuple)) else [depth]
+    if len(given) != count:
+        raise ValueError(f"depth: expected {count}, one for each camera, got {len(given)}")
+    found = []
+    for k, (one, shot) in enumerate(zip(given, task.shots, strict=True)):
+        name = f"depth[{k}]" if several else "depth"
+        value = as_tensor(name, one).detach().cpu()
+        check_float(name, value)
+        check_shape(name, value, shot.camera.size, (*shot.camera.size, 1), fix="it needs the picture's size")
+        value = value.reshape(shot.camera.size).float()
+        if bool((value < 0.0).any()):
+            raise ValueError(
+                f"{name}: expected distances along the camera's axis, 0 or NaN where there is none, got {float(value.nan_to_num().min()):g}"
+            )
+        found.append(torch.where(value.isfinite() & (value > 0.0), value, torch.nan))
+    return found
+
+
+def _warn_if_upside_down(task: PoseTask, search: Search | PhotoSearch, place: bool, max_size: int, spp: int) -> None:
     """Where a fit to the pictures turned over finds in them what it did not find as they are."""
     turned = task.turned_over()
     start = placed(turned) if place else search.start

@@ -101,7 +101,7 @@ class Search:
                 "it does not; is the object out of view, or of the background's colour?"
             )
         # The same many samples for all: a fit never ends at a worse pose than its start.
-        stays = found.short and len(_distinct([found.pose, self.start], 2)) == 1  # the start was the answer already
+        stays = found.short and len(distinct([found.pose, self.start], 2)) == 1  # the start was the answer already
         start = self._judge(self.start, stays)
         best = found if found.judged.beats(start.judged) else start
         self._take(best)
@@ -126,7 +126,7 @@ class Search:
             if best.judged.explained >= ENOUGH:
                 break
             begins = len(self.history)
-            ends = _distinct(self._ranked(coarse, [*self._others(best.pose), *ends[1:]]), FOLLOWED)
+            ends = distinct(self._ranked(coarse, [*self._others(best.pose), *ends[1:]]), FOLLOWED)
             ends = self._ranked(second, ends)
             best = self._on(best, ends, begins)
         return best
@@ -207,7 +207,7 @@ class Search:
             norms = {}
             if taken := search.observe(loss, partial(seen.equations, c, first=not search.accepted), slack):
                 way = way._replace(here=way.pose)
-                norms = _norms(level.free, 2.0 / seen.compared.count * search.gradient)
+                norms = norms(level.free, 2.0 / seen.compared.count * search.gradient)
                 c = min(c, seen.compared.scale())
                 search.loss = loss = seen.compared.loss(c)[0]
             way = way._replace(c=c, search=search.state(), random=self.generator.get_state())
@@ -271,7 +271,7 @@ class Search:
             p[TURN:SHIFT] = FARTHEST * self._ball()
             p[SHIFT:GROW] = FARTHEST_SHIFT * self._ball()
             drawn.append(self.task.moved(self.start if k % 2 else best, entries, p[entries]))
-        return _distinct(self._sorted(level, drawn, max(4, level.spp // 16)), KEPT)
+        return distinct(self._sorted(level, drawn, max(4, level.spp // 16)), KEPT)
 
     def _sorted(self, level: Level, poses: list[Pose], spp: int) -> list[Pose]:
         """By their loss, the least first."""
@@ -288,17 +288,17 @@ class Search:
         return radius * direction / direction.norm()
 
 
-def _norms(free: list[int], gradient: Tensor) -> dict[str, float]:
+def norms(free: list[int], gradient: Tensor) -> dict[str, float]:
     """Of each part of a step whose entries are `free`."""
     squares = dict(zip(free, gradient.square().tolist(), strict=True))
     sums = {name: [squares[entry] for entry in entries if entry in squares] for name, entries in PARTS.items()}
     return {name: math.sqrt(sum(part)) for name, part in sums.items() if part}
 
 
-def _distinct(poses: list[Pose], most: int) -> list[Pose]:
-    """The first ones that are turned apart from one another."""
+def distinct(poses: list[Pose], most: int, apart: float = 0.5 * ASIDE) -> list[Pose]:
+    """The first ones that are turned apart from one another, by so many radians."""
     kept: list[Pose] = []
     for pose in poses:
-        if all(angle(pose.R, other.R) > 0.5 * ASIDE for other in kept):
+        if all(angle(pose.R, other.R) > apart for other in kept):
             kept.append(pose)
     return kept[:most]

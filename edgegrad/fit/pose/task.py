@@ -89,6 +89,7 @@ class PoseTask:
     aovs: tuple[str, ...]  # what is compared, one after the other: "image", "alpha" or both
     shots: list[Shot]  # the pictures, whole
     clutter: bool  # what stands behind the object is not known: where it is not seen, nothing is compared
+    colourless: bool  # the meshes have no colours, and no mask says where they are: pictures show them grey
     extent: float  # norm over the channels of the pictures' range, of colours where there are any
     center: Tensor  # (3,) of the bounding box, in the mesh's units
     size: float  # its diagonal at the start, world units
@@ -132,11 +133,14 @@ class PoseTask:
                 image = shape if plain else torch.cat([before_black(image, shape)[0], shape], -1)
             else:
                 behind = background if background is not None else scene.background
+                clutter = clutter or plain  # colours that nobody knows cannot be compared
                 if behind is None:
                     clutter = clutter or is_clutter(image)
                 behind = _background(behind, image)
             shots.append(Shot(view.to("cpu", torch.float64, copy=True), image, behind, count))
         warn_of_faint("mask", masks)
+        if colourless := plain and mask is None:
+            scene = scene.replace(meshes=[_grey(part, shots[0].target.shape[-1]) for part in scene.meshes])
         if clutter:
             shots = [shot._replace(background=None) for shot in shots]
         aovs = ("image", "alpha") if clutter or (mask is not None and not plain) else ("image",)
@@ -168,7 +172,7 @@ class PoseTask:
                 "was it read or rendered right?"
             )
         bare = scene.replace(meshes=double, background=None)
-        return PoseTask(bare, aovs, shots, clutter, extent, (low + high) / 2, size, free, names)
+        return PoseTask(bare, aovs, shots, clutter, colourless, extent, (low + high) / 2, size, free, names)
 
     def pyramid(self, start: Pose, max_size: int, spp: int) -> list[Level]:
         """From coarse to fine. Raises ValueError when the object is behind the camera."""
@@ -299,6 +303,10 @@ class PoseTask:
             image[..., :-1] + (1.0 - image[..., -1:]) * FADED * shot.target
             for image, shot in zip(images, level.shots, strict=True)
         ]
+
+
+def _grey(mesh: Mesh, channels: int) -> Mesh:
+    return mesh.replace(colors=mesh.verts.new_full((len(mesh.verts), channels), 0.5, dtype=torch.float32))
 
 
 def _shots(camera: Any, target: Any, mask: Any, weight: Any, names: Names) -> list[tuple[str, Camera, Any, Any, Any]]:

@@ -1,0 +1,225 @@
+"""The search of fit_pose in photographs: Gauss-Newton over the terms of a photograph, from coarse to fine and from several starts.
+
+Colours are counted anew after each step, inside and around the silhouette as it is then; where the way from the start does not
+end at edges of the picture, it begins again from poses that are turned aside. Where the light turns out to leave the mesh's
+colours as they are, the search that compares them as they are has the last word, which is more precise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..journal import Journal, Way
+from ..pose import Pose, angle
+from ..result import Step
+from ..search import Search, distinct, norms
+from ..task import SHIFT, TURN, Level, PoseTask
+from .level import PhotoLevel, photo_levels
+
+ENOUGH = 0.65  # share of the render's edges: wrong poses reach 0.57, right ones 0.83 and more
+DAMPING, FLOOR = 0.1, 1e-5  # of the curvature's diagonal, and of its largest entry
+LONGEST = 0.1  # of any entry of a step
+COARSE_STEPS, FINE_STEPS = 12, 8  # on a level, at most
+# Other starts: turned about the axes of the camera by so many radians.
+ASIDE = (0.2, 0.4)
+FOLLOWED = 3  # of them, the best on the coarsest level
+APART = 0.05  # radians between poses that are followed both
+# Light that leaves colours as they are: the most that a coefficient differs.
+AS_THEY_ARE = 0.06
+NEAR = 0.1  # radians: a polished pose that is farther off is another one
+
+
+class _End(NamedTuple):
+    """Where a way down ended."""
+
+    explained: float
+    pose: Pose
+    short: bool  # the last step
+
+
+class PhotoSearch:
+    """The state of a search, as Search has it."""
+
+    def __init__(
+        self, task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, steps: int,
+        tolerance: float, seed: int, journal: Journal | None = None, further: bool = True,
+    ) -> None:  # fmt: skip
+        """`further`: whether other starts follow where the way down from the given one does not end well."""
+        self.task, self.start = task, start
+        # Colours are compared as they are first, where they may be that: before an even background, or in a mask.
+        self.colours_first = not task.clutter and all(depth is None for depth in depths)
+        self.levels = photo_levels(task, start, depths, max_size, spp, seed)
+        self.max_size, self.spp, self.steps, self.tolerance = max_size, spp, steps, tolerance
+        self.seed, self.further = seed, further
+        self.best, self.loss, self.converged, self.explained = start, math.nan, False, math.nan
+        self.history: list[Step] = []
+        self.journal = journal or Journal()
+        self.after_step: Callable[[], Any] = lambda: None
+        self._answered = False  # later ways do not show until they win
+
+    @property
+    def planned(self) -> int:
+        """Steps of the first way at most."""
+        return sum(self._most(level) for level in self.levels)
+
+    def run(self) -> None:
+        """Raises ValueError when nothing in the pictures depends on the pose."""
+        task = self.task
+        if self.colours_first:
+            colours = self._by_colours(self.start, task.pyramid(self.start, self.max_size, self.spp), self.further)
+            self._adopt(colours)
+            if self.converged:
+                return
+        begins = len(self.history)
+        found = self._judge(*self._down(self.start, self.levels))
+        if not self.history:
+            raise ValueError(
+                f"{task.names.init}: expected a pose at which the picture changes when the object moves, got one at which "
+                "it does not; is the object out of view?"
+            )
+        stays = found.short and len(distinct([found.pose, self.start], 2, APART)) == 1
+        best = max(self._judge(self.start, stays), found, key=lambda end: end.explained)
+        if not self.colours_first:
+            self._take(best)
+        best = self._from_aside(best, begins) if self.further and best.explained < ENOUGH else best
+        if self.colours_first:
+            # Colours did not fit as they are. The terms of photographs decide if they are sure.
+            if best.explained < ENOUGH:
+                self._forget(slice(begins, None))
+            else:
+                self._forget(slice(0, begins))
+                self._take(best)
+        elif task.clutter and best.explained >= ENOUGH and self._as_they_are(best.pose):
+            colours = self._by_colours(best.pose, task.pyramid(best.pose, self.max_size, self.spp)[-1:], False)
+            if colours.converged and angle(colours.best.R, best.pose.R) < NEAR:
+                self._adopt(colours)
+            else:
+                self._forget(slice(len(self.history) - len(colours.history), None))
+        self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
+
+    def first_end(self) -> float:
+        """The share of the render's edges that the pictures show where the way down from the start alone ends."""
+        return self._judge(*self._down(self.start, self.levels)).explained
+
+    def _from_aside(self, best: _End, begins: int) -> _End:
+        """Ways from other starts, until one ends where the pictures show the render's edges. Those of this search begin in the
+        history at `begins`."""
+        coarse, *finer = self.levels
+        answered = self._answered
+        self._answered = True
+        ends = [self._follow(coarse, self.task.moved(self.start, *turn))[0] for turn in _turns()]
+        scores = self.journal.numbers(lambda: [coarse.explained(pose, self.seed) for pose in ends])
+        order = sorted(range(len(ends)), key=lambda k: -scores[k])
+        for pose in distinct([ends[k] for k in order], FOLLOWED, APART):
+            before = len(self.history)
+            found = self._judge(*self._down(pose, finer))
+            if found.explained > best.explained:
+                best = found
+                self._forget(slice(begins, before))
+                if answered:
+                    self._take(best)
+            else:
+                self._forget(slice(before, None))
+            if best.explained >= ENOUGH:
+                break
+        return best
+
+    def _down(self, pose: Pose, levels: list[PhotoLevel]) -> tuple[Pose, bool]:
+        """Through the levels; the pose, and whether the last step was short."""
+        short = False
+        for level in levels:
+            pose, short = self._follow(level, pose)
+        return pose, short
+
+    def _follow(self, level: PhotoLevel, origin: Pose) -> tuple[Pose, bool]:
+        """Steps on one level; the pose, and whether the last step was short."""
+        way = self.journal.entered() or Way(origin, origin, math.inf)
+        for step in way.steps:
+            self._note(step)
+        while not way.done:
+            # The same samples at each step, so that steps come to rest.
+            normal, loss = level.equations(way.pose, self.seed)
+            if not float(normal.curvature.trace()) > 0.0:
+                self.journal.keep(way := way._replace(done=True))
+                break
+            diagonal = normal.curvature.diagonal()
+            damped = normal.curvature + torch.diag(DAMPING * diagonal + FLOOR * diagonal.max())
+            move = -torch.linalg.solve(damped, normal.gradient)
+            move = move * min(1.0, LONGEST / float(move.abs().max().clamp(min=1e-30)))
+            short = float(move.abs().max()) < self.tolerance * level.plain.coarseness
+            step = Step(level.size, loss, way.pose, True, norms(level.plain.free, normal.gradient))
+            steps = (*way.steps, step)
+            way = way._replace(
+                pose=self.task.moved(way.pose, level.plain.free, move), here=way.pose, lowest=loss, short=short,
+                done=short or len(steps) >= self._most(level), steps=steps,
+            )  # fmt: skip
+            self.journal.keep(way)
+            self._note(step)
+            self.after_step()
+        return way.pose, way.short
+
+    def _most(self, level: PhotoLevel) -> int:
+        return min(self.steps, COARSE_STEPS if level is self.levels[0] else FINE_STEPS)
+
+    def _note(self, step: Step) -> None:
+        if not self._answered:
+            self.best, self.loss = step.pose, step.loss
+        self.history.append(step)
+
+    def _forget(self, lost: slice) -> None:
+        self.history[lost] = [step._replace(best=False) for step in self.history[lost]]
+
+    def _judge(self, pose: Pose, short: bool) -> _End:
+        (share,) = self.journal.numbers(lambda: [self.levels[-1].explained(pose, self.seed)])
+        return _End(share, pose, short)
+
+    def _take(self, end: _End) -> None:
+        (self.loss,) = self.journal.numbers(lambda: [self.levels[-1].equations(end.pose, self.seed)[1]])
+        self.explained, self.best, self._answered = end.explained, end.pose, True
+        self.converged = end.short and end.explained >= ENOUGH
+
+    def _as_they_are(self, pose: Pose) -> bool:
+        """Whether the light leaves the mesh's colours as they are."""
+        (most,) = self.journal.numbers(lambda: [self._change(pose)])
+        return most < AS_THEY_ARE
+
+    def _change(self, pose: Pose) -> float:
+        """How far the light is from one that leaves colours as they are."""
+        lights = self.levels[-1].light(pose, self.seed)
+        white = torch.eye(1, lights[0].shape[1]) if lights and lights[0] is not None else None
+        return max(math.inf if one is None or white is None else float((one - white).abs().max()) for one in lights)
+
+    def _by_colours(self, start: Pose, levels: list[Level], further: bool) -> Search:
+        """The search that compares colours as they are, from a start; its steps follow in the history."""
+        search = Search(self.task, levels, start, self.steps, self.tolerance, self.seed, self.journal, further)
+        before = list(self.history)
+
+        def after_step() -> None:
+            self.history = [*before, *search.history]
+            if not before:
+                self.best, self.loss, self.explained = search.best, search.loss, search.explained
+            self.after_step()
+
+        search.after_step = after_step
+        search.run()
+        self.history = [*before, *search.history]
+        return search
+
+    def _adopt(self, search: Search) -> None:
+        self.best, self.loss, self._answered = search.best, search.loss, True
+        self.explained, self.converged = search.explained, search.converged
+
+
+def _turns() -> list[tuple[list[int], Tensor]]:
+    """Entries of a step and their values, for each other start."""
+    found = []
+    for size in ASIDE:
+        for axis in range(TURN, SHIFT):
+            for sign in (1.0, -1.0):
+                found.append(([axis], torch.tensor([sign * size], dtype=torch.float64)))
+    return found
