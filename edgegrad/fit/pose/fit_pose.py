@@ -79,6 +79,8 @@ def fit_pose(
                 else the median colour of the picture's border. If the border has many colours, the background counts as
                 unknown: then only what the object covers is compared
     weight      (H, W) or (H, W, 1), from 0: how much a pixel counts
+    depth       (H, W) or (H, W, 1), as a depth camera measures it from where the picture was taken: distances along +Z of the
+                camera in world units, 0 or NaN where there is none; or a list of them
     max_size    a larger picture is reduced to so many pixels on its longer side
     steps       at most so many on each level of the pyramid
     spp         samples a pixel of each render on the finest level; the others take as many in all
@@ -114,8 +116,8 @@ def fit_pose(
 @torch.enable_grad()
 def search_pose(
     mesh: Mesh | Scene, target: object, camera: object, mask: object, init: object, lens: Lens,
-    background: Tensor | float | None, weight: object, depth: object, names: Names, *, max_size: int, steps: int, spp: int, tolerance: float,
-    seed: int, search: bool, progress: bool, callback: Callable[[PoseFit], None] | None, checkpoint: PathLike | None,
+    background: Tensor | float | None, weight: object, depth: object, names: Names, *, max_size: int, steps: int, spp: int,
+    tolerance: float, seed: int, search: bool, progress: bool, callback: Callable[[PoseFit], None] | None, checkpoint: PathLike | None,
     checkpoint_every: int, resume: bool,
 ) -> PoseFit:  # fmt: skip
     """fit_pose(), with whatever is sought of the lens."""
@@ -210,8 +212,9 @@ def _depths(depth: object, task: PoseTask) -> list[Tensor | None]:
         check_shape(name, value, shot.camera.size, (*shot.camera.size, 1), fix="it needs the picture's size")
         value = value.reshape(shot.camera.size).float()
         if bool((value < 0.0).any()):
+            least = float(value.nan_to_num().min())
             raise ValueError(
-                f"{name}: expected distances along the camera's axis, 0 or NaN where there is none, got {float(value.nan_to_num().min()):g}"
+                f"{name}: expected distances along the camera's axis, 0 or NaN where there is none, got {least:g}"
             )
         found.append(torch.where(value.isfinite() & (value > 0.0), value, torch.nan))
     return found

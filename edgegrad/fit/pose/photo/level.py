@@ -92,8 +92,8 @@ class PhotoLevel:
         return found
 
     def equations(self, pose: Pose, seed: int) -> tuple[Normal, float]:
-        """Of all terms and pictures, and the mean loss of the region term. Each term is a likelihood in units of its own noise, so
-        they are added as they are."""
+        """Of all terms and pictures, and the mean loss of the region term. Each term is a likelihood in units of its own noise,
+        so they are added as they are."""
         D = len(self.plain.free)
         curvature, gradient = torch.zeros(D, D, dtype=torch.float64), torch.zeros(D, dtype=torch.float64)
         losses = []
@@ -116,8 +116,8 @@ class PhotoLevel:
         return Normal(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
 
     def explained(self, pose: Pose, seed: int) -> float:
-        """The share, 0 … 1, of the edges that the render should have in the pictures, of contours and of what is inside, that they
-        have."""
+        """The share, 0 … 1, of the edges that the render should have in the pictures, of contours and of what is inside, that
+        they have."""
         pairs, shown, length = [], 0.0, 0.0
         for seen in self.see(pose, seed):
             picture, contour = seen.picture, smoothed(seen.alpha[None], CONTOUR_BLUR)[0]

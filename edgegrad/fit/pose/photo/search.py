@@ -1,4 +1,4 @@
-"""The search of fit_pose in photographs: Gauss-Newton over the terms of a photograph, from coarse to fine and from several starts.
+"""The search of fit_pose in photographs: Gauss-Newton over their terms, from coarse to fine and from several starts.
 
 Colours are counted anew after each step, inside and around the silhouette as it is then; where the way from the start does not
 end at edges of the picture, it begins again from poses that are turned aside. Where the light turns out to leave the mesh's
@@ -22,9 +22,11 @@ from ..task import SHIFT, TURN, Level, PoseTask
 from .level import PhotoLevel, photo_levels
 
 ENOUGH = 0.65  # share of the render's edges: wrong poses reach 0.57, right ones 0.83 and more
-DAMPING, FLOOR = 0.1, 1e-5  # of the curvature's diagonal, and of its largest entry
+# Of the curvature's diagonal, where colours are still counted beside the object and where it is found, and of its largest entry.
+DAMPING, LAST_DAMPING, FLOOR = 0.1, 0.01, 1e-5
 LONGEST = 0.1  # of any entry of a step
-COARSE_STEPS, FINE_STEPS = 12, 8  # on a level, at most
+COARSE_STEPS, FINE_STEPS, LAST_STEPS = 12, 8, 20  # on a level, at most
+GAIN = 0.1  # a step that makes the pictures more likely by a smaller factor than exp(this / 2) is short: noise moves poses as far
 # Other starts: turned about the axes of the camera by so many radians.
 ASIDE = (0.2, 0.4)
 FOLLOWED = 3  # of them, the best on the coarsest level
@@ -148,10 +150,12 @@ class PhotoSearch:
                 self.journal.keep(way := way._replace(done=True))
                 break
             diagonal = normal.curvature.diagonal()
-            damped = normal.curvature + torch.diag(DAMPING * diagonal + FLOOR * diagonal.max())
+            damping = LAST_DAMPING if level.last else DAMPING
+            damped = normal.curvature + torch.diag(damping * diagonal + FLOOR * diagonal.max())
             move = -torch.linalg.solve(damped, normal.gradient)
             move = move * min(1.0, LONGEST / float(move.abs().max().clamp(min=1e-30)))
-            short = float(move.abs().max()) < self.tolerance * level.plain.coarseness
+            far = float(move.abs().max()) >= self.tolerance * level.plain.coarseness
+            short = not far or float(move @ normal.curvature @ move) < GAIN
             step = Step(level.size, loss, way.pose, True, norms(level.plain.free, normal.gradient))
             steps = (*way.steps, step)
             way = way._replace(
@@ -164,7 +168,7 @@ class PhotoSearch:
         return way.pose, way.short
 
     def _most(self, level: PhotoLevel) -> int:
-        return min(self.steps, COARSE_STEPS if level is self.levels[0] else FINE_STEPS)
+        return min(self.steps, COARSE_STEPS if level is self.levels[0] else LAST_STEPS if level.last else FINE_STEPS)
 
     def _note(self, step: Step) -> None:
         if not self._answered:
