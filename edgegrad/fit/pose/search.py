@@ -32,8 +32,7 @@ ROUNDS = 2  # of second opinions at most
 # Where the means of blocks differ by more of the pictures' range, something covers the object, or a place nearby looks alike; but
 # not where so much of the render's edges is in the pictures.
 APART, CLEAR = 0.03, 0.9
-FEWEST = 0.25  # of the edges that the render of the best pose has: with fewer, the object is hardly in view
-MUCH = 0.75  # of the share of its edges, where the pictures show few of them at all: they are there by chance
+ALMOST = 0.95  # as much of the edges, but for noise
 HOPE = 0.4  # share of the edges on the second level, below which another way does not go on
 # Of a second opinion: poses that are compared, how many of them take a few steps, and how many are followed further.
 COMPARED, KEPT, FOLLOWED = 150, 4, 3
@@ -51,12 +50,9 @@ class _Judged(NamedTuple):
     edges: float  # of the render, all together
 
     def beats(self, best: _Judged) -> bool:
-        """Whether this is the better answer: its loss is lower, and not a little lower with fewer of its edges in the pictures.
-        What covers the object, or lights it, has a part in the loss that another place may lower; edges are not found by chance.
-        """
-        if not self.loss < best.loss or self.edges < FEWEST * best.edges:
-            return False
-        return self.explained >= best.explained or (best.explained < ENOUGH and self.explained > MUCH * best.explained)
+        """Whether this is the better answer: its loss is lower, and it shows as much of the pictures' edges. What covers the
+        object, or lights it, has a part in the loss that another place may lower, and most of all one out of view."""
+        return self.loss < best.loss and self.explained * self.edges > ALMOST * best.explained * best.edges
 
 
 class _End(NamedTuple):
@@ -143,7 +139,12 @@ class Search:
 
     def first_end(self) -> float:
         """The share of the render's edges that the pictures show where the way down from the start alone ends."""
-        return self._judge(*self._down(self.start, self.levels)).judged.explained
+        coarse, second, *finest = self.levels
+        pose = self.start
+        for level in (coarse, second):
+            pose, *_ = self._follow(level, pose, self.steps, math.inf)
+        share = self._judged(pose, second).explained
+        return share if share < HOPE else self._judge(*self._down(pose, finest)).judged.explained
 
     def _tilted(self, pose: Pose) -> list[Pose]:
         """The pose, and others turned aside from it."""
@@ -299,6 +300,6 @@ def _distinct(poses: list[Pose], most: int) -> list[Pose]:
     """The first ones that are turned apart from one another."""
     kept: list[Pose] = []
     for pose in poses:
-        if all(angle(pose.R, other.R) > 0.5 * ASIDE for other in kept):
+        if len(kept) < most and all(angle(pose.R, other.R) > 0.5 * ASIDE for other in kept):
             kept.append(pose)
-    return kept[:most]
+    return kept
