@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..verdict import ENOUGH, coherent, edges_of, explained
-from .gauss_newton import MEMORY, PROBES_MEMORY, GaussNewton
+from .gauss_newton import FIRST_DAMPING, MEMORY, PROBES_MEMORY, GaussNewton
 from .journal import Journal, Way
 from .observed import Observed
 from .pose import Pose, angle
@@ -205,6 +205,8 @@ class Search:
             seen = Observed(task, level, way.pose, level.spp, seed, self.generator)
             c = seen.compared.scale() if way.c == math.inf else way.c
             loss, slack = seen.compared.loss(c)
+            if way.still:  # what rises there is noise
+                slack = math.inf
             norms = {}
             if taken := search.observe(loss, partial(seen.equations, c, first=not search.accepted), slack):
                 way = way._replace(here=way.pose)
@@ -216,12 +218,13 @@ class Search:
                 self.journal.keep(way := way._replace(done=True))
                 break
             move = search.step()
-            short = float(move.abs().max()) < self.tolerance * level.coarseness
+            still = float(move.abs().max()) < self.tolerance * level.coarseness
+            short = still and search.damping <= FIRST_DAMPING  # not for points that were turned down alone
             settled = search.settled and not last
             good = taken and loss <= way.lowest + NOISE * abs(way.lowest)
             step = Step(level.size, loss, way.pose, good, norms)
             way = way._replace(
-                pose=task.moved(way.here, level.free, move), lowest=loss if good else way.lowest, short=short,
+                pose=task.moved(way.here, level.free, move), lowest=loss if good else way.lowest, short=short, still=still,
                 done=short or settled or search.seen >= most, steps=(*way.steps, step),
             )  # fmt: skip
             self.journal.keep(way)
