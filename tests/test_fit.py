@@ -160,7 +160,7 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(options, stops, uninterru
     whole = small_fit(**options) if options else uninterrupted
     if not options:
         sizes = [step.size[0] for step in whole.history]
-        assert [sizes.count(n) for n in (24, 48)] == [30, 6] and sizes.count(96) > 2
+        assert set(sizes) == {24, 48, 96} and sizes.count(24) > 4 and len(sizes) > 14
     for stop in stops:
         stop %= whole.steps  # −1: the last step but the final comparison
 
@@ -180,14 +180,14 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(options, stops, uninterru
 
 def test_a_fit_that_was_killed_goes_on_from_its_last_checkpoint(uninterrupted, tmp_path):
     def die(fit):
-        if fit.steps == 20:
+        if fit.steps == 12:
             raise MemoryError
 
     steps = []
     with pytest.raises(MemoryError):
         small_fit(checkpoint=tmp_path / "fit.ckpt", checkpoint_every=8, callback=die)
     again = small_fit(checkpoint=tmp_path / "fit.ckpt", resume=True, callback=lambda fit: steps.append(fit.steps))
-    assert steps[0] == 17
+    assert steps[0] == 9
     same(again, uninterrupted)
 
 
@@ -239,7 +239,7 @@ def test_a_checkpoint_that_cannot_be_written_ends_no_fit(tmp_path, monkeypatch):
     monkeypatch.setattr("os.replace", replace)
     with pytest.warns(UserWarning, match=r"checkpoint: expected to write .*fit\.ckpt, got: No space left on device;"):
         fit = small_fit(steps=1, checkpoint=tmp_path / "fit.ckpt", checkpoint_every=1)
-    assert fit.steps > 5 and list(tmp_path.iterdir()) == []
+    assert fit.steps > 3 and list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("plain", [pytest.param(False, marks=pytest.mark.slow), True], ids=["coloured", "plain"])
