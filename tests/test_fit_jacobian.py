@@ -96,7 +96,9 @@ def test_the_motion_of_a_step(free, kind):
     task = PoseTask.of(bracket(), picture, view, None, None, BACKGROUND, Lens(), 1.0, Names())
     task = replace(task, free=free)
     level = task.level(1.0, 0.0, 1.0, 4, free)
-    pose = pose_from_matrix("", about_center(1.1 * START[:3, :3], (0.2, 0.1, -0.1)))._replace(focal=torch.tensor(1.2).double())
+    pose = pose_from_matrix("", about_center(1.1 * START[:3, :3], (0.2, 0.1, -0.1)))._replace(
+        focal=torch.tensor(1.2).double()
+    )
     found = motion(task, level, level.shots[0], pose)
     verts, h = bracket().verts, 1e-6
 

@@ -21,7 +21,10 @@ import torch
 from torch import Tensor
 
 FIRST_PROBES, PROBES = 24, 4  # images v at the first point, and at every later one
-MEMORY, PROBES_MEMORY = 0.0, 0.9  # weight of all earlier JᵀJ when a new one comes: of one by J, and of one by few probes
+MEMORY, PROBES_MEMORY = (
+    0.0,
+    0.9,
+)  # weight of all earlier JᵀJ when a new one comes: of one by J, and of one by few probes
 FIRST_DAMPING, LEAST_DAMPING = 0.1, 0.005  # relative to the diagonal of JᵀJ
 LONGEST = 0.07  # of any entry of a step: JᵀJ says little about poses further away
 FULL_STEPS, DECAY = 4, 0.5  # so many steps at full length once the loss hardly falls, then 1 / (1 + DECAY k)
