@@ -14,7 +14,7 @@ from .request import POSITIONS, SLOTS, Request, join, others_of, tensors_of
 
 FIRST_ORDER = (
     "second derivatives of a rendered image are not available (its gradient is an estimate whose own derivative is not "
-    "computed); for curvature use Gauss-Newton, JᵀJ from edgegrad.jvp, or from backward passes over the image, as edgegrad.fit.fit_pose does"
+    "computed); for curvature use Gauss-Newton, JᵀJ from backward passes over the image, as edgegrad.fit.fit_pose does"
 )
 
 

@@ -1,8 +1,9 @@
 """The search of fit_pose: Gauss-Newton from coarse to fine, and a second opinion where the picture does not show what it found.
 
-The given start is followed first, and if the pictures show the render's edges where it ends, that is the answer. A way down may end at
-a wrong pose that looks alike: then starts aside from the given one are followed on the coarsest level, which costs little, and after them
-the best of many poses around. Renders are as soft as the pictures, and what blur and compression leave starts no such search.
+The given start is followed first, and if the pictures show the render's edges where it ends, that is the answer. A way down may
+end at a wrong pose that looks alike: then starts aside from the given one are followed on the coarsest level, which costs little,
+and after them the best of many poses around. Renders are as soft as the pictures, and what blur and compression leave starts no
+such search.
 """
 
 from __future__ import annotations
