@@ -10,7 +10,7 @@ import torch
 import edgegrad as eg
 from edgegrad.fit import PoseFit, fit_pose
 from edgegrad.fit.checkpoints import FORMAT
-from edgegrad.fit.pose.gauss_newton import GaussNewton
+from edgegrad.fit.pose.gauss_newton import GaussNewton, Normal
 from edgegrad.fit.pose.result import pose_from_json
 
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
@@ -149,9 +149,9 @@ SECOND_OPINION = {"target": picture(camera(32)).flip(1), "steps": 21, "fit_focal
 @pytest.mark.parametrize(
     ("options", "stops"),
     [
-        # In the first of the starts, in another, between the levels, within and (−1) at the end of the last.
-        ({}, (13, 30)),
-        pytest.param({}, (1, 31, 37, -1), marks=pytest.mark.slow, id="other places"),
+        # On the coarsest level, on the next, at the first step, between levels, and (−1) at the end of the last.
+        ({}, (4, 10)),
+        pytest.param({}, (1, 7, 14, -1), marks=pytest.mark.slow, id="other places"),
         # Among other starts, on their ways to finer levels, on that of the best.
         pytest.param(SECOND_OPINION, (100, 210, 330), marks=pytest.mark.slow, id="second opinions"),
     ],
@@ -160,7 +160,7 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(options, stops, uninterru
     whole = small_fit(**options) if options else uninterrupted
     if not options:
         sizes = [step.size[0] for step in whole.history]
-        assert [sizes.count(n) for n in (24, 48)] == [30, 6] and sizes.count(96) > 2
+        assert set(sizes) == {24, 48, 96} and sizes.count(24) > 4 and len(sizes) > 14
     for stop in stops:
         stop %= whole.steps  # −1: the last step but the final comparison
 
@@ -180,14 +180,14 @@ def test_a_resumed_fit_ends_as_if_it_had_never_stopped(options, stops, uninterru
 
 def test_a_fit_that_was_killed_goes_on_from_its_last_checkpoint(uninterrupted, tmp_path):
     def die(fit):
-        if fit.steps == 20:
+        if fit.steps == 12:
             raise MemoryError
 
     steps = []
     with pytest.raises(MemoryError):
         small_fit(checkpoint=tmp_path / "fit.ckpt", checkpoint_every=8, callback=die)
     again = small_fit(checkpoint=tmp_path / "fit.ckpt", resume=True, callback=lambda fit: steps.append(fit.steps))
-    assert steps[0] == 17
+    assert steps[0] == 9
     same(again, uninterrupted)
 
 
@@ -239,7 +239,7 @@ def test_a_checkpoint_that_cannot_be_written_ends_no_fit(tmp_path, monkeypatch):
     monkeypatch.setattr("os.replace", replace)
     with pytest.warns(UserWarning, match=r"checkpoint: expected to write .*fit\.ckpt, got: No space left on device;"):
         fit = small_fit(steps=1, checkpoint=tmp_path / "fit.ckpt", checkpoint_every=1)
-    assert fit.steps > 5 and list(tmp_path.iterdir()) == []
+    assert fit.steps > 3 and list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("plain", [pytest.param(False, marks=pytest.mark.slow), True], ids=["coloured", "plain"])
@@ -429,31 +429,42 @@ def test_errors_name_the_argument(change, error, message):
     assert message in str(caught.value)
 
 
-def test_gauss_newton_estimates_the_curvature():
-    """The mean over probes is JᵀJ: for 24 probes the relative error is about √(2/24) = 0.29 an entry on the diagonal."""
+def test_the_curvature_from_probes():
+    """Their mean is JᵀJ: for 24 probes the relative error is about √(2/24) = 0.29 an entry on the diagonal."""
     generator = torch.Generator().manual_seed(0)
     J = torch.randn(4000, 3, generator=generator).double()
     p = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    estimates = []
-    for _ in range(50):
-        search = GaussNewton(generator)
-        search.observe(p, J @ p + 1.0)
-        estimates.append(search._curvature)
-    mean = torch.stack(estimates).mean(0)
+    found = [Normal.probed(p, [J @ p + 1.0], 24, generator) for _ in range(50)]
+    mean = torch.stack([one.curvature for one in found]).mean(0)
     # 1200 probes: √(2/1200) = 0.04; four of it.
     assert float((mean - J.T @ J).norm() / (J.T @ J).norm()) < 0.16
+    torch.testing.assert_close(found[0].gradient, J.sum(0))
+
+
+def test_the_normal_equations_of_several_images():
+    generator = torch.Generator().manual_seed(0)
+    tangents = [torch.randn(3, *shape, generator=generator) for shape in ((4, 5, 2), (6, 3, 2))]
+    residuals = [torch.randn(J.shape[1:], generator=generator) for J in tangents]
+    curvature, gradient = Normal.of(residuals, tangents)
+    J = torch.cat([one.flatten(1) for one in tangents], 1).double()
+    torch.testing.assert_close(curvature, J @ J.T)
+    torch.testing.assert_close(gradient, J @ torch.cat([r.flatten() for r in residuals]).double())
 
 
 def test_gauss_newton_goes_to_the_minimum_and_back_from_a_rise():
     generator = torch.Generator().manual_seed(0)
     J = torch.randn(500, 3, generator=generator).double() * torch.tensor([1.0, 0.2, 3.0]).double()
     truth, at = torch.tensor([0.2, -0.3, 0.1]).double(), torch.zeros(3).double()
-    search = GaussNewton(generator)
+    search = GaussNewton()
+
+    def refused():
+        raise AssertionError
+
     for _ in range(40):
-        p = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-        assert search.observe(p, J @ (at + p - truth))
+        r = J @ (at - truth)
+        assert search.observe(float(r.square().mean()), lambda r=r: Normal.of([r], [J.T]))
         at = at + search.step()
     assert float((at - truth).norm()) < 1e-3
     damping = search.damping
-    assert not search.observe(p, torch.full((500,), 1e3) + 0.0 * p.sum()) and search.damping > damping
-    assert not search.observe(p, torch.full((500,), math.nan) + 0.0 * p.sum())
+    assert not search.observe(1e6, refused) and search.damping > damping
+    assert not search.observe(math.nan, refused)

@@ -124,9 +124,9 @@ def test_the_pose_on_disk_follows_the_search(files, monkeypatch):
         return FIT_POSE(*args, callback=watch, **options)
 
     monkeypatch.setattr(edgegrad.fit, "fit_pose", watched)
-    assert cli.main(arguments(files, steps=2)) == 0
+    assert cli.main(arguments(files, steps=4)) == 0
     assert [pose.steps for pose in poses] == list(range(1, len(poses) + 1))
-    assert len(poses) > 10 and len({str(pose.matrix) for pose in poses}) > 5
+    assert len(poses) > 5 and len({str(pose.matrix) for pose in poses}) > 2
 
 
 # -- nowhere to write -------------------------------------------------------------------------------------------------

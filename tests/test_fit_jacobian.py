@@ -2,13 +2,17 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
-from test_fit import BACKGROUND, bracket, camera
+from test_fit import BACKGROUND, START, about_center, bracket, camera
 
 import edgegrad as eg
 from edgegrad.fit.pose.jacobian import Motion, derivatives
+from edgegrad.fit.pose.observed import motion
+from edgegrad.fit.pose.pose import pose_from_matrix
+from edgegrad.fit.pose.task import BEND, Lens, Names, PoseTask
 
 CENTER = torch.tensor([1.0, 0.75, 0.4], dtype=torch.float64)
 CHANNELS = ["image", "alpha", "position", "depth", "shading_normal", "normal"]
@@ -74,3 +78,40 @@ def test_no_rules_of_forward_mode_are_loaded():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize("free", [range(7), [0, 1, 2, 3, 4, 5, 7], range(18), [0, 1, 2, 3, 4, 5, *range(8, 18)]])
+@pytest.mark.parametrize("kind", ["perspective", "orthographic"])
+def test_the_motion_of_a_step(free, kind):
+    """That of where points are, and of the lens, by differences of PoseTask.moved() and lens()."""
+    free = [entry for entry in free if entry < BEND or kind == "perspective"]  # a parallel projection has no distortion
+    if kind == "orthographic":
+        view = eg.Camera.orthographic((3.0, 2.0, 4.0), CENTER, height=3.0, size=(24, 32))
+    else:
+        view = eg.Camera.look_at((3.0, 2.0, 4.0), CENTER, fov_y=45.0, size=(24, 32))
+    view = view.to(torch.float64)
+    if kind == "perspective":
+        view = view.replace(distortion=torch.tensor([0.1, 0.0, 0.01, 0.0]).double())
+    picture = eg.render(eg.Scene([bracket()], BACKGROUND), view)
+    task = PoseTask.of(bracket(), picture, view, None, None, BACKGROUND, Lens(), 1.0, Names())
+    task = replace(task, free=free)
+    level = task.level(1.0, 0.0, 1.0, 4, free)
+    pose = pose_from_matrix("", about_center(1.1 * START[:3, :3], (0.2, 0.1, -0.1)))._replace(
+        focal=torch.tensor(1.2).double()
+    )
+    found = motion(task, level, level.shots[0], pose)
+    verts, h = bracket().verts, 1e-6
+
+    def at(k, step):
+        moved = task.moved(pose, free, torch.zeros(len(free)).double().index_fill(0, torch.tensor(k), step))
+        camera = task.lens(view, moved)
+        return moved.scale * verts @ moved.R.T + moved.t, camera.K, camera.coefficients
+
+    points = found.of_points(pose.scale * verts @ pose.R.T + pose.t)
+    for k in range(len(free)):
+        moved, K, bend = ((a - b) / (2 * h) for a, b in zip(at(k, h), at(k, -h), strict=True))
+        torch.testing.assert_close(points[k], moved, rtol=0, atol=1e-6)
+        torch.testing.assert_close(torch.zeros_like(K) if found.K is None else found.K[k], K, rtol=0, atol=1e-6)
+        if kind == "perspective":
+            given = torch.zeros(8).double() if found.distortion is None else found.distortion[k]
+            torch.testing.assert_close(given[: len(bend)], bend, rtol=0, atol=1e-6)

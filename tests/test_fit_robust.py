@@ -1,19 +1,24 @@
 """fit_pose and fit_camera where pictures are not as they should be: covered, cluttered, of something else, from several sides."""
 
+import io
 import json
 import math
 import warnings
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, silhouette
 
 import edgegrad as eg
+from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import fit_camera, fit_pose, fit_scene, fit_texture
 from edgegrad.fit.pose import search
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.robust import Comparison
-from edgegrad.fit.pose.task import PARTS, Lens, Names, PoseTask, is_clutter
+from edgegrad.fit.pose.soft import softness
+from edgegrad.fit.pose.task import PARTS, Lens, Names, PoseTask, blurred, is_clutter
 from edgegrad.fit.views import before_black
 
 
@@ -55,20 +60,82 @@ def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
     monkeypatch.setattr(search.Search, "_down", ends_aside)
     monkeypatch.setattr(search, "ENOUGH", 0.0)  # all ends are taken for right
     if not looks:
-        monkeypatch.setattr(search, "FAR_ABOVE", math.inf)
+        monkeypatch.setattr(search, "APART", math.inf)
     fit = fit_pose(bracket(), image, view, silhouette(view) * free, START, steps=24, progress=False)
     assert (errors(fit)[0] < 1.0) == looks and fit.converged
     assert torch.equal([step for step in fit.history if step.best][-1].pose.matrix, fit.matrix)
 
 
-def test_noise_explains_the_loss_of_a_pose_that_is_right():
-    """Of what is seen whole: no other poses are looked at."""
+def compressed(image, quality):
+    """Through a JPEG file."""
+    file = io.BytesIO()
+    Image.fromarray((255.0 * linear_to_srgb(image.clamp(0, 1))).round().byte().numpy()).save(
+        file, "JPEG", quality=quality
+    )
+    return srgb_to_linear(torch.from_numpy(np.array(Image.open(file))).float() / 255.0)
+
+
+WORN = {
+    "sharp": lambda image: image,
+    "soft": lambda image: blurred(image, 1.0),
+    "compressed": lambda image: compressed(image, 85),
+    "both": lambda image: compressed(blurred(image, 0.7), 70),
+}
+
+
+@pytest.mark.parametrize("kind", WORN)
+def test_blur_and_compression_cost_no_second_search(kind):
+    """One way down is enough, and ends as near."""
+    view = camera(80)
+    fit = fit_pose(bracket(), WORN[kind](picture(view)), view, init=START, background=BACKGROUND, progress=False)
+    degrees, percent = errors(fit)
+    limit = 0.15 if kind in ("sharp", "soft") else 1.0  # without the blur of renders: 0.5 for soft
+    assert degrees < limit and percent < limit and fit.converged and fit.explained > 0.85, (degrees, percent)
+    sizes = [step.size for step in fit.history]
+    assert sizes == sorted(sizes) and fit.steps < 60  # a second search begins at a coarse level again
+
+
+def test_the_softness_of_a_picture():
     view = camera(64)
-    fit = fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, steps=12, progress=False)
-    pose = pose_from_matrix("", fit.matrix)
-    assert fit.task is not None
-    _, _, noise = search.Search(fit.task, fit.task.pyramid(pose, 64, 16), pose, 40, 3e-4, 0)._judged(pose)
-    assert 0.0 < fit.loss < search.FAR_ABOVE * noise < 1e-2
+    for sigma in (0.0, 0.6, 1.0):
+        task = PoseTask.of(bracket(), blurred(picture(view), sigma), view, None, None, BACKGROUND, Lens(), 1.0, Names())
+        pose = pose_from_matrix("", torch.eye(4))
+        level = task.level(1.0, 0.0, 1.0, 64, task.free)
+        renders = [task.images(level, pose, 64, seed) for seed in (0, 1)]
+        assert softness(task, level, *renders) == pytest.approx(sigma, abs=0.1)
+
+
+def lit():
+    """The bracket under a sun and a sky; for each face by its normal."""
+    mesh = bracket()
+    a, b, c = (mesh.verts[mesh.faces[:, corner]] for corner in range(3))
+    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+    sun = torch.nn.functional.normalize(torch.tensor([-1.0, 0.8, 0.0]).double(), dim=0)
+    sky = torch.tensor([0.35, 0.45, 0.6]).double() * (0.6 + 0.4 * normal[:, 1:2])
+    light = sky + torch.tensor([1.3, 1.15, 0.9]).double() * (normal @ sun).clamp(min=0)[:, None]
+    return mesh.replace(face_colors=(mesh.face_colors * light).float())
+
+
+@pytest.mark.parametrize("further", [pytest.param(True, marks=pytest.mark.slow), False])
+def test_an_unlit_mesh_in_a_lit_picture_stays_near_its_start(further):
+    """The loss alone is lowest where the object is out of view: 69° and three sizes away."""
+    view = camera(64)
+    target = picture(view, lit())
+    start = about_center(rotation(0.03, -0.03, 0.02), (0.02, 0.01, 0.0))
+    fit = fit_pose(bracket(), target, view, init=start, background=BACKGROUND, search=further, progress=False)
+    degrees, percent = errors(fit)
+    assert degrees < 3.0 and percent < 1.5, (degrees, percent)
+    if not further:
+        sizes = [step.size for step in fit.history]
+        assert sizes == sorted(sizes)
+
+
+def test_an_answer_shows_as_much_of_the_edges():
+    start = search._Judged(loss=1.0, explained=0.5, apart=0.1, edges=10.0)
+    assert start._replace(loss=0.9, explained=0.6).beats(start)
+    assert not start._replace(loss=1.1, explained=0.9).beats(start)
+    assert not start._replace(loss=0.9, explained=0.4).beats(start)
+    assert not start._replace(loss=0.9, explained=0.9, edges=5.0).beats(start)  # hardly in view
 
 
 def test_a_border_of_many_colours_is_clutter():
@@ -85,7 +152,8 @@ def test_what_is_not_in_the_picture_is_not_found(steps):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # nor turned over
         fit = fit_pose(bracket(), image, camera(32), background=BACKGROUND, steps=steps, progress=False)
-    assert not fit.converged and fit.explained < 0.5
+    # Of hundreds of places on so few pixels one is alike by chance.
+    assert not fit.converged and fit.explained < (0.5 if steps == 4 else 0.6)
     assert fit.state.startswith("not converged: the picture shows")
 
 
@@ -236,11 +304,11 @@ def test_the_history_of_a_camera(tmp_path):
     assert any(set(record.gradient) == {"world_to_camera", "K"} for record in history)
 
     def after_step(fit):
-        if fit.steps == 21:
+        if fit.steps == 8:
             raise KeyboardInterrupt
 
     kept = {"checkpoint": tmp_path / "fit.ckpt"}
-    assert len(fit(**kept, callback=after_step).history) == 21
+    assert len(fit(**kept, callback=after_step).history) == 8
     for record, again in zip(history, fit(**kept, resume=True).history, strict=True):
         assert (record.step, record.loss, record.gradient) == (again.step, again.loss, again.gradient)
         assert all(torch.equal(value, again.values[name]) for name, value in record.values.items())

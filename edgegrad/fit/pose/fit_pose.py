@@ -94,8 +94,8 @@ def fit_pose(
     resume      go on from the checkpoint, if there is one: the fit ends as if it had never stopped. One of a fit that
                 was given something else is refused
 
-    About a quarter of the object may be covered. The picture may be blurred by up to 2 pixels and compressed: renders are blurred
-    alike. The start is followed first. The fit is `converged` when its last step was short and the pictures show at least 60 % of
+    About a quarter of the object may be covered. The picture may be blurred by up to 1.4 pixels, and compressed: renders are made
+    as soft. The start is followed first. The fit is `converged` if its last step was short and the pictures show at least 60 % of
     the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few times as long,
     less where nothing in the picture looks like the object; where they do, but something covers the object or it is of another
     colour, nearby, in about the same time again. Another pose is the answer only if its loss is lower than that of `init` in the

@@ -22,7 +22,7 @@ from torch import Tensor
 
 FIRST_PROBES, PROBES = 24, 4  # images v at the first point, and at every later one
 MEMORY, PROBES_MEMORY = (
-    0.5,
+    0.0,
     0.9,
 )  # weight of all earlier JᵀJ when a new one comes: of one by J, and of one by few probes
 FIRST_DAMPING, LEAST_DAMPING = 0.1, 0.005  # relative to the diagonal of JᵀJ

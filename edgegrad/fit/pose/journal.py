@@ -26,6 +26,7 @@ class Way(NamedTuple):
     lowest: float  # loss so far, of this way and those that it is ranked with
     c: float = math.inf  # of the loss
     short: bool = False  # the last step
+    still: bool = False  # whether it was so short, for whatever reason, that it led to the same place
     done: bool = False
     steps: tuple[Step, ...] = ()
     search: Mapping[str, Any] = MappingProxyType({})  # the state of Gauss-Newton

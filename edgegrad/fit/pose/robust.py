@@ -70,16 +70,18 @@ class Comparison:
 
     def loss(self, c: float) -> tuple[float, float]:
         """The mean over pixels and channels, and by how much that of another render may be higher by its noise."""
-        total = near = paid = 0.0
+        total = near = paid = spread = 0.0
         for k, r in enumerate(self.differences):
             square = r.detach().square().sum(-1, keepdim=True)
             weight = self.level.shots[k].weight
             w = torch.ones_like(square) if weight is None else weight
             total += float((w * square / (1.0 + square / c**2)).sum())
-            near += float((w * square / (1.0 + square / c**2).square()).sum())  # what is far off is so in any samples
+            close = w * square / (1.0 + square / c**2).square()  # what is far off is so in any samples
+            near += float(close.sum())
+            spread += float(close.square().sum())  # its variance, where all that is left is noise
             if self.open:
                 paid += float((w * (1.0 - self.open[k].detach().square())).sum()) * PAYS * c**2
-        return (total - paid) / self.count, NOISE * (near + FAINT * paid) / self.count
+        return (total - paid) / self.count, (max(NOISE * near, math.sqrt(spread)) + NOISE * FAINT * paid) / self.count
 
     def residuals(self, c: float) -> list[Tensor]:
         """Whose squares sum up to the loss's approximation for one step."""

@@ -1,8 +1,9 @@
 """The search of fit_pose: Gauss-Newton from coarse to fine, and a second opinion where the picture does not show what it found.
 
-A way down from a start may end at a wrong pose that looks alike. The coarsest level costs little, so there the search begins from
-several starts; and where the pictures do not show the render's edges at the end, it begins again from the best of many poses
-around the start.
+The given start is followed first, and if the pictures show the render's edges where it ends, that is the answer. A way down may
+end at a wrong pose that looks alike: then starts aside from the given one are followed on the coarsest level, which costs little,
+and after them the best of many poses around. Renders are as soft as the pictures, and what blur and compression leave starts no
+such search.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..verdict import ENOUGH, coherent, edges_of, explained
-from .gauss_newton import MEMORY, PROBES_MEMORY, GaussNewton
+from .gauss_newton import FIRST_DAMPING, MEMORY, PROBES_MEMORY, GaussNewton
 from .journal import Journal, Way
 from .observed import Observed
 from .pose import Pose, angle
@@ -32,8 +33,7 @@ ROUNDS = 2  # of second opinions at most
 # Where the means of blocks differ by more of the pictures' range, something covers the object, or a place nearby looks alike; but
 # not where so much of the render's edges is in the pictures.
 APART, CLEAR = 0.03, 0.9
-FEWEST = 0.25  # of the edges that the render of the best pose has: with fewer, the object is hardly in view
-MUCH = 0.75  # of the share of its edges, where the pictures show few of them at all: they are there by chance
+ALMOST = 0.95  # as much of the edges, but for noise
 HOPE = 0.4  # share of the edges on the second level, below which another way does not go on
 # Of a second opinion: poses that are compared, how many of them take a few steps, and how many are followed further.
 COMPARED, KEPT, FOLLOWED = 150, 4, 3
@@ -51,12 +51,9 @@ class _Judged(NamedTuple):
     edges: float  # of the render, all together
 
     def beats(self, best: _Judged) -> bool:
-        """Whether this is the better answer: its loss is lower, and not a little lower with fewer of its edges in the pictures.
-        What covers the object, or lights it, has a part in the loss that another place may lower; edges are not found by chance.
-        """
-        if not self.loss < best.loss or self.edges < FEWEST * best.edges:
-            return False
-        return self.explained >= best.explained or (best.explained < ENOUGH and self.explained > MUCH * best.explained)
+        """Whether this is the better answer: its loss is lower, and it shows as much of the pictures' edges. What covers the
+        object, or lights it, has a part in the loss that another place may lower, and most of all one out of view."""
+        return self.loss < best.loss and self.explained * self.edges > ALMOST * best.explained * best.edges
 
 
 class _End(NamedTuple):
@@ -143,7 +140,12 @@ class Search:
 
     def first_end(self) -> float:
         """The share of the render's edges that the pictures show where the way down from the start alone ends."""
-        return self._judge(*self._down(self.start, self.levels)).judged.explained
+        coarse, second, *finest = self.levels
+        pose = self.start
+        for level in (coarse, second):
+            pose, *_ = self._follow(level, pose, self.steps, math.inf)
+        share = self._judged(pose, second).explained
+        return share if share < HOPE else self._judge(*self._down(pose, finest)).judged.explained
 
     def _tilted(self, pose: Pose) -> list[Pose]:
         """The pose, and others turned aside from it."""
@@ -204,6 +206,8 @@ class Search:
             seen = Observed(task, level, way.pose, level.spp, seed, self.generator)
             c = seen.compared.scale() if way.c == math.inf else way.c
             loss, slack = seen.compared.loss(c)
+            if way.still:  # what rises there is noise
+                slack = math.inf
             norms = {}
             if taken := search.observe(loss, partial(seen.equations, c, first=not search.accepted), slack):
                 way = way._replace(here=way.pose)
@@ -215,12 +219,13 @@ class Search:
                 self.journal.keep(way := way._replace(done=True))
                 break
             move = search.step()
-            short = float(move.abs().max()) < self.tolerance * level.coarseness
+            still = float(move.abs().max()) < self.tolerance * level.coarseness
+            short = still and search.damping <= FIRST_DAMPING  # not for points that were turned down alone
             settled = search.settled and not last
             good = taken and loss <= way.lowest + NOISE * abs(way.lowest)
             step = Step(level.size, loss, way.pose, good, norms)
             way = way._replace(
-                pose=task.moved(way.here, level.free, move), lowest=loss if good else way.lowest, short=short,
+                pose=task.moved(way.here, level.free, move), lowest=loss if good else way.lowest, short=short, still=still,
                 done=short or settled or search.seen >= most, steps=(*way.steps, step),
             )  # fmt: skip
             self.journal.keep(way)
@@ -299,6 +304,6 @@ def distinct(poses: list[Pose], most: int, apart: float = 0.5 * ASIDE) -> list[P
     """The first ones that are turned apart from one another, by so many radians."""
     kept: list[Pose] = []
     for pose in poses:
-        if all(angle(pose.R, other.R) > apart for other in kept):
+        if len(kept) < most and all(angle(pose.R, other.R) > apart for other in kept):
             kept.append(pose)
-    return kept[:most]
+    return kept

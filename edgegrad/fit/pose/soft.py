@@ -13,7 +13,7 @@ from torch import Tensor
 from .robust import Comparison
 from .task import Level, PoseTask, blurred
 
-BLURS = (0.0, 0.5, 0.7, 1.0, 1.4, 2.0)  # pixels, that are tried
+BLURS = (0.0, 0.5, 0.7, 1.0, 1.4)  # pixels, that are tried
 ALIKE = 0.1  # c, as a part of the pictures' range: what differs by more than that is of something else
 
 
