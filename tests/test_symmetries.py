@@ -232,7 +232,10 @@ def test_transforms_are_those_of_bop() -> None:
     assert torch.allclose(T[7, :3, :3] @ point + T[7, :3, 3], R.double() @ (point - offset) + offset, atol=1e-6)
     assert torch.allclose(T[315 + 7], T[7] @ found.motions[1])
     again = eg.Symmetries.from_bop(found.to_bop())
-    assert torch.equal(again.motions, found.motions) and found.to_bop()["symmetries_continuous"] == info["symmetries_continuous"]
+    assert (
+        torch.equal(again.motions, found.motions)
+        and found.to_bop()["symmetries_continuous"] == info["symmetries_continuous"]
+    )
     assert eg.Symmetries().to_bop() == {} and eg.Symmetries.from_bop({"diameter": 3.0}).trivial
     small = found.scaled(0.001)
     assert float(small.motions[1, 0, 3]) == 0.002 and float(small.continuous[0].offset[0]) == 0.001

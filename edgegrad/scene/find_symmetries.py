@@ -1,9 +1,10 @@
 """find_symmetries(): the rotations after which a mesh is where it was, from its surface.
 
 A symmetry keeps the centroid of the surface's area and commutes with its covariance. Where the three variances differ, only half
-turns about the principal axes are left; where two are equal, the third axis may be of any order and others lie across it; where all
-are equal, rotations are searched for on a grid over all of them, each refined by iterated closest points (Besl and McKay 1992) on the
-distances to the planes of the nearest faces (Chen and Medioni 1992). What comes out is a group, whose products are verified as well.
+turns about the principal axes are left; where two are equal, the third axis may be of any order, and others lie across it. Where
+all are equal, rotations are searched for on a grid over all of them, each refined by iterated closest points (Besl and McKay
+1992), on the distances to the planes of the nearest faces (Chen and Medioni 1992). What comes out is a group, whose products are
+verified as well.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ from ..check import check_flag, check_int, check_positive
 from .mesh import Mesh
 from .nearest import NEIGHBOURS, Places, Surface
 from .scene import Scene, as_scene
-from .symmetries import SymmetryAxis, Symmetries, about
+from .symmetries import Symmetries, SymmetryAxis, about
 
 SAMPLES = 600  # of the surface, and as many vertices, whose distances decide
-ROUGH = 200  # of these for what only ranks candidates
+ROUGH = 120  # of these for what only ranks candidates
 TURNS = 24  # of a rotation about an axis, by which it counts as continuous
 GOLDEN = math.pi * (3.0 - math.sqrt(5.0))  # multiples of this angle are evenly spread
-GRID = 1000  # rotations of the grid over all, some 20° apart
-REFINED = 24  # of these, the best that are not NEAR a symmetry that is known, refined
+GRID = 600  # rotations of the grid over all, some 25° apart
+REFINED = 16  # of these, the best that are not NEAR a symmetry that is known, refined
 NEAR = math.radians(30.0)
 STEPS = 12  # of iterated closest points
 FEWER = 4  # faces near a point that are looked at in the first half of these
@@ -84,8 +85,9 @@ class _Search:
         self.size = 2.0 * float(farthest)
         self.limit = self.tolerance * self.size
         self.few = samples.position[:: SAMPLES // ROUGH] - self.center
-        self.samples = samples
-        self.colors = self._seen(samples) if self.textured else None
+        colors = surface.colors(samples) if self.textured else None
+        self.brightest = 1.0 if colors is None else max(float(colors.max()), 1e-30)
+        self.colors = None if colors is None else self._seen(colors)
 
     def run(self) -> Symmetries:
         radius = np.linalg.norm(self.points, axis=1)
@@ -131,20 +133,14 @@ class _Search:
             return False
         if self.colors is None:
             return True
-        of_samples = Places(there.position[:SAMPLES], there.face[:SAMPLES], there.b[:SAMPLES])
-        seen = self._seen(of_samples)
-        assert seen is not None
-        odd = (seen - self.colors).abs().amax(1) > self.color_tolerance
+        colors = self.surface.colors(Places(there.position[:SAMPLES], there.face[:SAMPLES], there.b[:SAMPLES]))
+        assert colors is not None
+        odd = (self._seen(colors) - self.colors).abs().amax(1) > self.color_tolerance
         return float(odd.double().mean()) <= ODD_COLORS
 
-    def _seen(self, places: Places) -> Tensor | None:
-        """(N, C): square roots of colours, the brightest 1."""
-        colors = self.surface.colors(places)
-        if colors is None:
-            return None
-        if not hasattr(self, "brightest"):
-            self.brightest = float(colors.max())
-        return (colors.clamp(min=0.0) / (self.brightest if self.brightest > 0.0 else 1.0)).sqrt()
+    def _seen(self, colors: Tensor) -> Tensor:
+        """(N, C): square roots, of the brightest 1."""
+        return (colors.clamp(min=0.0) / self.brightest).sqrt()
 
     def _equal(self, i: int, j: int) -> bool:
         """Whether a surface whose points are off by the tolerance may have these two variances and be symmetric. Shifting points
@@ -262,8 +258,8 @@ class _Search:
 
 
 def _moments(triangles: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centroid (3,), variances (3,) and principal axes (3, 3) in columns, of the area. Of a triangle ∫ x xᵀ is its area / 12 times
-    (Σ v vᵀ + s sᵀ), with s the sum of its corners v."""
+    """Centroid (3,), variances (3,) and principal axes (3, 3) in columns, of the area. Of a triangle the integral of x xᵀ is its
+    area / 12 times (Σ v vᵀ + s sᵀ), with s the sum of its corners v."""
     weight = area / area.sum()
     center = weight @ triangles.mean(1)
     v = triangles - center

@@ -35,9 +35,7 @@ class Surface:
         corners = [mesh.verts.detach().cpu().double()[mesh.faces.cpu().long()].numpy() for mesh in scene.meshes]
         self.triangles = np.concatenate(corners)  # (F, 3, 3)
         self._first = np.cumsum([0, *(len(one) for one in corners)])
-        across = np.cross(
-            self.triangles[:, 1] - self.triangles[:, 0], self.triangles[:, 2] - self.triangles[:, 0]
-        )
+        across = np.cross(self.triangles[:, 1] - self.triangles[:, 0], self.triangles[:, 2] - self.triangles[:, 0])
         length = np.linalg.norm(across, axis=1)
         self.area = 0.5 * length
         self.normal = across / np.where(length > 0.0, length, 1.0)[:, None]  # (F, 3); zeros where a face has no area

@@ -92,7 +92,9 @@ class Symmetries:
         axes = tuple(self.continuous)
         for i, axis in enumerate(axes):
             if not isinstance(axis, SymmetryAxis):
-                raise TypeError(f"continuous[{i}]: expected a SymmetryAxis, got {type(axis).__name__}; eg.SymmetryAxis(…) makes one")
+                raise TypeError(
+                    f"continuous[{i}]: expected a SymmetryAxis, got {type(axis).__name__}; eg.SymmetryAxis(…) makes one"
+                )
         object.__setattr__(self, "continuous", axes)
 
     @classmethod
@@ -142,8 +144,8 @@ class Symmetries:
     def transforms(self, step: float = 0.01) -> Tensor:
         """(T, 4, 4): all of them, continuous ones in ⌈π / step⌉ equal angles each, so that between two of them no point moves by
         more than `step` of the object's diameter. In the order, and with the angles, of BOP's own toolkit: where there are axes,
-        each discrete one followed by the rotations about each axis. Of a sphere therefore only rotations about its axes; closest()
-        knows all of them. Raises ValueError."""
+        each discrete one followed by the rotations about each axis. Of a sphere therefore only the rotations about its axes;
+        closest() knows all of them. Raises ValueError."""
         check_positive("step", step, least=1e-4, most=1.0)
         if not self.continuous:
             return self.motions.clone()
@@ -228,7 +230,9 @@ def _common_point(axes: Sequence[SymmetryAxis]) -> Tensor:
     """(3,) nearest to all axes, by least squares of the distances: of those of a sphere its centre."""
     one = torch.eye(3, dtype=torch.float64)
     across = [one - torch.outer(axis.direction, axis.direction) for axis in axes]
-    return torch.linalg.solve(sum(across, 0 * one), sum((P @ a.offset for P, a in zip(across, axes, strict=True)), 0 * one[0]))
+    return torch.linalg.solve(
+        sum(across, 0 * one), sum((P @ a.offset for P, a in zip(across, axes, strict=True)), 0 * one[0])
+    )
 
 
 def _pose(name: str, value: object) -> Tensor:
