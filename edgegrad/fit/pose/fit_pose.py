@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -18,8 +18,10 @@ from tqdm import tqdm
 from ...camera.camera import Camera
 from ...check import check_flag, check_int, check_positive_int
 from ...files.paths import PathLike
+from ...scene.find_symmetries import find_symmetries
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ...scene.symmetries import Symmetries
 from ..checkpoints import Checkpoint, traits
 from ..options import check_checkpoint
 from ..upside_down import BETTER, say_upside_down
@@ -55,6 +57,7 @@ def fit_pose(
     checkpoint: PathLike | None = None,
     checkpoint_every: int = 25,
     resume: bool = False,
+    symmetries: Symmetries | Literal["find"] | None = None,
 ) -> PoseFit:
     """Rotation and translation (and scale, and focal length) of a known mesh in a picture, or in several.
 
@@ -87,6 +90,8 @@ def fit_pose(
     checkpoint  a file that holds the fit's state, written every `checkpoint_every` steps and at the end, never in part
     resume      go on from the checkpoint, if there is one: the fit ends as if it had never stopped. One of a fit that
                 was given something else is refused
+    symmetries  of the mesh: of the poses that they make the same, the one nearest to the start is reported, by its rotation.
+                "find" looks for them with find_symmetries(). They change nothing of the search itself
 
     About a quarter of the object may be covered. The fit is `converged` when its last step was short and the pictures show at
     least 60 % of the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few
@@ -99,7 +104,7 @@ def fit_pose(
     return search_pose(
         mesh, target, camera, mask, init, lens, background, weight, Names(), max_size=max_size, steps=steps, spp=spp,
         tolerance=tolerance, seed=seed, progress=progress, callback=callback, checkpoint=checkpoint,
-        checkpoint_every=checkpoint_every, resume=resume,
+        checkpoint_every=checkpoint_every, resume=resume, symmetries=_symmetries(symmetries, mesh),
     )  # fmt: skip
 
 
@@ -109,7 +114,7 @@ def search_pose(
     mesh: Mesh | Scene, target: object, camera: object, mask: object, init: object, lens: Lens,
     background: Tensor | float | None, weight: object, names: Names, *, max_size: int, steps: int, spp: int, tolerance: float,
     seed: int, progress: bool, callback: Callable[[PoseFit], None] | None, checkpoint: PathLike | None,
-    checkpoint_every: int, resume: bool,
+    checkpoint_every: int, resume: bool, symmetries: Symmetries | None = None,
 ) -> PoseFit:  # fmt: skip
     """fit_pose(), with whatever is sought of the lens."""
     began = time.perf_counter()
@@ -146,7 +151,7 @@ def search_pose(
             file.write({"journal": journal.state(), "seconds": seconds()})
 
     def result() -> PoseFit:
-        best: Pose = search.best
+        best: Pose = search.best if symmetries is None else search.best.closest(symmetries, start)
         history = list(search.history)
         cameras = [task.lens(one, best) for one in given_cameras]
         return PoseFit(
@@ -179,6 +184,17 @@ def search_pose(
         bar.close()
     keep()
     return result()
+
+
+def _symmetries(given: object, mesh: Mesh | Scene) -> Symmetries | None:
+    """Raises TypeError or ValueError, or what find_symmetries() raises."""
+    if given is None or isinstance(given, Symmetries):
+        return given
+    if given == "find":
+        return find_symmetries(mesh)
+    if isinstance(given, str):
+        raise ValueError(f'symmetries: expected Symmetries, "find" or None, got {given!r}')
+    raise TypeError(f'symmetries: expected Symmetries, "find" or None, got {type(given).__name__}')
 
 
 def _warn_if_upside_down(task: PoseTask, search: Search, place: bool, max_size: int, spp: int) -> None:
