@@ -224,9 +224,13 @@ class Dataset:
         tests = [name for name in splits if name.startswith("test")]
         chosen = split or ("test" if "test" in tests else next(iter(tests if len(tests) == 1 else splits), ""))
         if chosen not in splits or (split is None and chosen not in tests and len(splits) > 1):
-            got = ", ".join(splits) or "none: it has no folder with numbered scenes in it"
-            wish = f"the split {split!r}" if split else "one split to read"
-            raise ValueError(f"{folder}: expected {wish}, got {got}; choose by split=")
+            if not splits:
+                raise ValueError(
+                    f"{folder}: expected folders of splits, such as test/000001/scene_camera.json, got none; is it the folder that "
+                    "has models/ in it?"
+                )
+            wish = f"the split {split!r}" if split else "the name of a split"
+            raise ValueError(f"{folder}: expected {wish}, got {', '.join(splits)}; name one of these")
         self.split = chosen
         self._paths = {int(path.name): path for path in _scene_folders(self.folder / chosen)}
         self._scenes: dict[int, _Scene] = {}
