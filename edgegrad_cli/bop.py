@@ -28,7 +28,9 @@ def add(commands: Any) -> None:
     errors.add_argument(
         "--targets", metavar="NAME", help="file in DATASET that lists what is to be found (test_targets_bop19.json)"
     )
-    errors.add_argument("--no-vsd", action="store_true", help="leave out VSD, which takes most of the time and needs depth")
+    errors.add_argument(
+        "--no-vsd", action="store_true", help="leave out VSD, which takes most of the time and needs depth"
+    )
     errors.add_argument(
         "--delta", type=millimetres, default=15.0, metavar="MM", help="of VSD (%(default)g); BOP takes 5 for ITODD"
     )
@@ -37,7 +39,9 @@ def add(commands: Any) -> None:
 
     better = kinds.add_parser("refine", help="fit each pose of a result file to its image", description=_refine.__doc__)
     _add_files(better)
-    better.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.csv", help="the result file that is written")
+    better.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="OUT.csv", help="the result file that is written"
+    )
     better.add_argument("--limit", type=count, metavar="N", help="only the first N rows")
     better.add_argument("--resume", action="store_true", help="go on after the rows that OUT.csv has")
     better.add_argument(
@@ -53,7 +57,9 @@ def add(commands: Any) -> None:
 
 
 def _add_files(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="its folder, with models/ and a folder for each split")
+    parser.add_argument(
+        "dataset", type=Path, metavar="DATASET", help="its folder, with models/ and a folder for each split"
+    )
     parser.add_argument("results", type=Path, metavar="RESULTS.csv", help="scene_id,im_id,obj_id,score,R,t,time")
     parser.add_argument("--split", help="test, val, train_pbr … (test, or the only one there is)")
 
@@ -105,7 +111,9 @@ def _refine(args: argparse.Namespace) -> int:
     with tqdm(total=len(given), initial=len(done), desc="refine", unit="row", leave=False) as bar:
         for row in given[len(done) :]:
             try:
-                found = refine(dataset, row, size=args.size, steps=args.steps, seed=args.seed, unconverged=args.unconverged)
+                found = refine(
+                    dataset, row, size=args.size, steps=args.steps, seed=args.seed, unconverged=args.unconverged
+                )
             except KeyboardInterrupt:
                 interrupted = True
                 break
@@ -121,7 +129,10 @@ def _refine(args: argparse.Namespace) -> int:
                 _draw(args.pictures, len(done), found)
             tqdm.write(_said(found), file=sys.stdout)
             bar.update()
-    print(f"{len(done)} of {len(given)} rows in {args.out}" + (f"; {kept} of those refined now kept their pose" if kept else ""))
+    print(
+        f"{len(done)} of {len(given)} rows in {args.out}"
+        + (f"; {kept} of those refined now kept their pose" if kept else "")
+    )
     if interrupted:
         print("edgegrad: interrupted; the same command with --resume goes on from there", file=sys.stderr)
     return INTERRUPTED if interrupted else 0
@@ -160,7 +171,9 @@ def _key(row: Estimate) -> tuple[int, int, int, float]:
 def _timed(done: Sequence[Estimate], given: Sequence[Estimate], spent: dict[tuple[int, int], float]) -> list[Estimate]:
     """BOP wants one time for all rows of an image; it stays unknown where it was."""
     return [
-        replace(row, seconds=before.seconds + spent[row.scene_id, row.im_id] if before.seconds >= 0.0 else before.seconds)
+        replace(
+            row, seconds=before.seconds + spent[row.scene_id, row.im_id] if before.seconds >= 0.0 else before.seconds
+        )
         for row, before in zip(done, given)  # noqa: B905  the rest is to come
     ]
 
@@ -171,7 +184,9 @@ def _draw(folder: Path, number: int, found: Refined) -> None:
 
     if found.fit is not None and found.fit.history:
         row = found.estimate
-        draw_fit(folder / f"{number:06d}_scene{row.scene_id:06d}_image{row.im_id:06d}_object{row.obj_id:06d}.png", found.fit)
+        draw_fit(
+            folder / f"{number:06d}_scene{row.scene_id:06d}_image{row.im_id:06d}_object{row.obj_id:06d}.png", found.fit
+        )
 
 
 def _said(found: Refined) -> str:

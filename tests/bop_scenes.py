@@ -14,7 +14,9 @@ from edgegrad.scene.symmetries import about
 
 SIZE = (72, 96)
 K = torch.tensor([[120.0, 0.0, 47.5], [0.0, 120.0, 35.5], [0.0, 0.0, 1.0]])
-PALETTE = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.7, 0.2], [0.1, 0.2, 0.8], [0.9, 0.8, 0.1], [0.1, 0.8, 0.8], [0.8, 0.2, 0.8]])
+PALETTE = torch.tensor(
+    [[0.8, 0.1, 0.1], [0.1, 0.7, 0.2], [0.1, 0.2, 0.8], [0.9, 0.8, 0.1], [0.1, 0.8, 0.8], [0.8, 0.2, 0.8]]
+)
 # sRGB of 8 bits, as PLY files hold colours, so that what is read is what was rendered.
 PALETTE = eg.image.srgb_to_linear((eg.image.linear_to_srgb(PALETTE) * 255).round() / 255)
 
@@ -48,10 +50,23 @@ TRUTHS = [
 ]
 
 
+def camera() -> eg.Camera:
+    one = torch.eye(3, dtype=torch.float64)
+    return eg.Camera.from_opencv(one, one.new_zeros(3), K.double(), SIZE)
+
+
 def make(folder: Path, scene_id: int = 3) -> Path:
     models = meshes()
     bop.write_models(folder, models, {5: eg.find_symmetries(models[5])})
-    one = torch.eye(3, dtype=torch.float64)
-    camera = eg.Camera.from_opencv(one, one.new_zeros(3), K.double(), SIZE)
-    bop.write_scene(folder, scene_id, [bop.Shot(camera, objects) for objects in TRUTHS], models, spp=32)
+    bop.write_scene(folder, scene_id, [bop.Shot(camera(), objects) for objects in TRUTHS], models, spp=32)
     return folder
+
+
+def estimates(moved: torch.Tensor | None = None) -> list[bop.Estimate]:
+    """The true poses, each followed by a motion in the camera's axes."""
+    moved = torch.eye(4, dtype=torch.float64) if moved is None else moved
+    return [
+        bop.Estimate(3, im_id, obj_id, 0.9 - 0.1 * i, moved @ truth, 1.5)
+        for im_id, objects in enumerate(TRUTHS)
+        for i, (obj_id, truth) in enumerate(objects)
+    ]

@@ -2,8 +2,8 @@
 
 Everything is as BOP has it: millimetres, poses from the mesh to the camera (+X right, +Y down, +Z forward), angles in degrees.
 
-Hodaň et al., "BOP: Benchmark for 6D Object Pose Estimation", ECCV 2018; "BOP Challenge 2020 on 6D Object Localization", ECCVW 2020;
-https://bop.felk.cvut.cz
+Hodaň et al., "BOP: Benchmark for 6D Object Pose Estimation", ECCV 2018; "BOP Challenge 2020 on 6D Object Localization", ECCVW
+2020; https://bop.felk.cvut.cz
 """
 
 from .dataset import Dataset, Frame, Model, Target, Truth

@@ -39,12 +39,12 @@ ROUNDED = 1e-2  # how far R Rᵀ may be from 1 in files
 
 
 class Target(NamedTuple):
-    """What is to be found: `count` instances of an object in an image."""
+    """What is to be found: how many instances of an object in an image."""
 
     scene_id: int
     im_id: int
     obj_id: int
-    count: int
+    instances: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,8 +226,8 @@ class Dataset:
         if chosen not in splits or (split is None and chosen not in tests and len(splits) > 1):
             if not splits:
                 raise ValueError(
-                    f"{folder}: expected folders of splits, such as test/000001/scene_camera.json, got none; is it the folder that "
-                    "has models/ in it?"
+                    f"{folder}: expected folders of splits, such as test/000001/scene_camera.json, got none; is it the folder "
+                    "that has models/ in it?"
                 )
             wish = f"the split {split!r}" if split else "the name of a split"
             raise ValueError(f"{folder}: expected {wish}, got {', '.join(splits)}; name one of these")
@@ -296,7 +296,8 @@ class Dataset:
             found = []
             for i, entry in enumerate(entries):
                 ids = [
-                    int(numbers(f"{path}, entry {i}", entry, key)) for key in ("scene_id", "im_id", "obj_id", "inst_count")
+                    int(numbers(f"{path}, entry {i}", entry, key))
+                    for key in ("scene_id", "im_id", "obj_id", "inst_count")
                 ]
                 found.append(Target(*ids))
             return [target for target in found if target.scene_id in self._paths]

@@ -1,9 +1,10 @@
 """Errors of a pose: ADD, ADI, MSSD, MSPD and VSD.
 
-Poses are (4, 4) from the mesh to the camera, points (N, 3) vertices of the mesh, all in float64 and millimetres (or any one unit).
+Poses are (4, 4) from the mesh to the camera, points (N, 3) vertices of the mesh, all in float64 and millimetres (or any one
+unit).
 
-ADD, ADI    Hinterstoisser et al., "Model Based Training, Detection and Pose Estimation of Texture-Less 3D Objects in Heavily Cluttered
-            Scenes", ACCV 2012
+ADD, ADI    Hinterstoisser et al., "Model Based Training, Detection and Pose Estimation of Texture-Less 3D Objects in Heavily
+            Cluttered Scenes", ACCV 2012
 VSD         Hodaň et al., "BOP: Benchmark for 6D Object Pose Estimation", ECCV 2018
 MSSD, MSPD  Hodaň et al., "BOP Challenge 2020 on 6D Object Localization", ECCVW 2020
 """
@@ -13,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ..camera.camera import Camera
@@ -59,22 +59,24 @@ def mspd(estimate: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor, ca
 def vsd(
     estimate: Tensor, truth: Tensor, measured: Tensor, camera: Camera, diameter: float, taus: Sequence[float], delta: float = 15.0
 ) -> list[float]:  # fmt: skip
-    """Visible surface discrepancy, 0 … 1, one for each tau: the share of the pixels in which the object is seen in either pose where
-    it is not seen in both, or the distances differ by tau diameters or more. Symmetries need no mention: only what is seen counts.
+    """Visible surface discrepancy, 0 … 1, one for each tau: of the pixels in which the object is seen in either pose, the share
+    where it is not seen in both, or the distances differ by tau diameters or more. Symmetries need no mention: only what is seen
+    counts.
 
     estimate, truth  (H, W) depth images of the object in the two poses, as depth_image makes them
     measured         (H, W) the scene's; 0 where the sensor measured nothing: there the object counts as seen, as in BOP19
     delta            mm: where the object is at most so much behind what was measured, it is seen
     """
-    length = pixel_rays(camera).norm(dim=-1)
-    E, T, M = (depth.double() * length for depth in (estimate, truth, measured))  # distances from the eye
-    seen_T = (T > 0) & ((T - M <= delta) | (M == 0))
-    seen_E = (E > 0) & ((E - M <= delta) | (M == 0) | seen_T)
-    both, either = seen_E & seen_T, seen_E | seen_T
+    length = pixel_rays(camera).norm(dim=-1)  # distances from the eye, not depths, are compared
+    mine, theirs, scene = (depth.double() * length for depth in (estimate, truth, measured))
+    unknown = scene == 0
+    seen_truly = (theirs > 0) & ((theirs - scene <= delta) | unknown)
+    seen = (mine > 0) & ((mine - scene <= delta) | unknown | seen_truly)
+    both, either = seen & seen_truly, seen | seen_truly
     count = int(either.sum())
     if count == 0:
         return [1.0 for _ in taus]
-    apart = (E - T).abs()[both] / diameter
+    apart = (mine - theirs).abs()[both] / diameter
     alone = count - int(both.sum())
     return [(int((apart >= tau).sum()) + alone) / count for tau in taus]
 

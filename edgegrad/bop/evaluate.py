@@ -1,10 +1,11 @@
 """Results against the poses that are known: the errors of each estimate, and the recalls of BOP19.
 
-For each target, n instances of an object in an image, the n estimates with the highest scores count, and the n instances of which most
-is seen. In the order of their scores estimates take the instance with the lowest error below a threshold that none has taken yet; the
-recall is the share of all instances that are taken. AR_VSD is the mean over ten misalignments tau, 5 … 50 % of the diameter, and
-ten thresholds 0.05 … 0.5; AR_MSSD that over thresholds 5 … 50 % of the diameter; AR_MSPD that over 5 … 50 pixels of an image 640
-pixels wide; AR the mean of the three. ADD(-S) is the recall below 10 % of the diameter, by ADI where the object has symmetries.
+For each target, n instances of an object in an image, the n estimates with the highest scores count, and the n instances of
+which most is seen. In the order of their scores, estimates take of the instances that are left the one with the lowest error, if
+that is below a threshold; the recall is the share of all instances that are taken. AR_VSD is the mean over ten misalignments tau,
+5 … 50 % of the diameter, and ten thresholds 0.05 … 0.5; AR_MSSD that over thresholds 5 … 50 % of the diameter; AR_MSPD that over
+5 … 50 pixels of an image 640 pixels wide; AR the mean of the three. ADD(-S) is the recall below 10 % of the diameter, by ADI where
+the object has symmetries.
 
 Hodaň et al., "BOP Challenge 2020 on 6D Object Localization", ECCVW 2020
 """
@@ -146,9 +147,9 @@ def evaluate(
     of_object: dict[int, list[_Found]] = {}
     for target in tqdm(chosen, desc="errors", unit="target", disable=not progress, leave=False):
         frame, model = dataset.frame(target.scene_id, target.im_id), dataset.model(target.obj_id, evaluation=True)
-        best = sorted(given.get(target[:3], []), key=lambda one: -one.score)[: target.count]
+        best = sorted(given.get(target[:3], []), key=lambda one: -one.score)[: target.instances]
         truths = sorted(frame.truths_of(target.obj_id), key=lambda one: -(1.0 if one.visible is None else one.visible))
-        truths = truths[: target.count]
+        truths = truths[: target.instances]
         errors = _errors(frame, model, best, truths, delta if with_vsd else None)
         rows = [_row(one, truths, of_one) for one, of_one in zip(best, errors, strict=True)]
         matches = {} if not rows or not truths else _matches(errors, model, frame.camera.size[1])
@@ -217,8 +218,8 @@ def _matches(errors: list[list[PairErrors]], model: Model, width: int) -> dict[s
 
 
 def matched(errors: np.ndarray, threshold: float) -> int:
-    """How many of the instances (columns) the estimates take, rows in the order of their scores: each the one with the lowest error
-    below the threshold that is left."""
+    """How many of the instances (columns) the estimates take, rows in the order of their scores: each the one with the lowest
+    error of those that are left, if below the threshold."""
     left = errors.astype(np.float64).copy()
     count = 0
     for row in left:

@@ -53,8 +53,9 @@ def refine(
     steps, seed, progress, callback  as of fit_pose
     unconverged  take the pose also of a fit that did not converge; else the estimate's own is kept
 
-    Of the poses that symmetries make the same, the one nearest to the estimate's comes out. A fit that cannot be made, since the object
-    is not in the image, say, keeps the pose and says why. Raises FileNotFoundError or ValueError that names what the data set lacks.
+    Of the poses that symmetries make the same, the one nearest to the estimate's comes out. A fit that cannot be made, since the
+    object is not in the image, say, keeps the pose and says why. Raises FileNotFoundError or ValueError that names what the data
+    set lacks.
     """
     check_positive("margin", margin, least=0.0, most=100.0)
     for name, value in (("size", size), ("steps", steps)):

@@ -1,7 +1,7 @@
 """BOP's result files: CSV with a header and the columns scene_id, im_id, obj_id, score, R, t, time.
 
-R has 9 numbers by rows and t 3 in mm, parted by spaces; time is that of all estimates of an image together, in seconds, -1 where it
-is not known. https://bop.felk.cvut.cz/challenges/bop-challenge-2019/#formatofresults
+R has 9 numbers by rows and t 3 in mm, parted by spaces; time is that of all estimates of an image together, in seconds, -1 where
+it is not known. https://bop.felk.cvut.cz/challenges/bop-challenge-2019/#formatofresults
 """
 
 from __future__ import annotations
@@ -65,7 +65,9 @@ def write_results(path: PathLike, estimates: Iterable[Estimate]) -> None:
         writer.writerow(COLUMNS)
         for one in estimates:
             R, t = (" ".join(map(repr, part.flatten().tolist())) for part in (one.pose[:3, :3], one.pose[:3, 3]))
-            writer.writerow([one.scene_id, one.im_id, one.obj_id, repr(float(one.score)), R, t, repr(float(one.seconds))])
+            writer.writerow(
+                [one.scene_id, one.im_id, one.obj_id, repr(float(one.score)), R, t, repr(float(one.seconds))]
+            )
 
 
 def _id(where: str, name: str, text: str) -> int:

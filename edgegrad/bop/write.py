@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,9 +44,11 @@ class Shot:
     background: Tensor | float = 0.5
 
 
-def write_models(folder: PathLike, meshes: Mapping[int, Mesh], symmetries: Mapping[int, Symmetries] | None = None) -> None:
-    """models/obj_000001.ply … and models_info.json with boxes, diameters and symmetries, of meshes in mm by their ids. Missing folders
-    are made. Raises TypeError, ValueError, OSError, or ImportError without SciPy."""
+def write_models(
+    folder: PathLike, meshes: Mapping[int, Mesh], symmetries: Mapping[int, Symmetries] | None = None
+) -> None:
+    """models/obj_000001.ply … and models_info.json with boxes, diameters and symmetries, of meshes in mm by their ids. Missing
+    folders are made. Raises TypeError, ValueError, OSError, or ImportError without SciPy."""
     info = {}
     for obj_id, mesh in meshes.items():
         check_int("obj_id", obj_id, 0, 999_999)
@@ -104,7 +107,9 @@ def write_scene(
                 write_image(base / kind / f"{im_id:06d}_{i:06d}.png", srgb_to_linear(area.float()))
             if share >= 0.1:
                 seen[obj_id] = seen.get(obj_id, 0) + 1
-        targets += [{"scene_id": scene_id, "im_id": im_id, "obj_id": o, "inst_count": n} for o, n in sorted(seen.items())]
+        targets += [
+            {"scene_id": scene_id, "im_id": im_id, "obj_id": o, "inst_count": n} for o, n in sorted(seen.items())
+        ]
         picture = shot.picture if shot.picture is not None else _rendered(shot, meshes, spp)
         write_image(base / "rgb" / f"{im_id:06d}.png", picture)
         _write_depth(base / "depth" / f"{im_id:06d}.png", torch.where(torch.isfinite(nearest), nearest, 0.0))
@@ -129,10 +134,8 @@ def _rendered(shot: Shot, meshes: Mapping[int, Mesh], spp: int) -> Tensor:
 def _diameter(points: np.ndarray) -> float:
     """The largest distance between two points: corners of their convex hull."""
     spatial: Any = require("scipy.spatial", "edgegrad[fit]", "diameters")
-    try:
+    with suppress(spatial.QhullError):  # flat, or fewer than four
         points = points[spatial.ConvexHull(points).vertices]
-    except spatial.QhullError:  # flat, or fewer than four
-        pass
     return float(max(np.linalg.norm(points - point, axis=1).max() for point in points))
 
 
