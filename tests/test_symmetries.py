@@ -216,6 +216,31 @@ def test_closest_is_exact_about_an_axis() -> None:
     assert torch.allclose(found.closest(pose @ scale, reference)[:3, :3], 2.0 * closest[:3, :3], atol=1e-12)
 
 
+def test_fit_pose_reports_the_nearest() -> None:
+    """The search is the same; its result is turned by what the symmetries leave free."""
+    cylinder = mesh_of(trimesh.creation.cylinder(1, 3, sections=32), displaced=False)
+    camera = eg.Camera.look_at((0.0, 0.0, 9.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (32, 32))
+    truth = rigid((1.0, 0.4, 0.0), (0.1, 0.2, 0.0))
+    shown = eg.render_aovs(cylinder.transformed(truth[:3, :3], truth[:3, 3]), camera, ["image", "alpha"])
+    start = truth @ rigid((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)) @ rigid((0.1, 0.05, 0.0), (0.05, 0.0, 0.0))
+
+    def fitted(symmetries: eg.Symmetries | None, mesh: eg.Mesh = cylinder) -> eg.fit.PoseFit:
+        return eg.fit.fit_pose(
+            mesh, shown["image"], camera, shown["alpha"][..., 0], start, steps=2, progress=False, symmetries=symmetries
+        )  # fmt: skip
+
+    free, found = fitted(None), eg.find_symmetries(cylinder)
+    nearest = found.closest(free, start)
+    assert float((nearest - free.matrix).abs().max()) > 1e-5
+    fit = fitted(found)
+    assert torch.allclose(fit.matrix, nearest, atol=1e-12) and fit.loss == free.loss
+    assert torch.allclose(fitted("find").matrix, nearest, atol=1e-12)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="symmetries: expected Symmetries, \"find\" or None, got 'all'"):
+        fitted("all")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="symmetries: expected Symmetries, .* got Tensor"):
+        fitted(torch.eye(4))  # pyright: ignore[reportArgumentType]
+
+
 def test_transforms_are_those_of_bop() -> None:
     """⌈π / 0.01⌉ = 315 turns about the axis, after each discrete one."""
     info = {
