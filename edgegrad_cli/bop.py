@@ -62,6 +62,9 @@ def _add_files(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("results", type=Path, metavar="RESULTS.csv", help="scene_id,im_id,obj_id,score,R,t,time")
     parser.add_argument("--split", help="test, val, train_pbr … (test, or the only one there is)")
+    parser.add_argument(
+        "--models", metavar="NAME", help="folder of meshes: models_cad, models_reconst … (models, or the only one)"
+    )
 
 
 def _errors(args: argparse.Namespace) -> int:
@@ -72,7 +75,7 @@ def _errors(args: argparse.Namespace) -> int:
 
     if args.out is not None:
         check_suffix(args.out, (".json",))  # before the work rather than after it
-    estimates, dataset = read_results(args.results), Dataset(args.dataset, args.split)
+    estimates, dataset = read_results(args.results), Dataset(args.dataset, args.split, args.models)
     targets = None if args.targets is None else dataset.targets(args.targets)
     found = evaluate(dataset, estimates, targets, with_vsd=not args.no_vsd, delta=args.delta)
     print(found.table(), flush=True)
@@ -98,7 +101,7 @@ def _refine(args: argparse.Namespace) -> int:
 
     check_suffix(args.out, (".csv",))
     given = read_results(args.results)[: args.limit]
-    dataset = Dataset(args.dataset, args.split)
+    dataset = Dataset(args.dataset, args.split, args.models)
     done = _done(args, given)
     if args.pictures is not None:
         from edgegrad.optional import DRAWING, require

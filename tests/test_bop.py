@@ -111,7 +111,7 @@ INFO, TRUTH, VIEWS = "models/models_info.json", "test/000003/scene_gt.json", "te
 @pytest.mark.parametrize(
     "file, content, ask, words",
     [
-        (INFO, None, lambda data: data.objects, "models_info.json: expected a file"),
+        (INFO, None, lambda data: data.objects, "expected models/models_info.json, got no folder with such a file"),
         (INFO, "{", lambda data: data.objects, "models_info.json: expected JSON"),
         (INFO, "[]", lambda data: data.objects, "expected an object"),
         (INFO, '{"a": 1}', lambda data: data.objects, "expected ids as keys, got 'a'"),
@@ -135,6 +135,19 @@ def test_spoilt(
         (folder / file).write_text(content)
     with pytest.raises((FileNotFoundError, ValueError), match=words):
         ask(bop.Dataset(folder))
+
+
+def test_choice_of_the_models(folder: Path) -> None:
+    """As T-LESS has them: of two folders one must be named; models_eval is for errors alone."""
+    (folder / "models").rename(folder / "models_cad")
+    shutil.copytree(folder / "models_cad", folder / "models_eval")
+    assert bop.Dataset(folder).model(1).path.parent.name == "models_cad"
+    shutil.copytree(folder / "models_cad", folder / "models_reconst")
+    chosen = bop.Dataset(folder, models="models_reconst")
+    assert chosen.model(1).path.parent.name == "models_reconst" and chosen.objects == [1, 5]
+    assert chosen.model(1, evaluation=True).path.parent.name == "models_eval"
+    with pytest.raises(FileNotFoundError, match="got models_cad, models_eval, models_reconst; download"):
+        bop.Dataset(folder).model(1)
 
 
 def test_choice_of_the_split(folder: Path) -> None:

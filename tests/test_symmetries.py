@@ -235,9 +235,9 @@ def test_fit_pose_reports_the_nearest() -> None:
     fit = fitted(found)
     assert torch.allclose(fit.matrix, nearest, atol=1e-12) and fit.loss == free.loss
     assert torch.allclose(fitted("find").matrix, nearest, atol=1e-12)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="symmetries: expected Symmetries, \"find\" or None, got 'all'"):
+    with pytest.raises(ValueError, match=r"symmetries: expected Symmetries, .find. or None, got 'all'"):
         fitted("all")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match="symmetries: expected Symmetries, .* got Tensor"):
+    with pytest.raises(TypeError, match=r"symmetries: expected Symmetries, .* got Tensor"):
         fitted(torch.eye(4))  # pyright: ignore[reportArgumentType]
 
 

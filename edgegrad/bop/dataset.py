@@ -32,6 +32,7 @@ from ..scene.symmetries import Symmetries
 from .json_files import by_number, listed, numbers, read_json, rigid
 
 TARGETS = "test_targets_bop19.json"
+INFO, EVALUATION = "models_info.json", "models_eval"
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 LEAST_VISIBLE = 0.1  # BOP19's targets are objects of which so much is seen
 KEPT = 4  # scenes whose files stay in memory; each may have thousands of poses
@@ -210,11 +211,13 @@ class Dataset:
 
     folder  with models/ and one folder a split
     split   its name, such as "test", "val" or "train_pbr"; when None "test", or the only one that begins with it, or the only one
+    models  the folder of meshes, such as "models_cad" or "models_reconst" of T-LESS; when None "models", or the only one but
+            "models_eval"
 
     Raises FileNotFoundError or ValueError that names what is missing and lists what is there; so does what is asked for later.
     """
 
-    def __init__(self, folder: PathLike, split: str | None = None) -> None:
+    def __init__(self, folder: PathLike, split: str | None = None, models: str | None = None) -> None:
         self.folder = Path(folder)
         if not self.folder.is_dir():
             raise FileNotFoundError(f"{folder}: expected the folder of a BOP data set, got no such folder")
@@ -231,7 +234,7 @@ class Dataset:
                 )
             wish = f"the split {split!r}" if split else "the name of a split"
             raise ValueError(f"{folder}: expected {wish}, got {', '.join(splits)}; name one of these")
-        self.split = chosen
+        self.split, self._models_name = chosen, models
         self._paths = {int(path.name): path for path in _scene_folders(self.folder / chosen)}
         self._scenes: dict[int, _Scene] = {}
         self._models: dict[tuple[int, bool], Model] = {}
@@ -241,22 +244,35 @@ class Dataset:
     @cached_property
     def objects(self) -> list[int]:
         """Ids of the objects in models/models_info.json."""
-        return sorted(self._model_infos(self.folder / "models"))
+        return sorted(self._model_infos(self._models_folder(False)))
 
     def model(self, obj_id: int, evaluation: bool = False) -> Model:
         """An object; with `evaluation` from models_eval/, if there is such a folder. Raises ValueError that lists the objects."""
         if (obj_id, evaluation) not in self._models:
-            folder = self.folder / ("models_eval" if evaluation else "models")
-            folder = folder if folder.is_dir() else self.folder / "models"
-            infos, path = self._model_infos(folder), folder / "models_info.json"
+            folder = self._models_folder(evaluation)
+            infos, path = self._model_infos(folder), folder / INFO
             if obj_id not in infos:
                 raise ValueError(f"{path}: expected object {obj_id} in it, got {listed(infos)}; choose one of these")
             ply = folder / f"obj_{obj_id:06d}.ply"
             self._models[obj_id, evaluation] = Model(obj_id, ply, infos[obj_id], f"{path}, object {obj_id}")
         return self._models[obj_id, evaluation]
 
+    def _models_folder(self, evaluation: bool) -> Path:
+        """Raises FileNotFoundError that lists what is there."""
+        if evaluation and (self.folder / EVALUATION).is_dir():
+            return self.folder / EVALUATION
+        names = sorted(path.parent.name for path in self.folder.glob(f"*/{INFO}"))
+        others = [name for name in names if name != EVALUATION]
+        chosen = self._models_name or ("models" if "models" in others or len(others) != 1 else others[0])
+        if chosen not in names:
+            raise FileNotFoundError(
+                f"{self.folder}: expected {chosen}/{INFO}, got {', '.join(names) or 'no folder with such a file'}; download the "
+                "models, or name their folder by models="
+            )
+        return self.folder / chosen
+
     def _model_infos(self, folder: Path) -> dict[int, Any]:
-        path = folder / "models_info.json"
+        path = folder / INFO
         return by_number(path, read_json(path, dict))
 
     # -- images -----------------------------------------------------------------------------------------------------------

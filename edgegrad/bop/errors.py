@@ -11,7 +11,8 @@ MSSD, MSPD  Hodaň et al., "BOP Challenge 2020 on 6D Object Localization", ECCVW
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from torch import Tensor
@@ -20,7 +21,7 @@ from ..camera.camera import Camera
 from ..optional import require
 from .depth import pixel_rays
 
-MOST_POINTS = 1 << 21  # of all symmetries, at once
+FEW = 256  # points for bounds
 
 
 def add(estimate: Tensor, truth: Tensor, points: Tensor) -> float:
@@ -41,19 +42,20 @@ def mssd(estimate: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor) ->
 
     symmetries  (T, 4, 4), the identity among them, as Symmetries.transforms() gives them
     """
-    moved = _moved(estimate, points)
-    return min(
-        float((moved - _moved(truth @ some, points)).norm(dim=-1).amax(-1).min()) for some in _parts(symmetries, points)
-    )
+
+    def apart(some: Tensor, x: Tensor) -> Tensor:
+        return (_moved(estimate, x) - _moved(truth @ some, x)).norm(dim=-1)
+
+    return _least_largest(apart, symmetries, points)
 
 
 def mspd(estimate: Tensor, truth: Tensor, points: Tensor, symmetries: Tensor, camera: Camera) -> float:
     """Maximum symmetry-aware projection distance, in pixels: as mssd, between the points' places in the image."""
-    place = camera.project(_moved(estimate, points))
-    return min(
-        float((place - camera.project(_moved(truth @ some, points))).norm(dim=-1).amax(-1).min())
-        for some in _parts(symmetries, points)
-    )
+
+    def apart(some: Tensor, x: Tensor) -> Tensor:
+        return (camera.project(_moved(estimate, x)) - camera.project(_moved(truth @ some, x))).norm(dim=-1)
+
+    return _least_largest(apart, symmetries, points)
 
 
 def vsd(
@@ -86,5 +88,16 @@ def _moved(pose: Tensor, points: Tensor) -> Tensor:
     return points @ pose[..., :3, :3].mT + pose[..., None, :3, 3]
 
 
-def _parts(symmetries: Tensor, points: Tensor) -> Sequence[Tensor]:
-    return symmetries.split(max(1, MOST_POINTS // len(points)))
+def _least_largest(apart: Callable[[Tensor, Tensor], Tensor], symmetries: Tensor, points: Tensor) -> float:
+    """The least over the symmetries (T, 4, 4) of the largest of the distances (T, N) that `apart` gives for points (N, 3).
+
+    The largest of a few points is a lower bound. Symmetries are looked at with all points in the order of their bounds, until the
+    bound of the next is above the least that was found: exact, and of hundreds of symmetries a few are left."""
+    few = points[:: max(1, len(points) // FEW)]
+    bounds, order = apart(symmetries, few).amax(-1).sort()
+    best = math.inf
+    for bound, i in zip(bounds.tolist(), order.tolist(), strict=True):
+        if bound >= best:
+            break
+        best = min(best, float(apart(symmetries[i], points).max()))
+    return best

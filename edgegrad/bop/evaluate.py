@@ -4,8 +4,8 @@ For each target, n instances of an object in an image, the n estimates with the 
 which most is seen. In the order of their scores, estimates take of the instances that are left the one with the lowest error, if
 that is below a threshold; the recall is the share of all instances that are taken. AR_VSD is the mean over ten misalignments tau,
 5 … 50 % of the diameter, and ten thresholds 0.05 … 0.5; AR_MSSD that over thresholds 5 … 50 % of the diameter; AR_MSPD that over
-5 … 50 pixels of an image 640 pixels wide; AR the mean of the three. ADD(-S) is the recall below 10 % of the diameter, by ADI where
-the object has symmetries.
+5 … 50 pixels of an image 640 pixels wide; AR the mean of the three. ADD(-S) is the recall below 10 % of the diameter, by ADI
+where the object has symmetries.
 
 Hodaň et al., "BOP Challenge 2020 on 6D Object Localization", ECCVW 2020
 """
@@ -106,7 +106,7 @@ class Evaluation:
             {
                 "scene_id": row.estimate.scene_id, "im_id": row.estimate.im_id, "obj_id": row.estimate.obj_id,
                 "score": row.estimate.score, "gt_id": None if row.truth is None else row.truth.index,
-                **({} if row.errors is None else dataclasses.asdict(row.errors)),
+                **({} if row.errors is None else _finite(dataclasses.asdict(row.errors))),
             }
             for row in self.rows
         ]  # fmt: skip
@@ -244,6 +244,13 @@ def _recalls(found: list[_Found], with_vsd: bool) -> Recalls:
         statistics.median(one.degrees for one in off) if off else math.nan,
         statistics.median(one.distance for one in off) if off else math.nan,
     )  # fmt: skip
+
+
+def _finite(errors: dict[str, Any]) -> dict[str, Any]:
+    """null, for JSON has no infinity, which the projection of a point beside the eye may reach."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in errors.items()
+    }
 
 
 def _named(recalls: Recalls) -> dict[str, Any]:
