@@ -134,18 +134,21 @@ def test_noise_below_the_tolerance() -> None:
 
 
 def test_colors_break_them() -> None:
-    cube = trimesh.creation.box((1, 1, 1))
+    """A box with a square base has 8 rotations."""
+    solid = trimesh.creation.box((1, 1, 2))
     one, other = torch.tensor([0.8, 0.2, 0.2]), torch.tensor([0.2, 0.2, 0.8])
-    top = torch.tensor(cube.face_normals[:, 2] > 0.5)
-    z = torch.tensor(np.abs(cube.face_normals[:, 2]) > 0.5)
-    painted = mesh_of(cube, face_colors=torch.where(top[:, None], other, one))
-    belted = mesh_of(cube, face_colors=torch.where(z[:, None], other, one))
-    assert len(eg.find_symmetries(painted).motions) == 4
-    assert len(eg.find_symmetries(belted).motions) == 8
-    assert len(eg.find_symmetries(painted, textured=False).motions) == 24
-    assert len(eg.find_symmetries(painted, color_tolerance=1.0).motions) == 24
-    grey = mesh_of(cube, face_colors=torch.full((12, 3), 0.3))
-    assert len(eg.find_symmetries(grey).motions) == 24
+
+    def painted(where: np.ndarray) -> eg.Mesh:
+        return mesh_of(solid, face_colors=torch.where(torch.tensor(where)[:, None], other, one))
+
+    x, _, z = solid.face_normals.T
+    top = painted(z > 0.5)
+    assert len(eg.find_symmetries(top).motions) == 4
+    assert len(eg.find_symmetries(painted(np.abs(z) > 0.5)).motions) == 8
+    assert len(eg.find_symmetries(painted(np.abs(x) > 0.5)).motions) == 4
+    assert len(eg.find_symmetries(painted(x > 0.5)).motions) == 2
+    assert len(eg.find_symmetries(top, textured=False).motions) == 8
+    assert len(eg.find_symmetries(top, color_tolerance=1.0).motions) == 8
 
 
 def test_a_texture_breaks_them() -> None:
@@ -206,12 +209,13 @@ def test_closest_is_exact_about_an_axis() -> None:
     pose, reference = rigid((0.3, 1.0, -0.2), (1.0, 2.0, 3.0)), rigid((2.0, 0.1, 0.4), (0.0, -1.0, 2.0))
     closest = found.closest(pose, reference)
     plain = eg.Symmetries()
-    all_of_them = pose @ found.transforms(0.002)
+    all_of_them = pose @ found.transforms(0.005)
+    assert len(all_of_them) == 1256
     fine = min(plain.error(one, reference).degrees for one in all_of_them)
     exact = plain.error(closest, reference).degrees
-    assert exact <= fine + 1e-9 and fine - exact < 0.02
+    assert exact <= fine + 1e-9 and fine - exact < 0.1
     # It is one of them, and with a scale as well.
-    assert float((all_of_them - closest).abs().amax((1, 2)).min()) < 0.02
+    assert float((all_of_them - closest).abs().amax((1, 2)).min()) < 0.05
     scale = torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0], dtype=torch.float64))
     assert torch.allclose(found.closest(pose @ scale, reference)[:3, :3], 2.0 * closest[:3, :3], atol=1e-12)
 

@@ -30,6 +30,7 @@ GRID = 600  # rotations of the grid over all, some 25° apart
 REFINED = 16  # of these, the best that are not NEAR a symmetry that is known, refined
 NEAR = math.radians(30.0)
 STEPS = 12  # of iterated closest points
+LONGEST = 0.3  # radians of such a step
 FEWER = 4  # faces near a point that are looked at in the first half of these
 SMALLEST_POLYHEDRAL, LARGEST_POLYHEDRAL = 12, 60  # rotations of the tetrahedron and of the icosahedron
 LARGEST_GROUP = 144
@@ -124,6 +125,7 @@ class _Search:
     # -- what a symmetry is ----------------------------------------------------------------------------------------------
 
     def _maps(self, R: np.ndarray) -> bool:
+        """Whether a rotation about the centroid is one: all points come near the surface, and nearly all to the same colour."""
         rough = self.surface.rough_distance(self.few @ R.T + self.center)
         if np.median(rough) > 3.0 * self.limit + 0.02 * self.size:
             return False
@@ -219,9 +221,8 @@ class _Search:
             damping = 1e-9 * np.trace(J.T @ J) * np.eye(3)
             step = -np.linalg.solve(J.T @ J + damping, J.T @ residual)
             length = float(np.linalg.norm(step))
-            if length < 1e-10 and k > STEPS // 2:
-                break
-            R = _turn(step / length, min(length, 0.3)) @ R
+            if length > 0.0:
+                R = _turn(step / length, min(length, LONGEST)) @ R
         return R
 
     # -- what they make together -----------------------------------------------------------------------------------------
