@@ -210,7 +210,6 @@ def test_closest_is_exact_about_an_axis() -> None:
     closest = found.closest(pose, reference)
     plain = eg.Symmetries()
     all_of_them = pose @ found.transforms(0.005)
-    assert len(all_of_them) == 1256
     fine = min(plain.error(one, reference).degrees for one in all_of_them)
     exact = plain.error(closest, reference).degrees
     assert exact <= fine + 1e-9 and fine - exact < 0.1
