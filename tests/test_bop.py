@@ -156,7 +156,10 @@ def test_choice_of_the_split(folder: Path) -> None:
     shutil.copytree(scenes, folder / "test_other")
     assert bop.Dataset(folder).split == "test"
     scenes.rename(folder / "train")
-    assert bop.Dataset(folder).split == "test_other" and bop.Dataset(folder, "train").split == "train"
+    data = bop.Dataset(folder, "train")
+    assert bop.Dataset(folder).split == "test_other" and data.split == "train"
+    (folder / "test_targets_bop19.json").write_text("[]")  # says nothing of another split
+    assert data.targets()[-1] == bop.Target(3, 1, 5, 2) and bop.Dataset(folder).targets() == []
     (folder / "test_other").rename(folder / "val")
     with pytest.raises(ValueError, match="expected the name of a split, got train, val; name one"):
         bop.Dataset(folder)

@@ -6,10 +6,12 @@ Hodaň et al., "BOP: Benchmark for 6D Object Pose Estimation", ECCV 2018; "BOP C
 2020; https://bop.felk.cvut.cz
 """
 
-from .dataset import Dataset, Frame, Model, Target, Truth
+from .dataset import Dataset, Target
 from .depth import depth_image
 from .errors import add, adi, mspd, mssd, vsd
 from .evaluate import Evaluation, PairErrors, Recalls, Row, evaluate
+from .frame import Frame, Truth
+from .model import Model
 from .refine import Refined, refine
 from .results import Estimate, read_results, write_results
 from .write import Shot, write_models, write_scene

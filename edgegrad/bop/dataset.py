@@ -12,31 +12,19 @@ https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
-from torch import Tensor
-
-from ..camera.camera import Camera
-from ..files.formats.part import Wanted, naming
-from ..files.image import read_image, read_size, read_stored
-from ..files.load import load_mesh
-from ..files.mask import read_mask
-from ..files.parts import read_model
 from ..files.paths import PathLike
-from ..scene.mesh import Mesh
-from ..scene.symmetries import Symmetries
-from .json_files import by_number, listed, numbers, read_json, rigid
+from .frame import Frame, SceneFiles
+from .json_files import by_number, listed, numbers, read_json
+from .model import Model
 
 TARGETS = "test_targets_bop19.json"
 INFO, EVALUATION = "models_info.json", "models_eval"
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 LEAST_VISIBLE = 0.1  # BOP19's targets are objects of which so much is seen
 KEPT = 4  # scenes whose files stay in memory; each may have thousands of poses
-ROUNDED = 1e-2  # how far R Rᵀ may be from 1 in files
 
 
 class Target(NamedTuple):
@@ -46,164 +34,6 @@ class Target(NamedTuple):
     im_id: int
     obj_id: int
     instances: int
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """An instance of an object in an image, as scene_gt.json has it."""
-
-    index: int  # its place in the image's list, by which masks are named
-    obj_id: int
-    pose: Tensor  # (4, 4) float64, mesh to camera, mm
-    visible: float | None  # the share of its silhouette that is seen, 0 … 1; None without scene_gt_info.json
-
-
-class Model:
-    """An object: its mesh in millimetres, its diameter and its symmetries.
-
-    obj_id; path of its PLY; diameter in mm, the largest distance between two vertices; symmetries
-    """
-
-    def __init__(self, obj_id: int, path: Path, info: dict[str, Any], where: str) -> None:
-        self.obj_id, self.path = obj_id, path
-        self.diameter = float(numbers(where, info, "diameter"))
-        try:
-            self.symmetries = Symmetries.from_bop(info)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{where}: {error}") from None
-
-    @cached_property
-    def mesh(self) -> Mesh:
-        """With its colours or texture, as radiance. Read once. Raises what load_mesh raises."""
-        return load_mesh(self.path)
-
-    @cached_property
-    def points(self) -> Tensor:
-        """(N, 3) float64, mm: the vertices as the file has them, also where it repeats one, for means over them. Raises what
-        load_mesh raises."""
-        with naming(self.path):
-            model = read_model(self.path, Wanted(materials=False))
-        return torch.cat([torch.from_numpy(part.verts).double() for part in model.parts])
-
-    def __repr__(self) -> str:
-        return f"Model({self.obj_id}, diameter {self.diameter:.4g} mm, {self.symmetries!r})"
-
-
-class Frame:
-    """An image of a scene: what is known of it, and its files, read when they are asked for.
-
-    scene_id, im_id; truths: the instances in it, in the order of scene_gt.json
-    """
-
-    def __init__(self, scene: _Scene, im_id: int) -> None:
-        self._scene, self.scene_id, self.im_id = scene, scene.scene_id, im_id
-        path = scene.folder / "scene_camera.json"
-        if im_id not in scene.cameras:
-            raise ValueError(f"{path}: expected image {im_id} in it, got {listed(scene.cameras)}; choose one of these")
-        self._where, self._camera = f"{path}, image {im_id}", scene.cameras[im_id]
-
-    @property
-    def K(self) -> Tensor:
-        """(3, 3) float64 as the file has it: the centre of the first pixel at (0, 0)."""
-        return numbers(self._where, self._camera, "cam_K", 3, 3)
-
-    @cached_property
-    def camera(self) -> Camera:
-        """At the origin, looking along +Z, in float64: poses are from the mesh to it. Its size is that of the picture."""
-        one = torch.eye(3, dtype=torch.float64)
-        return Camera.from_opencv(one, one.new_zeros(3), self.K, read_size(self.picture_path))
-
-    @cached_property
-    def truths(self) -> list[Truth]:
-        """Raises FileNotFoundError where the split has no public poses."""
-        return self._scene.truths(self.im_id)
-
-    def truths_of(self, obj_id: int) -> list[Truth]:
-        """Of one object."""
-        return [truth for truth in self.truths if truth.obj_id == obj_id]
-
-    @property
-    def picture_path(self) -> Path:
-        """Of the colour image, or else the grey one, or else the depth image. Raises FileNotFoundError."""
-        return self._file(("rgb", "gray", "depth"), f"{self.im_id:06d}")
-
-    def picture(self) -> Tensor:
-        """(H, W, 3) linear radiance, also of a grey image. Raises FileNotFoundError, or what read_image raises."""
-        return read_image(self._file(("rgb", "gray"), f"{self.im_id:06d}"), channels=3)
-
-    def depth(self) -> Tensor:
-        """(H, W) float64 along the optical axis, mm; 0 where the sensor measured none. Raises FileNotFoundError or ValueError."""
-        path = self._file(("depth",), f"{self.im_id:06d}")
-        color, _, largest = read_stored(path)
-        if largest is None or color.shape[-1] != 1:
-            raise ValueError(f"{path}: expected depth as whole numbers in one channel, got something else")
-        scale = float(numbers(self._where, self._camera, "depth_scale"))
-        return (color[..., 0].double() * largest).round() * scale
-
-    def mask(self, index: int) -> Tensor:
-        """(H, W), 1 on the silhouette of truths[index], also where something covers it. Raises FileNotFoundError."""
-        return read_mask(self._file(("mask",), f"{self.im_id:06d}_{index:06d}"))
-
-    def mask_visible(self, index: int) -> Tensor:
-        """(H, W), 1 where truths[index] is seen. Raises FileNotFoundError."""
-        return read_mask(self._file(("mask_visib",), f"{self.im_id:06d}_{index:06d}"))
-
-    def _file(self, folders: tuple[str, ...], name: str) -> Path:
-        for folder in folders:
-            for suffix in PICTURES:
-                if (path := self._scene.folder / folder / (name + suffix)).is_file():
-                    return path
-        raise FileNotFoundError(
-            f"{self._scene.folder}: expected {name}.png (or .jpg, .tif) in {' or '.join(folders)}, got no such file; "
-            "download the images of this split"
-        )
-
-    def __repr__(self) -> str:
-        return f"Frame(scene {self.scene_id}, image {self.im_id})"
-
-
-class _Scene:
-    """The JSON files of a scene."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.scene_id = folder, int(folder.name)
-
-    @cached_property
-    def cameras(self) -> dict[int, Any]:
-        path = self.folder / "scene_camera.json"
-        return by_number(path, read_json(path, dict))
-
-    @cached_property
-    def _poses(self) -> dict[int, Any]:
-        path = self.folder / "scene_gt.json"
-        if not path.exists():
-            raise FileNotFoundError(
-                f"{path}: expected the poses of the objects, got no such file; some test splits keep them secret: take another "
-                "split, such as val"
-            )
-        return by_number(path, read_json(path, dict))
-
-    @cached_property
-    def _info(self) -> dict[int, Any] | None:
-        path = self.folder / "scene_gt_info.json"
-        return by_number(path, read_json(path, dict)) if path.exists() else None
-
-    def truths(self, im_id: int) -> list[Truth]:
-        path = self.folder / "scene_gt.json"
-        if im_id not in self._poses:
-            raise ValueError(f"{path}: expected image {im_id} in it, got {listed(self._poses)}; choose one of these")
-        info = None if self._info is None else self._info.get(im_id)
-        found = []
-        for i, entry in enumerate(self._poses[im_id]):
-            where = f"{path}, image {im_id}, entry {i}"
-            R, t = numbers(where, entry, "cam_R_m2c", 3, 3), numbers(where, entry, "cam_t_m2c", 3)
-            visible = None
-            if info is not None and i < len(info):
-                at = f"{self.folder / 'scene_gt_info.json'}, image {im_id}, entry {i}"
-                visible = float(numbers(at, info[i], "visib_fract"))
-            obj_id = int(numbers(where, entry, "obj_id"))
-            found.append(Truth(i, obj_id, rigid(f"{where}, cam_R_m2c", R, t, ROUNDED), visible))
-        return found
 
 
 class Dataset:
@@ -221,23 +51,30 @@ class Dataset:
         self.folder = Path(folder)
         if not self.folder.is_dir():
             raise FileNotFoundError(f"{folder}: expected the folder of a BOP data set, got no such folder")
-        splits = sorted(
-            path.name for path in self.folder.iterdir() if path.is_dir() and any(_scene_folders(path))
-        )  # fmt: skip
-        tests = [name for name in splits if name.startswith("test")]
-        chosen = split or ("test" if "test" in tests else next(iter(tests if len(tests) == 1 else splits), ""))
-        if chosen not in splits or (split is None and chosen not in tests and len(splits) > 1):
-            if not splits:
-                raise ValueError(
-                    f"{folder}: expected folders of splits, such as test/000001/scene_camera.json, got none; is it the folder "
-                    "that has models/ in it?"
-                )
-            wish = f"the split {split!r}" if split else "the name of a split"
-            raise ValueError(f"{folder}: expected {wish}, got {', '.join(splits)}; name one of these")
-        self.split, self._models_name = chosen, models
-        self._paths = {int(path.name): path for path in _scene_folders(self.folder / chosen)}
-        self._scenes: dict[int, _Scene] = {}
+        self.split, self._models_name = self._chosen(split), models
+        self._paths = {int(path.name): path for path in _scene_folders(self.folder / self.split)}
+        self._scenes: dict[int, SceneFiles] = {}
         self._models: dict[tuple[int, bool], Model] = {}
+
+    def _chosen(self, split: str | None) -> str:
+        """The name of a split. Raises ValueError that lists them."""
+        names = sorted(path.name for path in self.folder.iterdir() if path.is_dir() and _scene_folders(path))
+        if not names:
+            raise ValueError(
+                f"{self.folder}: expected folders of splits, such as test/000001/scene_camera.json, got none; is it the folder "
+                "that has models/ in it?"
+            )
+        if split is not None:
+            if split not in names:
+                raise ValueError(
+                    f"{self.folder}: expected the split {split!r}, got {', '.join(names)}; name one of these"
+                )
+            return split
+        tests = [name for name in names if name.startswith("test")]
+        for some in (["test"] if "test" in names else [], tests, names):
+            if len(some) == 1:
+                return some[0]
+        raise ValueError(f"{self.folder}: expected the name of a split, got {', '.join(names)}; name one of these")
 
     # -- objects ----------------------------------------------------------------------------------------------------------
 
@@ -290,12 +127,12 @@ class Dataset:
         """Raises ValueError that lists the scenes, or the images."""
         return Frame(self._scene(scene_id), im_id)
 
-    def _scene(self, scene_id: int) -> _Scene:
+    def _scene(self, scene_id: int) -> SceneFiles:
         if scene_id not in self._paths:
             raise ValueError(
                 f"{self.folder / self.split}: expected scene {scene_id}, got {listed(self._paths)}; choose one of these"
             )
-        scene = self._scenes.pop(scene_id, None) or _Scene(self._paths[scene_id])
+        scene = self._scenes.pop(scene_id, None) or SceneFiles(self._paths[scene_id])
         self._scenes[scene_id] = scene  # the last one used stands last
         while len(self._scenes) > KEPT:
             del self._scenes[next(iter(self._scenes))]
@@ -304,10 +141,10 @@ class Dataset:
     # -- what is to be found ------------------------------------------------------------------------------------------------
 
     def targets(self, file: str = TARGETS) -> list[Target]:
-        """Those of a file beside the splits; without it, all instances of which at least 10 % are seen, as BOP19 chose them.
-        Only of the scenes of this split. Raises ValueError."""
+        """Those of a file beside the splits, which is about test splits; without it, or of another split, all instances of which
+        at least 10 % are seen, as BOP19 chose them. Raises FileNotFoundError or ValueError."""
         path = self.folder / file
-        if path.exists():
+        if path.exists() and (file != TARGETS or self.split.startswith("test")):
             entries = read_json(path, list)
             found = []
             for i, entry in enumerate(entries):

@@ -26,9 +26,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ..check import check_flag, check_positive
-from .dataset import Dataset, Frame, Model, Target, Truth
+from .dataset import Dataset, Target
 from .depth import depth_image
 from .errors import add, adi, mspd, mssd, vsd
+from .frame import Frame, Truth
+from .model import Model
 from .results import Estimate
 
 STEP = 0.01  # of continuous symmetries, as bop_toolkit's max_sym_disc_step

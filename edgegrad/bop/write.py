@@ -66,9 +66,9 @@ def write_scene(
     folder: PathLike, scene_id: int, shots: Sequence[Shot], meshes: Mapping[int, Mesh], split: str = "test", spp: int = 64
 ) -> None:  # fmt: skip
     """SPLIT/000001/ with rgb/, depth/, mask/, mask_visib/, scene_camera.json, scene_gt.json and scene_gt_info.json of images
-    numbered from 0, and the scene's targets (instances of which at least 10 % are seen) in test_targets_bop19.json, in place of
-    those that this scene has there. Masks and depth are those at the centres of the pixels. Raises TypeError, ValueError or
-    OSError."""
+    numbered from 0. Of a test split also the scene's targets (instances of which at least 10 % are seen), in
+    test_targets_bop19.json, in place of those that this scene has there. Masks and depth are those at the centres of the pixels.
+    Raises TypeError, ValueError or OSError."""
     check_int("scene_id", scene_id, 0, 999_999)
     base = Path(folder) / split / f"{scene_id:06d}"
     cameras: dict[str, Any] = {}
@@ -115,6 +115,8 @@ def write_scene(
         _write_depth(base / "depth" / f"{im_id:06d}.png", torch.where(torch.isfinite(nearest), nearest, 0.0))
     for name, content in (("scene_camera", cameras), ("scene_gt", poses), ("scene_gt_info", infos)):
         _write_json(base / f"{name}.json", content)
+    if not split.startswith("test"):
+        return
     file = Path(folder) / TARGETS
     others = json.loads(file.read_text(encoding="utf-8")) if file.exists() else []
     _write_json(file, [one for one in others if one["scene_id"] != scene_id] + targets)
