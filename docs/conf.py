@@ -52,7 +52,10 @@ nitpick_ignore_regex = [
     ("py:class", r"edgegrad\.(fit\.views\.View|camera\.fields\.CameraT|points\.steps\.Steps)|PoseTask"),
 ]
 # Nobody calls these: functions return them.
-RETURNED = {"Hits", "Plan", "Profile", "PrimaryHits", "SurfaceSamples", "EdgeSamples", "PoseFit", "CameraFit", "Fit"}
+RETURNED = {
+    "Hits", "Plan", "Profile", "PrimaryHits", "SurfaceSamples", "EdgeSamples", "PoseFit", "CameraFit", "Fit", "Model", "Frame",
+    "Truth", "Evaluation", "Recalls", "Row", "PairErrors", "Refined", "PoseError",
+}  # fmt: skip
 
 
 def references() -> dict[str, str]:

@@ -39,11 +39,13 @@ from .profile import profile
 from .render import jvp, render, screen_gradient
 from .scene import provided
 from .scene.environment import Environment
+from .scene.find_symmetries import find_symmetries
 from .scene.lights import AreaLight, DirectionalLight, LightPoints, PointLight, SphericalHarmonics, SpotLight
 from .scene.material import Material, Texture, vertex_normals
 from .scene.mesh import Mesh
 from .scene.mesh_light import MeshLight
 from .scene.scene import Scene
+from .scene.symmetries import Symmetries, SymmetryAxis
 
 # What the classes of scenes can do with the help of packages above them.
 provided.from_trimesh, provided.to_trimesh, provided.thumbnail = from_trimesh, to_trimesh, thumbnail
@@ -53,7 +55,7 @@ del from_trimesh, to_trimesh, thumbnail, provided  # names of the package are th
 torch.serialization.add_safe_globals(
     [
         AreaLight, Camera, DirectionalLight, Environment, Material, Mesh, MeshLight, PointLight, Scene, SphericalHarmonics,
-        SpotLight, Texture,
+        SpotLight, Symmetries, SymmetryAxis, Texture,
     ]
 )  # fmt: skip
 
@@ -76,10 +78,13 @@ __all__ = [
     "SphericalHarmonics",
     "SpotLight",
     "SurfaceSamples",
+    "Symmetries",
+    "SymmetryAxis",
     "Texture",
     "View",
     "attach_boundary",
     "edge_samples",
+    "find_symmetries",
     "fit",
     "jvp",
     "load_camera",

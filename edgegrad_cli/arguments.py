@@ -139,3 +139,13 @@ def seconds(text: str) -> float:
     if not 0.0 < found < float("inf"):
         raise argparse.ArgumentTypeError(f"expected seconds above 0, got {text!r}")
     return found
+
+
+def millimetres(text: str) -> float:
+    try:
+        found = float(text)
+    except ValueError:
+        found = -1.0
+    if not 0.0 <= found < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected millimetres from 0 up, got {text!r}")
+    return found

@@ -20,6 +20,7 @@ import pytest
 import torch
 
 import edgegrad
+import edgegrad.bop
 import edgegrad.fit
 
 FOLDER = Path(__file__).parents[1] / "docs"
@@ -97,7 +98,7 @@ def test_equations_are_typeset() -> None:
         assert not [found for found in code if re.search("[∫∮∂∇]", found)], page.name
 
 
-@pytest.mark.parametrize("module", [edgegrad, edgegrad.fit])
+@pytest.mark.parametrize("module", [edgegrad, edgegrad.bop, edgegrad.fit])
 def test_reference_has_all_that_is_public(module: ModuleType) -> None:
     reference = "".join(page.read_text(encoding="utf-8") for page in (FOLDER / "api").glob("*.md"))
     listed = set(re.findall(r"^\.\. auto\w+:: (\S+)$", reference, re.MULTILINE))

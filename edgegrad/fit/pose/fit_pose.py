@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -18,12 +18,13 @@ from tqdm import tqdm
 from ...camera.camera import Camera
 from ...check import as_tensor, check_flag, check_float, check_int, check_positive_int, check_shape
 from ...files.paths import PathLike
+from ...scene.find_symmetries import find_symmetries
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ...scene.symmetries import Symmetries
 from ..checkpoints import Checkpoint, traits
 from ..options import check_checkpoint
 from ..upside_down import BETTER, say_upside_down
-from ..verdict import ENOUGH
 from .journal import Journal
 from .photo.search import PhotoSearch
 from .place import placed
@@ -58,6 +59,7 @@ def fit_pose(
     checkpoint: PathLike | None = None,
     checkpoint_every: int = 25,
     resume: bool = False,
+    symmetries: Symmetries | Literal["find"] | None = None,
 ) -> PoseFit:
     """Rotation and translation (and scale, and focal length) of a known mesh in a picture, or in several.
 
@@ -93,6 +95,8 @@ def fit_pose(
     checkpoint  a file that holds the fit's state, written every `checkpoint_every` steps and at the end, never in part
     resume      go on from the checkpoint, if there is one: the fit ends as if it had never stopped. One of a fit that
                 was given something else is refused
+    symmetries  of the mesh: of the poses that they make the same, the one nearest to the start is reported, by its rotation.
+                "find" looks for them with find_symmetries(). They change nothing of the search itself
 
     About a quarter of the object may be covered. The picture may be blurred by up to 1.4 pixels, and compressed: renders are made
     as soft. The start is followed first. The fit is `converged` if its last step was short and the pictures show at least 60 % of
@@ -108,7 +112,7 @@ def fit_pose(
     return search_pose(
         mesh, target, camera, mask, init, lens, background, weight, depth, Names(), max_size=max_size, steps=steps, spp=spp,
         tolerance=tolerance, seed=seed, search=search, progress=progress, callback=callback, checkpoint=checkpoint,
-        checkpoint_every=checkpoint_every, resume=resume,
+        checkpoint_every=checkpoint_every, resume=resume, symmetries=_symmetries(symmetries, mesh),
     )  # fmt: skip
 
 
@@ -117,8 +121,8 @@ def fit_pose(
 def search_pose(
     mesh: Mesh | Scene, target: object, camera: object, mask: object, init: object, lens: Lens,
     background: Tensor | float | None, weight: object, depth: object, names: Names, *, max_size: int, steps: int, spp: int,
-    tolerance: float, seed: int, search: bool, progress: bool, callback: Callable[[PoseFit], None] | None, checkpoint: PathLike | None,
-    checkpoint_every: int, resume: bool,
+    tolerance: float, seed: int, search: bool, progress: bool, callback: Callable[[PoseFit], None] | None,
+    checkpoint: PathLike | None, checkpoint_every: int, resume: bool, symmetries: Symmetries | None = None,
 ) -> PoseFit:  # fmt: skip
     """fit_pose(), with whatever is sought of the lens."""
     began = time.perf_counter()
@@ -160,7 +164,7 @@ def search_pose(
             file.write({"journal": journal.state(), "seconds": seconds()})
 
     def result() -> PoseFit:
-        best: Pose = ways.best
+        best: Pose = ways.best if symmetries is None else ways.best.closest(symmetries, start)
         history = list(ways.history)
         cameras = [task.lens(one, best) for one in given_cameras]
         return PoseFit(
@@ -185,7 +189,7 @@ def search_pose(
     ways.after_step = after_step
     try:
         ways.run()
-        if search and ways.explained < ENOUGH:
+        if search and not ways.converged and ways.explained < ways.enough:
             _warn_if_upside_down(task, ways, init is None, max_size, spp)
     except KeyboardInterrupt:
         interrupted = True
@@ -220,13 +224,29 @@ def _depths(depth: object, task: PoseTask) -> list[Tensor | None]:
     return found
 
 
+def _symmetries(given: object, mesh: Mesh | Scene) -> Symmetries | None:
+    """Raises TypeError or ValueError, or what find_symmetries() raises."""
+    if given is None or isinstance(given, Symmetries):
+        return given
+    if given == "find":
+        return find_symmetries(mesh)
+    if isinstance(given, str):
+        raise ValueError(f'symmetries: expected Symmetries, "find" or None, got {given!r}')
+    raise TypeError(f'symmetries: expected Symmetries, "find" or None, got {type(given).__name__}')
+
+
 def _warn_if_upside_down(task: PoseTask, search: Search | PhotoSearch, place: bool, max_size: int, spp: int) -> None:
     """Where a fit to the pictures turned over finds in them what it did not find as they are."""
     turned = task.turned_over()
     start = placed(turned) if place else search.start
-    again = Search(turned, turned.pyramid(start, max_size, spp), start, search.steps, search.tolerance, search.seed)
+    way = search.steps, search.tolerance, search.seed
+    again: Search | PhotoSearch
+    if task.clutter:
+        again = PhotoSearch(turned, start, [None] * len(task.shots), max_size, spp, *way)
+    else:
+        again = Search(turned, turned.pyramid(start, max_size, spp), start, *way)
     found = again.first_end()
-    if found >= max(ENOUGH, search.explained + BETTER):
+    if found >= max(again.enough, search.explained + BETTER):
         say_upside_down(
             search.task.names.target, f"it shows {found:.0%} of the render's edges, as given {search.explained:.0%}"
         )

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ...check import check_finite, check_shape
+from ...scene.symmetries import Symmetries
 
 
 class Pose(NamedTuple):
@@ -31,6 +32,11 @@ class Pose(NamedTuple):
     def numbers(self) -> list[float]:
         """All of them, one after the other."""
         return [number for field in self for number in field.flatten().tolist()]
+
+    def closest(self, symmetries: Symmetries, reference: Pose) -> Pose:
+        """Of the poses in which the mesh looks the same, the one whose rotation is nearest to the reference's."""
+        matrix = symmetries.closest(self.matrix, reference.matrix)
+        return self._replace(R=matrix[:3, :3] / self.scale, t=matrix[:3, 3])
 
     @staticmethod
     def of(numbers: list[float]) -> Pose:

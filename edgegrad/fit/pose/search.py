@@ -68,6 +68,8 @@ class Search:
     """The state of a search. `best`, `loss` and `history` may be read after each step, and `journal` at any time: a
     search that is given it goes on from there."""
 
+    enough = ENOUGH
+
     def __init__(
         self, task: PoseTask, levels: list[Level], start: Pose, steps: int, tolerance: float, seed: int,
         journal: Journal | None = None, further: bool = True,
@@ -211,7 +213,7 @@ class Search:
             norms = {}
             if taken := search.observe(loss, partial(seen.equations, c, first=not search.accepted), slack):
                 way = way._replace(here=way.pose)
-                norms = norms(level.free, 2.0 / seen.compared.count * search.gradient)
+                norms = norms_of(level.free, 2.0 / seen.compared.count * search.gradient)
                 c = min(c, seen.compared.scale())
                 search.loss = loss = seen.compared.loss(c)[0]
             way = way._replace(c=c, search=search.state(), random=self.generator.get_state())
@@ -293,7 +295,7 @@ class Search:
         return radius * direction / direction.norm()
 
 
-def norms(free: list[int], gradient: Tensor) -> dict[str, float]:
+def norms_of(free: list[int], gradient: Tensor) -> dict[str, float]:
     """Of each part of a step whose entries are `free`."""
     squares = dict(zip(free, gradient.square().tolist(), strict=True))
     sums = {name: [squares[entry] for entry in entries if entry in squares] for name, entries in PARTS.items()}

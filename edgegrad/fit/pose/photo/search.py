@@ -17,7 +17,7 @@ from torch import Tensor
 from ..journal import Journal, Way
 from ..pose import Pose, angle
 from ..result import Step
-from ..search import Search, distinct, norms
+from ..search import Search, distinct, norms_of
 from ..task import SHIFT, TURN, Level, PoseTask
 from .level import PhotoLevel, photo_levels
 
@@ -46,6 +46,8 @@ class _End(NamedTuple):
 
 class PhotoSearch:
     """The state of a search, as Search has it."""
+
+    enough = ENOUGH
 
     def __init__(
         self, task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, steps: int,
@@ -97,7 +99,7 @@ class PhotoSearch:
                 self._forget(slice(0, begins))
                 self._take(best)
         elif task.clutter and best.explained >= ENOUGH and self._as_they_are(best.pose):
-            colours = self._by_colours(best.pose, task.pyramid(best.pose, self.max_size, self.spp)[-1:], False)
+            colours = self._by_colours(best.pose, task.pyramid(best.pose, self.max_size, self.spp)[-2:], False)
             if colours.converged and angle(colours.best.R, best.pose.R) < NEAR:
                 self._adopt(colours)
             else:
@@ -156,7 +158,7 @@ class PhotoSearch:
             move = move * min(1.0, LONGEST / float(move.abs().max().clamp(min=1e-30)))
             far = float(move.abs().max()) >= self.tolerance * level.plain.coarseness
             short = not far or float(move @ normal.curvature @ move) < GAIN
-            step = Step(level.size, loss, way.pose, True, norms(level.plain.free, normal.gradient))
+            step = Step(level.size, loss, way.pose, True, norms_of(level.plain.free, normal.gradient))
             steps = (*way.steps, step)
             way = way._replace(
                 pose=self.task.moved(way.pose, level.plain.free, move), here=way.pose, lowest=loss, short=short,

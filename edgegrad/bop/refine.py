@@ -1,0 +1,118 @@
+"""An estimate made better by fit_pose, from the colour image alone."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ..camera.camera import Camera
+from ..check import check_flag, check_int, check_positive, check_positive_int
+from ..fit.pose.fit_pose import fit_pose
+from ..fit.pose.pose import angle
+from ..fit.pose.result import PoseFit
+from .dataset import Dataset
+from .results import Estimate
+
+SMALLEST = 16  # pixels of the crop on its longer side
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """What became of an estimate."""
+
+    estimate: Estimate  # with the pose found; with its own where `kept` is True. Its time is that of before
+    fit: PoseFit | None  # None where none could be made
+    kept: bool  # whether the pose stayed as it was
+    why: str  # in words
+    degrees: float  # by which the pose was turned
+    distance: float  # mm by which the mesh's origin was moved
+    seconds: float
+
+
+def refine(
+    dataset: Dataset,
+    estimate: Estimate,
+    *,
+    margin: float = 0.5,
+    size: int = 256,
+    steps: int = 40,
+    seed: int = 0,
+    unconverged: bool = False,
+    progress: bool = False,
+    callback: Callable[[PoseFit], None] | None = None,
+) -> Refined:
+    """Fits the object's mesh, with its colours, to the image around where the estimate has it.
+
+    margin       how much of the image around the object is looked at, in sizes of its box in the image
+    size         most pixels on the longer side of that part: a larger one is reduced
+    steps, seed, progress, callback  as of fit_pose
+    unconverged  take the pose also of a fit that did not converge; else the estimate's own is kept
+
+    Of the poses that symmetries make the same, the one nearest to the estimate's comes out. A fit that cannot be made, since the
+    object is not in the image, say, keeps the pose and says why. Raises FileNotFoundError or ValueError that names what the data
+    set lacks.
+    """
+    check_positive("margin", margin, least=0.0, most=100.0)
+    for name, value in (("size", size), ("steps", steps)):
+        check_positive_int(name, value)
+    check_int("seed", seed, 0, 2**32 - 1)
+    check_flag("unconverged", unconverged)
+    began = time.perf_counter()
+    frame, model = dataset.frame(estimate.scene_id, estimate.im_id), dataset.model(estimate.obj_id)
+    camera, picture, mesh = frame.camera, frame.picture(), model.mesh
+
+    def kept(why: str, fit: PoseFit | None = None) -> Refined:
+        return Refined(estimate, fit, True, why, 0.0, 0.0, time.perf_counter() - began)
+
+    box = _box(mesh.verts.double(), estimate.pose, camera, margin)
+    if box is None:
+        return kept("the image does not show the object where the estimate has it")
+    top, left, height, width = box
+    part = picture[top : top + height, left : left + width]
+    if mesh.channels == 1:
+        part = part.mean(-1, keepdim=True)
+    try:
+        fit = fit_pose(
+            mesh, part, camera.crop(top, left, height, width), init=_orthonormal(estimate.pose), max_size=size, steps=steps,
+            seed=seed, progress=progress, callback=callback, symmetries=model.symmetries,
+        )  # fmt: skip
+    except ValueError as error:
+        return kept(f"no fit: {error}")
+    if not fit.converged and not unconverged:
+        return kept(fit.state, fit)
+    turned = math.degrees(angle(_orthonormal(estimate.pose)[:3, :3], fit.R))
+    moved = float((fit.t - estimate.pose[:3, 3]).norm())
+    return Refined(
+        replace(estimate, pose=fit.matrix), fit, False, fit.state, turned, moved, time.perf_counter() - began
+    )  # fmt: skip
+
+
+def _box(verts: Tensor, pose: Tensor, camera: Camera, margin: float) -> tuple[int, int, int, int] | None:
+    """Top, left, height and width of the part of the image around the object; None where it is not in it."""
+    q = verts @ pose[:3, :3].T + pose[:3, 3]
+    if float(q[:, 2].min()) <= 0.0:
+        return None
+    xy = camera.project(q)
+    low, high = xy.amin(0), xy.amax(0)
+    H, W = camera.size
+    limit = low.new_tensor([W, H])
+    if bool((high <= 0).any() or (low >= limit).any()):
+        return None
+    beside = margin * float((high - low).max()) + 0.5 * SMALLEST
+    (left, top), (right, bottom) = (
+        (low - beside).floor().clamp(min=0).int().tolist(), (high + beside).ceil().minimum(limit).int().tolist(),
+    )  # fmt: skip
+    return top, left, bottom - top, right - left
+
+
+def _orthonormal(pose: Tensor) -> Tensor:
+    """With the rotation that is nearest to what a file rounded."""
+    U, _, Vh = torch.linalg.svd(pose[:3, :3])
+    found = pose.clone()
+    found[:3, :3] = U @ Vh
+    return found
