@@ -77,7 +77,7 @@ class PhotoSearch:
         if self.colours_first:
             colours = self._by_colours(self.start, task.pyramid(self.start, self.max_size, self.spp), self.further)
             self._adopt(colours)
-            if self.converged:
+            if colours.explained >= colours.enough:
                 return
         begins = len(self.history)
         found = self._judge(*self._down(self.start, self.levels))
