@@ -22,6 +22,7 @@ from ..task import SHIFT, TURN, Level, PoseTask
 from .level import PhotoLevel, photo_levels
 
 ENOUGH = 0.65  # share of the render's edges: wrong poses reach 0.57, right ones 0.83 and more
+SURE = 0.85  # the same, where a picture before an even background shows less than enough of the edges of colours as they are
 # Of the curvature's diagonal, where colours are still counted beside the object and where it is found, and of its largest entry.
 DAMPING, LAST_DAMPING, FLOOR = 0.1, 0.01, 1e-5
 LONGEST = 0.1  # of any entry of a step
@@ -93,7 +94,7 @@ class PhotoSearch:
         best = self._from_aside(best, begins) if self.further and best.explained < ENOUGH else best
         if self.colours_first:
             # Colours did not fit as they are. The terms of photographs decide if they are sure.
-            if best.explained < ENOUGH:
+            if best.explained < SURE:
                 self._forget(slice(begins, None))
             else:
                 self._forget(slice(0, begins))
