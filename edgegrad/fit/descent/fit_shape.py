@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from types import ModuleType
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import check_positive, check_positive_int
-from ...optional import require
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..checkpoints import Checkpoint
 from ..history import Record
 from ..options import Options, Parameter
+from ..remeshing import crowded_edges, remeshed
 from ..smooth import Smooth
 from ..upside_down import warn_of_masks
 from ..views import Images, View, views_of
@@ -28,7 +25,6 @@ from .result import Fit
 
 SMOOTHNESS = 4.0  # λ of I + λ L
 SMALLEST = 64  # pixels on the shorter side of pictures of coarse levels
-REMESHING = 5  # rounds
 
 
 def fit_shape(
@@ -72,7 +68,7 @@ def fit_shape(
     if faces is not None:
         check_positive_int("faces", faces)
     # Before the first level rather than after it.
-    if levels > 1 and (count := len(_gpytoolbox().non_manifold_edges(mesh.faces.cpu().numpy().astype(np.int32)))):
+    if levels > 1 and (count := crowded_edges(mesh)):
         raise ValueError(
             f"mesh: expected no more than two triangles at each edge, as remeshing needs, got {count} edges with more; "
             "give levels=1, or a sphere around the object"
@@ -163,18 +159,3 @@ class _Search:
     def scene(self, mesh: Mesh) -> Scene:
         made = self.look(mesh)
         return made if isinstance(made, Scene) else Scene([made], self.background)
-
-
-def remeshed(mesh: Mesh, faces: int) -> Mesh:
-    """About so many even triangles on the same surface (Botsch and Kobbelt 2004), by gpytoolbox. Raises ImportError."""
-    a, b, c = mesh.verts.double()[mesh.faces.long()].unbind(1)
-    area = 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
-    edge = math.sqrt(4.0 * area / (math.sqrt(3.0) * faces))  # of equilateral triangles
-    verts, triangles = _gpytoolbox().remesh_botsch(
-        mesh.verts.double().numpy(), mesh.faces.numpy().astype(np.int32), REMESHING, edge, True
-    )
-    return Mesh(torch.from_numpy(verts).to(mesh.verts.dtype), torch.from_numpy(triangles.astype(np.int64)))
-
-
-def _gpytoolbox() -> ModuleType:
-    return require("gpytoolbox", "edgegrad[fit]", "remeshing")
