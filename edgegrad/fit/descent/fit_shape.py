@@ -14,6 +14,7 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..checkpoints import Checkpoint
 from ..history import Record
+from ..measured import Measured
 from ..options import Options, Parameter
 from ..remeshing import crowded_edges, remeshed
 from ..smooth import Smooth
@@ -33,6 +34,9 @@ def fit_shape(
     images: Images | None = None,
     *,
     masks: Images | None = None,
+    depths: Images | Measured | None = None,
+    normals: Images | Measured | None = None,
+    positions: Images | Measured | None = None,
     weights: Images | None = None,
     levels: int = 3,
     faces: int | None = None,
@@ -43,9 +47,14 @@ def fit_shape(
     regularizer: Callable[[Scene], Tensor] | None = None,
     **options: Any,
 ) -> Fit:
-    """Finds the shape of a mesh from pictures or masks of it.
+    """Finds the shape of a mesh from pictures, masks, or measured depths, normals or positions of it.
 
     mesh        where the fit starts: a sphere around the object will do, where the object has no holes
+    depths      (H, W) each, along the optical axis, +Z of the camera, in world units, as sensors give them
+    normals     (H, W, 3) each, of length 1, world axes, outwards
+    positions   (H, W, 3) each, world coordinates
+                These three are measured where they are finite and not 0; Measured(values, …) says with which weights. A camera
+                may have only some of the pictures, None standing for what it has not: a sensor beside the camera is one more
     levels      after each but the last the mesh is remeshed to triangles of even size, half as long on each level as on the one
                 before; 1: the mesh as it is
     faces       about so many on the last level; None: four times as many as on the level before
@@ -73,7 +82,8 @@ def fit_shape(
             f"mesh: expected no more than two triangles at each edge, as remeshing needs, got {count} edges with more; "
             "give levels=1, or a sphere around the object"
         )
-    views = views_of(cameras, images, masks, weights)
+    measured = {"depths": depths, "normals": normals, "positions": positions}
+    views = views_of(cameras, images, masks, weights, measured)
     behind = None if masks is not None else background
     bare = Mesh(mesh.verts.detach().cpu().float().clone(), mesh.faces.detach().cpu().clone())
     return _Search(views, opts, levels, faces, lr, smoothness, look or _itself, behind, regularizer).run(bare)
