@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..optional import require
 from ..camera.camera import Camera
+from ..optional import require
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..warnings import warn
@@ -183,7 +183,9 @@ def _named(cameras: object) -> dict[str, Camera]:
             raise TypeError(
                 f"cameras: expected a Camera, a sequence of them, or some by name, got {type(cameras).__name__}"
             )
-        given = {"camera": cameras} if isinstance(cameras, Camera) else {f"camera {k}": c for k, c in enumerate(cameras)}
+        given = (
+            {"camera": cameras} if isinstance(cameras, Camera) else {f"camera {k}": c for k, c in enumerate(cameras)}
+        )
     found = {}
     for name, camera in given.items():
         if not isinstance(camera, Camera):

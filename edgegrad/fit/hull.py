@@ -74,7 +74,8 @@ def _where_cameras_look(views: Sequence[View]) -> tuple[Tensor, Tensor]:
         eyes.append(-R.T @ t)
         axes.append(R[2])
     eye, axis = torch.stack(eyes), F.normalize(torch.stack(axes), dim=1)
-    across = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]  # (I − a aᵀ), Σ (I − a aᵀ)(x − e) = 0
+    # Of lines through e along a: Σ (I − a aᵀ)(x − e) = 0.
+    across = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
     total = across.sum(0)
     if float(torch.linalg.eigvalsh(total)[0]) < 1e-4 * len(views):
         raise ValueError("cameras: expected some that look in different directions, got parallel ones; give bounds")
@@ -121,7 +122,8 @@ def _inside(views: Sequence[View], axes: Sequence[Tensor], reach: float = 0.0) -
         if reach > 0.0:
             near = depth[depth > 0].min() if camera.projection == "perspective" and bool((depth > 0).any()) else 1.0
             pixels = min(max(camera.size), int(reach * float(camera.K[0, 0]) / float(near)) + 1)
-            image = F.max_pool2d(F.max_pool2d(image, (2 * pixels + 1, 1), 1, (pixels, 0)), (1, 2 * pixels + 1), 1, (0, pixels))
+            image = F.max_pool2d(image, (2 * pixels + 1, 1), 1, (pixels, 0))
+            image = F.max_pool2d(image, (1, 2 * pixels + 1), 1, (0, pixels))
         place = camera.project(points.to(camera.K.dtype)).double()
         H, W = camera.size
         valid = place.isfinite().all(-1)

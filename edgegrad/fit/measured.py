@@ -76,9 +76,7 @@ class Measurement:
         return ((value - low) / (high - low).clamp(min=1e-30)).clamp(0.0, 1.0)
 
 
-def measurements(
-    given: Mapping[str, Any], cameras: Sequence[Camera]
-) -> list[dict[str, Measurement]]:
+def measurements(given: Mapping[str, Any], cameras: Sequence[Camera]) -> list[dict[str, Measurement]]:
     """For each camera what was measured there, by the channel of render_aovs(); `given` by the argument's name, each a Measured,
     or its values. Raises TypeError or ValueError that names the argument."""
     found: list[dict[str, Measurement]] = [{} for _ in cameras]
@@ -117,13 +115,13 @@ def _each(name: str, value: Any, cameras: Sequence[Camera]) -> list[Any]:
     single = len(cameras) == 1 and not isinstance(value, (list, tuple)) and getattr(value, "ndim", 0) < 4
     given = [value] if single else value
     if len(given) != len(cameras):
-        raise ValueError(f"{name}: expected {len(cameras)}, one for each camera, got {len(given)}; None where one has none")
+        raise ValueError(
+            f"{name}: expected {len(cameras)}, one for each camera, got {len(given)}; None where one has none"
+        )
     return list(given)
 
 
-def _checked(
-    name: str, picture: Any, weight: Any, width: int, size: tuple[int, int]
-) -> tuple[Tensor, Tensor]:
+def _checked(name: str, picture: Any, weight: Any, width: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Picture (H, W, width) and weight (H, W, 1), both zero where nothing was measured. Raises TypeError or ValueError."""
     fix = "the camera must have the picture's size: camera.resized((H, W))"
     value = as_tensor(name, picture).detach().cpu()

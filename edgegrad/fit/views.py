@@ -43,7 +43,9 @@ class View:
     def shown(self) -> Tensor:
         """(H, W, c) the channel to show, from 0 to 1 where it is neither a colour nor a mask."""
         first = self.aovs[0]
-        return self.measured[first].displayed(self.measured[first].value) if first in self.measured else self.wanted[first]
+        return (
+            self.measured[first].displayed(self.measured[first].value) if first in self.measured else self.wanted[first]
+        )
 
     @property
     def wanted(self) -> dict[str, Tensor]:

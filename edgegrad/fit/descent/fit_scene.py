@@ -267,7 +267,7 @@ def judged(build: Build, views: list[View], options: Options, descent: Descent, 
             renders = [
                 next(_renders(scene, cameras, views, [i], options, spp, (options.seed + k) % 2**32))[1] for k in (1, 2)
             ]
-            means = {name: 0.5 * (a + b)[0] for (name, a), b in zip(renders[0].items(), renders[1].values(), strict=True)}
+            means = {name: 0.5 * (found + renders[1][name])[0] for name, found in renders[0].items()}
             for name, target in view.wanted.items():
                 loss += float(loss_functions[name](means[name], target, view.weights[name])) / len(views)
                 pairs.append((renders[0][name][0], renders[1][name][0], target, view.weight))

@@ -81,8 +81,8 @@ class Fit:
         return "converged"
 
     def render(self, index: int = 0, spp: int = 64, seed: int = 0) -> Tensor:
-        """(H, W, C) as the camera of that place sees the fit; alpha (H, W, 1) where there was a mask alone, and where there was none
-        either depth, normal or position, as render_aovs() gives them."""
+        """(H, W, C) as the camera of that place sees the fit; alpha (H, W, 1) where there was a mask alone; where there was none,
+        the depth, normal or position that was measured, as render_aovs() gives it."""
         return _render(self.scene, self.cameras[index], self.views[index], spp, seed)
 
     def plot(self, most: int = 4) -> Figure:
