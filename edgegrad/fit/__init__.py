@@ -13,8 +13,9 @@ from .pose.fit_camera import CameraFit, fit_camera
 from .pose.fit_pose import fit_pose
 from .pose.pose import Pose
 from .pose.result import PoseFit, Step
+from .unwrapping import unwrapped
 
 __all__ = [
     "CameraFit", "Fit", "Measured", "Options", "Parameter", "Pose", "PoseFit", "Progress", "Record", "Step",
-    "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers", "visual_hull",
+    "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers", "unwrapped", "visual_hull",
 ]  # fmt: skip

@@ -10,10 +10,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ..camera.camera import Camera
-from ..check import as_tensor, check_finite, check_int, check_shape
+from ..check import as_tensor, check_finite, check_int, check_positive_int, check_shape
 from ..scene.mesh import Mesh
 from .regularizers import edges
-from .remeshing import gpytoolbox
+from .remeshing import gpytoolbox, remeshed
 from .views import Images, View, views_of
 
 COARSE = 48  # cells on a side of the cubes in which the object is looked for
@@ -21,7 +21,11 @@ SMALL = 0.01  # pieces with a smaller share of the largest one's faces are left 
 
 
 def visual_hull(
-    cameras: Camera | Sequence[Camera], masks: Images, resolution: int = 96, bounds: Tensor | None = None
+    cameras: Camera | Sequence[Camera],
+    masks: Images,
+    resolution: int = 96,
+    faces: int | None = None,
+    bounds: Tensor | None = None,
 ) -> Mesh:
     """The largest body that has these silhouettes (Laurentini 1994), as a closed mesh: a start for fit_shape() that has the
     object's holes, and its parts where they are seen apart.
@@ -30,6 +34,7 @@ def visual_hull(
     masks       (H, W) each, 1 on the object, 0 elsewhere; beyond a side of an image that a mask touches, the
                 object may go on, and nothing is cut away
     resolution  cells on the longest side of the box around the object: details smaller than a cell are not there
+    faces       about so many, even triangles, as a fit wants them: few for its first level; None: those of the cells
     bounds      (2, 3) opposite corners of a box that holds the object; None: found from where the cameras look
 
     Marching cubes at a mask of one half (Lorensen and Cline 1987). Pieces with less than 1 % of the faces of the largest are left
@@ -52,7 +57,8 @@ def visual_hull(
     # One cell around, so that the surface is closed.
     axes = [float(low[k]) + cell * (torch.arange(int(count[k])) - 1).double() for k in range(3)]
     inside = _closed(_inside(views, axes))
-    return _surface(inside, axes)
+    found = _surface(inside, axes)
+    return found if faces is None else remeshed(found, check_positive_int("faces", faces))
 
 
 def _checked(bounds: object) -> tuple[Tensor, Tensor]:
