@@ -16,7 +16,7 @@ from .regularizers import edges
 from .remeshing import gpytoolbox, remeshed
 from .views import Images, View, views_of
 
-COARSE = 48  # cells on a side of the cubes in which the object is looked for
+COARSE = 32  # cells on a side of the cubes in which the object is looked for
 SMALL = 0.01  # pieces with a smaller share of the largest one's faces are left out
 
 
@@ -41,6 +41,8 @@ def visual_hull(
     out. Needs gpytoolbox (`pip install 'edgegrad[fit]'`). Raises TypeError or ValueError that names the argument, ImportError.
     """
     check_int("resolution", resolution, 4, 512)
+    if faces is not None:
+        check_positive_int("faces", faces)
     views = views_of(cameras, None, masks)
     if len(views) < 2:
         raise ValueError(f"cameras: expected at least two, got {len(views)}; one silhouette does not bound a body")
@@ -58,7 +60,7 @@ def visual_hull(
     axes = [float(low[k]) + cell * (torch.arange(int(count[k])) - 1).double() for k in range(3)]
     inside = _closed(_inside(views, axes))
     found = _surface(inside, axes)
-    return found if faces is None else remeshed(found, check_positive_int("faces", faces))
+    return found if faces is None else remeshed(found, faces)
 
 
 def _checked(bounds: object) -> tuple[Tensor, Tensor]:
