@@ -3,9 +3,9 @@
     python benchmarks/photos_dino.py FOLDER [--first 2] [--out dino.png]
 
 FOLDER holds the data set dinoSparseRing of the Middlebury multi-view benchmark (Seitz et al. 2006): a matte white figure before
-black, 640 × 480, `dinoSR_par.txt` with K, R and t of each view. Silhouettes are where a picture is brighter than 0.15. Dark shadows
-on the figure are as dark as what is behind it, so pixels that a closing by 9 would add are not known, as the data's notes
-advise: they have no weight, in the fit and in the IoU. Held out is every fourth view.
+black, 640 × 480, `dinoSR_par.txt` with K, R and t of each view. Silhouettes are where a picture is brighter than 0.15. Dark
+shadows on the figure are as dark as what is behind it, so pixels that a closing by 9 would add are not known, as the data's
+notes advise: they have no weight, in the fit and in the IoU. Held out is every fourth view.
 
 Printed are, for each view held out, the IoU of the silhouettes where they are known, and over all pixels; and the PSNR of the
 textured render, of sRGB values from 0 to 1, over the known mask and over the whole picture with its background put to black.

@@ -74,7 +74,9 @@ def test_an_object_that_goes_on_beyond_an_image():
     """Where it touches the rim nothing is cut away; where it does not, nothing is beyond."""
     egg = ball(3)
     cameras = around(egg, 12)
-    near = [camera.crop(0, 0, 64, 37) if k % 3 == 0 else camera for k, camera in enumerate(cameras)]  # the middle is at 32
+    near = [
+        camera.crop(0, 0, 64, 37) if k % 3 == 0 else camera for k, camera in enumerate(cameras)
+    ]  # the middle is at 32
     masks = silhouettes(egg, near)
     assert all(bool((mask[:, -1] > 0.5).any()) for mask in masks[::3])
     hull = visual_hull(near, masks, 40)
@@ -131,7 +133,7 @@ def test_unwrapped_faces_lie_apart_and_keep_their_shape():
     ring = torus()
     found = unwrapped(ring, 256)
     assert torch.equal(found.faces, ring.faces) and torch.equal(found.verts, ring.verts)
-    assert 0.0 <= float(found.uvs.min()) and float(found.uvs.max()) <= 1.0
+    assert float(found.uvs.min()) >= 0.0 and float(found.uvs.max()) <= 1.0
 
     def lengths(points, faces):
         corner = points[faces]

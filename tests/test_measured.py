@@ -35,7 +35,9 @@ def test_what_was_not_measured_does_not_count():
     render[:, 1, :2] = 9.0
     assert float(measured_loss(render, torch.ones_like(render), [given], covers=False)) == 0.0
     render[:, 2, 3] += 0.1  # one pixel, by the scale: 2x² / (x² + 4) = 0.4
-    assert float(measured_loss(render, torch.ones_like(render), [given], covers=False)) == pytest.approx(0.4 / 24, rel=1e-5)
+    assert float(measured_loss(render, torch.ones_like(render), [given], covers=False)) == pytest.approx(
+        0.4 / 24, rel=1e-5
+    )
     doubled = one("depths", depth, weights=2.0 * weights, scale=0.1, factor=3.0)
     assert float(measured_loss(render, torch.ones_like(render), [doubled], False)) == pytest.approx(2.4 / 24, rel=1e-5)
 
@@ -108,9 +110,17 @@ GOOD = torch.full((4, 6), 3.0)
         ({"depths": GOOD * nan}, ValueError, "depths: expected a pixel that was measured, got none"),
         ({"depths": [GOOD, GOOD]}, ValueError, "depths: expected 1, one for each camera, got 2"),
         ({"depths": Measured(GOOD, weights=-GOOD)}, ValueError, "weights of depths: expected finite numbers from 0 up"),
-        ({"depths": Measured([None], weights=GOOD)}, ValueError, "depths: expected a picture beside its weights, got None"),
+        (
+            {"depths": Measured([None], weights=GOOD)},
+            ValueError,
+            "depths: expected a picture beside its weights, got None",
+        ),
         ({"normals": GOOD}, ValueError, r"normals: expected shape \(4, 6, 3\)"),
-        ({"normals": torch.full((4, 6, 3), 128.0)}, ValueError, "normals: expected vectors of length 1 .* x / 127.5 − 1"),
+        (
+            {"normals": torch.full((4, 6, 3), 128.0)},
+            ValueError,
+            "normals: expected vectors of length 1 .* x / 127.5 − 1",
+        ),
         ({"positions": GOOD[..., None]}, ValueError, r"positions: expected shape \(4, 6, 3\)"),
     ],
 )
@@ -215,7 +225,7 @@ def test_views_that_have_only_some_of_it(dent, tmp_path):
     assert [view.aovs for view in fit.views] == [
         ["alpha", "shading_normal"], ["depth", "alpha"], ["alpha", "depth"], ["alpha"], ["alpha"],
     ]  # fmt: skip
-    assert 0.0 < fit.loss and 0.0 < fit.explained <= 1.0
+    assert fit.loss > 0.0 and 0.0 < fit.explained <= 1.0
     assert fit.render(1).shape == (40, 40, 1) and float(fit.render(1).max()) > 2.0
     pytest.importorskip("matplotlib")
     assert "fit.png" in fit.save(tmp_path)

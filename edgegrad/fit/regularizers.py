@@ -55,8 +55,8 @@ def normal_consistency(verts: Tensor, faces: Tensor) -> Tensor:
 
 
 def area(verts: Tensor, faces: Tensor) -> Tensor:
-    """The area of the surface, in squared diagonals of its bounding box: the smallest surface among those that the pictures allow.
-    In a fit to silhouettes it takes away what no view has seen to be empty, for nothing else does."""
+    """The area of the surface, in squared diagonals of its bounding box: the smallest surface among those that pictures allow. In
+    a fit to silhouettes it takes away what no view shows to be empty or full, for nothing else does."""
     a, b, c = verts[faces.long()].unbind(1)
     low, high = verts.detach().aminmax(dim=0)
     return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / (high - low).square().sum().clamp(min=1e-30)

@@ -11,8 +11,8 @@ from ..scene.mesh import Mesh
 
 
 def unwrapped(mesh: Mesh, size: int = 512, gap: int = 4) -> Mesh:
-    """The mesh with texture coordinates for fit_texture(): charts of little stretch, side by side in a square, by xatlas. Vertices
-    and faces stay as they are; colours and textures are left away.
+    """The mesh with texture coordinates for fit_texture(): charts of little stretch, side by side in a square, by xatlas.
+    Vertices and faces stay as they are; colours and textures are left away.
 
     size  texels on a side of the texture that it is for
     gap   texels between charts, so that a texel belongs to one of them

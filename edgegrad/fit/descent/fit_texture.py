@@ -49,7 +49,9 @@ def fit_texture(
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; load one with load_mesh(path)")
     if mesh.uvs is None:
-        raise ValueError("mesh: expected texture coordinates, got a mesh without; unwrap it first: edgegrad.fit.unwrapped(mesh)")
+        raise ValueError(
+            "mesh: expected texture coordinates, got a mesh without; unwrap it first: edgegrad.fit.unwrapped(mesh)"
+        )
     if not isinstance(size, int) and (not isinstance(size, (tuple, list)) or len(size) != 2):
         raise TypeError(f"size: expected an int or (h, w), got {size!r}")
     h, w = (size, size) if isinstance(size, int) else size
