@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from edgegrad.image import linear_to_srgb, srgb_to_linear
 
 BRIGHT = 0.15  # of the brightest channel, sRGB
 SPECKS, SHADOWS = 2, 9  # pixels that closings fill: noise; what may be a shadow
-TEXELS = 1024
+TEXELS = 512
 
 
 @dataclass(frozen=True)
@@ -98,11 +99,33 @@ def shape(photos: list[Photo], steps: int = 150) -> Fit:
     return fit(carved.mesh, photos, 0.03, faces=20000)
 
 
-def texture(mesh: eg.Mesh, photos: list[Photo], steps: int = 100) -> Fit:
-    return fit_texture(
-        unwrapped(mesh, TEXELS), [p.camera for p in photos], [p.image for p in photos], TEXELS,
-        masks=[p.mask for p in photos], weights=[p.known for p in photos], lr=0.05, steps=steps, spp=4, views_per_step=4,
-    )  # fmt: skip
+def refined(mesh: eg.Mesh, photos: list[Photo], rounds: int = 3) -> Iterator[eg.Mesh]:
+    """With a texture; then by turns the shape on which that texture shows what the photographs do, and the texture again: what is
+    hollow, contours do not tell, but a texture slides on a surface that is not where the figure's is."""
+    half = [p.resized(0.5) for p in photos]
+    cameras, images = [p.camera for p in half], [p.image for p in half]
+    masks, weights = [p.mask for p in half], [p.known for p in half]
+
+    def textured(mesh: eg.Mesh, steps: int) -> eg.Mesh:
+        return fit_texture(
+            mesh, cameras, images, TEXELS, masks=masks, weights=weights, lr=0.05, steps=steps, spp=4, views_per_step=4
+        ).mesh
+
+    found = textured(unwrapped(mesh, TEXELS), 60)
+    yield found
+    for _ in range(rounds):
+        known = found
+
+        def look(bare: eg.Mesh, known: eg.Mesh = known) -> eg.Mesh:
+            return known.replace(verts=bare.verts)
+
+        moved = fit_shape(
+            known, cameras, images, masks=masks, weights=weights, look=look, levels=1, lr=0.004, steps=130, spp=2,
+            views_per_step=3,
+            regularizer=lambda scene: 0.02 * regularizers.area(scene.meshes[0].verts, scene.meshes[0].faces),
+        )  # fmt: skip
+        found = textured(known.replace(verts=moved.mesh.verts), 40)
+        yield found
 
 
 def iou(a: Tensor, b: Tensor, weight: Tensor | float = 1.0) -> float:
@@ -138,27 +161,29 @@ def sheet(rows: list[tuple[Photo, Tensor, Tensor]]) -> Tensor:
     return torch.cat(lines)
 
 
-def dino(folder: Path, first: int = 2, out: Path | None = None) -> list[dict[str, float]]:
+def dino(folder: Path, first: int = 2, out: Path | None = None) -> None:
     photos = read(folder)
     held, seen = photos[first::4], [p for i, p in enumerate(photos) if i % 4 != first]
     began = time.perf_counter(), time.process_time()
-    mesh = shape(seen).mesh
-    middle = time.perf_counter(), time.process_time()
-    found = texture(mesh, seen).mesh
-    end = time.perf_counter(), time.process_time()
-    rows = [measured(found, photo) for photo in held]
-    names = list(rows[0][0])
-    print(f"{'held out':>16} " + " ".join(f"{name:>9}" for name in names))
-    for photo, (numbers, _, _) in zip(held, rows, strict=True):
-        print(f"{photo.name:>16} " + " ".join(f"{numbers[name]:9.3f}" for name in names))
-    others = [measured(found, photo)[0] for photo in seen]
-    print(f"{'fitted, mean':>16} " + " ".join(f"{sum(o[name] for o in others) / len(others):9.3f}" for name in names))
-    for name, (a, b) in {"shape": (began, middle), "texture": (middle, end)}.items():
-        print(f"{name}: {b[0] - a[0]:.0f} s, {b[1] - a[1]:.0f} s of processor time")
+    found = shape(seen).mesh
+    report("by contours", began, found, held, seen)
+    for k, found in enumerate(refined(found, seen)):
+        report("textured" if k == 0 else f"refined {k}", began, found, held, seen)
     if out is not None:
-        eg.write_image(out, sheet([(p, image, alpha) for p, (_, image, alpha) in zip(held, rows, strict=True)]))
-        eg.save_mesh(out.with_suffix(".glb"), found)
-    return [numbers for numbers, _, _ in rows]
+        eg.write_image(out, sheet([(photo, *measured(found, photo)[1:]) for photo in held]))
+        eg.save_mesh(out.with_suffix(".glb"), found.replace(texture=found.texture.clamp(0.0, 1.0)))
+
+
+def report(stage: str, began: tuple[float, float], mesh: eg.Mesh, held: list[Photo], seen: list[Photo]) -> None:
+    """A line for each view held out, and the mean of those fitted."""
+    wall, work = time.perf_counter() - began[0], time.process_time() - began[1]
+    print(f"{stage}, after {wall:.0f} s, {work:.0f} s of processor time")
+    rows = {photo.name: measured(mesh, photo)[0] for photo in held}
+    others = [measured(mesh, photo)[0] for photo in seen]
+    rows["fitted, mean"] = {name: sum(o[name] for o in others) / len(others) for name in others[0]}
+    for title, numbers in rows.items():
+        shown = (f"{name} {x:.3f}" for name, x in numbers.items() if mesh.texture is not None or name.startswith("IoU"))
+        print(f"{title:>16}  " + "  ".join(shown), flush=True)
 
 
 def main() -> None:
