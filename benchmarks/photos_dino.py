@@ -165,11 +165,11 @@ def dino(folder: Path, first: int = 2, out: Path | None = None) -> None:
     photos = read(folder)
     held, seen = photos[first::4], [p for i, p in enumerate(photos) if i % 4 != first]
     began = time.perf_counter(), time.process_time()
-    found = shape(seen).mesh
-    report("by contours", began, found, held, seen)
-    for k, found in enumerate(refined(found, seen)):
+    found = bare = shape(seen).mesh
+    report("by contours", began, bare, held, seen)
+    for k, found in enumerate(refined(bare, seen)):
         report("textured" if k == 0 else f"refined {k}", began, found, held, seen)
-    if out is not None:
+    if out is not None and found.texture is not None:
         eg.write_image(out, sheet([(photo, *measured(found, photo)[1:]) for photo in held]))
         eg.save_mesh(out.with_suffix(".glb"), found.replace(texture=found.texture.clamp(0.0, 1.0)))
 

@@ -186,7 +186,6 @@ def test_a_dent_that_masks_do_not_tell(dent):
     assert error(start) > 0.2
     depths = error(fit_shape(start, cameras, masks=masks, depths=covered(views, "depth"), **OPTIONS).mesh)
     normals = error(fit_shape(start, cameras, masks=masks, normals=covered(views, "shading_normal"), **OPTIONS).mesh)
-    print(depths, normals)
     assert depths < 0.03 and normals < 0.03, (depths, normals)  # of a dent 0.4 deep; by masks alone 0.07
 
 
@@ -209,7 +208,6 @@ def test_a_sensor_with_holes_noise_and_mixed_pixels(dent):
         positions.append(None if k in (1, 3) else there)
     start = ball(2).replace(verts=1.15 * ball(2).verts)
     found = error(fit_shape(start, cameras, depths=depths, positions=positions, **OPTIONS).mesh)
-    print(found)
     assert found < 0.04, found
 
 
