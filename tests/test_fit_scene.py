@@ -478,6 +478,13 @@ def test_the_best_values_are_not_those_of_the_easiest_views():
     easy, hard = (torch.full((8, 8, 1), value) for value in (0.45, 1.0))
     for images in ([easy, hard], [hard, easy]):
         fit = fit_scene(
-            mesh, cameras, images, {"face_colors": 0.02}, views_per_step=1, steps=60, weights=torch.ones(2, 8, 8), **QUIET
+            mesh,
+            cameras,
+            images,
+            {"face_colors": 0.02},
+            views_per_step=1,
+            steps=60,
+            weights=torch.ones(2, 8, 8),
+            **QUIET,
         )
         assert float(fit.values["face_colors"].mean()) > 0.6  # the mean of both is the best
