@@ -19,6 +19,7 @@ from .io import (
     read_mask,
     save_camera,
     save_mesh,
+    save_scene,
     write_image,
 )
 from .live import viewer
@@ -100,6 +101,7 @@ __all__ = [
     "render_aovs",
     "save_camera",
     "save_mesh",
+    "save_scene",
     "screen_gradient",
     "surface_samples",
     "trace",

@@ -5,9 +5,9 @@ from .files.formats.views import View
 from .files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
 from .files.load import load_mesh, load_scene
 from .files.mask import read_mask
-from .files.save import save_mesh
+from .files.save import save_mesh, save_scene
 
 __all__ = [
     "View", "linear_to_srgb", "load_camera", "load_cameras", "load_mesh", "load_scene", "read_image", "read_mask", "save_camera",
-    "save_mesh", "srgb_to_linear", "write_image",
+    "save_mesh", "save_scene", "srgb_to_linear", "write_image",
 ]  # fmt: skip

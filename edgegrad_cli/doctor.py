@@ -22,7 +22,8 @@ OPTIONAL = {
     "mitsuba": "peers: compared in edgegrad report",
     "scipy": "report: statistics",
     "cholespy": "fit, report: smooth steps of shapes",
-    "gpytoolbox": "fit: remeshing",
+    "gpytoolbox": "fit: remeshing, visual hulls",
+    "xatlas": "fit: unwrapping",
     "torchmetrics": "fit: SSIM",
 }
 TOLERANCE = 0.02  # of the gradient's size; its own error is 0.1 %

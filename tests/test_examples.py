@@ -101,6 +101,15 @@ def test_a_shape() -> None:
     assert shape.chamfer(found.mesh, stone) < 1.0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("given", ["depths", "sensor"])
+def test_a_shape_from_six_depth_maps(given: str) -> None:
+    shape = example("shape")
+    stone = shape.stone(5)
+    found = shape.fit(stone, views=6, size=96, given=given, steps=80, progress=False)
+    assert shape.chamfer(found.mesh, stone) < 0.3
+
+
 def test_there_is_no_other() -> None:
     assert sorted(path.stem for path in FOLDER.glob("*.py")) == [
         "focal",

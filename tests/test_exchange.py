@@ -92,7 +92,7 @@ def test_save_shapes_and_faults(tmp_path: Path) -> None:
         close(eg.load_mesh(tmp_path / f"a.{ending}"), mesh)
     with pytest.raises(ValueError, match=r"a\.fbx: expected a file name that ends in \.ply"):
         eg.save_mesh(tmp_path / "a.fbx", mesh)
-    with pytest.raises(TypeError, match="expected a Mesh, got Scene; save the meshes of a scene one by one"):
+    with pytest.raises(TypeError, match="expected a Mesh, got Scene; a Scene is for save_scene"):
         eg.save_mesh(tmp_path / "a.ply", eg.Scene([mesh]))
 
 

@@ -468,3 +468,23 @@ def test_a_shape_resumes_on_a_later_level(tmp_path):
     whole = fit_shape(ball(1), cameras, **options)
     assert again.steps == whole.steps == 12
     torch.testing.assert_close(again.mesh.verts, whole.mesh.verts, rtol=0, atol=1e-6)
+
+
+def test_the_best_values_are_not_those_of_the_easiest_views():
+    """Two views of which the first drawn has the smaller loss at the start than both have at the end."""
+    square = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    mesh = eg.Mesh(square, torch.tensor([[0, 1, 2], [0, 2, 3]]), face_colors=torch.full((2, 1), 0.4))
+    cameras = [eg.Camera.look_at((x, 0.0, 3.0), (0, 0, 0), size=(8, 8)) for x in (0.0, 0.1)]
+    easy, hard = (torch.full((8, 8, 1), value) for value in (0.45, 1.0))
+    for images in ([easy, hard], [hard, easy]):
+        fit = fit_scene(
+            mesh,
+            cameras,
+            images,
+            {"face_colors": 0.02},
+            views_per_step=1,
+            steps=60,
+            weights=torch.ones(2, 8, 8),
+            **QUIET,
+        )
+        assert float(fit.values["face_colors"].mean()) > 0.6  # the mean of both is the best

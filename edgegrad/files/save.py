@@ -1,10 +1,11 @@
-"""Meshes to and from trimesh, and into files by it.
+"""Meshes to and from trimesh, meshes and scenes into files by it.
 
 trimesh keeps colours as 8-bit sRGB, here they are linear; its texture coordinates are the vertices', which are split at seams.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..camera.camera import Camera
 from ..optional import require
 from ..scene.mesh import Mesh
+from ..scene.scene import Scene
 from ..warnings import warn
 from .formats.geometry import in_double, rounding
-from .formats.gltf_write import to_glb
+from .formats.gltf_pack import scene_to_gltf, to_glb
 from .formats.part import Fault, Part
 from .formats.source import Textures, linear_colors
 from .formats.text_write import to_obj, to_off
@@ -25,6 +28,7 @@ from .paths import PathLike, check_suffix, replacing
 from .welding import to_mesh
 
 WRITTEN = (".ply", ".obj", ".glb", ".stl", ".off")
+SCENES = (".glb", ".gltf")
 
 
 def from_trimesh(given: Any) -> Mesh:
@@ -109,7 +113,7 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     """
     file = check_suffix(path, WRITTEN)
     if not isinstance(mesh, Mesh):
-        raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; save the meshes of a scene one by one")
+        raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; a Scene is for save_scene")
     _check_channels(mesh)
     kind = file.suffix.lower()[1:]
     beside = {}
@@ -132,6 +136,63 @@ def save_mesh(path: PathLike, mesh: Mesh) -> None:
     for name, data in {**beside, file.name: content}.items():
         with replacing(file.parent / Path(name).name) as temporary:
             temporary.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def save_scene(
+    path: PathLike, scene: Scene | Mesh, cameras: Camera | Sequence[Camera] | Mapping[str, Camera] | None = None
+) -> None:
+    """Writes a scene as GLB or glTF by the name's ending; a .gltf holds its arrays and images itself. Missing folders are made.
+
+    scene    a mesh each becomes a node, with its material as save_mesh() writes it; one without a material is said to be unlit
+             (KHR_materials_unlit). Directional, point and spot lights are KHR_lights_punctual. What meshes share stands in the
+             file once
+    cameras  one, a batch, a sequence, or by name
+
+    `load_scene(path, lit=True)` reads the meshes in their order and the lights, load_cameras(path, size) the cameras. A glTF
+    has no environments, spherical harmonics, backgrounds, lenses, and no cameras whose principal point is off the middle or whose
+    pixels are not square: a warning names what is left out, rounded or clipped.
+
+    Raises TypeError or ValueError (another ending, channels that are not 1 or 3), OSError, or ImportError without trimesh.
+    """
+    file = check_suffix(path, SCENES)
+    if not isinstance(scene, Scene | Mesh):
+        raise TypeError(f"scene: expected a Scene or a Mesh, got {type(scene).__name__}")
+    whole = Scene([scene]) if isinstance(scene, Mesh) else scene
+    if whole.channels not in (1, 3):
+        raise ValueError(f"scene: expected 1 or 3 channels, got {whole.channels}; pick some")
+    content, lost = scene_to_gltf(whole, _named(cameras), file.suffix.lower()[1:])
+    if any(rounding(mesh.verts.detach().cpu().numpy())[1] for mesh in whole.meshes):
+        lost = [*lost, "positions beyond float32"]
+    if lost:
+        warn(
+            f"left out of {file.suffix}",
+            f"save_scene: {file.name} holds no {', no '.join(lost)}; torch.save(scene, path) keeps all of a Scene, and "
+            "save_camera() all of a camera",
+        )
+    with replacing(file) as temporary:
+        temporary.write_bytes(content)
+
+
+def _named(cameras: object) -> dict[str, Camera]:
+    """One by one; without names of their own by number. Raises TypeError."""
+    if cameras is None:
+        return {}
+    given = dict(cameras) if isinstance(cameras, Mapping) else None
+    if given is None:
+        if not isinstance(cameras, Camera | Sequence) or isinstance(cameras, str):
+            raise TypeError(
+                f"cameras: expected a Camera, a sequence of them, or some by name, got {type(cameras).__name__}"
+            )
+        given = (
+            {"camera": cameras} if isinstance(cameras, Camera) else {f"camera {k}": c for k, c in enumerate(cameras)}
+        )
+    found = {}
+    for name, camera in given.items():
+        if not isinstance(camera, Camera):
+            raise TypeError(f"cameras[{name!r}]: expected a Camera, got {type(camera).__name__}")
+        several = camera.batch is not None
+        found |= {f"{name}{f' {k}' if several else ''}": one for k, one in enumerate(camera if several else [camera])}
+    return found
 
 
 def _check_channels(mesh: Mesh) -> None:

@@ -48,6 +48,8 @@ class Checkpoint:
             "masks": [view.mask for view in views],
             "weights": [view.weight for view in views],
         }
+        if any(view.measured for view in views):
+            of_views["measured"] = [dict(view.measured) for view in views]
         of_options = {name: getattr(options, name) for name in SAME}
         return Checkpoint(options.checkpoint, options.resume, {**given, **of_views, **of_options})
 

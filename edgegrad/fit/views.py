@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -14,6 +14,7 @@ from ..camera.camera import Camera
 from ..check import as_tensor, check_finite, check_float, check_shape
 from ..scene.tree import map_tensors
 from ..warnings import warn
+from .measured import Measurement, area_mean, measurements
 
 Images = Tensor | Sequence[Tensor]
 FULL = 0.98  # a mask of more covers the whole pixel
@@ -30,15 +31,25 @@ class View:
     mask: Tensor | None  # (H, W, 1), the share of each pixel that the object covers
     weight: Tensor | None  # (H, W, 1), zero where the picture says nothing
     sure: Tensor | None = None  # (H, W, 1), zero where its colour is not sure, for the mask is neither full nor empty
+    measured: Mapping[str, Measurement] = field(default_factory=dict)  # by the channel of render_aovs()
 
     @property
     def aovs(self) -> list[str]:
-        """The channels to compare, as render_aovs() names them."""
-        return ["image"] * (self.image is not None) + ["alpha"] * (self.mask is not None)
+        """The channels to render, as render_aovs() names them; the first is the one to show."""
+        own = ["image"] * (self.image is not None) + ["alpha"] * (self.mask is not None)
+        return [*own, *self.measured, *(["alpha"] if self.measured and self.mask is None else [])]
+
+    @property
+    def shown(self) -> Tensor:
+        """(H, W, c) the channel to show, from 0 to 1 where it is neither a colour nor a mask."""
+        first = self.aovs[0]
+        return (
+            self.measured[first].displayed(self.measured[first].value) if first in self.measured else self.wanted[first]
+        )
 
     @property
     def wanted(self) -> dict[str, Tensor]:
-        """The same channels of the picture, (H, W, c) each."""
+        """Image and alpha of the picture, (H, W, c) each."""
         both = {"image": self.image, "alpha": self.mask}
         return {name: value for name, value in both.items() if value is not None}
 
@@ -58,7 +69,8 @@ class View:
             None if value is None else area_mean(value, size)
             for value in (self.image, self.mask, self.weight, self.sure)
         )
-        return View(self.camera.resized(size), image, mask, weight, sure)
+        measured = {name: one.resized(size) for name, one in self.measured.items()}
+        return View(self.camera.resized(size), image, mask, weight, sure, measured)
 
 
 def views_of(
@@ -66,6 +78,7 @@ def views_of(
     images: Images | None,
     masks: Images | None = None,
     weights: Images | None = None,
+    measured: Mapping[str, Any] | None = None,
 ) -> list[View]:
     """One View for each camera. Raises TypeError or ValueError that names the argument.
 
@@ -73,24 +86,29 @@ def views_of(
     images    (H, W, C) for one camera, else (B, H, W, C) or a sequence; linear radiance
     masks     (H, W) or (H, W, 1) each, 1 on the object and 0 elsewhere
     weights   (H, W) or (H, W, 1) each, from 0: how much a pixel counts
+    measured  "depths", "normals" and "positions", each as measurements() takes it
+
+    In a sequence of any of them None stands where a camera has none.
     """
     split = cameras_of(cameras)
     pictures, shapes, counts = (
         _images(name, value, split) for name, value in (("images", images), ("masks", masks), ("weights", weights))
     )
+    beside = measurements(measured or {}, split)
     views = []
-    for camera, image, mask, weight in zip(split, pictures, shapes, counts, strict=True):
+    for i, (camera, image, mask, weight) in enumerate(zip(split, pictures, shapes, counts, strict=True)):
         for name, value in (("masks", mask), ("weights", weight)):
             if value is not None:
                 check_shape(name, value, (*camera.size, 1))
         if weight is not None and not bool((weight >= 0).all()):
             raise ValueError(f"weights: expected numbers from 0 up, got {float(weight.min()):g}")
-        if image is None and mask is None:
-            raise ValueError("images: expected pictures or masks to compare with, got neither")
+        if image is None and mask is None and not beside[i]:
+            which = f" for cameras[{i}]" if any(x is not None for x in (*pictures, *shapes)) or any(beside) else ""
+            raise ValueError(f"images: expected pictures or masks to compare with, got neither{which}")
         sure = None
         if image is not None and mask is not None:
             image, sure = before_black(image, mask)
-        views.append(View(camera, image, mask, weight, sure))
+        views.append(View(camera, image, mask, weight, sure, _counted(beside[i], mask, weight)))
     for name, values in (("masks", shapes), ("weights", counts)):
         given = [value for value in values if value is not None]
         if given and not any(bool((value > 0).any()) for value in given):
@@ -99,6 +117,14 @@ def views_of(
             )
     warn_of_faint("masks", [mask for mask in shapes if mask is not None])
     return views
+
+
+def _counted(measured: dict[str, Measurement], mask: Tensor | None, weight: Tensor | None) -> dict[str, Measurement]:
+    """With the weights of the view's pixels. Where a mask is neither full nor empty, a depth may be that of the object, of what
+    lies behind, or between; where it is empty, it is not the object's."""
+    count = torch.ones(()) if weight is None else weight
+    count = count if mask is None else count * (mask > FULL)
+    return {name: replace(one, weight=one.weight * count) for name, one in measured.items()}
 
 
 def cameras_of(cameras: object) -> list[Camera]:
@@ -136,7 +162,7 @@ def _images(name: str, value: object, cameras: list[Camera]) -> list[Tensor | No
     if len(given) != len(cameras):
         raise ValueError(f"{name}: expected {len(cameras)}, one for each camera, got {len(given)}")
     return [
-        check_image(name if single else f"{name}[{i}]", image, camera.size)
+        None if image is None else check_image(name if single else f"{name}[{i}]", image, camera.size)
         for i, (image, camera) in enumerate(zip(given, cameras, strict=True))
     ]
 
@@ -216,11 +242,6 @@ def _around(image: Tensor) -> Tensor:
     return F.avg_pool2d(image.movedim(-1, 0)[None], 3, stride=1, padding=1)[0].movedim(0, -1)
 
 
-def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """Means over the new pixels' areas, which is what a render of that size with the box filter estimates."""
-    return F.interpolate(image.movedim(-1, 0)[None], size=size, mode="area")[0].movedim(0, -1)
-
-
 def grouped(views: Sequence[View]) -> list[list[int]]:
     """Places of views whose cameras can be rendered as one batch, with the same channels to compare."""
     groups: dict[Any, list[int]] = {}
@@ -229,6 +250,6 @@ def grouped(views: Sequence[View]) -> list[list[int]]:
         lens = None if camera.distortion is None else camera.distortion.shape
         shape = None if view.image is None else view.image.shape[-1]
         key = camera.size, camera.projection, lens, camera.K.dtype, shape, view.mask is None
-        key = *key, view.weight is None, view.sure is None
+        key = *key, view.weight is None, view.sure is None, tuple(view.measured)
         groups.setdefault(key, []).append(i)
     return list(groups.values())

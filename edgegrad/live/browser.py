@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..camera.camera import Camera
-from ..files.formats.gltf_write import to_glb
+from ..files.formats.gltf_pack import to_glb
 from ..optional import require
 from ..scene.material import Material, vertex_normals
 from ..scene.mesh import PLAIN, Mesh

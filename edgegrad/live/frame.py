@@ -86,9 +86,10 @@ def _frame(scene: Scene, cameras: list[Camera], views: list[View]) -> Frame:
         behind = area_mean(behind, size) if behind is not None and behind.dim() == 3 else behind
         name = (*view.aovs, "image")[0]
         camera = cameras[index].resized(size)
-        return render_aovs(scene.replace(background=behind), camera, [name], spp=SPP, seed=0)[name]
+        found = render_aovs(scene.replace(background=behind), camera, [name], spp=SPP, seed=0)[name]
+        return view.measured[name].displayed(found) if name in view.measured else found
 
-    return Frame(scene, None, cameras, [view.image if view.image is not None else view.mask for view in views], render)
+    return Frame(scene, None, cameras, [view.shown if view.aovs else None for view in views], render)
 
 
 def _frame_of_pose(task: PoseTask, step: Step) -> Frame:

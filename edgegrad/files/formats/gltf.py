@@ -15,10 +15,11 @@ MATT = "KHR_materials_specular"  # with a factor of 0: what is not metal has no 
 DRACO = "KHR_draco_mesh_compression"
 VISIBILITY = "KHR_node_visibility"
 PUNCTUAL = "KHR_lights_punctual"
+UNLIT = "KHR_materials_unlit"
 QUANTIZED = "KHR_mesh_quantization"
 # Extensions that are read, or that change no picture.
 READ = {
-    PUNCTUAL, DRACO, VISIBILITY, QUANTIZED, "KHR_materials_unlit", "KHR_materials_emissive_strength", "KHR_texture_transform",
+    PUNCTUAL, DRACO, VISIBILITY, QUANTIZED, UNLIT, "KHR_materials_emissive_strength", "KHR_texture_transform",
     "EXT_texture_webp", "KHR_xmp", "KHR_xmp_json_ld",
 }  # fmt: skip
 NEEDLESS = re.compile(

@@ -1,8 +1,4 @@
-"""Meshes with their materials as GLB files.
-
-trimesh packs arrays and images. What it drops or rounds is said in the JSON that it hands over before writing: factors
-in full, samplers, several sets of texture coordinates, the strength of emission, the scale of normal maps.
-"""
+"""What a mesh looks like, in the terms of glTF: its material, textures, and attributes of vertices."""
 
 from __future__ import annotations
 
@@ -12,12 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...optional import require
 from ...scene.appearance import coordinates
 from ...scene.material import Material, Texture
 from ...scene.mesh import PLAIN, Mesh
 from ..image import to_bytes
-from .gltf import MATT
+from .gltf import MATT, UNLIT
 from .gltf_texture import LINEAR, NEAREST, WRAPS
 
 FILTERS = {"linear": (LINEAR, LINEAR), "nearest": (NEAREST, NEAREST), "mipmap": (LINEAR, 9987)}  # near and far
@@ -25,28 +20,13 @@ UNEVEN = 1e-3  # lengths that differ by so little are rounded
 WRAP_CODES = {name: code for code, name in WRAPS.items()}
 
 
-def to_glb(mesh: Mesh) -> tuple[bytes, list[str]]:
-    """The file, and what of the mesh it does not hold. Raises ImportError without trimesh, or pillow for textures."""
-    look = _Look(mesh)
-    verts, faces, attributes = _split(look)
-    trimesh = require("trimesh", "trimesh", "saving meshes")
-    export = require("trimesh.exchange.gltf", "trimesh", "saving meshes").export_glb
-    made = trimesh.Trimesh(verts, faces, process=False, vertex_attributes=attributes)
-    if look.material:
-        images = {name: _picture(image) for name, image in look.images.items()}
-        made.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(**images))
-    scene = trimesh.Scene({mesh.name: made} if mesh.name else made)
-    return export(scene, include_normals=False, tree_postprocessor=look.write), look.lost
+class Look:
+    """What a mesh looks like in the terms of glTF.
 
+    unlit  whether one without a material is said to be unlit (KHR_materials_unlit), so that it comes back without
+    """
 
-def _picture(image: np.ndarray) -> Any:
-    return require("PIL.Image", "edgegrad[files]", "saving textures").fromarray(image)
-
-
-class _Look:
-    """What a mesh looks like in the terms of glTF."""
-
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: Mesh, unlit: bool = False) -> None:
         self.mesh = mesh
         self.lost: list[str] = []
         self.images: dict[str, np.ndarray] = {}  # 8 bit, by the field of the material
@@ -63,7 +43,7 @@ class _Look:
         material = mesh.material
         base, factor = self._base(material or Material())
         opacity = self._alpha(base)
-        if material is None and not self.images and opacity is None:
+        if material is None and not self.images and opacity is None and not unlit:
             return
         four = [*factor.expand(3).tolist(), 1.0 if opacity is None else opacity]
         self.material = {"pbrMetallicRoughness": {"baseColorFactor": four}}
@@ -72,6 +52,7 @@ class _Look:
             self.material |= {"alphaCutoff": max(0.0, mesh.alpha_cutoff)} if mode == "MASK" else {}
         if material is None:
             self.material["pbrMetallicRoughness"] |= {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+            self.material |= {"extensions": {UNLIT: {}}} if unlit else {}
             return
         self.material["doubleSided"] = material.two_sided
         self._surface(material)
@@ -233,14 +214,14 @@ class _Look:
 
     # -- in the file ------------------------------------------------------------------------------------------------
 
-    def write(self, tree: dict[str, Any]) -> None:
+    def write(self, tree: dict[str, Any], primitive: dict[str, Any]) -> None:
         """Into the JSON that trimesh made, where attributes of vertices have names of their own, and the material is
         images alone."""
-        for primitive in (p for given in tree["meshes"] for p in given["primitives"]):
-            primitive["attributes"] = {name.lstrip("_"): index for name, index in primitive["attributes"].items()}
+        primitive["attributes"] = {name.lstrip("_"): index for name, index in primitive["attributes"].items()}
         if not self.material:
             return
-        (material,) = tree["materials"]
+        material = tree["materials"][primitive["material"]]
+        material.pop("name", None)
         for field, texture in self.textures.items():
             near, far = FILTERS[texture.filter]
             wraps = [WRAP_CODES[wrap] for wrap in texture.wraps]
@@ -250,8 +231,6 @@ class _Look:
             reference["texCoord"] = self._set(texture)
             tree["textures"][reference["index"]]["sampler"] = len(samplers) - 1
         _merge(material, self.material)
-        if "extensions" in material:
-            tree["extensionsUsed"] = [*tree.get("extensionsUsed", []), *material["extensions"]]
 
 
 def _merge(into: dict[str, Any], given: dict[str, Any]) -> None:
@@ -274,7 +253,7 @@ def _colors(mesh: Mesh) -> tuple[str, tuple[Tensor, Tensor] | None]:
     return "", None
 
 
-def _split(look: _Look) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+def split(look: Look) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Vertices, faces, and attributes of vertices, with a leading _ as trimesh wants them: a glTF has one index for all."""
     mesh = look.mesh
     given: dict[str, tuple[Tensor, Tensor]] = {"": (mesh.verts, mesh.faces)}

@@ -18,6 +18,7 @@ from ...scene.tree import map_tensors, named_tensors, with_named
 from ..checkpoints import Checkpoint
 from ..history import Record
 from ..losses import loss_of
+from ..measured import Measurement, comparable, measured_loss
 from ..options import Options, Parameter
 from ..upside_down import warn_of_masks
 from ..verdict import explained
@@ -202,12 +203,16 @@ def objective_of(
         picks = _picks(len(views), options, step)
         total = torch.zeros((), dtype=torch.float64)
         for group, renders in _renders(scene, cameras, views, picks, options, options.spp, seed):
-            for name, render in renders.items():
+            first = views[group[0]]
+            for name in first.wanted:
                 target = _stacked([views[i].wanted[name] for i in group])
                 weights = [views[i].weights[name] for i in group]
                 weight = None if weights[0] is None else _stacked(weights)
                 by = loss if name == "image" else mask_loss
-                total = total + len(group) * by(render, target, weight).double()
+                total = total + len(group) * by(renders[name], target, weight).double()
+            for name in first.measured:
+                given = [views[i].measured[name] for i in group]
+                total = total + len(group) * _of_measured(renders, name, given, first.mask is None).double()
         total = total / len(picks)
         return total if regularizer is None else total + regularizer(scene)
 
@@ -236,6 +241,10 @@ def _renders(
         yield group, render_aovs(scene, batch, views[group[0]].aovs, spp=spp, seed=seed, **options.render)
 
 
+def _of_measured(renders: dict[str, Tensor], name: str, given: Sequence[Measurement], covers: bool) -> Tensor:
+    return measured_loss(renders[name], renders["alpha"], given, covers)
+
+
 def _stacked(tensors: Sequence[Tensor | None]) -> Tensor:
     return torch.stack([tensor for tensor in tensors if tensor is not None])
 
@@ -258,10 +267,15 @@ def judged(build: Build, views: list[View], options: Options, descent: Descent, 
             renders = [
                 next(_renders(scene, cameras, views, [i], options, spp, (options.seed + k) % 2**32))[1] for k in (1, 2)
             ]
+            means = {name: 0.5 * (found + renders[1][name])[0] for name, found in renders[0].items()}
             for name, target in view.wanted.items():
-                first, second = (found[name][0] for found in renders)
-                loss += float(loss_functions[name](0.5 * (first + second), target, view.weights[name])) / len(views)
-                pairs.append((first, second, target, view.weight))
+                loss += float(loss_functions[name](means[name], target, view.weights[name])) / len(views)
+                pairs.append((renders[0][name][0], renders[1][name][0], target, view.weight))
+            for name, given in view.measured.items():
+                mean = {key: value[None] for key, value in means.items()}
+                loss += float(_of_measured(mean, name, [given], view.mask is None)) / len(views)
+                target, weight = comparable(means[name], means["alpha"], given)
+                pairs.append((renders[0][name][0], renders[1][name][0], target, weight))
     return Fit(
         values=descent.values, scene=scene, cameras=cameras, views=views, loss=loss, explained=explained(pairs),
         flat=descent.flat, interrupted=descent.interrupted, history=descent.history, seconds=descent.seconds, start=start,

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from types import ModuleType
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
 from ...check import check_positive, check_positive_int
-from ...optional import require
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..checkpoints import Checkpoint
 from ..history import Record
+from ..measured import Measured
 from ..options import Options, Parameter
+from ..remeshing import crowded_edges, remeshed
 from ..smooth import Smooth
 from ..upside_down import warn_of_masks
 from ..views import Images, View, views_of
@@ -28,7 +26,6 @@ from .result import Fit
 
 SMOOTHNESS = 4.0  # λ of I + λ L
 SMALLEST = 64  # pixels on the shorter side of pictures of coarse levels
-REMESHING = 5  # rounds
 
 
 def fit_shape(
@@ -37,6 +34,9 @@ def fit_shape(
     images: Images | None = None,
     *,
     masks: Images | None = None,
+    depths: Images | Measured | None = None,
+    normals: Images | Measured | None = None,
+    positions: Images | Measured | None = None,
     weights: Images | None = None,
     levels: int = 3,
     faces: int | None = None,
@@ -47,9 +47,14 @@ def fit_shape(
     regularizer: Callable[[Scene], Tensor] | None = None,
     **options: Any,
 ) -> Fit:
-    """Finds the shape of a mesh from pictures or masks of it.
+    """Finds the shape of a mesh from pictures, masks, or measured depths, normals or positions of it.
 
     mesh        where the fit starts: a sphere around the object will do, where the object has no holes
+    depths      (H, W) each, along the optical axis, +Z of the camera, in world units, as sensors give them
+    normals     (H, W, 3) each, of length 1, world axes, outwards
+    positions   (H, W, 3) each, world coordinates
+                These three are measured where they are finite and not 0; Measured(values, …) says with which weights. A camera
+                may have only some of the pictures, None standing for what it has not: a sensor beside the camera is one more
     levels      after each but the last the mesh is remeshed to triangles of even size, half as long on each level as on the one
                 before; 1: the mesh as it is
     faces       about so many on the last level; None: four times as many as on the level before
@@ -72,12 +77,13 @@ def fit_shape(
     if faces is not None:
         check_positive_int("faces", faces)
     # Before the first level rather than after it.
-    if levels > 1 and (count := len(_gpytoolbox().non_manifold_edges(mesh.faces.cpu().numpy().astype(np.int32)))):
+    if levels > 1 and (count := crowded_edges(mesh)):
         raise ValueError(
             f"mesh: expected no more than two triangles at each edge, as remeshing needs, got {count} edges with more; "
             "give levels=1, or a sphere around the object"
         )
-    views = views_of(cameras, images, masks, weights)
+    measured = {"depths": depths, "normals": normals, "positions": positions}
+    views = views_of(cameras, images, masks, weights, measured)
     behind = None if masks is not None else background
     bare = Mesh(mesh.verts.detach().cpu().float().clone(), mesh.faces.detach().cpu().clone())
     return _Search(views, opts, levels, faces, lr, smoothness, look or _itself, behind, regularizer).run(bare)
@@ -163,18 +169,3 @@ class _Search:
     def scene(self, mesh: Mesh) -> Scene:
         made = self.look(mesh)
         return made if isinstance(made, Scene) else Scene([made], self.background)
-
-
-def remeshed(mesh: Mesh, faces: int) -> Mesh:
-    """About so many even triangles on the same surface (Botsch and Kobbelt 2004), by gpytoolbox. Raises ImportError."""
-    a, b, c = mesh.verts.double()[mesh.faces.long()].unbind(1)
-    area = 0.5 * float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum())
-    edge = math.sqrt(4.0 * area / (math.sqrt(3.0) * faces))  # of equilateral triangles
-    verts, triangles = _gpytoolbox().remesh_botsch(
-        mesh.verts.double().numpy(), mesh.faces.numpy().astype(np.int32), REMESHING, edge, True
-    )
-    return Mesh(torch.from_numpy(verts).to(mesh.verts.dtype), torch.from_numpy(triangles.astype(np.int64)))
-
-
-def _gpytoolbox() -> ModuleType:
-    return require("gpytoolbox", "edgegrad[fit]", "remeshing")

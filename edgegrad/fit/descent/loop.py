@@ -21,6 +21,7 @@ from .adam import Adam
 
 CUT, CUTS = 0.3, 3  # learning rates fall by this factor when the loss is flat; so often before the fit ends
 SMOOTH = 0.9  # the best values are those of the least loss, averaged over some ten steps for its noise
+WARM = 10  # steps of few views until their losses are averaged enough to be compared
 SMALL = 64  # values of up to so many numbers are kept for each step
 
 
@@ -117,7 +118,9 @@ class _Loop:
             return record
         self.smooth = SMOOTH * self.smooth + (1.0 - SMOOTH) * number
         mean = self.smooth / (1.0 - SMOOTH ** len(self.history))
-        if mean <= self.least:
+        # The first views of several may be those of the least loss, whatever the values.
+        warming = self.options.views_per_step is not None and len(self.history) <= WARM
+        if mean <= self.least or warming:
             self.least = mean
             self.best = {name: value.detach().clone() for name, value in self.values.items()}
         self.optimizer.step(dict(zip(self.values, gradients, strict=True)))

@@ -81,7 +81,8 @@ class Fit:
         return "converged"
 
     def render(self, index: int = 0, spp: int = 64, seed: int = 0) -> Tensor:
-        """(H, W, C) as the camera of that place sees the fit; alpha (H, W, 1) where masks alone were compared."""
+        """(H, W, C) as the camera of that place sees the fit; alpha (H, W, 1) where there was a mask alone; where there was none,
+        the depth, normal or position that was measured, as render_aovs() gives it."""
         return _render(self.scene, self.cameras[index], self.views[index], spp, seed)
 
     def plot(self, most: int = 4) -> Figure:
@@ -91,9 +92,10 @@ class Fit:
         rows = []
         for i in chosen:
             view = self.views[i]
-            target = view.image if view.image is not None else view.mask
-            assert target is not None
-            rows.append((target, _render(self.start, view.camera, view, 64, 0), self.render(i)))
+            start, end = _render(self.start, view.camera, view, 64, 0), self.render(i)
+            if (measured := view.measured.get(view.aovs[0])) is not None:
+                start, end = measured.displayed(start), measured.displayed(end)
+            rows.append((view.shown, start, end))
         return require("edgegrad.fit.plots", *DRAWING).comparison(rows)
 
     def plot_history(self) -> Figure:

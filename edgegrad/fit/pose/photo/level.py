@@ -21,7 +21,7 @@ from ..pose import Pose
 from ..task import ZOOM, Level, PoseTask, Shot
 from .contour import PURE, Sides, contour_term
 from .depth import depth_term
-from .light import HARMONICS, Lit
+from .light import HARMONICS, TOGETHER, Lit
 from .picture import Picture, Windows, palette, smoothed
 from .region import posterior, region_term
 from .surface import AOVS, Surface
@@ -118,7 +118,7 @@ class PhotoLevel:
     def explained(self, pose: Pose, seed: int) -> float:
         """The share, 0 … 1, of the edges that the render should have in the pictures, of contours and of what is inside, that
         they have."""
-        pairs, shown, length = [], 0.0, 0.0
+        pairs, shown, length, apart = [], 0.0, 0.0, 1.0
         for seen in self.see(pose, seed):
             picture, contour = seen.picture, smoothed(seen.alpha[None], CONTOUR_BLUR)[0]
             sides = Sides.of(picture, contour, seen.near)
@@ -129,6 +129,8 @@ class PhotoLevel:
             if seen.lit is None or picture.mask is not None:
                 pairs.append((sides.mixed, sides.mixed, picture.outlined, band[..., None]))
             if seen.lit is not None:
+                # A light with as many numbers as there are pixels that tell apart explains any picture.
+                apart = min(apart, 1.0 - self.harmonics * TOGETHER / len(seen.lit.residual))
                 inside, lit = seen.lit.surface.inside, linear_to_srgb(seen.lit.predicted.clamp(0.0, 1.0))
                 expected, weight = lit, torch.where(inside, picture.weight, 0.0)
                 if picture.mask is None:
@@ -137,7 +139,7 @@ class PhotoLevel:
                 pairs.append((expected, expected, picture.display, weight[..., None]))
         if length == 0.0:
             return 0.0
-        return explained(pairs) * min(1.0, shown / length / SHOWN)
+        return explained(pairs) * min(1.0, shown / length / SHOWN) * max(0.0, apart)
 
     def light(self, pose: Pose, seed: int) -> list[Tensor | None]:
         """The coefficients of the light (C, n) in each picture."""

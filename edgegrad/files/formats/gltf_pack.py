@@ -1,0 +1,142 @@
+"""Meshes with their materials, lights and cameras as glTF and GLB files.
+
+trimesh packs arrays and images. What it drops or rounds is said in the JSON that it hands over before writing: factors
+in full, samplers, several sets of texture coordinates, the strength of emission, the scale of normal maps, lights and cameras.
+What several meshes share stands in the file once.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...camera.camera import Camera
+from ...optional import require
+from ...scene.lights import Light
+from ...scene.mesh import Mesh
+from ...scene.scene import Scene
+from .gltf import PUNCTUAL
+from .gltf_nodes_write import camera_of, light_of, node_of, place_of
+from .gltf_write import Look, split
+
+
+def to_glb(mesh: Mesh) -> tuple[bytes, list[str]]:
+    """The file, and what of the mesh it does not hold. Raises ImportError without trimesh, or pillow for textures."""
+    return _packed([mesh], [], {}, "glb", unlit=False)
+
+
+def scene_to_gltf(scene: Scene, cameras: Mapping[str, Camera], kind: str) -> tuple[bytes, list[str]]:
+    """A "glb", or a "gltf" that holds its arrays and images itself, and what of the scene and cameras it does not hold. Raises
+    ImportError as to_glb() does."""
+    content, lost = _packed(scene.meshes, [light for light in scene.lights if isinstance(light, Light)], cameras, kind)
+    return content, [*lost, *(["background"] if scene.background is not None else [])]
+
+
+def _packed(
+    meshes: Sequence[Mesh], lights: Sequence[Light], cameras: Mapping[str, Camera], kind: str, unlit: bool = True
+) -> tuple[bytes, list[str]]:
+    trimesh = require("trimesh", "trimesh", "saving meshes")
+    gltf = require("trimesh.exchange.gltf", "trimesh", "saving meshes")
+    looks = [Look(mesh, unlit) for mesh in meshes]
+    parts = {}
+    for k, look in enumerate(looks):
+        verts, faces, attributes = split(look)
+        made = trimesh.Trimesh(verts, faces, process=False, vertex_attributes=attributes)
+        if look.material:
+            images = {name: _picture(image) for name, image in look.images.items()}
+            # Of another name each, or trimesh takes those with the same images for one.
+            material = trimesh.visual.material.PBRMaterial(name=f"material {k}", **images)
+            made.visual = trimesh.visual.TextureVisuals(material=material)
+        parts[str(k)] = made
+    lost = [f"{what}{_which(k, len(looks))}" for k, look in enumerate(looks) for what in look.lost]
+
+    def write(tree: dict[str, Any]) -> None:
+        for mesh in tree["meshes"]:
+            number = int(mesh["name"])
+            mesh["name"] = meshes[number].name or f"geometry_{number}"
+            looks[number].write(tree, mesh["primitives"][0])
+        for node in tree["nodes"]:
+            if "mesh" in node:
+                node["name"] = tree["meshes"][node["mesh"]]["name"]
+        _share(tree)
+        lost.extend(_place(tree, lights, cameras, meshes))
+        used = {name for material in tree.get("materials", []) for name in material.get("extensions", {})}
+        if used := sorted({*tree.get("extensionsUsed", []), *tree.get("extensions", {}), *used}):
+            tree["extensionsUsed"] = used
+
+    options = {"include_normals": False, "tree_postprocessor": write}
+    if kind == "glb":
+        return gltf.export_glb(trimesh.Scene(parts), **options), lost
+    files = gltf.export_gltf(trimesh.Scene(parts), merge_buffers=True, embed_buffers=True, **options)
+    return files["model.gltf"], lost
+
+
+def _which(k: int, count: int) -> str:
+    return f" of meshes[{k}]" if count > 1 else ""
+
+
+def _picture(image: np.ndarray) -> Any:
+    return require("PIL.Image", "edgegrad[files]", "saving textures").fromarray(image)
+
+
+def _share(tree: dict[str, Any]) -> None:
+    """Images, samplers, textures and materials that are alike become one."""
+    images, samplers = (_unique(tree, name) for name in ("images", "samplers"))
+    for texture in tree.get("textures", []):
+        texture["source"] = images[texture["source"]]
+        if "sampler" in texture:
+            texture["sampler"] = samplers[texture["sampler"]]
+    textures = _unique(tree, "textures")
+    for material in tree.get("materials", []):
+        for given in (material, material.get("pbrMetallicRoughness", {})):
+            for name, reference in given.items():
+                if name.endswith("Texture"):
+                    reference["index"] = textures[reference["index"]]
+    materials = _unique(tree, "materials")
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            if "material" in primitive:
+                primitive["material"] = materials[primitive["material"]]
+
+
+def _unique(tree: dict[str, Any], name: str) -> list[int]:
+    """Leaves one of each in a list of the file, and gives the new number of each old one."""
+    kept: dict[str, int] = {}
+    numbers = [kept.setdefault(json.dumps(entry, sort_keys=True), len(kept)) for entry in tree.get(name, [])]
+    if kept:
+        tree[name] = [json.loads(entry) for entry in kept]
+    return numbers
+
+
+def _place(
+    tree: dict[str, Any], lights: Sequence[Light], cameras: Mapping[str, Camera], meshes: Sequence[Mesh]
+) -> list[str]:
+    """Adds the nodes of lights and cameras, and says which of them cannot be there."""
+    lost: list[str] = []
+    nodes: list[dict[str, Any]] = []
+    written: list[dict[str, Any]] = []
+    for k, light in enumerate(lights):
+        name = f"{type(light).__name__} (lights[{k}])"
+        made, missing = light_of(light)
+        lost += [f"{what} of {name}" for what in missing]
+        if made is None:
+            lost.append(name)
+        else:
+            nodes.append(node_of(place_of(light), extensions={PUNCTUAL: {"light": len(written)}}))
+            written.append(made)
+    if written:
+        tree.setdefault("extensions", {})[PUNCTUAL] = {"lights": written}
+    for name, camera in cameras.items():
+        found = camera_of(camera, meshes)
+        if isinstance(found, str):
+            lost.append(f"camera {name!r} ({found})")
+        else:
+            tree.setdefault("cameras", []).append(found[0])
+            nodes.append(node_of(found[1], name=name, camera=len(tree["cameras"]) - 1))
+    first = len(tree["nodes"])
+    tree["nodes"] += nodes
+    tree["scenes"][0]["nodes"] = [*tree["scenes"][0]["nodes"], *range(first, len(tree["nodes"]))]
+    return lost

@@ -1,0 +1,197 @@
+"""The visual hull of silhouettes: where a fit of a shape may start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..camera.camera import Camera
+from ..check import as_tensor, check_finite, check_int, check_positive_int, check_shape
+from ..scene.mesh import Mesh
+from .regularizers import edges
+from .remeshing import gpytoolbox, remeshed
+from .views import Images, View, views_of
+
+COARSE = 32  # cells on a side of the cubes in which the object is looked for
+SMALL = 0.01  # pieces with a smaller share of the largest one's faces are left out
+
+
+def visual_hull(
+    cameras: Camera | Sequence[Camera],
+    masks: Images,
+    resolution: int = 96,
+    faces: int | None = None,
+    bounds: Tensor | None = None,
+) -> Mesh:
+    """The largest body that has these silhouettes (Laurentini 1994), as a closed mesh: a start for fit_shape() that has the
+    object's holes, and its parts where they are seen apart.
+
+    cameras     at least two that look at the object from different sides
+    masks       (H, W) each, 1 on the object, 0 elsewhere; beyond a side of an image that a mask touches, the
+                object may go on, and nothing is cut away
+    resolution  cells on the longest side of the box around the object: details smaller than a cell are not there
+    faces       about so many, even triangles, as a fit wants them: few for its first level; None: those of the cells
+    bounds      (2, 3) opposite corners of a box that holds the object; None: found from where the cameras look
+
+    Marching cubes at a mask of one half (Lorensen and Cline 1987). Pieces with less than 1 % of the faces of the largest are left
+    out. Needs gpytoolbox (`pip install 'edgegrad[fit]'`). Raises TypeError or ValueError that names the argument, ImportError.
+    """
+    check_int("resolution", resolution, 4, 512)
+    if faces is not None:
+        check_positive_int("faces", faces)
+    views = views_of(cameras, None, masks)
+    if len(views) < 2:
+        raise ValueError(f"cameras: expected at least two, got {len(views)}; one silhouette does not bound a body")
+    missing = [i for i, view in enumerate(views) if view.mask is None]
+    if missing:
+        raise ValueError(f"masks[{missing[0]}]: expected a mask, got None; leave that camera out")
+    gpytoolbox("a visual hull")  # before the work
+    box = _where_cameras_look(views) if bounds is None else _checked(bounds)
+    for _ in range(2 if bounds is None else 1):
+        box = _occupied(views, box)
+    low, high = box
+    cell = float((high - low).max()) / resolution
+    count = ((high - low) / cell).ceil().long() + 3
+    # One cell around, so that the surface is closed.
+    axes = [float(low[k]) + cell * (torch.arange(int(count[k])) - 1).double() for k in range(3)]
+    inside = _closed(_inside(views, axes))
+    found = _surface(inside, axes)
+    return found if faces is None else remeshed(found, faces)
+
+
+def _checked(bounds: object) -> tuple[Tensor, Tensor]:
+    box = as_tensor("bounds", bounds, floating=True).detach().cpu().double()
+    check_shape("bounds", box, (2, 3))
+    check_finite("bounds", box)
+    low, high = box.amin(0), box.amax(0)
+    if not bool((high > low).all()):
+        raise ValueError("bounds: expected opposite corners of a box, got one without volume")
+    return low, high
+
+
+def _where_cameras_look(views: Sequence[View]) -> tuple[Tensor, Tensor]:
+    """A cube around the point nearest to all optical axes, as large as what the cameras see there."""
+    eyes, axes = [], []
+    for view in views:
+        pose = view.camera.world_to_camera.double()
+        R, t = pose[:3, :3], pose[:3, 3]
+        eyes.append(-R.T @ t)
+        axes.append(R[2])
+    eye, axis = torch.stack(eyes), F.normalize(torch.stack(axes), dim=1)
+    # Of lines through e along a: Σ (I − a aᵀ)(x − e) = 0.
+    across = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
+    total = across.sum(0)
+    if float(torch.linalg.eigvalsh(total)[0]) < 1e-4 * len(views):
+        raise ValueError("cameras: expected some that look in different directions, got parallel ones; give bounds")
+    middle = torch.linalg.solve(total, (across @ eye[:, :, None]).sum(0)[:, 0])
+    half = 0.0
+    for view in views:
+        camera = view.camera
+        depth = float(camera.world_to_camera[2, :3].double() @ middle + camera.world_to_camera[2, 3].double())
+        if camera.projection in ("perspective", "orthographic"):
+            span = max(camera.size[0] / float(camera.K[1, 1]), camera.size[1] / float(camera.K[0, 0]))
+            half = max(half, 0.5 * span * (abs(depth) if camera.projection == "perspective" else 1.0))
+        else:
+            half = max(half, abs(depth))
+    return middle - half, middle + half
+
+
+def _occupied(views: Sequence[View], box: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """The part of the box that is not empty, and a cell more. Raises ValueError."""
+    low, high = box
+    step = (high - low) / COARSE
+    axes = [low[k] + step[k] * (torch.arange(COARSE).double() + 0.5) for k in range(3)]
+    # Any pixel of the mask that a cell may cover: the masks are dilated by a cell.
+    places = (_inside(views, axes, float(step.max())) > 0.0).nonzero()
+    if not len(places):
+        raise ValueError(
+            "masks: expected silhouettes of one object, got some that have no body in common; look for cameras in other "
+            "conventions, or turned images, or give bounds"
+        )
+    first, last = places.amin(0), places.amax(0) + 1
+    return low + step * (first - 0.5).clamp(min=0), low + step * (last + 0.5).clamp(max=COARSE)
+
+
+def _inside(views: Sequence[View], axes: Sequence[Tensor], reach: float = 0.0) -> Tensor:
+    """(nx, ny, nz): the least mask at the points of a grid; zero where no camera sees. With a `reach`, the largest within so many
+    world units counts for each."""
+    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    least, seen = torch.ones(len(points)), torch.zeros(len(points), dtype=torch.bool)
+    for view in views:
+        camera, mask = view.camera, view.mask
+        assert mask is not None
+        image = mask.movedim(-1, 0)[None]
+        pose = camera.world_to_camera.double()
+        depth = points @ pose[2, :3] + pose[2, 3]
+        if reach > 0.0:
+            near = depth[depth > 0].min() if camera.projection == "perspective" and bool((depth > 0).any()) else 1.0
+            pixels = min(max(camera.size), int(reach * float(camera.K[0, 0]) / float(near)) + 1)
+            image = F.max_pool2d(image, (2 * pixels + 1, 1), 1, (pixels, 0))
+            image = F.max_pool2d(image, (1, 2 * pixels + 1), 1, (0, pixels))
+        place = camera.project(points.to(camera.K.dtype)).double()
+        H, W = camera.size
+        valid = place.isfinite().all(-1)
+        if camera.projection == "perspective":
+            valid &= depth > 0
+        unit = torch.where(valid[:, None], 2.0 * place / place.new_tensor([W, H]) - 1.0, 0.0).float()
+        found = F.grid_sample(image, unit[None, None], align_corners=False, padding_mode="border")[0, 0, 0]
+        found = torch.where((unit.abs() <= 1.0).all(-1), found, _beyond(mask, unit))
+        least, seen = torch.where(valid, torch.minimum(least, found), least), seen | valid
+    return (least * seen).reshape([len(axis) for axis in axes])
+
+
+def _beyond(mask: Tensor, unit: Tensor) -> Tensor:
+    """(N,) what counts as the mask at places outside of an image, whose corners are ±1: 1 beyond sides that it touches, for there
+    the object may go on; 0 beyond the others."""
+    sides = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}
+    ends = {name: bool((side > 0.5).any()) for name, side in sides.items()}
+    x, y = unit.unbind(-1)
+    outside = {"left": x < -1.0, "right": x > 1.0, "top": y < -1.0, "bottom": y > 1.0}
+    none = torch.stack([outside[name] for name, touched in ends.items() if not touched] or [torch.zeros_like(x).bool()])
+    return (~none.any(0)).float()
+
+
+def _closed(inside: Tensor) -> Tensor:
+    """Nothing on the rim of the grid."""
+    inside = inside.clone()
+    for dim in range(3):
+        for end in (0, -1):
+            inside.select(dim, end).zero_()
+    return inside
+
+
+def _surface(inside: Tensor, axes: Sequence[Tensor]) -> Mesh:
+    nx, ny, nz = inside.shape
+    grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+    order = grid.permute(1, 2, 0, 3).reshape(-1, 3)  # x runs fastest, then z: how gpytoolbox counts them
+    field = inside.permute(1, 2, 0).reshape(-1).double()
+    found, faces = gpytoolbox("a visual hull").marching_cubes(field.numpy(), order.numpy(), nx, ny, nz, 0.5)
+    if not len(faces):
+        raise ValueError("masks: expected an object larger than a cell, got none; give a higher resolution, or bounds")
+    verts, triangles = torch.from_numpy(np.ascontiguousarray(found)), torch.from_numpy(faces.astype(np.int64))
+    a, b, c = verts[triangles].unbind(1)
+    if float((a * torch.linalg.cross(b, c)).sum()) < 0.0:  # six times the volume
+        triangles = triangles.flip(1)
+    return _without_crumbs(verts, triangles)
+
+
+def _without_crumbs(verts: Tensor, faces: Tensor) -> Mesh:
+    """Without small pieces."""
+    label = torch.arange(len(verts))
+    pairs = edges(faces)
+    while True:  # the least number of all vertices that hang together, by steps that double
+        new = label.scatter_reduce(0, pairs[:, 0], label[pairs[:, 1]], "amin")
+        new = new.scatter_reduce(0, pairs[:, 1], new[pairs[:, 0]], "amin")
+        new = new[new]
+        if torch.equal(new, label):
+            break
+        label = new
+    piece = label[faces[:, 0]]
+    count = torch.bincount(piece, minlength=len(verts))
+    faces = faces[count[piece] >= SMALL * count.max()]
+    used, index = faces.unique(return_inverse=True)
+    return Mesh(verts[used].float(), index.reshape(-1, 3))

@@ -1,0 +1,212 @@
+"""Pictures of depth, normals and positions, from sensors or other renderers, and how a render is compared with them.
+
+A render's channels are multiplied by its alpha a, and so is the picture before it is compared: r = c − a m, of the channel c and
+what was measured, m. At a silhouette r then jumps by the difference of two depths, not by the depth itself, so it does not
+matter from where depths are counted. Where the render shows nothing, r is zero; that what was measured is covered, says the
+mask, or where there is none a term of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ..camera.camera import Camera
+from ..check import as_tensor, check_float, check_positive, check_shape
+
+CHANNELS = {"depths": "depth", "normals": "shading_normal", "positions": "position"}  # of render_aovs(), by argument
+WIDTHS = {"depth": 1, "shading_normal": 3, "position": 3}
+NORMAL_SCALE = 0.1  # some 6°
+MAD = 1.4826  # standard deviations of Gaussian noise in the median of its sizes
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Pictures of depth, normals or positions, and how far to trust them.
+
+    values   for each camera (H, W), (H, W, 1) or (H, W, 3), or None where it has none. What is not finite, or 0 (of normals and
+             positions all three), is not measured
+    weights  for each camera (H, W) or (H, W, 1), from 0, or None: how much a pixel counts, as a sensor's confidence says. None: 1
+    factor   how much all of them count beside masks and colours
+    scale    residuals up to about this are noise, in the units of `values`; once most are so small, much larger ones are
+             taken for outliers. None: the width of a pixel at the object, and for normals 0.1
+
+    Raises TypeError or ValueError that names the argument.
+    """
+
+    values: Any
+    weights: Any = None
+    factor: float = 1.0
+    scale: float | None = None
+
+    def __post_init__(self) -> None:
+        check_positive("factor", self.factor, least=0.0, most=1e9)
+        if self.scale is not None:
+            check_positive("scale", self.scale, least=1e-30, most=1e30)
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """One such picture. `factor` and `scale` are the same in all views."""
+
+    value: Tensor  # (H, W, c), zero where nothing was measured
+    weight: Tensor  # (H, W, 1), zero there too
+    factor: float
+    scale: float
+    metric: bool  # whether the scale is that of a pixel's width, which grows as pixels do
+
+    def resized(self, size: tuple[int, int]) -> Measurement:
+        """Means over larger pixels; what was measured in less than half of one, is not."""
+        H, W = self.value.shape[:2]
+        weight = area_mean(self.weight, size)
+        value = area_mean(self.value * self.weight, size) / weight.clamp(min=1e-30)
+        known = (area_mean((self.weight > 0).float(), size) >= 0.5).float()
+        scale = self.scale * (H * W / (size[0] * size[1])) ** 0.5 if self.metric else self.scale
+        return replace(self, value=value * known, weight=weight * known, scale=scale)
+
+    def displayed(self, value: Tensor) -> Tensor:
+        """(H, W, c) from 0 to 1, the range of what was measured, but for what is not there."""
+        seen = self.value[self.weight[..., 0] > 0]
+        low, high = (seen.amin(0), seen.amax(0)) if len(seen) else (value.amin(), value.amax())
+        return ((value - low) / (high - low).clamp(min=1e-30)).clamp(0.0, 1.0)
+
+
+def measurements(given: Mapping[str, Any], cameras: Sequence[Camera]) -> list[dict[str, Measurement]]:
+    """For each camera what was measured there, by the channel of render_aovs(); `given` by the argument's name, each a Measured,
+    or its values. Raises TypeError or ValueError that names the argument."""
+    found: list[dict[str, Measurement]] = [{} for _ in cameras]
+    for name, value in given.items():
+        if value is None:
+            continue
+        trust = value if isinstance(value, Measured) else Measured(value)
+        pictures = _each(name, trust.values, cameras)
+        weights = _each(f"weights of {name}", trust.weights, cameras)
+        checked: dict[int, tuple[Tensor, Tensor]] = {}
+        for i, (picture, weight, camera) in enumerate(zip(pictures, weights, cameras, strict=True)):
+            where = name if len(cameras) == 1 else f"{name}[{i}]"
+            if picture is not None:
+                checked[i] = _checked(where, picture, weight, WIDTHS[CHANNELS[name]], camera.size)
+            elif weight is not None:
+                raise ValueError(f"{where}: expected a picture beside its weights, got None")
+        if not any(bool((weight > 0).any()) for _, weight in checked.values()):
+            raise ValueError(
+                f"{name}: expected a pixel that was measured, got none: all are 0, not finite, or have the weight 0"
+            )
+        if name == "normals":
+            _check_lengths(checked)
+        scale = trust.scale
+        if scale is None:
+            scale = NORMAL_SCALE if name == "normals" else _pixel_width(name, checked, cameras)
+        for i, (picture, weight) in checked.items():
+            metric = trust.scale is None and name != "normals"
+            found[i][CHANNELS[name]] = Measurement(picture, weight, trust.factor, scale, metric)
+    return found
+
+
+def _each(name: str, value: Any, cameras: Sequence[Camera]) -> list[Any]:
+    """One for each camera. Raises ValueError."""
+    if value is None:
+        return [None] * len(cameras)
+    single = len(cameras) == 1 and not isinstance(value, (list, tuple)) and getattr(value, "ndim", 0) < 4
+    given = [value] if single else value
+    if len(given) != len(cameras):
+        raise ValueError(
+            f"{name}: expected {len(cameras)}, one for each camera, got {len(given)}; None where one has none"
+        )
+    return list(given)
+
+
+def _checked(name: str, picture: Any, weight: Any, width: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Picture (H, W, width) and weight (H, W, 1), both zero where nothing was measured. Raises TypeError or ValueError."""
+    fix = "the camera must have the picture's size: camera.resized((H, W))"
+    value = as_tensor(name, picture).detach().cpu()
+    if not value.is_floating_point():
+        raise TypeError(
+            f"{name}: expected floating-point numbers, got {value.dtype}; of a sensor's integers take x.float() times its unit"
+        )
+    check_float(name, value)
+    shapes = [(*size, 1), size] if width == 1 else [(*size, width)]
+    check_shape(name, value, *shapes, fix=fix)
+    value = value.reshape(*size, width).float()
+    known = value.isfinite().all(-1, keepdim=True)
+    value = torch.where(known, value, 0.0)
+    known = known & (value != 0).any(-1, keepdim=True)
+    if width == 1 and bool((value < 0).any()):
+        raise ValueError(
+            f"{name}: expected depths along the optical axis, +Z, from 0 up, got {float(value.min()):g}; OpenGL's look along "
+            "−Z: take −z"
+        )
+    if weight is None:
+        return value, known.float()
+    count = as_tensor(f"weights of {name}", weight).detach().cpu().float()
+    check_shape(f"weights of {name}", count, (*size, 1), size, fix=fix)
+    if not bool((count >= 0).all()) or not bool(count.isfinite().all()):
+        raise ValueError(f"weights of {name}: expected finite numbers from 0 up, got {float(count.min()):g}")
+    known = known & (count.reshape(*size, 1) > 0)
+    return value * known, count.reshape(*size, 1) * known
+
+
+def _check_lengths(pictures: Mapping[int, tuple[Tensor, Tensor]]) -> None:
+    longest = max(float(value.norm(dim=-1).max()) for value, _ in pictures.values())
+    if not 0.5 < longest < 1.01:
+        raise ValueError(
+            f"normals: expected vectors of length 1 in world axes, got lengths up to {longest:g}; of 8-bit numbers take "
+            "x / 127.5 − 1"
+        )
+
+
+def _pixel_width(name: str, pictures: Mapping[int, tuple[Tensor, Tensor]], cameras: Sequence[Camera]) -> float:
+    """What a pixel covers at what was measured, the median of the views."""
+    widths = []
+    for i, (value, weight) in pictures.items():
+        camera, seen = cameras[i], value[weight[..., 0] > 0]
+        if not len(seen):
+            continue
+        away = torch.ones(1)
+        if camera.projection != "orthographic":
+            if name == "positions":
+                pose = camera.world_to_camera.float()
+                away = (seen @ pose[:3, :3].T + pose[:3, 3]).norm(dim=1)
+            else:
+                away = seen[:, 0]
+        widths.append(float(away.median()) / float(camera.K[0, 0].abs()))
+    return max(sorted(widths)[len(widths) // 2], 1e-30)
+
+
+def comparable(render: Tensor, alpha: Tensor, given: Measurement) -> tuple[Tensor, Tensor]:
+    """What a render (H, W, c) with alpha (H, W, 1) is compared with, and the weights: where nothing was measured, with itself."""
+    known = given.weight > 0
+    return torch.where(known, alpha * given.value, render), given.weight
+
+
+def measured_loss(render: Tensor, alpha: Tensor, given: Sequence[Measurement], covers: bool) -> Tensor:
+    """Of renders (B, H, W, c) with alpha (B, H, W, 1), a mean over all pixels: with x = |r| / s Geman and McClure's
+    2x² / (x² + 4), which levels off for outliers, times s / scale. s is the residuals' median size, and the scale at least, so
+    that a shape that is far away is not taken for an outlier.
+
+    covers  whether the render must be opaque where a pixel and those beside it were measured, for there is no mask that says it
+    """
+    value, weight = torch.stack([m.value for m in given]), torch.stack([m.weight for m in given])
+    square = (render - alpha * value).square().sum(-1, keepdim=True)
+    scale, typical = given[0].scale, 0.0
+    with torch.no_grad():
+        seen = (weight > 0) & (alpha > 0.5)
+        if bool(seen.any()):
+            typical = MAD * float(square[seen].median().sqrt())
+    s = max(scale, typical)
+    x2 = square / s**2
+    total = (s / scale) * (weight * 2.0 * x2 / (x2 + 4.0)).mean()
+    if covers:
+        inner = -F.max_pool2d(-(weight > 0).float().movedim(-1, 1), 3, 1, 1).movedim(1, -1)
+        total = total + (weight * inner * (1.0 - alpha).square()).mean()
+    return given[0].factor * total
+
+
+def area_mean(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """Means over the new pixels' areas, which is what a render of that size with the box filter estimates."""
+    return F.interpolate(image.movedim(-1, 0)[None], size=size, mode="area")[0].movedim(0, -1)
