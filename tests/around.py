@@ -173,6 +173,7 @@ def check_gradient(case: Case, spp: int = 2048, seeds: int = 4, step: float = 0.
     found = gradient(case, 4, surface_samples=100 * spp, edge_samples=50_000, filter=filter)
     high, low = (eg.render(*case(torch.tensor(h, dtype=F64)), spp=256) for h in (0.01, -0.01))
     size = float((high - low).abs().sum()) / 0.02
+    assert size > 0, "nothing that moves is in view"
     noise = math.hypot(fd.error, found.error)
     if abs(fd.mean) < FAINT * size:
         assert abs(found.mean - fd.mean) < 0.01 * size + 4 * noise

@@ -255,8 +255,12 @@ def test_gradient(place: str, what: str) -> None:
 
 
 VIEWS = ["whole", "skewed", "crop", "several turns"]
-# One in seven of all: each place with each view, and each derivative with all of both.
-SOME = list(itertools.product(PLACES, [boundary, both], VIEWS, WHAT))[::7]
+# One in seven of all: each place with each view, and each derivative with all of both. The crop shows but one of the balls.
+SOME = [
+    (place, kind, view, what)
+    for place, kind, view, what in list(itertools.product(PLACES, [boundary, both], VIEWS, WHAT))[::7]
+    if view != "crop" or kind is both or place == "pole"
+]
 
 
 @pytest.mark.slow
@@ -264,10 +268,10 @@ SOME = list(itertools.product(PLACES, [boundary, both], VIEWS, WHAT))[::7]
 def test_gradients(place: str, kind: Callable[..., eg.Scene], view: str, what: str) -> None:
     """With a filter through which the loss is smooth: a box filter has kinks where edges pass the borders of pixels, and small
     steps have noise."""
-    if view == "crop" and place == "ahead":
-        pytest.skip("not in view")
+    # Ball and room move together, so that terms nearly cancel, and what is left changes over longer steps.
+    step = 0.01 if what == "vertices" else 0.02
     check_gradient(
-        moved(lambda dx=0.0: kind(PLACES[place], dx), CAMERAS[view], what), spp=4096, seeds=6, step=0.02, filter="tent"
+        moved(lambda dx=0.0: kind(PLACES[place], dx), CAMERAS[view], what), spp=4096, seeds=6, step=step, filter="tent"
     )
 
 

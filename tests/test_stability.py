@@ -29,11 +29,12 @@ stability = importlib.import_module("edgegrad.report.stability.run")  # the pack
 FAST = [name for name, case in CASES.items() if not case.slow and case.group != "light"]
 
 
-def check(name: str, effort: Effort) -> None:
+def check(name: str, effort: Effort) -> dict:
     """Right, or a limit where one is known: what has become right is none any longer. However long it takes, or a busy machine
     would have fewer seeds, and with more noise more is right."""
     row = measure.measure(CASES[name], dataclasses.replace(effort, seconds=math.inf))
     assert row["verdict"] == (LIMIT if CASES[name].limit else RIGHT), row
+    return row
 
 
 @pytest.mark.parametrize("name", FAST)
@@ -44,7 +45,9 @@ def test_case(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_case_at_full_accuracy(name):
-    check(name, Effort())
+    row = check(name, Effort())
+    if CASES[name].more > 1:  # for a gradient that is 5 % off to be wrong, beyond four standard errors and 2 %
+        assert max(part["noise"] for part in row["parts"].values()) < 0.0075, row
 
 
 # -- the references are checked ---------------------------------------------------------------------------------------
@@ -173,18 +176,38 @@ def test_what_is_raised_is_told(triangle):
     assert row["verdict"] == RAISED and "verts: expected finite" in row["raised"]
 
 
-@pytest.mark.parametrize("visibility", [True, False])
-def test_finite_differences_tell(visibility):
-    """Of the renderer, without exact integrals: a triangle's shift, with and without its boundary term."""
+def shifted_triangle(visibility: bool = True) -> Problem:
+    """Without exact integrals: its gradient is compared with finite differences."""
     scene, camera = one_triangle(), front_camera(32)
     direction = torch.tensor([0.7, 0.6, -0.2], dtype=torch.float64)
-    problem = Problem(
+    return Problem(
         {"shift": torch.zeros(1, dtype=torch.float64)},
         lambda parts: (scene.transformed(t=parts["shift"] * direction), camera), None, "finite differences", {"shift": 0.01},
         options={"surface_samples": 20_000, "edge_samples": 20_000, "visibility": visibility},
     )  # fmt: skip
-    row = measure.measure(case_of(problem), QUICK)
+
+
+@pytest.mark.parametrize("visibility", [True, False])
+def test_finite_differences_tell(visibility):
+    """Of the renderer: a triangle's shift, with and without its boundary term."""
+    row = measure.measure(case_of(shifted_triangle(visibility)), QUICK)
     assert row["verdict"] == (RIGHT if visibility else WRONG), row
+
+
+@pytest.mark.parametrize(("more", "noise", "seeds", "differences"), [(1, 0.0, 4, 2), (4, 0.0, 16, 8), (4, 1.0, 2, 2)])
+def test_a_case_takes_more_seeds_where_noise_asks_for_them(more, noise, seeds, differences, monkeypatch):
+    counts = []
+
+    def count(*arguments):
+        run = found(*arguments)
+        counts.append(run.count)
+        return run
+
+    found = measure.differences
+    monkeypatch.setattr(measure, "differences", count)
+    effort = Effort(seeds=(2, 4), noise=noise, difference_seeds=(2,), difference_spp=16, seconds=math.inf)
+    row = measure.measure(case_of(shifted_triangle(), more=more), effort)
+    assert row["seeds"] == seeds and counts == [differences] * 2  # of a step and of half of it
 
 
 # -- statistics and fits ----------------------------------------------------------------------------------------------

@@ -123,7 +123,8 @@ def components(problem: Problem, seeds: int) -> Components:
 
 def lit_components(problem: Problem, seeds: int) -> Components:
     """Of the parts alone: the chance of both sides, and the degrees of freedom of Welch (1947)."""
-    effort = Effort(difference_seeds=max(4, seeds // 8))
+    others = max(4, seeds // 8)
+    effort = Effort(difference_seeds=(others,))
     adjoint = problem.cotangent(torch.empty(0))
     runs = [differences(problem, adjoint, name, 1.0, effort) for name in problem.parts]
     running = Running()
@@ -133,12 +134,12 @@ def lit_components(problem: Problem, seeds: int) -> Components:
     wanted, squares = (torch.cat([getattr(run, n) for run in runs]) for n in ("mean", "squares"))
     own, other = (
         running.squares / (seeds - 1) / seeds,
-        squares / (effort.difference_seeds - 1) / effort.difference_seeds,
+        squares / (others - 1) / others,
     )
     error, off = (own + other).sqrt(), running.mean - wanted
     varies = error > 0  # not the place of a light that has none
     assert not bool(off[~varies].any()), "a component without noise is off"
-    freedom = (own + other) ** 2 / (own**2 / (seeds - 1) + other**2 / (effort.difference_seeds - 1))
+    freedom = (own + other) ** 2 / (own**2 / (seeds - 1) + other**2 / (others - 1))
     size = float(wanted.norm())
     return Components(
         (off / error)[varies], freedom[varies], float(own.sum().sqrt() * math.sqrt(seeds)) / size,

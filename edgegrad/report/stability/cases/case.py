@@ -67,6 +67,7 @@ class Case:
     limit: str = ""  # why it cannot be right, where that is known
     most: float = 0.0  # relative error that a limit may show before it counts as wrong
     slow: bool = False
+    more: int = 1  # times the seeds, where the gradient of a part is small beside its noise
 
 
 class Group:

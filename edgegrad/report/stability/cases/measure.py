@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -25,12 +25,19 @@ class Effort:
 
     seeds: tuple[int, ...] = (8, 32, 128, 512)
     noise: float = 0.004
-    difference_seeds: int = 8  # of finite differences
+    difference_seeds: tuple[int, ...] = (8,)  # of finite differences, for each part by itself
     difference_spp: int = 2048
     seconds: float = 30.0  # no more seeds after that
 
+    def up_to(self, more: int) -> Effort:
+        """So many times as many seeds, where those here leave more noise."""
+        if more == 1:
+            return self
+        seeds, differences = ((*n, more * n[-1]) for n in (self.seeds, self.difference_seeds))
+        return replace(self, seeds=seeds, difference_seeds=differences)
 
-QUICK = Effort(seeds=(4, 16, 64), noise=0.009, difference_seeds=4, difference_spp=1024, seconds=6.0)
+
+QUICK = Effort(seeds=(4, 16, 64), noise=0.009, difference_seeds=(4,), difference_spp=1024, seconds=6.0)
 
 
 class Estimate(NamedTuple):
@@ -60,7 +67,7 @@ def measure(case: Case, effort: Effort) -> dict[str, Any]:
     begin = time.perf_counter()
     row: dict[str, Any] = {"group": case.group, "name": case.name, "extreme": case.extreme}
     try:
-        row |= compare(case.build(), effort)
+        row |= compare(case.build(), effort.up_to(case.more))
         row["verdict"], row["worst"] = verdict(row, case)
     except (ValueError, TypeError) as error:
         row |= {"verdict": RAISED, "raised": f"{type(error).__name__}: {error}"}
@@ -174,7 +181,7 @@ def by_differences(problem: Problem, effort: Effort) -> tuple[Tensor, dict[str, 
 
 
 def differences(problem: Problem, adjoint: Tensor, name: str, scale: float, effort: Effort) -> Running:
-    """Of each component of a part; each seed of the effort gives one."""
+    """Of each component of a part, from each seed of the effort until the noise is below what it asks for."""
     make, finer = problem.equal or problem.make, problem.finer
     value, h = problem.parts[name], scale * problem.steps[name]
     units = torch.eye(value.numel(), dtype=value.dtype).reshape(-1, *value.shape)
@@ -186,7 +193,10 @@ def differences(problem: Problem, adjoint: Tensor, name: str, scale: float, effo
 
     run = Running()
     with torch.no_grad():
-        for seed in range(effort.difference_seeds):
-            both = [(loss(value + h * e, seed), loss(value - h * e, seed)) for e in units]
-            run.add(torch.tensor([(high - low) / (2.0 * h) for high, low in both], dtype=torch.float64))
+        for seeds in effort.difference_seeds:
+            for seed in range(run.count, seeds):
+                both = [(loss(value + h * e, seed), loss(value - h * e, seed)) for e in units]
+                run.add(torch.tensor([(high - low) / (2.0 * h) for high, low in both], dtype=torch.float64))
+            if run.estimate().error <= effort.noise * float(run.mean.norm()):
+                break
     return run
