@@ -21,7 +21,7 @@ from ..pose import Pose
 from ..task import ZOOM, Level, PoseTask, Shot
 from .contour import PURE, Sides, contour_term
 from .depth import depth_term
-from .light import HARMONICS, TOGETHER, Lit
+from .light import HARMONICS, Lit
 from .picture import Picture, Windows, palette, smoothed
 from .region import posterior, region_term
 from .surface import AOVS, Surface
@@ -37,6 +37,7 @@ RADIUS = 0.15  # of windows in which colours are counted, in the object's extent
 MASKED = 0.01  # probability that a mask is wrong
 VISIBLE = 10  # pixels that a render must cover
 CONTRAST = 2.0  # of both sides of a contour that shows, in standard deviations
+RESOLVED = 40.0  # pixels across the object: light and colours that are fitted to fewer explain any picture
 SHOWN = 0.5  # share of the contour that has to show; with less, less is explained
 
 
@@ -118,10 +119,11 @@ class PhotoLevel:
     def explained(self, pose: Pose, seed: int) -> float:
         """The share, 0 … 1, of the edges that the render should have in the pictures, of contours and of what is inside, that
         they have."""
-        pairs, shown, length, apart = [], 0.0, 0.0, 1.0
+        pairs, shown, length, extent = [], 0.0, 0.0, 0.0
         for seen in self.see(pose, seed):
             picture, contour = seen.picture, smoothed(seen.alpha[None], CONTOUR_BLUR)[0]
             sides = Sides.of(picture, contour, seen.near)
+            extent = max(extent, seen.extent)
             on = ((contour > PURE) & (contour < 1.0 - PURE)).float() * picture.weight
             length += float(on.sum())
             shown += float((on * (sides.contrast > CONTRAST) * sides.band).sum())
@@ -129,8 +131,6 @@ class PhotoLevel:
             if seen.lit is None or picture.mask is not None:
                 pairs.append((sides.mixed, sides.mixed, picture.outlined, band[..., None]))
             if seen.lit is not None:
-                # A light with as many numbers as there are pixels that tell apart explains any picture.
-                apart = min(apart, 1.0 - self.harmonics * TOGETHER / len(seen.lit.residual))
                 inside, lit = seen.lit.surface.inside, linear_to_srgb(seen.lit.predicted.clamp(0.0, 1.0))
                 expected, weight = lit, torch.where(inside, picture.weight, 0.0)
                 if picture.mask is None:
@@ -139,7 +139,7 @@ class PhotoLevel:
                 pairs.append((expected, expected, picture.display, weight[..., None]))
         if length == 0.0:
             return 0.0
-        return explained(pairs) * min(1.0, shown / length / SHOWN) * max(0.0, apart)
+        return explained(pairs) * min(1.0, shown / length / SHOWN) * min(1.0, extent / RESOLVED)
 
     def light(self, pose: Pose, seed: int) -> list[Tensor | None]:
         """The coefficients of the light (C, n) in each picture."""

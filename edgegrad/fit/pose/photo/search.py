@@ -78,7 +78,7 @@ class PhotoSearch:
         if self.colours_first:
             colours = self._by_colours(self.start, task.pyramid(self.start, self.max_size, self.spp), self.further)
             self._adopt(colours)
-            if colours.explained >= colours.enough:
+            if colours.explained >= colours.enough or not self.further:
                 return
         begins = len(self.history)
         found = self._judge(*self._down(self.start, self.levels))
