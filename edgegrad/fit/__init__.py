@@ -5,14 +5,15 @@ from .descent.fit_scene import Progress, fit_scene
 from .descent.fit_shape import fit_shape
 from .descent.fit_texture import fit_texture
 from .descent.result import Fit
+from .ending import Ending
 from .history import Record
 from .options import Options, Parameter
+from .placement import Pose, PoseParameter
 from .pose.fit_camera import CameraFit, fit_camera
 from .pose.fit_pose import fit_pose
-from .pose.pose import Pose
 from .pose.result import PoseFit, Step
 
 __all__ = [
-    "CameraFit", "Fit", "Options", "Parameter", "Pose", "PoseFit", "Progress", "Record", "Step",
-    "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers",
+    "CameraFit", "Ending", "Fit", "Options", "Parameter", "Pose", "PoseFit", "PoseParameter", "Progress", "Record",
+    "Step", "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers",
 ]  # fmt: skip
