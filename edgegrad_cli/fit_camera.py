@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
             principal=args.principal, distortion=args.distortion, steps=args.steps, seed=args.seed, callback=view,
             checkpoint=args.out / CHECKPOINT, resume=args.resume,
         )  # fmt: skip
-        print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.state}")
+        print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}")
         K = fit.camera.K.tolist()
         print(f"focal length {K[0][0]:.6g} px, principal point {K[0][2]:.6g}, {K[1][2]:.6g} px", flush=True)
         save_camera(args.out / "camera.json", fit.camera)

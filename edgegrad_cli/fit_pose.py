@@ -108,7 +108,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print_fit(fit: PoseFit, focal: bool) -> None:
-    lines = [f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.state}", "mesh to world:"]
+    lines = [f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}", "mesh to world:"]
     lines += ["  " + "  ".join(f"{value:12.6f}" for value in row) for row in fit.matrix.tolist()]
     if focal:
         lines.append(f"focal length: {float(fit.camera.K[0, 0]):.6g} px")

@@ -84,7 +84,7 @@ def finish(fit: Fit, folder: Path) -> int:
     from . import INTERRUPTED
     from .arguments import CHECKPOINT
 
-    print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.state}", flush=True)
+    print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}", flush=True)
     written = [*fit.save(folder, figures=_can_draw()), CHECKPOINT]
     print(f"wrote {', '.join(written)} in {folder}")
     return INTERRUPTED if fit.interrupted else 0

@@ -56,7 +56,7 @@ def main() -> None:
         if seed == 0:
             fit.plot().savefig(args.out)
         good += abs(after) <= 1.0
-        print(f"{seed:3d}  focal length {before:+6.2f} % → {after:+6.3f} %  {fit.state.split(':')[0]}", flush=True)
+        print(f"{seed:3d}  focal length {before:+6.2f} % → {after:+6.3f} %  {fit.reason.split(':')[0]}", flush=True)
     print(f"{good} of {args.starts} focal lengths within 1 %")
 
 

@@ -108,7 +108,7 @@ def main() -> None:
         claimed += fit.converged
         wrong += fit.converged and after > limit
         print(
-            f"{seed:3d}  {before:5.1f}° → {after:7.3f}°  explained {fit.explained:4.0%}  {fit.state.split(':')[0]}",
+            f"{seed:3d}  {before:5.1f}° → {after:7.3f}°  explained {fit.explained:4.0%}  {fit.reason.split(':')[0]}",
             flush=True,
         )
     print(

@@ -113,7 +113,7 @@ def main() -> None:
     found.plot().savefig(args.out)
     print(
         f"{len(mesh.faces)} faces, found with {len(found.mesh.faces)}: Chamfer distance {chamfer(found.mesh, mesh):.2f} % of the "
-        f"diagonal; {wall:.0f} s, {work:.0f} s of processor time; {found.state}"
+        f"diagonal; {wall:.0f} s, {work:.0f} s of processor time; {found.reason}"
     )
 
 

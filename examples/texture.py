@@ -42,7 +42,7 @@ def main() -> None:
     found = fit(mesh, args.size)
     found.plot().savefig(args.out)
     print(
-        f"PSNR {held_out(mesh, found.mesh, args.size):.1f} dB in a view held out; {found.seconds:.0f} s; {found.state}"
+        f"PSNR {held_out(mesh, found.mesh, args.size):.1f} dB in a view held out; {found.seconds:.0f} s; {found.reason}"
     )
 
 

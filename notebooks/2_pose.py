@@ -155,7 +155,7 @@ print(f"rotation off by {by_hand:.3f}°, translation by {(t.detach() - true_t).n
 
 # %%
 fit = fit_pose(stone, target, camera, background=behind, progress=False)
-print(f"{fit.state} after {fit.steps} steps in {fit.seconds:.1f} s")
+print(f"{fit.reason} after {fit.steps} steps in {fit.seconds:.1f} s")
 print(
     f"rotation off by {math.degrees(roma.rotmat_geodesic_distance(fit.R.float(), roma.rotvec_to_rotmat(true_w))):.3f}°"
 )
@@ -177,7 +177,9 @@ covered_target = torch.where(board, stripes, target)
 covered = fit_pose(stone, covered_target, camera, background=behind, progress=False)
 off = math.degrees(roma.rotmat_geodesic_distance(covered.R.float(), roma.rotvec_to_rotmat(true_w)))
 alpha = eg.render_aovs(posed(true_w, true_t), camera, ["alpha"])["alpha"] > 0.5
-print(f"{(board & alpha).sum() / alpha.sum():.0%} of the stone is covered; rotation off by {off:.2f}°; {covered.state}")
+print(
+    f"{(board & alpha).sum() / alpha.sum():.0%} of the stone is covered; rotation off by {off:.2f}°; {covered.reason}"
+)
 print(f"the picture shows {covered.explained:.0%} of the render's edges")
 show(picture=covered_target, fit=eg.render(stone.transformed(covered.R.float(), covered.t.float()), camera, spp=64))
 

@@ -124,7 +124,7 @@ show([*pictures, images[2]], ["sphere", "a step by the gradient", "a smoothed st
 found = fit_shape(
     sphere, cameras, images, masks=masks, look=lit, levels=2, steps=60, lr=0.02, spp=4, faces=6000, progress=False
 )
-print(f"{found.state}; {len(found.mesh.faces)} faces, {found.seconds:.0f} s")
+print(f"{found.reason}; {len(found.mesh.faces)} faces, {found.seconds:.0f} s")
 
 plain = sphere.verts.clone().requires_grad_()
 optimizer = torch.optim.Adam([plain], lr=0.01)
@@ -140,7 +140,7 @@ show(
 )
 
 # %% [markdown]
-# The fit says `not converged`, for the loss still falls: more steps, or a third level, would sharpen the bumps.
+# The fit says `loss still falling`: more steps, or a third level, would sharpen the bumps.
 #
 # *What to see:* from a view that no picture shows, `fit_shape` has the stone and its bumps. Plain Adam comes near too,
 # but left a tangle on top: where triangles have turned over there is no way back.

@@ -145,7 +145,7 @@ with torch.no_grad():
     picture = eg.render(town, taken, spp=256, seed=7)
 first = eg.Camera.look_at((3.4, -5.4, 3.8), (0.0, 0.0, 0.2), (0, 0, 1), 55.0, size)
 fit = fit_camera(town, picture, first, distortion=4, progress=False)
-print(fit.state)
+print(fit.reason)
 
 
 def report(name, camera):

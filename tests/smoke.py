@@ -51,7 +51,7 @@ def files_and_fits() -> None:
     target = eg.render(mesh.transformed(turn), camera, spp=64, seed=1)
     fit = fit_pose(mesh, target, camera, background=0.0, progress=False)
     error = torch.rad2deg(torch.acos(((fit.R.T.to(turn) @ turn).trace() / 2 - 0.5).clamp(-1, 1)))
-    assert fit.converged and float(error) < 0.5, (fit.state, error)
+    assert fit.converged and float(error) < 0.5, (fit.reason, error)
     with tempfile.TemporaryDirectory() as folder:
         model, picture = Path(folder) / "mesh.ply", Path(folder) / "picture.png"
         eg.save_mesh(model, mesh)

@@ -154,7 +154,7 @@ def test_what_is_not_in_the_picture_is_not_found(steps):
         fit = fit_pose(bracket(), image, camera(32), background=BACKGROUND, steps=steps, progress=False)
     # Of hundreds of places on so few pixels one is alike by chance.
     assert not fit.converged and fit.explained < (0.5 if steps == 4 else 0.6)
-    assert fit.state.startswith("not converged: the picture shows")
+    assert fit.reason.startswith("edges not explained: the pictures show")
 
 
 @pytest.mark.parametrize("masked", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -265,7 +265,7 @@ def test_a_camera_and_its_focal_length():
     fit = fit_camera(bracket(), picture(true), start, background=BACKGROUND, steps=16, progress=False)
     found = fit.camera
     assert float(found.K[0, 0] / true.K[0, 0]) == pytest.approx(1.0, abs=0.02)
-    assert fit.converged and fit.state == "converged"
+    assert fit.converged and fit.reason == "converged"
     # Rendered from there, the scene looks like the picture.
     again = eg.render(eg.Scene([bracket()], BACKGROUND), found, spp=64, seed=3)
     assert float((again - picture(true)).square().mean()) < 1e-4

@@ -10,6 +10,7 @@ from test_fit import BACKGROUND, bracket, camera
 import edgegrad as eg
 from edgegrad.fit import Parameter, fit_scene, fit_shape, fit_texture, losses, regularizers, verdict
 from edgegrad.fit.descent.adam import Adam
+from edgegrad.fit.ending import Ending
 from edgegrad.fit.smooth import Smooth
 from edgegrad.fit.verdict import explained, picture_noise
 
@@ -136,7 +137,7 @@ def test_finds_named_tensors_each_at_its_rate():
         start, cameras, target, {"meshes.0.face_colors": Parameter(0.05, low=0.0), "background": 0.02},
         steps=250, patience=15, callback=seen.append, **QUIET,
     )  # fmt: skip
-    assert fit.converged and fit.state == "converged" and fit.explained > 0.95
+    assert fit.converged and fit.reason == "converged" and fit.explained > 0.95
     torch.testing.assert_close(fit.values["background"], BACKGROUND, atol=0.01, rtol=0)
     assert float((fit.mesh.face_colors - mesh.face_colors).abs().median()) < 0.02
     assert seen == fit.history and fit.steps == len(seen) < 250
@@ -195,15 +196,15 @@ def test_a_flat_loss_alone_is_no_convergence():
     fit = fit_scene(
         eg.Scene([bracket()], BACKGROUND), cameras, target, {"background": 0.02}, steps=200, patience=8, **QUIET
     )
-    assert fit.flat and not fit.converged and fit.explained < 0.6
-    assert "not converged: the pictures show" in fit.state
+    assert fit.ending is Ending.FLAT and not fit.converged and fit.explained < 0.6
+    assert fit.reason.startswith("edges not explained: the pictures show")
 
 
 def test_a_loss_that_still_falls_is_no_convergence():
     cameras = views(1)
     target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
     fit = fit_scene(eg.Scene([bracket()], torch.zeros(3)), cameras, target, {"background": 1e-3}, steps=20, **QUIET)
-    assert not fit.flat and not fit.converged and "more steps" in fit.state
+    assert not fit.converged and fit.reason.startswith("loss still falling: give it more steps")
 
 
 def colour_fit(cameras, target, **options):
@@ -262,7 +263,7 @@ def test_an_interruption_keeps_the_best_values():
     fit = colour_fit(
         cameras, target, steps=40, callback=lambda r: (_ for _ in ()).throw(KeyboardInterrupt) if r.step == 25 else None
     )
-    assert fit.interrupted and fit.state == "interrupted" and fit.steps == 26
+    assert fit.interrupted and fit.reason == "interrupted" and fit.steps == 26
     assert fit.loss < 0.5 * fit.history[0].loss
 
 

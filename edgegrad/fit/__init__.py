@@ -5,17 +5,19 @@ from .descent.fit_scene import Progress, fit_scene
 from .descent.fit_shape import fit_shape
 from .descent.fit_texture import fit_texture
 from .descent.result import Fit
+from .ending import Ending
 from .history import Record
 from .hull import visual_hull
 from .measured import Measured
 from .options import Options, Parameter
+from .placement import Pose, PoseParameter
 from .pose.fit_camera import CameraFit, fit_camera
 from .pose.fit_pose import fit_pose
-from .pose.pose import Pose
 from .pose.result import PoseFit, Step
 from .unwrapping import unwrapped
 
 __all__ = [
-    "CameraFit", "Fit", "Measured", "Options", "Parameter", "Pose", "PoseFit", "Progress", "Record", "Step",
-    "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers", "unwrapped", "visual_hull",
+    "CameraFit", "Ending", "Fit", "Measured", "Options", "Parameter", "Pose", "PoseFit", "PoseParameter", "Progress", "Record",
+    "Step", "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers", "unwrapped",
+    "visual_hull",
 ]  # fmt: skip

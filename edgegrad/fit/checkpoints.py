@@ -16,12 +16,14 @@ from ..camera.camera import Camera
 from ..files.paths import PathLike, replacing
 from ..warnings import warn
 from .options import Options, Parameter
+from .placement import Placement
 from .views import View
 
-FORMAT = 5
+FORMAT = 6
 SAME = (
     "loss",
     "mask_loss",
+    "method",
     "views_per_step",
     "spp",
     "seed",
@@ -123,6 +125,8 @@ def _parts(value: Any) -> Any:
             yield from _parts(value[name])
     elif isinstance(value, Parameter):
         yield from _parts((value.lr, value.value, value.low, value.high, value.uniform))
+    elif isinstance(value, Placement):
+        yield from _parts((value.coordinates, value.start, value.center, value.size))
     elif isinstance(value, (tuple, list)):
         for part in value:
             yield from _parts(part)

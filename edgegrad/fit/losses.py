@@ -4,7 +4,9 @@ Each takes image and target (..., H, W, C) and, if wanted, a weight (..., H, W, 
 channels, weighted. A fit takes any function of this form.
 
 A render has noise of its samples, which is independent of that of its gradient. The gradient of `l2` is therefore unbiased
-with any number of samples; losses that are not quadratic are so in the limit of many.
+with any number of samples; losses that are not quadratic are so in the limit of many. Losses that count outliers less (`l1`,
+`huber`, `robust`) are for what is wrong in the picture; of a noisy render they drop the rare bright samples that carry a part of
+its light.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ def robust(
     """ρ(r) = |α−2|/α (((r/scale)² / |α−2| + 1)^(α/2) − 1), a general and adaptive robust loss (Barron 2019).
 
     alpha 2 is l2, 1 a smooth l1, 0 Cauchy's log(½ x² + 1), −2 Geman and McClure's 2x² / (x² + 4), −∞ Welsch's 1 − exp(−½ x²),
-    x = r/scale: at 0 and below, residuals far beyond `scale` hardly matter, whatever hides the object there.
+    x = r/scale: at 0 and below, residuals far beyond `scale` hardly matter, whatever hides the object there. For renders whose
+    own noise is well below `scale`: rare bright samples, as of glossy surfaces under small lamps, would be left out too, and the
+    fit be biased. Raise spp and light_samples first.
     """
     square = ((image - target) / scale).square()
     if alpha == 2.0:

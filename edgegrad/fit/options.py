@@ -17,6 +17,7 @@ from ..files.paths import PathLike
 from .history import Record
 from .losses import Loss, loss_of
 
+METHODS = ("adam", "gauss-newton")
 RENDER = tuple(inspect.signature(render_aovs).parameters)[3:]
 
 
@@ -69,14 +70,20 @@ class Options:
     """What all fits by descent can be told.
 
     loss              between render and picture: "l1", "l2", "huber", "robust", "ssim", or a function of image, target and
-                      weight; edgegrad.fit.losses has more, with their parameters
+                      weight; edgegrad.fit.losses has more, with their parameters. "robust" for what the render lacks, not
+                      against noise of glossy light
     mask_loss         the same between the render's alpha and the mask, also "iou"
+    method            "adam", for any count of numbers; or "gauss-newton", for up to 400: far fewer steps, each with the
+                      derivative by every one of them in forward mode. It wants all views in each step, and a loss of each
+                      pixel by itself (not "ssim", "iou" or a pyramid). A step then moves no number by more than ten learning
+                      rates
     steps             at most so many
     views_per_step    so many views, drawn anew, in each step; None: all of them
     spp               samples a pixel
     seed              the same seed gives the same fit
-    patience          steps: the loss is flat when its mean over so many falls by less than
-    tolerance         this share against the mean over as many before
+    patience          the fit ends where so many more steps promise, by the gradients at the end of the last ones, that the loss
+    tolerance         falls by less than this share of it, or of what it has fallen by so far, or by less than its noise; "adam"
+                      first takes shorter steps, three times
     progress          show a bar with the loss on standard error
     callback          called after each step with its Record, which is a Progress: it has scene and cameras too; KeyboardInterrupt
                       from it ends the fit
@@ -89,6 +96,7 @@ class Options:
 
     loss: str | Loss = "l2"
     mask_loss: str | Loss = "l2"
+    method: str = "adam"
     steps: int = 500
     views_per_step: int | None = None
     spp: int = 16
@@ -107,6 +115,8 @@ class Options:
             check_positive_int(name, getattr(self, name))
         if self.views_per_step is not None:
             check_positive_int("views_per_step", self.views_per_step)
+        if self.method not in METHODS:
+            raise ValueError(f"method: expected one of {', '.join(METHODS)}, got {self.method!r}")
         check_int("seed", self.seed, 0, 2**32 - 1)
         check_positive("tolerance", self.tolerance, least=0.0, most=1.0)
         for name in ("loss", "mask_loss"):

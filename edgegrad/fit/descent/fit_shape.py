@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -13,15 +13,18 @@ from ...check import check_positive, check_positive_int
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..checkpoints import Checkpoint
+from ..ending import Ending
 from ..history import Record
 from ..measured import Measured
 from ..options import Options, Parameter
+from ..placement import Coordinates
 from ..remeshing import crowded_edges, remeshed
 from ..smooth import Smooth
 from ..upside_down import warn_of_masks
 from ..views import Images, View, views_of
-from .fit_scene import judged, objective_of, options_of, reporter
+from .fit_scene import options_of, reporter, way_of
 from .loop import Descent, descend
+from .objective import Objective, judged
 from .result import Fit
 
 SMOOTHNESS = 4.0  # λ of I + λ L
@@ -135,16 +138,16 @@ class _Search:
             saved, mesh = None, mesh.replace(verts=found.values["verts"])
             history += [record._replace(step=len(history) + k) for k, record in enumerate(found.history)]
             seconds += found.seconds
-            if found.interrupted or level == self.levels - 1:
+            if found.ending is Ending.INTERRUPTED or level == self.levels - 1:
                 break
             level += 1
             mesh = remeshed(mesh, round(last / 4 ** (self.levels - 1 - level)))
-        whole = Descent({"verts": mesh.verts}, history, seconds, found.flat, found.interrupted)
+        whole = Descent({"verts": mesh.verts}, history, seconds, found.ending)
 
-        def build(values: dict[str, Tensor]) -> tuple[Scene, list[Camera]]:
+        def build(values: Mapping[str, Tensor]) -> tuple[Scene, list[Camera]]:
             return self.scene(mesh.replace(verts=values["verts"])), [view.camera for view in self.views]
 
-        return judged(build, self.views, self.options, whole, self.scene(start))
+        return judged(Objective(build, self.views, self.options), whole, self.scene(start), Coordinates({}))
 
     def descend(
         self, mesh: Mesh, level: int, save: Callable[[dict[str, Any]], None], saved: dict[str, Any] | None
@@ -157,13 +160,13 @@ class _Search:
         low, high = mesh.verts.aminmax(dim=0)
         rate = self.lr * float((high - low).norm()) * 0.5**level
 
-        def build(values: dict[str, Tensor]) -> tuple[Scene, list[Camera]]:
+        def build(values: Mapping[str, Tensor]) -> tuple[Scene, list[Camera]]:
             return self.scene(mesh.replace(verts=smooth(values["verts"]))), [view.camera for view in views]
 
-        objective = objective_of(build, views, self.options, self.regularizer)
+        objective = Objective(build, views, self.options, self.regularizer)
         parameters = {"verts": Parameter(rate, smooth.times(mesh.verts), uniform=True)}
         title = f"level {level + 1} of {self.levels}"
-        found = descend(objective, parameters, self.options, save, saved, title, reporter(build, views))
+        found = descend(way_of(parameters, self.options), objective, save, saved, title, reporter(build, views))
         return found._replace(values={"verts": smooth(found.values["verts"])})
 
     def scene(self, mesh: Mesh) -> Scene:

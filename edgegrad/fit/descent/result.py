@@ -21,7 +21,9 @@ from ...files.save import save_mesh
 from ...optional import DRAWING, require
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..ending import Ending, reason_of
 from ..history import Record, number_or_none, plain_history
+from ..placement import Pose
 from ..verdict import ENOUGH
 from ..views import View
 
@@ -33,20 +35,21 @@ if TYPE_CHECKING:
 class Fit:
     """What a fit found.
 
-    values     the parameters, by name
+    values     the parameters, by name; poses as matrices (4, 4) float64, mesh to world
+    poses      those of PoseParameters, by name
     scene      with them, and cameras
     loss       of all views, without the regularizer, at 64 samples a pixel or more
     explained  the share of the render's edges that the pictures show too, 0 … 1
-    flat       whether the loss had stopped falling before the steps ended
+    ending     why the fit took no more steps
     """
 
     values: dict[str, Tensor]
+    poses: dict[str, Pose]
     scene: Scene
     cameras: list[Camera]
     loss: float
     explained: float
-    flat: bool
-    interrupted: bool
+    ending: Ending
     seconds: float
     views: list[View] = field(repr=False)
     history: list[Record] = field(repr=False)
@@ -58,8 +61,13 @@ class Fit:
 
     @property
     def converged(self) -> bool:
-        """The loss is flat, and what is left of it is explained: not a wrong place, nor a picture of something else."""
-        return self.flat and self.explained >= ENOUGH
+        """Further steps lead no further, and the pictures show what the fit has found: not a wrong place, nor a picture of
+        something else."""
+        return self.ending is Ending.FLAT and self.explained >= ENOUGH
+
+    @property
+    def interrupted(self) -> bool:
+        return self.ending is Ending.INTERRUPTED
 
     @property
     def mesh(self) -> Mesh:
@@ -67,18 +75,10 @@ class Fit:
         return self.scene.meshes[0]
 
     @property
-    def state(self) -> str:
-        """In words: "converged", or what kept it from that."""
-        if self.interrupted:
-            return "interrupted"
-        if not self.flat:
-            return "not converged: the loss still falls; give it more steps"
-        if self.explained < ENOUGH:
-            return (
-                f"not converged: the pictures show {self.explained:.0%} of the render's edges; "
-                "start nearer, or look for what is wrong in scene, cameras or pictures"
-            )
-        return "converged"
+    def reason(self) -> str:
+        """In words: "converged", or what kept the fit from that: "edges not explained: …", "loss still falling: …", "steps ran
+        out: …", "interrupted"."""
+        return reason_of(self.ending, self.explained)
 
     def render(self, index: int = 0, spp: int = 64, seed: int = 0) -> Tensor:
         """(H, W, C) as the camera of that place sees the fit; alpha (H, W, 1) where there was a mask alone; where there was none,
@@ -105,7 +105,7 @@ class Fit:
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
         """Writes all of it to a folder, which is made where it is missing, and gives the files' names:
 
-        fit.json      loss, state, cameras, and values of up to 64 numbers
+        fit.json      loss, reason, cameras, and values of up to 64 numbers
         values.pt     all values, for torch.load
         history.json  loss, gradient norms and small values of each step
         mesh*.ply     the shapes that moved
@@ -130,9 +130,10 @@ class Fit:
             torch.save(self.values, temporary)
         written.append("values.pt")
         text("history.json", plain_history(self.history))
+        moved = any(n.endswith("verts") for n in self.values) or any(not n.startswith("cameras.") for n in self.poses)
         for i, mesh in enumerate(self.scene.meshes):
             number = "" if len(self.scene.meshes) == 1 else str(i)
-            if any(name.endswith("verts") for name in self.values):
+            if moved:
                 save_mesh(out / f"mesh{number}.ply", mesh)
                 written.append(f"mesh{number}.ply")
             if mesh.texture is not None and mesh.texture.shape[-1] in (1, 3):
@@ -156,7 +157,7 @@ class Fit:
     def _summary(self) -> dict[str, Any]:
         small = {name: value.tolist() for name, value in self.values.items() if value.numel() <= 64}
         return {
-            "state": self.state, "converged": self.converged, "loss": number_or_none(self.loss), "explained": self.explained,
+            "reason": self.reason, "converged": self.converged, "loss": number_or_none(self.loss), "explained": self.explained,
             "steps": self.steps, "seconds": round(self.seconds, 3), "values": small,
         }  # fmt: skip
 

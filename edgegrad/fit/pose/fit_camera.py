@@ -82,9 +82,9 @@ class CameraFit:
         return self.search.interrupted
 
     @property
-    def state(self) -> str:
-        """In words: "converged", or what kept it from that."""
-        return self.search.state
+    def reason(self) -> str:
+        """As of PoseFit."""
+        return self.search.reason
 
     def plot(self) -> Figure:
         """target | start | fit | difference."""

@@ -1,48 +1,14 @@
-"""A pose: mesh to world, and what was found of the lens."""
+"""Poses from matrices, and the angle between two."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ...check import check_finite, check_shape
-from ...scene.symmetries import Symmetries
-
-
-class Pose(NamedTuple):
-    """Mesh to world, `world = scale · R v + t`, and the focal length relative to the given camera's. All float64."""
-
-    R: Tensor  # (3, 3)
-    t: Tensor  # (3,) world units
-    scale: Tensor  # ()
-    focal: Tensor  # ()
-    principal: Tensor = torch.zeros(2, dtype=torch.float64)  # how far the point moved, in widths of the image
-    distortion: Tensor = torch.zeros(8, dtype=torch.float64)  # what is added to the camera's
-
-    @property
-    def matrix(self) -> Tensor:
-        """(4, 4) float64, for column vectors."""
-        last = self.t.new_tensor([[0.0, 0.0, 0.0, 1.0]])
-        return torch.cat([torch.cat([self.scale * self.R, self.t[:, None]], 1), last])
-
-    @property
-    def numbers(self) -> list[float]:
-        """All of them, one after the other."""
-        return [number for field in self for number in field.flatten().tolist()]
-
-    def closest(self, symmetries: Symmetries, reference: Pose) -> Pose:
-        """Of the poses in which the mesh looks the same, the one whose rotation is nearest to the reference's."""
-        matrix = symmetries.closest(self.matrix, reference.matrix)
-        return self._replace(R=matrix[:3, :3] / self.scale, t=matrix[:3, 3])
-
-    @staticmethod
-    def of(numbers: list[float]) -> Pose:
-        """From `numbers`."""
-        R, t, scale, focal, principal, distortion = torch.tensor(numbers, dtype=torch.float64).split([9, 3, 1, 1, 2, 8])
-        return Pose(R.reshape(3, 3), t, scale[0], focal[0], principal, distortion)
+from ..placement import Pose
 
 
 def pose_from_matrix(name: str, matrix: object) -> Pose:

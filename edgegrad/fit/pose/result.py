@@ -16,7 +16,7 @@ from torch import Tensor
 from ...camera.camera import Camera
 from ...files.paths import PathLike, replacing
 from ...optional import DRAWING, require
-from ..verdict import ENOUGH
+from ..ending import Ending, reason_of
 from .pose import Pose, pose_from_matrix
 
 if TYPE_CHECKING:
@@ -70,18 +70,10 @@ class PoseFit:
         return Pose(self.R, self.t, self.scale * one, one).matrix
 
     @property
-    def state(self) -> str:
-        """In words: "converged", or what kept it from that."""
-        if self.interrupted:
-            return "interrupted"
-        if self.converged:
-            return "converged"
-        if self.explained < ENOUGH:
-            return (
-                f"not converged: the picture shows {self.explained:.0%} of the render's edges; start nearer, or look for what is "
-                "wrong in mesh, camera or picture"
-            )
-        return "not converged: give it more steps"
+    def reason(self) -> str:
+        """In words: "converged", or what kept the fit from that: "edges not explained: …", "steps ran out: …", "interrupted"."""
+        ending = Ending.INTERRUPTED if self.interrupted else Ending.FLAT if self.converged else Ending.STEPS
+        return reason_of(ending, self.explained, "mesh, camera or picture")
 
     def plot(self) -> Figure:
         """target | start | fit | difference, a row for each picture; with a mask all over black, as they were compared."""

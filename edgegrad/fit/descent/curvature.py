@@ -1,0 +1,146 @@
+"""The curvature JᵀWJ of a loss of images by some hundred numbers, by forward mode.
+
+J is the derivative of the images by the numbers, a direction each, and W what the loss makes of differences r: the gradient of a
+loss ρ(r) is that of ½ w r² with w = ρ′(r)/r held fixed (iteratively reweighted least squares, Holland and Welsch 1977), for a
+squared loss the exact one (Gauss-Newton).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from ...render import jvp
+from ...scene.tree import map_tensors, tensors_in
+from .building import Built
+from .objective import Objective
+
+MOST = 400  # numbers, each of which is a direction
+FAINT = 1e-3  # of the range of the pictures: differences below count as these, for some losses have no weight at 0
+
+
+def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> Tensor:
+    """(n, n) float64 by all numbers of the tensors, one after the other. Raises TypeError where something has no forward mode."""
+    plain = {name: value.detach() for name, value in tensors.items()}
+    n = sum(value.numel() for value in plain.values())
+    try:
+        (scene, cameras), tangents = _tangents(objective, plain)
+        total = torch.zeros(n, n, dtype=torch.float64)
+        picks, options = objective.picks(step), objective.options
+        for group in objective.groups(picks):
+            aovs = objective.views[group[0]].aovs
+            images: dict[str, list[Tensor]] = {name: [] for name in aovs}
+            slopes: dict[str, list[Tensor]] = {name: [] for name in aovs}
+            for i in group:
+                held = {id(tensor) for tensor in (*tensors_in(scene), *tensors_in(cameras[i]))}
+                own = {tensor: tangent for tensor, tangent in tangents if id(tensor) in held}
+                if not own:
+                    continue
+                seed = objective.seed(step) + i
+                found = jvp(scene, cameras[i], own, options.spp, seed % 2**32, aovs=aovs, **options.render)
+                for name in aovs:
+                    images[name].append(found[0][name])
+                    slopes[name].append(found[1][name])
+            for name in aovs if images[aovs[0]] else ():
+                weight = weights_of(objective, name, group, torch.stack(images[name])) / len(picks)
+                for w, J in zip(weight, slopes[name], strict=True):
+                    rows = J.reshape(n, -1) * w.sqrt().flatten()
+                    total += (rows @ rows.T).double()
+    except (NotImplementedError, RuntimeError) as error:
+        if "forward" not in str(error):
+            raise
+        raise TypeError(
+            "method: expected a scene and cameras that PyTorch differentiates in forward mode by what is sought, as "
+            f'"gauss-newton" needs, got {error}; give method="adam"'
+        ) from error
+    if objective.regularizer is not None:
+        total += _of_regularizer(objective, plain)
+    return total
+
+
+def _tangents(objective: Objective, tensors: Mapping[str, Tensor]) -> tuple[Built, list[tuple[Tensor, Tensor]]]:
+    """Scene and cameras, and the derivative (n, *shape) of each of their tensors that depends on the numbers."""
+    rows: list[list[Tensor | None]] = []
+    for name, value in tensors.items():
+        for k in range(value.numel()):
+            with forward_ad.dual_level():
+                unit = torch.zeros_like(value)
+                unit.view(-1)[k] = 1.0
+                # Copies, for a dual number is made in place of what it is made of.
+                moved = {n: v.clone() for n, v in tensors.items()}
+                moved[name] = forward_ad.make_dual(moved[name], unit)
+                rows.append([forward_ad.unpack_dual(tensor).tangent for tensor in _floating(objective.build(moved))])
+    with torch.no_grad():
+        scene, cameras = objective.build(tensors)
+        scene, cameras = map_tensors(scene, torch.Tensor.detach), [map_tensors(c, torch.Tensor.detach) for c in cameras]
+    found = []
+    for tensor, column in zip(_floating((scene, cameras)), zip(*rows, strict=True), strict=True):
+        if any(tangent is not None for tangent in column):
+            zero = torch.zeros_like(tensor)
+            found.append((tensor, torch.stack([zero if tangent is None else tangent.detach() for tangent in column])))
+    return (scene, cameras), found
+
+
+def _floating(thing: Any) -> list[Tensor]:
+    return [tensor for tensor in tensors_in(thing) if tensor.is_floating_point()]
+
+
+def weights_of(objective: Objective, name: str, group: list[int], render: Tensor) -> Tensor:
+    """w (B, H, W, c) of these views' channel, by the sum of their losses."""
+    target = torch.stack([objective.views[i].wanted[name] for i in group])
+    return _weights(lambda image: objective.of_group(name, group, image), render.detach(), target)
+
+
+def _weights(loss: Callable[[Tensor], Tensor], render: Tensor, target: Tensor) -> Tensor:
+    least = FAINT * float((target.amax() - target.amin()).clamp(min=1e-12))
+    r = render - target
+    r = torch.where(r.abs() < least, torch.where(r < 0, -least, least), r)
+    with torch.enable_grad():
+        image = (target + r).requires_grad_()
+        (slope,) = torch.autograd.grad(loss(image), image)
+    return (slope / r).clamp(min=0.0)
+
+
+def check_pointwise(objective: Objective) -> None:
+    """That each pixel has a loss of its own: its weight does not change with differences elsewhere. Raises ValueError."""
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(1, 16, 16, 3, generator=generator)
+    r = 0.2 * (0.1 + torch.rand(target.shape, generator=generator))
+    some = (torch.rand(16, 16, generator=generator) < 0.5)[..., None].expand_as(target)
+    for option, name in (("loss", "image"), ("mask_loss", "alpha")):
+        if not any(name in view.aovs for view in objective.views):
+            continue
+        by = objective.losses[name]
+        whole, part = (
+            _weights(lambda image, by=by: by(image, target, None), target + x, target)
+            for x in (r, torch.where(some, r, 0.5 * r))
+        )
+        if bool(((whole - part).abs() > 1e-3 * whole.abs().max())[some].any()):
+            raise ValueError(
+                f'{option}: expected a loss of each pixel by itself for method="gauss-newton", as l1, l2, huber and robust are, '
+                'got one that mixes pixels; choose one of these, or method="adam"'
+            )
+
+
+def _of_regularizer(objective: Objective, tensors: Mapping[str, Tensor]) -> Tensor:
+    """Its second derivative, without what curves down."""
+    assert objective.regularizer is not None
+    leaves = [value.clone().requires_grad_() for value in tensors.values()]
+    with torch.enable_grad():
+        slope = _gradient(objective.regularizer(objective.build(dict(zip(tensors, leaves, strict=True)))[0]), leaves)
+        H = torch.stack([_gradient(part, leaves) for part in slope]).detach()
+    size, axes = torch.linalg.eigh(0.5 * (H + H.T))
+    return axes @ torch.diag(size.clamp(min=0.0)) @ axes.T
+
+
+def _gradient(value: Tensor, leaves: list[Tensor]) -> Tensor:
+    """(n,) float64, differentiable; zero where nothing depends on a leaf."""
+    if not value.requires_grad:
+        return torch.zeros(sum(leaf.numel() for leaf in leaves), dtype=torch.float64)
+    found = torch.autograd.grad(value, leaves, create_graph=True, allow_unused=True)
+    parts = (torch.zeros_like(leaf) if part is None else part for leaf, part in zip(leaves, found, strict=True))
+    return torch.cat([part.flatten().double() for part in parts])

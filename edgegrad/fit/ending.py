@@ -1,0 +1,32 @@
+"""How a fit ended, and what that means for its result, in words."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from .verdict import ENOUGH
+
+
+class Ending(Enum):
+    """Why a fit took no more steps."""
+
+    FLAT = "the steps led no further"
+    STEPS = "steps ran out"
+    FALLING = "loss still falling"
+    INTERRUPTED = "interrupted"
+
+
+def reason_of(ending: Ending, explained: float, suspects: str = "scene, cameras or pictures") -> str:
+    """In words: "converged", or what kept the fit from that, and after a colon how to mend it."""
+    if ending is Ending.INTERRUPTED:
+        return "interrupted"
+    if ending is Ending.FALLING:
+        return "loss still falling: give it more steps, or larger learning rates"
+    if explained < ENOUGH:
+        return (
+            f"edges not explained: the pictures show {explained:.0%} of the render's edges; start nearer, or look for what is "
+            f"wrong in {suspects}"
+        )
+    if ending is Ending.STEPS:
+        return "steps ran out: what is sought has not come to rest; give it more steps"
+    return "converged"

@@ -1,0 +1,180 @@
+"""Where an object stands: a pose, and a parameter of a fit that is one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..camera.poses import check_rotation, rigid, rotation
+from ..check import check_finite, check_positive, check_shape
+from ..scene.mesh import Mesh
+from ..scene.scene import Scene
+from ..scene.symmetries import Symmetries
+from .history import Record
+from .options import Parameter
+
+
+class Pose(NamedTuple):
+    """Mesh to world, `world = scale · R v + t`, and the focal length relative to the given camera's. float64 where a fit gives
+    it; in a function that makes the scene of fit_scene(), in the type of the object's vertices."""
+
+    R: Tensor  # (3, 3)
+    t: Tensor  # (3,) world units
+    scale: Tensor = torch.ones((), dtype=torch.float64)  # ()
+    focal: Tensor = torch.ones((), dtype=torch.float64)  # ()
+    principal: Tensor = torch.zeros(2, dtype=torch.float64)  # how far the point moved, in widths of the image
+    distortion: Tensor = torch.zeros(8, dtype=torch.float64)  # what is added to the camera's
+
+    @property
+    def matrix(self) -> Tensor:
+        """(4, 4), for column vectors."""
+        return rigid(self.scale * self.R, self.t)
+
+    @property
+    def numbers(self) -> list[float]:
+        """All of them, one after the other."""
+        return [number for field in self for number in field.flatten().tolist()]
+
+    def closest(self, symmetries: Symmetries, reference: Pose) -> Pose:
+        """Of the poses in which the mesh looks the same, the one whose rotation is nearest to the reference's."""
+        matrix = symmetries.closest(self.matrix, reference.matrix)
+        return self._replace(R=matrix[:3, :3] / self.scale, t=matrix[:3, 3])
+
+    @staticmethod
+    def of(numbers: list[float]) -> Pose:
+        """From `numbers`."""
+        R, t, scale, focal, principal, distortion = torch.tensor(numbers, dtype=torch.float64).split([9, 3, 1, 1, 2, 8])
+        return Pose(R.reshape(3, 3), t, scale[0], focal[0], principal, distortion)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseParameter:
+    """A pose that is sought, in steps by a rotation vector about the object's centre, and a shift in sizes of the object.
+
+    start     where it stands at first, a Pose(R, t) or Pose(R, t, scale); None: where its vertices are
+    of        the object, a Mesh or a Scene: its centre and size are those of its bounding box. None: of what the scene holds
+              under the parameter's name
+    rotation  learning rates: about so many radians in a step,
+    shift     so many sizes of the object, the diagonals of its bounding box,
+    scale     and so much of the logarithm of the scale; None: that stays as it is
+    """
+
+    start: Pose | None = None
+    of: Mesh | Scene | None = None
+    rotation: float = 0.01
+    shift: float = 0.01
+    scale: float | None = None
+
+    def placed(self, name: str, of: Mesh | Scene | None = None) -> Placement:
+        """Checked; `of` where it names no object itself. Raises TypeError or ValueError."""
+        for rate in ("rotation", "shift", "scale"):
+            if rate != "scale" or self.scale is not None:
+                check_positive(f"{name}: {rate}", getattr(self, rate), least=0.0, most=1e30)
+        thing = of if self.of is None else self.of
+        if not isinstance(thing, Mesh | Scene):
+            got = "none" if thing is None else type(thing).__name__
+            raise TypeError(
+                f"{name}: of: expected the Mesh or Scene that is moved, got {got}; give PoseParameter(…, of=mesh)"
+            )
+        meshes = [thing] if isinstance(thing, Mesh) else thing.meshes
+        verts = torch.cat([mesh.verts.detach().cpu().double() for mesh in meshes])
+        low, high = verts.aminmax(dim=0)
+        size = float((high - low).norm())
+        if size == 0.0:
+            raise ValueError(f"{name}: of: expected an object with a size, got all vertices at one place")
+        return Placement(self, _checked(name, self.start), 0.5 * (low + high), size, meshes[0].verts.dtype)
+
+
+def _checked(name: str, start: object) -> Pose:
+    """float64 on the CPU. Raises TypeError or ValueError."""
+    f64 = torch.float64
+    if start is None:
+        return Pose(torch.eye(3, dtype=f64), torch.zeros(3, dtype=f64))
+    if not isinstance(start, Pose):
+        raise TypeError(f"{name}: start: expected a Pose, got {type(start).__name__}; give Pose(R, t)")
+    R, t, scale = (torch.as_tensor(x).detach().cpu().to(f64, copy=True) for x in start[:3])
+    for part, value, shape in (("R", R, (3, 3)), ("t", t, (3,)), ("scale", scale, ())):
+        check_shape(f"{name}: {part}", value, shape)
+        check_finite(f"{name}: {part}", value)
+    check_rotation(f"{name}: R", R)
+    if float(scale) <= 0.0:
+        raise ValueError(f"{name}: scale: expected a number above 0, got {float(scale):g}")
+    return Pose(R, t, scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A PoseParameter of a known object. Its coordinates are zero at the start: a rotation vector ω about the centre c, a shift d
+    in sizes, and the logarithm of a scale; R = exp([ω]×) R₀, and the centre is at s₀ R₀ c + t₀ + d · size."""
+
+    parameter: PoseParameter
+    start: Pose
+    center: Tensor  # (3,) of the object, before it is moved
+    size: float
+    dtype: torch.dtype  # of its vertices
+
+    @property
+    def coordinates(self) -> dict[str, Parameter]:
+        """As parameters of their own, by the names that gradients have in histories."""
+        rates = {"rotation": self.parameter.rotation, "shift": self.parameter.shift}
+        found = {name: Parameter(rate, torch.zeros(3, dtype=torch.float64)) for name, rate in rates.items()}
+        if self.parameter.scale is not None:
+            found["scale"] = Parameter(self.parameter.scale, torch.zeros((), dtype=torch.float64))
+        return found
+
+    def pose(self, values: Mapping[str, Tensor]) -> Pose:
+        """At these coordinates, differentiable."""
+        R0, t0, s0 = self.start[:3]
+        R = rotation(values["rotation"]) @ R0
+        scale = s0 * values["scale"].exp() if "scale" in values else s0
+        middle = s0 * (R0 @ self.center) + t0 + self.size * s0 * values["shift"]
+        return Pose(R, middle - scale * (R @ self.center), scale)
+
+
+class Coordinates:
+    """The tensors in which a fit takes its steps, and the values of which a scene is made: some of these are poses."""
+
+    def __init__(self, parameters: Mapping[str, Parameter | Placement]) -> None:
+        self.parameters: dict[str, Parameter] = {}
+        self.placements = {name: p for name, p in parameters.items() if isinstance(p, Placement)}
+        for name, parameter in parameters.items():
+            if isinstance(parameter, Placement):
+                self.parameters |= {f"{name}.{part}": p for part, p in parameter.coordinates.items()}
+            else:
+                self.parameters[name] = parameter
+
+    def values(self, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Tensors, and a Pose for each PoseParameter, by the parameters' names; differentiable."""
+        if not self.placements:
+            return dict(tensors)
+        found: dict[str, Any] = dict(tensors)
+        for name, placement in self.placements.items():
+            parts = {part: found.pop(f"{name}.{part}") for part in placement.coordinates}
+            found[name] = Pose(*(part.to(placement.dtype) for part in placement.pose(parts)[:3]))
+        return found
+
+    def plain(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The same without gradients, and with poses as matrices (4, 4) float64, as results and histories have them."""
+        with torch.no_grad():
+            found = {name: tensor.detach() for name, tensor in tensors.items()}
+            for name, pose in self.poses(tensors).items():
+                for part in self.placements[name].coordinates:
+                    del found[f"{name}.{part}"]
+                found[name] = pose.matrix
+            return found
+
+    def recorded(self, record: Record) -> Record:
+        """As histories have it."""
+        return record._replace(values=self.plain(record.values)) if self.placements else record
+
+    def poses(self, tensors: Mapping[str, Tensor]) -> dict[str, Pose]:
+        """Those by name, float64."""
+        with torch.no_grad():
+            return {
+                name: placement.pose({part: tensors[f"{name}.{part}"].detach() for part in placement.coordinates})
+                for name, placement in self.placements.items()
+            }

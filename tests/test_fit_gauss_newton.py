@@ -1,0 +1,242 @@
+"""Gauss-Newton steps of fit_scene: the curvature, the damping, bounds, and what they refuse."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from test_fit import BACKGROUND, bracket, camera, rotation
+
+import edgegrad as eg
+from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, losses
+from edgegrad.fit.descent import gauss_newton
+from edgegrad.fit.descent.building import builder
+from edgegrad.fit.descent.curvature import curvature, weights_of
+from edgegrad.fit.descent.gauss_newton import GaussNewtonSteps
+from edgegrad.fit.descent.objective import Objective
+from edgegrad.fit.options import Options
+from edgegrad.fit.placement import Coordinates
+from edgegrad.fit.views import views_of
+
+F64 = torch.float64
+QUIET = {"progress": False, "spp": 4}
+
+
+def views(sizes=(32, 32, 24)):
+    """Of which two are rendered as one batch."""
+    return [camera(size, distance) for size, distance in zip(sizes, (4.5, 5.5, 4.0), strict=True)]
+
+
+def objective_of(scene, cameras, targets, parameters, regularizer=None, weights=None, **options):
+    seen = views_of(cameras, targets, None, weights)
+    build, _ = builder(scene, [view.camera for view in seen], False)
+    coordinates = Coordinates(parameters)
+    tensors = {name: p.value for name, p in coordinates.parameters.items()}
+    given = Options(**{"spp": 16, **options})
+    return Objective(lambda values: build(coordinates.values(values)), seen, given, regularizer), tensors
+
+
+# -- the curvature ----------------------------------------------------------------------------------------------------
+
+
+def test_curvature_of_a_background_is_that_of_its_square():
+    """image = … + (1 − α) b: the second derivative of the mean square by b is 2 Σ(1 − α)² over pixels and channels, weighted."""
+    cameras = views()
+    weights = [torch.linspace(0.2, 1.8, view.size[0])[:, None].expand(view.size) for view in cameras]
+    scene = eg.Scene([bracket()], BACKGROUND)
+    targets = [torch.rand(*view.size, 3) for view in cameras]
+    objective, tensors = objective_of(
+        scene, cameras, targets, {"background": Parameter(0.1, BACKGROUND.clone())}, weights=weights
+    )
+    H = curvature(objective, tensors, 0)
+    # The loss of a batch is one mean over all that it weighs, and counts as often as it has views.
+    total = 0.0
+    for group in ([0, 1], [2]):
+        open_ = torch.stack([1 - eg.render_aovs(scene, cameras[i], ["alpha"], spp=64)["alpha"] for i in group])
+        w = torch.stack([weights[i][..., None] for i in group])
+        total += len(group) / 3 * float((w * open_**2).sum() / w.sum()) * 2 / 3
+    torch.testing.assert_close(H, total * torch.eye(3, dtype=F64), rtol=0.02, atol=0.02 * total)
+
+
+def test_curvature_of_a_pose_is_that_of_its_loss():
+    """At the answer the loss of an expected image is ½ δᵀ H δ; here of the differences of renders with many samples."""
+    view = camera(32)
+    scene = eg.Scene([bracket()], BACKGROUND)
+    target = eg.render(scene, view, spp=1024, seed=5)
+    placement = PoseParameter(Pose(torch.eye(3), torch.zeros(3)), bracket()).placed("pose")
+
+    def moved(values):
+        return eg.Scene([bracket().transformed(values["pose"].R, values["pose"].t)], BACKGROUND)
+
+    objective, tensors = objective_of(moved, [view], [target], {"pose": placement}, spp=64)
+    H = torch.stack([curvature(objective, tensors, step) for step in range(4)]).mean(0)
+    for direction in ([1, 0, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0], [0, 1, 0, 0.2, -0.3, 0], [0, 0, 0, 0, 0, 1]):
+        d = 0.02 * torch.tensor(direction, dtype=F64)
+        there = {"pose.rotation": d[:3], "pose.shift": d[3:]}
+        with torch.no_grad():
+            image = eg.render(objective.build(there)[0], view, spp=1024, seed=6)
+        assert float(0.5 * d @ H @ d) == pytest.approx(float((image - target).square().mean()), rel=0.25)
+
+
+@pytest.mark.parametrize("name", ["l1", "l2", "huber", "robust"])
+def test_weights_are_those_of_the_loss(name):
+    """ρ′(r) / r, divided by the count of numbers."""
+    view, target = camera(8), torch.zeros(8, 8, 3)
+    objective, _ = objective_of(
+        bracket(), [view], [target + 0.5], {"verts": Parameter(0.1, bracket().verts)}, loss=name
+    )
+    r = torch.linspace(-0.5, 0.5, 8 * 8 * 3).reshape(8, 8, 3)
+    w = weights_of(objective, "image", [0], (target + 0.5 + r)[None])[0] * r.numel()
+    x = (r / 0.1).square()
+    expected = {
+        "l1": 1 / r.abs(), "l2": torch.full_like(r, 2.0), "huber": (0.1 / r.abs()).clamp(max=1.0),
+        "robust": 100.0 * (x / 4 + 1) ** -2,
+    }[name]  # fmt: skip
+    torch.testing.assert_close(w.float(), expected, rtol=1e-3, atol=1e-4)
+
+
+def test_curvature_of_a_regularizer():
+    """Of (b − 1)⁴ and what b has no part in; of a saddle without the way down."""
+    scene, view = eg.Scene([bracket()], BACKGROUND), camera(16)
+    target = torch.zeros(16, 16, 3)
+    parameters = {"background": Parameter(0.1, torch.tensor([0.0, 2.0, 1.5]))}
+
+    def curved(regularizer):
+        objective, tensors = objective_of(scene, [view], [target], parameters, regularizer)
+        bare, _ = objective_of(scene, [view], [target], parameters)
+        return curvature(objective, tensors, 0) - curvature(bare, tensors, 0)
+
+    H = curved(lambda made: (made.background - 1.0).pow(4).sum())
+    torch.testing.assert_close(H, torch.diag(torch.tensor([12.0, 12.0, 3.0], dtype=F64)))
+    H = curved(lambda made: made.background[0] ** 2 - made.background[1] ** 2)
+    torch.testing.assert_close(H, torch.diag(torch.tensor([2.0, 0.0, 0.0], dtype=F64)), rtol=0, atol=1e-6)
+    assert not curved(lambda made: made.meshes[0].verts.square().mean()).any()
+
+
+# -- the steps --------------------------------------------------------------------------------------------------------
+
+
+class Valley:
+    """A loss by two numbers that have no picture: it falls to 0 at (1, −2), and is no parabola far from there."""
+
+    def __call__(self, values, step):
+        noise = 1e-4 * float(torch.randn((), generator=torch.Generator().manual_seed(step)))
+        return losses.robust(values["x"][None, None], self.bottom[None, None], None, 1.0, 0.0) + noise
+
+    bottom = torch.tensor([1.0, -2.0], dtype=F64)
+
+
+@pytest.fixture
+def valley(monkeypatch):
+    def made(curvature, start=(5.0, 5.0), lr=1.0, **bounds):
+        monkeypatch.setattr(gauss_newton, "curvature", lambda *_: curvature * torch.eye(2, dtype=F64))
+        monkeypatch.setattr(gauss_newton, "check_pointwise", lambda objective: None)
+        x = Parameter(lr, torch.tensor(start, dtype=F64), **bounds)
+        return GaussNewtonSteps({"x": x}, Options()), Valley()
+
+    return made
+
+
+def test_a_step_that_raises_the_loss_is_taken_back(valley):
+    """By a curvature that is far too small, each step would land far beyond."""
+    way, objective = valley(0.003)
+    start = 0.5 * (math.log1p(8.0) + math.log1p(24.5))
+    for _ in range(40):
+        way.advance(objective)
+        assert way.loss < start + 0.01  # of each accepted point
+    assert max(record.loss for record in way.history) > start + 0.1  # of some that were not
+    assert way.accepted < way.step - 3
+    assert float((way.best["x"] - objective.bottom).norm()) < 0.3
+
+
+def test_a_right_curvature_needs_few_steps_and_then_ends(valley):
+    way, objective = valley(0.5, start=(1.6, -2.5))
+    for _ in range(60):
+        way.advance(objective)
+        if way.flat:
+            break
+    assert way.flat and way.step < 30
+    assert float((way.best["x"] - objective.bottom).norm()) < 0.05
+
+
+def test_no_number_moves_by_more_than_ten_rates(valley):
+    way, objective = valley(1e-6, lr=0.01)
+    way.advance(objective)
+    assert float((way.values["x"].detach() - 5.0).abs().max()) == pytest.approx(0.1)
+
+
+def test_bounds_hold_and_the_others_go_on(valley):
+    way, objective = valley(0.5, start=(1.6, -1.0), low=torch.tensor([1.3, -9.0], dtype=F64))
+    for _ in range(60):
+        way.advance(objective)
+        assert float(way.values["x"].detach()[0]) >= 1.3
+        if way.flat:
+            break
+    assert float(way.best["x"][0]) == pytest.approx(1.3)
+    assert float(way.best["x"][1]) == pytest.approx(-2.0, abs=0.05)
+
+
+def test_a_loss_without_a_number_is_taken_back(valley):
+    way, objective = valley(0.5, start=(1.6, -2.5))
+    way.advance(objective)
+    here = way.here.clone()
+    objective.bottom = objective.bottom * math.nan
+    way.advance(objective)
+    assert torch.equal(way.here, here) and torch.isfinite(way.values["x"]).all()
+
+
+def test_is_far_quicker_than_adam_by_steps():
+    view = camera(32)
+    scene = eg.Scene([bracket()], BACKGROUND)
+    target = eg.render(scene, view, spp=64, seed=1 << 20)
+    start = Pose(rotation(0.1, -0.1, 0.05), torch.tensor([0.05, 0.0, 0.1], dtype=F64))
+    seen = []
+    wanted = {"meshes.0.pose": PoseParameter(start, rotation=0.02, shift=0.01)}
+    fit = fit_scene(scene, view, target, wanted, method="gauss-newton", callback=seen.append, **QUIET)
+    assert fit.converged and fit.steps < 40 and [record.step for record in seen] == list(range(fit.steps))
+    assert float((fit.poses["meshes.0.pose"].R - torch.eye(3)).norm()) < 0.02
+    assert set(seen[0].gradient) == {"meshes.0.pose.rotation", "meshes.0.pose.shift"}
+
+
+# -- what it refuses --------------------------------------------------------------------------------------------------
+
+
+class NoForward(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x):
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, g):
+        return g
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"method": "newton"}, ValueError, "method: expected one of adam, gauss-newton, got 'newton'"),
+        ({"parameters": {"texture": 0.1}}, ValueError, r"expected at most 400 numbers .* got 3072; give method=.adam"),
+        ({"views_per_step": 1}, ValueError, "views_per_step: expected None for method"),
+        ({"loss": losses.multiscale()}, ValueError, "loss: expected a loss of each pixel by itself"),
+        ({"loss": "iou"}, ValueError, "loss: expected a loss of each pixel by itself"),
+        (
+            {"scene": lambda values: quad().replace(verts=NoForward.apply(values["v"])), "parameters": {"v": None}},
+            TypeError,
+            r"method: expected .* forward mode.*give method=.adam",
+        ),
+    ],
+)
+def test_errors_name_the_argument(change, error, message):
+    arguments = {"scene": quad(), "parameters": {"verts": 0.01}, "method": "gauss-newton", **QUIET, **change}
+    if "v" in arguments["parameters"]:
+        arguments["parameters"] = {"v": Parameter(0.01, quad().verts)}
+    view = eg.Camera.look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), size=(16, 16))
+    with pytest.raises(error, match=message):
+        fit_scene(cameras=view, images=torch.zeros(16, 16, 3), **arguments)
+
+
+def quad():
+    square = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    return eg.Mesh(square, faces, texture=torch.rand(32, 32, 3), uvs=0.5 + 0.5 * square[:, :2], uv_faces=faces)

@@ -1,0 +1,228 @@
+"""A pose among the parameters of fit_scene: what it is, by which names, and in all that a fit writes."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from test_fit import BACKGROUND, bracket, camera, rotation
+from test_fit import START as START_MATRIX
+
+import edgegrad as eg
+from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene
+from edgegrad.fit.placement import Coordinates
+
+F64 = torch.float64
+QUIET = {"progress": False, "spp": 4}
+START = Pose(START_MATRIX[:3, :3], START_MATRIX[:3, 3])
+
+
+def target(view):
+    return eg.render(eg.Scene([bracket()], BACKGROUND), view, spp=64, seed=1 << 20)
+
+
+def fitted(size=24, **options):
+    view = camera(size)
+    start = eg.Scene([bracket()], BACKGROUND)
+    wanted = {"meshes.0.pose": PoseParameter(START, rotation=0.02, shift=0.01)}
+    return fit_scene(start, view, target(view), wanted, **{**QUIET, **options})
+
+
+# -- what it is -------------------------------------------------------------------------------------------------------
+
+
+def test_steps_are_rotation_vectors_about_the_middle_and_shifts_in_sizes():
+    mesh, size = bracket(), math.sqrt(2.0**2 + 1.5**2 + 0.8**2)
+    center = torch.tensor([1.0, 0.75, 0.4], dtype=F64)
+    scaled = START._replace(scale=torch.tensor(1.3, dtype=F64))
+    placement = PoseParameter(scaled, mesh, scale=0.01).placed("pose")
+    at = {name: p.value for name, p in placement.coordinates.items()}
+    torch.testing.assert_close(placement.pose(at).matrix, scaled.matrix)
+    where = 1.3 * START.R @ center + START.t
+    turn = torch.tensor([0.3, -2.0, 0.4], dtype=F64)
+    turned = placement.pose({**at, "rotation": turn})
+    torch.testing.assert_close(turned.R, rotation(*turn.tolist()) @ START.R)
+    torch.testing.assert_close(1.3 * turned.R @ center + turned.t, where)
+    moved = placement.pose({**at, "shift": torch.tensor([0.5, 0.0, -1.0], dtype=F64)})
+    torch.testing.assert_close(moved.t - scaled.t, 1.3 * size * torch.tensor([0.5, 0.0, -1.0], dtype=F64))
+    grown = placement.pose({**at, "scale": torch.tensor(math.log(2.0), dtype=F64)})
+    assert float(grown.scale) == pytest.approx(2.6)
+    torch.testing.assert_close(2.6 * grown.R @ center + grown.t, where)
+
+
+def test_a_pose_is_differentiable_in_all_its_steps():
+    placement = PoseParameter(START, bracket(), scale=0.01).placed("pose")
+    values = [torch.randn(p.value.shape, dtype=F64).requires_grad_() for p in placement.coordinates.values()]
+
+    def pose(*values):
+        return placement.pose(dict(zip(placement.coordinates, values, strict=True))).matrix
+
+    assert torch.autograd.gradcheck(pose, values, check_forward_ad=True)
+
+
+def test_a_function_gets_a_pose_in_the_type_of_the_object():
+    mesh, seen = bracket().to(torch.float32), []
+
+    def scene(values):
+        seen.append(values["place"])
+        return mesh.transformed(values["place"].R, values["place"].t, values["place"].scale)
+
+    fit = fit_scene(scene, camera(16), target(camera(16)), {"place": PoseParameter(START, mesh)}, steps=2, **QUIET)
+    assert all(isinstance(pose, Pose) and pose.R.dtype == pose.t.dtype == torch.float32 for pose in seen)
+    assert seen[1].R.requires_grad and fit.mesh.verts.dtype == torch.float32
+    assert fit.values["place"].shape == (4, 4) and fit.values["place"].dtype == F64
+    assert torch.equal(fit.poses["place"].matrix, fit.values["place"])
+
+
+# -- what it finds, and by which names --------------------------------------------------------------------------------
+
+
+def test_finds_a_pose_by_name():
+    fit = fitted(48, steps=200)
+    pose = fit.poses["meshes.0.pose"]
+    torch.testing.assert_close(fit.history[0].values["meshes.0.pose"], START_MATRIX, rtol=0, atol=1e-12)
+    apart = math.degrees(math.asin(float((pose.R - torch.eye(3)).norm()) / 8**0.5) * 2.0)
+    middle = torch.tensor([1.0, 0.75, 0.4], dtype=F64)
+    assert fit.converged and apart < 0.5
+    assert float((pose.R @ middle + pose.t - middle).norm()) < 0.005 * 2.62
+    torch.testing.assert_close(fit.mesh.verts, bracket().transformed(pose.R, pose.t).verts)
+
+
+def test_turns_of_more_than_a_half_circle_are_rotations():
+    """Steps add up in a rotation vector; what it makes is a rotation all the same."""
+    placement = PoseParameter(START, bracket()).placed("pose")
+    for turn in (3.5, 6.0, 20.0):
+        at = {"rotation": torch.tensor([0.0, turn, 0.3], dtype=F64), "shift": torch.zeros(3, dtype=F64)}
+        R = placement.pose(at).R
+        torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=F64))
+
+
+def test_the_pose_of_a_mesh_and_what_else_is_sought_of_it():
+    """Vertices are moved with it; so is a scene's second mesh alone."""
+    mesh, view = bracket(), camera(16)
+    pose = Pose(START.R, START.t)
+    fit = fit_scene(mesh, view, target(view), {"pose": PoseParameter(pose), "verts": 1e-3}, steps=2, **QUIET)
+    found = fit.poses["pose"]
+    torch.testing.assert_close(
+        fit.mesh.verts, mesh.replace(verts=fit.values["verts"]).transformed(found.R, found.t, found.scale).verts
+    )
+    two = eg.Scene([mesh, mesh.transformed(t=torch.tensor([1.4, 1.2, 0.5], dtype=F64), scale=0.3)], BACKGROUND)
+    fit = fit_scene(two, view, target(view), {"meshes.1.pose": PoseParameter()}, steps=9, **QUIET)
+    assert torch.equal(fit.scene.meshes[0].verts, mesh.verts)
+    assert float((fit.scene.meshes[1].verts - two.meshes[1].verts).abs().max()) > 1e-3
+
+
+def test_a_camera_moves_the_other_way():
+    """A camera moved by M sees what the old one sees moved by M⁻¹."""
+    view = camera(16)
+    scene = eg.Scene([bracket()], BACKGROUND)
+    fit = fit_scene(scene, view, target(view), {"cameras.0.pose": PoseParameter(START)}, steps=1, **QUIET)
+    expected = view.world_to_camera.double() @ torch.linalg.inv(START_MATRIX)
+    started = fit.history[0].values["cameras.0.pose"]
+    torch.testing.assert_close(started, START_MATRIX)
+    moved = fit.values["cameras.0.pose"]
+    torch.testing.assert_close(
+        fit.cameras[0].world_to_camera.double(),
+        view.world_to_camera.double() @ torch.linalg.inv(moved), rtol=0, atol=1e-5,
+    )  # fmt: skip
+    assert float((expected - fit.cameras[0].world_to_camera.double()).abs().max()) < 0.2
+
+
+# -- in what a fit writes ---------------------------------------------------------------------------------------------
+
+
+def test_histories_files_and_pictures_have_the_pose(tmp_path):
+    seen = []
+    fit = fitted(steps=4, callback=lambda progress: seen.append((progress, progress.scene.meshes[0].verts)))
+    record, verts = seen[-1]
+    assert (
+        set(record.gradient) == {"meshes.0.pose.rotation", "meshes.0.pose.shift"} and min(record.gradient.values()) > 0
+    )
+    torch.testing.assert_close(seen[-2][1], bracket().transformed(*_parts(record.values["meshes.0.pose"])).verts)
+    assert not torch.equal(verts, seen[-2][1])
+    names = fit.save(tmp_path)
+    assert {"fit.json", "values.pt", "history.json", "fit.png", "loss.png", "mesh.ply"} <= set(names)
+    summary = json.loads((tmp_path / "fit.json").read_text())
+    torch.testing.assert_close(torch.tensor(summary["values"]["meshes.0.pose"], dtype=F64), fit.values["meshes.0.pose"])
+    assert summary["reason"] == fit.reason
+    history = json.loads((tmp_path / "history.json").read_text())
+    torch.testing.assert_close(torch.tensor(history[0]["values"]["meshes.0.pose"], dtype=F64), START_MATRIX)
+    values = torch.load(tmp_path / "values.pt", weights_only=True)
+    assert torch.equal(values["meshes.0.pose"], fit.values["meshes.0.pose"])
+
+
+def _parts(matrix):
+    return matrix[:3, :3], matrix[:3, 3]
+
+
+@pytest.mark.parametrize("method", ["adam", "gauss-newton"])
+def test_a_resumed_fit_ends_as_if_it_had_never_stopped(tmp_path, method):
+    def stop(record):
+        if record.step == 5:
+            raise KeyboardInterrupt
+
+    whole = fitted(steps=12, method=method)
+    options = {"steps": 12, "checkpoint": tmp_path / "fit.ckpt", "resume": True, "method": method}
+    half = fitted(callback=stop, **options)
+    assert half.reason == "interrupted" and half.steps == 6
+    again = fitted(**options)
+    assert again.steps == whole.steps and again.reason == whole.reason
+    assert torch.equal(again.values["meshes.0.pose"], whole.values["meshes.0.pose"])
+    for a, b in zip(again.history, whole.history, strict=True):
+        assert a.loss == b.loss and torch.equal(a.values["meshes.0.pose"], b.values["meshes.0.pose"])
+    other = {"meshes.0.pose": PoseParameter(START, rotation=0.03)}
+    with pytest.raises(ValueError, match="another parameters"):
+        fit_scene(eg.Scene([bracket()], BACKGROUND), camera(24), target(camera(24)), other, **QUIET, **options)
+
+
+def test_coordinates_without_poses_are_the_values():
+    coordinates = Coordinates({"x": Parameter(0.1, torch.ones(2))})
+    x = torch.ones(2)
+    assert coordinates.values({"x": x})["x"] is x and not coordinates.poses({"x": x})
+
+
+@pytest.mark.parametrize(
+    ("parameters", "error", "message"),
+    [
+        ({"meshes.0.pose": 0.1}, TypeError, "meshes.0.pose: expected a PoseParameter, got float"),
+        ({"meshes.1.pose": PoseParameter()}, ValueError, "did you mean 'meshes.0.pose'"),
+        ({"background": PoseParameter()}, ValueError, "expected a pose's name among meshes.0.pose, cameras.0.pose"),
+        ({"cameras.0.pose": PoseParameter(scale=0.1)}, ValueError, "cameras.0.pose: scale: expected None for a camera"),
+        (
+            {"meshes.0.pose": PoseParameter(torch.eye(4))},
+            TypeError,
+            "meshes.0.pose: start: expected a Pose, got Tensor",
+        ),
+        (
+            {"meshes.0.pose": PoseParameter(Pose(2.0 * torch.eye(3), torch.zeros(3)))},
+            ValueError,
+            "meshes.0.pose: R: expected a rotation",
+        ),
+        (
+            {"meshes.0.pose": PoseParameter(Pose(torch.eye(3), torch.zeros(2)))},
+            ValueError,
+            r"meshes.0.pose: t: expected shape \(3,\)",
+        ),
+        (
+            {"meshes.0.pose": PoseParameter(START._replace(scale=torch.tensor(-1.0)))},
+            ValueError,
+            "meshes.0.pose: scale: expected a number above 0, got -1",
+        ),
+        ({"meshes.0.pose": PoseParameter(rotation=-1.0)}, ValueError, "meshes.0.pose: rotation: expected"),
+        ({"meshes.0.pose": PoseParameter(of="bunny")}, TypeError, "meshes.0.pose: of: expected the Mesh or Scene"),
+    ],
+)
+def test_errors_name_the_argument(parameters, error, message):
+    view = camera(16)
+    with pytest.raises(error, match=message):
+        fit_scene(eg.Scene([bracket()], BACKGROUND), view, target(view), parameters, **QUIET)
+
+
+def test_a_function_must_be_told_of_what():
+    view = camera(16)
+    with pytest.raises(
+        TypeError, match=r"place: of: expected the Mesh or Scene that is moved, got none; give PoseParam"
+    ):
+        fit_scene(lambda values: bracket(), view, target(view), {"place": PoseParameter()}, **QUIET)
