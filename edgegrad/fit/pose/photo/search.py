@@ -143,7 +143,7 @@ class PhotoSearch:
 
     def _follow(self, level: PhotoLevel, origin: Pose) -> tuple[Pose, bool]:
         """Steps on one level; the pose, and whether the last step was short."""
-        way = self.journal.entered() or Way(origin, origin, math.inf)
+        way = self.journal.entered() or Way(origin, origin, math.inf, search={})
         for step in way.steps:
             self._note(step)
         while not way.done:
