@@ -84,11 +84,11 @@ def refine(
     except ValueError as error:
         return kept(f"no fit: {error}")
     if not fit.converged and not unconverged:
-        return kept(fit.state, fit)
+        return kept(fit.reason, fit)
     turned = math.degrees(angle(_orthonormal(estimate.pose)[:3, :3], fit.R))
     moved = float((fit.t - estimate.pose[:3, 3]).norm())
     return Refined(
-        replace(estimate, pose=fit.matrix), fit, False, fit.state, turned, moved, time.perf_counter() - began
+        replace(estimate, pose=fit.matrix), fit, False, fit.reason, turned, moved, time.perf_counter() - began
     )  # fmt: skip
 
 
