@@ -176,10 +176,7 @@ def photo_levels(
     harmonics = 0 if task.colourless or task.aovs == ("alpha",) else 1 if task.scene.is_shaded else HARMONICS
     levels = []
     for k, n in enumerate(halved):
-        sizes = [
-            tuple(max(1, round(side * f / 2**n)) for side in shot.camera.size)
-            for shot, f in zip(shots, finest, strict=True)
-        ]
+        sizes = [_reduced(shot.camera.size, f / 2**n) for shot, f in zip(shots, finest, strict=True)]
         pictures = [Picture.of(shot, masked, depth, size) for shot, depth, size in zip(shots, cut, sizes, strict=True)]
         smaller = [shot._replace(camera=picture.camera) for shot, picture in zip(shots, pictures, strict=True)]
         blur = BLURS[k] if k < len(BLURS) else 0.0
@@ -190,6 +187,10 @@ def photo_levels(
         palettes = levels[0].palettes if levels else [palette(picture.outlined, seed) for picture in pictures]
         levels.append(PhotoLevel(task, plain, pictures, palettes, blur, few, k == len(halved) - 1))
     return levels
+
+
+def _reduced(size: tuple[int, int], factor: float) -> tuple[int, int]:
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
 
 
 def _crop(task: PoseTask, shot: Shot, pose: Pose) -> tuple[int, int, int, int, float]:

@@ -64,7 +64,7 @@ class Lit:
         w = count
         light = y.new_zeros(colour.shape[-1], harmonics)
         ridge = torch.zeros_like(light)
-        e = y.norm(dim=-1)
+        residual, middle = -y, LEAST
         for _ in range(REWEIGHTED):
             for c in range(len(light)):
                 curvature = (B[:, c] * w[:, None]).T @ B[:, c]
