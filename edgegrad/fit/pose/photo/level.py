@@ -31,6 +31,7 @@ SMALLEST = 12  # pixels on the shorter side of the coarsest level
 BLURS = (1.0, 0.7)  # pixels: of alpha on the coarse levels; the last but one, if there are three
 CONTOUR_BLUR = 0.9  # of alpha in the contour term: about that of photographs at full size
 FEW_HARMONICS = 4  # of the light on the coarsest level
+GRID = 16  # pixels that crops are aligned to, so that a pose which is a little different has the same
 MARGIN = 0.6  # around the object that a crop keeps, in its extent in the image
 AROUND = 0.25  # of the object's extent in the image, where colours count as those that surround it
 RADIUS = 0.15  # of windows in which colours are counted, in the object's extent in the image
@@ -203,8 +204,9 @@ def _crop(task: PoseTask, shot: Shot, pose: Pose) -> tuple[int, int, int, int, f
         return 0, 0, H, W, float(max(H, W)) / 2
     low, high = seen.amin(0), seen.amax(0)
     extent = float((high - low).norm())
-    left, top = (max(0, math.floor(float(v) - MARGIN * extent)) for v in low)
-    right, bottom = (min(side, math.ceil(float(v) + MARGIN * extent)) for v, side in zip(high, (W, H), strict=True))
+    left, top = (max(0, GRID * math.floor((float(v) - MARGIN * extent) / GRID)) for v in low)
+    ends = (GRID * math.ceil((float(v) + MARGIN * extent) / GRID) for v in high)
+    right, bottom = (min(side, end) for end, side in zip(ends, (W, H), strict=True))
     if right - left < SMALLEST or bottom - top < SMALLEST:
         return 0, 0, H, W, float(max(H, W)) / 2
     return top, left, bottom - top, right - left, extent

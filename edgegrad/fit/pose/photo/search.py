@@ -55,7 +55,7 @@ class PhotoSearch:
         tolerance: float, seed: int, journal: Journal | None = None, further: bool = True,
     ) -> None:  # fmt: skip
         """`further`: whether other starts follow where the way down from the given one does not end well."""
-        self.task, self.start = task, start
+        self.task, self.start, self.depths = task, start, depths
         # Colours are compared as they are first, where they may be that: before an even background, or in a mask.
         self.colours_first = not task.clutter and all(depth is None for depth in depths)
         self.levels = photo_levels(task, start, depths, max_size, spp, seed)
@@ -88,10 +88,13 @@ class PhotoSearch:
                 "it does not; is the object out of view?"
             )
         stays = found.short and len(distinct([found.pose, self.start], 2, APART)) == 1
-        best = max(self._judge(self.start, stays), found, key=lambda end: end.explained)
+        start = self._judge(self.start, stays)
+        best = max(start, found, key=lambda end: end.explained)
         if not self.colours_first:
             self._take(best)
         best = self._from_aside(best, begins) if self.further and best.explained < ENOUGH else best
+        if best.explained >= ENOUGH and best is not start:
+            best = self._surrounded(best)
         if self.colours_first:
             # Colours did not fit as they are. The terms of photographs decide if they are sure.
             if best.explained < SURE:
@@ -133,6 +136,21 @@ class PhotoSearch:
             if best.explained >= ENOUGH:
                 break
         return best
+
+    def _surrounded(self, best: _End) -> _End:
+        """The end, once more with what surrounds the object where it is now: it does not depend on the start any more."""
+        last = photo_levels(self.task, best.pose, self.depths, self.max_size, self.spp, self.seed)[-1]
+        before = len(self.history)
+        pose, short = self._follow(last, best.pose)
+        (share,) = self.journal.numbers(lambda: [last.explained(pose, self.seed)])
+        if share < ENOUGH:
+            self._forget(slice(before, None))
+            return best
+        self.levels = [*self.levels[:-1], last]
+        found = _End(share, pose, short)
+        if not self.colours_first:
+            self._take(found)
+        return found
 
     def _down(self, pose: Pose, levels: list[PhotoLevel]) -> tuple[Pose, bool]:
         """Through the levels; the pose, and whether the last step was short."""
