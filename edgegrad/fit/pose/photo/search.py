@@ -56,8 +56,8 @@ class PhotoSearch:
     ) -> None:  # fmt: skip
         """`further`: whether other starts follow where the way down from the given one does not end well."""
         self.task, self.start, self.depths = task, start, depths
-        # Colours are compared as they are first, where they may be that: before an even background, or in a mask.
-        self.colours_first = not task.clutter and all(depth is None for depth in depths)
+        # Before an even background colours are compared as they are first.
+        self.colours_first = not task.clutter and "alpha" not in task.aovs and all(depth is None for depth in depths)
         self.levels = photo_levels(task, start, depths, max_size, spp, seed)
         self.max_size, self.spp, self.steps, self.tolerance = max_size, spp, steps, tolerance
         self.seed, self.further = seed, further
@@ -74,17 +74,49 @@ class PhotoSearch:
 
     def run(self) -> None:
         """Raises ValueError when nothing in the pictures depends on the pose."""
-        task = self.task
         if self.colours_first:
-            colours = self._by_colours(self.start, task.pyramid(self.start, self.max_size, self.spp), self.further)
+            self._colours_first()
+        else:
+            self._photograph_first()
+        self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
+
+    def _colours_first(self) -> None:
+        """The terms of photographs decide where colours do not fit as they are, if they are sure."""
+        colours = self._by_colours(self.start, self.task.pyramid(self.start, self.max_size, self.spp), self.further)
+        self._adopt(colours)
+        if colours.explained >= colours.enough or not self.further:
+            return
+        begins = len(self.history)
+        best = self._photograph()
+        lost = slice(0, begins) if best.explained >= SURE else slice(begins, None)
+        self._forget(lost)
+        if best.explained >= SURE:
+            self._take(best)
+
+    def _photograph_first(self) -> None:
+        """Colours as they are have the last word where the light leaves them so, and in a mask where its terms find nothing."""
+        task, best = self.task, self._photograph()
+        pyramid = task.pyramid(best.pose, self.max_size, self.spp)
+        if best.explained >= ENOUGH and not task.colourless and self._as_they_are(best.pose):
+            colours = self._by_colours(best.pose, pyramid[-2:], False)
+            better = colours.converged and angle(colours.best.R, best.pose.R) < NEAR
+        elif best.explained < ENOUGH and not task.clutter and self.further:
+            colours = self._by_colours(self.start, task.pyramid(self.start, self.max_size, self.spp), True)
+            better = colours.converged
+        else:
+            return
+        if better:
             self._adopt(colours)
-            if colours.explained >= colours.enough or not self.further:
-                return
+        else:
+            self._forget(slice(len(self.history) - len(colours.history), None))
+
+    def _photograph(self) -> _End:
+        """The best end by the terms of photographs."""
         begins = len(self.history)
         found = self._judge(*self._down(self.start, self.levels))
         if not self.history:
             raise ValueError(
-                f"{task.names.init}: expected a pose at which the picture changes when the object moves, got one at which "
+                f"{self.task.names.init}: expected a pose at which the picture changes when the object moves, got one at which "
                 "it does not; is the object out of view?"
             )
         stays = found.short and len(distinct([found.pose, self.start], 2, APART)) == 1
@@ -93,22 +125,7 @@ class PhotoSearch:
         if not self.colours_first:
             self._take(best)
         best = self._from_aside(best, begins) if self.further and best.explained < ENOUGH else best
-        if best.explained >= ENOUGH and best is not start:
-            best = self._surrounded(best)
-        if self.colours_first:
-            # Colours did not fit as they are. The terms of photographs decide if they are sure.
-            if best.explained < SURE:
-                self._forget(slice(begins, None))
-            else:
-                self._forget(slice(0, begins))
-                self._take(best)
-        elif task.clutter and best.explained >= ENOUGH and self._as_they_are(best.pose):
-            colours = self._by_colours(best.pose, task.pyramid(best.pose, self.max_size, self.spp)[-2:], False)
-            if colours.converged and angle(colours.best.R, best.pose.R) < NEAR:
-                self._adopt(colours)
-            else:
-                self._forget(slice(len(self.history) - len(colours.history), None))
-        self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
+        return self._surrounded(best) if best.explained >= ENOUGH and best is not start else best
 
     def first_end(self) -> float:
         """The share of the render's edges that the pictures show where the way down from the start alone ends."""
