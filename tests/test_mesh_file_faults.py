@@ -48,7 +48,7 @@ from edgegrad.files.load import load_mesh, load_scene
         ),
         ("a.stl", "<!DOCTYPE html><html>404</html>", "a page of the web"),
         ("a.ply", "\n <HTML>404</HTML>", "a page of the web"),
-        ("a.off", gzip.compress(OFF.encode()), "data compressed by gzip; unpack"),
+        ("a.off", gzip.compress(OFF.encode(), mtime=0), "data compressed by gzip; unpack"),
         ("a.gltf", b"PK\x03\x04" + bytes(30), "an archive of zip; unpack"),
         ("a.obj", GOOD.replace("v 0 1 0", "v 0 nan 0"), "finite positions.* at vertex 2"),
         ("a.obj", GOOD.replace("v 0 1 0", "v 0 1e99 0"), "finite positions.* at vertex 2"),
