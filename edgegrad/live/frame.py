@@ -14,6 +14,7 @@ from ..aovs import render_aovs
 from ..camera.camera import Camera
 from ..files.image import linear_to_srgb
 from ..fit import CameraFit, Fit, PoseFit, Progress
+from ..fit.pose.photo.shown import shown
 from ..fit.pose.result import Step
 from ..fit.pose.task import PoseTask
 from ..fit.views import Images, View, area_mean, cameras_of, views_of
@@ -96,7 +97,7 @@ def _frame_of_pose(task: PoseTask, step: Step) -> Frame:
     def render(index: int) -> Tensor:
         one = dataclasses.replace(task, shots=[task.shots[index]])
         factor = min(1.0, LARGEST / max(one.shots[0].camera.size))
-        return one.pictures(one.level(factor, blur=0.0, coarseness=1.0, spp=SPP, free=[]), step.pose)[0]
+        return shown(one, one.level(factor, blur=0.0, coarseness=1.0, spp=SPP, free=[]), step.pose)[0]
 
     cameras = [task.lens(shot.camera, step.pose) for shot in task.shots]
     return Frame(task.scene, step.pose.matrix, cameras, [shot.target for shot in task.shots], render)

@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ...files.paths import PathLike, replacing
 from ..plots import comparison, displayed, draw_gradients
+from .photo.shown import shown
 from .result import PoseFit, Step
 from .task import Level, PoseTask
 
@@ -33,7 +34,7 @@ def sheet(fit: PoseFit) -> Figure:
     """What draw_fit writes: a row for each picture."""
     task = _task(fit)
     level = _level(task, PANEL)
-    start, end = (task.pictures(level, step.pose) for step in (fit.history[0], _way(fit)[-1]))
+    start, end = (shown(task, level, step.pose) for step in (fit.history[0], _way(fit)[-1]))
     return comparison([(shot.target, a, b) for shot, a, b in zip(level.shots, start, end, strict=True)])
 
 
@@ -67,7 +68,7 @@ def curves_of(fit: PoseFit) -> Figure:
         labelled.add((h, w))
         above.plot([k + 1 for k in best], [history[k].loss for k in best], ".-", color=color, label=label)
     above.set_yscale("log")
-    above.set_ylabel("mean squared difference")
+    above.set_ylabel("loss" if fit.task is not None and fit.task.clutter else "mean squared difference")
     above.spines[["top", "right"]].set_visible(False)
     above.legend(frameon=False, fontsize=8, title="best so far", title_fontsize=8)
     draw_gradients(below, [step.gradient for step in history])
@@ -85,7 +86,7 @@ def draw_animation(path: PathLike, fit: PoseFit) -> None:
     font = ImageFont.load_default(max(9, round(0.05 * target.shape[0])))
     frames = []
     for step in _frames(_way(fit)):
-        image = displayed(task.pictures(level, step.pose)[0])
+        image = displayed(shown(task, level, step.pose)[0])
         panels = np.concatenate([target, image, np.clip(2.0 * np.abs(image - target), 0, 1)], 1)
         frame = Image.fromarray((panels * 255.0).round().astype(np.uint8))
         edge = round(0.03 * frame.height)

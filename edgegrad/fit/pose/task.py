@@ -293,16 +293,9 @@ class PoseTask:
         ]
 
     def pictures(self, level: Level, pose: Pose, seed: int = 0) -> list[Tensor]:
-        """The renders as pictures: over the background where that is known, else over the faded target; without an alpha that
-        was compared beside them only because of that."""
+        """The renders as pictures, over the background, which is known."""
         with torch.no_grad():
-            images = self.images(level, pose, level.spp, seed)
-        if not self.clutter:
-            return images
-        return [
-            image[..., :-1] + (1.0 - image[..., -1:]) * FADED * shot.target
-            for image, shot in zip(images, level.shots, strict=True)
-        ]
+            return self.images(level, pose, level.spp, seed)
 
 
 def _grey(mesh: Mesh, channels: int) -> Mesh:
