@@ -142,10 +142,6 @@ class PhotoLevel:
             return 0.0
         return explained(pairs) * min(1.0, shown / length / SHOWN) * min(1.0, extent / RESOLVED)
 
-    def light(self, pose: Pose, seed: int) -> list[Tensor | None]:
-        """The coefficients of the light (C, n) in each picture."""
-        return [None if seen.lit is None else seen.lit.coefficients for seen in self.see(pose, seed)]
-
 
 def _posterior(seen: Seen, colours: Tensor) -> Tensor:
     """(h, w), that a pixel shows the object: by the mask, or else by its colour."""

@@ -79,6 +79,14 @@ class Lit:
         slopes = slope(0.5 * (predicted + pictured))[inside]
         return Lit(surface, predicted, light, residual, w, middle, B, scale, slopes, ridge)
 
+    @property
+    def change(self) -> float:
+        """How much the light changes the mesh's colours, in parts of them: 0 where it leaves them as they are."""
+        inside = self.surface.inside
+        colour = self.surface.channels["image"].float()[inside]
+        irradiance = spherical(self.surface.normals[inside])[..., : self.coefficients.shape[1]] @ self.coefficients.T
+        return float((colour * (irradiance - 1.0)).abs().mean() / colour.abs().mean().clamp(min=1e-30))
+
     def term(self) -> Normal:
         """The equations of a step of the pose, of which those of the light are eliminated."""
         surface = self.surface

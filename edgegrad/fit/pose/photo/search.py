@@ -32,8 +32,7 @@ GAIN = 0.1  # a step that makes the pictures more likely by a smaller factor tha
 ASIDE = (0.2, 0.4)
 FOLLOWED = 3  # of them, the best on the coarsest level
 APART = 0.05  # radians between poses that are followed both
-# Light that leaves colours as they are: the most that a coefficient differs.
-AS_THEY_ARE = 0.06
+AS_THEY_ARE = 0.05  # mean change of colours, in parts of them, by light that leaves them as they are
 NEAR = 0.1  # radians: a polished pose that is farther off is another one
 
 
@@ -108,7 +107,7 @@ class PhotoSearch:
         if better:
             self._adopt(colours)
         else:
-            self._forget(slice(len(self.history) - len(colours.history), None))
+            self._forget(slice(len(self.history) - len(colours.history) + 1, None))
 
     def _photograph(self) -> _End:
         """The best end by the terms of photographs."""
@@ -231,10 +230,9 @@ class PhotoSearch:
         return most < AS_THEY_ARE
 
     def _change(self, pose: Pose) -> float:
-        """How far the light is from one that leaves colours as they are."""
-        lights = self.levels[-1].light(pose, self.seed)
-        white = torch.eye(1, lights[0].shape[1]) if lights and lights[0] is not None else None
-        return max(math.inf if one is None or white is None else float((one - white).abs().max()) for one in lights)
+        """How far colours in the light are from those of the mesh, in parts of these, of all pictures the farthest."""
+        seen = self.levels[-1].see(pose, self.seed)
+        return max(math.inf if one.lit is None else one.lit.change for one in seen)
 
     def _by_colours(self, start: Pose, levels: list[Level], further: bool) -> Search:
         """The search that compares colours as they are, from a start; its steps follow in the history."""
@@ -249,7 +247,7 @@ class PhotoSearch:
 
         search.after_step = after_step
         search.run()
-        self.history = [*before, *search.history]
+        self.history = [*before, *search.history[:-1]]  # the last is no step, but the final comparison
         return search
 
     def _adopt(self, search: Search) -> None:
