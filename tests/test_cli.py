@@ -46,7 +46,7 @@ def fit(files, *more):
 
 def test_fit_pose(files, capsys):
     out = files / "new" / "out"
-    assert fit(files, "--init", files / "init.json", "--steps", 12, "--out", out) == 0
+    assert fit(files, "--init", files / "init.json", "--steps", 20, "--out", out) == 0
     found = PoseFit.from_json((out / "pose.json").read_text())
     assert max(errors(found)) < 1.0 and found.converged
     said = capsys.readouterr()
@@ -357,7 +357,7 @@ def test_fit_pose_resumes(files, monkeypatch):
 
     def write_pose(folder, fit):
         write(folder, fit)
-        if fit.steps == 15:
+        if fit.steps == 9:
             raise KeyboardInterrupt
 
     said = ["--init", files / "init.json", "--steps", 4]
@@ -366,9 +366,9 @@ def test_fit_pose_resumes(files, monkeypatch):
     monkeypatch.setattr(outputs, "write_pose", write_pose)
     assert fit(files, *said, "--resume", "--out", files / "half") == cli.INTERRUPTED
     monkeypatch.undo()
-    assert found("half")["steps"] == 15
+    assert found("half")["steps"] == 9
     assert fit(files, *said, "--resume", "--out", files / "half") == 0
-    assert found("half") == found("whole") and found("whole")["steps"] > 20
+    assert found("half") == found("whole") and found("whole")["steps"] > 11
     for name in ("fit.png", "loss.png"):
         assert (files / "half" / name).read_bytes() == (files / "whole" / name).read_bytes()
 

@@ -46,9 +46,9 @@ def test_a_quarter_covered(how, steps):
 
 @pytest.mark.parametrize("looks", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
-    """Where noise does not explain the loss left, as with a board cut out of the mask, turned poses are looked at."""
+    """Where something covers the object, as a board does, turned poses are looked at."""
     view = camera(64)
-    image, free = covered(view, picture(view))
+    image, _ = covered(view, picture(view))
     down, aside = search.Search._down, []
 
     def ends_aside(self, pose, levels):
@@ -61,7 +61,7 @@ def test_a_wrong_place_nearby_is_left_for_a_better_one(looks, monkeypatch):
     monkeypatch.setattr(search, "ENOUGH", 0.0)  # all ends are taken for right
     if not looks:
         monkeypatch.setattr(search, "APART", math.inf)
-    fit = fit_pose(bracket(), image, view, silhouette(view) * free, START, steps=24, progress=False)
+    fit = fit_pose(bracket(), image, view, init=START, background=BACKGROUND, steps=24, progress=False)
     assert (errors(fit)[0] < 1.0) == looks and fit.converged
     assert torch.equal([step for step in fit.history if step.best][-1].pose.matrix, fit.matrix)
 
