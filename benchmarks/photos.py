@@ -183,7 +183,7 @@ def _around(run: Run, part: Part, case: Case, truth: Placed, turns: tuple[float,
         fit = run.fitted(part, case, start, truth, f"{part.name.replace(',', '').replace(' ', '-')}-{k:02d}")[1]
         ends.append(Placed(fit.R, fit.t))
     middle = ends[int(np.argmin([statistics.median(case.apart(end, other)[0] for other in ends) for end in ends]))]
-    part.spread = max(case.apart(end, middle)[0] for end in ends) if largest else None
+    part.spread = max(case.apart(end, middle)[0] for end in ends)
     return part
 
 
