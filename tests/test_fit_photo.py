@@ -1,4 +1,4 @@
-"""fit_pose in photographs: each term's normal equations against oracles, and poses found in light that nobody knows, before clutter."""
+"""fit_pose in photographs: the equations of each term against oracles, and poses in light that nobody knows, before clutter."""
 
 import io
 import math
