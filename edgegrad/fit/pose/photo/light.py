@@ -24,7 +24,7 @@ from .surface import Surface, slope
 
 BLUR = 1.0  # pixels, of both
 HARMONICS = 9
-RIDGE = 0.02  # of the constant's curvature: keeps what the picture does not show of the light near zero
+RIDGE = 0.005  # of the constant's curvature: keeps what the picture does not show of the light near zero
 FEWEST = 60  # pixels
 REWEIGHTED = 4  # times
 LEAST = 0.02  # standard deviation of a difference
