@@ -69,7 +69,13 @@ class Journal:
 
 def _packed(way: Way) -> dict[str, Any]:
     steps = [(step.size, step.loss, step.pose.numbers, step.best, dict(step.gradient)) for step in way.steps]
-    return {**way._asdict(), "pose": way.pose.numbers, "here": way.here.numbers, "steps": steps}
+    return {
+        **way._asdict(),
+        "pose": way.pose.numbers,
+        "here": way.here.numbers,
+        "steps": steps,
+        "search": dict(way.search),
+    }
 
 
 def _unpacked(packed: dict[str, Any]) -> Way:

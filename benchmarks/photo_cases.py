@@ -1,0 +1,187 @@
+"""Pictures as a camera takes them, made here: an object in the light of a sun and a sky before a photograph, with an exposure and
+a white balance, blurred, noisy and compressed. A fit knows the mesh and the camera alone."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image, ImageFilter
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad.camera.poses import rotation
+from edgegrad.files.image import linear_to_srgb, srgb_to_linear
+
+Kind = Literal["easy", "lit", "shadow", "covered", "plain"]
+SIZE = 256  # pixels
+COVERED = 0.25  # of the object's pixels
+BLUR, NOISE, QUALITY = 1.0, 0.02, 70  # pixels, sRGB values, of JPEG
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A pose, mesh to world."""
+
+    R: Tensor  # (3, 3)
+    t: Tensor  # (3,)
+
+    @property
+    def matrix(self) -> Tensor:
+        """(4, 4)."""
+        M = torch.eye(4, dtype=torch.float64)
+        M[:3, :3], M[:3, 3] = self.R, self.t
+        return M
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a fit is given, and where the object is."""
+
+    name: str
+    mesh: eg.Mesh
+    picture: Tensor  # (H, W, 3) linear
+    camera: eg.Camera
+    truth: Placed
+    depth: Tensor | None = None  # (H, W)
+
+    @property
+    def center(self) -> Tensor:
+        """(3,) of the bounding box, in the mesh's units."""
+        low, high = self.mesh.verts.double().aminmax(dim=0)
+        return (low + high) / 2
+
+    @property
+    def size(self) -> float:
+        """The diagonal of the bounding box."""
+        low, high = self.mesh.verts.double().aminmax(dim=0)
+        return float((high - low).norm())
+
+    def beside(self, pose: Placed, degrees: float, shift: float, rng: np.random.Generator) -> Placed:
+        """The pose turned by an angle and shifted by a length, both in random directions."""
+        R = turned(degrees, rng) @ pose.R.double()
+        center = pose.R.double() @ self.center + pose.t.double() + shift * direction(rng)
+        return Placed(R, center - R @ self.center)
+
+    def apart(self, a: Placed, b: Placed) -> tuple[float, float]:
+        """Degrees between two poses, and how far apart the object's centres are, in the mesh's units."""
+        M = a.R.double() @ b.R.double().T
+        sine = 0.5 * torch.stack([M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]]).norm()
+        ways = [pose.R.double() @ self.center + pose.t.double() for pose in (a, b)]
+        return math.degrees(math.atan2(float(sine), 0.5 * (float(M.trace()) - 1.0))), float((ways[0] - ways[1]).norm())
+
+
+def direction(rng: np.random.Generator) -> Tensor:
+    """(3,) of length 1, in any direction alike."""
+    return F.normalize(torch.from_numpy(rng.normal(size=3)), dim=0)
+
+
+def turned(degrees: float, rng: np.random.Generator) -> Tensor:
+    """(3, 3), about a random axis."""
+    return rotation(math.radians(degrees) * direction(rng))
+
+
+def rendered(name: str, mesh: eg.Mesh, photographs: Sequence[Tensor], kind: Kind, seed: int) -> Case:
+    """A case of a kind.
+
+    easy     one pose, light and photograph of a mesh for all seeds; colours as they are lit, hardly worn (QUALITY 85)
+    lit      any pose, sun, sky, exposure ± 1 stop, white balance ± 20 %, worn
+    shadow   as lit, and a bar that is out of view casts its shadow across the object
+    covered  as lit, and a straight border covers a quarter of the object
+    plain    as lit, but the fit has no colours
+    """
+    easy = kind == "easy"
+    rng = np.random.default_rng(0 if easy else seed)
+    mesh = _centred(mesh)
+    camera = eg.Camera.look_at((0, 0.4, -3.4), (0, 0, 0), (0, 1, 0), fov_y=40.0, size=(SIZE, SIZE))
+    truth = Placed(turned(30.0 if easy else rng.uniform(0.0, 180.0), rng), 0.05 * torch.from_numpy(rng.normal(size=3)))
+    behind = _view(photographs[0 if easy else seed % len(photographs)], rng)
+    image = _lit(mesh.transformed(truth.R, truth.t), camera, behind, kind == "shadow", rng)
+    if not easy:
+        image = image * torch.from_numpy(2.0 ** rng.uniform(-1.0, 1.0) * rng.uniform(0.8, 1.2, 3)).float()
+    if kind == "covered":
+        alpha = eg.render_aovs(mesh.transformed(truth.R, truth.t), camera, ["alpha"], 16)["alpha"]
+        image = _covered(image, alpha, _view(photographs[(seed + 1) % len(photographs)], rng), rng)
+    picture = _worn(image, 0.7, 0.0, 85, rng) if easy else _worn(image, BLUR, NOISE, QUALITY, rng)
+    seen = eg.Mesh(mesh.verts, mesh.faces) if kind == "plain" else mesh
+    return Case(name, seen, picture, camera, truth)
+
+
+def clutter(seed: int, size: int = SIZE) -> Tensor:
+    """(size, size, 3) linear: boards of many sizes and colours that lie on one another, each with a pattern of its own. For
+    where no photograph is at hand."""
+    rng = np.random.default_rng(seed)
+    x = (np.arange(size) + 0.5) / size
+    image = np.ones((size, size, 3)) * rng.uniform(0.2, 0.7, 3)
+    for k in range(60):
+        middle, angle = rng.uniform(0.0, 1.0, 2), rng.uniform(0.0, math.pi)
+        half = rng.uniform(0.03, 0.45, 2) * (1.0 - k / 90)
+        u = (x[None] - middle[0]) * math.cos(angle) + (x[:, None] - middle[1]) * math.sin(angle)
+        v = -(x[None] - middle[0]) * math.sin(angle) + (x[:, None] - middle[1]) * math.cos(angle)
+        waves = np.sin(2.0 * math.pi * rng.uniform(2.0, 25.0) * u + 3.0 * np.sin(rng.uniform(0.0, 15.0) * v))
+        colour = rng.uniform(0.05, 0.9, 3) * (1.0 + rng.uniform(0.0, 0.35) * waves[..., None])
+        inside = (abs(u) < half[0]) & (abs(v) < half[1])
+        image = np.where(inside[..., None], colour * (1.0 + 0.5 * rng.uniform(-1.0, 1.0) * u[..., None]), image)
+    return srgb_to_linear(torch.from_numpy(image).float().clamp(0.0, 1.0))
+
+
+def _centred(mesh: eg.Mesh) -> eg.Mesh:
+    """About the origin, of a diagonal that the camera sees well."""
+    low, high = mesh.verts.aminmax(dim=0)
+    return mesh.replace(verts=(mesh.verts - (low + high) / 2) / (high - low).norm() * 1.8, material=None)
+
+
+def _view(photograph: Tensor, rng: np.random.Generator) -> Tensor:
+    """(SIZE, SIZE, 3): a square of a photograph, as large as it fits."""
+    H, W = photograph.shape[:2]
+    side = min(H, W)
+    top, left = rng.integers(0, H - side + 1), rng.integers(0, W - side + 1)
+    square = photograph[top : top + side, left : left + side].movedim(-1, 0)[None]
+    return F.interpolate(square, size=(SIZE, SIZE), mode="area")[0].movedim(0, -1).contiguous()
+
+
+def _lit(mesh: eg.Mesh, camera: eg.Camera, behind: Tensor, shadow: bool, rng: np.random.Generator) -> Tensor:
+    """(SIZE, SIZE, 3), matte, with the shadows that it casts on itself."""
+    way = torch.from_numpy(rng.normal(size=3)).float()
+    way[1], way[2] = -way[1].abs() - 0.3, 0.7 * way[2].abs()  # from above, and from the camera's side
+    way = F.normalize(way, dim=0)
+    lights = [
+        eg.DirectionalLight(way, float(rng.uniform(1.5, 3.5))),
+        eg.Environment(torch.from_numpy(rng.uniform(0.3, 0.6, 3)).float(), visible=False),
+    ]
+    matte = mesh.replace(material=eg.Material(), normals=eg.vertex_normals(mesh.verts, mesh.faces))
+    meshes = [matte]
+    if shadow:
+        across = F.normalize(torch.linalg.cross(way, torch.from_numpy(rng.normal(size=3)).float()), dim=0)
+        along = torch.linalg.cross(way, across)
+        place = -12.0 * way + float(rng.uniform(-0.3, 0.3)) * across
+        ends = [place + a * across + b * along for a, b in ((-0.15, -3.0), (0.15, -3.0), (0.15, 3.0), (-0.15, 3.0))]
+        bar = eg.Mesh(torch.stack(ends), torch.tensor([[0, 1, 2], [0, 2, 3]]))
+        channels = mesh.channels or 3
+        meshes.append(bar.replace(face_colors=torch.zeros(2, channels), material=eg.Material()))
+    with torch.no_grad():
+        return eg.render(eg.Scene(meshes, background=behind, lights=lights), camera, spp=64, light_samples=2)
+
+
+def _covered(image: Tensor, alpha: Tensor, cover: Tensor, rng: np.random.Generator) -> Tensor:
+    rows, columns = torch.nonzero(alpha[..., 0] > 0.5, as_tuple=True)
+    angle = rng.uniform(0.0, 2.0 * math.pi)
+    place = torch.arange(SIZE) * math.cos(angle) + torch.arange(SIZE)[:, None] * math.sin(angle)
+    border = place[rows, columns].quantile(COVERED)
+    return torch.where((place < border)[..., None], cover.flip(1), image)
+
+
+def _worn(image: Tensor, blur: float, noise: float, quality: int, rng: np.random.Generator) -> Tensor:
+    """Through a lens, a sensor and a file."""
+    pixels = (255.0 * linear_to_srgb(image.clamp(0.0, 1.0))).round().byte().numpy()
+    seen = np.asarray(Image.fromarray(pixels).filter(ImageFilter.GaussianBlur(blur)), np.float32) / 255.0
+    seen = seen + noise * rng.normal(size=seen.shape)
+    file = io.BytesIO()
+    Image.fromarray((255.0 * seen.clip(0.0, 1.0)).round().astype(np.uint8)).save(file, "JPEG", quality=quality)
+    return srgb_to_linear(torch.from_numpy(np.asarray(Image.open(file), np.float32) / 255.0))

@@ -1,0 +1,276 @@
+"""fit_pose in photographs: how often it finds the pose, how exactly, and whether it knows.
+
+    python benchmarks/photos.py [FOLDER] [--parts lit squirrel …] [--starts 20] [--pictures out/photos] [--json out/photos.json]
+
+Without FOLDER, in pictures made here (photo_cases.py): of the stone of the examples, or of --meshes, before --backgrounds, the
+photographs of FOLDER, or a clutter of boards. With it, in real photographs, whose cameras are OpenCV's (x right, y down, z
+forward, pixels, X_cam = R X + t):
+
+    squirrel/frame.png, squirrel_demo_low.obj (mm, without colours), camera_and_init.json: K, cam_R_model_init,
+        cam_t_model_init_mm, mesh_centre_to_subtract_mm
+    gelatin_box/000001-color.png, 000001-depth.png (16 bits, 0.1 mm), 009_gelatin_box_textured.gltf (m),
+        009_gelatin_box_tex1024.png, reference.json: {"009_gelatin_box": K, cam_R_mesh, cam_t_mesh_m}
+    cracker_box/image_rgb.png, 003_cracker_box_textured.gltf (m), 003_cracker_box_tex1024.png, reference.json: K, a start
+        cam_R_bop, cam_t_bop_m, and gltf_to_bop_R, gltf_to_bop_t_m
+    bottle/_sequence/color_camera_image_200.png, …_201.png, depth_camera_image_200.png, …_201.png, depth_camera.yaml (of M3T),
+        bottle/_body/schauma.obj (m), reference.json: K, {"schauma": cam_R_body, cam_t_body_m, geometry_offset_z_m}
+
+Errors are the angle, and how far the object's centre is off, as a part of the object's size, the diagonal of its bounding box, or
+in its mesh's units. `falsely` counts fits that say `converged` and are more than three times the limits off.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import photo_folder
+import torch
+import torch.nn.functional as F
+from photo_cases import Case, Kind, Placed, clutter, rendered
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad.fit import PoseFit, fit_pose
+
+sys.path.append(str(Path(__file__).parents[1] / "examples"))
+
+FAR_OFF = 3.0  # limits: beyond, a fit must not say that it has converged
+RIM = 0.3  # share of a pixel by which a neighbour's alpha is higher on a contour
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a fit must reach, and how many fits."""
+
+    degrees: float
+    shift: float  # of the object's size
+    share: float = 0.0  # of the fits; 0 where that is not asked
+    apart: float = 0.0  # degrees to the fits' own middle; 0 where that is not asked
+
+
+@dataclass
+class Trial:
+    """One fit."""
+
+    case: str
+    start_degrees: float
+    start_shift: float  # of the object's size, as `shift`
+    degrees: float
+    shift: float
+    length: float  # of the shift, in the mesh's units
+    explained: float
+    converged: bool
+    steps: int
+    seconds: float
+    right: bool
+    falsely: bool
+
+    def line(self) -> str:
+        verdict = "falsely converged" if self.falsely else "" if self.right else "missed"
+        return (
+            f"  {self.case:14s} {self.start_degrees:5.1f}° {self.start_shift:5.1%} → {self.degrees:6.2f}° {self.shift:6.2%} "
+            f"({self.length:.3g})  explained {self.explained:.2f}  {'converged' if self.converged else '-':9s} "
+            f"{self.steps:3d} steps {self.seconds:5.1f} s  {verdict}"
+        )
+
+
+@dataclass
+class Part:
+    """Fits of one kind, and what they must reach."""
+
+    name: str
+    limits: Limits
+    trials: list[Trial] = field(default_factory=list)
+    spread: float | None = None  # degrees: the largest angle to the middle one of the ends
+
+    def cells(self) -> tuple[str, ...]:
+        count = len(self.trials)
+        right = sum(trial.right for trial in self.trials)
+        known = sum(trial.converged and trial.right for trial in self.trials)
+        falsely = sum(trial.falsely for trial in self.trials)
+        must = (
+            f"{self.limits.share:.0%} in {self.limits.degrees:g}°, {self.limits.shift:.2g}" if self.limits.share else ""
+        )
+        met = "" if not self.limits.share else "met" if right >= self.limits.share * count and not falsely else "missed"
+        if self.limits.apart and self.spread is not None:
+            must += f", {self.limits.apart:g}° apart"
+            met = met if self.spread <= self.limits.apart else "missed"
+        middle = [statistics.median(getattr(trial, name) for trial in self.trials) for name in ("degrees", "shift")]
+        return (
+            self.name, f"{right} of {count}", f"{known}", f"{falsely}", f"{middle[0]:.2f}°", f"{middle[1]:.2%}",
+            "" if self.spread is None else f"{self.spread:.2f}°",
+            f"{statistics.fmean(t.steps for t in self.trials):.0f}",
+            f"{statistics.fmean(t.seconds for t in self.trials):.1f}", must, met,
+        )  # fmt: skip
+
+
+TABLE = ("part", "right", "of them converged", "falsely", "angle", "shift", "apart", "steps", "seconds", "must", "")
+WIDTHS = (22, 10, 17, 7, 7, 7, 7, 5, 7, 34, 6)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What all parts are given."""
+
+    starts: int
+    pictures: Path | None
+    meshes: Sequence[eg.Mesh]
+    backgrounds: Sequence[Tensor]
+
+    def fitted(
+        self, part: Part, case: Case, start: Placed, truth: Placed, label: str, search: bool = True
+    ) -> tuple[Trial, PoseFit]:
+        fit = fit_pose(
+            case.mesh, case.picture, case.camera, init=start.matrix, depth=case.depth, search=search, progress=False
+        )
+        found, limits = Placed(fit.R, fit.t), part.limits
+        before, after = case.apart(start, truth), case.apart(found, truth)
+        off = max(after[0] / limits.degrees, after[1] / case.size / limits.shift)
+        trial = Trial(
+            case.name, before[0], before[1] / case.size, after[0], after[1] / case.size, after[1], fit.explained,
+            fit.converged, fit.steps, fit.seconds, off <= 1.0, fit.converged and off > FAR_OFF,
+        )  # fmt: skip
+        part.trials.append(trial)
+        print(trial.line(), flush=True)
+        if self.pictures is not None:
+            self.pictures.mkdir(parents=True, exist_ok=True)
+            eg.write_image(self.pictures / f"{label}.png", outlined(case, start, found))
+        return trial, fit
+
+
+def outlined(case: Case, start: Placed, found: Placed) -> Tensor:
+    """(H, W, 3): the photograph with the contour of the start in blue and that of the fit in yellow."""
+    image = case.picture
+    for pose, colour in ((start, (0.1, 0.3, 1.0)), (found, (1.0, 0.9, 0.0))):
+        alpha = eg.render_aovs(case.mesh.transformed(pose.R, pose.t), case.camera, ["alpha"], 16)["alpha"]
+        highest = F.max_pool2d(alpha.movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
+        image = torch.where(highest - alpha > RIM, torch.tensor(colour), image)
+    return image
+
+
+def _scenes(kind: Kind, degrees: float, shift: float, limits: Limits) -> Callable[[Run, str], Part]:
+    """Starts at random, up to `degrees` and a `shift` of the object's size in one easy picture, and that far in others."""
+
+    def run(run: Run, name: str) -> Part:
+        part = Part(name, limits)
+        for k in range(run.starts):
+            number = k % len(run.meshes)
+            case = rendered(
+                f"{kind} {number}", run.meshes[number], run.backgrounds, kind, 0 if kind == "easy" else 100 + k
+            )
+            rng = np.random.default_rng([k, round(degrees)])
+            share = (rng.uniform(1 / 3, 1.0), rng.uniform()) if kind == "easy" else (1.0, 1.0)
+            start = case.beside(case.truth, degrees * share[0], shift * case.size * share[1], rng)
+            run.fitted(part, case, start, case.truth, f"{name}-{k:02d}")
+        return part
+
+    return run
+
+
+def _around(run: Run, part: Part, case: Case, truth: Placed, turns: tuple[float, float], shift: float) -> Part:
+    """Starts at random around a pose: by angles of a range, and by up to a shift, in the mesh's units."""
+    ends = []
+    for k in range(run.starts):
+        rng = np.random.default_rng([7, k])
+        start = case.beside(truth, rng.uniform(*turns), rng.uniform(0.0, shift), rng)
+        fit = run.fitted(part, case, start, truth, f"{part.name.replace(',', '').replace(' ', '-')}-{k:02d}")[1]
+        ends.append(Placed(fit.R, fit.t))
+    middle = ends[int(np.argmin([statistics.median(case.apart(end, other)[0] for other in ends) for end in ends]))]
+    part.spread = max(case.apart(end, middle)[0] for end in ends)
+    return part
+
+
+def _squirrel(run: Run, folder: Path) -> Iterator[Part]:
+    case = photo_folder.squirrel(folder)
+    first = Part("squirrel, given start", Limits(90.0, 1.0))
+    fit = run.fitted(first, case, case.truth, case.truth, "squirrel")[1]
+    yield first
+    answer = Placed(fit.R, fit.t)
+    yield _around(run, Part("squirrel, back", Limits(0.3, 0.5 / case.size, 1.0)), case, answer, (3.0, 15.0), 20.0)
+
+
+def _gelatin_box(run: Run, folder: Path) -> Iterator[Part]:
+    for with_depth in (False, True):
+        case = photo_folder.gelatin_box(folder, with_depth)
+        part = Part("gelatin box" + " with depth" * with_depth, Limits(1.5, 0.03, 0.95, 0.5))
+        yield _around(run, part, case, case.truth, (5.0, 12.0), 0.05 * case.size)
+
+
+def _cracker_box(run: Run, folder: Path) -> Iterator[Part]:
+    case = photo_folder.cracker_box(folder)
+    part = Part("cracker box, start", Limits(90.0, 1.0))
+    run.fitted(part, case, case.truth, case.truth, "cracker-box")
+    yield part
+
+
+def _bottle(run: Run, folder: Path) -> Iterator[Part]:
+    for with_depth in (False, True):
+        case = photo_folder.bottle(folder, 200, with_depth)
+        limits = Limits(1.0, 0.003 / case.size, 1.0) if with_depth else Limits(2.0, 0.01, 1.0)
+        for frame in (200, 201):
+            case = photo_folder.bottle(folder, frame, with_depth)
+            part = Part(f"bottle {frame}" + " with depth" * with_depth, limits)
+            yield _around(run, part, case, case.truth, (5.0, 12.0), 0.05 * case.size)
+
+
+MADE: dict[str, Callable[[Run, str], Part]] = {
+    "easy": _scenes("easy", 15.0, 0.05, Limits(0.5, 0.003, 0.97)),
+    "far": _scenes("easy", 30.0, 0.10, Limits(0.5, 0.003, 0.90)),
+    "lit": _scenes("lit", 15.0, 0.05, Limits(1.0, 0.01, 0.90)),
+    "shadow": _scenes("shadow", 15.0, 0.05, Limits(1.5, 0.03)),
+    "covered": _scenes("covered", 15.0, 0.05, Limits(1.5, 0.03, 0.80)),
+    "plain": _scenes("plain", 15.0, 0.05, Limits(2.0, 0.03, 0.80)),
+}
+REAL: dict[str, Callable[[Run, Path], Iterator[Part]]] = {
+    "squirrel": _squirrel, "gelatin_box": _gelatin_box, "cracker_box": _cracker_box, "bottle": _bottle,
+}  # fmt: skip
+
+
+def _meshes(paths: Sequence[str]) -> list[eg.Mesh]:
+    if paths:
+        return [eg.load_mesh(path) for path in paths]
+    from objects import pebble
+
+    return [pebble()]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="real photographs")
+    parser.add_argument("--parts", nargs="+", choices=[*MADE, *REAL], metavar="PART", help=", ".join([*MADE, *REAL]))
+    parser.add_argument("--starts", type=int, default=20, metavar="N", help="of each part")
+    parser.add_argument("--meshes", nargs="+", default=[], metavar="FILE", help="textured, for pictures made here")
+    parser.add_argument("--backgrounds", nargs="+", default=[], metavar="FILE", help="photographs behind them")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="contours over the photographs")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="every fit")
+    given = parser.parse_args()
+    parts = given.parts or list(REAL if given.folder else MADE)
+    if given.folder is None and (needed := [part for part in parts if part in REAL]):
+        parser.error(f"--parts {needed[0]} needs FOLDER")
+    backgrounds = [eg.read_image(path, channels=3) for path in given.backgrounds]
+    if not backgrounds and given.folder is not None:
+        backgrounds = photo_folder.photographs(given.folder)
+    backgrounds = backgrounds or [clutter(seed) for seed in range(4)]
+    run = Run(given.starts, given.pictures, _meshes(given.meshes), backgrounds)
+    done: list[Part] = []
+    for name in parts:
+        print(name, flush=True)
+        found = [MADE[name](run, name)] if name in MADE else REAL[name](run, given.folder)
+        for part in found:
+            done.append(part)
+            if given.json is not None:
+                given.json.parent.mkdir(parents=True, exist_ok=True)
+                given.json.write_text(json.dumps([asdict(one) for one in done], indent=1) + "\n", encoding="utf-8")
+    for cells in (TABLE, *(part.cells() for part in done)):
+        print("  ".join(f"{cell:{width}s}" for cell, width in zip(cells, WIDTHS, strict=True)).rstrip())
+
+
+if __name__ == "__main__":
+    main()
