@@ -91,13 +91,13 @@ class PhotoLevel:
             found.append(Seen(picture, alpha, tangents, near * picture.weight, extent, surface, lit))
         return found
 
-    def equations(self, pose: Pose, seed: int) -> tuple[Normal, float]:
+    def equations(self, pose: Pose, seed: int, views: list[Seen] | None = None) -> tuple[Normal, float]:
         """Of all terms and pictures, and the mean loss of the region term. Each term is a likelihood in units of its own noise,
-        so they are added as they are."""
+        so they are added as they are. `views`: what see() gave for the pose, where it was asked before."""
         D = len(self.plain.free)
         curvature, gradient = torch.zeros(D, D, dtype=torch.float64), torch.zeros(D, dtype=torch.float64)
         losses = []
-        for seen, colours in zip(self.see(pose, seed), self.palettes, strict=True):
+        for seen, colours in zip(self.see(pose, seed) if views is None else views, self.palettes, strict=True):
             if seen.extent == 0.0:
                 continue
             region, loss = region_term(_posterior(seen, colours), seen.alpha, seen.tangents, seen.near, self.blur)
@@ -115,11 +115,11 @@ class PhotoLevel:
                     curvature, gradient = curvature + term.curvature, gradient + term.gradient
         return Normal(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
 
-    def explained(self, pose: Pose, seed: int) -> float:
+    def explained(self, pose: Pose, seed: int, views: list[Seen] | None = None) -> float:
         """The share, 0 … 1, of the edges that the render should have in the pictures, of contours and of what is inside, that
-        they have."""
+        they have. `views`: as of equations()."""
         pairs, shown, length = [], 0.0, 0.0
-        for seen in self.see(pose, seed):
+        for seen in self.see(pose, seed) if views is None else views:
             picture, contour = seen.picture, smoothed(seen.alpha[None], CONTOUR_BLUR)[0]
             sides = Sides.of(picture, contour, seen.near)
             on = ((contour > PURE) & (contour < 1.0 - PURE)).float() * picture.weight
@@ -153,9 +153,10 @@ def _posterior(seen: Seen, colours: Tensor) -> Tensor:
 
 
 def photo_levels(
-    task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, seed: int
-) -> list[PhotoLevel]:
-    """From coarse to fine, of what surrounds the object at the start."""
+    task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, seed: int,
+    palettes: list[Tensor] | None = None,
+) -> list[PhotoLevel]:  # fmt: skip
+    """From coarse to fine, of what surrounds the object at the start. `palettes`: of the pictures, where they are known."""
     crops = [_crop(task, shot, start) for shot in task.shots]
     shots, cut, across = [], [], []
     for shot, depth, (top, left, h, w, extent) in zip(task.shots, depths, crops, strict=True):
@@ -185,7 +186,8 @@ def photo_levels(
         free = [entry for entry in task.free if entry < ZOOM] if k == 0 else task.free
         plain = Level(smaller, 0.0, float(2**n), spp, free)
         few = min(harmonics, FEW_HARMONICS) if k == 0 else harmonics
-        palettes = levels[0].palettes if levels else [palette(picture.outlined, seed) for picture in pictures]
+        if palettes is None:
+            palettes = [palette(picture.outlined, seed) for picture in pictures]
         levels.append(PhotoLevel(task, plain, pictures, palettes, blur, few, k == len(halved) - 1))
     return levels
 
