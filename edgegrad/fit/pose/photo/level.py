@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -97,10 +98,10 @@ class PhotoLevel:
         D = len(self.plain.free)
         curvature, gradient = torch.zeros(D, D, dtype=torch.float64), torch.zeros(D, dtype=torch.float64)
         losses = []
-        for seen, colours in zip(self.see(pose, seed) if views is None else views, self.palettes, strict=True):
+        for k, seen in enumerate(self.see(pose, seed) if views is None else views):
             if seen.extent == 0.0:
                 continue
-            region, loss = region_term(_posterior(seen, colours), seen.alpha, seen.tangents, seen.near, self.blur)
+            region, loss = region_term(self._posterior(k, seen), seen.alpha, seen.tangents, seen.near, self.blur)
             losses.append(loss)
             terms: list[Normal | None] = [region]
             if seen.lit is not None:
@@ -139,17 +140,22 @@ class PhotoLevel:
             return 0.0
         return explained(pairs) * min(1.0, shown / length / SHOWN)
 
+    @cached_property
+    def _labels(self) -> list[Tensor]:
+        """Of the pixels of each picture; they are the same at each step."""
+        return [picture.labels(colours) for picture, colours in zip(self.pictures, self.palettes, strict=True)]
+
+    def _posterior(self, k: int, seen: Seen) -> Tensor:
+        """(h, w), that a pixel of picture k shows the object: by the mask, or else by its colour."""
+        mask = seen.picture.mask
+        if mask is not None:
+            return mask.clamp(MASKED, 1.0 - MASKED)
+        windows = Windows(seen.picture, self._labels[k], self.palettes[k], RADIUS * seen.extent)
+        return posterior(windows, seen.alpha, seen.near)
+
     def light(self, pose: Pose, seed: int) -> list[Tensor | None]:
         """The coefficients of the light (C, n) in each picture."""
         return [None if seen.lit is None else seen.lit.coefficients for seen in self.see(pose, seed)]
-
-
-def _posterior(seen: Seen, colours: Tensor) -> Tensor:
-    """(h, w), that a pixel shows the object: by the mask, or else by its colour."""
-    mask = seen.picture.mask
-    if mask is not None:
-        return mask.clamp(MASKED, 1.0 - MASKED)
-    return posterior(Windows(seen.picture, colours, RADIUS * seen.extent), seen.alpha, seen.near)
 
 
 def photo_levels(

@@ -48,6 +48,10 @@ class Picture:
         """(h, w)."""
         return self.camera.size
 
+    def labels(self, colours: Tensor) -> Tensor:
+        """(h · w,): which of the colours (n, C) is nearest to that of each pixel."""
+        return torch.cdist(self.display.flatten(0, 1), colours).argmin(1)
+
     @property
     def outlined(self) -> Tensor:
         """(h, w, c), what shows the outline of the object: the mask, or else the colours."""
@@ -77,13 +81,13 @@ class Windows:
     WIDTH = 1.5  # standard deviation of a window, in cells
     LEAST = 1e-3  # pixels of all colours that every window has
 
-    def __init__(self, picture: Picture, colours: Tensor, radius: float) -> None:
+    def __init__(self, picture: Picture, label: Tensor, colours: Tensor, radius: float) -> None:
+        """`label` (h · w,): what Picture.labels() gives for the colours (n, C)."""
         h, w = picture.size
         cell = max(1.0, radius / CELLS)
         self.shape = math.ceil(h / cell), math.ceil(w / cell)
         rows, columns = (torch.arange(h) / cell).long(), (torch.arange(w) / cell).long()
         self.size = h, w
-        label = torch.cdist(picture.display.flatten(0, 1), colours).argmin(1)
         self.count = len(colours)
         self._index = label * (self.shape[0] * self.shape[1]) + (rows[:, None] * self.shape[1] + columns).flatten()
         alike = torch.exp(-0.5 * (torch.cdist(colours, colours) / self.ALIKE).square())
