@@ -12,13 +12,11 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from os import PathLike as OsPath
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...camera.poses import rotation
 from ...check import check_int, check_positive_int
 from ...files.image import read_image
 from ...files.paths import PathLike
@@ -31,7 +29,7 @@ from .photo.picture import Picture, palette
 from .photo.search import DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST, PhotoSearch
 from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit
-from .task import Lens, Names, PoseTask, Shot
+from .task import Lens, Names, PoseTask
 
 Frame = Tensor | PathLike
 STEPS, LAST_STEPS = 3, 2  # on the last level but one and on the last, where the prediction is good
@@ -41,7 +39,7 @@ POOR = 0.45  # of the render's edges: a picture that shows fewer hardly shows th
 PATIENCE = 4  # such pictures one after the other, and the object is lost
 AGAIN = 5  # pictures from one search for a lost object to the next
 SEARCH_STEPS = 12  # on each level of it
-SLOWER = 0.8  # of the velocity that is kept from a picture that hardly shows the object
+FARTHEST = 0.25  # radians and object sizes that steps lead from where they begin
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,36 +165,46 @@ class Tracker:
 
     def _found(self, task: PoseTask, depth: Tensor | None, predicted: Pose) -> tuple[Pose, float]:
         """The pose, and the share of the edges there."""
-        levels = self._levels(task, depth, predicted)
         best, share = predicted, 0.0
         if not self.first and self.poor == 0:
-            pose = self._stepped(levels[-2], predicted, STEPS)
-            best, share = self._judged(levels[-1], *self._last(levels[-1], pose, LAST_STEPS))
+            levels = self._levels(task, depth, predicted)
+            pose, _ = self._stepped(levels[-2], predicted, STEPS)
+            best, share = self._believed(*self._stepped(levels[-1], pose, LAST_STEPS), predicted)
         if share < ENOUGH:
             for start in [predicted] if self.first else [predicted, self.good]:
                 levels = self._levels(task, depth, start)
-                pose = start
-                for level in levels[:-1]:
-                    pose = self._stepped(level, pose, MORE_STEPS)
-                pose, again = self._judged(levels[-1], *self._last(levels[-1], pose, MORE_STEPS))
+                pose, again = start, 0.0
+                for level in levels:
+                    pose, again = self._stepped(level, pose, MORE_STEPS)
+                pose, again = self._believed(pose, again, start)
                 if again > share:
                     best, share = pose, again
                 if share >= ENOUGH:
                     break
         return best, share
 
-    def _last(self, level: PhotoLevel, pose: Pose, most: int) -> tuple[Pose, list[Seen]]:
-        """Steps on the last level, and what is seen from the end."""
-        pose = self._stepped(level, pose, most)
-        return pose, level.see(pose, self.seed)
+    def _believed(self, pose: Pose, share: float, start: Pose) -> tuple[Pose, float]:
+        """Steps that lead far from where they began follow something else than the object, whatever they explain there."""
+        assert self.task is not None
+        near = angle(start.R, pose.R) < FARTHEST and self._way(start, pose) < FARTHEST * self.task.size
+        return (pose, share) if near or self.first else (start, 0.0)
 
-    def _judged(self, level: PhotoLevel, pose: Pose, views: list[Seen]) -> tuple[Pose, float]:
-        return pose, level.explained(pose, self.seed, views)
+    def _way(self, a: Pose, b: Pose) -> float:
+        """Between the object's centres."""
+        return float((self._center(a) - self._center(b)).norm())
 
-    def _stepped(self, level: PhotoLevel, pose: Pose, most: int) -> Pose:
-        """After so many Gauss-Newton steps at most, or a short one."""
+    def _center(self, pose: Pose) -> Tensor:
+        assert self.task is not None
+        return pose.scale * (pose.R @ self.task.center) + pose.t
+
+    def _stepped(self, level: PhotoLevel, pose: Pose, most: int) -> tuple[Pose, float]:
+        """After so many Gauss-Newton steps at most, or a short one; on the last level also the share of the edges, as it was
+        before the last step, which is short where the way ends well."""
+        views: list[Seen] = []
+        at = pose
         for _ in range(most):
-            normal, _loss = level.equations(pose, self.seed)
+            at, views = pose, level.see(pose, self.seed)
+            normal, _loss = level.equations(pose, self.seed, views)
             if not float(normal.curvature.trace()) > 0.0:
                 break
             diagonal = normal.curvature.diagonal()
@@ -207,7 +215,7 @@ class Tracker:
             pose = level.task.moved(pose, level.plain.free, move)
             if float(move.abs().max()) < SHORT * level.plain.coarseness:
                 break
-        return pose
+        return pose, level.explained(at, self.seed, views) if level.last else math.nan
 
     def _levels(self, task: PoseTask, depth: Tensor | None, pose: Pose) -> list[PhotoLevel]:
         return photo_levels(task, pose, [depth], self.max_size, self.spp, self.seed, self.palettes)
@@ -219,26 +227,22 @@ class Tracker:
         return search.best, search.explained
 
     def _predicted(self) -> Pose:
-        """By the motion between the two pictures before."""
+        """By constant velocity."""
         assert self.task is not None
-        center = self.task.center
         R = self.turn @ self.pose.R
-        where = self.pose.scale * (self.pose.R @ center) + self.pose.t + self.shift
-        return self.pose._replace(R=R, t=where - self.pose.scale * (R @ center))
+        where = self._center(self.pose) + self.shift
+        return self.pose._replace(R=R, t=where - self.pose.scale * (R @ self.task.center))
 
     def _move(self, pose: Pose, share: float, lost: bool) -> None:
         """Takes in where the object is now."""
-        assert self.task is not None
-        center = self.task.center
-        if lost:
-            self.pose = self.good
+        if lost or share < POOR:  # where it went is not known
             self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-            return
-        if not self.first:
-            self.turn = pose.R @ self.pose.R.T
-            self.shift = pose.scale * (pose.R @ center) + pose.t - self.pose.scale * (self.pose.R @ center) - self.pose.t
-        self.pose, self.first = pose, False
-        if share >= ENOUGH:
+        elif not self.first:
+            far = angle(self.pose.R, pose.R) > FARTHEST  # found again
+            self.turn = torch.eye(3, dtype=torch.float64) if far else pose.R @ self.pose.R.T
+            self.shift = torch.zeros(3, dtype=torch.float64) if far else self._center(pose) - self._center(self.pose)
+        self.pose, self.first = self.good if lost else pose, False
+        if share >= ENOUGH and not lost:
             self.good = pose
 
     def _task(self, name: str, picture: Tensor) -> PoseTask:
