@@ -11,8 +11,9 @@ from .pose.fit_camera import CameraFit, fit_camera
 from .pose.fit_pose import fit_pose
 from .pose.pose import Pose
 from .pose.result import PoseFit, Step
+from .pose.track import TrackedPose, track
 
 __all__ = [
-    "CameraFit", "Fit", "Options", "Parameter", "Pose", "PoseFit", "Progress", "Record", "Step",
-    "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers",
+    "CameraFit", "Fit", "Options", "Parameter", "Pose", "PoseFit", "Progress", "Record", "Step", "TrackedPose",
+    "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers", "track",
 ]  # fmt: skip
