@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from os import PathLike as OsPath
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ...camera.camera import Camera
@@ -25,7 +26,7 @@ from ...scene.scene import Scene
 from ..views import check_image
 from .fit_pose import depth_image
 from .photo.level import PhotoLevel, Seen, photo_levels
-from .photo.picture import Picture, palette
+from .photo.picture import Picture, palette, smoothed
 from .photo.search import DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST, PhotoSearch
 from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit
@@ -38,6 +39,10 @@ SHORT = 1e-3  # of a step on the last level: radians and object sizes
 POOR = 0.45  # of the render's edges: a picture that shows fewer hardly shows the object there
 PATIENCE = 4  # such pictures one after the other, and the object is lost
 AGAIN = 5  # pictures from one search for a lost object to the next
+RATE = 0.1  # of a picture, in the light of all
+LEARNT = 0.8  # of the edges, in pictures that light is learnt from
+# What covers the object: so many deviations off, over so many pixels; what it counts; how much of the object is near.
+OFF, ACROSS, COVERED, SEEN_FROM = 4.0, 1.5, 0.02, 0.05
 SEARCH_STEPS = 12  # on each level of it
 FARTHEST = 0.25  # radians and object sizes that steps lead from where they begin
 
@@ -138,6 +143,8 @@ class Tracker:
         self.first = True
         self.task: PoseTask | None = None
         self.palettes: list[Tensor] = []
+        self.light: Tensor | None = None  # coefficients (C, n) of the pictures before
+        self.deviation = 0.0  # from what they predict, as Lit has it
 
     @torch.inference_mode(False)
     @torch.enable_grad()
@@ -167,12 +174,12 @@ class Tracker:
         """The pose, and the share of the edges there."""
         best, share = predicted, 0.0
         if not self.first and self.poor == 0:
-            levels = self._levels(task, depth, predicted)
+            levels = self._uncovered(self._levels(task, depth, predicted), predicted)
             pose, _ = self._stepped(levels[-2], predicted, STEPS)
             best, share = self._believed(*self._stepped(levels[-1], pose, LAST_STEPS), predicted)
         if share < ENOUGH:
             for start in [predicted] if self.first else [predicted, self.good]:
-                levels = self._levels(task, depth, start)
+                levels = self._uncovered(self._levels(task, depth, start), start)
                 pose, again = start, 0.0
                 for level in levels:
                     pose, again = self._stepped(level, pose, MORE_STEPS)
@@ -182,6 +189,40 @@ class Tracker:
                 if share >= ENOUGH:
                     break
         return best, share
+
+    def _uncovered(self, levels: list[PhotoLevel], pose: Pose) -> list[PhotoLevel]:
+        """With weights near zero where the picture is not what the mesh is at that pose in the light of the pictures before: there
+        something covers it. The light of this picture alone would follow what covers the object."""
+        if self.light is None:
+            return levels
+        (seen,) = levels[-2].see(pose, self.seed)
+        if seen.lit is None or seen.lit.coefficients.shape != self.light.shape:
+            return levels
+        inside = seen.lit.surface.inside
+        off = torch.zeros_like(inside, dtype=torch.float32)
+        off[inside] = (seen.lit.difference(self.light) > OFF * self.deviation).float()
+        # Edges that are a pixel off are thin; what covers the object is not.
+        share = smoothed(torch.stack([off, inside.float()]), ACROSS)
+        covered = (share[0] > 0.5 * share[1]) & (share[1] > SEEN_FROM)
+        weight = 1.0 - (1.0 - COVERED) * covered.float()
+        found = []
+        for level in levels:
+            pictures = []
+            for picture in level.pictures:
+                at = F.interpolate(weight[None, None], picture.size, mode="bilinear")[0, 0]
+                pictures.append(replace(picture, weight=picture.weight * at))
+            found.append(replace(level, pictures=pictures))
+        return found
+
+    def _learn(self, views: list[Seen]) -> None:
+        """Takes in the light of a picture that shows the object."""
+        for seen in views:
+            if seen.lit is not None:
+                old = self.light is not None and self.light.shape == seen.lit.coefficients.shape
+                rate = RATE if old else 1.0
+                light = self.light if old and self.light is not None else seen.lit.coefficients
+                self.light = (1.0 - rate) * light + rate * seen.lit.coefficients
+                self.deviation = (1.0 - rate) * self.deviation + rate * seen.lit.deviation
 
     def _believed(self, pose: Pose, share: float, start: Pose) -> tuple[Pose, float]:
         """Steps that lead far from where they began follow something else than the object, whatever they explain there."""
@@ -215,7 +256,12 @@ class Tracker:
             pose = level.task.moved(pose, level.plain.free, move)
             if float(move.abs().max()) < SHORT * level.plain.coarseness:
                 break
-        return pose, level.explained(at, self.seed, views) if level.last else math.nan
+        if not level.last:
+            return pose, math.nan
+        share = level.explained(at, self.seed, views)
+        if share >= LEARNT:
+            self._learn(views)
+        return pose, share
 
     def _levels(self, task: PoseTask, depth: Tensor | None, pose: Pose) -> list[PhotoLevel]:
         return photo_levels(task, pose, [depth], self.max_size, self.spp, self.seed, self.palettes)

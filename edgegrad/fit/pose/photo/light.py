@@ -79,6 +79,10 @@ class Lit:
         slopes = slope(0.5 * (predicted + pictured))[inside]
         return Lit(surface, predicted, light, residual, w, middle, B, scale, slopes, ridge)
 
+    def difference(self, light: Tensor) -> Tensor:
+        """(N,): how far the picture inside is from the surface in another light (C, n), scaled as `residual` is."""
+        return (torch.einsum("pcn,cn->pc", self._basis, light - self.coefficients) + self.residual).norm(dim=-1)
+
     def term(self) -> Normal:
         """The equations of a step of the pose, of which those of the light are eliminated."""
         surface = self.surface
