@@ -13,7 +13,7 @@ import edgegrad as eg
 from edgegrad.fit import track
 from edgegrad_cli import main
 
-SIZE, COUNT = 80, 10
+SIZE, COUNT = 72, 8
 
 
 @pytest.fixture(scope="module")
@@ -40,19 +40,19 @@ def test_a_stone_that_turns(film, frames):
     found = [first, *poses]
     assert [pose.index for pose in found] == list(range(COUNT)) and not any(pose.lost for pose in found)
     degrees, percent = worst([errors(film, pose.index, pose.R, pose.t) for pose in found])
-    assert degrees < 2.0 and percent < 7.0  # 27° further than the start; most of the way off is along the view
+    assert degrees < 2.0 and percent < 7.0  # 21° further than the start; most of the way off is along the view
     assert min(pose.explained for pose in found) > 0.8
     assert torch.equal(found[-1].matrix[:3, :3], found[-1].R) and torch.equal(found[-1].matrix[:3, 3], found[-1].t)
 
 
 def test_lost_and_found_again(film):
-    gone = replace(film, poses=[film.poses[0]] * 12, gone=(2, 8))
+    gone = replace(film, poses=[film.poses[0]] * 8, gone=(1, 6))
     found = list(track(film.mesh, gone, film.camera, film.poses[0]))
-    assert [pose.lost for pose in found[:8]] == [False] * 5 + [True] * 3
+    assert [pose.lost for pose in found[:6]] == [False] * 4 + [True] * 2
     assert not found[-1].lost
-    degrees, percent = errors(gone, 11, found[-1].R, found[-1].t)
+    degrees, percent = errors(gone, 7, found[-1].R, found[-1].t)
     assert degrees < 2.0 and percent < 7.0
-    assert torch.equal(found[6].matrix, found[7].matrix)  # where it was seen last
+    assert torch.equal(found[4].matrix, found[5].matrix)  # where it was seen last
 
 
 @pytest.mark.parametrize(

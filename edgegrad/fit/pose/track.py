@@ -25,6 +25,7 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..views import check_image
 from .fit_pose import depth_image
+from .gauss_newton import Normal
 from .photo.level import PhotoLevel, Seen, photo_levels
 from .photo.picture import Picture, palette, smoothed
 from .photo.search import DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST, PhotoSearch
@@ -35,6 +36,7 @@ from .task import Lens, Names, PoseTask
 Frame = Tensor | PathLike
 STEPS, LAST_STEPS = 3, 2  # on the last level but one and on the last, where the prediction is good
 MORE_STEPS = 8  # on each level, where it is not
+STEADY = 0.02  # standard deviation of the motion from that of constant velocity, radians and object sizes
 SHORT = 1e-3  # of a step on the last level: radians and object sizes
 POOR = 0.45  # of the render's edges: a picture that shows fewer hardly shows the object there
 PATIENCE = 4  # such pictures one after the other, and the object is lost
@@ -175,8 +177,9 @@ class Tracker:
         best, share = predicted, 0.0
         if not self.first and self.poor == 0:
             levels = self._uncovered(self._levels(task, depth, predicted), predicted)
-            pose, _ = self._stepped(levels[-2], predicted, STEPS)
-            best, share = self._believed(*self._stepped(levels[-1], pose, LAST_STEPS), predicted)
+            offset = torch.zeros(len(levels[-1].plain.free), dtype=torch.float64)
+            pose, _ = self._stepped(levels[-2], predicted, STEPS, offset)
+            best, share = self._believed(*self._stepped(levels[-1], pose, LAST_STEPS, offset), predicted)
         if share < ENOUGH:
             for start in [predicted] if self.first else [predicted, self.good]:
                 levels = self._uncovered(self._levels(task, depth, start), start)
@@ -191,8 +194,8 @@ class Tracker:
         return best, share
 
     def _uncovered(self, levels: list[PhotoLevel], pose: Pose) -> list[PhotoLevel]:
-        """With weights near zero where the picture is not what the mesh is at that pose in the light of the pictures before: there
-        something covers it. The light of this picture alone would follow what covers the object."""
+        """With weights near zero where something covers the object: there the picture is not what the mesh is at that pose in the
+        light of the pictures before. The light of this picture alone would follow what covers it."""
         if self.light is None:
             return levels
         (seen,) = levels[-2].see(pose, self.seed)
@@ -238,9 +241,12 @@ class Tracker:
         assert self.task is not None
         return pose.scale * (pose.R @ self.task.center) + pose.t
 
-    def _stepped(self, level: PhotoLevel, pose: Pose, most: int) -> tuple[Pose, float]:
+    def _stepped(
+        self, level: PhotoLevel, pose: Pose, most: int, offset: Tensor | None = None
+    ) -> tuple[Pose, float]:  # fmt: skip
         """After so many Gauss-Newton steps at most, or a short one; on the last level also the share of the edges, as it was
-        before the last step, which is short where the way ends well."""
+        before the last step, which is short where the way ends well. `offset` (n,): how far the steps have led from the
+        prediction, which they add to; the object is taken to be near that, as far as the picture shows little of it."""
         views: list[Seen] = []
         at = pose
         for _ in range(most):
@@ -248,12 +254,17 @@ class Tracker:
             normal, _loss = level.equations(pose, self.seed, views)
             if not float(normal.curvature.trace()) > 0.0:
                 break
+            if offset is not None:
+                known = torch.eye(len(offset), dtype=torch.float64) / STEADY**2
+                normal = Normal(normal.curvature + known, normal.gradient + known @ offset)
             diagonal = normal.curvature.diagonal()
             damping = LAST_DAMPING if level.last else DAMPING
             damped = normal.curvature + torch.diag(damping * diagonal + FLOOR * diagonal.max())
             move = -torch.linalg.solve(damped, normal.gradient)
             move = move * min(1.0, LONGEST / float(move.abs().max().clamp(min=1e-30)))
             pose = level.task.moved(pose, level.plain.free, move)
+            if offset is not None:
+                offset += move
             if float(move.abs().max()) < SHORT * level.plain.coarseness:
                 break
         if not level.last:
