@@ -107,14 +107,14 @@ class Film:
 
 
 def _before(picture: Tensor, way: float) -> Tensor:
-    """With an arm across, a fourth of the picture wide, that goes from the left to the right."""
+    """With an arm across, a sixth of the picture wide, that goes from the left to the right."""
     size = picture.shape[0]
     v, u = torch.meshgrid((torch.arange(size) + 0.5) / size, (torch.arange(size) + 0.5) / size, indexing="ij")
     x, y = u - (1.5 * way - 0.25), v - 0.75
     a, b = 0.9 * x + 0.3 * y, 0.95 * y - 0.3 * x
-    edge = (0.13 - (a.square() + (0.13 / 0.45 * b).square()).sqrt()) * size
+    edge = (0.085 - (a.square() + (0.085 / 0.45 * b).square()).sqrt()) * size
     cover = (edge + 0.5).clamp(0.0, 1.0)[..., None]
-    shade = 1.0 - 2.5 * a.abs() + 0.06 * torch.sin(60.0 * a) * torch.sin(45.0 * b)
+    shade = 1.0 - 3.5 * a.abs() + 0.06 * torch.sin(60.0 * a) * torch.sin(45.0 * b)
     return (1.0 - cover) * picture + cover * (torch.tensor(SKIN) * shade[..., None]).clamp(0.0, 1.0)
 
 

@@ -36,7 +36,7 @@ from .task import Lens, Names, PoseTask
 Frame = Tensor | PathLike
 STEPS, LAST_STEPS = 3, 2  # on the last level but one and on the last, where the prediction is good
 MORE_STEPS = 8  # on each level, where it is not
-STEADY = 0.02  # standard deviation of the motion from that of constant velocity, radians and object sizes
+STEADY = 0.03  # standard deviation of the motion from that of constant velocity, radians and object sizes
 SHORT = 1e-3  # of a step on the last level: radians and object sizes
 POOR = 0.45  # of the render's edges: a picture that shows fewer hardly shows the object there
 PATIENCE = 4  # such pictures one after the other, and the object is lost
@@ -142,7 +142,7 @@ class Tracker:
         self.pose = self.good = start  # the last one, and the last one at which the object was seen
         self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)  # a picture
         self.poor = 0  # pictures one after the other that hardly show the object
-        self.first = True
+        self.first, self.moves = True, False  # whether the velocity is known
         self.task: PoseTask | None = None
         self.palettes: list[Tensor] = []
         self.light: Tensor | None = None  # coefficients (C, n) of the pictures before
@@ -165,7 +165,7 @@ class Tracker:
         else:
             self.poor += 1
         lost = self.poor >= PATIENCE
-        if lost and (self.poor - PATIENCE) % AGAIN == 0:
+        if lost and (self.poor - PATIENCE) % AGAIN == AGAIN - 1:
             again, found = self._searched(task, near)
             if found >= ENOUGH:
                 pose, share, lost, self.poor = again, found, False, 0
@@ -177,11 +177,11 @@ class Tracker:
         best, share = predicted, 0.0
         if not self.first and self.poor == 0:
             levels = self._uncovered(self._levels(task, depth, predicted), predicted)
-            offset = torch.zeros(len(levels[-1].plain.free), dtype=torch.float64)
+            offset = torch.zeros(len(levels[-1].plain.free), dtype=torch.float64) if self.moves else None
             pose, _ = self._stepped(levels[-2], predicted, STEPS, offset)
             best, share = self._believed(*self._stepped(levels[-1], pose, LAST_STEPS, offset), predicted)
         if share < ENOUGH:
-            for start in [predicted] if self.first else [predicted, self.good]:
+            for start in [predicted] if self.first or predicted is self.good else [predicted, self.good]:
                 levels = self._uncovered(self._levels(task, depth, start), start)
                 pose, again = start, 0.0
                 for level in levels:
@@ -286,12 +286,15 @@ class Tracker:
     def _predicted(self) -> Pose:
         """By constant velocity."""
         assert self.task is not None
+        if self.poor >= PATIENCE:
+            return self.good
         R = self.turn @ self.pose.R
         where = self._center(self.pose) + self.shift
         return self.pose._replace(R=R, t=where - self.pose.scale * (R @ self.task.center))
 
     def _move(self, pose: Pose, share: float, lost: bool) -> None:
         """Takes in where the object is now."""
+        self.moves = not (self.first or lost or share < POOR)
         if lost or share < POOR:  # where it went is not known
             self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
         elif not self.first:
