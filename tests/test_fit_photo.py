@@ -285,7 +285,7 @@ def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
     fit = fit_pose(bracket(kind == "plain"), image, view, init=START, progress=False, **given)
     off = errors(fit)
     assert off[0] < degrees and off[1] < percent and fit.converged, (off, fit.explained)
-    assert fit.explained >= search.ENOUGH and fit.state == "converged"  # 12.3° and 8.4 % off at the start
+    assert fit.explained >= search.ENOUGH and fit.reason == "converged"  # 12.3° and 8.4 % off at the start
 
 
 def test_two_photographs_of_one_pose(taken):
@@ -304,7 +304,7 @@ def test_a_photograph_of_something_else_is_not_converged():
     view = camera(64)
     fit = fit_pose(bracket(), clutter(64, 3), view, init=START, search=False, progress=False)
     assert not fit.converged and fit.explained < search.ENOUGH
-    assert fit.state.startswith("not converged")
+    assert fit.reason.startswith("not converged")
 
 
 def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, tmp_path):

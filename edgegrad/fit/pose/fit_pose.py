@@ -211,17 +211,22 @@ def _depths(depth: object, task: PoseTask) -> list[Tensor | None]:
     found = []
     for k, (one, shot) in enumerate(zip(given, task.shots, strict=True)):
         name = f"depth[{k}]" if several else "depth"
-        value = as_tensor(name, one).detach().cpu()
-        check_float(name, value)
-        check_shape(name, value, shot.camera.size, (*shot.camera.size, 1), fix="it needs the picture's size")
-        value = value.reshape(shot.camera.size).float()
-        if bool((value < 0.0).any()):
-            least = float(value.nan_to_num().min())
-            raise ValueError(
-                f"{name}: expected distances along the camera's axis, 0 or NaN where there is none, got {least:g}"
-            )
-        found.append(torch.where(value.isfinite() & (value > 0.0), value, torch.nan))
+        found.append(depth_image(name, one, shot.camera.size))
     return found
+
+
+def depth_image(name: str, given: object, size: tuple[int, int]) -> Tensor:
+    """(H, W), NaN where it was not measured. Raises TypeError or ValueError."""
+    value = as_tensor(name, given).detach().cpu()
+    check_float(name, value)
+    check_shape(name, value, size, (*size, 1), fix="it needs the picture's size")
+    value = value.reshape(size).float()
+    if bool((value < 0.0).any()):
+        least = float(value.nan_to_num().min())
+        raise ValueError(
+            f"{name}: expected distances along the camera's axis, 0 or NaN where there is none, got {least:g}"
+        )
+    return torch.where(value.isfinite() & (value > 0.0), value, torch.nan)
 
 
 def _symmetries(given: object, mesh: Mesh | Scene) -> Symmetries | None:

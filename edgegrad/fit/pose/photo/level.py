@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -93,16 +94,16 @@ class PhotoLevel:
             found.append(Seen(picture, alpha, tangents, near * picture.weight, extent, surface, lit))
         return found
 
-    def equations(self, pose: Pose, seed: int) -> tuple[Normal, float]:
+    def equations(self, pose: Pose, seed: int, views: list[Seen] | None = None) -> tuple[Normal, float]:
         """Of all terms and pictures, and the mean loss of the region term. Each term is a likelihood in units of its own noise,
-        so they are added as they are."""
+        so they are added as they are. `views`: what see() gave for the pose, where it was asked before."""
         D = len(self.plain.free)
         curvature, gradient = torch.zeros(D, D, dtype=torch.float64), torch.zeros(D, dtype=torch.float64)
         losses = []
-        for seen, colours in zip(self.see(pose, seed), self.palettes, strict=True):
+        for k, seen in enumerate(self.see(pose, seed) if views is None else views):
             if seen.extent == 0.0:
                 continue
-            region, loss = region_term(_posterior(seen, colours), seen.alpha, seen.tangents, seen.near, self.blur)
+            region, loss = region_term(self._posterior(k, seen), seen.alpha, seen.tangents, seen.near, self.blur)
             losses.append(loss)
             terms: list[Normal | None] = [region]
             if seen.lit is not None:
@@ -117,11 +118,11 @@ class PhotoLevel:
                     curvature, gradient = curvature + term.curvature, gradient + term.gradient
         return Normal(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
 
-    def explained(self, pose: Pose, seed: int) -> float:
+    def explained(self, pose: Pose, seed: int, views: list[Seen] | None = None) -> float:
         """The share, 0 … 1, of the edges that the render should have in the pictures, of contours and of what is inside, that
-        they have."""
+        they have. `views`: as of equations()."""
         pairs, shown, length, extent = [], 0.0, 0.0, 0.0
-        for seen in self.see(pose, seed):
+        for seen in self.see(pose, seed) if views is None else views:
             picture, contour = seen.picture, smoothed(seen.alpha[None], CONTOUR_BLUR)[0]
             sides = Sides.of(picture, contour, seen.near)
             extent = max(extent, seen.extent)
@@ -142,19 +143,25 @@ class PhotoLevel:
             return 0.0
         return explained(pairs) * min(1.0, shown / length / SHOWN) * min(1.0, extent / RESOLVED)
 
+    @cached_property
+    def _labels(self) -> list[Tensor]:
+        """Of the pixels of each picture; they are the same at each step."""
+        return [picture.labels(colours) for picture, colours in zip(self.pictures, self.palettes, strict=True)]
 
-def _posterior(seen: Seen, colours: Tensor) -> Tensor:
-    """(h, w), that a pixel shows the object: by the mask, or else by its colour."""
-    mask = seen.picture.mask
-    if mask is not None:
-        return mask.clamp(MASKED, 1.0 - MASKED)
-    return posterior(Windows(seen.picture, colours, RADIUS * seen.extent), seen.alpha, seen.near)
+    def _posterior(self, k: int, seen: Seen) -> Tensor:
+        """(h, w), that a pixel of picture k shows the object: by the mask, or else by its colour."""
+        mask = seen.picture.mask
+        if mask is not None:
+            return mask.clamp(MASKED, 1.0 - MASKED)
+        windows = Windows(seen.picture, self._labels[k], self.palettes[k], RADIUS * seen.extent)
+        return posterior(windows, seen.alpha, seen.near)
 
 
 def photo_levels(
-    task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, seed: int
-) -> list[PhotoLevel]:
-    """From coarse to fine, of what surrounds the object at the start."""
+    task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, seed: int,
+    palettes: list[Tensor] | None = None,
+) -> list[PhotoLevel]:  # fmt: skip
+    """From coarse to fine, of what surrounds the object at the start. `palettes`: of the pictures, where they are known."""
     crops = [_crop(task, shot, start) for shot in task.shots]
     shots, cut, across = [], [], []
     for shot, depth, (top, left, h, w, extent) in zip(task.shots, depths, crops, strict=True):
@@ -181,7 +188,8 @@ def photo_levels(
         free = [entry for entry in task.free if entry < ZOOM] if k == 0 else task.free
         plain = Level(smaller, 0.0, float(2**n), spp, free)
         few = min(harmonics, FEW_HARMONICS) if k == 0 else harmonics
-        palettes = levels[0].palettes if levels else [palette(picture.outlined, seed) for picture in pictures]
+        if palettes is None:
+            palettes = [palette(picture.outlined, seed) for picture in pictures]
         levels.append(PhotoLevel(task, plain, pictures, palettes, blur, few, k == len(halved) - 1))
     return levels
 

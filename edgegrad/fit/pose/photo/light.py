@@ -87,6 +87,10 @@ class Lit:
         irradiance = spherical(self.surface.normals[inside])[..., : self.coefficients.shape[1]] @ self.coefficients.T
         return float((colour * (irradiance - 1.0)).abs().mean() / colour.abs().mean().clamp(min=1e-30))
 
+    def difference(self, light: Tensor) -> Tensor:
+        """(N,): how far the picture inside is from the surface in another light (C, n), scaled as `residual` is."""
+        return (torch.einsum("pcn,cn->pc", self._basis, light - self.coefficients) + self.residual).norm(dim=-1)
+
     def term(self) -> Normal:
         """The equations of a step of the pose, of which those of the light are eliminated."""
         surface = self.surface

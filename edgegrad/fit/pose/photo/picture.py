@@ -48,6 +48,10 @@ class Picture:
         """(h, w)."""
         return self.camera.size
 
+    def labels(self, colours: Tensor) -> Tensor:
+        """(h · w,): which of the colours (n, C) is nearest to that of each pixel."""
+        return torch.cdist(self.display.flatten(0, 1), colours).argmin(1)
+
     @property
     def outlined(self) -> Tensor:
         """(h, w, c), what shows the outline of the object: the mask, or else the colours."""
@@ -77,13 +81,13 @@ class Windows:
     WIDTH = 1.5  # standard deviation of a window, in cells
     LEAST = 1e-3  # pixels of all colours that every window has
 
-    def __init__(self, picture: Picture, colours: Tensor, radius: float) -> None:
+    def __init__(self, picture: Picture, label: Tensor, colours: Tensor, radius: float) -> None:
+        """`label` (h · w,): what Picture.labels() gives for the colours (n, C)."""
         h, w = picture.size
         cell = max(1.0, radius / CELLS)
         self.shape = math.ceil(h / cell), math.ceil(w / cell)
         rows, columns = (torch.arange(h) / cell).long(), (torch.arange(w) / cell).long()
         self.size = h, w
-        label = torch.cdist(picture.display.flatten(0, 1), colours).argmin(1)
         self.count = len(colours)
         self._index = label * (self.shape[0] * self.shape[1]) + (rows[:, None] * self.shape[1] + columns).flatten()
         alike = torch.exp(-0.5 * (torch.cdist(colours, colours) / self.ALIKE).square())
@@ -104,7 +108,13 @@ def smoothed(images: Tensor, sigma: float) -> Tensor:
     if sigma == 0.0:
         return images
     radius = math.ceil(3.0 * sigma)
-    kernel = torch.exp(-0.5 * (torch.arange(-radius, radius + 1).to(images) / sigma) ** 2)
-    kernel = kernel / kernel.sum()
-    images = F.conv2d(images[:, None], kernel.reshape(1, 1, 1, -1), padding=(0, radius))
-    return F.conv2d(images, kernel.reshape(1, 1, -1, 1), padding=(radius, 0))[:, 0]
+    kernel = [math.exp(-0.5 * (k / sigma) ** 2) for k in range(radius + 1)]
+    total = kernel[0] + 2.0 * sum(kernel[1:])
+    # Sums of shifted images, which take a third of the time of torch's convolution.
+    for axis in (2, 1):
+        found, size = images * (kernel[0] / total), images.shape[axis]
+        for k in range(1, min(radius + 1, size)):
+            for to, of in ((k, 0), (0, k)):
+                found.narrow(axis, to, size - k).add_(images.narrow(axis, of, size - k), alpha=kernel[k] / total)
+        images = found
+    return images

@@ -35,9 +35,9 @@ class Surface:
         share = self.channels["alpha"][self.inside].double()
         points = self.channels["position"][self.inside].double() / share
         ways = self.motion.of_points(points)
-        found = []
+        camera, found = self.camera.to(torch.float64), []
         for k, way in enumerate(ways):
-            ends = [self._moved(k, sign * STEP).project(points + sign * STEP * way) for sign in (1.0, -1.0)]
+            ends = [self._moved(camera, k, sign * STEP).project(points + sign * STEP * way) for sign in (1.0, -1.0)]
             found.append((ends[0] - ends[1]) / (2.0 * STEP))
         return torch.stack(found).nan_to_num(0.0, 0.0, 0.0).float()
 
@@ -46,8 +46,8 @@ class Surface:
         """(h, w, 3), of length 1."""
         return F.normalize(self.channels["normal"].float(), dim=-1, eps=1e-6)
 
-    def _moved(self, k: int, step: float) -> Camera:
-        camera, fields = self.camera.to(torch.float64), {}
+    def _moved(self, camera: Camera, k: int, step: float) -> Camera:
+        fields = {}
         if self.motion.K is not None:
             fields["K"] = camera.K + step * self.motion.K[k]
         if self.motion.distortion is not None and camera.distortion is not None:

@@ -1,0 +1,145 @@
+"""edgegrad.fit.track and `edgegrad track`: a mesh in a film, in light that nobody told it, before clutter."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from moving import Film, errors, worst
+
+import edgegrad as eg
+from edgegrad.fit import track
+from edgegrad_cli import main
+
+SIZE, COUNT = 80, 7
+
+
+@pytest.fixture(scope="module")
+def film() -> Film:
+    return Film.turning(SIZE, COUNT, spp=8)
+
+
+@pytest.fixture(scope="module")
+def frames(film: Film) -> list[torch.Tensor]:
+    return list(film)
+
+
+def test_a_stone_that_turns(film, frames):
+    read = []
+
+    def one_by_one():
+        for frame in frames:
+            read.append(frame)
+            yield frame
+
+    poses = track(film.mesh, one_by_one(), film.camera, film.poses[0])
+    first = next(poses)
+    assert len(read) == 1 and first.index == 0  # no more than is asked for
+    found = [first, *poses]
+    assert [pose.index for pose in found] == list(range(COUNT)) and not any(pose.lost for pose in found)
+    degrees, percent = worst([errors(film, pose.index, pose.R, pose.t) for pose in found])
+    assert degrees < 3.0 and percent < 7.0  # 18° further than the start; most of the way off is along the view
+    assert min(pose.explained for pose in found) > 0.8
+    assert torch.equal(found[-1].matrix[:3, :3], found[-1].R) and torch.equal(found[-1].matrix[:3, 3], found[-1].t)
+
+
+def test_lost_and_found_again(film):
+    gone = replace(film, poses=[film.poses[0]] * 8, gone=(1, 6))
+    found = list(track(film.mesh, gone, film.camera, film.poses[0]))
+    assert [pose.lost for pose in found[:6]] == [False] * 4 + [True] * 2
+    assert not found[-1].lost
+    degrees, percent = errors(gone, 7, found[-1].R, found[-1].t)
+    assert degrees < 3.0 and percent < 7.0
+    assert torch.equal(found[4].matrix, found[5].matrix)  # where it was seen last
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda image: image.index_fill(0, torch.tensor([3]), torch.nan), "frames[2]: expected finite numbers"),
+        (lambda image: image[:-1], "frames[2]: expected shape"),
+        (lambda image: image[..., :2], "frames[2]: expected 3 channels"),
+        (lambda image: "missing.png", "frames[2]"),
+    ],
+)
+def test_a_broken_frame_is_named(film, frames, spoil, words):
+    found = []
+    with pytest.raises((ValueError, OSError)) as caught:
+        found.extend(track(film.mesh, [], film.camera, film.poses[0]))
+        for pose in track(film.mesh, [*frames[:2], spoil(frames[2])], film.camera, film.poses[0]):
+            found.append(pose)
+    assert words in str(caught.value) and len(found) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"frames": "film.mp4"}, "frames: expected"),
+        ({"frames": torch.zeros(SIZE, SIZE, 3)}, "frames: expected"),
+        ({"camera": None}, "camera: expected"),
+        ({"mesh": 3}, "mesh: expected"),
+        ({"init": torch.eye(3)}, "init: expected"),
+        ({"spp": 0}, "spp: expected"),
+        ({"depth": 1.0}, "depth: expected"),
+    ],
+)
+def test_bad_arguments_are_named_at_once(film, frames, change, words):
+    given = {"mesh": film.mesh, "frames": frames, "camera": film.camera, "init": film.poses[0], **change}
+    with pytest.raises((TypeError, ValueError), match=words):
+        track(**given)
+
+
+def test_depth_for_each_frame(film, frames):
+    with pytest.raises(ValueError, match="depth: expected one for each frame, got 1"):
+        list(track(film.mesh, frames[:2], film.camera, film.poses[0], depth=[None]))
+    plain = eg.Mesh(film.mesh.verts, film.mesh.faces)
+    depths = []
+    for pose in film.poses[:4]:
+        moved = plain.transformed(pose[:3, :3].float(), pose[:3, 3].float())
+        channels = eg.render_aovs(eg.Scene([moved]), film.camera, ["depth", "alpha"])
+        alpha = channels["alpha"][..., 0]
+        depths.append(torch.where(alpha > 0.99, channels["depth"][..., 0] / alpha, torch.nan))
+    for pose in track(plain, frames[:4], film.camera, film.poses[0], depth=depths):
+        degrees, percent = errors(film, pose.index, pose.R, pose.t)
+        assert degrees < 2.0 and percent < 1.5
+
+
+def test_command_line_on_a_folder(film, frames, tmp_path, capsys):
+    eg.save_mesh(tmp_path / "stone.ply", film.mesh)
+    eg.save_camera(tmp_path / "camera.json", film.camera)
+    (tmp_path / "init.json").write_text(json.dumps({"mesh_to_world": film.poses[0].tolist()}))
+    folder = tmp_path / "film"
+    folder.mkdir()
+    for k, frame in enumerate(frames[:3]):
+        eg.write_image(folder / f"{k}.png", frame)
+    out = tmp_path / "out"
+    arguments = ["track", str(tmp_path / "stone.ply"), str(folder), "--camera", str(tmp_path / "camera.json")]
+    arguments += ["--init", str(tmp_path / "init.json"), "--out", str(out)]
+    assert main(arguments) == 0
+    rows = json.loads((out / "poses.json").read_text())["poses"]
+    for row in rows:
+        M = torch.tensor(row["mesh_to_world"], dtype=torch.float64)
+        degrees, percent = errors(film, row["frame"], M[:3, :3], M[:3, 3])
+        assert degrees < 3.0 and percent < 7.0 and not row["lost"]
+    assert len(rows) == 3 and (out / "frames" / "00002.png").is_file()
+    assert any((out / name).is_file() for name in ("film.mp4", "film.webp"))
+    # The contour is drawn on the frame and nowhere else.
+    drawn = (eg.read_image(out / "frames" / "00000.png", channels=3) - frames[0]).abs().amax(-1) > 0.02
+    assert 0.01 < float(drawn.float().mean()) < 0.2
+
+    eg.write_image(folder / "3.png", frames[3][:-4])  # of another size
+    assert main(arguments) == 2
+    assert "frames[3]: expected" in capsys.readouterr().err
+    assert len(json.loads((out / "poses.json").read_text())["poses"]) == 3
+    assert main([*arguments[:2], str(tmp_path / "nothing"), *arguments[3:]]) == 2
+
+
+@pytest.mark.slow
+def test_two_hundred_frames_and_a_hand():
+    film = Film.turning(256, 200, hand=(60, 120))
+    found = list(track(film.mesh, film, film.camera, film.poses[0]))
+    degrees = [errors(film, pose.index, pose.R, pose.t)[0] for pose in found]
+    assert not any(pose.lost for pose in found)
+    assert sum(degrees) / len(degrees) <= 0.5
