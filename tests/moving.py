@@ -46,7 +46,9 @@ def clutter(size: int, seed: int = 0) -> Tensor:
         blots = torch.rand(1, 3, cells, cells, generator=generator) - 0.5
         image = image + contrast * 2.0 * F.interpolate(blots, (size, size), mode="bicubic")
     for _ in range(14):
-        top, left, h, w = (torch.rand(4, generator=generator) * torch.tensor([0.9, 0.9, 0.3, 0.3]) * size).long().tolist()
+        top, left, h, w = (
+            (torch.rand(4, generator=generator) * torch.tensor([0.9, 0.9, 0.3, 0.3]) * size).long().tolist()
+        )
         image[..., top : top + h + 2, left : left + w + 2] = torch.rand(1, 3, 1, 1, generator=generator)
     return image[0].movedim(0, -1).clamp(0.02, 0.98)
 
@@ -98,7 +100,9 @@ class Film:
             ]
             scene = eg.Scene([mesh], background=srgb_to_linear(self.background), lights=lights)
             with torch.no_grad():
-                picture = linear_to_srgb(eg.render(scene, self.camera, spp=self.spp, light_samples=1, seed=k).clamp(0.0, 1.0))
+                picture = linear_to_srgb(
+                    eg.render(scene, self.camera, spp=self.spp, light_samples=1, seed=k).clamp(0.0, 1.0)
+                )
         if self.hand is not None and self.hand[0] <= k < self.hand[1]:
             picture = _before(picture, (k - self.hand[0]) / (self.hand[1] - self.hand[0]))
         generator = torch.Generator().manual_seed(k)
