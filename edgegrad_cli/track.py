@@ -41,9 +41,15 @@ def add(commands: Any) -> None:
     parser.add_argument("--size", type=count, default=256, help="most pixels on the longer side (%(default)s)")
     parser.add_argument("--spp", type=count, default=8, help="samples a pixel (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
-    parser.add_argument("--fps", type=count, default=25, help="frames a second of the film that is written (%(default)s)")
     parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="for poses.json, frames with contours, and film.mp4 or .webp"
+        "--fps", type=count, default=25, help="frames a second of the film that is written (%(default)s)"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="for poses.json, frames with contours, and film.mp4 or .webp",
     )
     parser.set_defaults(run=run)
 
@@ -189,7 +195,11 @@ def _write_film(folder: Path, pictures: list[Path], fps: int) -> str | None:
     with replacing(folder / "film.mp4") as temporary, av.open(str(temporary), "w", format="mp4") as container:
         h, w = read(pictures[0]).shape[:2]
         stream = container.add_stream("libx264", rate=fps, options={"crf": "20"})
-        stream.width, stream.height, stream.pix_fmt = w - w % 2, h - h % 2, "yuv420p"  # which has colours of 2 × 2 pixels
+        stream.width, stream.height, stream.pix_fmt = (
+            w - w % 2,
+            h - h % 2,
+            "yuv420p",
+        )  # which has colours of 2 × 2 pixels
         for path in pictures:
             picture = np.ascontiguousarray(read(path)[: h - h % 2, : w - w % 2])
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
