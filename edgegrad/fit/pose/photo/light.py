@@ -25,6 +25,7 @@ from .surface import Surface, slope
 BLUR = 1.0  # pixels, of both
 HARMONICS = 9
 RIDGE = 5e-4  # of the constant's curvature: keeps what the picture does not show of the light near zero; more would bias poses
+WHOLE = 0.9  # share of a blur's window that lies inside
 FEWEST = 60  # pixels
 REWEIGHTED = 4  # times
 LEAST = 0.02  # standard deviation of a difference
@@ -77,7 +78,9 @@ class Lit:
             w = count * (1.0 + (e / (3.0 * middle)).square()).pow(-2)
         predicted = torch.einsum("hwcn,cn->hwc", basis, light)
         slopes = slope(0.5 * (predicted + pictured))[inside]
-        return Lit(surface, predicted, light, residual, w, middle, B, scale, slopes, ridge)
+        # Beside the rim a blur reaches fewer pixels, and slopes are too low.
+        whole = smoothed(inside[None].float(), BLUR)[0][inside] > WHOLE
+        return Lit(surface, predicted, light, residual, w * whole, middle, B, scale, slopes, ridge)
 
     @property
     def change(self) -> float:
