@@ -31,7 +31,7 @@ WHITE = 0.15  # of the light's colour
 SHAPE = 0.25  # of a mask's error beside that of colours
 PLACES = 3  # of a view, at one size
 TURNED_APART, PLACED_APART, SIZED_APART = 0.3, 0.15, 1.3  # radians, object sizes, factor: poses that are kept both
-KEPT = 48
+KEPT = 32
 RANKED = 2000
 
 
@@ -140,7 +140,7 @@ def _everywhere(task: PoseTask, views: Views) -> list[Match]:
             for value, place in zip(values, here, strict=True):
                 middle = [STRIDE * (place % w) + 0.5 * T - margin, STRIDE * (place // w) + 0.5 * T - margin]
                 position = torch.tensor([middle[0] * W / size[1], middle[1] * H / size[0]])
-                found.append(Match(value, n, position, pixels))
+                found.append(Match(value * pixels, n, position, pixels))
     return found
 
 
