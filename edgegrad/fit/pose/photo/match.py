@@ -29,9 +29,12 @@ NOISE = 0.06  # standard deviation of a pixel, sRGB values: of noise, and of wha
 SHADE = 0.3  # of the light's slopes, relative to its constant
 WHITE = 0.15  # of the light's colour
 SHAPE = 0.25  # of a mask's error beside that of colours
+POWERS = 1.0, 1.4  # of the object's size, that the ratios are multiplied by: larger ones have more pixels, which are alike
 PLACES = 3  # of a view, at one size
 TURNED_APART, PLACED_APART, SIZED_APART = 0.3, 0.15, 1.3  # radians, object sizes, factor: poses that are kept both
-KEPT = 32
+KEPT = 24
+ALIKE = 0.08  # standard deviation of colours that look alike, sRGB values
+COUNTED = 1500  # pixels that tell how frequent colours are
 RANKED = 2000
 
 
@@ -47,7 +50,10 @@ class Match(NamedTuple):
 def matches(task: PoseTask, views: Views) -> list[Pose]:
     """The best poses in the first picture, distinct, the best first. The mask, where there is one, says where they are."""
     masked = "alpha" in task.aovs and not task.clutter
-    return _distinct(task, views, _in_mask(task, views) if masked else _everywhere(task, views))
+    if masked:
+        return _distinct(task, views, _in_mask(task, views), KEPT)
+    first, second = (_distinct(task, views, found, KEPT) for found in _everywhere(task, views))
+    return [pose for pair in zip(first, second, strict=False) for pose in pair]
 
 
 class _Filter:
@@ -66,45 +72,46 @@ class _Filter:
         A = torch.einsum("nijck,nijcl->nckl", weighted, basis)
         self.inverse = torch.linalg.inv(_with_prior(A.double())).float()  # (n, 4C, 4C)
         self.filters = weighted.permute(0, 3, 4, 1, 2)  # (n, C, 4, T, T)
-        self.areas = torch.stack([self.inside.sum((1, 2)), self.around.sum((1, 2))])  # (2, n)
 
-    def scores(self, picture: Tensor, stride: int) -> Tensor:
-        """(n, h, w) of a picture (C, H, W)."""
+    def scores(self, picture: Tensor, surprise: Tensor, stride: int) -> Tensor:
+        """(2, n, h, w) of a picture (C, H, W), of whose pixels `surprise` (H, W) is −log of the density of their colours: log
+        likelihood ratios of the view to one colour for all, a pixel, and to the colours of the whole picture."""
         parts = []
-        square = picture.square().sum(0)[None, None]
         sides = torch.stack([self.inside, self.around], 1)
         for at in range(0, len(self.inside), AT_ONCE):
             rows = slice(at, at + AT_ONCE)
-            filters, side, areas = self.filters[rows], sides[rows], self.areas[:, rows]
-            n, T = len(side), side.shape[-1]
-            sums, b = [], []
+            n, T = len(self.inside[rows]), self.inside.shape[-1]
+            b, sums = [], []
             for c in range(self.C):
-                both = torch.cat([filters[:, c], side], 1).flatten(0, 1)[:, None]
+                both = torch.cat([self.filters[rows, c], sides[rows]], 1).flatten(0, 1)[:, None]
                 out = F.conv2d(picture[None, c : c + 1], both, stride=stride)[0]
                 out = out.reshape(n, 6, *out.shape[1:])
                 b.append(out[:, :4])
                 sums.append(out[:, 4:])
-            squares = F.conv2d(square, side.flatten(0, 1)[:, None], stride=stride)[0]
+            squares = F.conv2d(picture.square().sum(0)[None, None], sides[rows].flatten(0, 1)[:, None], stride=stride)[0]
             squares = squares.reshape(n, 2, *squares.shape[1:])
-            parts.append(_score(torch.cat(b, 1), torch.stack(sums, 2), squares, self.inverse[rows], areas))
-        return torch.cat(parts)
+            rare = F.conv2d(surprise[None, None], self.inside[rows, None], stride=stride)[0]
+            parts.append(self._ratios(torch.cat(b, 1), torch.stack(sums, 2), squares, rare, rows))
+        return torch.cat(parts, 1)
+
+    def _ratios(self, b: Tensor, sums: Tensor, squares: Tensor, rare: Tensor, rows: slice) -> Tensor:
+        """b (n, 4C, h, w); sums (n, 2, C, h, w) and squares (n, 2, h, w) of what is inside and around; rare (n, h, w)."""
+        inside, around = (x[rows].sum((1, 2)).clamp(min=1e-3)[:, None, None] for x in (self.inside, self.around))
+        error = (squares[:, 0] - (b * torch.einsum("nkl,nlhw->nkhw", self.inverse[rows], b)).sum(1)).clamp(min=0.0)
+        beside = (squares[:, 1] - sums[:, 1].square().sum(1) / around).clamp(min=0.0)
+        even = (squares.sum(1) - sums.sum(1).square().sum(1) / (inside + around)).clamp(min=0.0)
+        noise = NOISE**2 * self.C * (inside + around)
+        variance = error / (self.C * inside) + NOISE**2
+        return torch.stack([
+            torch.log((even + noise) / (error + beside + noise)),
+            rare - 0.5 * self.C * inside * (variance.log() + math.log(2.0 * math.pi) + 1.0),
+        ])  # fmt: skip
 
     def errors(self, crops: Tensor) -> Tensor:
         """(n,) squared errors inside each view, of pictures (n, C, T, T)."""
         b = torch.einsum("ncfij,ncij->ncf", self.filters, crops).flatten(1)
         total = (crops.square().sum(1) * self.inside).sum((1, 2))
         return (total - torch.einsum("nk,nkl,nl->n", b, self.inverse, b)).clamp(min=0.0)
-
-
-def _score(b: Tensor, sums: Tensor, squares: Tensor, inverse: Tensor, areas: Tensor) -> Tensor:
-    """(n, h, w), the log likelihood ratio of a pixel. b (n, 4C, h, w); sums (n, 2, C, h, w) and squares (n, 2, h, w), of what is
-    inside and around."""
-    area = areas.T[..., None, None].clamp(min=1e-3)  # (n, 2, 1, 1)
-    lit = squares[:, 0] - (b * torch.einsum("nkl,nlhw->nkhw", inverse, b)).sum(1)
-    around = squares[:, 1] - sums[:, 1].square().sum(1) / area[:, 1]
-    even = squares.sum(1) - sums.sum(1).square().sum(1) / area.sum(1)
-    noise = NOISE**2 * b.shape[1] / 4 * area.sum(1)
-    return torch.log((even.clamp(min=0.0) + noise) / (lit.clamp(min=0.0) + around.clamp(min=0.0) + noise))
 
 
 def _with_prior(A: Tensor) -> Tensor:
@@ -119,13 +126,14 @@ def _with_prior(A: Tensor) -> Tensor:
     return full.reshape(n, 4 * C, 4 * C)
 
 
-def _everywhere(task: PoseTask, views: Views) -> list[Match]:
+def _everywhere(task: PoseTask, views: Views) -> list[list[Match]]:
+    """By each of the ratios."""
     shot = task.shots[0]
     H, W = shot.camera.size
     target = linear_to_srgb(shot.target.float().clamp(0.0, 1.0))
     filters, T = _Filter(views), views.alpha.shape[-1]
     margin = T // 3
-    found: list[Match] = []
+    found: list[list[Match]] = [[], []]
     for k in range(1 + math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO))):
         pixels = SMALLEST * RATIO**k * min(H, W)  # across the object, in the picture
         factor = min(1.0, ACROSS / pixels)
@@ -133,15 +141,25 @@ def _everywhere(task: PoseTask, views: Views) -> list[Match]:
         if min(size) + 2 * margin < T:
             continue
         picture = F.pad(area_mean(target, size).movedim(-1, 0)[None], (margin,) * 4, mode="replicate")[0]
-        scores = filters.scores(picture, STRIDE)
-        h, w = scores.shape[1:]
-        best, places = scores.flatten(1).topk(min(PLACES, h * w))
-        for n, (values, here) in enumerate(zip(best.tolist(), places.tolist(), strict=True)):
-            for value, place in zip(values, here, strict=True):
-                middle = [STRIDE * (place % w) + 0.5 * T - margin, STRIDE * (place // w) + 0.5 * T - margin]
-                position = torch.tensor([middle[0] * W / size[1], middle[1] * H / size[0]])
-                found.append(Match(value * pixels, n, position, pixels))
+        both = filters.scores(picture, _surprise(picture), STRIDE)
+        h, w = both.shape[-2:]
+        for kind, (scores, power) in enumerate(zip(both, POWERS, strict=True)):
+            best, places = scores.flatten(1).topk(min(PLACES, h * w))
+            for n, (values, here) in enumerate(zip(best.tolist(), places.tolist(), strict=True)):
+                for value, place in zip(values, here, strict=True):
+                    middle = [STRIDE * (place % w) + 0.5 * T - margin, STRIDE * (place // w) + 0.5 * T - margin]
+                    position = torch.tensor([middle[0] * W / size[1], middle[1] * H / size[0]])
+                    found[kind].append(Match(value * pixels**power, n, position, pixels))
     return found
+
+
+def _surprise(picture: Tensor) -> Tensor:
+    """(H, W), −log of the density of each pixel's colour in (C, H, W)."""
+    C, H, W = picture.shape
+    pixels = picture.flatten(1).T
+    some = pixels[:: max(1, len(pixels) // COUNTED)]
+    log = (-0.5 * (torch.cdist(pixels, some) / ALIKE).square()).logsumexp(1) - math.log(len(some))
+    return (C * math.log(ALIKE * math.sqrt(2.0 * math.pi)) - log).reshape(H, W)
 
 
 def _in_mask(task: PoseTask, views: Views) -> list[Match]:
@@ -180,7 +198,7 @@ def _in_mask(task: PoseTask, views: Views) -> list[Match]:
     return found
 
 
-def _distinct(task: PoseTask, views: Views, found: list[Match]) -> list[Pose]:
+def _distinct(task: PoseTask, views: Views, found: list[Match], most: int) -> list[Pose]:
     camera = task.shots[0].camera
     kept: list[tuple[Match, Pose]] = []
     for one in sorted(found, key=lambda one: -one.score)[:RANKED]:
@@ -188,7 +206,7 @@ def _distinct(task: PoseTask, views: Views, found: list[Match]) -> list[Pose]:
         pose = pose_at(task, views.rotations[one.view], one.position, depth)
         if all(_apart(one, pose, *other) for other in kept):
             kept.append((one, pose))
-            if len(kept) == KEPT:
+            if len(kept) == most:
                 break
     return [pose for _, pose in kept]
 
