@@ -95,6 +95,11 @@ def fit_pose(
                 box), and logarithms of scale and focal length
     seed        the same seed gives the same fit
     search      False for a start near the answer: one way down from there, whatever it ends at
+    starts      how many poses to start from; the best after a few steps are followed down, until an end shows 80 % of the
+                render's edges. Around `init` they are turned by up to 45°; without it they are turned in all ways, at the place
+                that `init` says for None. "global" looks for the object in the whole first picture, seen by a perspective or
+                orthographic camera, from all sides and at sizes from 0.25 to 1.25 of the picture's shorter side, or in the
+                mask; `init` is None then. 1: the start alone, and what `search` does further; with more, `search` has no say
     progress    show a bar with the loss on standard error
     callback    called after each step with the best fit so far
     checkpoint  a file that holds the fit's state, written every `checkpoint_every` steps and at the end, never in part

@@ -22,14 +22,21 @@ from ..pose import Pose, angle
 from ..task import PoseTask
 from .views import ACROSS, RING, Views, across, pose_at
 
-SMALLEST, LARGEST, RATIO = 0.25, 1.25, 1.2  # the object's diagonal in the picture's shorter sides, and between two sizes
+SMALLEST, LARGEST, RATIO = (
+    0.25,
+    1.25,
+    1.2,
+)  # the object's diagonal in the picture's shorter sides, and between two sizes
 STRIDE = 2  # pixels between two places
 AT_ONCE = 128  # views
 NOISE = 0.06  # standard deviation of a pixel, sRGB values: of noise, and of what views lack by their spacing
 SHADE = 0.3  # of the light's slopes, relative to its constant
 WHITE = 0.15  # of the light's colour
 SHAPE = 0.25  # of a mask's error beside that of colours
-POWERS = 1.0, 1.4  # of the object's size, that the ratios are multiplied by: larger ones have more pixels, which are alike
+POWERS = (
+    1.0,
+    1.4,
+)  # of the object's size, that the ratios are multiplied by: larger ones have more pixels, which are alike
 PLACES = 3  # of a view, at one size
 TURNED_APART, PLACED_APART, SIZED_APART = 0.3, 0.15, 1.3  # radians, object sizes, factor: poses that are kept both
 KEPT = 24
@@ -88,7 +95,9 @@ class _Filter:
                 out = out.reshape(n, 6, *out.shape[1:])
                 b.append(out[:, :4])
                 sums.append(out[:, 4:])
-            squares = F.conv2d(picture.square().sum(0)[None, None], sides[rows].flatten(0, 1)[:, None], stride=stride)[0]
+            squares = F.conv2d(picture.square().sum(0)[None, None], sides[rows].flatten(0, 1)[:, None], stride=stride)[
+                0
+            ]
             squares = squares.reshape(n, 2, *squares.shape[1:])
             rare = F.conv2d(surprise[None, None], self.inside[rows, None], stride=stride)[0]
             parts.append(self._ratios(torch.cat(b, 1), torch.stack(sums, 2), squares, rare, rows))

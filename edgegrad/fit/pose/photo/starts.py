@@ -40,7 +40,14 @@ class Starts:
         seed: int, journal: Journal, search: Callable[[Pose, Journal], Search | PhotoSearch],
     ) -> None:  # fmt: skip
         """`starts` makes them, and `search` what follows one of them down."""
-        self.task, self.start, self.starts, self.depths, self.max_size, self.seed = task, start, starts, depths, max_size, seed
+        self.task, self.start, self.starts, self.depths, self.max_size, self.seed = (
+            task,
+            start,
+            starts,
+            depths,
+            max_size,
+            seed,
+        )
         self.journal, self._search = journal, search
         one = search(start, journal)
         self.enough, self.steps, self.tolerance, self.planned = one.enough, one.steps, one.tolerance, one.planned
@@ -82,7 +89,11 @@ class Starts:
 
         way.after_step = after_step
         way.run()
-        if first or (way.converged, way.explained) > (self.converged, self.explained) or (colours_first and way.converged):
+        if (
+            first
+            or (way.converged, way.explained) > (self.converged, self.explained)
+            or (colours_first and way.converged)
+        ):
             before = [step._replace(best=False) for step in before]
             self.history = [*before, *way.history]
             self.best, self.loss, self.explained, self.converged = way.best, way.loss, way.explained, way.converged
@@ -124,7 +135,9 @@ def _step(normal: Normal) -> Tensor | None:
     diagonal = normal.curvature.diagonal()
     if not float(diagonal.sum()) > 0.0:
         return None
-    move = -torch.linalg.solve(normal.curvature + torch.diag(DAMPING * diagonal + FLOOR * diagonal.max()), normal.gradient)
+    move = -torch.linalg.solve(
+        normal.curvature + torch.diag(DAMPING * diagonal + FLOOR * diagonal.max()), normal.gradient
+    )
     return move * min(1.0, LONGEST / float(move.abs().max().clamp(min=1e-30)))
 
 
