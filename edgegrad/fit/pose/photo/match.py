@@ -1,10 +1,12 @@
 """Where in a picture an object might be, and how it is turned: views of it, compared with the picture everywhere at low
 resolution.
 
-A view explains a part of a picture by the mesh's colours in the light that fits them best there, and by one colour around them;
-what it has to beat is one colour for all of the part. With inside the silhouette the basis B of colours times harmonics, the
-squared error is Σy² − bᵀA⁻¹b, with b = Σ B y and A = Σ B Bᵀ (a matched subspace filter, Scharf and Friedlander 1994). A does
-not depend on the place, and b is a correlation, so all places are had at once.
+A view explains a part of a picture by the mesh's colours in the light that fits them best there. What it has to beat is, for one
+list of matches, one colour for all of the part, where the view has one around the object, and for another that the pixels are
+drawn from the colours of the whole picture: the first finds contours and patterns, the second rare colours. With the basis B of
+colours times harmonics inside the silhouette, the squared error is Σy² − bᵀA⁻¹b, with b = Σ B y and A = Σ B Bᵀ (a matched
+subspace filter, Scharf and Friedlander 1994). A does not depend on the place, and b is a correlation, so all places are had at
+once.
 """
 
 from __future__ import annotations
@@ -68,7 +70,6 @@ class _Filter:
 
     def __init__(self, views: Views) -> None:
         alpha, colours, normals = views.alpha, views.colours, views.normals
-        n, T = alpha.shape[:2]
         self.C = colours.shape[-1]
         self.inside = torch.where(alpha > 0.5, alpha, torch.zeros_like(alpha))
         near = F.max_pool2d((alpha > 0.02).float()[:, None], 2 * RING + 1, 1, RING)[:, 0]
@@ -87,7 +88,7 @@ class _Filter:
         sides = torch.stack([self.inside, self.around], 1)
         for at in range(0, len(self.inside), AT_ONCE):
             rows = slice(at, at + AT_ONCE)
-            n, T = len(self.inside[rows]), self.inside.shape[-1]
+            n = len(self.inside[rows])
             b, sums = [], []
             for c in range(self.C):
                 both = torch.cat([self.filters[rows, c], sides[rows]], 1).flatten(0, 1)[:, None]

@@ -70,11 +70,11 @@ class Starts:
         if not self.history and failed is not None:
             raise failed
         if self.colours_first and self.converged:
-            # From so near, colours are compared as they are, if they fit.
+            # From so near, colours may be compared as they are, which is more precise where they fit.
             self._followed(self.best, True)
 
     def _followed(self, pose: Pose, colours_first: bool = False) -> Search | PhotoSearch:
-        """The way down from a start; it is the answer if it is better than those before, or the last word."""
+        """The way down from a start; it is the answer if it is better than those before."""
         way = self._search(pose, self.journal)
         if isinstance(way, PhotoSearch):
             way.colours_first = colours_first
@@ -89,11 +89,7 @@ class Starts:
 
         way.after_step = after_step
         way.run()
-        if (
-            first
-            or (way.converged, way.explained) > (self.converged, self.explained)
-            or (colours_first and way.converged)
-        ):
+        if first or (way.converged, way.explained) > (self.converged, self.explained):
             before = [step._replace(best=False) for step in before]
             self.history = [*before, *way.history]
             self.best, self.loss, self.explained, self.converged = way.best, way.loss, way.explained, way.converged
