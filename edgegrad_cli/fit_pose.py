@@ -34,6 +34,10 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--init", type=Path, metavar="POSE.json", help="pose to start from; as in the mesh file when left out"
     )
+    parser.add_argument(
+        "--starts", type=_starts, default=1, metavar="N|global",
+        help="so many starts, around --init or turned in all ways; global looks in the whole picture (%(default)s)",
+    )  # fmt: skip
     add_resume(parser)
     parser.add_argument(
         "--weight", type=Path, help="image of the picture's size: how much a pixel counts, black not at all"
@@ -55,6 +59,10 @@ def add(commands: Any) -> None:
     )
     add_live(parser)
     parser.set_defaults(run=run)
+
+
+def _starts(text: str) -> int | str:
+    return text if text == "global" else count(text)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -93,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
         fit = fit_pose(
             scene, picture, camera, mask, None if init is None else init.matrix,
             fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=read_background(args.background, picture),
-            weight=weight, max_size=args.size, steps=args.steps, seed=args.seed, callback=after_step,
+            weight=weight, max_size=args.size, steps=args.steps, seed=args.seed, starts=args.starts, callback=after_step,
             checkpoint=args.out / CHECKPOINT, resume=args.resume,
         )  # fmt: skip
         # Neither a full disk nor a closed terminal may lose the result: it is printed before the files are written, and they

@@ -1,0 +1,129 @@
+"""Small renders of a mesh from all sides, and the rotations that they are made at."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from ....aovs import render_aovs
+from ....camera.camera import Camera
+from ....camera.poses import rotation
+from ....files.image import linear_to_srgb
+from ....scene.mesh import Mesh
+from ....scene.scene import Scene
+from ..pose import Pose
+from ..task import PoseTask, focal_of
+
+ACROSS = 20  # pixels: the diagonal of the object's box in a view
+RING = 2  # pixels around it, which show what the object stands before
+SIDES, TURNS = 96, 18  # of views: directions, and turns about each; some 20° apart
+FILLS = 0.6  # of the picture's shorter side, an object as views see its perspective
+SPP = 4
+LEAST_DEPTH = 1.2  # of the object's centre, in sizes of it
+
+
+@dataclass(frozen=True)
+class Views:
+    """Renders at n rotations, of the object's centre in the middle of the image."""
+
+    rotations: Tensor  # (n, 3, 3) float64, mesh to camera
+    alpha: Tensor  # (n, T, T)
+    colours: Tensor  # (n, T, T, C), sRGB values; 1 where the mesh has no colours
+    normals: Tensor  # (n, T, T, 3), in mesh axes
+
+    @staticmethod
+    def of(task: PoseTask, rotations: Tensor, seed: int) -> Views:
+        """As the first picture's camera would see the object on its axis, ACROSS pixels large."""
+        camera, side = task.shots[0].camera, ACROSS + 2 * RING
+        perspective = camera.projection != "orthographic"
+        depth = 2.0 * task.size
+        if perspective:
+            depth = task.size * max(focal_of(camera) / (FILLS * min(camera.size)), LEAST_DEPTH)
+        K = torch.eye(3, dtype=torch.float64)
+        K[:2, :2] = camera.K[:2, :2] * (ACROSS / across(task, camera, depth))
+        K[:2, 2] = 0.5 * side
+        world = torch.eye(4, dtype=torch.float64).repeat(len(rotations), 1, 1)
+        world[:, :3, :3] = rotations
+        world[:, :3, 3] = world.new_tensor([0.0, 0.0, depth]) - rotations @ task.center
+        cameras = Camera(world, K.repeat(len(rotations), 1, 1), (side, side), projection=camera.projection)
+        scene, names = task.scene, ["alpha", "normal"]
+        plain = task.colourless or task.aovs == ("alpha",)
+        if plain:
+            scene = Scene([Mesh(mesh.verts, mesh.faces) for mesh in scene.meshes])
+        with torch.no_grad():
+            seen = render_aovs(scene, cameras, names if plain else [*names, "image"], SPP, seed)
+        alpha = seen["alpha"].float()
+        normals = F.normalize(seen["normal"].float(), dim=-1, eps=1e-6)
+        channels = task.shots[0].target.shape[-1] - ("alpha" in task.aovs and not task.clutter)
+        colours = torch.ones(*alpha.shape[:3], channels)
+        if not plain:
+            colours = linear_to_srgb((seen["image"].float() / alpha.clamp(min=1e-3)).clamp(0.0, 1.0))
+        return Views(rotations, alpha[..., 0], colours, normals)
+
+
+def across(task: PoseTask, camera: Camera, depth: float) -> float:
+    """Pixels across the object, the diagonal of its box, at a depth."""
+    return focal_of(camera) * task.size / (1.0 if camera.projection == "orthographic" else depth)
+
+
+def pose_at(task: PoseTask, R: Tensor, position: Tensor, depth: float) -> Pose:
+    """Where the first camera sees the object's centre at `position` (2,) in pixels and at `depth`, and the object as a view of
+    the rotation R has it: off the axis the object is turned like the ray to it. Distortion is left out."""
+    camera = task.shots[0].camera
+    view, K = camera.world_to_camera.double(), camera.K.double()
+    ray = torch.linalg.solve(K[:2, :2], position.double() - K[:2, 2])
+    center = torch.cat([ray, ray.new_tensor([depth])])
+    if camera.projection != "orthographic":
+        center = depth * torch.cat([ray, ray.new_ones(1)])
+        aside = ray.norm()
+        if aside > 0.0:
+            R = rotation(torch.stack([-ray[1], ray[0], ray.new_zeros(())]) / aside * torch.atan(aside)) @ R
+    turned = view[:3, :3].T @ R
+    one = torch.ones((), dtype=torch.float64)
+    t = view[:3, :3].T @ (center - view[:3, 3]) - turned @ task.center
+    return Pose(turned, t, one, one)
+
+
+def all_sides() -> Tensor:
+    """(SIDES · TURNS, 3, 3): directions on Fibonacci's sphere, each turned about itself."""
+    k = torch.arange(SIDES, dtype=torch.float64)
+    z = 1.0 - (2.0 * k + 1.0) / SIDES
+    longitude = math.pi * (3.0 - math.sqrt(5.0)) * k
+    first = _rotations(torch.stack([torch.zeros_like(k), torch.acos(z), torch.zeros_like(k)], -1))
+    second = _rotations(torch.stack([torch.zeros_like(k), torch.zeros_like(k), longitude], -1))
+    turn = torch.arange(TURNS, dtype=torch.float64) * (2.0 * math.pi / TURNS)
+    turns = _rotations(torch.stack([torch.zeros_like(turn), torch.zeros_like(turn), turn], -1))
+    return (turns[None] @ (first @ second)[:, None]).flatten(0, 1)
+
+
+def spread(count: int) -> Tensor:
+    """(count, 3, 3) rotations all over SO(3), evenly (Alexa, Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3),
+    2022)."""
+    s = torch.arange(count, dtype=torch.float64) + 0.5
+    inner, outer = (s / count).sqrt(), (1.0 - s / count).sqrt()
+    a, b = 2.0 * math.pi * s / math.sqrt(2.0), 2.0 * math.pi * s / 1.533751168755204288118041
+    x, y, z, w = inner * a.sin(), inner * a.cos(), outer * b.sin(), outer * b.cos()
+    half = torch.stack([x, y, z], -1)
+    length = half.norm(dim=-1, keepdim=True)
+    return _rotations(half / length.clamp(min=1e-12) * 2.0 * torch.atan2(length, w[:, None]))
+
+
+def ball(count: int, radius: float) -> Tensor:
+    """(count, 3, 3) rotations by up to `radius` radians, the first by none, the others evenly: about axes on Fibonacci's sphere,
+    by angles as their volume grows."""
+    k = torch.arange(count, dtype=torch.float64)
+    z = 1.0 - (2.0 * k + 1.0) / count
+    around = (1.0 - z * z).sqrt()
+    longitude = math.pi * (3.0 - math.sqrt(5.0)) * k
+    axes = torch.stack([around * longitude.cos(), around * longitude.sin(), z], -1)
+    # Multiples of the golden ratio, so that angles have nothing to do with axes.
+    share = torch.where(k > 0, (k * 0.6180339887498949) % 1.0, torch.zeros_like(k))
+    return _rotations(axes * (radius * share.pow(1.0 / 3.0))[:, None])
+
+
+def _rotations(vectors: Tensor) -> Tensor:
+    return torch.stack([rotation(vector) for vector in vectors])

@@ -1,0 +1,131 @@
+"""Many starts of fit_pose, and none at all: rotations that cover what they should, matches with a picture, ends and refusals."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from test_fit import bracket
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad.camera.poses import rotation
+from edgegrad.fit import fit_pose
+from edgegrad.fit.pose.photo.match import matches
+from edgegrad.fit.pose.photo.views import all_sides, ball, pose_at, spread
+from edgegrad.fit.pose.pose import angle
+from edgegrad.fit.pose.task import Lens, Names, PoseTask
+
+CENTER = torch.tensor([1.0, 0.75, 0.4])
+SIZE = 96
+
+
+def camera() -> eg.Camera:
+    eye = CENTER + torch.tensor([1.2, 1.0, 4.0])
+    return eg.Camera.look_at(eye, CENTER, fov_y=45.0, size=(SIZE, SIZE))
+
+
+def truth(turn: tuple[float, float, float], shift: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
+    """A pose turned about the object's centre."""
+    R = rotation(torch.tensor(turn))
+    return R, CENTER + torch.tensor(shift) - R @ CENTER
+
+
+def pictured(R: Tensor, t: Tensor) -> tuple[eg.Mesh, Tensor, Tensor]:
+    """The mesh, its picture in light before clutter, and a mask."""
+    mesh = bracket().to(torch.float32)
+    moved = mesh.transformed(R, t)
+    generator = torch.Generator().manual_seed(3)
+    coarse = 0.15 + 0.5 * torch.rand(1, 3, 9, 9, generator=generator)
+    clutter = torch.nn.functional.interpolate(coarse, (SIZE, SIZE), mode="bilinear")[0].movedim(0, -1)
+    light = [eg.DirectionalLight((-0.5, -0.8, -1.0), 2.0), eg.Environment((0.5, 0.5, 0.6), visible=False)]
+    lit = moved.replace(material=eg.Material())
+    with torch.no_grad():
+        picture = eg.render(eg.Scene([lit], background=clutter, lights=light), camera(), spp=32)
+        mask = (eg.render_aovs(moved, camera(), ["alpha"], 16)["alpha"] >= 0.5).float()
+    return mesh, picture, mask
+
+
+def farthest(rotations: Tensor, seed: int = 0) -> float:
+    """Radians from random rotations to the nearest of these, at most."""
+    q = torch.nn.functional.normalize(
+        torch.randn(300, 4, generator=torch.Generator().manual_seed(seed)), dim=-1
+    ).double()
+    probes = [rotation(2.0 * torch.acos(x[0].clamp(-1, 1)) * x[1:] / x[1:].norm().clamp(min=1e-9)) for x in q]
+    cosine = 0.5 * (torch.einsum("nij,mij->nm", torch.stack(probes), rotations) - 1.0)
+    return float(torch.acos(cosine.amax(1).clamp(-1.0, 1.0)).max())
+
+
+def test_rotations_cover_all_of_so3() -> None:
+    # Balls of this radius around evenly spread rotations have some three times the volume of SO(3).
+    assert farthest(spread(1000)) < 0.42
+    assert farthest(spread(30)) < 1.35
+    assert farthest(all_sides()) < 0.42
+    assert farthest(all_sides()[::2]) > 0.25  # the measure can tell
+
+
+def test_rotations_are_rotations() -> None:
+    for found in (spread(50), ball(50, 0.8), all_sides()):
+        assert torch.allclose(found @ found.mT, torch.eye(3).double().expand_as(found), atol=1e-9)
+        assert torch.allclose(torch.linalg.det(found), torch.ones(len(found)).double())
+
+
+def test_a_ball_begins_with_no_turn_and_is_filled_evenly() -> None:
+    angles = torch.tensor([angle(torch.eye(3).double(), R) for R in ball(200, 0.8)])
+    assert float(angles[0]) < 1e-9 and float(angles.max()) <= 0.8
+    # Half of a ball's volume is within 2^(-1/3) of its radius.
+    assert float((angles < 0.8 * 0.5 ** (1.0 / 3.0)).double().mean()) == pytest.approx(0.5, abs=0.04)
+
+
+def test_a_pose_off_the_axis_shows_the_object_where_it_should_and_turned_alike() -> None:
+    mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    task = PoseTask.of(mesh, picture, camera(), mask, None, None, Lens(), 1.0, Names())
+    R = rotation(torch.tensor([0.4, -0.3, 0.8], dtype=torch.float64))
+    pose = pose_at(task, R, torch.tensor([80.0, 20.0]), 5.0)
+    center = pose.R @ task.center + pose.t
+    assert torch.allclose(camera().to(torch.float64).project(center), torch.tensor([80.0, 20.0]).double(), atol=1e-4)
+    # What the ray to the object sees of it is what the axis sees of the view.
+    view = camera().world_to_camera.double()
+    seen = view[:3, :3] @ center + view[:3, 3]
+    assert float(seen[2]) == pytest.approx(5.0, abs=1e-6)
+    ray = (view[:3, :3] @ pose.R).T @ (seen / seen.norm())
+    assert torch.allclose(ray, R.T @ torch.tensor([0.0, 0.0, 1.0]).double(), atol=1e-6)
+
+
+@pytest.mark.parametrize("turn", [(0.4, 2.0, -0.7), (2.5, 0.3, 0.2)])
+def test_a_mask_says_where_the_object_is(turn: tuple[float, float, float]) -> None:
+    from edgegrad.fit.pose.photo.views import Views
+
+    R, t = truth(turn, (0.3, -0.2, 0.4))
+    mesh, picture, mask = pictured(R, t)
+    task = PoseTask.of(mesh, picture, camera(), mask, None, None, Lens(), 1.0, Names())
+    found = matches(task, Views.of(task, all_sides(), 0))
+    centers = [pose.R @ task.center + pose.t for pose in found]
+    true = R.double() @ task.center + t.double()
+    near = [
+        angle(pose.R, R.double()) < 0.5 and float((center - true).norm()) < 0.25 * task.size
+        for pose, center in zip(found, centers, strict=True)
+    ]
+    assert any(near[:8])
+
+
+def test_with_a_mask_no_start_is_needed() -> None:
+    R, t = truth((0.4, 2.0, -0.7), (0.3, -0.2, 0.4))
+    mesh, picture, mask = pictured(R, t)
+    fit = fit_pose(mesh, picture, camera(), mask, starts="global", progress=False)
+    assert fit.converged
+    assert angle(fit.R.double(), R.double()) < math.radians(2.0)
+    again = fit_pose(mesh, picture, camera(), mask, starts="global", progress=False, max_size=SIZE)
+    assert torch.equal(again.matrix, fit.matrix)  # the same seed, the same fit
+
+
+def test_refused() -> None:
+    mesh, picture, mask = pictured(*truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    for starts, says in ((0, "starts"), ("all", 'or "global"'), (10**6, "starts")):
+        with pytest.raises(ValueError, match=says):
+            fit_pose(mesh, picture, camera(), mask, starts=starts, progress=False)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="starts"):
+        fit_pose(mesh, picture, camera(), mask, starts=2.5, progress=False)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="leave init out"):
+        fit_pose(mesh, picture, camera(), mask, torch.eye(4), starts="global", progress=False)
