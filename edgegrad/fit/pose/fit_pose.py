@@ -172,8 +172,10 @@ def search_pose(
     if starts == 1:
         ways = way(start, journal, search)
     else:
-        made = partial(anywhere, task, seed) if starts == "global" else partial(
-            around if init is not None else everywhere, task, start, starts
+        made = (
+            partial(anywhere, task, seed)
+            if starts == "global"
+            else partial(around if init is not None else everywhere, task, start, starts)
         )
         ways = Starts(task, start, made, depths, max_size, seed, journal, partial(way, further=False))
     interrupted = False
