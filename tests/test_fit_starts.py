@@ -39,7 +39,10 @@ def pictured(R: Tensor, t: Tensor) -> tuple[eg.Mesh, Tensor, Tensor]:
     generator = torch.Generator().manual_seed(3)
     coarse = 0.15 + 0.5 * torch.rand(1, 3, 9, 9, generator=generator)
     clutter = torch.nn.functional.interpolate(coarse, (SIZE, SIZE), mode="bilinear")[0].movedim(0, -1)
-    light = [eg.DirectionalLight((-0.5, -0.8, -1.0), 2.0), eg.Environment((0.5, 0.5, 0.6), visible=False)]
+    light = [
+        eg.DirectionalLight(torch.tensor([-0.5, -0.8, -1.0]), 2.0),
+        eg.Environment(torch.tensor([0.5, 0.5, 0.6]), visible=False),
+    ]
     lit = moved.replace(material=eg.Material())
     with torch.no_grad():
         picture = eg.render(eg.Scene([lit], background=clutter, lights=light), camera(), spp=32)
