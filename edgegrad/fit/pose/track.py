@@ -34,7 +34,7 @@ from .result import PoseFit
 from .task import Lens, Names, PoseTask
 
 Frame = Tensor | PathLike
-STEPS, LAST_STEPS = 3, 2  # on the last level but one and on the last, where the prediction is good
+STEPS, LAST_STEPS = 4, 4  # on the last level but one and on the last, where the prediction is good
 MORE_STEPS = 8  # on each level, where it is not
 STEADY = 0.03  # standard deviation of the motion from that of constant velocity, radians and object sizes
 SHORT = 1e-3  # of a step on the last level: radians and object sizes
@@ -294,13 +294,16 @@ class Tracker:
 
     def _move(self, pose: Pose, share: float, lost: bool) -> None:
         """Takes in where the object is now."""
-        self.moves = not (self.first or lost or share < POOR)
+        moved, self.moves = self.moves, not (self.first or lost or share < POOR)
         if lost or share < POOR:  # where it went is not known
             self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
         elif not self.first:
             far = angle(self.pose.R, pose.R) > FARTHEST  # found again
-            self.turn = torch.eye(3, dtype=torch.float64) if far else pose.R @ self.pose.R.T
-            self.shift = torch.zeros(3, dtype=torch.float64) if far else self._center(pose) - self._center(self.pose)
+            turn = torch.eye(3, dtype=torch.float64) if far else pose.R @ self.pose.R.T
+            shift = torch.zeros(3, dtype=torch.float64) if far else self._center(pose) - self._center(self.pose)
+            # The difference of two poses has the errors of both, and predictions by it alone add them up.
+            known = moved and not far
+            self.turn, self.shift = (_between(self.turn, turn), 0.5 * (self.shift + shift)) if known else (turn, shift)
         self.pose, self.first = self.good if lost else pose, False
         if share >= ENOUGH and not lost:
             self.good = pose
@@ -326,3 +329,9 @@ class Tracker:
         if self.task is not None and picture.shape[-1] != (C := self.task.shots[0].target.shape[-1]):
             raise ValueError(f"{name}: expected {C} channels as of the frames before, got {picture.shape[-1]}")
         return picture
+
+
+def _between(A: Tensor, B: Tensor) -> Tensor:
+    """The rotation in the middle of two (3, 3)."""
+    U, _, Vh = torch.linalg.svd(A + B)
+    return U @ Vh
