@@ -27,6 +27,7 @@ SURE = 0.85  # the same, where a picture before an even background shows less th
 DAMPING, LAST_DAMPING, FLOOR = 0.1, 0.01, 1e-5
 LONGEST = 0.1  # of any entry of a step
 COARSE_STEPS, FINE_STEPS, LAST_STEPS = 12, 8, 20  # on a level, at most
+FULL_STEPS = 8  # of full length on the last level
 GAIN = 0.1  # a step that makes the pictures more likely by a smaller factor than exp(this / 2) is short: noise moves poses as far
 # Other starts: turned about the axes of the camera by so many radians.
 ASIDE = (0.2, 0.4)
@@ -191,6 +192,8 @@ class PhotoSearch:
             damped = normal.curvature + torch.diag(damping * diagonal + FLOOR * diagonal.max())
             move = -torch.linalg.solve(damped, normal.gradient)
             move = move * min(1.0, LONGEST / float(move.abs().max().clamp(min=1e-30)))
+            if level.last and len(way.steps) > FULL_STEPS:
+                move = 0.5 * move  # weights that are solved anew at each step make full ones go to and fro
             far = float(move.abs().max()) >= self.tolerance * level.plain.coarseness
             short = not far or float(move @ normal.curvature @ move) < GAIN
             step = Step(level.size, loss, way.pose, True, norms_of(level.plain.free, normal.gradient))
