@@ -22,6 +22,8 @@ from ..task import SHIFT, TURN, Level, PoseTask
 from .level import PhotoLevel, photo_levels
 
 ENOUGH = 0.65  # share of the render's edges: wrong poses reach 0.57, right ones 0.83 and more
+# The same of a contour alone: wrong places in clutter reach 0.81, right ones show 0.87 and more.
+ALONE_ENOUGH = 0.85
 SURE = 0.85  # the same, where a picture before an even background shows less than enough of the edges of colours as they are
 # Of the curvature's diagonal, where colours are still counted beside the object and where it is found, and of its largest entry.
 DAMPING, LAST_DAMPING, FLOOR = 0.1, 0.01, 1e-5
@@ -48,14 +50,13 @@ class _End(NamedTuple):
 class PhotoSearch:
     """The state of a search, as Search has it."""
 
-    enough = ENOUGH
-
     def __init__(
         self, task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, steps: int,
         tolerance: float, seed: int, journal: Journal | None = None, further: bool = True,
     ) -> None:  # fmt: skip
         """`further`: whether other starts follow where the way down from the given one does not end well."""
         self.task, self.start, self.depths = task, start, depths
+        self.enough = ALONE_ENOUGH if task.colourless else ENOUGH
         # Before an even background colours are compared as they are first.
         self.colours_first = not task.clutter and "alpha" not in task.aovs and all(depth is None for depth in depths)
         self.levels = photo_levels(task, start, depths, max_size, spp, seed)
@@ -97,10 +98,10 @@ class PhotoSearch:
         """Colours as they are have the last word where the light leaves them so, and in a mask where its terms find nothing."""
         task, best = self.task, self._photograph()
         pyramid = task.pyramid(best.pose, self.max_size, self.spp)
-        if best.explained >= ENOUGH and not task.colourless and self._as_they_are(best.pose):
+        if best.explained >= self.enough and not task.colourless and self._as_they_are(best.pose):
             colours = self._by_colours(best.pose, pyramid[-2:], False)
             better = colours.converged and angle(colours.best.R, best.pose.R) < NEAR
-        elif best.explained < ENOUGH and not task.clutter and self.further:
+        elif best.explained < self.enough and not task.clutter and self.further:
             colours = self._by_colours(self.start, task.pyramid(self.start, self.max_size, self.spp), True)
             better = colours.converged
         else:
@@ -124,8 +125,8 @@ class PhotoSearch:
         best = max(start, found, key=lambda end: end.explained)
         if not self.colours_first:
             self._take(best)
-        best = self._from_aside(best, begins) if self.further and best.explained < ENOUGH else best
-        return self._surrounded(best) if best.explained >= ENOUGH and best is not start else best
+        best = self._from_aside(best, begins) if self.further and best.explained < self.enough else best
+        return self._surrounded(best) if best.explained >= self.enough and best is not start else best
 
     def first_end(self) -> float:
         """The share of the render's edges that the pictures show where the way down from the start alone ends."""
@@ -150,7 +151,7 @@ class PhotoSearch:
                     self._take(best)
             else:
                 self._forget(slice(before, None))
-            if best.explained >= ENOUGH:
+            if best.explained >= self.enough:
                 break
         return best
 
@@ -160,7 +161,7 @@ class PhotoSearch:
         before = len(self.history)
         pose, short = self._follow(last, best.pose)
         (share,) = self.journal.numbers(lambda: [last.explained(pose, self.seed)])
-        if share < ENOUGH:
+        if share < self.enough:
             self._forget(slice(before, None))
             return best
         self.levels = [*self.levels[:-1], last]
@@ -225,7 +226,7 @@ class PhotoSearch:
     def _take(self, end: _End) -> None:
         (self.loss,) = self.journal.numbers(lambda: [self.levels[-1].equations(end.pose, self.seed)[1]])
         self.explained, self.best, self._answered = end.explained, end.pose, True
-        self.converged = end.short and end.explained >= ENOUGH
+        self.converged = end.short and end.explained >= self.enough
 
     def _as_they_are(self, pose: Pose) -> bool:
         """Whether the light leaves the mesh's colours as they are."""
