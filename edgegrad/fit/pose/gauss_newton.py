@@ -38,6 +38,17 @@ class Normal(NamedTuple):
     curvature: Tensor  # JᵀJ (n, n)
     gradient: Tensor  # Jᵀr (n,)
 
+    def damped(self, damping: float, floor: float, longest: float) -> Tensor | None:
+        """The step (n,), no entry longer than `longest`, by a damping relative to the diagonal of JᵀJ, and a `floor` relative to
+        its largest entry; None where nothing depends on the parameters."""
+        diagonal = self.curvature.diagonal()
+        if not float(diagonal.sum()) > 0.0:
+            return None
+        step = -torch.linalg.solve(
+            self.curvature + torch.diag(damping * diagonal + floor * diagonal.max()), self.gradient
+        )
+        return step * min(1.0, longest / float(step.abs().max().clamp(min=1e-30)))
+
     @staticmethod
     def of(residuals: Sequence[Tensor], tangents: Sequence[Tensor]) -> Normal:
         """From images r, and the derivatives (n, …) of each. Sums are taken in float64."""

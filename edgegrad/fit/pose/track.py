@@ -253,15 +253,12 @@ class Tracker:
             at, views = pose, level.see(pose, self.seed)
             normal, _loss = level.equations(pose, self.seed, views)
             if not float(normal.curvature.trace()) > 0.0:
-                break
+                break  # the prior below would hide that
             if offset is not None:
                 known = torch.eye(len(offset), dtype=torch.float64) / STEADY**2
                 normal = Normal(normal.curvature + known, normal.gradient + known @ offset)
-            diagonal = normal.curvature.diagonal()
-            damping = LAST_DAMPING if level.last else DAMPING
-            damped = normal.curvature + torch.diag(damping * diagonal + FLOOR * diagonal.max())
-            move = -torch.linalg.solve(damped, normal.gradient)
-            move = move * min(1.0, LONGEST / float(move.abs().max().clamp(min=1e-30)))
+            move = normal.damped(LAST_DAMPING if level.last else DAMPING, FLOOR, LONGEST)
+            assert move is not None
             pose = level.task.moved(pose, level.plain.free, move)
             if offset is not None:
                 offset += move

@@ -19,9 +19,7 @@ REACH = 2.0  # pixels: standard deviation of the windows that colours are taken 
 NOISE = 0.03  # standard deviation of a pixel, sRGB values
 PURE = 0.03  # share of the other side in a pixel of one side alone
 SUPPORT = 0.03  # of a window
-TOLERANCE = (
-    12.0  # squared differences, in variances of all channels, far above this hardly count (Geman and McClure 1987)
-)
+TOLERANCE = 12.0  # squared differences, in variances, that are far above this hardly count (Geman and McClure 1987)
 FEWEST = 20  # pixels on the contour
 
 

@@ -28,10 +28,8 @@ def depth_term(surface: Surface, measured: Tensor, weight: Tensor, size: float) 
     deviation = min(max(1.4826 * float(residual.abs().median()), LEAST * size), WIDEST * size)
     robust = weight[inside] * (1.0 + (residual / (3.0 * deviation)).square()).pow(-2)
     axis = surface.camera.world_to_camera[2, :3].double()
-    share = surface.channels["alpha"][surface.inside].double()
-    points = surface.channels["position"][surface.inside].double() / share
     among = inside[surface.inside]
-    along = (surface.motion.of_points(points[among]) @ axis).float()
+    along = (surface.motion.of_points(surface.points[among]) @ axis).float()
     J = along - (surface.flow()[:, among] * slope(z[..., None])[inside][:, 0]).sum(-1)
     information = 1.0 / (TOGETHER * deviation**2)
     weighted = (J * robust).double()

@@ -13,6 +13,7 @@ to the second order (Malis, Improving Vision-Based Control Using Efficient Secon
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -29,7 +30,6 @@ WHOLE = 0.9  # share of a blur's window that lies inside
 FEWEST = 60  # pixels
 REWEIGHTED = 4  # times
 LEAST = 0.02  # standard deviation of a difference
-MEDIAN = 1.54  # of the length of three normal differences
 # Differences of neighbouring pixels are alike, for shadows and highlights have an extent: so many pixels count as one.
 TOGETHER = 8.0
 
@@ -74,7 +74,7 @@ class Lit:
                 light[c] = torch.linalg.solve(curvature + torch.diag(ridge[c]), (B[:, c] * w[:, None]).T @ y[:, c])
             residual = torch.einsum("pcn,cn->pc", B, light) - y
             e = residual.norm(dim=-1)
-            middle = max(float(e.median()) / MEDIAN, LEAST)
+            middle = max(float(e.median()) / _median(len(light)), LEAST)
             w = count * (1.0 + (e / (3.0 * middle)).square()).pow(-2)
         predicted = torch.einsum("hwcn,cn->hwc", basis, light)
         slopes = slope(0.5 * (predicted + pictured))[inside]
@@ -129,6 +129,11 @@ def spherical_slopes(n: Tensor, tangents: Tensor) -> Tensor:
     (x, y, z), (a, b, c) = n.unbind(-1), tangents.unbind(-1)
     parts = [a * 0.0, a, b, c, a * y + x * b, b * z + y * c, 6.0 * z * c, a * z + x * c, 2.0 * (x * a - y * b)]
     return torch.stack(parts, -1)
+
+
+def _median(channels: int) -> float:
+    """Of the length of so many normal numbers of variance 1 (Wilson and Hilferty, The Distribution of Chi-Square, 1931)."""
+    return math.sqrt(channels * (1.0 - 2.0 / (9.0 * channels)) ** 3)
 
 
 def _blurred_inside(image: Tensor, inside: Tensor) -> Tensor:

@@ -5,8 +5,7 @@ object is P = p_f / (p_f + p_b). A render covers the share α of it, so the like
 −Σ log f (Prisacariu and Reid, PWP3D, 2012). Colours are counted near each pixel, for those of the whole picture seldom tell an
 object from what surrounds it (Tjaden et al., A Region-Based Gauss-Newton Approach, 2017).
 
-The steps are Gauss-Newton's with the square root of −log f as the residual's scale: the gradient is −(2P − 1)/f ∇α and the
-curvature is the sum of its squares, as of Fisher's information.
+The gradient is −Σ (2P − 1)/f ∇α, with P held fixed, and the curvature is Σ of the squares of the same, Fisher's information.
 """
 
 from __future__ import annotations

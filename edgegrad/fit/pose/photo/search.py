@@ -97,9 +97,8 @@ class PhotoSearch:
     def _photograph_first(self) -> None:
         """Colours as they are have the last word where the light leaves them so, and in a mask where its terms find nothing."""
         task, best = self.task, self._photograph()
-        pyramid = task.pyramid(best.pose, self.max_size, self.spp)
         if best.explained >= self.enough and not task.colourless and self._as_they_are(best.pose):
-            colours = self._by_colours(best.pose, pyramid[-2:], False)
+            colours = self._by_colours(best.pose, task.pyramid(best.pose, self.max_size, self.spp)[-2:], False)
             better = colours.converged and angle(colours.best.R, best.pose.R) < NEAR
         elif best.explained < self.enough and not task.clutter and self.further:
             colours = self._by_colours(self.start, task.pyramid(self.start, self.max_size, self.spp), True)
@@ -185,14 +184,10 @@ class PhotoSearch:
         while not way.done:
             # The same samples at each step, so that steps come to rest.
             normal, loss = level.equations(way.pose, self.seed)
-            if not float(normal.curvature.trace()) > 0.0:
+            move = normal.damped(LAST_DAMPING if level.last else DAMPING, FLOOR, LONGEST)
+            if move is None:
                 self.journal.keep(way := way._replace(done=True))
                 break
-            diagonal = normal.curvature.diagonal()
-            damping = LAST_DAMPING if level.last else DAMPING
-            damped = normal.curvature + torch.diag(damping * diagonal + FLOOR * diagonal.max())
-            move = -torch.linalg.solve(damped, normal.gradient)
-            move = move * min(1.0, LONGEST / float(move.abs().max().clamp(min=1e-30)))
             if level.last and len(way.steps) > FULL_STEPS:
                 move = 0.5 * move  # weights that are solved anew at each step make full ones go to and fro
             far = float(move.abs().max()) >= self.tolerance * level.plain.coarseness

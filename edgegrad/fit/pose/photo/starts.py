@@ -10,10 +10,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from ..gauss_newton import Normal
 from ..journal import Journal
 from ..pose import Pose
 from ..result import Step
@@ -40,14 +38,8 @@ class Starts:
         seed: int, journal: Journal, search: Callable[[Pose, Journal], Search | PhotoSearch],
     ) -> None:  # fmt: skip
         """`starts` makes them, and `search` what follows one of them down."""
-        self.task, self.start, self.starts, self.depths, self.max_size, self.seed = (
-            task,
-            start,
-            starts,
-            depths,
-            max_size,
-            seed,
-        )
+        self.task, self.start, self.starts, self.depths = task, start, starts, depths
+        self.max_size, self.seed = max_size, seed
         self.journal, self._search = journal, search
         one = search(start, journal)
         self.enough, self.steps, self.tolerance, self.planned = one.enough, one.steps, one.tolerance, one.planned
@@ -119,22 +111,11 @@ class Starts:
         level = photo_levels(self.task, pose, self.depths, self.max_size, SPP, self.seed)[0]
         for _ in range(FIRST_STEPS):
             normal, _ = level.equations(pose, self.seed)
-            move = _step(normal)
+            move = normal.damped(DAMPING, FLOOR, LONGEST)
             if move is None:
                 break
             pose = self.task.moved(pose, level.plain.free, move)
         return level.explained(pose, self.seed), pose
-
-
-def _step(normal: Normal) -> Tensor | None:
-    """Damped, and not too long; None where nothing depends on the pose."""
-    diagonal = normal.curvature.diagonal()
-    if not float(diagonal.sum()) > 0.0:
-        return None
-    move = -torch.linalg.solve(
-        normal.curvature + torch.diag(DAMPING * diagonal + FLOOR * diagonal.max()), normal.gradient
-    )
-    return move * min(1.0, LONGEST / float(move.abs().max().clamp(min=1e-30)))
 
 
 def around(task: PoseTask, pose: Pose, count: int) -> list[Pose]:

@@ -30,10 +30,14 @@ class Surface:
         open_ = (channels["alpha"][..., 0] < COVERED).float()
         return Surface(camera, channels, F.max_pool2d(open_[None, None], 3, 1, 1)[0, 0] == 0.0, motion)
 
+    @property
+    def points(self) -> Tensor:
+        """(N, 3) float64, those inside, world coordinates."""
+        return self.channels["position"][self.inside].double() / self.channels["alpha"][self.inside].double()
+
     def flow(self) -> Tensor:
         """(D, N, 2) how the N points inside move in the image by the motion, pixels; by central differences, for any lens."""
-        share = self.channels["alpha"][self.inside].double()
-        points = self.channels["position"][self.inside].double() / share
+        points = self.points
         ways = self.motion.of_points(points)
         camera, found = self.camera.to(torch.float64), []
         for k, way in enumerate(ways):
