@@ -200,6 +200,19 @@ def test_a_flat_loss_alone_is_no_convergence():
     assert fit.reason.startswith("edges not explained: the pictures show")
 
 
+@pytest.mark.parametrize(("method", "rate"), [("adam", 0.3), ("gauss-newton", 0.02)])
+def test_a_tolerance_of_0_takes_all_steps(method, rate):
+    cameras = views(1)
+    options = {"steps": 60, "patience": 2, "method": method, **QUIET, "spp": 1}
+    target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)
+
+    def steps(tolerance):
+        scene = eg.Scene([bracket()], torch.zeros(3))
+        return fit_scene(scene, cameras, target, {"background": rate}, tolerance=tolerance, **options).steps
+
+    assert steps(0.01) < 60 and steps(0.0) == 60
+
+
 def test_a_loss_that_still_falls_is_no_convergence():
     cameras = views(1)
     target = pictures(eg.Scene([bracket()], BACKGROUND), cameras)

@@ -83,7 +83,7 @@ class Options:
     seed              the same seed gives the same fit
     patience          the fit ends where so many more steps promise, by the gradients at the end of the last ones, that the loss
     tolerance         falls by less than this share of it, or of what it has fallen by so far, or by less than its noise; "adam"
-                      first takes shorter steps, three times
+                      first takes shorter steps, three times. With a tolerance of 0 it takes all its steps
     progress          show a bar with the loss on standard error
     callback          called after each step with its Record, which is a Progress: it has scene and cameras too; KeyboardInterrupt
                       from it ends the fit

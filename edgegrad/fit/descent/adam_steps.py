@@ -64,9 +64,9 @@ class AdamSteps(Way):
         """Lowers the learning rates where the steps lead down no longer, or the loss falls no longer; when it has fallen often
         enough, it is flat."""
         p = self.options.patience
-        if not self.falling:
+        if self.impatient:
             self._cut()
-        elif self.step - self.since >= 2 * p:
+        elif self.options.tolerance > 0.0 and self.step - self.since >= 2 * p:
             losses = [record.loss for record in self.history[-2 * p :]]
             before, now = sum(losses[:p]) / p, sum(losses[p:]) / p
             # not <=, so that losses that are NaN count as flat

@@ -97,7 +97,7 @@ class GaussNewtonSteps(Way):
             self.H = curvature(objective, self.values, step) * self.rates * self.rates[:, None]
         self.places = [*self.places, self.here] if self.settled else [self.here]
         self.best = self._named(torch.stack(self.places[-((len(self.places) + 1) // 2) :]).mean(0))
-        self.flat = self.settled > SETTLED and not self.falling
+        self.flat = self.settled > SETTLED and self.impatient
 
     def _step(self) -> Tensor:
         """From the last accepted point, in the parameters' units."""

@@ -56,6 +56,11 @@ class Way:
         """Whether as many more steps as the patience promise more than the tolerance allows, and than can be told from noise."""
         return self.falls.promise(self.options.patience) > self.falls.least(self.options)
 
+    @property
+    def impatient(self) -> bool:
+        """Whether it leads down no longer, by a tolerance that says what counts; never by one of 0."""
+        return self.options.tolerance > 0.0 and not self.falling
+
     def ending(self, interrupted: bool) -> Ending:
         if interrupted:
             return Ending.INTERRUPTED
