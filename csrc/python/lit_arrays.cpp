@@ -63,7 +63,7 @@ LampArrays make_lamp(const std::string& kind, int position, int direction, int i
             refuse("running, density: expected a number for each face or texel");
         lamp.running = running->data(), lamp.density = density->data(), lamp.size = int64_t(running->size());
     }
-    if (stream.size() != 3) refuse("stream: expected three numbers");
+    if (stream.size() != std::size(lamp.stream)) refuse("stream: expected five numbers");
     std::copy(stream.begin(), stream.end(), lamp.stream);
     return {lamp, running, density};
 }

@@ -276,7 +276,7 @@ def _texture(mesh: Mesh, texture: Texture, tables: _Tables) -> Any:
 
 
 def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) -> Any:
-    stream = [mixed_bits(number * 0x10001 + k) for k in range(3)]
+    stream = [mixed_bits(number * 0x10001 + k) for k in range(5)]
 
     def lamp(kind: str, **fields: Any) -> Any:
         return core.Lamp(kind, stream=stream, **{"eps": eps, **fields})

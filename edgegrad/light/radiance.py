@@ -37,6 +37,7 @@ from . import in_kernel
 from .bsdf import Scattering, dot, terminator
 from .creases import note_jumps
 from .in_kernel import is_fused, nearest_textures
+from .lobes import Lobes
 
 FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
 
@@ -217,6 +218,12 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
         count = 1 if light.punctual or hits._only_light else lighting.samples
         for sample in range(count):
             total = total + _light_sample(hits, light, (sample, count), surface, lighting.shadows) / count
+    lobes = None if hits._only_light else Lobes.of(surface.v, surface.n, surface.scattering)
+    for light in scene.casting if lobes is not None else ():
+        if isinstance(light, Environment) and not hits._knows_light(light):
+            for sample in range(lighting.samples):
+                lobe_sample = _lobe_sample(hits, light, (sample, lighting.samples), surface, lighting.shadows)
+                total = total + lobe_sample / lighting.samples
     return _where_seen(hits, material, total)
 
 
@@ -231,7 +238,21 @@ def _light_sample(hits: Hits, light: Light, sample: tuple[int, int], surface: _S
     points = hits.light_points(light, *sample)
     if isinstance(light, Environment) and not hits._knows_light(light):
         points = light.above(points, surface.g)
+        lobes = Lobes.of(surface.v, surface.n, surface.scattering)
+        points = points if lobes is None else lobes.combined(light, points)
     return _scattered(hits, light, points, surface, shadows, lambda rows, y: light.arriving(points.select(rows), y))
+
+
+def _lobe_sample(
+    hits: Hits, light: Environment, sample: tuple[int, int], surface: _Surface, shadows: bool
+) -> Tensor:
+    """(N, C): the same of one point that is drawn by how the surface scatters, of surfaces that do not scatter too widely."""
+    lobes = Lobes.of(surface.v, surface.n, surface.scattering)
+    assert lobes is not None
+    u = hits.random(5, hits._index(light), *sample)[:, 3:]
+    points = lobes.points(light, u, surface.g)
+    found = _scattered(hits, light, points, surface, shadows, lambda rows, y: light.arriving(points.select(rows), y))
+    return torch.where(lobes.narrow[:, None], found, 0.0)
 
 
 def _scattered(

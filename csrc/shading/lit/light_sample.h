@@ -6,6 +6,7 @@
 
 #include "shading/lit/environment.h"
 #include "shading/lit/lit_surface.h"
+#include "shading/lit/lobe_draw.h"
 #include "shading/lit/punctual.h"
 
 namespace edgegrad {
@@ -58,19 +59,44 @@ inline Vec3 place(const LitScene& lit, const Lamp& lamp, const LightPoint& p) {
     }
 }
 
-// The point of a light that point i of a surface with the normal g is lit by.
-inline LightPoint light_point(const LitScene& lit, const LitPoints& points, int64_t i, const LightSample& which,
-                              Vec3 g) {
+// The point of an environment in a direction that lies above a surface, drawn by the light and mirrored up there, or drawn
+// by the lobe. Its density is the one that the power heuristic leaves (Veach and Guibas 1995): p / w, w = p² / Σ p²,
+// of as many draws by the one as by the other.
+inline LightPoint combined(LightPoint p, double by_light, double by_lobe, bool of_lobe) {
+    const double own = of_lobe ? by_lobe : by_light;
+    p.density = own > 0 ? (by_light * by_light + by_lobe * by_lobe) / own : 0;
+    return p;
+}
+
+// The point of a light that point i of a surface is lit by. It does not exist where a lobe is wanted of what has none.
+template <class S>
+LightPoint light_point(const LitScene& lit, const LitPoints& points, int64_t i, const LightSample& which,
+                       const Surface<S>& o) {
     const Lamp& lamp = lit.lamps[which.lamp];
     if (lamp.is_punctual()) return {};
     const ForcedLight& forced = points.forced;
-    if (forced.lamp == which.lamp) return {forced.index[i], forced.uv[2 * i], forced.uv[2 * i + 1], forced.density[i]};
+    const LightPoint nowhere{0, 0, 0, 0};
+    if (forced.lamp == which.lamp)
+        return which.by_lobe ? nowhere
+                             : LightPoint{forced.index[i], forced.uv[2 * i], forced.uv[2 * i + 1], forced.density[i]};
     // Numbers that fill the unit cube evenly (edgegrad/points/seeds.py).
     const uint64_t seed = uint64_t(points.seed[i]) * uint64_t(which.count) + uint64_t(which.sample);
-    double u[3];
-    for (int k = 0; k < 3; ++k) u[k] = double((seed * lit.step[k] + lamp.stream[k]) >> 11) * 0x1p-53;
-    const LightPoint p = draw(lamp, u);
-    return lamp.kind == Lamp::Kind::environment ? above(lit.tables, lamp, p, g) : p;
+    const auto number = [&](int k) { return double((seed * lit.step[k % 3] + lamp.stream[k]) >> 11) * 0x1p-53; };
+    if (lamp.kind == Lamp::Kind::mesh) {
+        const double u[3] = {number(0), number(1), number(2)};
+        return draw(lamp, u);
+    }
+    const Vec3 g = plain(o.g);
+    const DrawnLobe lobe(o);
+    if (which.by_lobe) {
+        if (!lobe.exists()) return nowhere;
+        const Vec3 l = lobe.draw(number(3), number(4));
+        const LightPoint p = point_towards(lit.tables, lamp, l);
+        return combined(p, above(lit.tables, lamp, p, g).density, lobe.density(l), true);
+    }
+    const double u[3] = {number(0), number(1), number(2)};
+    const LightPoint p = above(lit.tables, lamp, draw(lamp, u), g);
+    return lobe.exists() ? combined(p, p.density, lobe.density(place(lit, lamp, p)), false) : p;
 }
 
 // What one light sample adds, before it is known to be seen: f E max(0, n·l).

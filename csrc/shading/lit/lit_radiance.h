@@ -55,7 +55,7 @@ void radiance(const LitScene& lit, const LitPoints& points, const LitOptions& op
     if (options.only < 0) add_unshadowed(lit, o, total);
     for (size_t k = 0; k < lights.size(); ++k)
         if (seen[k] > 0)
-            add_light<S>(lit, lit.lamps[lights[k].lamp], light_point(lit, points, i, lights[k], plain(o.g)),
+            add_light<S>(lit, lit.lamps[lights[k].lamp], light_point(lit, points, i, lights[k], o),
                          1.0 / lights[k].count, o, total);
 }
 // Whether no light that a point sees, nor anything else, gives it radiance: then it has no derivatives either.
@@ -74,7 +74,7 @@ inline void radiance_vjp(const LitScene& lit, const LitPoints& points, const Lit
     if (options.only < 0) add_unshadowed_vjp(lit, o, total_bar, bar, to);
     for (size_t k = 0; k < lights.size(); ++k)
         if (seen[k] > 0)
-            add_light_vjp(lit, lit.lamps[lights[k].lamp], light_point(lit, points, i, lights[k], o.g),
+            add_light_vjp(lit, lit.lamps[lights[k].lamp], light_point(lit, points, i, lights[k], o),
                           1.0 / lights[k].count, o, total_bar, bar, to);
     look_up_material_vjp(lit, o, bar, to);
     surface_vjp(lit, o, bar, to);

@@ -20,6 +20,8 @@ struct LitMesh {
     bool has_material = false, two_sided = true, lambertian = true;
     Source color, base, metallic, roughness, emission;  // the colour of the mesh itself, and its material's
     NormalSource normal;
+
+    bool is_glossy() const { return has_material && !lambertian; }
 };
 
 struct LitScene {
@@ -39,6 +41,9 @@ struct LitScene {
         size_t k = 0;
         while (k + 1 < meshes.size() && face >= meshes[k + 1].first_face) ++k;
         return meshes[k];
+    }
+    bool is_glossy() const {
+        return std::any_of(meshes.begin(), meshes.end(), [](const LitMesh& m) { return m.is_glossy(); });
     }
     EmissiveFaces emitter(const Lamp& lamp) const {
         const LitMesh& mesh = meshes[lamp.mesh];
@@ -83,7 +88,9 @@ constexpr int8_t not_asked = -1;
 
 struct LightSample {
     int lamp, sample, count;  // one of so many of a lamp
+    bool by_lobe = false;     // drawn by how the surface scatters, not by the light
 };
+// First those that are drawn by the light.
 inline std::vector<LightSample> light_samples(const LitScene& lit, const LitOptions& options) {
     std::vector<LightSample> out;
     for (int k = 0; k < int(lit.lamps.size()); ++k) {
@@ -91,6 +98,10 @@ inline std::vector<LightSample> light_samples(const LitScene& lit, const LitOpti
         const int count = lit.lamps[k].is_punctual() ? 1 : options.samples;
         for (int s = 0; s < count; ++s) out.push_back({k, s, count});
     }
+    if (options.only >= 0 || !lit.is_glossy()) return out;
+    for (int k = 0; k < int(lit.lamps.size()); ++k)
+        if (lit.lamps[k].kind == Lamp::Kind::environment)
+            for (int s = 0; s < options.samples; ++s) out.push_back({k, s, options.samples, true});
     return out;
 }
 

@@ -47,6 +47,14 @@ void set_surface(const LitScene& lit, int64_t face, const S* b, Surface<S>& o) {
     o.n = o.mesh->normal.is_flat() ? o.g : o.side * shading_normal(tables, o.mesh->normal, o.at, o.frame);
 }
 
+// What the directions depend on that are drawn by how a surface scatters.
+template <class S>
+void look_up_roughness(const LitScene& lit, Surface<S>& o) {
+    Scattering<S>& s = o.scattering;
+    s.lambertian = o.mesh->lambertian, s.roughness = 1;
+    if (o.mesh->roughness.exists()) value(lit.tables, o.mesh->roughness, o.at, 1, &s.roughness);
+}
+
 // The base colour, and what else scatters.
 constexpr double plain_color = 0.7;  // of a mesh without colours (PLAIN in edgegrad/scene/mesh.py)
 template <class S>
@@ -61,10 +69,9 @@ void look_up_material(const LitScene& lit, Surface<S>& o) {
         value(lit.tables, mesh.base, o.at, C, factor);
         for (int c = 0; c < C; ++c) s.base[c] *= factor[c];
     }
-    s.lambertian = mesh.lambertian;
-    s.metallic = 0, s.roughness = 1;
+    s.metallic = 0;
     if (mesh.metallic.exists()) value(lit.tables, mesh.metallic, o.at, 1, &s.metallic);
-    if (mesh.roughness.exists()) value(lit.tables, mesh.roughness, o.at, 1, &s.roughness);
+    look_up_roughness(lit, o);
 }
 
 // Cotangents of what a point is made of.

@@ -54,7 +54,10 @@ void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayC
     const size_t K = lights.size();
     buffers.surfaces.resize(points.size);
     for (int64_t i = 0; i < points.size; ++i)
-        if (wanted(i)) set_surface<double>(lit, points.face[i], points.b + 3 * i, buffers.surfaces[i]);
+        if (wanted(i)) {
+            set_surface<double>(lit, points.face[i], points.b + 3 * i, buffers.surfaces[i]);
+            look_up_roughness(lit, buffers.surfaces[i]);
+        }
     // Light by light, for rays that are cast together are the faster the more alike they are.
     for (size_t k = 0; k < K; ++k) {
         const Lamp& lamp = lit.lamps[lights[k].lamp];
@@ -64,7 +67,8 @@ void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayC
             const Surface<double>& o = buffers.surfaces[i];
             int8_t& found = seen[i * K + k] = not_asked;
             if (!o.mesh->has_material || o.is_black()) continue;
-            const LightPoint point = light_point(lit, points, i, lights[k], o.g);
+            const LightPoint point = light_point(lit, points, i, lights[k], o);
+            if (!point.exists()) continue;
             if (lamp.kind == Lamp::Kind::mesh &&
                 !shows(scene, lit.emitter(lamp).first + point.index, {point.u, point.v}))
                 continue;  // the lamp is cut out there
