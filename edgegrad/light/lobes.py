@@ -10,39 +10,40 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ..scene.environment import Environment
-from ..scene.lights import LightPoints
-from .bsdf import LEAST_ALPHA, Scattering, dot, ggx
+from .bsdf import LEAST_ALPHA, dot, ggx
 
-WIDEST_LOBE = 0.65  # roughness above which directions drawn by the lobe only cost
+WIDEST_LOBE = 0.65  # roughness
 
 
 class Lobes(NamedTuple):
-    """Of N points, without derivatives, in float64."""
+    """Of N points, without derivatives, in float64. Where they are wide, directions drawn by them only cost."""
 
     v: Tensor  # (N, 3) unit, above the surface
     n: Tensor  # (N, 3) unit
     alpha: Tensor  # (N, 1)
     bound: Tensor  # (N, 1), of the cap of normals whose mirrored directions are above
-    narrow: Tensor  # (N,) bool: where directions are drawn by it
+    narrow: Tensor  # (N,) bool
 
     @classmethod
     @torch.no_grad()
-    def of(cls, v: Tensor, n: Tensor, scattering: Scattering) -> Lobes | None:
-        """None where no surface is glossy."""
-        if scattering.roughness is None:
-            return None
+    def of(cls, v: Tensor, n: Tensor, roughness: Tensor) -> Lobes:
+        """Of unit directions to the viewer and normals (N, 3), and roughnesses (N, 1) or (1, 1)."""
         v, n = v.detach().double(), n.detach().double()
-        roughness = scattering.roughness.detach().double().expand(len(n), 1)
+        roughness = roughness.detach().double().expand(len(n), 1)
         narrow = (roughness <= WIDEST_LOBE)[:, 0]
-        if not bool(narrow.any()):
-            return None
         nv = dot(n, v)
         v = torch.where(nv >= 0, v, normalize(v - nv * n, dim=-1))
         nv = nv.clamp(min=0)
         alpha = (roughness * roughness).clamp(min=LEAST_ALPHA)
         a2, s = alpha * alpha, 1 + (1 - nv * nv).clamp(min=0).sqrt()
         return cls(v, n, alpha, (1 - a2) * s * s / (s * s + a2 * nv * nv), narrow)
+
+    def select(self, rows: Tensor) -> Lobes:
+        return Lobes(*(part[rows] for part in self))
+
+    def repeated(self, times: int) -> Lobes:
+        """Each so many times."""
+        return Lobes(*(part.repeat_interleave(times, 0) for part in self))
 
     def density(self, l: Tensor) -> Tensor:
         """(N,) by solid angle, of unit directions (N, 3): D(h) / 2 (k n·v + √(α² + (1 − α²) (n·v)²)), k the bound."""
@@ -62,23 +63,6 @@ class Lobes(NamedTuple):
         m = torch.stack([across * phi.cos(), across * phi.sin(), z], 1) + wide
         h = (normalize(m * stretch, dim=-1)[:, None] @ axes)[:, 0]
         return normalize(2 * dot(self.v, h) * h - self.v, dim=-1)
-
-    def points(self, light: Environment, u: Tensor, g: Tensor) -> LightPoints:
-        """Points of a light from numbers (N, 2) in [0, 1), with the densities of combined(); g (N, 3) are the faces' normals."""
-        l = self.draw(u)
-        points = light.points_at(l)
-        by_light = light.above(points, g).density
-        return points._replace(density=_combined(self.density(l), by_light))
-
-    def combined(self, light: Environment, points: LightPoints) -> LightPoints:
-        """Points that the light has drawn, where as many are drawn by lobes: their densities are those that the power heuristic
-        leaves (Veach and Guibas 1995), p / w, w = p² / Σ p²."""
-        both = _combined(points.density, self.density(light.place(points).detach()))
-        return points._replace(density=torch.where(self.narrow, both, points.density))
-
-
-def _combined(own: Tensor, other: Tensor) -> Tensor:
-    return (own * own + other * other) / own
 
 
 def _axes_around(n: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ with one point, or a few, of each light that has an extent. Spherical harmonics 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -37,7 +37,7 @@ from . import in_kernel
 from .bsdf import Scattering, dot, terminator
 from .creases import note_jumps
 from .in_kernel import is_fused, nearest_textures
-from .lobes import Lobes
+from .resampled import Glossy, resampled
 
 FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
 
@@ -72,11 +72,12 @@ class Lighting(NamedTuple):
         extended = any(not light.punctual for light in scene.casting)
         spp = request.image.spp
         points = max(FEWEST_IN_PENUMBRA, spp // 4) if extended else shaded_points(spp)
+        in_image = self._in_image(scene, points, spp)
         fused = is_fused(scene)
         additive = not scene.blends
         effort = Effort(
             points=points,
-            kernel_image=(lambda frame: _kernel_image(frame, self, points)) if fused and additive else None,
+            kernel_image=(lambda frame: _kernel_image(frame, *in_image)) if fused and additive else None,
             blended=scene.blends,
             lit=True,
             keeps_little=fused,
@@ -91,6 +92,15 @@ class Lighting(NamedTuple):
         for tensor in unreached(image, tensors_in((scene, camera))):
             image = image + tensor.reshape(-1)[:0].sum().to(image)
         return image
+
+    def _in_image(self, scene: Scene, points: int, spp: int) -> tuple[Lighting, int]:
+        """How an image is lit without derivatives, and how many points of a face in a pixel are shaded. On glossy surfaces under
+        skies, more points with fewer light samples each: what is mirrored changes within a pixel as well."""
+        glossy = any(mesh.material is not None and mesh.material.is_glossy for mesh in scene.meshes)
+        if not glossy or not any(isinstance(light, Environment) for light in scene.casting):
+            return self, points
+        more = max(points, min(spp, points * self.samples))
+        return self._replace(samples=-(-points * self.samples // more)), more
 
     def __call__(self, hits: Hits) -> Tensor:
         return radiance(hits, *self)
@@ -120,7 +130,7 @@ class _Surface(NamedTuple):
         g, v = hits._surfaces.face_normals(hits._face), hits.view
         side = torch.where(_in_front(g, v), 1.0, -1.0).to(g)
         n = at.shading_normal(g)
-        lambertian = material.metallic is None and material.roughness is None
+        lambertian = not material.is_glossy
         metallic, roughness = (
             None if lambertian else g.new_full((1, 1), default) if given is None else at.value(given)
             for given, default in ((material.metallic, 0.0), (material.roughness, 1.0))
@@ -216,14 +226,8 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
         if hits._only_light and not hits._knows_light(light):
             continue
         count = 1 if light.punctual or hits._only_light else lighting.samples
-        for sample in range(count):
-            total = total + _light_sample(hits, light, (sample, count), surface, lighting.shadows) / count
-    lobes = None if hits._only_light else Lobes.of(surface.v, surface.n, surface.scattering)
-    for light in scene.casting if lobes is not None else ():
-        if isinstance(light, Environment) and not hits._knows_light(light):
-            for sample in range(lighting.samples):
-                lobe_sample = _lobe_sample(hits, light, (sample, lighting.samples), surface, lighting.shadows)
-                total = total + lobe_sample / lighting.samples
+        for points in _points_of(hits, light, count, surface):
+            total = total + _light_sample(hits, light, points, surface, lighting.shadows) / count
     return _where_seen(hits, material, total)
 
 
@@ -233,26 +237,20 @@ def _where_seen(hits: Hits, material: Material, total: Tensor) -> Tensor:
     return total if material.two_sided else torch.where(front, total, 0.0)
 
 
-def _light_sample(hits: Hits, light: Light, sample: tuple[int, int], surface: _Surface, shadows: bool) -> Tensor:
-    """(N, C): f max(0, n·l) V E of one point of a light, `sample` = (number, count)."""
-    points = hits.light_points(light, *sample)
-    if isinstance(light, Environment) and not hits._knows_light(light):
-        points = light.above(points, surface.g)
-        lobes = Lobes.of(surface.v, surface.n, surface.scattering)
-        points = points if lobes is None else lobes.combined(light, points)
+def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> Iterator[LightPoints]:
+    """`count` points of a light for each point of a surface."""
+    if hits._knows_light(light) or not isinstance(light, Environment):
+        yield from (hits.light_points(light, sample, count) for sample in range(count))
+    elif surface.scattering.roughness is None:
+        yield from (light.above(hits.light_points(light, k, count), surface.g) for k in range(count))
+    else:
+        glossy = Glossy.of(surface.v, surface.n, surface.g, surface.scattering, hits._seed)
+        yield from resampled(light, hits._index(light), glossy, count)
+
+
+def _light_sample(hits: Hits, light: Light, points: LightPoints, surface: _Surface, shadows: bool) -> Tensor:
+    """(N, C): f max(0, n·l) V E of one point of a light."""
     return _scattered(hits, light, points, surface, shadows, lambda rows, y: light.arriving(points.select(rows), y))
-
-
-def _lobe_sample(
-    hits: Hits, light: Environment, sample: tuple[int, int], surface: _Surface, shadows: bool
-) -> Tensor:
-    """(N, C): the same of one point that is drawn by how the surface scatters, of surfaces that do not scatter too widely."""
-    lobes = Lobes.of(surface.v, surface.n, surface.scattering)
-    assert lobes is not None
-    u = hits.random(5, hits._index(light), *sample)[:, 3:]
-    points = lobes.points(light, u, surface.g)
-    found = _scattered(hits, light, points, surface, shadows, lambda rows, y: light.arriving(points.select(rows), y))
-    return torch.where(lobes.narrow[:, None], found, 0.0)
 
 
 def _scattered(

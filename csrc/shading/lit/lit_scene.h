@@ -20,8 +20,6 @@ struct LitMesh {
     bool has_material = false, two_sided = true, lambertian = true;
     Source color, base, metallic, roughness, emission;  // the colour of the mesh itself, and its material's
     NormalSource normal;
-
-    bool is_glossy() const { return has_material && !lambertian; }
 };
 
 struct LitScene {
@@ -41,9 +39,6 @@ struct LitScene {
         size_t k = 0;
         while (k + 1 < meshes.size() && face >= meshes[k + 1].first_face) ++k;
         return meshes[k];
-    }
-    bool is_glossy() const {
-        return std::any_of(meshes.begin(), meshes.end(), [](const LitMesh& m) { return m.is_glossy(); });
     }
     EmissiveFaces emitter(const Lamp& lamp) const {
         const LitMesh& mesh = meshes[lamp.mesh];
@@ -80,6 +75,7 @@ struct LitOptions {
     bool shadows = true;
     int samples = 1;  // points of each light with an extent, for each point that is shaded
     int only = -1;    // the lamp of which alone radiance is wanted; −1: of all that there is
+    double dark = 0;  // points of lights are drawn as if no glossy surface were darker: what is black has derivatives
 };
 
 // Whether a point sees a light sample: 1, or 0 where it is in shadow, or that it was not asked, for the surface is
@@ -88,9 +84,7 @@ constexpr int8_t not_asked = -1;
 
 struct LightSample {
     int lamp, sample, count;  // one of so many of a lamp
-    bool by_lobe = false;     // drawn by how the surface scatters, not by the light
 };
-// First those that are drawn by the light.
 inline std::vector<LightSample> light_samples(const LitScene& lit, const LitOptions& options) {
     std::vector<LightSample> out;
     for (int k = 0; k < int(lit.lamps.size()); ++k) {
@@ -98,10 +92,6 @@ inline std::vector<LightSample> light_samples(const LitScene& lit, const LitOpti
         const int count = lit.lamps[k].is_punctual() ? 1 : options.samples;
         for (int s = 0; s < count; ++s) out.push_back({k, s, count});
     }
-    if (options.only >= 0 || !lit.is_glossy()) return out;
-    for (int k = 0; k < int(lit.lamps.size()); ++k)
-        if (lit.lamps[k].kind == Lamp::Kind::environment)
-            for (int s = 0; s < options.samples; ++s) out.push_back({k, s, options.samples, true});
     return out;
 }
 

@@ -29,7 +29,7 @@ Vector<S> towards_viewer(const LitScene& lit, Vector<S> y) {
     return lit.perspective ? unit(eye - y) : eye;
 }
 
-// Written in place: it is large, and its scattering comes later.
+// Written in place: it is large, and what it scatters comes later.
 template <class S>
 void set_surface(const LitScene& lit, int64_t face, const S* b, Surface<S>& o) {
     const std::vector<Table>& tables = lit.tables;
@@ -44,15 +44,8 @@ void set_surface(const LitScene& lit, int64_t face, const S* b, Surface<S>& o) {
     o.v = towards_viewer<S>(lit, o.y);
     o.side = dot(plain(o.frame.g), plain(o.v)) >= 0 ? 1 : -1;
     o.g = o.side * o.frame.g;
+    o.scattering.lambertian = !o.mesh->has_material || o.mesh->lambertian;
     o.n = o.mesh->normal.is_flat() ? o.g : o.side * shading_normal(tables, o.mesh->normal, o.at, o.frame);
-}
-
-// What the directions depend on that are drawn by how a surface scatters.
-template <class S>
-void look_up_roughness(const LitScene& lit, Surface<S>& o) {
-    Scattering<S>& s = o.scattering;
-    s.lambertian = o.mesh->lambertian, s.roughness = 1;
-    if (o.mesh->roughness.exists()) value(lit.tables, o.mesh->roughness, o.at, 1, &s.roughness);
 }
 
 // The base colour, and what else scatters.
@@ -69,9 +62,9 @@ void look_up_material(const LitScene& lit, Surface<S>& o) {
         value(lit.tables, mesh.base, o.at, C, factor);
         for (int c = 0; c < C; ++c) s.base[c] *= factor[c];
     }
-    s.metallic = 0;
+    s.metallic = 0, s.roughness = 1;
     if (mesh.metallic.exists()) value(lit.tables, mesh.metallic, o.at, 1, &s.metallic);
-    look_up_roughness(lit, o);
+    if (mesh.roughness.exists()) value(lit.tables, mesh.roughness, o.at, 1, &s.roughness);
 }
 
 // Cotangents of what a point is made of.
