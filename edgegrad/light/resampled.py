@@ -85,9 +85,7 @@ class _Candidates(NamedTuple):
     running: Tensor  # (N, J) the running sum of their weights, target / density
 
     @classmethod
-    def of(
-        cls, light: Environment, stream: int, surfaces: Glossy, lobes: Lobes, all: int, by_lobe: int
-    ) -> _Candidates:
+    def of(cls, light: Environment, stream: int, surfaces: Glossy, lobes: Lobes, all: int, by_lobe: int) -> _Candidates:
         N, by_light = len(surfaces.n), all - by_lobe
         drawn = light.draw(uniform(_parts(surfaces.seed, by_light), 3, stream))
         kinds = [(drawn, light.place(drawn), by_light)]

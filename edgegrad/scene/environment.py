@@ -92,7 +92,6 @@ class Environment(Light):
     def _table(self) -> tuple[Tensor, Tensor]:
         """(h · w,) float64: the running sum of the probabilities of texels, and their densities by solid angle."""
         with torch.no_grad():
-            h, w = self._size
             image = self._magnitude
             # The mean of the bilinear function over a texel.
             rows = torch.cat([image[:1], image, image[-1:]])
