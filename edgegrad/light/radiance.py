@@ -93,11 +93,16 @@ class Lighting(NamedTuple):
             image = image + tensor.reshape(-1)[:0].sum().to(image)
         return image
 
+    @staticmethod
+    def resamples(scene: Scene) -> bool:
+        """Whether points of lights are drawn by how surfaces scatter as well."""
+        glossy = any(mesh.material is not None and mesh.material.is_glossy for mesh in scene.meshes)
+        return glossy and any(isinstance(light, Environment) for light in scene.casting)
+
     def _in_image(self, scene: Scene, points: int, spp: int) -> tuple[Lighting, int]:
         """How an image is lit without derivatives, and how many points of a face in a pixel are shaded. On glossy surfaces under
         skies, more points with fewer light samples each: what is mirrored changes within a pixel as well."""
-        glossy = any(mesh.material is not None and mesh.material.is_glossy for mesh in scene.meshes)
-        if not glossy or not any(isinstance(light, Environment) for light in scene.casting):
+        if not self.resamples(scene):
             return self, points
         more = max(points, min(spp, points * self.samples))
         return self._replace(samples=-(-points * self.samples // more)), more

@@ -28,7 +28,8 @@ class Environment(Light):
     rotation  (3, 3)  from that frame to the world; the identity when None
     visible   shown behind all surfaces where the scene has no background of its own
 
-    Directions are drawn by what texels emit times their solid angle, a tenth of them evenly. Radiance below zero is not refused,
+    Directions are drawn by what texels emit times their solid angle, a tenth of them evenly; for glossy surfaces also by how they
+    scatter. Radiance below zero is not refused,
     for an optimisation may pass there: like a negative intensity of other lights, it takes light away.
 
     Raises TypeError or ValueError that names the argument.
