@@ -94,7 +94,12 @@ def glossy(bench: Bench) -> list[Row]:
         for r, must in EVEN.items()
     ]
     rows += [
-        Row(f"… sky with lamps, 32 light samples, roughness {r}: noise", relative("lamps", r, 32, n), unit=" %", must=must)
+        Row(
+            f"… sky with lamps, 32 light samples, roughness {r}: noise",
+            relative("lamps", r, 32, n),
+            unit=" %",
+            must=must,
+        )
         for r, must in UNDER_LAMPS.items()
     ]
     try:

@@ -40,8 +40,9 @@ class Glossy(NamedTuple):
         base, metallic = base.detach().double(), metallic.detach().double()
         diffuse = (base * (1 - metallic)).abs().mean(1, keepdim=True).clamp(min=DARK)
         head_on = (DIELECTRIC * (1 - metallic) + base * metallic).abs().mean(1, keepdim=True).clamp(min=DARK)
-        numbers = (part.detach().double().expand(len(n), 1) for part in (roughness, diffuse, head_on))
-        return cls(*(part.detach().double() for part in (v, n, g)), *numbers, seed)
+        v, n, g = v.detach().double(), n.detach().double(), g.detach().double()
+        roughness, diffuse, head_on = (x.detach().double().expand(len(n), 1) for x in (roughness, diffuse, head_on))
+        return cls(v, n, g, roughness, diffuse, head_on, seed)
 
     def select(self, rows: Tensor) -> Glossy:
         return Glossy(*(part[rows] for part in self))
@@ -79,7 +80,7 @@ def resampled(light: Environment, stream: int, surfaces: Glossy, count: int) -> 
 class _Candidates(NamedTuple):
     """J for each of N points."""
 
-    index: Tensor  # (N, J)
+    index: Tensor  # pyright: ignore[reportIncompatibleMethodOverride]: (N, J)
     uv: Tensor  # (N, J, 2)
     target: Tensor  # (N, J)
     running: Tensor  # (N, J) the running sum of their weights, target / density
