@@ -24,6 +24,7 @@ import torch
 from costs import aovs, backward, bits, forward, large, small, sparse, textures, threads, update
 from defaults import deep, flat_colors, kernel_hash, noise, tangled
 from equal_error import boundary, interior, step
+from glossy import glossy
 from light import light
 from processes import memory, order, start
 from table import HEAD, Bench, Row, Skipped, line
@@ -54,6 +55,7 @@ ROWS: dict[str, Callable[[Bench], list[Row]]] = {
     "flat-colors": flat_colors,
     "noise": noise,
     "light": light,
+    "glossy": glossy,
 }
 # What is slow or wrong in the scenes of others first: rows that a change of the default samples is measured by.
 GROUPS = {"safe": ("deep", "tangled", "flat-colors", "noise")}

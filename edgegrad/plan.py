@@ -133,8 +133,10 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     where = "lit" if scene.is_lit else "seen, with mipmaps, in PyTorch"
     terms["textures"] = Term(False, f"looked up where they are {where}")
     del terms["shader"]
+    resampled = lighting.resamples(scene)
+    how = "; on glossy surfaces those of skies by what they give, of candidates by light and lobe" if resampled else ""
     terms["lights"] = Term(
-        lights > 0, f"{lights} points of lights for each point; at most {AT_ONCE:,} points at a time"
+        lights > 0, f"{lights} points of lights for each point{how}; at most {AT_ONCE:,} points at a time"
     )
     why = (
         f"{lights} rays for each point of the gradient, and for each face in a pixel"

@@ -84,7 +84,8 @@ def render(
                      Closer lines cost more and err less
     shadows          of lit scenes: False lets light pass through everything
     light_samples    of lit scenes: points drawn of each light that has an extent, for each point that is shaded. Of a face in a
-                     pixel at most a quarter of its samples are, or 4 if spp is below 16
+                     pixel at most a quarter of its samples are, or 4 if spp is below 16; in images of glossy surfaces under an
+                     Environment all are, with fewer points of lights each and no fewer in all
 
     A scene with a light, or with a mesh that has a material, is lit: see Scene and Material. It is shaded in PyTorch, as by a
     `shader`, and its image has the dtype of the vertices.

@@ -240,7 +240,9 @@ CASES = {
         for light in (sky, image_sky)
     },
     **{
-        f"sphere on a sphere, {light.__name__}, {moves} moves": Case(sphere_on_sphere, light, moves)
+        f"sphere on a sphere, {light.__name__}, {moves} moves": Case(
+            sphere_on_sphere, light, moves, step=0.02, samples=3 if moves == CASTER else 16
+        )
         for light in (point, sun)
         for moves in (CASTER, RECEIVER)
     },

@@ -51,6 +51,7 @@ MeshArrays make_mesh(int64_t first_face, int64_t faces, int32_t first_vertex, bo
 LampArrays make_lamp(const std::string& kind, int position, int direction, int intensity, int color, int inner_angle,
                      int outer_angle, int rotation, int radiance, int mesh, int64_t height, int64_t width,
                      bool is_image, std::optional<In<double, 1>> running, std::optional<In<double, 1>> density,
+                     std::optional<In<double, 1>> brightness, std::optional<In<double, 1>> cosines,
                      const std::vector<uint64_t>& stream, double eps) {
     Lamp lamp;
     lamp.kind = kind_of<Lamp::Kind>("kind", kind,
@@ -63,9 +64,15 @@ LampArrays make_lamp(const std::string& kind, int position, int direction, int i
             refuse("running, density: expected a number for each face or texel");
         lamp.running = running->data(), lamp.density = density->data(), lamp.size = int64_t(running->size());
     }
-    if (stream.size() != 3) refuse("stream: expected three numbers");
+    if (lamp.kind == Lamp::Kind::environment) {
+        if (!brightness || int64_t(brightness->size()) != lamp.size || lamp.size != height * width)
+            refuse("brightness: expected a number for each texel");
+        if (!cosines || int64_t(cosines->size()) != height + 1) refuse("cosines: expected one more than rows");
+        lamp.brightness = brightness->data(), lamp.cosines = cosines->data();
+    }
+    if (stream.size() != std::size(lamp.stream)) refuse("stream: expected six numbers");
     std::copy(stream.begin(), stream.end(), lamp.stream);
-    return {lamp, running, density};
+    return {lamp, {running, density, brightness, cosines}};
 }
 
 }  // namespace
@@ -204,8 +211,8 @@ void bind_lit_arrays(nb::module_& m) {
         nb::new_(&make_lamp), "kind"_a, nb::kw_only(), "position"_a = no_table, "direction"_a = no_table,
         "intensity"_a = no_table, "color"_a = no_table, "inner_angle"_a = no_table, "outer_angle"_a = no_table,
         "rotation"_a = no_table, "radiance"_a = no_table, "mesh"_a = -1, "height"_a = 1, "width"_a = 1,
-        "is_image"_a = false, "running"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(), "stream"_a,
-        "eps"_a);
+        "is_image"_a = false, "running"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(),
+        "brightness"_a.noconvert() = nb::none(), "cosines"_a.noconvert() = nb::none(), "stream"_a, "eps"_a);
     nb::class_<LitArrays>(m, "Lit").def(
         nb::init<std::vector<AnyTable>, std::vector<MeshArrays>, std::vector<LampArrays>, Rows, int, int, bool, int,
                  const std::vector<double>&, const std::vector<uint64_t>&>(),
@@ -221,8 +228,10 @@ void bind_lit_arrays(nb::module_& m) {
              "index"_a.noconvert() = nb::none(), "uv"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(),
              "lit"_a.noconvert() = nb::none());
     nb::class_<LitOptions>(m, "LitOptions")
-        .def(nb::new_([](bool shadows, int samples, int only) { return LitOptions{shadows, samples, only}; }),
-             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a);
+        .def(nb::new_([](bool shadows, int samples, int only, double dark) {
+                 return LitOptions{shadows, samples, only, dark};
+             }),
+             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a, "dark"_a);
 }
 
 }  // namespace edgegrad

@@ -27,7 +27,7 @@ struct MeshArrays {
 
 struct LampArrays {
     Lamp view;
-    std::optional<In<double, 1>> running, density;
+    std::vector<std::optional<In<double, 1>>> arrays;  // that it refers to
 };
 
 // All of it, checked: what indexes what exists.

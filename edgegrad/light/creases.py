@@ -84,7 +84,7 @@ def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
     power = [light._power(verts).detach().abs().mean() for light in scene.casting]
     infinite = [light.infinite for light in scene.casting]
     found = in_kernel.light_on_faces(verts, mesh.faces, view, infinite, torch.cat(places), torch.stack(power))
-    if material.metallic is None and material.roughness is None:
+    if not material.is_glossy:
         return found
     g = _face_normals(surfaces, index)
     away = dot(g[:, 0], view.to_viewer(verts[mesh.faces[:, 0].long()])) < 0

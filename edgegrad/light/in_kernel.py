@@ -25,6 +25,7 @@ from ..scene.material import WRAPS, Parameter, Texture
 from ..scene.mesh import FILTERS, Mesh
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
+from .resampled import DARK
 
 _64_BITS = 2**64 - 1
 
@@ -99,7 +100,7 @@ def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
     def compute(kernel: Any, faces: Tensor, arguments: dict[str, Any], *tables: Tensor) -> Sequence[Tensor]:
         found, asked = kernel.lit_image(
             lit=layout.kernel(tables, faces),
-            options=core.LitOptions(shadows=shadows, samples=samples, only=-1),
+            options=core.LitOptions(shadows=shadows, samples=samples, only=-1, dark=0.0),
             points=points,
             seed=seed,
             again=again,
@@ -237,7 +238,7 @@ def _mesh(mesh: Mesh, first_face: int, first_vertex: int, tables: _Tables) -> An
         first_vertex=first_vertex,
         has_material=material is not None,
         two_sided=material is None or material.two_sided,
-        lambertian=material is None or (material.metallic is None and material.roughness is None),
+        lambertian=material is None or not material.is_glossy,
         color=color,
         base_color=source(None if material is None else material.base_color),
         metallic=source(None if material is None else material.metallic),
@@ -276,7 +277,7 @@ def _texture(mesh: Mesh, texture: Texture, tables: _Tables) -> Any:
 
 
 def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) -> Any:
-    stream = [mixed_bits(number * 0x10001 + k) for k in range(3)]
+    stream = [mixed_bits(number * 0x10001 + k) for k in range(6)]
 
     def lamp(kind: str, **fields: Any) -> Any:
         return core.Lamp(kind, stream=stream, **{"eps": eps, **fields})
@@ -287,7 +288,7 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
         # Where a ray meets a thin face, its rounding error is many times the spacing of doubles: a lamp must not hide itself.
         return lamp("mesh", mesh=mesh, running=running, density=density, eps=max(eps, 2.0**-40))
     if isinstance(light, Environment):
-        running, density = values_of(*light._table)
+        running, density, brightness, cosines = values_of(*light._table, light._brightness, light._cosines)
         height, width = light._size
         return lamp(
             "environment",
@@ -298,6 +299,8 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
             is_image=light.radiance.dim() == 3,
             running=running,
             density=density,
+            brightness=brightness,
+            cosines=cosines,
         )
     if isinstance(light, SphericalHarmonics):
         coefficients = tables.add(light.coefficients, light.coefficients.shape[1])
@@ -361,7 +364,7 @@ class _Shading(NamedTuple):
         return {
             "lit": self.layout.kernel(self._tables(tensors), self._flat(tensors).faces),
             "points": core.LitPoints(b=array(b), forced_lamp=self.forced, **arrays),
-            "options": core.LitOptions(shadows=self.shadows, samples=self.samples, only=self.only),
+            "options": core.LitOptions(shadows=self.shadows, samples=self.samples, only=self.only, dark=DARK),
             "threads": torch.get_num_threads(),
         }
 

@@ -8,7 +8,7 @@ with one point, or a few, of each light that has an extent. Spherical harmonics 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -37,6 +37,7 @@ from . import in_kernel
 from .bsdf import Scattering, dot, terminator
 from .creases import note_jumps
 from .in_kernel import is_fused, nearest_textures
+from .resampled import Glossy, resampled
 
 FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
 
@@ -71,11 +72,12 @@ class Lighting(NamedTuple):
         extended = any(not light.punctual for light in scene.casting)
         spp = request.image.spp
         points = max(FEWEST_IN_PENUMBRA, spp // 4) if extended else shaded_points(spp)
+        in_image = self._in_image(scene, points, spp)
         fused = is_fused(scene)
         additive = not scene.blends
         effort = Effort(
             points=points,
-            kernel_image=(lambda frame: _kernel_image(frame, self, points)) if fused and additive else None,
+            kernel_image=(lambda frame: _kernel_image(frame, *in_image)) if fused and additive else None,
             blended=scene.blends,
             lit=True,
             keeps_little=fused,
@@ -90,6 +92,20 @@ class Lighting(NamedTuple):
         for tensor in unreached(image, tensors_in((scene, camera))):
             image = image + tensor.reshape(-1)[:0].sum().to(image)
         return image
+
+    @staticmethod
+    def resamples(scene: Scene) -> bool:
+        """Whether points of lights are drawn by how surfaces scatter as well."""
+        glossy = any(mesh.material is not None and mesh.material.is_glossy for mesh in scene.meshes)
+        return glossy and any(isinstance(light, Environment) for light in scene.casting)
+
+    def _in_image(self, scene: Scene, points: int, spp: int) -> tuple[Lighting, int]:
+        """How an image is lit without derivatives, and how many points of a face in a pixel are shaded. On glossy surfaces under
+        skies, more points with fewer light samples each: what is mirrored changes within a pixel as well."""
+        if not self.resamples(scene):
+            return self, points
+        more = max(points, min(spp, points * self.samples))
+        return self._replace(samples=-(-points * self.samples // more)), more
 
     def __call__(self, hits: Hits) -> Tensor:
         return radiance(hits, *self)
@@ -119,7 +135,7 @@ class _Surface(NamedTuple):
         g, v = hits._surfaces.face_normals(hits._face), hits.view
         side = torch.where(_in_front(g, v), 1.0, -1.0).to(g)
         n = at.shading_normal(g)
-        lambertian = material.metallic is None and material.roughness is None
+        lambertian = not material.is_glossy
         metallic, roughness = (
             None if lambertian else g.new_full((1, 1), default) if given is None else at.value(given)
             for given, default in ((material.metallic, 0.0), (material.roughness, 1.0))
@@ -215,8 +231,8 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
         if hits._only_light and not hits._knows_light(light):
             continue
         count = 1 if light.punctual or hits._only_light else lighting.samples
-        for sample in range(count):
-            total = total + _light_sample(hits, light, (sample, count), surface, lighting.shadows) / count
+        for points in _points_of(hits, light, count, surface):
+            total = total + _light_sample(hits, light, points, surface, lighting.shadows) / count
     return _where_seen(hits, material, total)
 
 
@@ -226,11 +242,19 @@ def _where_seen(hits: Hits, material: Material, total: Tensor) -> Tensor:
     return total if material.two_sided else torch.where(front, total, 0.0)
 
 
-def _light_sample(hits: Hits, light: Light, sample: tuple[int, int], surface: _Surface, shadows: bool) -> Tensor:
-    """(N, C): f max(0, n·l) V E of one point of a light, `sample` = (number, count)."""
-    points = hits.light_points(light, *sample)
-    if isinstance(light, Environment) and not hits._knows_light(light):
-        points = light.above(points, surface.g)
+def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> Iterator[LightPoints]:
+    """`count` points of a light for each point of a surface."""
+    if hits._knows_light(light) or not isinstance(light, Environment):
+        yield from (hits.light_points(light, sample, count) for sample in range(count))
+    elif surface.scattering.roughness is None:
+        yield from (light.above(hits.light_points(light, k, count), surface.g) for k in range(count))
+    else:
+        glossy = Glossy.of(surface.v, surface.n, surface.g, surface.scattering, hits._seed)
+        yield from resampled(light, hits._index(light), glossy, count)
+
+
+def _light_sample(hits: Hits, light: Light, points: LightPoints, surface: _Surface, shadows: bool) -> Tensor:
+    """(N, C): f max(0, n·l) V E of one point of a light."""
     return _scattered(hits, light, points, surface, shadows, lambda rows, y: light.arriving(points.select(rows), y))
 
 

@@ -28,7 +28,8 @@ class Environment(Light):
     rotation  (3, 3)  from that frame to the world; the identity when None
     visible   shown behind all surfaces where the scene has no background of its own
 
-    Directions are drawn by what texels emit times their solid angle, a tenth of them evenly. Radiance below zero is not refused,
+    Directions are drawn by what texels emit times their solid angle, a tenth of them evenly; for glossy surfaces also by how they
+    scatter. Radiance below zero is not refused,
     for an optimisation may pass there: like a negative intensity of other lights, it takes light away.
 
     Raises TypeError or ValueError that names the argument.
@@ -65,17 +66,39 @@ class Environment(Light):
         return (1, 1) if self.radiance.dim() == 1 else (self.radiance.shape[0], self.radiance.shape[1])
 
     @cached_property
+    def _magnitude(self) -> Tensor:
+        """(h, w) float64."""
+        return self.radiance.detach().double().reshape(*self._size, -1).abs().mean(2)
+
+    @cached_property
+    def _cosines(self) -> Tensor:
+        """(h + 1,) float64: of the angles from +Y at which rows begin and end."""
+        h = self._size[0]
+        return torch.arange(h + 1, device=self.radiance.device).double().mul(math.pi / h).cos()
+
+    @property
+    def _solid_angles(self) -> Tensor:
+        """(h, w) float64, of texels."""
+        h, w = self._size
+        return ((self._cosines[:-1] - self._cosines[1:]) * (2 * math.pi / w))[:, None].expand(h, w)
+
+    @cached_property
+    def _brightness(self) -> Tensor:
+        """(h · w,) float64: the magnitude of texels, and a share of the mean, so that what is dark has a gradient too."""
+        mean = (self._magnitude * self._solid_angles).sum() / (4 * math.pi)
+        mean = torch.where(mean > 0, mean, 1.0)
+        return ((1 - EVEN) * self._magnitude + EVEN * mean).reshape(-1)
+
+    @cached_property
     def _table(self) -> tuple[Tensor, Tensor]:
         """(h · w,) float64: the running sum of the probabilities of texels, and their densities by solid angle."""
         with torch.no_grad():
-            h, w = self._size
-            image = self.radiance.detach().double().reshape(h, w, -1).abs().mean(2)
+            image = self._magnitude
             # The mean of the bilinear function over a texel.
             rows = torch.cat([image[:1], image, image[-1:]])
             image = (rows[:-2] + 6 * rows[1:-1] + rows[2:]) / 8
             image = (image.roll(1, 1) + 6 * image + image.roll(-1, 1)) / 8
-            border = torch.arange(h + 1, device=image.device).double().mul(math.pi / h).cos()
-            angle = ((border[:-1] - border[1:]) * (2 * math.pi / w))[:, None].expand(h, w)
+            angle = self._solid_angles
             power = image * angle
             total = float(power.sum())
             share = angle / (4 * math.pi)
@@ -89,10 +112,9 @@ class Environment(Light):
 
     def _own_directions(self, points: LightPoints) -> Tensor:
         """(N, 3) float64, in the frame of the image."""
-        h, w = self._size
+        w = self._size[1]
         row, column = points.index // w, points.index % w
-        border = torch.stack([row, row + 1]).double().mul(math.pi / h).cos()
-        y = torch.lerp(border[0], border[1], points.uv[:, 1])
+        y = torch.lerp(self._cosines[row], self._cosines[row + 1], points.uv[:, 1])
         phi = (2 * math.pi / w) * (column + points.uv[:, 0]) - math.pi
         across = (1 - y * y).clamp(min=0).sqrt()
         return torch.stack([across * phi.sin(), y, -across * phi.cos()], 1)
@@ -104,11 +126,11 @@ class Environment(Light):
             x, y, z = (d if self.rotation is None else normalize(d @ self.rotation.to(d), dim=-1)).unbind(-1)
             h, w = self._size
             row = (torch.acos(y.clamp(-1, 1)) * (h / math.pi)).long().clamp(0, h - 1)
-            border = torch.stack([row, row + 1]).double().mul(math.pi / h).cos()
+            top, bottom = self._cosines[row], self._cosines[row + 1]
             turn = (torch.atan2(x, -z) / (2 * math.pi) + 0.5) * w
             column = turn.long().clamp(0, w - 1)
             index = row * w + column
-            uv = torch.stack([turn - column, (y - border[0]) / (border[1] - border[0])], 1).clamp(0, 1)
+            uv = torch.stack([turn - column, (y - top) / (bottom - top)], 1).clamp(0, 1)
             return LightPoints(index, uv, self._table[1][index])
 
     def above(self, points: LightPoints, normal: Tensor) -> LightPoints:
@@ -131,6 +153,22 @@ class Environment(Light):
     def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
         radiance = self._looked_up(self._own_directions(points))
         return (radiance / points.density[:, None]).to(position)
+
+    def brightness_at(self, points: LightPoints) -> Tensor:
+        """(N,) float64: about how bright the image is there, for the choice of points alone."""
+        h, w = self._size
+        if h * w == 1:
+            return self._brightness.expand(len(points.index))
+        column = (points.index % w) + points.uv[:, 0] - 0.5
+        row = torch.div(points.index, w, rounding_mode="floor") + points.uv[:, 1] - 0.5
+        c0, r0 = column.floor(), row.floor()
+        a, b = column - c0, row - r0
+
+        def texel(down: int, right: int) -> Tensor:
+            return self._brightness[(r0 + down).clamp(0, h - 1).long() * w + (c0 + right).long() % w]
+
+        top = torch.lerp(texel(0, 0), texel(0, 1), a)
+        return torch.lerp(top, torch.lerp(texel(1, 0), texel(1, 1), a), b)
 
     def towards(self, direction: Tensor) -> Tensor:
         """(N, C): the radiance from where directions (N, 3) in the world point to, of any length; differentiable."""

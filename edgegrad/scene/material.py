@@ -170,6 +170,11 @@ class Material:
         return counts[0] if counts else None
 
     @property
+    def is_glossy(self) -> bool:
+        """Whether it follows the metallic-roughness model, not Lambert's law."""
+        return self.metallic is not None or self.roughness is not None
+
+    @property
     def textures(self) -> dict[str, Texture]:
         """By the names of the fields."""
         fields = ("base_color", "metallic", "roughness", "emission", "normal_map")

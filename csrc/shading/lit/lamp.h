@@ -21,7 +21,9 @@ struct Lamp {
     // Of lights with an extent: the running sum of the probabilities of faces or texels, and their densities.
     const double *running = nullptr, *density = nullptr;
     int64_t size = 0;
-    uint64_t stream[3] = {};  // of its random numbers
+    // Of an environment: how bright texels are, but none is black, and the cosines of where rows begin and end.
+    const double *brightness = nullptr, *cosines = nullptr;
+    uint64_t stream[6] = {};  // of its random numbers: three of the light, two of lobes, one of the choice
     double eps = 0;           // relative spacing of places of its points
 
     bool is_infinite() const {
@@ -35,6 +37,8 @@ struct Lamp {
 struct LightPoint {
     int64_t index = 0;
     double u = 0, v = 0, density = 1;
+
+    bool exists() const { return density > 0; }
 };
 
 // From numbers u in [0, 1).

@@ -18,9 +18,10 @@ void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster&
                 const LitOptions& options, ShadeBuffers& buffers, double* radiance_out, int8_t* seen) {
     query_visibility(lit, scene, caster, points, options, buffers, seen, [](int64_t) { return true; });
     for (int64_t i = 0; radiance_out && i < points.size; ++i) {
-        look_up_material(lit, buffers.surfaces[i]);
-        radiance<double>(lit, points, options, buffers.lights, i, buffers.surfaces[i], seen + i * buffers.lights.size(),
-                         radiance_out + i * lit.channels);
+        const size_t first = i * buffers.lights.size();
+        Surface<double>& o = buffers.surfaces[i];
+        if (o.scattering.lambertian) look_up_material(lit, o);
+        radiance(lit, options, buffers.lights, &buffers.points[first], o, seen + first, radiance_out + i * lit.channels);
     }
 }
 
@@ -55,11 +56,15 @@ void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& o
     const std::vector<LightSample> lights = light_samples(lit, options);
     std::fill(b_bar, b_bar + 3 * points.size, 0.0);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
+        std::vector<LightPoint> of_lights(lights.size());
         for (int64_t i = first; i < last; ++i) {
+            const int8_t* sees = seen + i * lights.size();
             Surface<double> o;
             set_surface<double>(lit, points.face[i], points.b + 3 * i, o);
-            radiance_vjp(lit, points, options, lights, i, o, seen + i * lights.size(), bar + i * lit.channels,
-                         b_bar + 3 * i, chunk);
+            if (o.is_black() || is_unlit(lit, *o.mesh, sees, lights.size())) continue;
+            look_up_material(lit, o);
+            light_points(lit, points, options, lights, i, o, of_lights.data());
+            radiance_vjp(lit, options, lights, of_lights.data(), o, sees, bar + i * lit.channels, b_bar + 3 * i, chunk);
         }
     });
 }
@@ -81,10 +86,14 @@ void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const R
                 return std::any_of(of_point, of_point + lit.channels, [](double x) { return x != 0; });
             };
             query_visibility(lit, scene, caster, some, options, *buffers, seen.data(), wanted);
-            for (int64_t i = 0; i < some.size; ++i)
-                if (wanted(i))
-                    radiance_vjp(lit, some, options, buffers->lights, i, buffers->surfaces[i], seen.data() + i * K,
-                                 bar + (first + i) * lit.channels, b_bar + 3 * (first + i), chunk);
+            for (int64_t i = 0; i < some.size; ++i) {
+                Surface<double>& o = buffers->surfaces[i];
+                const int8_t* sees = seen.data() + i * K;
+                if (!wanted(i) || o.is_black() || is_unlit(lit, *o.mesh, sees, K)) continue;
+                if (o.scattering.lambertian) look_up_material(lit, o);
+                radiance_vjp(lit, options, buffers->lights, &buffers->points[i * K], o, sees,
+                             bar + (first + i) * lit.channels, b_bar + 3 * (first + i), chunk);
+            }
         }
     });
 }
@@ -93,13 +102,15 @@ void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& o
                const double* b_dot, double* radiance_dot, Team& team) {
     const std::vector<LightSample> lights = light_samples(lit, options);
     team.each_block(points.size, [&](int64_t, int64_t first, int64_t last) {
+        std::vector<LightPoint> of_lights(lights.size());
         for (int64_t i = first; i < last; ++i) {
             Dual b[3], total[most_lit_channels];
             for (int k = 0; k < 3; ++k) b[k] = {points.b[3 * i + k], b_dot ? b_dot[3 * i + k] : 0};
             Surface<Dual> o;
             set_surface<Dual>(lit, points.face[i], b, o);
             look_up_material(lit, o);
-            radiance<Dual>(lit, points, options, lights, i, o, seen + i * lights.size(), total);
+            if (o.mesh->has_material && !o.is_black()) light_points(lit, points, options, lights, i, o, of_lights.data());
+            radiance(lit, options, lights, of_lights.data(), o, seen + i * lights.size(), total);
             for (int c = 0; c < lit.channels; ++c) radiance_dot[i * lit.channels + c] = total[c].dot;
         }
     });

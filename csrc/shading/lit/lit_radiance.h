@@ -48,34 +48,29 @@ inline void add_unshadowed_vjp(const LitScene& lit, const Surface<double>& o, co
 }
 
 template <class S>
-void radiance(const LitScene& lit, const LitPoints& points, const LitOptions& options,
-              const std::vector<LightSample>& lights, int64_t i, const Surface<S>& o, const int8_t* seen, S* total) {
+void radiance(const LitScene& lit, const LitOptions& options, const std::vector<LightSample>& lights,
+              const LightPoint* points, const Surface<S>& o, const int8_t* seen, S* total) {
     std::fill(total, total + lit.channels, S(0));
     if (o.is_black()) return;
     if (options.only < 0) add_unshadowed(lit, o, total);
     for (size_t k = 0; k < lights.size(); ++k)
         if (seen[k] > 0)
-            add_light<S>(lit, lit.lamps[lights[k].lamp], light_point(lit, points, i, lights[k], plain(o.g)),
-                         1.0 / lights[k].count, o, total);
+            add_light<S>(lit, lit.lamps[lights[k].lamp], points[k], 1.0 / lights[k].count, o, total);
 }
 // Whether no light that a point sees, nor anything else, gives it radiance: then it has no derivatives either.
-inline bool is_unlit(const LitScene& lit, int64_t face, const int8_t* seen, size_t lights) {
-    const LitMesh& mesh = lit.mesh_of(face);
+inline bool is_unlit(const LitScene& lit, const LitMesh& mesh, const int8_t* seen, size_t lights) {
     if (!mesh.has_material || mesh.emission.exists()) return false;
     return std::none_of(seen, seen + lights, [](int8_t s) { return s > 0; }) &&
            std::all_of(lit.lamps.begin(), lit.lamps.end(), [](const Lamp& lamp) { return lamp.casts(); });
 }
-inline void radiance_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options,
-                         const std::vector<LightSample>& lights, int64_t i, Surface<double>& o, const int8_t* seen,
+inline void radiance_vjp(const LitScene& lit, const LitOptions& options, const std::vector<LightSample>& lights,
+                         const LightPoint* points, const Surface<double>& o, const int8_t* seen,
                          const double* total_bar, double* b_bar, Cotangents& to) {
-    if (o.is_black() || is_unlit(lit, points.face[i], seen, lights.size())) return;
-    look_up_material(lit, o);
     SurfaceBar bar(lit.channels);
     if (options.only < 0) add_unshadowed_vjp(lit, o, total_bar, bar, to);
     for (size_t k = 0; k < lights.size(); ++k)
         if (seen[k] > 0)
-            add_light_vjp(lit, lit.lamps[lights[k].lamp], light_point(lit, points, i, lights[k], o.g),
-                          1.0 / lights[k].count, o, total_bar, bar, to);
+            add_light_vjp(lit, lit.lamps[lights[k].lamp], points[k], 1.0 / lights[k].count, o, total_bar, bar, to);
     look_up_material_vjp(lit, o, bar, to);
     surface_vjp(lit, o, bar, to);
     std::copy(bar.b, bar.b + 3, b_bar);

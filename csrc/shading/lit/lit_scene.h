@@ -75,6 +75,7 @@ struct LitOptions {
     bool shadows = true;
     int samples = 1;  // points of each light with an extent, for each point that is shaded
     int only = -1;    // the lamp of which alone radiance is wanted; −1: of all that there is
+    double dark = 0;  // points of lights are drawn as if no glossy surface were darker: what is black has derivatives
 };
 
 // Whether a point sees a light sample: 1, or 0 where it is in shadow, or that it was not asked, for the surface is

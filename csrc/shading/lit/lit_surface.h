@@ -29,7 +29,7 @@ Vector<S> towards_viewer(const LitScene& lit, Vector<S> y) {
     return lit.perspective ? unit(eye - y) : eye;
 }
 
-// Written in place: it is large, and its scattering comes later.
+// Written in place: it is large, and what it scatters comes later.
 template <class S>
 void set_surface(const LitScene& lit, int64_t face, const S* b, Surface<S>& o) {
     const std::vector<Table>& tables = lit.tables;
@@ -44,6 +44,7 @@ void set_surface(const LitScene& lit, int64_t face, const S* b, Surface<S>& o) {
     o.v = towards_viewer<S>(lit, o.y);
     o.side = dot(plain(o.frame.g), plain(o.v)) >= 0 ? 1 : -1;
     o.g = o.side * o.frame.g;
+    o.scattering.lambertian = !o.mesh->has_material || o.mesh->lambertian;
     o.n = o.mesh->normal.is_flat() ? o.g : o.side * shading_normal(tables, o.mesh->normal, o.at, o.frame);
 }
 
@@ -61,7 +62,6 @@ void look_up_material(const LitScene& lit, Surface<S>& o) {
         value(lit.tables, mesh.base, o.at, C, factor);
         for (int c = 0; c < C; ++c) s.base[c] *= factor[c];
     }
-    s.lambertian = mesh.lambertian;
     s.metallic = 0, s.roughness = 1;
     if (mesh.metallic.exists()) value(lit.tables, mesh.metallic, o.at, 1, &s.metallic);
     if (mesh.roughness.exists()) value(lit.tables, mesh.roughness, o.at, 1, &s.roughness);

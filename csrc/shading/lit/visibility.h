@@ -42,6 +42,7 @@ struct ShadowRays {
 struct ShadeBuffers {
     std::vector<LightSample> lights;
     std::vector<Surface<double>> surfaces;
+    std::vector<LightPoint> points;  // of lights, a row for each surface
     ShadowRays rays;
     std::vector<uint8_t> found;
 };
@@ -52,9 +53,15 @@ void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayC
                       const LitOptions& options, ShadeBuffers& buffers, int8_t* seen, Wanted wanted) {
     const std::vector<LightSample>& lights = buffers.lights;
     const size_t K = lights.size();
-    buffers.surfaces.resize(points.size);
+    buffers.surfaces.resize(points.size), buffers.points.resize(points.size * K);
     for (int64_t i = 0; i < points.size; ++i)
-        if (wanted(i)) set_surface<double>(lit, points.face[i], points.b + 3 * i, buffers.surfaces[i]);
+        if (wanted(i)) {
+            Surface<double>& o = buffers.surfaces[i];
+            set_surface<double>(lit, points.face[i], points.b + 3 * i, o);
+            if (!o.mesh->has_material || o.is_black()) continue;
+            if (!o.scattering.lambertian) look_up_material(lit, o);
+            light_points(lit, points, options, lights, i, o, &buffers.points[i * K]);
+        }
     // Light by light, for rays that are cast together are the faster the more alike they are.
     for (size_t k = 0; k < K; ++k) {
         const Lamp& lamp = lit.lamps[lights[k].lamp];
@@ -64,7 +71,8 @@ void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayC
             const Surface<double>& o = buffers.surfaces[i];
             int8_t& found = seen[i * K + k] = not_asked;
             if (!o.mesh->has_material || o.is_black()) continue;
-            const LightPoint point = light_point(lit, points, i, lights[k], o.g);
+            const LightPoint& point = buffers.points[i * K + k];
+            if (!point.exists()) continue;
             if (lamp.kind == Lamp::Kind::mesh &&
                 !shows(scene, lit.emitter(lamp).first + point.index, {point.u, point.v}))
                 continue;  // the lamp is cut out there

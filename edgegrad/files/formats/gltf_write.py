@@ -123,7 +123,7 @@ class Look:
     def _surface(self, material: Material) -> None:
         """How it scatters light."""
         base = self.material["pbrMetallicRoughness"]
-        if material.metallic is None and material.roughness is None:
+        if not material.is_glossy:
             base["metallicFactor"] = 0.0
             self.material["extensions"] = {MATT: {"specularFactor": 0.0}}
             return

@@ -296,7 +296,7 @@ def _material(mi: Any, props: Any, mesh: Mesh) -> None:
         1.0 if material.base_color is None else material.base_color,
         0.0 if material.emission is None else material.emission,
     ]
-    plain = material.metallic is None and material.roughness is None and mesh.normals is None
+    plain = not material.is_glossy and mesh.normals is None
     plain &= mesh.material is None or (mesh.colors is None and mesh.texture is None)
     plain &= not any(isinstance(value, Texture) or torch.as_tensor(value).dim() > 1 for value in given)
     if not plain or (material.emission is None) != material.two_sided:

@@ -1,0 +1,128 @@
+"""A metal ball under skies: how noisy its image is, beside Mitsuba's `direct` of as much time."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import statistics
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from table import Bench, Row, milliseconds, quartiles, seconds_of
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad.report.scenes import sphere
+
+SIZE = 96
+LAMPS = ((14, 40, 4, 60.0), (20, 90, 3, 120.0), (30, 64, 5, 40.0))  # row, column, size and radiance
+# The most noise of a pixel in percent of its radiance: under an even sky at 4 light samples, under lamps at 32.
+EVEN, UNDER_LAMPS = {0.5: 5.0, 0.2: 3.0, 0.05: 2.0}, {1.0: 4.0, 0.5: 5.0, 0.3: 7.0, 0.2: 10.0}
+
+
+def sky(kind: str) -> Tensor:
+    image = torch.full((64, 128, 3), 1.0 if kind == "even" else 0.2)
+    for row, column, size, radiance in LAMPS if kind != "even" else ():
+        image[row : row + size, column : column + size] = radiance
+    return image
+
+
+class Images:
+    """Of one ball, with a seed each."""
+
+    def __init__(self, kind: str, roughness: float, light_samples: int = 4) -> None:
+        verts = torch.nn.functional.normalize(sphere(5).verts.float(), dim=1)
+        metal = eg.Material(base_color=torch.ones(3), metallic=1.0, roughness=roughness)
+        mesh = eg.Mesh(verts, sphere(5).faces, normals=verts, material=metal)
+        self.scene = eg.Scene([mesh], lights=[eg.Environment(sky(kind))])
+        self.camera = eg.Camera.look_at((0.0, 0.3, 3.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 40.0, (SIZE, SIZE))
+        self.light_samples = light_samples
+
+    def __call__(self, seed: int) -> Tensor:
+        return eg.render(self.scene, self.camera, spp=16, light_samples=self.light_samples, seed=seed)
+
+
+class MitsubaImages:
+    """The same by Mitsuba's `direct`: a draw of the light and one of the material for each of 64 samples a pixel."""
+
+    def __init__(self, mi: Any, kind: str, roughness: float) -> None:
+        turn = mi.ScalarTransform4f
+        to_world = turn().look_at([0, 0.3, 3.2], [0, 0, 0], [0, 1, 0])
+        film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+        metal = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2}
+        sky_ = {"type": "envmap", "bitmap": mi.Bitmap(sky(kind).numpy()), "to_world": turn().rotate([0, 1, 0], 180)}
+        sensor = {"type": "perspective", "fov": 40, "fov_axis": "y", "to_world": to_world, "film": film}
+        parts = {
+            "integrator": {"type": "direct"},
+            "sensor": sensor,
+            "sky": sky_,
+            "ball": {"type": "sphere", "bsdf": metal},
+        }
+        self.mi, self.scene = mi, mi.load_dict({"type": "scene", **parts})
+
+    def __call__(self, seed: int) -> Tensor:
+        return torch.from_numpy(np.array(self.mi.render(self.scene, spp=64, seed=seed)))
+
+
+def drawn(images: Callable[[int], Tensor], count: int, first: int = 0) -> tuple[Tensor, list[float]]:
+    """(count, pixels of the ball, C) and seconds."""
+    images(first)
+    found: list[Tensor] = []
+    seconds = [seconds_of(lambda s=s: found.append(images(first + s))) for s in range(1, count + 1)]
+    y, x = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    inside = torch.hypot(x - SIZE / 2 + 0.5, y - SIZE / 2 + 0.5) < 0.4 * SIZE
+    return torch.stack(found)[:, inside].double(), seconds
+
+
+def noise(pixels: Tensor) -> float:
+    """The root mean square of that of pixels, over the mean radiance."""
+    return float(pixels.var(0).mean().sqrt() / pixels.mean())
+
+
+def relative(kind: str, roughness: float, light_samples: int, count: int) -> float:
+    """The mean of each pixel's noise over its radiance, in percent."""
+    pixels, _ = drawn(Images(kind, roughness, light_samples), count)
+    return 100 * float((pixels.std(0) / pixels.mean(0)).mean())
+
+
+def glossy(bench: Bench) -> list[Row]:
+    n = bench.repeats(16)
+    rows = [
+        Row(f"a metal ball, even sky, roughness {r}: noise", relative("even", r, 4, n), unit=" %", must=must)
+        for r, must in EVEN.items()
+    ]
+    rows += [
+        Row(
+            f"… sky with lamps, 32 light samples, roughness {r}: noise",
+            relative("lamps", r, 32, n),
+            unit=" %",
+            must=must,
+        )
+        for r, must in UNDER_LAMPS.items()
+    ]
+    try:
+        mi = importlib.import_module("mitsuba")
+    except ImportError:
+        return rows
+    mi.set_variant("scalar_rgb")
+    threads = torch.get_num_threads()
+    return rows + [beside(bench, mi, kind, r, threads) for kind in ("even", "lamps") for r in (0.5, 0.2, 0.1)]
+
+
+def beside(bench: Bench, mi: Any, kind: str, roughness: float, threads: int) -> Row:
+    """Noise over Mitsuba's in as much time: of independent samples it falls with the root of the time."""
+    ours, theirs = Images(kind, roughness), MitsubaImages(mi, kind, roughness)
+    ratios, seconds, others = [], [], []
+    for turn in range(bench.repeats(8)):
+        found, own = drawn(ours, 4, 10 * turn)
+        their_found, other = drawn(theirs, 4, 10 * turn)
+        seconds += own
+        others += other
+        share = statistics.median(own) / statistics.median(other)
+        ratios.append(noise(found) / noise(their_found) * math.sqrt(share))
+    return Row(
+        f"… {kind}, roughness {roughness}: noise over Mitsuba's of as much time", statistics.median(ratios), quartiles(ratios),
+        must=1.0, aim=0.5, note=f"edgegrad {milliseconds(seconds)}, Mitsuba {milliseconds(others)}, {threads} threads",
+    )  # fmt: skip

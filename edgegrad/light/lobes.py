@@ -1,0 +1,75 @@
+"""Directions drawn by how glossy surfaces scatter: mirrored at normals of microfacets that the viewer sees
+(csrc/shading/lit/lobe_draw.h, which names the sources)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from .bsdf import LEAST_ALPHA, dot, ggx
+
+WIDEST_LOBE = 0.65  # roughness
+
+
+class Lobes(NamedTuple):
+    """Of N points, without derivatives, in float64. Where they are wide, directions drawn by them only cost."""
+
+    v: Tensor  # (N, 3) unit, above the surface
+    n: Tensor  # (N, 3) unit
+    alpha: Tensor  # (N, 1)
+    bound: Tensor  # (N, 1), of the cap of normals whose mirrored directions are above
+    narrow: Tensor  # (N,) bool
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, v: Tensor, n: Tensor, roughness: Tensor) -> Lobes:
+        """Of unit directions to the viewer and normals (N, 3), and roughnesses (N, 1) or (1, 1)."""
+        v, n = v.detach().double(), n.detach().double()
+        roughness = roughness.detach().double().expand(len(n), 1)
+        narrow = (roughness <= WIDEST_LOBE)[:, 0]
+        nv = dot(n, v)
+        v = torch.where(nv >= 0, v, normalize(v - nv * n, dim=-1))
+        nv = nv.clamp(min=0)
+        alpha = (roughness * roughness).clamp(min=LEAST_ALPHA)
+        a2, s = alpha * alpha, 1 + (1 - nv * nv).clamp(min=0).sqrt()
+        return cls(v, n, alpha, (1 - a2) * s * s / (s * s + a2 * nv * nv), narrow)
+
+    def select(self, rows: Tensor) -> Lobes:
+        return Lobes(*(part[rows] for part in self))
+
+    def repeated(self, times: int) -> Lobes:
+        """Each so many times."""
+        return Lobes(*(part.repeat_interleave(times, 0) for part in self))
+
+    def density(self, l: Tensor) -> Tensor:
+        """(N,) by solid angle, of unit directions (N, 3): D(h) / 2 (k n·v + √(α² + (1 − α²) (n·v)²)), k the bound."""
+        a2, nv = self.alpha * self.alpha, dot(self.n, self.v).clamp(min=0)
+        D = ggx(self.n, normalize(self.v + l, dim=-1), a2)
+        return (D / (2 * (self.bound * nv + (a2 + (1 - a2) * nv * nv).sqrt())))[:, 0]
+
+    def draw(self, u: Tensor) -> Tensor:
+        """(N, 3) unit directions from numbers (N, 2) in [0, 1)."""
+        axes = _axes_around(self.n)
+        own = (axes @ self.v[:, :, None])[:, :, 0]
+        stretch = torch.cat([self.alpha, self.alpha, torch.ones_like(self.alpha)], 1)
+        wide = normalize(torch.cat([own[:, :2], own[:, 2:].clamp(min=0)], 1) * stretch, dim=-1)
+        b, phi = self.bound[:, 0] * wide[:, 2], 2 * math.pi * u[:, 0]
+        z = (1 - u[:, 1]) * (1 + b) - b
+        across = (1 - z * z).clamp(0, 1).sqrt()
+        m = torch.stack([across * phi.cos(), across * phi.sin(), z], 1) + wide
+        h = (normalize(m * stretch, dim=-1)[:, None] @ axes)[:, 0]
+        return normalize(2 * dot(self.v, h) * h - self.v, dim=-1)
+
+
+def _axes_around(n: Tensor) -> Tensor:
+    """(N, 3, 3): two unit vectors across n (N, 3), and n (Duff et al. 2017, "Building an orthonormal basis, revisited")."""
+    x, y, z = n.unbind(-1)
+    sign = torch.copysign(torch.ones_like(z), z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    rows = [1 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y, x, y, z]
+    return torch.stack(rows, -1).reshape(-1, 3, 3)
