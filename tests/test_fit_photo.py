@@ -16,13 +16,15 @@ from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import fit_pose
 from edgegrad.fit.pose.jacobian import Motion, Rendered
 from edgegrad.fit.pose.photo import light, search
-from edgegrad.fit.pose.photo.contour import Sides, contour_term
+from edgegrad.fit.pose.photo.contour import contour_term
 from edgegrad.fit.pose.photo.depth import depth_term
 from edgegrad.fit.pose.photo.light import Lit, _blurred_inside, spherical
-from edgegrad.fit.pose.photo.picture import Picture, Windows, palette, smoothed
-from edgegrad.fit.pose.photo.region import OUTLIERS, posterior, region_term
+from edgegrad.fit.pose.photo.picture import Picture
+from edgegrad.fit.pose.photo.region import region_term
 from edgegrad.fit.pose.photo.surface import AOVS, Surface
 from edgegrad.fit.pose.task import is_clutter
+from edgegrad.fit.region import OUTLIERS, Windows, labels, palette, posterior, smoothed
+from edgegrad.fit.sides import Sides
 
 CENTER = torch.tensor([1.0, 0.75, 0.4]).double()
 SIZE = 2.62
@@ -90,11 +92,13 @@ def test_the_posterior_tells_colours_apart_near_the_contour_alone():
     image = torch.where(((alpha > 0.5) == left)[..., None], red, green)
     picture = shown(view, image)
     colours = palette(picture.display, 0)
-    P = posterior(Windows(picture, picture.labels(colours), colours, 6.0), alpha, torch.ones(60, 60))
+    P = posterior(Windows(picture.size, labels(picture.display, colours), colours, 6.0), alpha, torch.ones(60, 60))
     edge = smoothed(alpha[None], 1.5)[0]
     near = (edge > 0.02) & (edge < 0.98)
     assert float(P[near & (alpha > 0.5)].min()) > 0.8 and float(P[near & (alpha < 0.5)].max()) < 0.2
-    whole = posterior(Windows(picture, picture.labels(colours), colours, 1000.0), alpha, torch.ones(60, 60))
+    whole = posterior(
+        Windows(picture.size, labels(picture.display, colours), colours, 1000.0), alpha, torch.ones(60, 60)
+    )
     assert float(whole[near & (alpha > 0.5)].min()) < 0.6
 
 
@@ -195,11 +199,11 @@ def test_a_contour_is_found_to_a_fiftieth_of_a_pixel(angle):
     near, at = torch.ones(n, n), 0.0
     for _ in range(4):
         tangents = -torch.exp(-0.5 * ((along - middle - at) / 0.9).square()) / (0.9 * math.sqrt(2 * math.pi))
-        sides = Sides.of(picture, alpha(middle + at), near)
+        sides = Sides.of(picture.display, alpha(middle + at), near)
         normal = contour_term(picture, sides, tangents[None])
         at -= float(normal.gradient / normal.curvature)
     assert at == pytest.approx(shift, abs=0.02)
-    assert contour_term(picture, Sides.of(picture, alpha(1e3), near), tangents[None]) is None
+    assert contour_term(picture, Sides.of(picture.display, alpha(1e3), near), tangents[None]) is None
 
 
 # The depth term
