@@ -24,7 +24,7 @@ WIDTH = 760  # pixels, at most
 
 
 def names() -> list[str]:
-    return sorted(path.stem for path in FOLDER.glob("[0-9]_*.py"))
+    return sorted((path.stem for path in FOLDER.glob("[0-9]*_*.py")), key=lambda name: int(name.partition("_")[0]))
 
 
 def executed(name: str, seconds: int = 300) -> NotebookNode:

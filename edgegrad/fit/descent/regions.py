@@ -13,11 +13,12 @@ from torch import Tensor
 
 from ...files.image import linear_to_srgb
 from ..region import RADIUS, Windows, around, labels, likelihood, palette, posterior, slope, smoothed
-from ..sides import outlines_explained
+from ..sides import PURE, outlines_explained
 from ..views import View
 
 EVERY = 3  # steps from one renewal to the next
 BLUR = 0.7  # pixels, of alpha: that of pictures, and some reach
+BESIDE = 2.5  # the same, where colours beside the contour are judged
 LEAST_AROUND = 0.02  # of what lies near the object: less tells no colours of a background
 
 
@@ -38,7 +39,9 @@ class Regions:
         share = alpha[..., 0].detach().float()
         near, extent = self.around(index, share)
         if extent > 0.0 and bool((near > 0.0).any()):
-            windows = Windows((share.shape[0], share.shape[1]), self.labels[index], self.palettes[index], RADIUS * extent)
+            windows = Windows(
+                (share.shape[0], share.shape[1]), self.labels[index], self.palettes[index], RADIUS * extent
+            )
             self.near[index], self.posteriors[index] = near, posterior(windows, share, near)
 
     def around(self, index: int, alpha: Tensor) -> tuple[Tensor, float]:
@@ -64,12 +67,19 @@ class Regions:
         return smoothed(tangents[..., 0].float(), BLUR)
 
     def explained(self, alphas: Sequence[Tensor]) -> float:
-        """The share of the contour that the pictures show, from alphas (H, W, 1)."""
-        parts = []
+        """How much of the contour the pictures show, 0 … 1, from alphas (H, W, 1) by which they were renewed: the share of its
+        edges, or, where that is less, how surely colours tell its two sides apart: the mean of 2P − 1 inside, 1 − 2P outside."""
+        parts, told, length = [], 0.0, 0.0
         for k, alpha in enumerate(alphas):
             share = alpha[..., 0].float()
-            parts.append((self.displays[k], share, self.around(k, share)[0]))
-        return outlines_explained(parts)
+            near = self.around(k, share)[0]
+            parts.append((self.displays[k], share, near))
+            soft = smoothed(share[None], BESIDE)[0]
+            band = ((soft > PURE) & (soft < 1.0 - PURE)) * near
+            sure = 2.0 * self.posteriors[k] - 1.0
+            told += float((band * torch.where(share > 0.5, sure, -sure)).sum())
+            length += float(band.sum())
+        return max(0.0, min(told / max(length, 1e-30), outlines_explained(parts)))
 
     def check(self, alphas: Sequence[Tensor]) -> None:
         """That the silhouettes of the start leave something of the pictures around them. Raises ValueError."""
