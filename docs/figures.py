@@ -204,7 +204,7 @@ def stages(folder: Path) -> None:
 
 
 def cup(folder: Path) -> None:
-    """The fit of a notebook in a photograph (coffee of scikit-image, by Rachel Michetti, CC0), and what it says of another side."""
+    """The fit of a notebook, from aside too. Photograph: coffee of scikit-image, by Rachel Michetti, CC0."""
     found = runpy.run_path(str(Path(__file__).parents[1] / "notebooks" / "10_a_photograph.py"))
     plt.close("all")
     seen = {

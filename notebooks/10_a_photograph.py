@@ -121,7 +121,7 @@ def keep(progress):
 
 
 fit = fitted(camera, R, t, start, callback=keep)
-print(f"{fit.reason} after {fit.steps} steps; the photograph shows {fit.explained:.0%} of the outline")
+print(f"{fit.reason} after {fit.steps} steps; explained: {fit.explained:.2f} (0.6 is enough)")
 outlines = {"start": fit.start, "after_9_steps": early["scene"], "fit": fit.scene}
 show(**{name: outlined(eg.render_aovs(one, camera, ["alpha"])["alpha"], photo) for name, one in outlines.items()})
 close = outlined(fit.render(), photo)
@@ -186,7 +186,7 @@ for length, one in ((focal, fit), (1.3 * focal, other)):
     pose, (rim, height, foot) = one.poses["pose"], one.values["cup"]
     elevation = math.degrees(math.asin(-float(F.normalize(pose.t, dim=0) @ pose.R[:, 2])))
     print(f"focal length {length:.0f} px: distance {pose.t.norm():.2f}, {elevation:.0f}° above the table, ", end="")
-    print(f"the cup's rim {rim:.2f}, its height {height:.2f}; {one.explained:.0%} of the outline shows")
+    print(f"the cup's rim {rim:.2f}, its height {height:.2f}; explained {one.explained:.2f}")
 
 # %% [markdown]
 # *What to see:* both outlines fit. Calibrate the camera, or take a second photograph.

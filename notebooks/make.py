@@ -35,7 +35,9 @@ def executed(name: str, seconds: int = 300) -> NotebookNode:
     )
     resources = {"metadata": {"path": FOLDER}}
     client = NotebookClient(notebook, timeout=seconds, kernel_name="python3", resources=resources, record_timing=False)
-    return client.execute(env={**os.environ, "PYTHONWARNINGS": "ignore::FutureWarning"})  # torch's, of its own code
+    # Those of torch's own code, and of progress bars that scikit-image does not draw.
+    ignored = "ignore::FutureWarning,ignore:IProgress not found"
+    return client.execute(env={**os.environ, "PYTHONWARNINGS": ignored})
 
 
 def small(png: str) -> str:

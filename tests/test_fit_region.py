@@ -69,7 +69,7 @@ def test_a_pose(method):
         bracket(plain=True), view, photograph(view, seed=2), given, loss="region", method=method, spp=8, progress=False
     )
     degrees, percent = errors(fit.poses["pose"])
-    assert degrees < 4.0 and percent < 2.0 and fit.explained > 0.6, (degrees, percent, fit.explained)
+    assert degrees < 4.0 and percent < 2.0 and fit.explained > 0.5, (degrees, percent, fit.explained)
 
 
 def test_a_camera(taken):
@@ -158,7 +158,7 @@ def test_what_is_not_there_is_not_explained():
     fit = fit_scene(
         vase(RADII), VIEW, clutter(96, 3), {"pose": PoseParameter()}, loss="region", spp=4, steps=30, progress=False
     )
-    assert not fit.converged and fit.explained < 0.6
+    assert not fit.converged and fit.explained < 0.5
 
 
 def test_pictures_of_it(taken):
