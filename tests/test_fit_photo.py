@@ -13,7 +13,7 @@ from test_fit import START, about_center, bracket, camera, errors, rotation
 import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
-from edgegrad.fit import fit_pose
+from edgegrad.fit import fit_camera, fit_pose
 from edgegrad.fit.pose.jacobian import Motion, Rendered
 from edgegrad.fit.pose.photo import light, search
 from edgegrad.fit.pose.photo.contour import contour_term
@@ -303,6 +303,18 @@ def test_two_photographs_of_one_pose(taken):
     )
     off = errors(fit)
     assert off[0] < 1.5 and off[1] < 1.0 and fit.converged, off
+
+
+def test_a_camera_in_a_photograph(taken):
+    """fit_camera takes the same terms; the camera starts as far from the bracket as the bracket did from its pose."""
+    view, image = taken
+    moved = view.replace(world_to_camera=view.world_to_camera.double() @ START)
+    fit = fit_camera(bracket(), image, moved, focal=False, search=False, progress=False)
+    found = fit.camera.world_to_camera.double() @ torch.linalg.inv(view.world_to_camera.double())
+    degrees = math.degrees(math.acos(min(1.0, (float(found[:3, :3].trace()) - 1.0) / 2.0)))
+    seen, before, right = (one.project(bracket().verts) for one in (fit.camera, moved, view))
+    assert degrees < 2.5 and fit.converged, degrees
+    assert float((seen - right).norm(dim=-1).mean()) < 0.8 < 4.0 < float((before - right).norm(dim=-1).mean())
 
 
 def test_a_photograph_of_something_else_is_not_converged():
