@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+import trimesh
 from test_fit import START, bracket, camera, errors
 from test_fit_photo import clutter, photograph
 
@@ -83,6 +84,30 @@ def test_a_camera(taken):
     off = (fit.cameras[0].project(corners) - VIEW.project(corners)).norm(dim=-1)
     assert float((moved.project(corners) - VIEW.project(corners)).norm(dim=-1).mean()) > 4.0
     assert float(off.mean()) < 1.0, off
+
+
+@pytest.mark.slow
+def test_a_shape_from_views():
+    """A sphere becomes a bumpy ellipsoid, without a mask."""
+
+    def sphere(subdivisions):
+        made = trimesh.creation.icosphere(subdivisions=subdivisions)
+        return torch.tensor(made.vertices.copy()).float(), torch.tensor(made.faces.copy())
+
+    n, faces = sphere(3)
+    verts = n * torch.tensor([1.0, 0.7, 0.8]) * (1.0 + 0.15 * torch.sin(3.0 * n[:, :1]))
+    true = eg.Mesh(verts, faces, colors=0.45 + 0.25 * torch.sin(4.0 * n))
+    angles = torch.arange(8) * math.pi / 4.0
+    eyes = torch.stack([3.6 * angles.cos(), torch.tensor([1.5, -1.5] * 4), 3.6 * angles.sin()], -1)
+    views = [eg.Camera.look_at(eye, (0.0, 0.0, 0.0), fov_y=40.0, size=(96, 96)) for eye in eyes]
+    images = [photograph(view, true, seed=k) for k, view in enumerate(views)]
+    fit = fit_shape(eg.Mesh(*sphere(2)), views, images, loss="region", levels=2, steps=80, spp=4, progress=False)
+
+    def off(mesh):
+        shown = [[eg.render_aovs(m, view, ["alpha"], spp=32)["alpha"] for m in (mesh, true)] for view in views]
+        return sum(float(losses.iou(*pair)) for pair in shown) / len(views)
+
+    assert off(fit.mesh) < 0.05 < 0.25 < off(fit.start.meshes[0])
 
 
 def test_loss_and_curvature_are_those_of_the_likelihood(taken):
