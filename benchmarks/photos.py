@@ -1,4 +1,4 @@
-"""fit_pose in photographs: how often it finds the pose, how exactly, and whether it knows.
+"""fit_pose and fit_camera in photographs: how often they find the pose, how exactly, and whether they know.
 
     python benchmarks/photos.py [FOLDER] [--parts lit squirrel …] [--starts 20] [--pictures out/photos] [--json out/photos.json]
 
@@ -14,6 +14,9 @@ forward, pixels, X_cam = R X + t):
         cam_R_bop, cam_t_bop_m, and gltf_to_bop_R, gltf_to_bop_t_m
     bottle/_sequence/color_camera_image_200.png, …_201.png, depth_camera_image_200.png, …_201.png, depth_camera.yaml (of M3T),
         bottle/_body/schauma.obj (m), reference.json: K, {"schauma": cam_R_body, cam_t_body_m, geometry_offset_z_m}
+
+In the parts `camera` and `focal` the object stays, and fit_camera looks for the camera, which was moved as the object is in the
+others; in `focal` also for a focal length that is off by FOCAL.
 
 Errors are the angle, and how far the object's centre is off, as a part of the object's size, the diagonal of its bounding box, or
 in its mesh's units. `falsely` counts fits that say `converged` and are more than three times the limits off.
@@ -37,11 +40,12 @@ from photo_cases import Case, Kind, Placed, clutter, rendered
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import PoseFit, fit_pose
+from edgegrad.fit import PoseFit, fit_camera, fit_pose
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
 
 FAR_OFF = 3.0  # limits: beyond, a fit must not say that it has converged
+FOCAL = 1.06  # by this factor or its inverse
 RIM = 0.3  # share of a pixel by which a neighbour's alpha is higher on a contour
 
 
@@ -130,7 +134,15 @@ class Run:
         fit = fit_pose(
             case.mesh, case.picture, case.camera, init=start.matrix, depth=case.depth, search=search, progress=False
         )
-        found, limits = Placed(fit.R, fit.t), part.limits
+        found = Placed(fit.R, fit.t)
+        return self.noted(part, case, start, found, truth, fit, label), fit
+
+    def noted(
+        self, part: Part, case: Case, start: Placed, found: Placed, truth: Placed, fit: PoseFit, label: str,
+        camera: eg.Camera | None = None,
+    ) -> Trial:  # fmt: skip
+        """A trial of the part. `camera`: that of the fit, where it is not the case's."""
+        limits = part.limits
         before, after = case.apart(start, truth), case.apart(found, truth)
         off = max(after[0] / limits.degrees, after[1] / case.size / limits.shift)
         trial = Trial(
@@ -141,15 +153,17 @@ class Run:
         print(trial.line(), flush=True)
         if self.pictures is not None:
             self.pictures.mkdir(parents=True, exist_ok=True)
-            eg.write_image(self.pictures / f"{label}.png", outlined(case, start, found))
-        return trial, fit
+            eg.write_image(self.pictures / f"{label}.png", outlined(case, start, found, camera))
+        return trial
 
 
-def outlined(case: Case, start: Placed, found: Placed) -> Tensor:
-    """(H, W, 3): the photograph with the contour of the start in blue and that of the fit in yellow."""
+def outlined(case: Case, start: Placed, found: Placed, camera: eg.Camera | None = None) -> Tensor:
+    """(H, W, 3): the photograph with the contour of the start in blue and that of the fit, by its own camera, in yellow."""
     image = case.picture
-    for pose, colour in ((start, (0.1, 0.3, 1.0)), (found, (1.0, 0.9, 0.0))):
-        alpha = eg.render_aovs(case.mesh.transformed(pose.R, pose.t), case.camera, ["alpha"], 16)["alpha"]
+    for pose, seen, colour in (
+        (start, case.camera, (0.1, 0.3, 1.0)), (found, camera or case.camera, (1.0, 0.9, 0.0)),
+    ):  # fmt: skip
+        alpha = eg.render_aovs(case.mesh.transformed(pose.R, pose.t), seen, ["alpha"], 16)["alpha"]
         highest = F.max_pool2d(alpha.movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
         image = torch.where(highest - alpha > RIM, torch.tensor(colour), image)
     return image
@@ -169,6 +183,36 @@ def _scenes(kind: Kind, degrees: float, shift: float, limits: Limits) -> Callabl
             share = (rng.uniform(1 / 3, 1.0), rng.uniform()) if kind == "easy" else (1.0, 1.0)
             start = case.beside(case.truth, degrees * share[0], shift * case.size * share[1], rng)
             run.fitted(part, case, start, case.truth, f"{name}-{k:02d}")
+        return part
+
+    return run
+
+
+def _cameras(focal: bool, limits: Limits) -> Callable[[Run, str], Part]:
+    """Cameras 10° and 5 % of the object's size off the right one, and with `focal` through a lens that is off."""
+
+    def run(run: Run, name: str) -> Part:
+        part = Part(name, limits)
+        for k in range(run.starts):
+            number = k % len(run.meshes)
+            case = rendered(f"lit {number}", run.meshes[number], run.backgrounds, "lit", 100 + k)
+            rng = np.random.default_rng([k, 10])
+            start = case.beside(case.truth, 10.0, 0.05 * case.size, rng)
+            # The camera that sees the object at rest as the case's camera sees it at the start.
+            moved = start.matrix @ torch.linalg.inv(case.truth.matrix)
+            W, K = case.camera.world_to_camera.double(), case.camera.K.clone()
+            if focal:
+                K[[0, 1], [0, 1]] *= FOCAL if k % 2 else 1.0 / FOCAL
+            given = case.camera.replace(world_to_camera=(W @ moved).float(), K=K)
+            still = case.mesh.transformed(case.truth.R.float(), case.truth.t.float())
+            fit = fit_camera(still, case.picture, given, focal=focal, progress=False)
+            # As a pose of the object before the case's camera.
+            back = torch.linalg.inv(W) @ fit.camera.world_to_camera.double() @ case.truth.matrix
+            found, seen = Placed(back[:3, :3], back[:3, 3]), case.camera.replace(K=fit.camera.K)
+            run.noted(part, case, start, found, case.truth, fit.search, f"{name}-{k:02d}", seen)
+            if focal:
+                ratio = [float(one.K[0, 0] / case.camera.K[0, 0]) for one in (given, fit.camera)]
+                print(f"    focal length {ratio[0] - 1:+.1%} → {ratio[1] - 1:+.1%}", flush=True)
         return part
 
     return run
@@ -227,6 +271,8 @@ MADE: dict[str, Callable[[Run, str], Part]] = {
     "shadow": _scenes("shadow", 15.0, 0.05, Limits(1.5, 0.03)),
     "covered": _scenes("covered", 15.0, 0.05, Limits(1.5, 0.03, 0.80)),
     "plain": _scenes("plain", 15.0, 0.05, Limits(2.0, 0.03, 0.80)),
+    "camera": _cameras(False, Limits(1.0, 0.01, 0.90)),
+    "focal": _cameras(True, Limits(1.5, 0.1, 0.80)),  # its distance goes with the focal length
 }
 REAL: dict[str, Callable[[Run, Path], Iterator[Part]]] = {
     "squirrel": _squirrel, "gelatin_box": _gelatin_box, "cracker_box": _cracker_box, "bottle": _bottle,

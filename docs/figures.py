@@ -1,7 +1,8 @@
-"""Draws the figures of concepts.md and how-it-works.md:  python docs/figures.py [FOLDER]"""
+"""Draws the figures of concepts.md, how-it-works.md and gallery.md:  python docs/figures.py [FOLDER]"""
 
 from __future__ import annotations
 
+import runpy
 import sys
 from pathlib import Path
 
@@ -202,10 +203,30 @@ def stages(folder: Path) -> None:
     figure.savefig(folder / "stages.png", dpi=110)
 
 
+def cup(folder: Path) -> None:
+    """The fit of a notebook, from aside too. Photograph: coffee of scikit-image, by Rachel Michetti, CC0."""
+    found = runpy.run_path(str(Path(__file__).parents[1] / "notebooks" / "10_a_photograph.py"))
+    plt.close("all")
+    seen = {
+        name: found["outlined"](eg.render_aovs(scene, found["camera"], ["alpha"])["alpha"], found["photo"])
+        for name, scene in (("start", found["fit"].start), ("fit", found["fit"].scene))
+    }
+    aside = found["solid"].replace(background=torch.ones(3))
+    shown = {
+        "photograph": found["photo"], **seen,
+        "from aside": eg.render(aside, found["views"]["lower"], 64, shader=found["from_photo"]),
+    }  # fmt: skip
+    figure, axes = plt.subplots(1, len(shown), figsize=(13, 2.5))
+    for axis, (title, image) in zip(axes, shown.items(), strict=True):
+        picture(axis, image, title)
+    figure.tight_layout()
+    figure.savefig(folder / "cup.jpg", dpi=110, pil_kwargs={"quality": 88})
+
+
 def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
     folder.mkdir(parents=True, exist_ok=True)
-    for draw in (light, derivatives, triangle_terms, curve_source, stages):
+    for draw in (light, derivatives, triangle_terms, curve_source, stages, cup):
         draw(folder)
 
 

@@ -24,7 +24,7 @@ WIDTH = 760  # pixels, at most
 
 
 def names() -> list[str]:
-    return sorted(path.stem for path in FOLDER.glob("[0-9]_*.py"))
+    return sorted((path.stem for path in FOLDER.glob("[0-9]*_*.py")), key=lambda name: int(name.partition("_")[0]))
 
 
 def executed(name: str, seconds: int = 300) -> NotebookNode:
@@ -35,7 +35,9 @@ def executed(name: str, seconds: int = 300) -> NotebookNode:
     )
     resources = {"metadata": {"path": FOLDER}}
     client = NotebookClient(notebook, timeout=seconds, kernel_name="python3", resources=resources, record_timing=False)
-    return client.execute(env={**os.environ, "PYTHONWARNINGS": "ignore::FutureWarning"})  # torch's, of its own code
+    # Those of torch's own code, and of progress bars that scikit-image does not draw.
+    ignored = "ignore::FutureWarning,ignore:IProgress not found"
+    return client.execute(env={**os.environ, "PYTHONWARNINGS": ignored})
 
 
 def small(png: str) -> str:

@@ -13,16 +13,18 @@ from test_fit import START, about_center, bracket, camera, errors, rotation
 import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
-from edgegrad.fit import fit_pose
+from edgegrad.fit import fit_camera, fit_pose
 from edgegrad.fit.pose.jacobian import Motion, Rendered
 from edgegrad.fit.pose.photo import light, search
-from edgegrad.fit.pose.photo.contour import Sides, contour_term
+from edgegrad.fit.pose.photo.contour import contour_term
 from edgegrad.fit.pose.photo.depth import depth_term
 from edgegrad.fit.pose.photo.light import Lit, _blurred_inside, spherical
-from edgegrad.fit.pose.photo.picture import Picture, Windows, palette, smoothed
-from edgegrad.fit.pose.photo.region import OUTLIERS, posterior, region_term
+from edgegrad.fit.pose.photo.picture import Picture
+from edgegrad.fit.pose.photo.region import region_term
 from edgegrad.fit.pose.photo.surface import AOVS, Surface
 from edgegrad.fit.pose.task import is_clutter
+from edgegrad.fit.region import OUTLIERS, Windows, labels, palette, posterior, smoothed
+from edgegrad.fit.sides import Sides
 
 CENTER = torch.tensor([1.0, 0.75, 0.4]).double()
 SIZE = 2.62
@@ -90,11 +92,13 @@ def test_the_posterior_tells_colours_apart_near_the_contour_alone():
     image = torch.where(((alpha > 0.5) == left)[..., None], red, green)
     picture = shown(view, image)
     colours = palette(picture.display, 0)
-    P = posterior(Windows(picture, picture.labels(colours), colours, 6.0), alpha, torch.ones(60, 60))
+    P = posterior(Windows(picture.size, labels(picture.display, colours), colours, 6.0), alpha, torch.ones(60, 60))
     edge = smoothed(alpha[None], 1.5)[0]
     near = (edge > 0.02) & (edge < 0.98)
     assert float(P[near & (alpha > 0.5)].min()) > 0.8 and float(P[near & (alpha < 0.5)].max()) < 0.2
-    whole = posterior(Windows(picture, picture.labels(colours), colours, 1000.0), alpha, torch.ones(60, 60))
+    whole = posterior(
+        Windows(picture.size, labels(picture.display, colours), colours, 1000.0), alpha, torch.ones(60, 60)
+    )
     assert float(whole[near & (alpha > 0.5)].min()) < 0.6
 
 
@@ -195,11 +199,11 @@ def test_a_contour_is_found_to_a_fiftieth_of_a_pixel(angle):
     near, at = torch.ones(n, n), 0.0
     for _ in range(4):
         tangents = -torch.exp(-0.5 * ((along - middle - at) / 0.9).square()) / (0.9 * math.sqrt(2 * math.pi))
-        sides = Sides.of(picture, alpha(middle + at), near)
+        sides = Sides.of(picture.display, alpha(middle + at), near)
         normal = contour_term(picture, sides, tangents[None])
         at -= float(normal.gradient / normal.curvature)
     assert at == pytest.approx(shift, abs=0.02)
-    assert contour_term(picture, Sides.of(picture, alpha(1e3), near), tangents[None]) is None
+    assert contour_term(picture, Sides.of(picture.display, alpha(1e3), near), tangents[None]) is None
 
 
 # The depth term
@@ -299,6 +303,18 @@ def test_two_photographs_of_one_pose(taken):
     )
     off = errors(fit)
     assert off[0] < 1.5 and off[1] < 1.0 and fit.converged, off
+
+
+def test_a_camera_in_a_photograph(taken):
+    """fit_camera takes the same terms; the camera starts as far from the bracket as the bracket did from its pose."""
+    view, image = taken
+    moved = view.replace(world_to_camera=view.world_to_camera.double() @ START)
+    fit = fit_camera(bracket(), image, moved, focal=False, search=False, progress=False)
+    found = fit.camera.world_to_camera.double() @ torch.linalg.inv(view.world_to_camera.double())
+    degrees = math.degrees(math.acos(min(1.0, (float(found[:3, :3].trace()) - 1.0) / 2.0)))
+    seen, before, right = (one.project(bracket().verts) for one in (fit.camera, moved, view))
+    assert degrees < 2.5 and fit.converged, degrees
+    assert float((seen - right).norm(dim=-1).mean()) < 0.8 < 4.0 < float((before - right).norm(dim=-1).mean())
 
 
 def test_a_photograph_of_something_else_is_not_converged():

@@ -178,6 +178,71 @@ def test_write_image_takes_what_a_loop_has_at_hand(tmp_path):
     assert read_image(tmp_path / "c.PNG").shape == (3, 4, 1)
 
 
+def test_curves_of_cameras(tmp_path):
+    """Exponents, tables for all channels or for each, and functions, against the formula for each value."""
+    codes = np.arange(256, dtype=np.uint8)
+    stored = np.stack([codes, codes[::-1], np.full(256, 100, np.uint8)], -1)[None]
+    path = tmp_path / "a.png"
+    Image.fromarray(stored).save(path)
+    values = stored / 255.0
+    tables = np.stack([np.linspace(0, 1, 256) ** g for g in (1.8, 2.2, 2.6)], -1)
+    coarse = np.array([0.0, 0.1, 0.4, 1.0])
+    for curve, expected in (
+        (2.2, values**2.2),
+        (1, values),
+        (torch.from_numpy(tables), np.stack([tables[stored[..., c], c] for c in range(3)], -1)),
+        (coarse, np.interp(values, np.linspace(0, 1, 4), coarse)),
+        ([0.0, 4.0], 4.0 * values),
+        (lambda v: 2.0 * v * v, 2.0 * values**2),
+        ("srgb", linear(stored.astype(int))),
+    ):
+        np.testing.assert_allclose(read_image(path, curve=curve).numpy(), expected, atol=1e-6)
+    grey = tmp_path / "grey.png"
+    Image.fromarray(stored[..., 0]).save(grey)
+    np.testing.assert_allclose(
+        read_image(grey, curve=coarse)[..., 0], np.interp(values[..., 0], np.linspace(0, 1, 4), coarse), atol=1e-6
+    )
+    rgba = np.concatenate([stored, stored[..., :1]], -1)
+    Image.fromarray(rgba).save(path)
+    np.testing.assert_allclose(read_image(path, curve=2.0)[..., 3], values[..., 0], atol=1e-6)  # alpha has no curve
+
+
+@pytest.mark.parametrize(
+    ("curve", "error", "message"),
+    [
+        ("rec709", ValueError, "curve: expected \"srgb\", an exponent, a table or a function, got 'rec709'"),
+        (0.0, ValueError, "curve: expected an exponent above 0 and up to 10, such as 2.2, got 0; 1 leaves"),
+        (float("nan"), ValueError, "curve: expected an exponent above 0"),
+        (None, TypeError, "curve: expected .* got None"),
+        (True, TypeError, "curve: expected .* got True"),
+        (
+            [0.0, 0.5, 0.4, 1.0],
+            ValueError,
+            r"that rise with the value, got \[0.5\] and then \[0.4\] at entries 1 and 2; sort",
+        ),
+        ([0.3, 0.3], ValueError, "that rise with the value, got 0.3 everywhere"),
+        ([-1.0, 1.0], ValueError, r"radiances from 0 up, got -1; take exp\(\) of logarithms"),
+        ([0.0, float("inf")], ValueError, "curve: expected finite"),
+        ([1.0], ValueError, r"curve: expected a table \(N,\), or \(N, 3\) .* got shape \(1,\)"),
+        (torch.ones(256, 2), ValueError, r"curve: expected a table .* got shape \(256, 2\)"),
+        (torch.linspace(0, 1, 9)[:, None].expand(9, 3), ValueError, r"for an image of 1 channel\(s\), got 3 columns"),
+        (lambda v: v.sum(), ValueError, r"curve: expected a function that gives radiances in the shape .* got \(\)"),
+        (lambda v: v / 0, ValueError, "curve: radiances: expected finite"),
+    ],
+)
+def test_faults_of_curves(tmp_path, curve, error, message):
+    path = tmp_path / "a.png"
+    Image.fromarray(np.zeros((2, 3), np.uint8)).save(path)
+    with pytest.raises(error, match=message):
+        read_image(path, curve=curve)
+
+
+def test_linear_files_have_no_curve(tmp_path):
+    write_image(tmp_path / "a.exr", torch.ones(2, 2, 3))
+    with pytest.raises(ValueError, match=r"curve: expected none for .*a.exr, whose floating-point pixels are linear"):
+        read_image(tmp_path / "a.exr", curve=2.2)
+
+
 def test_image_faults(tmp_path):
     image = torch.rand(3, 4, 3)
     with pytest.raises(ValueError, match=r"a\.gif: expected a file name that ends in \.png, \.jpg.*\.exr, \.hdr"):

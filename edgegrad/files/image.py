@@ -12,6 +12,7 @@ from ..camera.mistakes import warn_of_bytes
 from ..check import as_tensor, check_finite, check_not_meta, check_shape
 from ..optional import require
 from ..warnings import warn
+from .curve import Curve, decoder
 from .paths import PathLike, check_readable, check_suffix, replacing
 
 DISPLAY = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # 8 bit, sRGB
@@ -89,7 +90,7 @@ def read_stored(path: PathLike, exact: bool = False) -> Stored:
     return Stored(color, alpha, largest)
 
 
-def read_image(path: PathLike, channels: int | None = None) -> Tensor:
+def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb") -> Tensor:
     """(H, W, C) float32 from an image file: linear radiance, row 0 on top, upright as its EXIF orientation says.
 
     Integer pixels (PNG, JPEG, BMP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1;
@@ -99,6 +100,10 @@ def read_image(path: PathLike, channels: int | None = None) -> Tensor:
 
     channels  None keeps what the file has. 1 gives the luminance and 3 the colours, both without alpha;
               4 adds an alpha of 1 where the file has none
+    curve     how integer pixels, as values v from 0 to 1, become radiance: "srgb"; an exponent γ, vᵞ, 1 for pixels that are
+              linear already; a table (N,), or (N, 3) with a column for each colour, of the radiances of N values evenly spaced
+              from 0 to 1, as calibrations of a camera's response give it, which must rise; or a function of a tensor (n, C),
+              float64, such as those of colour-science. Floating-point pixels have none
 
     Raises FileNotFoundError, PermissionError, TypeError, ValueError (another kind of file, damaged, too large, colours that
     do not convert)
@@ -106,13 +111,18 @@ def read_image(path: PathLike, channels: int | None = None) -> Tensor:
     """
     if channels not in (None, 1, 3, 4):
         raise ValueError(f"channels: expected None, 1, 3 or 4, got {channels!r}")
+    decoded = decoder(curve, srgb_to_linear)
     color, alpha, largest = read_stored(path)
+    if largest is None and decoded is not srgb_to_linear:
+        raise ValueError(
+            f"curve: expected none for {path}, whose floating-point pixels are linear, got one; leave it out"
+        )
     # Not OpenImageIO's own conversion: what it does depends on the OCIO configuration that it finds.
     if largest is not None:
         for rows in color.split(
             max(1, (1 << 20) // color[0].numel())
         ):  # in place: doubles of all would be twice the image
-            rows.copy_(srgb_to_linear(rows.double()))
+            rows.copy_(decoded(rows.double().flatten(0, 1)).reshape(rows.shape))
     if channels is not None and color.shape[-1] not in (1, 3):
         raise ValueError(f"{path}: expected 1 or 3 colour channels, got {color.shape[-1]}; read it without channels=…")
     if channels == 1 and color.shape[-1] == 3:

@@ -19,7 +19,7 @@ from .options import Options, Parameter
 from .placement import Placement
 from .views import View
 
-FORMAT = 6
+FORMAT = 7
 SAME = (
     "loss",
     "mask_loss",

@@ -112,6 +112,7 @@ def _halved(x: Tensor) -> Tensor:
     return F.avg_pool2d(flat, 2).movedim(1, -1).reshape(*x.shape[:-3], x.shape[-3] // 2, x.shape[-2] // 2, x.shape[-1])
 
 
+REGION = "region"  # of pictures, not of renders: descent/regions.py has it
 LOSSES: dict[str, Loss] = {"l1": l1, "l2": l2, "huber": huber, "robust": robust, "iou": iou, "ssim": ssim}
 
 
@@ -122,7 +123,8 @@ def loss_of(name: str, loss: str | Loss) -> Loss:
     if not isinstance(loss, str):
         raise TypeError(f"{name}: expected a name or a function of image, target and weight, got {type(loss).__name__}")
     if loss not in LOSSES:
-        raise ValueError(f"{name}: expected one of {', '.join(LOSSES)}, or a function, got {loss!r}")
+        known = ", ".join([*LOSSES, REGION] if name == "loss" else LOSSES)
+        raise ValueError(f"{name}: expected one of {known}, or a function, got {loss!r}")
     return LOSSES[loss]
 
 

@@ -15,7 +15,7 @@ from ..aovs import render_aovs
 from ..check import as_tensor, check_finite, check_float, check_int, check_positive, check_positive_int
 from ..files.paths import PathLike
 from .history import Record
-from .losses import Loss, loss_of
+from .losses import REGION, Loss, loss_of
 
 METHODS = ("adam", "gauss-newton")
 RENDER = tuple(inspect.signature(render_aovs).parameters)[3:]
@@ -71,7 +71,10 @@ class Options:
 
     loss              between render and picture: "l1", "l2", "huber", "robust", "ssim", or a function of image, target and
                       weight; edgegrad.fit.losses has more, with their parameters. "robust" for what the render lacks, not
-                      against noise of glossy light
+                      against noise of glossy light. Or "region", for photographs without masks, whose light nobody knows: the
+                      object is where the colours are that lie within its silhouette, counted near the contour in the picture.
+                      It moves shapes, poses and cameras; colours of the render have no part in it, and all meshes of the scene
+                      are the object. Colours are counted by the present silhouette every three steps, and stay between
     mask_loss         the same between the render's alpha and the mask, also "iou"
     method            "adam", for any count of numbers; or "gauss-newton", for up to 400: far fewer steps, each with the
                       derivative by every one of them in forward mode. It wants all views in each step, and a loss of each
@@ -120,7 +123,8 @@ class Options:
         check_int("seed", self.seed, 0, 2**32 - 1)
         check_positive("tolerance", self.tolerance, least=0.0, most=1.0)
         for name in ("loss", "mask_loss"):
-            loss_of(name, getattr(self, name))
+            if name != "loss" or self.loss != REGION:
+                loss_of(name, getattr(self, name))
         if self.callback is not None and not callable(self.callback):
             raise TypeError(f"callback: expected a function of a Record, got {type(self.callback).__name__}")
         own = ("spp", "seed")

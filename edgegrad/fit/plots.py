@@ -16,20 +16,21 @@ from .history import Record
 INK = "#303030"
 
 
-def comparison(rows: Sequence[tuple[Tensor, Tensor, Tensor]]) -> Figure:
+def comparison(rows: Sequence[tuple[Tensor, Tensor, Tensor]], differences: bool = True) -> Figure:
     """target | start | fit | difference; a row of linear images (H, W, C) for each view."""
+    columns = 3 + differences
     shown = [tuple(map(displayed, row)) for row in rows]
     apart = [np.abs(end - target) for target, _, end in shown]
     # Errors of a good fit are too faint to see as they are; by a power of two, so that the caption is easy to read.
     largest = max(float(np.quantile(a, 0.999)) for a in apart)
     factor = 2 ** int(np.clip(np.floor(-np.log2(largest + 1e-9)), 0, 4))
     h, w = np.array(shown[0][0].shape[:2]) / max(shown[0][0].shape[:2])
-    figure = Figure(figsize=(4 * 2.4 * w + 0.3, 2.4 * h * len(rows) + 0.34), dpi=200, layout="constrained")
+    figure = Figure(figsize=(columns * 2.4 * w + 0.3, 2.4 * h * len(rows) + 0.34), dpi=200, layout="constrained")
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.04, wspace=0.0, hspace=0.0)  # type: ignore[union-attr]
-    grid = figure.subplots(len(rows), 4, squeeze=False)
-    titles = "target", "start", "fit", "difference" + (f" × {factor}" if factor > 1 else "")
+    grid = figure.subplots(len(rows), columns, squeeze=False)
+    titles = ("target", "start", "fit", "difference" + (f" × {factor}" if factor > 1 else ""))[:columns]
     for axes, row, difference in zip(grid, shown, apart, strict=True):
-        for ax, image in zip(axes, (*row, np.clip(factor * difference, 0, 1)), strict=True):
+        for ax, image in zip(axes, (*row, np.clip(factor * difference, 0, 1))[:columns], strict=True):
             ax.imshow(image, interpolation="nearest")
             ax.set_axis_off()
     for ax, title in zip(grid[0], titles, strict=True):

@@ -32,16 +32,20 @@ class View:
     weight: Tensor | None  # (H, W, 1), zero where the picture says nothing
     sure: Tensor | None = None  # (H, W, 1), zero where its colour is not sure, for the mask is neither full nor empty
     measured: Mapping[str, Measurement] = field(default_factory=dict)  # by the channel of render_aovs()
+    outlined: bool = False  # the picture tells where the object is, not its colours: alpha is rendered
 
     @property
     def aovs(self) -> list[str]:
         """The channels to render, as render_aovs() names them; the first is the one to show."""
-        own = ["image"] * (self.image is not None) + ["alpha"] * (self.mask is not None)
+        own = ["image"] * (self.image is not None and not self.outlined)
+        own += ["alpha"] * (self.mask is not None or self.outlined)
         return [*own, *self.measured, *(["alpha"] if self.measured and self.mask is None else [])]
 
     @property
     def shown(self) -> Tensor:
-        """(H, W, c) the channel to show, from 0 to 1 where it is neither a colour nor a mask."""
+        """(H, W, c) the picture, or the channel to show, from 0 to 1 where it is neither a colour nor a mask."""
+        if self.outlined and self.image is not None:
+            return self.image
         first = self.aovs[0]
         return (
             self.measured[first].displayed(self.measured[first].value) if first in self.measured else self.wanted[first]
@@ -50,7 +54,7 @@ class View:
     @property
     def wanted(self) -> dict[str, Tensor]:
         """Image and alpha of the picture, (H, W, c) each."""
-        both = {"image": self.image, "alpha": self.mask}
+        both = {"image": None if self.outlined else self.image, "alpha": self.mask}
         return {name: value for name, value in both.items() if value is not None}
 
     @property
@@ -70,7 +74,7 @@ class View:
             for value in (self.image, self.mask, self.weight, self.sure)
         )
         measured = {name: one.resized(size) for name, one in self.measured.items()}
-        return View(self.camera.resized(size), image, mask, weight, sure, measured)
+        return View(self.camera.resized(size), image, mask, weight, sure, measured, self.outlined)
 
 
 def views_of(
@@ -117,6 +121,23 @@ def views_of(
             )
     warn_of_faint("masks", [mask for mask in shapes if mask is not None])
     return views
+
+
+def outlined_views(views: Sequence[View]) -> list[View]:
+    """The same for a loss of regions. Raises ValueError where there is something else to compare than pictures."""
+    for view in views:
+        if view.mask is not None:
+            raise ValueError(
+                'masks: expected none with loss="region", which finds the object by its colours, got some; leave out the masks, '
+                'or the images and loss="region" (mask_loss compares masks)'
+            )
+        if view.measured:
+            raise ValueError(
+                f'{next(iter(view.measured))}s: expected none with loss="region", got some; give loss="l2" with masks or without'
+            )
+        if view.image is None:
+            raise ValueError('images: expected a picture for each camera with loss="region", got None')
+    return [replace(view, outlined=True) for view in views]
 
 
 def _counted(measured: dict[str, Measurement], mask: Tensor | None, weight: Tensor | None) -> dict[str, Measurement]:
@@ -250,6 +271,6 @@ def grouped(views: Sequence[View]) -> list[list[int]]:
         lens = None if camera.distortion is None else camera.distortion.shape
         shape = None if view.image is None else view.image.shape[-1]
         key = camera.size, camera.projection, lens, camera.K.dtype, shape, view.mask is None
-        key = *key, view.weight is None, view.sure is None, tuple(view.measured)
+        key = *key, view.weight is None, view.sure is None, tuple(view.measured), view.outlined
         groups.setdefault(key, []).append(i)
     return list(groups.values())

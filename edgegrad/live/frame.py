@@ -17,6 +17,7 @@ from ..fit import CameraFit, Fit, PoseFit, Progress
 from ..fit.pose.photo.shown import shown
 from ..fit.pose.result import Step
 from ..fit.pose.task import PoseTask
+from ..fit.sides import outlined
 from ..fit.views import Images, View, area_mean, cameras_of, views_of
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
@@ -88,6 +89,8 @@ def _frame(scene: Scene, cameras: list[Camera], views: list[View]) -> Frame:
         name = (*view.aovs, "image")[0]
         camera = cameras[index].resized(size)
         found = render_aovs(scene.replace(background=behind), camera, [name], spp=SPP, seed=0)[name]
+        if view.outlined:
+            return outlined(small.shown, found)
         return view.measured[name].displayed(found) if name in view.measured else found
 
     return Frame(scene, None, cameras, [view.shown if view.aovs else None for view in views], render)

@@ -36,6 +36,8 @@ class AdamSteps(Way):
         self.total: dict[str, Tensor] = {}  # of the values since the last cut
 
     def advance(self, objective: Objective) -> Record:
+        if self.renew(objective, self.values):
+            self.least = math.inf
         loss = objective(self.values, self.step)
         gradients = self.gradients(loss)
         record = self.record(float(loss.detach()), gradients, CUT**self.cuts)

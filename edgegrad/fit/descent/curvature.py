@@ -46,8 +46,13 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
                     images[name].append(found[0][name])
                     slopes[name].append(found[1][name])
             for name in aovs if images[aovs[0]] else ():
-                weight = weights_of(objective, name, group, torch.stack(images[name])) / len(picks)
-                for w, J in zip(weight, slopes[name], strict=True):
+                render, tangents_of = torch.stack(images[name]), slopes[name]
+                if objective.regions is None:
+                    weight = weights_of(objective, name, group, render) / len(picks)
+                else:
+                    weight = objective.regions.curvature(group, render) / len(picks)
+                    tangents_of = [objective.regions.blurred(J) for J in tangents_of]
+                for w, J in zip(weight, tangents_of, strict=True):
                     rows = J.reshape(n, -1) * w.sqrt().flatten()
                     total += (rows @ rows.T).double()
     except (NotImplementedError, RuntimeError) as error:
@@ -107,6 +112,8 @@ def _weights(loss: Callable[[Tensor], Tensor], render: Tensor, target: Tensor) -
 
 def check_pointwise(objective: Objective) -> None:
     """That each pixel has a loss of its own: its weight does not change with differences elsewhere. Raises ValueError."""
+    if objective.regions is not None:
+        return
     generator = torch.Generator().manual_seed(0)
     target = torch.rand(1, 16, 16, 3, generator=generator)
     r = 0.2 * (0.1 + torch.rand(target.shape, generator=generator))

@@ -72,6 +72,10 @@ class Falls:
             self._blocks = [a + b for a, b in zip(self._blocks[::2], self._blocks[1::2], strict=True)]
             self._length, self._filled = 2 * self._length, 2 * self._length
 
+    def part(self) -> None:
+        """The losses after this are no longer comparable with those before, but gradients are."""
+        self._losses = [*self._losses, math.nan]
+
     def note(self) -> None:
         """Before a step: where it begins."""
         self._before = {name: value.detach().clone() for name, value in self._values.items()}
@@ -104,10 +108,12 @@ class Falls:
         much of a loss may be what no step can mend; but not less than the noise of its mean over as many steps as the
         patience."""
         last = torch.tensor(self._losses, dtype=torch.float64)
-        if len(last) < 2:
+        differences = last.diff()
+        differences = differences[differences.isfinite()]
+        if len(differences) == 0:
             return 0.0
-        now = float(last.mean())
-        noise = float(last.diff().square().mean()) / 2.0  # of differences, in which a steady fall hardly counts
+        now = float(last.nanmean())
+        noise = float(differences.square().mean()) / 2.0  # in which a steady fall hardly counts
         share = options.tolerance * min(abs(now), abs(self.first - now))
         return max(share, math.sqrt(noise / options.patience))
 

@@ -14,10 +14,11 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..checkpoints import Checkpoint
 from ..history import Record
+from ..losses import REGION
 from ..options import Options, Parameter
 from ..placement import Coordinates, Placement, PoseParameter
 from ..upside_down import warn_of_masks
-from ..views import Images, View, views_of
+from ..views import Images, View, outlined_views, views_of
 from .adam_steps import AdamSteps
 from .building import Build, Built, Values, builder, built, checked_parameters, like
 from .gauss_newton import GaussNewtonSteps
@@ -93,6 +94,8 @@ def fit_scene(
     """
     opts = options_of(options)
     views = views_of(cameras, images, masks, weights)
+    if opts.loss == REGION:
+        views = outlined_views(views)
     build, known = builder(scene, [view.camera for view in views], drop_background=masks is not None)
     wanted = checked_parameters(parameters, known)
     return fit_views(build, views, wanted, opts, {"scene": scene, "parameters": wanted}, regularizer)
@@ -133,6 +136,7 @@ def fit_views(
     start, cameras = built(whole, {n: p.value for n, p in coordinates.parameters.items() if p.value is not None})
     warn_of_masks(views, start, cameras)
     objective = Objective(whole, views, options, regularizer)
+    objective.check({n: p.value for n, p in coordinates.parameters.items() if p.value is not None})
     way = way_of(coordinates.parameters, options)
     descent = descend(way, objective, checkpoint.write, saved, report=reporter(whole, views, coordinates))
     return judged(objective, descent, start, coordinates)

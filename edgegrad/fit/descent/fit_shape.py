@@ -15,13 +15,14 @@ from ...scene.scene import Scene
 from ..checkpoints import Checkpoint
 from ..ending import Ending
 from ..history import Record
+from ..losses import REGION
 from ..measured import Measured
 from ..options import Options, Parameter
 from ..placement import Coordinates
 from ..remeshing import crowded_edges, remeshed
 from ..smooth import Smooth
 from ..upside_down import warn_of_masks
-from ..views import Images, View, views_of
+from ..views import Images, View, outlined_views, views_of
 from .fit_scene import options_of, reporter, way_of
 from .loop import Descent, descend
 from .objective import Objective, judged
@@ -87,6 +88,8 @@ def fit_shape(
         )
     measured = {"depths": depths, "normals": normals, "positions": positions}
     views = views_of(cameras, images, masks, weights, measured)
+    if opts.loss == REGION:
+        views = outlined_views(views)
     behind = None if masks is not None else background
     bare = Mesh(mesh.verts.detach().cpu().float().clone(), mesh.faces.detach().cpu().clone())
     return _Search(views, opts, levels, faces, lr, smoothness, look or _itself, behind, regularizer).run(bare)
@@ -164,7 +167,10 @@ class _Search:
             return self.scene(mesh.replace(verts=smooth(values["verts"]))), [view.camera for view in views]
 
         objective = Objective(build, views, self.options, self.regularizer)
-        parameters = {"verts": Parameter(rate, smooth.times(mesh.verts), uniform=True)}
+        first = smooth.times(mesh.verts)
+        if level == 0 and saved is None:
+            objective.check({"verts": first})
+        parameters = {"verts": Parameter(rate, first, uniform=True)}
         title = f"level {level + 1} of {self.levels}"
         found = descend(way_of(parameters, self.options), objective, save, saved, title, reporter(build, views))
         return found._replace(values={"verts": smooth(found.values["verts"])})

@@ -13,6 +13,7 @@ from ...camera.camera import Camera
 from ...check import check_positive, check_positive_int
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..losses import REGION
 from ..options import Parameter
 from ..views import Images, views_of
 from .fit_scene import fit_views, options_of
@@ -46,6 +47,10 @@ def fit_texture(
     `fit.mesh`, its texture `fit.mesh.texture`. Raises TypeError or ValueError that names the argument.
     """
     opts = options_of(options)
+    if opts.loss == REGION:
+        raise ValueError(
+            f'loss: expected one between render and picture, got {opts.loss!r}, which is for shapes and poses; give "l1" or "l2"'
+        )
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; load one with load_mesh(path)")
     if mesh.uvs is None:

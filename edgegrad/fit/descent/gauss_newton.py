@@ -60,6 +60,10 @@ class GaussNewtonSteps(Way):
         if not self.step:
             check_pointwise(objective)
         step = self.step
+        if self.renew(objective, self._named(self.here)) and self.accepted:
+            # That what is compared with it is compared by the same.
+            with torch.no_grad():
+                self.loss = 0.5 * sum(float(objective(self._named(self.here), at)) for at in (step, step + AGAIN))
         first = objective(self.values, step)
         gradients = self.gradients(first)
         with torch.no_grad():

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from .objective import Objective
 
 SMALL = 64  # values of up to so many numbers are kept for each step
-_PLAIN = ("best", "step", "seconds", "flat")
+_PLAIN = ("best", "step", "seconds", "flat", "renewed")
 
 
 class Descent(NamedTuple):
@@ -46,10 +46,20 @@ class Way:
         self.history: list[Record] = []
         self.step, self.seconds, self.flat = 0, 0.0, False
         self.falls = Falls(self.values, apart)
+        self.renewed: tuple[int, dict[str, Tensor]] | None = None  # step and values of the objective's last renewal
 
     def advance(self, objective: Objective) -> Record:
         """One step, with the record of the point where it began."""
         raise NotImplementedError
+
+    def renew(self, objective: Objective, values: Mapping[str, Tensor]) -> bool:
+        """What the objective holds fixed between steps, where it is time to; False where losses stay comparable."""
+        if not objective.renews(self.step):
+            return False
+        self.renewed = self.step, {name: value.detach().clone() for name, value in values.items()}
+        objective.renew(self.renewed[1], self.step)
+        self.falls.part()
+        return True
 
     @property
     def falling(self) -> bool:
@@ -122,6 +132,8 @@ def descend(
     began, options = time.perf_counter(), way.options
     if saved is not None:
         way.load(saved)
+        if way.renewed is not None:
+            objective.renew(way.renewed[1], way.renewed[0])
     earlier = way.seconds
     interrupted = False
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from ...aovs import render_aovs
 from ...camera.camera import Camera
 from ...scene.scene import Scene
-from ..losses import loss_of
+from ..losses import REGION, loss_of
 from ..measured import comparable, measured_loss
 from ..options import Options
 from ..placement import Coordinates
@@ -18,6 +18,7 @@ from ..verdict import explained
 from ..views import View, grouped
 from .building import Built, built
 from .loop import Descent
+from .regions import EVERY, Regions
 from .result import Fit
 
 FINAL_SPP = 64  # samples a pixel of the renders that are judged
@@ -31,7 +32,10 @@ class Objective:
         regularizer: Callable[[Scene], Tensor] | None = None,
     ) -> None:  # fmt: skip
         self.build, self.views, self.options, self.regularizer = build, views, options, regularizer
-        self.losses = {"image": loss_of("loss", options.loss), "alpha": loss_of("mask_loss", options.mask_loss)}
+        self.losses = {"alpha": loss_of("mask_loss", options.mask_loss)}
+        self.regions = Regions(views, options.seed) if options.loss == REGION else None
+        if options.loss != REGION:
+            self.losses["image"] = loss_of("loss", options.loss)
 
     def __call__(self, tensors: Mapping[str, Tensor], step: int) -> Tensor:
         scene, cameras = self.build(tensors)
@@ -39,11 +43,50 @@ class Objective:
         total = torch.zeros((), dtype=torch.float64)
         for group, renders in self.renders(scene, cameras, picks, self.options.spp, self.seed(step)):
             first = self.views[group[0]]
+            if self.regions is not None:
+                total = total + self.regions.loss(group, renders["alpha"]) / len(picks)
             for name in first.wanted:
                 total = total + self.of_group(name, group, renders[name]) / len(picks)
             for name in first.measured:
                 total = total + self.of_measured(name, group, renders) / len(picks)
         return total if self.regularizer is None else total + self.regularizer(scene)
+
+    def renews(self, step: int) -> bool:
+        """Whether a step begins with renew()."""
+        return self.regions is not None and step % EVERY == 0
+
+    def renew(self, tensors: Mapping[str, Tensor], step: int) -> None:
+        """What the loss holds fixed between steps is what it is at these values."""
+        if self.regions is None:
+            return
+        for i, alpha in enumerate(self._alphas(tensors, self.options.spp, self.seed(step))):
+            self.regions.renew(i, alpha)
+
+    def check(self, tensors: Mapping[str, Tensor]) -> None:
+        """The start, and that the loss depends on all that is sought. Raises ValueError."""
+        if self.regions is None:
+            return
+        self.regions.check(self._alphas(tensors, self.options.spp, self.seed(0)))
+        self.renew(tensors, 0)
+        leaves = {name: value.detach().clone().requires_grad_() for name, value in tensors.items()}
+        loss = self(leaves, 0)
+        inputs = list(leaves.values())
+        found = torch.autograd.grad(loss, inputs, allow_unused=True) if loss.requires_grad else [None] * len(inputs)
+        for name, gradient in zip(leaves, found, strict=True):
+            if gradient is None:
+                raise ValueError(
+                    f'parameters: expected what moves the outline of the scene, as loss="region" needs, got {name!r}, on which '
+                    "alpha does not depend; fit it afterwards, with another loss"
+                )
+
+    def _alphas(self, tensors: Mapping[str, Tensor], spp: int, seed: int) -> list[Tensor]:
+        """(H, W, 1) of each view."""
+        scene, cameras = built(self.build, dict(tensors))
+        found: dict[int, Tensor] = {}
+        with torch.no_grad():
+            for group, renders in self.renders(scene, cameras, [*range(len(self.views))], spp, seed):
+                found |= dict(zip(group, renders["alpha"], strict=True))
+        return [found[i] for i in range(len(self.views))]
 
     def of_group(self, name: str, group: Sequence[int], render: Tensor) -> Tensor:
         """Σ of the loss of these views, whose channel `name` is `render` (B, H, W, c)."""
@@ -95,9 +138,14 @@ def judged(objective: Objective, descent: Descent, start: Scene, coordinates: Co
     scene, cameras = built(objective.build, descent.values)
     loss, pairs = 0.0, []
     spp = max(options.spp, FINAL_SPP)
+    objective.renew(descent.values, 0)
+    alphas: list[Tensor] = []
     with torch.no_grad():
         for i, view in enumerate(views):
             renders = [next(objective.renders(scene, cameras, [i], spp, (options.seed + k) % 2**32))[1] for k in (1, 2)]
+            if objective.regions is not None:
+                alphas.append(0.5 * (renders[0]["alpha"][0] + renders[1]["alpha"][0]))
+                loss += float(objective.regions.loss([i], alphas[-1][None])) / len(views)
             for name, target in view.wanted.items():
                 first, second = (found[name][0] for found in renders)
                 loss += float(objective.of_group(name, [i], 0.5 * (first + second)[None])) / len(views)
@@ -107,9 +155,10 @@ def judged(objective: Objective, descent: Descent, start: Scene, coordinates: Co
                 loss += float(objective.of_measured(name, [i], means)) / len(views)
                 target, weight = comparable(means[name][0], means["alpha"][0], given)
                 pairs.append((renders[0][name][0], renders[1][name][0], target, weight))
+    share = explained(pairs) if objective.regions is None else objective.regions.explained(alphas)
     history = [coordinates.recorded(record) for record in descent.history]
     return Fit(
         values=coordinates.plain(descent.values), poses=coordinates.poses(descent.values), scene=scene, cameras=cameras,
-        views=views, loss=loss, explained=explained(pairs), ending=descent.ending, history=history, seconds=descent.seconds,
+        views=views, loss=loss, explained=share, ending=descent.ending, history=history, seconds=descent.seconds,
         start=start,
     )  # fmt: skip

@@ -24,6 +24,7 @@ from ...scene.scene import Scene
 from ..ending import Ending, reason_of
 from ..history import Record, number_or_none, plain_history
 from ..placement import Pose
+from ..sides import outlined
 from ..verdict import ENOUGH
 from ..views import View
 
@@ -81,12 +82,12 @@ class Fit:
         return reason_of(self.ending, self.explained)
 
     def render(self, index: int = 0, spp: int = 64, seed: int = 0) -> Tensor:
-        """(H, W, C) as the camera of that place sees the fit; alpha (H, W, 1) where there was a mask alone; where there was none,
-        the depth, normal or position that was measured, as render_aovs() gives it."""
+        """(H, W, C) as the camera of that place sees the fit; alpha (H, W, 1) where there was a mask alone, or by regions; where
+        there was none, the depth, normal or position that was measured, as render_aovs() gives it."""
         return _render(self.scene, self.cameras[index], self.views[index], spp, seed)
 
     def plot(self, most: int = 4) -> Figure:
-        """target | start | fit | difference of up to so many views."""
+        """target | start | fit | difference of up to so many views; by regions the contour of start and fit in the picture."""
         n = len(self.views)
         chosen = sorted({round(k * (n - 1) / max(1, min(most, n) - 1)) for k in range(min(most, n))})
         rows = []
@@ -95,8 +96,10 @@ class Fit:
             start, end = _render(self.start, view.camera, view, 64, 0), self.render(i)
             if (measured := view.measured.get(view.aovs[0])) is not None:
                 start, end = measured.displayed(start), measured.displayed(end)
+            if view.outlined:
+                start, end = (outlined(view.shown, alpha) for alpha in (start, end))
             rows.append((view.shown, start, end))
-        return require("edgegrad.fit.plots", *DRAWING).comparison(rows)
+        return require("edgegrad.fit.plots", *DRAWING).comparison(rows, not self.views[0].outlined)
 
     def plot_history(self) -> Figure:
         """The loss and the norm of each gradient, step by step."""

@@ -23,11 +23,12 @@ from ...files.image import read_image
 from ...files.paths import PathLike
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..region import palette, smoothed
 from ..views import check_image
 from .fit_pose import depth_image
 from .gauss_newton import Normal
 from .photo.level import PhotoLevel, Seen, photo_levels
-from .photo.picture import Picture, palette, smoothed
+from .photo.picture import Picture
 from .photo.search import DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST, PhotoSearch
 from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit

@@ -14,35 +14,31 @@ from ....aovs import render_aovs
 from ....files.image import linear_to_srgb
 from ....scene.mesh import Mesh
 from ....scene.scene import Scene
+from ...region import RADIUS, Windows, around, labels, palette, posterior, smoothed
+from ...sides import ALONE_SHOWN, CONTRAST, PURE, Sides
+from ...sides import BLUR as CONTOUR_BLUR
 from ...verdict import explained
 from ..gauss_newton import Normal
 from ..jacobian import Rendered
 from ..observed import motion
 from ..pose import Pose
 from ..task import ZOOM, Level, PoseTask, Shot
-from .contour import PURE, Sides, contour_term
+from .contour import contour_term
 from .depth import depth_term
 from .light import HARMONICS, Lit
-from .picture import Picture, Windows, palette, smoothed
-from .region import posterior, region_term
+from .picture import Picture
+from .region import region_term
 from .surface import AOVS, Surface
 
 COARSEST = 30  # pixels across the object where the fit begins
 SMALLEST = 12  # pixels on the shorter side of the coarsest level
 BLURS = (1.0, 0.7)  # pixels: of alpha on the coarse levels; the last but one, if there are three
-CONTOUR_BLUR = 0.9  # of alpha in the contour term: about that of photographs at full size
 FEW_HARMONICS = 4  # of the light on the coarsest level
 GRID = 16  # pixels that crops are aligned to, so that a pose which is a little different has the same
 MARGIN = 0.6  # around the object that a crop keeps, in its extent in the image
-AROUND = 0.25  # of the object's extent in the image, where colours count as those that surround it
-RADIUS = 0.15  # of windows in which colours are counted, in the object's extent in the image
 MASKED = 0.01  # probability that a mask is wrong
-VISIBLE = 10  # pixels that a render must cover
-CONTRAST = 2.0  # of both sides of a contour that shows, in standard deviations
 RESOLVED = 40.0  # pixels across the object: light and colours that are fitted to fewer explain any picture
-# Share of the contour that has to show; with less, less is explained. More where the contour is all that is compared: wrong
-# places show 0.5 … 0.7 of it in clutter, right ones 0.85 and more.
-SHOWN, ALONE_SHOWN = 0.5, 0.85
+SHOWN = 0.5  # share of the contour that has to show beside what is inside; with less, less is explained
 
 
 @dataclass(frozen=True)
@@ -92,7 +88,7 @@ class PhotoLevel:
                     channels = render_aovs(moved, camera, names, self.plain.spp, seed)
                 surface = Surface.of(camera, channels, moves)
             lit = Lit.of(picture, surface, self.harmonics) if surface is not None and self.harmonics else None
-            near, extent = _around(alpha)
+            near, extent = around(alpha)
             found.append(Seen(picture, alpha, tangents, near * picture.weight, extent, surface, lit))
         return found
 
@@ -111,7 +107,7 @@ class PhotoLevel:
             if seen.lit is not None:
                 terms.append(seen.lit.term())
             if self.last:
-                sides = Sides.of(seen.picture, smoothed(seen.alpha[None], CONTOUR_BLUR)[0], seen.near)
+                sides = Sides.of(seen.picture.outlined, smoothed(seen.alpha[None], CONTOUR_BLUR)[0], seen.near)
                 terms.append(contour_term(seen.picture, sides, smoothed(seen.tangents, CONTOUR_BLUR)))
             if seen.surface is not None and seen.picture.depth is not None:
                 terms.append(depth_term(seen.surface, seen.picture.depth, seen.picture.weight, self.task.size))
@@ -126,7 +122,7 @@ class PhotoLevel:
         pairs, shown, length, extent = [], 0.0, 0.0, 0.0
         for seen in self.see(pose, seed) if views is None else views:
             picture, contour = seen.picture, smoothed(seen.alpha[None], CONTOUR_BLUR)[0]
-            sides = Sides.of(picture, contour, seen.near)
+            sides = Sides.of(picture.outlined, contour, seen.near)
             extent = max(extent, seen.extent)
             on = ((contour > PURE) & (contour < 1.0 - PURE)).float() * picture.weight
             length += float(on.sum())
@@ -149,14 +145,14 @@ class PhotoLevel:
     @cached_property
     def _labels(self) -> list[Tensor]:
         """Of the pixels of each picture; they are the same at each step."""
-        return [picture.labels(colours) for picture, colours in zip(self.pictures, self.palettes, strict=True)]
+        return [labels(picture.display, colours) for picture, colours in zip(self.pictures, self.palettes, strict=True)]
 
     def _posterior(self, k: int, seen: Seen) -> Tensor:
         """(h, w), that a pixel of picture k shows the object: by the mask, or else by its colour."""
         mask = seen.picture.mask
         if mask is not None:
             return mask.clamp(MASKED, 1.0 - MASKED)
-        windows = Windows(seen.picture, self._labels[k], self.palettes[k], RADIUS * seen.extent)
+        windows = Windows(seen.picture.size, self._labels[k], self.palettes[k], RADIUS * seen.extent)
         return posterior(windows, seen.alpha, seen.near)
 
 
@@ -217,16 +213,3 @@ def _crop(task: PoseTask, shot: Shot, pose: Pose) -> tuple[int, int, int, int, f
     if right - left < SMALLEST or bottom - top < SMALLEST:
         return 0, 0, H, W, float(max(H, W)) / 2
     return top, left, bottom - top, right - left, extent
-
-
-def _around(alpha: Tensor) -> tuple[Tensor, float]:
-    """What surrounds the object (h, w), and its extent, pixels; 0 where it is not seen."""
-    rows, columns = torch.nonzero(alpha > 0.5, as_tuple=True)
-    near = torch.zeros_like(alpha)
-    if len(rows) < VISIBLE:
-        return near, 0.0
-    low, high = (int(rows.min()), int(columns.min())), (int(rows.max()), int(columns.max()))
-    extent = math.hypot(high[0] - low[0], high[1] - low[1])
-    margin = int(AROUND * extent) + 2
-    near[max(0, low[0] - margin) : high[0] + margin, max(0, low[1] - margin) : high[1] + margin] = 1.0
-    return near, extent

@@ -19,8 +19,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ...region import smoothed
 from ..gauss_newton import Normal
-from .picture import Picture, smoothed
+from .picture import Picture
 from .surface import Surface, slope
 
 BLUR = 1.0  # pixels, of both

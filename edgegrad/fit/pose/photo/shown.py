@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ....aovs import render_aovs
+from ...sides import outlined
 from ..observed import motion
 from ..pose import Pose
 from ..task import FADED, Level, PoseTask
 from .light import HARMONICS, Lit, spherical
 from .picture import Picture
 from .surface import AOVS, Surface
-
-OUTLINE = 1.0, 0.8, 0.0  # linear radiance
-RIM = 0.3  # of alpha, between neighbours
 
 
 def shown(task: PoseTask, level: Level, pose: Pose) -> list[Tensor]:
@@ -31,9 +28,7 @@ def shown(task: PoseTask, level: Level, pose: Pose) -> list[Tensor]:
             alpha = channels["alpha"].float()
             image = shot.target * alpha if task.colourless else _lit(task, level, pose, channels, len(found))
         image = image + (1.0 - alpha) * FADED * shot.target
-        rim = F.max_pool2d(alpha.movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1) - alpha > RIM
-        colour = image.new_tensor(OUTLINE if image.shape[-1] == 3 else [1.0] * image.shape[-1])
-        found.append(torch.where(rim, colour, image))
+        found.append(outlined(image, alpha))
     return found
 
 

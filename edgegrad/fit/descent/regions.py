@@ -1,0 +1,109 @@
+"""The region term of pictures as a loss: −log(αP + (1 − α)(1 − P)), the mean over what surrounds the object.
+
+The posterior P is of the colours as a silhouette divides them (region.py). It is held fixed between renewals: with it, the loss
+is a function of the pixels' alpha, each by itself, which a descent can compare from step to step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ...files.image import linear_to_srgb
+from ..region import RADIUS, Windows, around, labels, likelihood, palette, posterior, slope, smoothed
+from ..sides import PURE, outlines_explained
+from ..verdict import ENOUGH
+from ..views import View
+
+EVERY = 3  # steps from one renewal to the next
+BLUR = 0.7  # pixels, of alpha: that of pictures, and some reach
+BESIDE = 2.5  # the same, where colours beside the contour are judged
+# Of right fits colours tell the sides apart by 0.70 … 0.81, of wrong ones on edges of clutter by up to 0.69.
+SURE = 0.695
+LEAST_AROUND = 0.02  # of what lies near the object: less tells no colours of a background
+
+
+class Regions:
+    """The pictures of some views, and what their colours say of the object's place."""
+
+    def __init__(self, views: Sequence[View], seed: int) -> None:
+        pictures = [view.image for view in views if view.image is not None]
+        self.displays = [linear_to_srgb(picture.clamp(0.0, 1.0)) for picture in pictures]
+        self.palettes = [palette(display, seed) for display in self.displays]
+        self.labels = [labels(*pair) for pair in zip(self.displays, self.palettes, strict=True)]
+        self.weights = [None if view.weight is None else view.weight[..., 0] for view in views]
+        self.near = [torch.zeros(view.camera.size) for view in views]
+        self.posteriors = [torch.full(view.camera.size, 0.5) for view in views]
+
+    def renew(self, index: int, alpha: Tensor) -> None:
+        """By the silhouette (H, W, 1) that a view shows; without one, what was known stays."""
+        share = alpha[..., 0].detach().float()
+        near, extent = self.around(index, share)
+        if extent > 0.0 and bool((near > 0.0).any()):
+            windows = Windows(
+                (share.shape[0], share.shape[1]), self.labels[index], self.palettes[index], RADIUS * extent
+            )
+            self.near[index], self.posteriors[index] = near, posterior(windows, share, near)
+
+    def around(self, index: int, alpha: Tensor) -> tuple[Tensor, float]:
+        """Weights (H, W) of what surrounds the object, and its extent, pixels; 0 where it is not seen."""
+        near, extent = around(alpha)
+        weight = self.weights[index]
+        return near if weight is None else near * weight, extent
+
+    def loss(self, group: Sequence[int], alpha: Tensor) -> Tensor:
+        """Σ of the losses of these views, of their alpha (B, H, W, 1)."""
+        P, near = self._of(group)
+        f = likelihood(P, smoothed(alpha[..., 0].float(), BLUR))
+        return -(near * f.double().log()).sum()
+
+    def curvature(self, group: Sequence[int], alpha: Tensor) -> Tensor:
+        """(B, H, W) of the same by each pixel's alpha, blurred as `blurred` does: Fisher's information."""
+        P, near = self._of(group)
+        return near * slope(P, smoothed(alpha[..., 0].float(), BLUR)).square()
+
+    @staticmethod
+    def blurred(tangents: Tensor) -> Tensor:
+        """(n, H, W) as alpha is blurred, from derivatives of alpha (n, H, W, 1)."""
+        return smoothed(tangents[..., 0].float(), BLUR)
+
+    def explained(self, alphas: Sequence[Tensor]) -> float:
+        """How much of the contour the pictures show, 0 … 1, from alphas (H, W, 1) by which they were renewed: the share of its
+        edges, or, where that is less, how surely colours tell its two sides apart: the mean of 2P − 1 inside, 1 − 2P outside, in
+        such units that SURE is just enough."""
+        parts, told, length = [], 0.0, 0.0
+        for k, alpha in enumerate(alphas):
+            share = alpha[..., 0].float()
+            near = self.around(k, share)[0]
+            parts.append((self.displays[k], share, near))
+            soft = smoothed(share[None], BESIDE)[0]
+            band = ((soft > PURE) & (soft < 1.0 - PURE)) * near
+            sure = 2.0 * self.posteriors[k] - 1.0
+            told += float((band * torch.where(share > 0.5, sure, -sure)).sum())
+            length += float(band.sum())
+        return max(0.0, min(ENOUGH / SURE * told / max(length, 1e-30), outlines_explained(parts)))
+
+    def check(self, alphas: Sequence[Tensor]) -> None:
+        """That the silhouettes of the start leave something of the pictures around them. Raises ValueError."""
+        seen = 0
+        for k, alpha in enumerate(alphas):
+            share = alpha[..., 0].float()
+            near, extent = self.around(k, share)
+            seen += extent > 0.0
+            if extent > 0.0 and float((near * (1.0 - share)).sum()) <= LEAST_AROUND * float(near.sum()):
+                raise ValueError(
+                    f'scene: expected meshes with some of the picture around them, as loss="region" needs, got a scene that '
+                    f"fills picture {k} at the start; leave out ground and walls, for all meshes of the scene are the object"
+                )
+        if not seen:
+            raise ValueError(
+                'scene: expected an object that the pictures show at the start, as loss="region" needs, got one out of view of '
+                "all cameras; start nearer"
+            )
+
+    def _of(self, group: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Posteriors (B, H, W), and weights whose sum is 1 for each view."""
+        near = torch.stack([self.near[i] for i in group])
+        return torch.stack([self.posteriors[i] for i in group]), near / near.sum((1, 2), keepdim=True).clamp(min=1e-30)

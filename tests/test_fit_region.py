@@ -1,0 +1,227 @@
+"""fit_scene(loss="region"): shapes, poses and cameras from photographs without a mask, in light that the fit does not know."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+import trimesh
+from test_fit import START, bracket, camera, errors
+from test_fit_photo import clutter, photograph
+
+import edgegrad as eg
+from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, fit_shape, fit_texture, losses
+from edgegrad.fit.descent.regions import BLUR, Regions
+from edgegrad.fit.region import OUTLIERS, smoothed
+from edgegrad.fit.views import outlined_views, views_of
+
+RADII = torch.tensor([0.55, 0.75, 0.35, 0.5])
+AROUND = 24
+VIEW = eg.Camera.look_at((0.3, 1.4, 4.0), (0.0, 0.0, 0.0), fov_y=40.0, size=(96, 96))
+
+
+def vase(radii):
+    """A solid of revolution about the y axis."""
+    angle = torch.arange(AROUND) * (2.0 * math.pi / AROUND)
+    r = torch.cat([torch.full((1,), 1e-3), radii, torch.full((1,), 1e-3)])
+    y = torch.tensor([-0.9, -0.9, -0.3, 0.3, 0.9, 0.9])
+    verts = torch.stack([r[:, None] * angle.cos(), y[:, None].expand(-1, AROUND), r[:, None] * angle.sin()], -1)
+    a = torch.arange(5)[:, None] * AROUND + torch.arange(AROUND)
+    b = torch.arange(5)[:, None] * AROUND + (torch.arange(AROUND) + 1) % AROUND
+    faces = torch.cat([torch.stack([a, a + AROUND, b], -1), torch.stack([b, a + AROUND, b + AROUND], -1)]).reshape(
+        -1, 3
+    )
+    return eg.Mesh(verts.reshape(-1, 3), faces)
+
+
+@pytest.fixture(scope="module")
+def taken():
+    """Of the vase, in a light, before clutter, compressed."""
+    mesh = vase(RADII)
+    return photograph(VIEW, mesh.replace(colors=0.45 + 0.25 * torch.sin(3.0 * mesh.verts)), seed=5)
+
+
+def test_a_shape_and_its_place(taken):
+    """The radii of a vase start 20 % off, and its place 3 % of its size."""
+    start = Pose(torch.eye(3), torch.tensor([0.06, -0.04, 0.0]))
+    given = {
+        "radii": Parameter(0.01, RADII * torch.tensor([1.2, 0.8, 1.2, 0.8]), low=0.05),
+        "pose": PoseParameter(start, of=vase(RADII), rotation=0.01, shift=0.005),
+    }
+
+    def scene(values):
+        pose = values["pose"]
+        return vase(values["radii"]).transformed(pose.R, pose.t)
+
+    fit = fit_scene(scene, VIEW, taken, given, loss="region", spp=8, progress=False)
+    assert fit.converged and fit.steps < 150, (fit.reason, fit.steps)
+    torch.testing.assert_close(fit.values["radii"], RADII, rtol=0.08, atol=0.0)
+    shown = eg.render_aovs(vase(RADII), VIEW, ["alpha"], spp=64)["alpha"]
+    assert losses.iou(fit.render(), shown) < 0.04
+
+
+@pytest.mark.parametrize("method", ["adam", "gauss-newton"])
+def test_a_pose(method):
+    """Of a bracket without colours, 12.3° and 8.4 % of its size off."""
+    view = camera(128)
+    given = {"pose": PoseParameter(Pose(START[:3, :3], START[:3, 3]))}
+    fit = fit_scene(
+        bracket(plain=True), view, photograph(view, seed=2), given, loss="region", method=method, spp=8, progress=False
+    )
+    degrees, percent = errors(fit.poses["pose"])
+    assert degrees < 4.0 and percent < 2.0 and fit.explained > 0.5, (degrees, percent, fit.explained)
+
+
+def test_a_camera(taken):
+    """Shifted before a vase that stays."""
+    moved = VIEW.replace(
+        world_to_camera=VIEW.world_to_camera + torch.tensor([[0.0, 0.0, 0.0, 0.15]] * 2 + [[0.0] * 4] * 2)
+    )
+    given = {"cameras.0.pose": PoseParameter(rotation=0.005, shift=0.005)}
+    fit = fit_scene(vase(RADII), moved, taken, given, loss="region", spp=8, progress=False)
+    corners = vase(RADII).verts
+    off = (fit.cameras[0].project(corners) - VIEW.project(corners)).norm(dim=-1)
+    assert float((moved.project(corners) - VIEW.project(corners)).norm(dim=-1).mean()) > 4.0
+    assert float(off.mean()) < 1.0, off
+
+
+@pytest.mark.slow
+def test_a_shape_from_views():
+    """A sphere becomes a bumpy ellipsoid, without a mask."""
+
+    def sphere(subdivisions):
+        made = trimesh.creation.icosphere(subdivisions=subdivisions)
+        return torch.tensor(made.vertices.copy()).float(), torch.tensor(made.faces.copy())
+
+    n, faces = sphere(3)
+    verts = n * torch.tensor([1.0, 0.7, 0.8]) * (1.0 + 0.15 * torch.sin(3.0 * n[:, :1]))
+    true = eg.Mesh(verts, faces, colors=0.45 + 0.25 * torch.sin(4.0 * n))
+    angles = torch.arange(8) * math.pi / 4.0
+    eyes = torch.stack([3.6 * angles.cos(), torch.tensor([1.5, -1.5] * 4), 3.6 * angles.sin()], -1)
+    views = [eg.Camera.look_at(eye, (0.0, 0.0, 0.0), fov_y=40.0, size=(96, 96)) for eye in eyes]
+    images = [photograph(view, true, seed=k) for k, view in enumerate(views)]
+    fit = fit_shape(eg.Mesh(*sphere(2)), views, images, loss="region", levels=2, steps=80, spp=4, progress=False)
+
+    def off(mesh):
+        shown = [[eg.render_aovs(m, view, ["alpha"], spp=32)["alpha"] for m in (mesh, true)] for view in views]
+        return sum(float(losses.iou(*pair)) for pair in shown) / len(views)
+
+    assert off(fit.mesh) < 0.05 < 0.25 < off(fit.start.meshes[0])
+
+
+def test_loss_and_curvature_are_those_of_the_likelihood(taken):
+    regions = Regions(outlined_views(views_of(VIEW, taken)), 0)
+    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"], spp=16)["alpha"]
+    regions.renew(0, alpha)
+    P, near = regions.posteriors[0].double(), regions.near[0].double() / regions.near[0].sum()
+    inside, outside = (
+        float(P[(alpha[..., 0] > 0.99) == side][near[(alpha[..., 0] > 0.99) == side] > 0].mean())
+        for side in (True, False)
+    )
+    assert inside > 0.75 and outside < 0.25
+    moving = (0.8 * alpha).requires_grad_()
+    soft = smoothed(moving[None, ..., 0], BLUR)[0].double()
+    expected = -(near * (soft * P + (1 - soft) * (1 - P) + OUTLIERS).log()).sum()
+    found = regions.loss([0], moving[None])
+    assert float(found) == pytest.approx(float(expected), rel=1e-6)
+    by = [torch.autograd.grad(loss, moving, retain_graph=True)[0] for loss in (found, expected)]
+    torch.testing.assert_close(by[0], by[1], rtol=1e-4, atol=1e-9)
+    # Fisher's information is the square of what each pixel gives, by its share of the mean.
+    slope = torch.autograd.grad(expected, soft)[0]
+    expected = torch.where(near > 0.0, slope.square() / near.clamp(min=1e-12), 0.0)
+    torch.testing.assert_close(regions.curvature([0], moving[None])[0].double(), expected, rtol=1e-4, atol=1e-9)
+
+
+def test_colours_are_counted_anew_where_the_object_has_moved(taken):
+    """And stay where it has left the picture."""
+    regions = Regions(outlined_views(views_of(VIEW, taken)), 0)
+    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"])["alpha"]
+    regions.renew(0, alpha)
+    first = regions.posteriors[0]
+    regions.renew(0, torch.roll(alpha, 10, 1))
+    second = regions.posteriors[0]
+    assert not torch.equal(first, second)
+    regions.renew(0, torch.zeros_like(alpha))
+    assert torch.equal(regions.posteriors[0], second) and float(regions.loss([0], torch.zeros_like(alpha)[None])) > 0.5
+
+
+def test_weights_leave_pixels_out(taken):
+    weights = torch.ones(96, 96)
+    weights[:, 60:] = 0.0
+    spoilt = torch.where(weights[..., None] > 0.0, taken, taken.flip(0))
+    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"])["alpha"]
+    found = []
+    for image in (taken, spoilt):
+        views = outlined_views(views_of(VIEW, image, None, weights))
+        regions = Regions(views, 0)
+        regions.palettes = [torch.rand(64, 3, generator=torch.Generator().manual_seed(1))]
+        regions.labels = [torch.cdist(regions.displays[0].flatten(0, 1), regions.palettes[0]).argmin(1)]
+        regions.renew(0, alpha)
+        found.append(float(regions.loss([0], alpha[None])))
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("method", ["adam", "gauss-newton"])
+def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, method, tmp_path):
+    """Also between two counts of the colours."""
+    given = {"pose": PoseParameter(Pose(torch.eye(3), torch.tensor([0.1, 0.0, 0.0])))}
+    told = {"loss": "region", "method": method, "spp": 4, "steps": 8, "progress": False}
+    expected = fit_scene(vase(RADII), VIEW, taken, given, **told)
+
+    def stop(record):
+        if record.step == 4:
+            raise KeyboardInterrupt
+
+    file = tmp_path / "fit.pt"
+    fit_scene(vase(RADII), VIEW, taken, given, checkpoint=file, callback=stop, **told)
+    found = fit_scene(vase(RADII), VIEW, taken, given, checkpoint=file, resume=True, **told)
+    assert found.loss == expected.loss and torch.equal(found.values["pose"], expected.values["pose"])
+
+
+def test_what_is_not_there_is_not_explained():
+    fit = fit_scene(
+        vase(RADII), VIEW, clutter(96, 3), {"pose": PoseParameter()}, loss="region", spp=4, steps=30, progress=False
+    )
+    assert not fit.converged and fit.explained < 0.5
+
+
+def test_pictures_of_it(taken):
+    fit = fit_scene(vase(RADII), VIEW, taken, {"pose": PoseParameter()}, loss="region", spp=4, steps=2, progress=False)
+    assert fit.render().shape == (96, 96, 1) and len(fit.plot().axes) == 3  # target, start, fit; no difference
+
+
+MESH = vase(RADII).replace(colors=torch.full((6 * AROUND, 3), 0.5))
+FIRST = {"pose": PoseParameter()}
+
+
+@pytest.mark.parametrize(
+    ("scene", "given", "error", "message"),
+    [
+        (MESH, {"images": None, "masks": torch.ones(96, 96)}, ValueError, r"masks: expected none with loss=\"region\""),
+        (MESH, {"masks": torch.ones(96, 96)}, ValueError, r"masks: expected none with loss=\"region\".*leave out the masks"),
+        (MESH, {"parameters": {"colors": 0.01}}, ValueError, r"parameters: expected what moves the outline.*'colors'"),
+        (MESH, {"mask_loss": "region"}, ValueError, r"mask_loss: expected one of l1, l2, huber, robust, iou, ssim, or"),
+        (MESH, {"loss": "regions"}, ValueError, r"loss: expected one of l1, .*ssim, region, or a function, got 'regions'"),
+        (MESH.transformed(t=torch.tensor([0.0, 0.0, -90.0])), {}, ValueError, r"scene: expected an object that the pict"),
+        (MESH.transformed(scale=9.0), {}, ValueError, r"scene: .* that fills picture 0 at the start; leave out ground and walls"),
+    ],
+)  # fmt: skip
+def test_errors(taken, scene, given, error, message):
+    whole = {"images": taken, "parameters": FIRST, "loss": "region", "progress": False, **given}
+    with pytest.raises(error, match=message):
+        fit_scene(scene, VIEW, **whole)
+
+
+def test_errors_of_other_fits(taken):
+    with pytest.raises(ValueError, match=r"loss: expected .* got 'region'"):
+        fit_texture(
+            MESH.replace(uvs=torch.rand(6 * AROUND, 2), uv_faces=MESH.faces, colors=None),
+            VIEW,
+            taken,
+            8,
+            loss="region",
+            progress=False,
+        )
+    with pytest.raises(ValueError, match=r"depths: expected none with loss=\"region\""):
+        fit_shape(MESH, VIEW, taken, depths=torch.ones(96, 96), loss="region", levels=1, progress=False)
