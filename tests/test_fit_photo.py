@@ -90,11 +90,13 @@ def test_the_posterior_tells_colours_apart_near_the_contour_alone():
     image = torch.where(((alpha > 0.5) == left)[..., None], red, green)
     picture = shown(view, image)
     colours = palette(picture.display, 0)
-    P = posterior(Windows(picture, picture.labels(colours), colours, 6.0), alpha, torch.ones(60, 60))
+    P = posterior(Windows(picture, colours.labels(picture.display), colours.colours, 6.0), alpha, torch.ones(60, 60))
     edge = smoothed(alpha[None], 1.5)[0]
     near = (edge > 0.02) & (edge < 0.98)
     assert float(P[near & (alpha > 0.5)].min()) > 0.8 and float(P[near & (alpha < 0.5)].max()) < 0.2
-    whole = posterior(Windows(picture, picture.labels(colours), colours, 1000.0), alpha, torch.ones(60, 60))
+    whole = posterior(
+        Windows(picture, colours.labels(picture.display), colours.colours, 1000.0), alpha, torch.ones(60, 60)
+    )
     assert float(whole[near & (alpha > 0.5)].min()) < 0.6
 
 
@@ -151,7 +153,10 @@ def test_the_light_of_a_matte_ball_is_found(spoilt, monkeypatch):
     free = inside & (smoothed((spoilt_image != image).any(-1).float()[None], 1.0)[0] == 0.0)
 
     def off(lit):
-        return float((lit.predicted - _blurred_inside(image, inside))[free].norm() / image[free].norm())
+        return float(
+            (lit.predicted - _blurred_inside(image.movedim(-1, 0), inside).movedim(0, -1))[free].norm()
+            / image[free].norm()
+        )
 
     assert off(Lit.of(shown(view, spoilt_image), surface, 9)) < 0.03  # the ridge
     monkeypatch.setattr(light, "RIDGE", 0.0)

@@ -27,7 +27,7 @@ from ..views import check_image
 from .fit_pose import depth_image
 from .gauss_newton import Normal
 from .photo.level import PhotoLevel, Seen, photo_levels
-from .photo.picture import Picture, palette, smoothed
+from .photo.picture import Palette, Picture, palette, smoothed
 from .photo.search import DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST, PhotoSearch
 from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit
@@ -144,7 +144,7 @@ class Tracker:
         self.poor = 0  # pictures one after the other that hardly show the object
         self.first, self.moves = True, False  # whether the velocity is known
         self.task: PoseTask | None = None
-        self.palettes: list[Tensor] = []
+        self.palettes: list[Palette] = []
         self.light: Tensor | None = None  # coefficients (C, n) of the pictures before
         self.deviation = 0.0  # from what they predict, as Lit has it
 
@@ -207,7 +207,8 @@ class Tracker:
         # Edges that are a pixel off are thin; what covers the object is not.
         share = smoothed(torch.stack([off, inside.float()]), ACROSS)
         covered = (share[0] > 0.5 * share[1]) & (share[1] > SEEN_FROM)
-        weight = 1.0 - (1.0 - COVERED) * covered.float()
+        weight = torch.ones_like(seen.alpha)
+        weight[seen.box][covered] = COVERED
         found = []
         for level in levels:
             pictures = []

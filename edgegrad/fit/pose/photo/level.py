@@ -23,7 +23,7 @@ from ..task import ZOOM, Level, PoseTask, Shot
 from .contour import PURE, Sides, contour_term
 from .depth import depth_term
 from .light import HARMONICS, Lit
-from .picture import Picture, Windows, palette, smoothed
+from .picture import Palette, Picture, Windows, palette, smoothed
 from .region import posterior, region_term
 from .surface import AOVS, Surface
 
@@ -34,6 +34,7 @@ CONTOUR_BLUR = 0.9  # of alpha in the contour term: about that of photographs at
 FEW_HARMONICS = 4  # of the light on the coarsest level
 GRID = 16  # pixels that crops are aligned to, so that a pose which is a little different has the same
 MARGIN = 0.6  # around the object that a crop keeps, in its extent in the image
+BESIDE = 12  # pixels around the silhouette: the windows that the contour's colours are taken from reach as far
 AROUND = 0.25  # of the object's extent in the image, where colours count as those that surround it
 RADIUS = 0.15  # of windows in which colours are counted, in the object's extent in the image
 MASKED = 0.01  # probability that a mask is wrong
@@ -50,12 +51,18 @@ class Seen:
     """A render beside a picture."""
 
     picture: Picture
+    box: tuple[slice, slice]  # rows and columns around the object
+    part: Picture  # what lies in them
     alpha: Tensor  # (h, w)
     tangents: Tensor  # (D, h, w)
     near: Tensor  # (h, w): weights of what lies around the object
     extent: float  # pixels across the object in the image
-    surface: Surface | None
+    surface: Surface | None  # in the box
     lit: Lit | None
+
+    def sides(self) -> Sides:
+        """Of the contour, in the box."""
+        return Sides.of(self.part, smoothed(self.alpha[self.box][None], CONTOUR_BLUR)[0], self.near[self.box])
 
 
 @dataclass(frozen=True)
@@ -65,7 +72,7 @@ class PhotoLevel:
     task: PoseTask
     plain: Level  # sizes and cameras as other fits have them
     pictures: list[Picture]
-    palettes: list[Tensor]
+    palettes: list[Palette]
     blur: float
     harmonics: int  # 0: the mesh has no colours
     last: bool
@@ -85,15 +92,18 @@ class PhotoLevel:
             rendered = Rendered(bare, camera, ["alpha"], self.plain.spp, seed)
             alpha = rendered.images["alpha"][..., 0].float()
             tangents = rendered.derivatives(moves)["alpha"][..., 0].float()
+            rows, columns = box = _box(alpha)
+            cut = camera.crop(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
+            part = picture.part(rows, columns, cut)
             surface = None
             if self.harmonics or picture.depth is not None:
                 names = [name for name in AOVS if name != "image" or self.harmonics]
                 with torch.no_grad():
-                    channels = render_aovs(moved, camera, names, self.plain.spp, seed)
-                surface = Surface.of(camera, channels, moves)
-            lit = Lit.of(picture, surface, self.harmonics) if surface is not None and self.harmonics else None
+                    channels = render_aovs(moved, cut, names, self.plain.spp, seed)
+                surface = Surface.of(cut, channels, moves)
+            lit = Lit.of(part, surface, self.harmonics) if surface is not None and self.harmonics else None
             near, extent = _around(alpha)
-            found.append(Seen(picture, alpha, tangents, near * picture.weight, extent, surface, lit))
+            found.append(Seen(picture, box, part, alpha, tangents, near * picture.weight, extent, surface, lit))
         return found
 
     def equations(self, pose: Pose, seed: int, views: list[Seen] | None = None) -> tuple[Normal, float]:
@@ -111,10 +121,11 @@ class PhotoLevel:
             if seen.lit is not None:
                 terms.append(seen.lit.term())
             if self.last:
-                sides = Sides.of(seen.picture, smoothed(seen.alpha[None], CONTOUR_BLUR)[0], seen.near)
-                terms.append(contour_term(seen.picture, sides, smoothed(seen.tangents, CONTOUR_BLUR)))
-            if seen.surface is not None and seen.picture.depth is not None:
-                terms.append(depth_term(seen.surface, seen.picture.depth, seen.picture.weight, self.task.size))
+                rows, columns = seen.box
+                blurred = smoothed(seen.tangents[:, rows, columns], CONTOUR_BLUR)
+                terms.append(contour_term(seen.part, seen.sides(), blurred))
+            if seen.surface is not None and seen.part.depth is not None:
+                terms.append(depth_term(seen.surface, seen.part.depth, seen.part.weight, self.task.size))
             for term in terms:
                 if term is not None:
                     curvature, gradient = curvature + term.curvature, gradient + term.gradient
@@ -125,8 +136,8 @@ class PhotoLevel:
         they have. `views`: as of equations()."""
         pairs, shown, length, extent = [], 0.0, 0.0, 0.0
         for seen in self.see(pose, seed) if views is None else views:
-            picture, contour = seen.picture, smoothed(seen.alpha[None], CONTOUR_BLUR)[0]
-            sides = Sides.of(picture, contour, seen.near)
+            picture, sides = seen.part, seen.sides()
+            contour = sides.alpha
             extent = max(extent, seen.extent)
             on = ((contour > PURE) & (contour < 1.0 - PURE)).float() * picture.weight
             length += float(on.sum())
@@ -149,20 +160,20 @@ class PhotoLevel:
     @cached_property
     def _labels(self) -> list[Tensor]:
         """Of the pixels of each picture; they are the same at each step."""
-        return [picture.labels(colours) for picture, colours in zip(self.pictures, self.palettes, strict=True)]
+        return [colours.labels(picture.display) for picture, colours in zip(self.pictures, self.palettes, strict=True)]
 
     def _posterior(self, k: int, seen: Seen) -> Tensor:
         """(h, w), that a pixel of picture k shows the object: by the mask, or else by its colour."""
         mask = seen.picture.mask
         if mask is not None:
             return mask.clamp(MASKED, 1.0 - MASKED)
-        windows = Windows(seen.picture, self._labels[k], self.palettes[k], RADIUS * seen.extent)
+        windows = Windows(seen.picture, self._labels[k], self.palettes[k].colours, RADIUS * seen.extent)
         return posterior(windows, seen.alpha, seen.near)
 
 
 def photo_levels(
     task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, seed: int,
-    palettes: list[Tensor] | None = None,
+    palettes: list[Palette] | None = None,
 ) -> list[PhotoLevel]:  # fmt: skip
     """From coarse to fine, of what surrounds the object at the start. `palettes`: of the pictures, where they are known."""
     crops = [_crop(task, shot, start) for shot in task.shots]
@@ -217,6 +228,16 @@ def _crop(task: PoseTask, shot: Shot, pose: Pose) -> tuple[int, int, int, int, f
     if right - left < SMALLEST or bottom - top < SMALLEST:
         return 0, 0, H, W, float(max(H, W)) / 2
     return top, left, bottom - top, right - left, extent
+
+
+def _box(alpha: Tensor) -> tuple[slice, slice]:
+    """Rows and columns of a silhouette alpha (h, w) and of what its contour is compared with; all where nothing is seen."""
+    found = []
+    for axis, size in enumerate(alpha.shape):
+        filled = torch.nonzero(alpha.amax(1 - axis) > 0.0)[:, 0]
+        low, high = (int(filled[0]), int(filled[-1]) + 1) if len(filled) else (0, size)
+        found.append(slice(max(0, low - BESIDE), min(size, high + BESIDE)))
+    return found[0], found[1]
 
 
 def _around(alpha: Tensor) -> tuple[Tensor, float]:
