@@ -8,10 +8,10 @@ the object is lost, and is searched for around its last good pose.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from os import PathLike as OsPath
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -34,9 +34,10 @@ from .result import PoseFit
 from .task import Lens, Names, PoseTask
 
 Frame = Tensor | PathLike
-STEPS, LAST_STEPS = 4, 4  # on the last level but one and on the last, where the prediction is good
+STEPS = 4  # on the last level but one and on the last, where the prediction is good
 MORE_STEPS = 8  # on each level, where it is not
-STEADY = 0.03  # standard deviation of the motion from that of constant velocity, radians and object sizes
+# Standard deviation of the motion from that of constant velocity, radians and object sizes: at first, and at least.
+STEADY, STEADIEST = 0.03, 0.005
 SHORT = 1e-3  # of a step on the last level: radians and object sizes
 POOR = 0.45  # of the render's edges: a picture that shows fewer hardly shows the object there
 PATIENCE = 4  # such pictures one after the other, and the object is lost
@@ -45,6 +46,8 @@ RATE = 0.1  # of a picture, in the light of all
 LEARNT = 0.8  # of the edges, in pictures that light is learnt from
 # What covers the object: so many deviations off, over so many pixels; what it counts; how much of the object is near.
 OFF, ACROSS, COVERED, SEEN_FROM = 4.0, 1.5, 0.02, 0.05
+SUDDEN = 0.3  # more of it covered than in the picture before
+HARDLY, MOSTLY = 0.2, 0.6  # of the object covered: the rest tells little
 SEARCH_STEPS = 12  # on each level of it
 FARTHEST = 0.25  # radians and object sizes that steps lead from where they begin
 
@@ -133,6 +136,27 @@ def _poses(tracker: Tracker, frames: Iterable[Frame], depth: Iterable[Tensor | N
         yield tracker.follow(index, frame, measured)
 
 
+class Cover(NamedTuple):
+    """What covers the object in a picture."""
+
+    weight: Tensor  # (h, w): of a pixel, near zero where it is covered
+    share: float  # of the object that is
+
+
+class End(NamedTuple):
+    """Where a way down ended."""
+
+    pose: Pose
+    share: float  # of the render's edges, where nothing covers it
+    covered: float  # share of the object
+    views: list[Seen]
+
+    @property
+    def shown(self) -> float:
+        """How much of the object the picture shows there."""
+        return self.share * (1.0 - self.covered)
+
+
 class Tracker:
     """What is known of a film so far."""
 
@@ -141,10 +165,12 @@ class Tracker:
         self.max_size, self.spp, self.seed = max_size, spp, seed
         self.pose = self.good = start  # the last one, and the last one at which the object was seen
         self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)  # a picture
-        self.poor = 0  # pictures one after the other that hardly show the object
+        self.poor = self.lost = 0  # pictures one after the other that hardly show the object, and in which it is lost
         self.first, self.moves = True, False  # whether the velocity is known
         self.task: PoseTask | None = None
         self.palettes: list[Palette] = []
+        self.steady = STEADY
+        self.covered = 0.0  # share of the object in the last picture
         self.light: Tensor | None = None  # coefficients (C, n) of the pictures before
         self.deviation = 0.0  # from what they predict, as Lit has it
 
@@ -159,48 +185,61 @@ class Tracker:
         task = replace(self.task, shots=[self.task.shots[0]._replace(target=picture)])
         near = None if measured is None else depth_image(f"depth[{index}]", measured, self.camera.size)
         predicted = self._predicted()
-        pose, share = self._found(task, near, predicted)
+        pose, share, self.covered, _ = self._found(task, near, predicted)
         if self.first or share >= POOR:
-            self.poor = 0
+            self.poor = self.lost = 0
         else:
             self.poor += 1
         lost = self.poor >= PATIENCE
-        if lost and (self.poor - PATIENCE) % AGAIN == AGAIN - 1:
+        self.lost = self.lost + 1 if lost else 0
+        if lost and self.lost % AGAIN == 0:
             again, found = self._searched(task, near)
             if found >= ENOUGH:
-                pose, share, lost, self.poor = again, found, False, 0
+                pose, share, lost, self.poor, self.lost = again, found, False, 0, 0
         self._move(pose, share, lost)
         return TrackedPose(index, self.pose.R, self.pose.t, float(self.pose.scale), share, lost)
 
-    def _found(self, task: PoseTask, depth: Tensor | None, predicted: Pose) -> tuple[Pose, float]:
-        """The pose, and the share of the edges there."""
-        best, share = predicted, 0.0
-        if not self.first and self.poor == 0:
-            levels = self._uncovered(self._levels(task, depth, predicted), predicted)
+    def _found(self, task: PoseTask, depth: Tensor | None, predicted: Pose) -> End:
+        """Where the object is."""
+        best = End(predicted, 0.0, 1.0, [])
+        if not self.first and not self.lost:
+            levels = self._levels(task, depth, predicted)
             offset = torch.zeros(len(levels[-1].plain.free), dtype=torch.float64) if self.moves else None
-            pose, _ = self._stepped(levels[-2], predicted, STEPS, offset)
-            best, share = self._believed(*self._stepped(levels[-1], pose, LAST_STEPS, offset), predicted)
-        if share < ENOUGH:
+            best = self._down(levels[-2:], predicted, STEPS, offset)
+            if offset is not None and best.share >= LEARNT and best.covered < HARDLY:
+                variance = (1.0 - RATE) * self.steady**2 + RATE * float(offset.square().mean())
+                self.steady = max(variance**0.5, STEADIEST)
+        if best.share < ENOUGH or best.covered > self.covered + SUDDEN:  # for what covers an object comes gradually
             for start in [predicted] if self.first or predicted is self.good else [predicted, self.good]:
-                levels = self._uncovered(self._levels(task, depth, start), start)
-                pose, again = start, 0.0
-                for level in levels:
-                    pose, again = self._stepped(level, pose, MORE_STEPS)
-                pose, again = self._believed(pose, again, start)
-                if again > share:
-                    best, share = pose, again
-                if share >= ENOUGH:
+                again = self._down(self._levels(task, depth, start), start, MORE_STEPS)
+                if again.shown > best.shown:
+                    best = again
+                if best.share >= ENOUGH and best.covered < MOSTLY:
                     break
-        return best, share
+        if best.share >= LEARNT and best.covered < MOSTLY:
+            self._learn(best.views)
+        return best if best.share >= POOR else best._replace(pose=predicted)
 
-    def _uncovered(self, levels: list[PhotoLevel], pose: Pose) -> list[PhotoLevel]:
-        """With weights near zero where something covers the object: there the picture is not what the mesh is at that pose in the
-        light of the pictures before. The light of this picture alone would follow what covers it."""
-        if self.light is None:
-            return levels
-        (seen,) = levels[-2].see(pose, self.seed)
-        if seen.lit is None or seen.lit.coefficients.shape != self.light.shape:
-            return levels
+    def _down(self, levels: list[PhotoLevel], start: Pose, most: int, offset: Tensor | None = None) -> End:
+        """Through the levels, with so many steps on each at most; `offset` as of _stepped()."""
+        cover = self._cover(levels[-2].see(start, self.seed)) if offset is not None else None
+        pose, views = start, []
+        for level in levels:
+            pose, views = self._stepped(_uncovered(level, cover), pose, most, offset)
+            cover = self._cover(views) or cover
+        share = levels[-1].explained(pose, self.seed, views)
+        # Steps that lead far from where they began follow something else than the object, whatever they explain there.
+        near = angle(start.R, pose.R) < FARTHEST and self._way(start, pose) < FARTHEST * levels[-1].task.size
+        if not near and not self.first:
+            return End(start, 0.0, 1.0, [])
+        return End(pose, share, 0.0 if cover is None else cover.share, views)
+
+    def _cover(self, views: list[Seen]) -> Cover | None:
+        """What covers the object in a picture: there it is not what the mesh is at that pose in the light of the pictures before.
+        The light of this picture alone would follow what covers it."""
+        (seen,) = views
+        if seen.lit is None or self.light is None or seen.lit.coefficients.shape != self.light.shape:
+            return None
         inside = seen.lit.surface.inside
         off = torch.zeros_like(inside, dtype=torch.float32)
         off[inside] = (seen.lit.difference(self.light) > OFF * self.deviation).float()
@@ -209,14 +248,7 @@ class Tracker:
         covered = (share[0] > 0.5 * share[1]) & (share[1] > SEEN_FROM)
         weight = torch.ones_like(seen.alpha)
         weight[seen.box][covered] = COVERED
-        found = []
-        for level in levels:
-            pictures = []
-            for picture in level.pictures:
-                at = F.interpolate(weight[None, None], picture.size, mode="bilinear")[0, 0]
-                pictures.append(replace(picture, weight=picture.weight * at))
-            found.append(replace(level, pictures=pictures))
-        return found
+        return Cover(weight, float(covered[inside].float().mean()))
 
     def _learn(self, views: list[Seen]) -> None:
         """Takes in the light of a picture that shows the object."""
@@ -228,12 +260,6 @@ class Tracker:
                 self.light = (1.0 - rate) * light + rate * seen.lit.coefficients
                 self.deviation = (1.0 - rate) * self.deviation + rate * seen.lit.deviation
 
-    def _believed(self, pose: Pose, share: float, start: Pose) -> tuple[Pose, float]:
-        """Steps that lead far from where they began follow something else than the object, whatever they explain there."""
-        assert self.task is not None
-        near = angle(start.R, pose.R) < FARTHEST and self._way(start, pose) < FARTHEST * self.task.size
-        return (pose, share) if near or self.first else (start, 0.0)
-
     def _way(self, a: Pose, b: Pose) -> float:
         """Between the object's centres."""
         return float((self._center(a) - self._center(b)).norm())
@@ -244,19 +270,18 @@ class Tracker:
 
     def _stepped(
         self, level: PhotoLevel, pose: Pose, most: int, offset: Tensor | None = None
-    ) -> tuple[Pose, float]:  # fmt: skip
-        """After so many Gauss-Newton steps at most, or a short one; on the last level also the share of the edges, as it was
-        before the last step, which is short where the way ends well. `offset` (n,): how far the steps have led from the
-        prediction, which they add to; the object is taken to be near that, as far as the picture shows little of it."""
+    ) -> tuple[Pose, list[Seen]]:  # fmt: skip
+        """After so many Gauss-Newton steps at most, or a short one, and what was seen before the last, which is short where the
+        way ends well. `offset` (n,): how far the steps have led from the prediction, which they add to; the object is taken to
+        be near that, as far as the picture shows little of it."""
         views: list[Seen] = []
-        at = pose
         for _ in range(most):
-            at, views = pose, level.see(pose, self.seed)
+            views = level.see(pose, self.seed)
             normal, _loss = level.equations(pose, self.seed, views)
             if not float(normal.curvature.trace()) > 0.0:
                 break  # the prior below would hide that
             if offset is not None:
-                known = torch.eye(len(offset), dtype=torch.float64) / STEADY**2
+                known = torch.eye(len(offset), dtype=torch.float64) / self.steady**2
                 normal = Normal(normal.curvature + known, normal.gradient + known @ offset)
             move = normal.damped(LAST_DAMPING if level.last else DAMPING, FLOOR, LONGEST)
             assert move is not None
@@ -265,12 +290,7 @@ class Tracker:
                 offset += move
             if float(move.abs().max()) < SHORT * level.plain.coarseness:
                 break
-        if not level.last:
-            return pose, math.nan
-        share = level.explained(at, self.seed, views)
-        if share >= LEARNT:
-            self._learn(views)
-        return pose, share
+        return pose, views
 
     def _levels(self, task: PoseTask, depth: Tensor | None, pose: Pose) -> list[PhotoLevel]:
         return photo_levels(task, pose, [depth], self.max_size, self.spp, self.seed, self.palettes)
@@ -284,7 +304,7 @@ class Tracker:
     def _predicted(self) -> Pose:
         """By constant velocity."""
         assert self.task is not None
-        if self.poor >= PATIENCE:
+        if self.lost:
             return self.good
         R = self.turn @ self.pose.R
         where = self._center(self.pose) + self.shift
@@ -292,8 +312,11 @@ class Tracker:
 
     def _move(self, pose: Pose, share: float, lost: bool) -> None:
         """Takes in where the object is now."""
-        moved, self.moves = self.moves, not (self.first or lost or share < POOR)
-        if lost or share < POOR:  # where it went is not known
+        if not (self.first or lost) and (share < POOR or self.covered > MOSTLY):
+            self.pose = pose  # and goes on as it went
+            return
+        moved, self.moves = self.moves, not (self.first or lost)
+        if lost:  # where it went is not known
             self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
         elif not self.first:
             far = angle(self.pose.R, pose.R) > FARTHEST  # found again
@@ -327,6 +350,16 @@ class Tracker:
         if self.task is not None and picture.shape[-1] != (C := self.task.shots[0].target.shape[-1]):
             raise ValueError(f"{name}: expected {C} channels as of the frames before, got {picture.shape[-1]}")
         return picture
+
+
+def _uncovered(level: PhotoLevel, cover: Cover | None) -> PhotoLevel:
+    if cover is None:
+        return level
+    pictures = []
+    for picture in level.pictures:
+        at = F.interpolate(cover.weight[None, None], picture.size, mode="bilinear")[0, 0]
+        pictures.append(replace(picture, weight=picture.weight * at))
+    return replace(level, pictures=pictures)
 
 
 def _between(A: Tensor, B: Tensor) -> Tensor:

@@ -75,7 +75,7 @@ class Lit:
             light = torch.linalg.solve(curvature + torch.diag_embed(ridge), weighted @ y[..., None])[..., 0]
             residual = (light[:, None] @ B)[:, 0] - y
             e = residual.square().sum(0).sqrt()
-            middle = max(float(e.median()) / _median(C), LEAST)
+            middle = max(_weighted_median(e, count) / _median(C), LEAST)
             robust = count * (1.0 + (e / (3.0 * middle)).square()).pow(-2)
         predicted = (light[:, None] @ basis.flatten(2)).reshape(C, h, w)
         slopes = slope(0.5 * (predicted + pictured))[..., inside]
@@ -130,6 +130,15 @@ def spherical_slopes(n: Tensor, tangents: Tensor) -> Tensor:
     (x, y, z), (a, b, c) = n.unbind(-1), tangents.unbind(-1)
     parts = [a * 0.0, a, b, c, a * y + x * b, b * z + y * c, 6.0 * z * c, a * z + x * c, 2.0 * (x * a - y * b)]
     return torch.stack(parts, -1)
+
+
+def _weighted_median(values: Tensor, weights: Tensor) -> float:
+    """Of (N,): what is known to be covered may be most of a surface."""
+    if bool((weights == weights[0]).all()):
+        return float(values.median())
+    ordered, order = values.sort()
+    below = weights[order].cumsum(0)
+    return float(ordered[torch.searchsorted(below, 0.5 * below[-1]).clamp(max=len(values) - 1)])
 
 
 def _median(channels: int) -> float:
