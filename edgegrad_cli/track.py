@@ -109,6 +109,7 @@ def _write_poses(folder: Path, poses: list[TrackedPose]) -> None:
         {
             "frame": pose.index, "mesh_to_world": pose.matrix.tolist(),
             "explained": pose.explained if math.isfinite(pose.explained) else None, "lost": pose.lost,
+            "covered": pose.covered, "reason": pose.reason,
         }
         for pose in poses
     ]  # fmt: skip

@@ -14,7 +14,6 @@ from os import PathLike as OsPath
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ...camera.camera import Camera
@@ -27,11 +26,14 @@ from ..views import check_image
 from .fit_pose import depth_image
 from .gauss_newton import Normal
 from .photo.level import PhotoLevel, Seen, photo_levels
-from .photo.picture import Palette, Picture, palette, smoothed
-from .photo.search import DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST, PhotoSearch
+from .photo.match import matches
+from .photo.picture import Palette, Picture, palette
+from .photo.remembered import Remembered
+from .photo.search import ALONE_ENOUGH, DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST
+from .photo.views import Views, across, ball
 from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit
-from .task import Lens, Names, PoseTask
+from .task import Lens, Names, PoseTask, depth_of
 
 Frame = Tensor | PathLike
 STEPS = 4  # on the last level but one and on the last, where the prediction is good
@@ -42,13 +44,14 @@ SHORT = 1e-3  # of a step on the last level: radians and object sizes
 POOR = 0.45  # of the render's edges: a picture that shows fewer hardly shows the object there
 PATIENCE = 4  # such pictures one after the other, and the object is lost
 AGAIN = 5  # pictures from one search for a lost object to the next
-RATE = 0.1  # of a picture, in the light of all
+RATE = 0.1  # of a picture, in how steadily the object moves
 LEARNT = 0.8  # of the edges, in pictures that light is learnt from
-# What covers the object: so many deviations off, over so many pixels; what it counts; how much of the object is near.
-OFF, ACROSS, COVERED, SEEN_FROM = 4.0, 1.5, 0.02, 0.05
 SUDDEN = 0.3  # more of it covered than in the picture before
 HARDLY, MOSTLY = 0.2, 0.6  # of the object covered: the rest tells little
-SEARCH_STEPS = 12  # on each level of it
+# The search for a lost object: views, by so many radians at most from the last good pose, and by such a factor in size;
+# matches that are followed for a few steps, and of them to the end.
+VIEWS, TURNED, SIZES = 160, 1.1, 1.2
+CANDIDATES, FOLLOWED = 20, 4
 FARTHEST = 0.25  # radians and object sizes that steps lead from where they begin
 
 
@@ -60,8 +63,24 @@ class TrackedPose:
     R: Tensor  # (3, 3) float64
     t: Tensor  # (3,) float64, world units
     scale: float  # that of `init`
-    explained: float  # the share of the render's edges that the picture shows too, 0 … 1
+    explained: (
+        float  # the share of the render's edges that the picture shows too, 0 … 1, where nothing covers the object
+    )
     lost: bool  # the pose is the last one at which the object was seen
+    covered: float = 0.0  # the share of the object that the light of the pictures before does not explain, 0 … 1
+
+    @property
+    def reason(self) -> str:
+        """In words, how well the pose is known: "seen", or "lost: …", "hardly seen: …" or "covered: …"."""
+        if self.lost:
+            return "lost: where the object was seen last, since pictures one after the other hardly show it"
+        if self.explained < POOR:
+            return (
+                f"hardly seen: where its motion leads, for the picture shows {self.explained:.0%} of the render's edges"
+            )
+        if self.covered > MOSTLY:
+            return f"covered: {self.covered:.0%} of the object is not what it looked like before"
+        return "seen"
 
     @property
     def matrix(self) -> Tensor:
@@ -136,13 +155,6 @@ def _poses(tracker: Tracker, frames: Iterable[Frame], depth: Iterable[Tensor | N
         yield tracker.follow(index, frame, measured)
 
 
-class Cover(NamedTuple):
-    """What covers the object in a picture."""
-
-    weight: Tensor  # (h, w): of a pixel, near zero where it is covered
-    share: float  # of the object that is
-
-
 class End(NamedTuple):
     """Where a way down ended."""
 
@@ -171,8 +183,7 @@ class Tracker:
         self.palettes: list[Palette] = []
         self.steady = STEADY
         self.covered = 0.0  # share of the object in the last picture
-        self.light: Tensor | None = None  # coefficients (C, n) of the pictures before
-        self.deviation = 0.0  # from what they predict, as Lit has it
+        self.remembered = Remembered()
 
     @torch.inference_mode(False)
     @torch.enable_grad()
@@ -193,11 +204,13 @@ class Tracker:
         lost = self.poor >= PATIENCE
         self.lost = self.lost + 1 if lost else 0
         if lost and self.lost % AGAIN == 0:
-            again, found = self._searched(task, near)
-            if found >= ENOUGH:
-                pose, share, lost, self.poor, self.lost = again, found, False, 0, 0
+            again = self._searched(task, near)
+            if again.share >= (ALONE_ENOUGH if task.colourless else ENOUGH) and again.covered < MOSTLY:
+                pose, share, self.covered, _ = again
+                lost, self.poor, self.lost = False, 0, 0
         self._move(pose, share, lost)
-        return TrackedPose(index, self.pose.R, self.pose.t, float(self.pose.scale), share, lost)
+        where = self.pose.R, self.pose.t, float(self.pose.scale)
+        return TrackedPose(index, *where, share, lost, self.covered)
 
     def _found(self, task: PoseTask, depth: Tensor | None, predicted: Pose) -> End:
         """Where the object is."""
@@ -205,60 +218,36 @@ class Tracker:
         if not self.first and not self.lost:
             levels = self._levels(task, depth, predicted)
             offset = torch.zeros(len(levels[-1].plain.free), dtype=torch.float64) if self.moves else None
-            best = self._down(levels[-2:], predicted, STEPS, offset)
+            best = self._believed(self._down(levels[-2:], predicted, STEPS, offset), predicted)
             if offset is not None and best.share >= LEARNT and best.covered < HARDLY:
                 variance = (1.0 - RATE) * self.steady**2 + RATE * float(offset.square().mean())
                 self.steady = max(variance**0.5, STEADIEST)
         if best.share < ENOUGH or best.covered > self.covered + SUDDEN:  # for what covers an object comes gradually
             for start in [predicted] if self.first or predicted is self.good else [predicted, self.good]:
-                again = self._down(self._levels(task, depth, start), start, MORE_STEPS)
+                again = self._believed(self._down(self._levels(task, depth, start), start, MORE_STEPS), start)
                 if again.shown > best.shown:
                     best = again
                 if best.share >= ENOUGH and best.covered < MOSTLY:
                     break
         if best.share >= LEARNT and best.covered < MOSTLY:
-            self._learn(best.views)
+            self.remembered.learn(best.views)
         return best if best.share >= POOR else best._replace(pose=predicted)
 
     def _down(self, levels: list[PhotoLevel], start: Pose, most: int, offset: Tensor | None = None) -> End:
         """Through the levels, with so many steps on each at most; `offset` as of _stepped()."""
-        cover = self._cover(levels[-2].see(start, self.seed)) if offset is not None else None
+        cover = self.remembered.cover(levels[-2].see(start, self.seed)) if offset is not None else None
         pose, views = start, []
         for level in levels:
-            pose, views = self._stepped(_uncovered(level, cover), pose, most, offset)
-            cover = self._cover(views) or cover
+            pose, views = self._stepped(level if cover is None else cover.left_out(level), pose, most, offset)
+            cover = self.remembered.cover(views) or cover
         share = levels[-1].explained(pose, self.seed, views)
-        # Steps that lead far from where they began follow something else than the object, whatever they explain there.
-        near = angle(start.R, pose.R) < FARTHEST and self._way(start, pose) < FARTHEST * levels[-1].task.size
-        if not near and not self.first:
-            return End(start, 0.0, 1.0, [])
         return End(pose, share, 0.0 if cover is None else cover.share, views)
 
-    def _cover(self, views: list[Seen]) -> Cover | None:
-        """What covers the object in a picture: there it is not what the mesh is at that pose in the light of the pictures before.
-        The light of this picture alone would follow what covers it."""
-        (seen,) = views
-        if seen.lit is None or self.light is None or seen.lit.coefficients.shape != self.light.shape:
-            return None
-        inside = seen.lit.surface.inside
-        off = torch.zeros_like(inside, dtype=torch.float32)
-        off[inside] = (seen.lit.difference(self.light) > OFF * self.deviation).float()
-        # Edges that are a pixel off are thin; what covers the object is not.
-        share = smoothed(torch.stack([off, inside.float()]), ACROSS)
-        covered = (share[0] > 0.5 * share[1]) & (share[1] > SEEN_FROM)
-        weight = torch.ones_like(seen.alpha)
-        weight[seen.box][covered] = COVERED
-        return Cover(weight, float(covered[inside].float().mean()))
-
-    def _learn(self, views: list[Seen]) -> None:
-        """Takes in the light of a picture that shows the object."""
-        for seen in views:
-            if seen.lit is not None:
-                old = self.light is not None and self.light.shape == seen.lit.coefficients.shape
-                rate = RATE if old else 1.0
-                light = self.light if old and self.light is not None else seen.lit.coefficients
-                self.light = (1.0 - rate) * light + rate * seen.lit.coefficients
-                self.deviation = (1.0 - rate) * self.deviation + rate * seen.lit.deviation
+    def _believed(self, end: End, start: Pose) -> End:
+        """Steps that lead far from where they began follow something else than the object, whatever they explain there."""
+        assert self.task is not None
+        near = angle(start.R, end.pose.R) < FARTHEST and self._way(start, end.pose) < FARTHEST * self.task.size
+        return end if near or self.first else End(start, 0.0, 1.0, [])
 
     def _way(self, a: Pose, b: Pose) -> float:
         """Between the object's centres."""
@@ -295,11 +284,37 @@ class Tracker:
     def _levels(self, task: PoseTask, depth: Tensor | None, pose: Pose) -> list[PhotoLevel]:
         return photo_levels(task, pose, [depth], self.max_size, self.spp, self.seed, self.palettes)
 
-    def _searched(self, task: PoseTask, depth: Tensor | None) -> tuple[Pose, float]:
-        """From the last good pose, and others about it."""
-        search = PhotoSearch(task, self.good, [depth], self.max_size, self.spp, SEARCH_STEPS, SHORT, self.seed)
-        search.run()
-        return search.best, search.explained
+    def _searched(self, task: PoseTask, depth: Tensor | None) -> End:
+        """Where the whole picture looks like the object, as large about as it was, and turned by up to some 60°."""
+        camera, scale, best = task.shots[0].camera, self.good.scale, End(self.good, 0.0, 1.0, [])
+        if camera.projection not in ("perspective", "orthographic"):
+            return best
+        unit = replace(
+            task, scene=task.scene.transformed(torch.eye(3), torch.zeros(3), scale), center=scale * task.center
+        )
+        rotations = ball(VIEWS, TURNED) @ (camera.world_to_camera[:3, :3] @ self.good.R)
+        far = self._distance(self.good)
+        size = across(unit, camera, far) / min(camera.size)
+        views = self.remembered.shone_on(Views.of(unit, rotations, self.seed), camera)
+        poses = [pose._replace(scale=scale) for pose in matches(unit, views, (size / SIZES, size * SIZES))]
+        if camera.projection == "orthographic":  # which does not show it
+            axis = camera.world_to_camera[2, :3]
+            poses = [pose._replace(t=pose.t + (far - self._distance(pose)) * axis) for pose in poses]
+        found = []
+        for pose in poses[:CANDIDATES]:
+            level = self._levels(task, depth, pose)[0]
+            pose, views = self._stepped(level, pose, STEPS)
+            found.append((level.explained(pose, self.seed, views), pose))
+        found.sort(key=lambda one: -one[0])
+        for _, pose in found[:FOLLOWED]:
+            again = self._down(self._levels(task, depth, pose), pose, MORE_STEPS)
+            best = max(best, again, key=lambda end: end.shown)
+        return best
+
+    def _distance(self, pose: Pose) -> float:
+        """Of the object's centre from the camera, world units; along the view, as sizes in the picture have it."""
+        assert self.task is not None
+        return float(depth_of(self.camera.to(torch.float64), pose, self.task.center))
 
     def _predicted(self) -> Pose:
         """By constant velocity."""
@@ -350,16 +365,6 @@ class Tracker:
         if self.task is not None and picture.shape[-1] != (C := self.task.shots[0].target.shape[-1]):
             raise ValueError(f"{name}: expected {C} channels as of the frames before, got {picture.shape[-1]}")
         return picture
-
-
-def _uncovered(level: PhotoLevel, cover: Cover | None) -> PhotoLevel:
-    if cover is None:
-        return level
-    pictures = []
-    for picture in level.pictures:
-        at = F.interpolate(cover.weight[None, None], picture.size, mode="bilinear")[0, 0]
-        pictures.append(replace(picture, weight=picture.weight * at))
-    return replace(level, pictures=pictures)
 
 
 def _between(A: Tensor, B: Tensor) -> Tensor:

@@ -24,11 +24,7 @@ from ..pose import Pose, angle
 from ..task import PoseTask
 from .views import ACROSS, RING, Views, across, pose_at
 
-SMALLEST, LARGEST, RATIO = (
-    0.25,
-    1.25,
-    1.2,
-)  # the object's diagonal in the picture's shorter sides, and between two sizes
+SIZES, RATIO = (0.25, 1.25), 1.2  # the object's diagonal in the picture's shorter sides, and between two sizes
 STRIDE = 2  # pixels between two places
 AT_ONCE = 128  # views
 NOISE = 0.06  # standard deviation of a pixel, sRGB values: of noise, and of what views lack by their spacing
@@ -56,12 +52,13 @@ class Match(NamedTuple):
     pixels: float  # of the picture, across the object
 
 
-def matches(task: PoseTask, views: Views) -> list[Pose]:
-    """The best poses in the first picture, distinct, the best first. The mask, where there is one, says where they are."""
+def matches(task: PoseTask, views: Views, sizes: tuple[float, float] = SIZES) -> list[Pose]:
+    """The best poses in the first picture, distinct, the best first. The mask, where there is one, says where they are, or else
+    they have `sizes` between two, of the object's diagonal in the picture's shorter sides."""
     masked = "alpha" in task.aovs and not task.clutter
     if masked:
         return _distinct(task, views, _in_mask(task, views), KEPT)
-    first, second = (_distinct(task, views, found, KEPT) for found in _everywhere(task, views))
+    first, second = (_distinct(task, views, found, KEPT) for found in _everywhere(task, views, sizes))
     return [pose for pair in zip(first, second, strict=False) for pose in pair]
 
 
@@ -136,7 +133,7 @@ def _with_prior(A: Tensor) -> Tensor:
     return full.reshape(n, 4 * C, 4 * C)
 
 
-def _everywhere(task: PoseTask, views: Views) -> list[list[Match]]:
+def _everywhere(task: PoseTask, views: Views, sizes: tuple[float, float]) -> list[list[Match]]:
     """By each of the ratios."""
     shot = task.shots[0]
     H, W = shot.camera.size
@@ -144,8 +141,8 @@ def _everywhere(task: PoseTask, views: Views) -> list[list[Match]]:
     filters, T = _Filter(views), views.alpha.shape[-1]
     margin = T // 3
     found: list[list[Match]] = [[], []]
-    for k in range(1 + math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO))):
-        pixels = SMALLEST * RATIO**k * min(H, W)  # across the object, in the picture
+    for k in range(1 + math.floor(math.log(sizes[1] / sizes[0]) / math.log(RATIO))):
+        pixels = sizes[0] * RATIO**k * min(H, W)  # across the object, in the picture
         factor = min(1.0, ACROSS / pixels)
         size = max(1, round(H * factor)), max(1, round(W * factor))
         if min(size) + 2 * margin < T:
