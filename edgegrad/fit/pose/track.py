@@ -26,7 +26,7 @@ from ..views import check_image
 from .fit_pose import depth_image
 from .gauss_newton import Normal
 from .photo.level import PhotoLevel, Seen, photo_levels
-from .photo.match import matches
+from .photo.match import look_alikes, matches
 from .photo.picture import Palette, Picture, palette
 from .photo.remembered import Remembered
 from .photo.search import ALONE_ENOUGH, DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST
@@ -296,7 +296,8 @@ class Tracker:
         far = self._distance(self.good)
         size = across(unit, camera, far) / min(camera.size)
         views = self.remembered.shone_on(Views.of(unit, rotations, self.seed), camera)
-        poses = [pose._replace(scale=scale) for pose in matches(unit, views, (size / SIZES, size * SIZES))]
+        look = matches if self.remembered.light is None else look_alikes
+        poses = [pose._replace(scale=scale) for pose in look(unit, views, (size / SIZES, size * SIZES))]
         if camera.projection == "orthographic":  # which does not show it
             axis = camera.world_to_camera[2, :3]
             poses = [pose._replace(t=pose.t + (far - self._distance(pose)) * axis) for pose in poses]
@@ -309,6 +310,8 @@ class Tracker:
         for _, pose in found[:FOLLOWED]:
             again = self._down(self._levels(task, depth, pose), pose, MORE_STEPS)
             best = max(best, again, key=lambda end: end.shown)
+            if best.share >= LEARNT and best.covered < HARDLY:
+                break
         return best
 
     def _distance(self, pose: Pose) -> float:
