@@ -3,7 +3,7 @@
 Where the object was and how it moved says about where it is. From there a few Gauss-Newton steps over the terms of photographs
 (region, contour, light and depth) find it, on two levels of resolution around the object alone. Where they do not end at edges
 of the picture, more steps begin on the coarsest level, from where the object was as well; where that fails for some pictures
-the object is lost, and is searched for around its last good pose.
+the object is lost, and is searched for in the whole picture, in the light that it was seen in.
 """
 
 from __future__ import annotations
@@ -116,7 +116,9 @@ def track(
 
     The light and what stands behind the object need not be known. The mesh may move by some 10° and a fifth of its size from a
     picture to the next, more where it moves evenly; something may pass before it. Where four pictures in a row hardly show the
-    object (`explained` below 0.45), it is `lost`, and is searched for around its last good pose until it is found again.
+    object (`explained` below 0.45), it is `lost`, and is searched for until it is found again: where it was seen last in each
+    picture, and in every fifth all over it, turned by up to some 60° and up to a fifth larger or smaller, by perspective and
+    orthographic cameras.
 
     Arguments are checked at once. A picture that cannot be used (another size, numbers that are not finite, a file that
     is not there) is an error, ValueError, TypeError or OSError, that names it as `frames[k]`, raised when it is asked
