@@ -313,6 +313,15 @@ def test_a_photograph_of_something_else_is_not_converged():
     assert fit.reason.startswith("edges not explained")
 
 
+def test_noise_is_refused_without_following_other_starts():
+    noise = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0))
+    fit = fit_pose(bracket(), noise, camera(96), init=START, progress=False)
+    assert not fit.converged and fit.explained < 0.1
+    assert fit.reason.startswith("edges not explained")
+    finest = [step for step in fit.history if step.size == fit.history[-1].size]
+    assert len(finest) <= search.LAST_STEPS + search.FINE_STEPS + 1  # of the given start alone
+
+
 def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, tmp_path):
     view, image = taken
     start, whole = about_center(rotation(0.05, -0.04, 0.03)), {"progress": False, "search": False, "spp": 8, "steps": 4}
