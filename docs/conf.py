@@ -49,7 +49,10 @@ python_use_unqualified_type_names = True
 OTHERS = r"(torch|numpy|collections|os|pathlib|typing)\..*|Tensor|Vector|Figure|Path"
 nitpick_ignore_regex = [
     ("py:.*", OTHERS),
-    ("py:class", r"edgegrad\.(fit\.views\.View|fit\.placement\.Placement|camera\.fields\.CameraT|points\.steps\.Steps)|PoseTask"),
+    (
+        "py:class",
+        r"edgegrad\.(fit\.views\.View|fit\.placement\.Placement|camera\.fields\.CameraT|points\.steps\.Steps)|PoseTask",
+    ),
 ]
 # Nobody calls these: functions return them.
 RETURNED = {

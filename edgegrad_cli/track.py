@@ -8,26 +8,25 @@ import math
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
+from fractions import Fraction
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
 from .arguments import add_mesh, add_view, count, number
+from .films import USUAL_FPS, read_film, write_film
 from .inputs import read_pose, read_scene, read_view
 
 if TYPE_CHECKING:
-    import numpy as np
     from torch import Tensor
 
     from edgegrad import Camera
     from edgegrad.fit import TrackedPose
     from edgegrad.scene.scene import Scene
 
-PICTURES = ".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".exr", ".hdr"
 EVERY = 10  # frames from one poses.json to the next
 FOUND, LOST = (60, 230, 90), (230, 60, 60)  # colours of contours
-VIDEO = "edgegrad[video]", "reading or writing a video"
 
 
 def add(commands: Any) -> None:
@@ -42,7 +41,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--spp", type=count, default=8, help="samples a pixel (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
     parser.add_argument(
-        "--fps", type=count, default=25, help="frames a second of the film that is written (%(default)s)"
+        "--fps", type=count, help=f"frames a second of the film that is written (the video's; of a folder {USUAL_FPS})"
     )
     parser.add_argument(
         "--out",
@@ -62,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     from . import INTERRUPTED
 
     scene, init = read_scene(args), read_pose(args.init)
-    frames = _frames(args.film)
+    frames, fps = read_film(args.film)
     first = next(frames)
     camera = read_view(args, scene, (first.shape[0], first.shape[1]), args.init)
     outputs.make_folder(args.out)
@@ -92,46 +91,15 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         interrupted = True
     finally:
+        names = ["frames"]
         if poses:
             _write_poses(args.out, poses)
-    names = ["poses.json", "frames"]
-    if film := _write_film(args.out, written, args.fps):
-        names.append(film)
+            names.insert(0, "poses.json")
+        if film := write_film(args.out, written, Fraction(args.fps or fps or USUAL_FPS)):
+            names.append(film)
     lost = sum(pose.lost for pose in poses)
     print(f"{len(poses)} frames, lost in {lost}\nwrote {', '.join(names)} in {args.out}")
     return INTERRUPTED if interrupted else 0
-
-
-def _frames(film: Path) -> Iterator[Tensor]:
-    """(H, W, 3) linear radiance, one after the other. Raises OSError, ValueError or ImportError."""
-    import torch
-
-    from edgegrad import read_image
-    from edgegrad.files.image import srgb_to_linear
-    from edgegrad.optional import require
-
-    if film.is_dir():
-        paths = sorted(path for path in film.iterdir() if path.suffix.lower() in PICTURES)
-        if not paths:
-            raise ValueError(f"{film}: expected a folder with images, got none of {', '.join(PICTURES)} in it")
-        return (read_image(path, channels=3) for path in paths)
-    if not film.is_file():
-        raise FileNotFoundError(2, "expected a video or a folder of images, got neither", str(film))
-    av = require("av", *VIDEO)
-
-    def decoded() -> Iterator[Tensor]:
-        try:
-            with av.open(str(film)) as container:
-                for frame in container.decode(video=0):
-                    yield srgb_to_linear(torch.from_numpy(frame.to_ndarray(format="rgb24")).float() / 255.0)
-        except av.error.FFmpegError as error:
-            raise ValueError(f"{film}: expected a video, got a fault in it ({error})") from error
-
-    frames = decoded()
-    first = next(frames, None)
-    if first is None:
-        raise ValueError(f"{film}: expected a video, got one without frames")
-    return chain([first], frames)
 
 
 def _write_poses(folder: Path, poses: list[TrackedPose]) -> None:
@@ -141,6 +109,7 @@ def _write_poses(folder: Path, poses: list[TrackedPose]) -> None:
         {
             "frame": pose.index, "mesh_to_world": pose.matrix.tolist(),
             "explained": pose.explained if math.isfinite(pose.explained) else None, "lost": pose.lost,
+            "covered": pose.covered, "reason": pose.reason,
         }
         for pose in poses
     ]  # fmt: skip
@@ -164,44 +133,3 @@ def _write_overlay(path: Path, frame: Tensor, scene: Scene, camera: Camera, pose
     picture = frame.clone()
     picture[contour] = srgb_to_linear(torch.tensor(LOST if pose.lost else FOUND) / 255.0)
     write_image(path, picture)
-
-
-def _write_film(folder: Path, pictures: list[Path], fps: int) -> str | None:
-    """film.mp4, or without the library of videos film.webp; its name. None without the library of pictures as well."""
-    import numpy as np
-
-    from edgegrad.files.paths import replacing
-    from edgegrad.optional import DRAWING, require
-
-    if not pictures:
-        return None
-    try:
-        images = require("PIL.Image", *DRAWING)
-    except ImportError as error:
-        print(f"edgegrad: no film: {error}", file=sys.stderr)
-        return None
-
-    def read(path: Path) -> np.ndarray:
-        with images.open(path) as image:
-            return np.asarray(image.convert("RGB"))
-
-    try:
-        av = require("av", *VIDEO)
-    except ImportError:
-        with replacing(folder / "film.webp") as temporary:
-            head, *rest = (images.fromarray(read(path)) for path in pictures)
-            head.save(temporary, save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, quality=80)
-        return "film.webp"
-    with replacing(folder / "film.mp4") as temporary, av.open(str(temporary), "w", format="mp4") as container:
-        h, w = read(pictures[0]).shape[:2]
-        stream = container.add_stream("libx264", rate=fps, options={"crf": "20"})
-        stream.width, stream.height, stream.pix_fmt = (
-            w - w % 2,
-            h - h % 2,
-            "yuv420p",
-        )  # which has colours of 2 × 2 pixels
-        for path in pictures:
-            picture = np.ascontiguousarray(read(path)[: h - h % 2, : w - w % 2])
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        container.mux(stream.encode())
-    return "film.mp4"

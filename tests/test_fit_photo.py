@@ -23,7 +23,7 @@ from edgegrad.fit.pose.photo.picture import Picture
 from edgegrad.fit.pose.photo.region import region_term
 from edgegrad.fit.pose.photo.surface import AOVS, Surface
 from edgegrad.fit.pose.task import is_clutter
-from edgegrad.fit.region import OUTLIERS, Windows, labels, palette, posterior, smoothed
+from edgegrad.fit.region import OUTLIERS, Windows, palette, posterior, smoothed
 from edgegrad.fit.sides import Sides
 
 CENTER = torch.tensor([1.0, 0.75, 0.4]).double()
@@ -92,12 +92,14 @@ def test_the_posterior_tells_colours_apart_near_the_contour_alone():
     image = torch.where(((alpha > 0.5) == left)[..., None], red, green)
     picture = shown(view, image)
     colours = palette(picture.display, 0)
-    P = posterior(Windows(picture.size, labels(picture.display, colours), colours, 6.0), alpha, torch.ones(60, 60))
+    P = posterior(
+        Windows(picture.size, colours.labels(picture.display), colours.colours, 6.0), alpha, torch.ones(60, 60)
+    )
     edge = smoothed(alpha[None], 1.5)[0]
     near = (edge > 0.02) & (edge < 0.98)
     assert float(P[near & (alpha > 0.5)].min()) > 0.8 and float(P[near & (alpha < 0.5)].max()) < 0.2
     whole = posterior(
-        Windows(picture.size, labels(picture.display, colours), colours, 1000.0), alpha, torch.ones(60, 60)
+        Windows(picture.size, colours.labels(picture.display), colours.colours, 1000.0), alpha, torch.ones(60, 60)
     )
     assert float(whole[near & (alpha > 0.5)].min()) < 0.6
 
@@ -155,7 +157,10 @@ def test_the_light_of_a_matte_ball_is_found(spoilt, monkeypatch):
     free = inside & (smoothed((spoilt_image != image).any(-1).float()[None], 1.0)[0] == 0.0)
 
     def off(lit):
-        return float((lit.predicted - _blurred_inside(image, inside))[free].norm() / image[free].norm())
+        return float(
+            (lit.predicted - _blurred_inside(image.movedim(-1, 0), inside).movedim(0, -1))[free].norm()
+            / image[free].norm()
+        )
 
     assert off(Lit.of(shown(view, spoilt_image), surface, 9)) < 0.03  # the ridge
     monkeypatch.setattr(light, "RIDGE", 0.0)
@@ -322,6 +327,15 @@ def test_a_photograph_of_something_else_is_not_converged():
     fit = fit_pose(bracket(), clutter(64, 3), view, init=START, search=False, progress=False)
     assert not fit.converged and fit.explained < search.ENOUGH
     assert fit.reason.startswith("edges not explained")
+
+
+def test_noise_is_refused_without_following_other_starts():
+    noise = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0))
+    fit = fit_pose(bracket(), noise, camera(96), init=START, progress=False)
+    assert not fit.converged and fit.explained < 0.1
+    assert fit.reason.startswith("edges not explained")
+    finest = [step for step in fit.history if step.size == fit.history[-1].size]
+    assert len(finest) <= search.LAST_STEPS + search.FINE_STEPS + 1  # of the given start alone
 
 
 def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, tmp_path):

@@ -13,7 +13,7 @@ from test_fit_photo import clutter, photograph
 import edgegrad as eg
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, fit_shape, fit_texture, losses
 from edgegrad.fit.descent.regions import BLUR, Regions
-from edgegrad.fit.region import OUTLIERS, smoothed
+from edgegrad.fit.region import OUTLIERS, Palette, smoothed
 from edgegrad.fit.views import outlined_views, views_of
 
 RADII = torch.tensor([0.55, 0.75, 0.35, 0.5])
@@ -155,8 +155,8 @@ def test_weights_leave_pixels_out(taken):
     for image in (taken, spoilt):
         views = outlined_views(views_of(VIEW, image, None, weights))
         regions = Regions(views, 0)
-        regions.palettes = [torch.rand(64, 3, generator=torch.Generator().manual_seed(1))]
-        regions.labels = [torch.cdist(regions.displays[0].flatten(0, 1), regions.palettes[0]).argmin(1)]
+        regions.palettes = [Palette(torch.rand(64, 3, generator=torch.Generator().manual_seed(1)))]
+        regions.labels = [regions.palettes[0].labels(regions.displays[0])]
         regions.renew(0, alpha)
         found.append(float(regions.loss([0], alpha[None])))
     assert found[0] == pytest.approx(found[1], rel=1e-6)

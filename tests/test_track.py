@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
 import torch
-from moving import Film, errors, worst
+from moving import DISTANCE, Film, errors, worst
 
 import edgegrad as eg
+from edgegrad.camera.poses import rotation
 from edgegrad.fit import track
 from edgegrad_cli import main
 
@@ -53,6 +55,23 @@ def test_lost_and_found_again(film):
     degrees, percent = errors(gone, 7, found[-1].R, found[-1].t)
     assert degrees < 1.5 and percent < 6.0
     assert torch.equal(found[4].matrix, found[5].matrix)  # where it was seen last
+    words = [pose.reason.split(":")[0] for pose in found]
+    assert words == ["seen", *["hardly seen"] * 3, *["lost"] * 2, "seen", "seen"]
+
+
+def test_found_again_elsewhere_and_turned(film):
+    """By 30°, and a quarter of the picture aside; while it is away nothing else is taken for it. The mesh is of other units."""
+    there = film.poses[0].clone()
+    there[:3, :3] = rotation(torch.tensor([0.3, 0.4, 0.15]).double()) @ there[:3, :3]
+    there[:3, 3] += film.camera.world_to_camera[1, :3].double() * 0.25 * 2.0 * DISTANCE * math.tan(math.radians(20.0))
+    gone = replace(film, poses=[film.poses[0]] * 7 + [there] * 2, gone=(1, 7))
+    larger = film.mesh.replace(verts=100.0 * film.mesh.verts)
+    init = film.poses[0] @ torch.diag(torch.tensor([0.01, 0.01, 0.01, 1.0]).double())
+    found = list(track(larger, gone, film.camera, init))
+    assert all(pose.lost for pose in found[4:7]) and not found[-1].lost
+    assert found[-1].scale == pytest.approx(0.01)
+    degrees, percent = errors(gone, 8, found[-1].R, found[-1].t)
+    assert degrees < 2.0 and percent < 6.0
 
 
 @pytest.mark.parametrize(
@@ -134,6 +153,15 @@ def test_command_line_on_a_folder(film, frames, tmp_path, capsys):
     assert "frames[3]: expected" in capsys.readouterr().err
     assert len(json.loads((out / "poses.json").read_text())["poses"]) == 3
     assert main([*arguments[:2], str(tmp_path / "nothing"), *arguments[3:]]) == 2
+
+
+def test_a_hand_that_covers_more_than_half(film):
+    """Over three pictures, while the stone turns on: then the light of one picture alone would be the hand's."""
+    going = replace(film, poses=film.poses[:3] + [film.poses[k] for k in range(3, COUNT)], hand=(-4, 9))
+    found = list(track(film.mesh, going, film.camera, film.poses[0]))
+    assert not any(pose.lost for pose in found) and max(pose.covered for pose in found) > 0.4
+    degrees, percent = worst([errors(film, pose.index, pose.R, pose.t) for pose in found])
+    assert degrees < 3.0 and percent < 6.0
 
 
 @pytest.mark.slow

@@ -55,13 +55,32 @@ def around(alpha: Tensor) -> tuple[Tensor, float]:
     return near, extent
 
 
-def labels(display: Tensor, colours: Tensor) -> Tensor:
-    """(h · w,): which of the colours (n, C) is nearest to that of each pixel of (h, w, C)."""
-    return torch.cdist(display.flatten(0, 1), colours).argmin(1)
+class Palette:
+    """A few colours (n, C), and for every colour which of them is nearest."""
+
+    CELLS = 32  # of three channels each, in which all colours have the same one of the palette
+
+    def __init__(self, colours: Tensor) -> None:
+        self.colours = colours
+        self._table: Tensor | None = None
+        if colours.shape[1] == 3:
+            middle = (torch.arange(self.CELLS) + 0.5) / self.CELLS
+            self._table = self._nearest(torch.cartesian_prod(middle, middle, middle))
+
+    def labels(self, display: Tensor) -> Tensor:
+        """(h · w,), of a picture (h, w, C)."""
+        pixels = display.flatten(0, 1)
+        if self._table is None:
+            return self._nearest(pixels)
+        r, g, b = (pixels * self.CELLS).long().clamp(0, self.CELLS - 1).unbind(-1)
+        return self._table[(r * self.CELLS + g) * self.CELLS + b]
+
+    def _nearest(self, pixels: Tensor) -> Tensor:
+        return torch.cdist(pixels, self.colours).argmin(1)
 
 
-def palette(display: Tensor, seed: int) -> Tensor:
-    """(n, C) colours that stand for those of (h, w, C): Lloyd's algorithm (k-means), from pixels drawn at random."""
+def palette(display: Tensor, seed: int) -> Palette:
+    """Of colours that stand for those of (h, w, C): Lloyd's algorithm (k-means), from pixels drawn at random."""
     generator = torch.Generator().manual_seed(seed)
     pixels = display.flatten(0, 1)
     pixels = pixels[torch.randperm(len(pixels), generator=generator)[:SAMPLED]]
@@ -73,7 +92,7 @@ def palette(display: Tensor, seed: int) -> Tensor:
         mean = torch.zeros_like(colours).index_add_(0, nearest, pixels) / count.clamp(min=1)
         lonely = pixels[distance.amin(1).topk(len(colours)).indices]  # colours that nothing is near to start anew
         colours = torch.where(count > 0, mean, lonely)
-    return colours
+    return Palette(colours)
 
 
 class Windows:
@@ -84,7 +103,7 @@ class Windows:
     LEAST = 1e-3  # pixels of all colours that every window has
 
     def __init__(self, size: tuple[int, int], label: Tensor, colours: Tensor, radius: float) -> None:
-        """`label` (h · w,): what labels() gives for the colours (n, C)."""
+        """`label` (h · w,): what Palette.labels() gives for the colours (n, C)."""
         h, w = size
         cell = max(1.0, radius / CELLS)
         self.shape = math.ceil(h / cell), math.ceil(w / cell)

@@ -50,7 +50,7 @@ def explained(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> floa
         extent = (both.amax((0, 1, 2)) - both.amin((0, 1, 2))).clamp(min=1e-30)
         least = DEVIATIONS * samples.sqrt() + DISPLAY * extent
         gradient = _gradient(mean)
-        size = gradient.norm(dim=0)
+        size = torch.hypot(*gradient)
         w = torch.ones_like(mean[..., :1]) if weight is None else weight
         count = w * size * (size > least) / extent
         share = (gradient * _gradient(picture)).sum(0) / size.square().clamp(min=1e-30)

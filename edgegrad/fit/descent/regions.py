@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ...files.image import linear_to_srgb
-from ..region import RADIUS, Windows, around, labels, likelihood, palette, posterior, slope, smoothed
+from ..region import RADIUS, Windows, around, likelihood, palette, posterior, slope, smoothed
 from ..sides import PURE, outlines_explained
 from ..verdict import ENOUGH
 from ..views import View
@@ -32,7 +32,7 @@ class Regions:
         pictures = [view.image for view in views if view.image is not None]
         self.displays = [linear_to_srgb(picture.clamp(0.0, 1.0)) for picture in pictures]
         self.palettes = [palette(display, seed) for display in self.displays]
-        self.labels = [labels(*pair) for pair in zip(self.displays, self.palettes, strict=True)]
+        self.labels = [own.labels(display) for display, own in zip(self.displays, self.palettes, strict=True)]
         self.weights = [None if view.weight is None else view.weight[..., 0] for view in views]
         self.near = [torch.zeros(view.camera.size) for view in views]
         self.posteriors = [torch.full(view.camera.size, 0.5) for view in views]
@@ -43,7 +43,7 @@ class Regions:
         near, extent = self.around(index, share)
         if extent > 0.0 and bool((near > 0.0).any()):
             windows = Windows(
-                (share.shape[0], share.shape[1]), self.labels[index], self.palettes[index], RADIUS * extent
+                (share.shape[0], share.shape[1]), self.labels[index], self.palettes[index].colours, RADIUS * extent
             )
             self.near[index], self.posteriors[index] = near, posterior(windows, share, near)
 

@@ -3,18 +3,17 @@
 Where the object was and how it moved says about where it is. From there a few Gauss-Newton steps over the terms of photographs
 (region, contour, light and depth) find it, on two levels of resolution around the object alone. Where they do not end at edges
 of the picture, more steps begin on the coarsest level, from where the object was as well; where that fails for some pictures
-the object is lost, and is searched for around its last good pose.
+the object is lost, and is searched for in the whole picture, in the light that it was seen in.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from os import PathLike as OsPath
+from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ...camera.camera import Camera
@@ -23,30 +22,37 @@ from ...files.image import read_image
 from ...files.paths import PathLike
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
-from ..region import palette, smoothed
+from ..region import Palette, palette
 from ..views import check_image
 from .fit_pose import depth_image
 from .gauss_newton import Normal
 from .photo.level import PhotoLevel, Seen, photo_levels
+from .photo.match import look_alikes, matches
 from .photo.picture import Picture
-from .photo.search import DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST, PhotoSearch
+from .photo.remembered import Remembered
+from .photo.search import ALONE_ENOUGH, DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST
+from .photo.views import Views, across, ball
 from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit
-from .task import Lens, Names, PoseTask
+from .task import Lens, Names, PoseTask, depth_of
 
 Frame = Tensor | PathLike
-STEPS, LAST_STEPS = 4, 4  # on the last level but one and on the last, where the prediction is good
+STEPS = 4  # on the last level but one and on the last, where the prediction is good
 MORE_STEPS = 8  # on each level, where it is not
-STEADY = 0.03  # standard deviation of the motion from that of constant velocity, radians and object sizes
+# Standard deviation of the motion from that of constant velocity, radians and object sizes: at first, and at least.
+STEADY, STEADIEST = 0.03, 0.005
 SHORT = 1e-3  # of a step on the last level: radians and object sizes
 POOR = 0.45  # of the render's edges: a picture that shows fewer hardly shows the object there
 PATIENCE = 4  # such pictures one after the other, and the object is lost
 AGAIN = 5  # pictures from one search for a lost object to the next
-RATE = 0.1  # of a picture, in the light of all
+RATE = 0.1  # of a picture, in how steadily the object moves
 LEARNT = 0.8  # of the edges, in pictures that light is learnt from
-# What covers the object: so many deviations off, over so many pixels; what it counts; how much of the object is near.
-OFF, ACROSS, COVERED, SEEN_FROM = 4.0, 1.5, 0.02, 0.05
-SEARCH_STEPS = 12  # on each level of it
+SUDDEN = 0.3  # more of it covered than in the picture before
+HARDLY, MOSTLY = 0.2, 0.6  # of the object covered: the rest tells little
+# The search for a lost object: views, by so many radians at most from the last good pose, and by such a factor in size;
+# matches that are followed for a few steps, and of them to the end.
+VIEWS, TURNED, SIZES = 160, 1.1, 1.2
+CANDIDATES, FOLLOWED = 20, 4
 FARTHEST = 0.25  # radians and object sizes that steps lead from where they begin
 
 
@@ -58,8 +64,24 @@ class TrackedPose:
     R: Tensor  # (3, 3) float64
     t: Tensor  # (3,) float64, world units
     scale: float  # that of `init`
-    explained: float  # the share of the render's edges that the picture shows too, 0 … 1
+    explained: (
+        float  # the share of the render's edges that the picture shows too, 0 … 1, where nothing covers the object
+    )
     lost: bool  # the pose is the last one at which the object was seen
+    covered: float = 0.0  # the share of the object that the light of the pictures before does not explain, 0 … 1
+
+    @property
+    def reason(self) -> str:
+        """In words, how well the pose is known: "seen", or "lost: …", "hardly seen: …" or "covered: …"."""
+        if self.lost:
+            return "lost: where the object was seen last, since pictures one after the other hardly show it"
+        if self.explained < POOR:
+            return (
+                f"hardly seen: where its motion leads, for the picture shows {self.explained:.0%} of the render's edges"
+            )
+        if self.covered > MOSTLY:
+            return f"covered: {self.covered:.0%} of the object is not what it looked like before"
+        return "seen"
 
     @property
     def matrix(self) -> Tensor:
@@ -95,7 +117,9 @@ def track(
 
     The light and what stands behind the object need not be known. The mesh may move by some 10° and a fifth of its size from a
     picture to the next, more where it moves evenly; something may pass before it. Where four pictures in a row hardly show the
-    object (`explained` below 0.45), it is `lost`, and is searched for around its last good pose until it is found again.
+    object (`explained` below 0.45), it is `lost`, and is searched for until it is found again: where it was seen last in each
+    picture, and in every fifth all over it, turned by up to some 60° and up to a fifth larger or smaller, by perspective and
+    orthographic cameras.
 
     Arguments are checked at once. A picture that cannot be used (another size, numbers that are not finite, a file that
     is not there) is an error, ValueError, TypeError or OSError, that names it as `frames[k]`, raised when it is asked
@@ -134,6 +158,20 @@ def _poses(tracker: Tracker, frames: Iterable[Frame], depth: Iterable[Tensor | N
         yield tracker.follow(index, frame, measured)
 
 
+class End(NamedTuple):
+    """Where a way down ended."""
+
+    pose: Pose
+    share: float  # of the render's edges, where nothing covers it
+    covered: float  # share of the object
+    views: list[Seen]
+
+    @property
+    def shown(self) -> float:
+        """How much of the object the picture shows there."""
+        return self.share * (1.0 - self.covered)
+
+
 class Tracker:
     """What is known of a film so far."""
 
@@ -142,12 +180,13 @@ class Tracker:
         self.max_size, self.spp, self.seed = max_size, spp, seed
         self.pose = self.good = start  # the last one, and the last one at which the object was seen
         self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)  # a picture
-        self.poor = 0  # pictures one after the other that hardly show the object
+        self.poor = self.lost = 0  # pictures one after the other that hardly show the object, and in which it is lost
         self.first, self.moves = True, False  # whether the velocity is known
         self.task: PoseTask | None = None
-        self.palettes: list[Tensor] = []
-        self.light: Tensor | None = None  # coefficients (C, n) of the pictures before
-        self.deviation = 0.0  # from what they predict, as Lit has it
+        self.palettes: list[Palette] = []
+        self.steady = STEADY
+        self.covered = 0.0  # share of the object in the last picture
+        self.remembered = Remembered()
 
     @torch.inference_mode(False)
     @torch.enable_grad()
@@ -160,79 +199,58 @@ class Tracker:
         task = replace(self.task, shots=[self.task.shots[0]._replace(target=picture)])
         near = None if measured is None else depth_image(f"depth[{index}]", measured, self.camera.size)
         predicted = self._predicted()
-        pose, share = self._found(task, near, predicted)
+        pose, share, self.covered, _ = self._found(task, near, predicted)
         if self.first or share >= POOR:
-            self.poor = 0
+            self.poor = self.lost = 0
         else:
             self.poor += 1
         lost = self.poor >= PATIENCE
-        if lost and (self.poor - PATIENCE) % AGAIN == AGAIN - 1:
-            again, found = self._searched(task, near)
-            if found >= ENOUGH:
-                pose, share, lost, self.poor = again, found, False, 0
+        self.lost = self.lost + 1 if lost else 0
+        if lost and self.lost % AGAIN == 0:
+            again = self._searched(task, near)
+            if again.share >= (ALONE_ENOUGH if task.colourless else ENOUGH) and again.covered < MOSTLY:
+                pose, share, self.covered, _ = again
+                lost, self.poor, self.lost = False, 0, 0
         self._move(pose, share, lost)
-        return TrackedPose(index, self.pose.R, self.pose.t, float(self.pose.scale), share, lost)
+        where = self.pose.R, self.pose.t, float(self.pose.scale)
+        return TrackedPose(index, *where, share, lost, self.covered)
 
-    def _found(self, task: PoseTask, depth: Tensor | None, predicted: Pose) -> tuple[Pose, float]:
-        """The pose, and the share of the edges there."""
-        best, share = predicted, 0.0
-        if not self.first and self.poor == 0:
-            levels = self._uncovered(self._levels(task, depth, predicted), predicted)
+    def _found(self, task: PoseTask, depth: Tensor | None, predicted: Pose) -> End:
+        """Where the object is."""
+        best = End(predicted, 0.0, 1.0, [])
+        if not self.first and not self.lost:
+            levels = self._levels(task, depth, predicted)
             offset = torch.zeros(len(levels[-1].plain.free), dtype=torch.float64) if self.moves else None
-            pose, _ = self._stepped(levels[-2], predicted, STEPS, offset)
-            best, share = self._believed(*self._stepped(levels[-1], pose, LAST_STEPS, offset), predicted)
-        if share < ENOUGH:
+            best = self._believed(self._down(levels[-2:], predicted, STEPS, offset), predicted)
+            if offset is not None and best.share >= LEARNT and best.covered < HARDLY:
+                variance = (1.0 - RATE) * self.steady**2 + RATE * float(offset.square().mean())
+                self.steady = max(variance**0.5, STEADIEST)
+        if best.share < ENOUGH or best.covered > self.covered + SUDDEN:  # for what covers an object comes gradually
             for start in [predicted] if self.first or predicted is self.good else [predicted, self.good]:
-                levels = self._uncovered(self._levels(task, depth, start), start)
-                pose, again = start, 0.0
-                for level in levels:
-                    pose, again = self._stepped(level, pose, MORE_STEPS)
-                pose, again = self._believed(pose, again, start)
-                if again > share:
-                    best, share = pose, again
-                if share >= ENOUGH:
+                again = self._believed(self._down(self._levels(task, depth, start), start, MORE_STEPS), start)
+                if again.shown > best.shown:
+                    best = again
+                if best.share >= ENOUGH and best.covered < MOSTLY:
                     break
-        return best, share
+        if best.share >= LEARNT and best.covered < MOSTLY:
+            self.remembered.learn(best.views)
+        return best if best.share >= POOR else best._replace(pose=predicted)
 
-    def _uncovered(self, levels: list[PhotoLevel], pose: Pose) -> list[PhotoLevel]:
-        """With weights near zero where something covers the object: there the picture is not what the mesh is at that pose in the
-        light of the pictures before. The light of this picture alone would follow what covers it."""
-        if self.light is None:
-            return levels
-        (seen,) = levels[-2].see(pose, self.seed)
-        if seen.lit is None or seen.lit.coefficients.shape != self.light.shape:
-            return levels
-        inside = seen.lit.surface.inside
-        off = torch.zeros_like(inside, dtype=torch.float32)
-        off[inside] = (seen.lit.difference(self.light) > OFF * self.deviation).float()
-        # Edges that are a pixel off are thin; what covers the object is not.
-        share = smoothed(torch.stack([off, inside.float()]), ACROSS)
-        covered = (share[0] > 0.5 * share[1]) & (share[1] > SEEN_FROM)
-        weight = 1.0 - (1.0 - COVERED) * covered.float()
-        found = []
+    def _down(self, levels: list[PhotoLevel], start: Pose, most: int, offset: Tensor | None = None) -> End:
+        """Through the levels, with so many steps on each at most; `offset` as of _stepped()."""
+        cover = self.remembered.cover(levels[-2].see(start, self.seed)) if offset is not None else None
+        pose, views = start, []
         for level in levels:
-            pictures = []
-            for picture in level.pictures:
-                at = F.interpolate(weight[None, None], picture.size, mode="bilinear")[0, 0]
-                pictures.append(replace(picture, weight=picture.weight * at))
-            found.append(replace(level, pictures=pictures))
-        return found
+            pose, views = self._stepped(level if cover is None else cover.left_out(level), pose, most, offset)
+            cover = self.remembered.cover(views) or cover
+        share = levels[-1].explained(pose, self.seed, views)
+        return End(pose, share, 0.0 if cover is None else cover.share, views)
 
-    def _learn(self, views: list[Seen]) -> None:
-        """Takes in the light of a picture that shows the object."""
-        for seen in views:
-            if seen.lit is not None:
-                old = self.light is not None and self.light.shape == seen.lit.coefficients.shape
-                rate = RATE if old else 1.0
-                light = self.light if old and self.light is not None else seen.lit.coefficients
-                self.light = (1.0 - rate) * light + rate * seen.lit.coefficients
-                self.deviation = (1.0 - rate) * self.deviation + rate * seen.lit.deviation
-
-    def _believed(self, pose: Pose, share: float, start: Pose) -> tuple[Pose, float]:
+    def _believed(self, end: End, start: Pose) -> End:
         """Steps that lead far from where they began follow something else than the object, whatever they explain there."""
         assert self.task is not None
-        near = angle(start.R, pose.R) < FARTHEST and self._way(start, pose) < FARTHEST * self.task.size
-        return (pose, share) if near or self.first else (start, 0.0)
+        near = angle(start.R, end.pose.R) < FARTHEST and self._way(start, end.pose) < FARTHEST * self.task.size
+        return end if near or self.first else End(start, 0.0, 1.0, [])
 
     def _way(self, a: Pose, b: Pose) -> float:
         """Between the object's centres."""
@@ -244,19 +262,18 @@ class Tracker:
 
     def _stepped(
         self, level: PhotoLevel, pose: Pose, most: int, offset: Tensor | None = None
-    ) -> tuple[Pose, float]:  # fmt: skip
-        """After so many Gauss-Newton steps at most, or a short one; on the last level also the share of the edges, as it was
-        before the last step, which is short where the way ends well. `offset` (n,): how far the steps have led from the
-        prediction, which they add to; the object is taken to be near that, as far as the picture shows little of it."""
+    ) -> tuple[Pose, list[Seen]]:  # fmt: skip
+        """After so many Gauss-Newton steps at most, or a short one, and what was seen before the last, which is short where the
+        way ends well. `offset` (n,): how far the steps have led from the prediction, which they add to; the object is taken to
+        be near that, as far as the picture shows little of it."""
         views: list[Seen] = []
-        at = pose
         for _ in range(most):
-            at, views = pose, level.see(pose, self.seed)
+            views = level.see(pose, self.seed)
             normal, _loss = level.equations(pose, self.seed, views)
             if not float(normal.curvature.trace()) > 0.0:
                 break  # the prior below would hide that
             if offset is not None:
-                known = torch.eye(len(offset), dtype=torch.float64) / STEADY**2
+                known = torch.eye(len(offset), dtype=torch.float64) / self.steady**2
                 normal = Normal(normal.curvature + known, normal.gradient + known @ offset)
             move = normal.damped(LAST_DAMPING if level.last else DAMPING, FLOOR, LONGEST)
             assert move is not None
@@ -265,26 +282,50 @@ class Tracker:
                 offset += move
             if float(move.abs().max()) < SHORT * level.plain.coarseness:
                 break
-        if not level.last:
-            return pose, math.nan
-        share = level.explained(at, self.seed, views)
-        if share >= LEARNT:
-            self._learn(views)
-        return pose, share
+        return pose, views
 
     def _levels(self, task: PoseTask, depth: Tensor | None, pose: Pose) -> list[PhotoLevel]:
         return photo_levels(task, pose, [depth], self.max_size, self.spp, self.seed, self.palettes)
 
-    def _searched(self, task: PoseTask, depth: Tensor | None) -> tuple[Pose, float]:
-        """From the last good pose, and others about it."""
-        search = PhotoSearch(task, self.good, [depth], self.max_size, self.spp, SEARCH_STEPS, SHORT, self.seed)
-        search.run()
-        return search.best, search.explained
+    def _searched(self, task: PoseTask, depth: Tensor | None) -> End:
+        """Where the whole picture looks like the object, as large about as it was, and turned by up to some 60°."""
+        camera, scale, best = task.shots[0].camera, self.good.scale, End(self.good, 0.0, 1.0, [])
+        if camera.projection not in ("perspective", "orthographic"):
+            return best
+        unit = replace(
+            task, scene=task.scene.transformed(torch.eye(3), torch.zeros(3), scale), center=scale * task.center
+        )
+        rotations = ball(VIEWS, TURNED) @ (camera.world_to_camera[:3, :3] @ self.good.R)
+        far = self._distance(self.good)
+        size = across(unit, camera, far) / min(camera.size)
+        views = self.remembered.shone_on(Views.of(unit, rotations, self.seed), camera)
+        look = matches if self.remembered.light is None else look_alikes
+        poses = [pose._replace(scale=scale) for pose in look(unit, views, (size / SIZES, size * SIZES))]
+        if camera.projection == "orthographic":  # which does not show it
+            axis = camera.world_to_camera[2, :3]
+            poses = [pose._replace(t=pose.t + (far - self._distance(pose)) * axis) for pose in poses]
+        found = []
+        for pose in poses[:CANDIDATES]:
+            level = self._levels(task, depth, pose)[0]
+            pose, views = self._stepped(level, pose, STEPS)
+            found.append((level.explained(pose, self.seed, views), pose))
+        found.sort(key=lambda one: -one[0])
+        for _, pose in found[:FOLLOWED]:
+            again = self._down(self._levels(task, depth, pose), pose, MORE_STEPS)
+            best = max(best, again, key=lambda end: end.shown)
+            if best.share >= LEARNT and best.covered < HARDLY:
+                break
+        return best
+
+    def _distance(self, pose: Pose) -> float:
+        """Of the object's centre from the camera, world units; along the view, as sizes in the picture have it."""
+        assert self.task is not None
+        return float(depth_of(self.camera.to(torch.float64), pose, self.task.center))
 
     def _predicted(self) -> Pose:
         """By constant velocity."""
         assert self.task is not None
-        if self.poor >= PATIENCE:
+        if self.lost:
             return self.good
         R = self.turn @ self.pose.R
         where = self._center(self.pose) + self.shift
@@ -292,8 +333,11 @@ class Tracker:
 
     def _move(self, pose: Pose, share: float, lost: bool) -> None:
         """Takes in where the object is now."""
-        moved, self.moves = self.moves, not (self.first or lost or share < POOR)
-        if lost or share < POOR:  # where it went is not known
+        if not (self.first or lost) and (share < POOR or self.covered > MOSTLY):
+            self.pose = pose  # and goes on as it went
+            return
+        moved, self.moves = self.moves, not (self.first or lost)
+        if lost:  # where it went is not known
             self.turn, self.shift = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
         elif not self.first:
             far = angle(self.pose.R, pose.R) > FARTHEST  # found again

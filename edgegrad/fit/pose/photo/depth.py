@@ -30,7 +30,7 @@ def depth_term(surface: Surface, measured: Tensor, weight: Tensor, size: float) 
     axis = surface.camera.world_to_camera[2, :3].double()
     among = inside[surface.inside]
     along = (surface.motion.of_points(surface.points[among]) @ axis).float()
-    J = along - (surface.flow()[:, among] * slope(z[..., None])[inside][:, 0]).sum(-1)
+    J = along - (surface.flow()[:, among] * slope(z[None])[:, 0, inside].T).sum(-1)
     information = 1.0 / (TOGETHER * deviation**2)
     weighted = (J * robust).double()
     return Normal(information * weighted @ J.T.double(), information * weighted @ residual.double())

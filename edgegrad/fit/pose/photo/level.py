@@ -14,7 +14,7 @@ from ....aovs import render_aovs
 from ....files.image import linear_to_srgb
 from ....scene.mesh import Mesh
 from ....scene.scene import Scene
-from ...region import RADIUS, Windows, around, labels, palette, posterior, smoothed
+from ...region import RADIUS, Palette, Windows, around, palette, posterior, smoothed
 from ...sides import ALONE_SHOWN, CONTRAST, PURE, Sides
 from ...sides import BLUR as CONTOUR_BLUR
 from ...verdict import explained
@@ -36,6 +36,7 @@ BLURS = (1.0, 0.7)  # pixels: of alpha on the coarse levels; the last but one, i
 FEW_HARMONICS = 4  # of the light on the coarsest level
 GRID = 16  # pixels that crops are aligned to, so that a pose which is a little different has the same
 MARGIN = 0.6  # around the object that a crop keeps, in its extent in the image
+BESIDE = 12  # pixels around the silhouette: the windows that the contour's colours are taken from reach as far
 MASKED = 0.01  # probability that a mask is wrong
 RESOLVED = 40.0  # pixels across the object: light and colours that are fitted to fewer explain any picture
 SHOWN = 0.5  # share of the contour that has to show beside what is inside; with less, less is explained
@@ -46,12 +47,18 @@ class Seen:
     """A render beside a picture."""
 
     picture: Picture
+    box: tuple[slice, slice]  # rows and columns around the object
+    part: Picture  # what lies in them
     alpha: Tensor  # (h, w)
     tangents: Tensor  # (D, h, w)
     near: Tensor  # (h, w): weights of what lies around the object
     extent: float  # pixels across the object in the image
-    surface: Surface | None
+    surface: Surface | None  # in the box
     lit: Lit | None
+
+    def sides(self) -> Sides:
+        """Of the contour, in the box."""
+        return Sides.of(self.part.outlined, smoothed(self.alpha[self.box][None], CONTOUR_BLUR)[0], self.near[self.box])
 
 
 @dataclass(frozen=True)
@@ -61,7 +68,7 @@ class PhotoLevel:
     task: PoseTask
     plain: Level  # sizes and cameras as other fits have them
     pictures: list[Picture]
-    palettes: list[Tensor]
+    palettes: list[Palette]
     blur: float
     harmonics: int  # 0: the mesh has no colours
     last: bool
@@ -81,15 +88,18 @@ class PhotoLevel:
             rendered = Rendered(bare, camera, ["alpha"], self.plain.spp, seed)
             alpha = rendered.images["alpha"][..., 0].float()
             tangents = rendered.derivatives(moves)["alpha"][..., 0].float()
+            rows, columns = box = _box(alpha)
+            cut = camera.crop(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
+            part = picture.part(rows, columns, cut)
             surface = None
             if self.harmonics or picture.depth is not None:
                 names = [name for name in AOVS if name != "image" or self.harmonics]
                 with torch.no_grad():
-                    channels = render_aovs(moved, camera, names, self.plain.spp, seed)
-                surface = Surface.of(camera, channels, moves)
-            lit = Lit.of(picture, surface, self.harmonics) if surface is not None and self.harmonics else None
+                    channels = render_aovs(moved, cut, names, self.plain.spp, seed)
+                surface = Surface.of(cut, channels, moves)
+            lit = Lit.of(part, surface, self.harmonics) if surface is not None and self.harmonics else None
             near, extent = around(alpha)
-            found.append(Seen(picture, alpha, tangents, near * picture.weight, extent, surface, lit))
+            found.append(Seen(picture, box, part, alpha, tangents, near * picture.weight, extent, surface, lit))
         return found
 
     def equations(self, pose: Pose, seed: int, views: list[Seen] | None = None) -> tuple[Normal, float]:
@@ -107,10 +117,11 @@ class PhotoLevel:
             if seen.lit is not None:
                 terms.append(seen.lit.term())
             if self.last:
-                sides = Sides.of(seen.picture.outlined, smoothed(seen.alpha[None], CONTOUR_BLUR)[0], seen.near)
-                terms.append(contour_term(seen.picture, sides, smoothed(seen.tangents, CONTOUR_BLUR)))
-            if seen.surface is not None and seen.picture.depth is not None:
-                terms.append(depth_term(seen.surface, seen.picture.depth, seen.picture.weight, self.task.size))
+                rows, columns = seen.box
+                blurred = smoothed(seen.tangents[:, rows, columns], CONTOUR_BLUR)
+                terms.append(contour_term(seen.part, seen.sides(), blurred))
+            if seen.surface is not None and seen.part.depth is not None:
+                terms.append(depth_term(seen.surface, seen.part.depth, seen.part.weight, self.task.size))
             for term in terms:
                 if term is not None:
                     curvature, gradient = curvature + term.curvature, gradient + term.gradient
@@ -121,8 +132,8 @@ class PhotoLevel:
         they have. `views`: as of equations()."""
         pairs, shown, length, extent = [], 0.0, 0.0, 0.0
         for seen in self.see(pose, seed) if views is None else views:
-            picture, contour = seen.picture, smoothed(seen.alpha[None], CONTOUR_BLUR)[0]
-            sides = Sides.of(picture.outlined, contour, seen.near)
+            picture, sides = seen.part, seen.sides()
+            contour = sides.alpha
             extent = max(extent, seen.extent)
             on = ((contour > PURE) & (contour < 1.0 - PURE)).float() * picture.weight
             length += float(on.sum())
@@ -145,20 +156,20 @@ class PhotoLevel:
     @cached_property
     def _labels(self) -> list[Tensor]:
         """Of the pixels of each picture; they are the same at each step."""
-        return [labels(picture.display, colours) for picture, colours in zip(self.pictures, self.palettes, strict=True)]
+        return [colours.labels(picture.display) for picture, colours in zip(self.pictures, self.palettes, strict=True)]
 
     def _posterior(self, k: int, seen: Seen) -> Tensor:
         """(h, w), that a pixel of picture k shows the object: by the mask, or else by its colour."""
         mask = seen.picture.mask
         if mask is not None:
             return mask.clamp(MASKED, 1.0 - MASKED)
-        windows = Windows(seen.picture.size, self._labels[k], self.palettes[k], RADIUS * seen.extent)
+        windows = Windows(seen.picture.size, self._labels[k], self.palettes[k].colours, RADIUS * seen.extent)
         return posterior(windows, seen.alpha, seen.near)
 
 
 def photo_levels(
     task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, seed: int,
-    palettes: list[Tensor] | None = None,
+    palettes: list[Palette] | None = None,
 ) -> list[PhotoLevel]:  # fmt: skip
     """From coarse to fine, of what surrounds the object at the start. `palettes`: of the pictures, where they are known."""
     crops = [_crop(task, shot, start) for shot in task.shots]
@@ -213,3 +224,13 @@ def _crop(task: PoseTask, shot: Shot, pose: Pose) -> tuple[int, int, int, int, f
     if right - left < SMALLEST or bottom - top < SMALLEST:
         return 0, 0, H, W, float(max(H, W)) / 2
     return top, left, bottom - top, right - left, extent
+
+
+def _box(alpha: Tensor) -> tuple[slice, slice]:
+    """Rows and columns of a silhouette alpha (h, w) and of what its contour is compared with; all where nothing is seen."""
+    found = []
+    for axis, size in enumerate(alpha.shape):
+        filled = torch.nonzero(alpha.amax(1 - axis) > 0.0)[:, 0]
+        low, high = (int(filled[0]), int(filled[-1]) + 1) if len(filled) else (0, size)
+        found.append(slice(max(0, low - BESIDE), min(size, high + BESIDE)))
+    return found[0], found[1]

@@ -42,12 +42,12 @@ class Lit:
     surface: Surface
     predicted: Tensor  # (h, w, C) linear radiance, blurred
     coefficients: Tensor  # (C, n), of harmonics
-    residual: Tensor  # (N, C) of the pixels inside, scaled
+    residual: Tensor  # (C, N) of the pixels inside, scaled
     robust: Tensor  # (N,) weights
     deviation: float  # of a scaled difference
-    _basis: Tensor  # (N, C, n), scaled
-    _scale: Tensor  # (N, C)
-    _slopes: Tensor  # (N, C, 2)
+    _basis: Tensor  # (C, n, N), scaled
+    _scale: Tensor  # (C, N)
+    _slopes: Tensor  # (2, C, N)
     _ridge: Tensor  # (C, n)
 
     @staticmethod
@@ -56,32 +56,34 @@ class Lit:
         inside = surface.inside
         if int(inside.sum()) < FEWEST:
             return None
-        colour, Y = surface.channels["image"].float(), spherical(surface.normals)[..., :harmonics]
-        pictured = _blurred_inside(picture.radiance, inside)
-        basis = torch.stack([_blurred_inside(one[..., None] * Y, inside) for one in colour.unbind(-1)], -2)
+        # Channels come first here, where most of the time of a fit goes.
+        colour = surface.channels["image"].float().movedim(-1, 0)
+        Y = spherical(surface.normals)[..., :harmonics].movedim(-1, 0)
+        C, (h, w) = len(colour), inside.shape
+        pictured = _blurred_inside(picture.radiance.movedim(-1, 0), inside)
+        basis = _blurred_inside((colour[:, None] * Y).flatten(0, 1), inside).reshape(C, harmonics, h, w)
         # The slope of the display's curve, about: noise and errors are even in its values.
-        scale = (pictured + 0.02 + 0.1 * pictured[inside].mean()).clamp(min=1e-3).rsqrt()[inside]
-        B, y = basis[inside] * scale[..., None], pictured[inside] * scale
+        y = pictured[:, inside]
+        scale = (y + 0.02 + 0.1 * y.mean()).clamp(min=1e-3).rsqrt()
+        B, y = basis[:, :, inside] * scale[:, None], y * scale
         count = picture.weight[inside]
-        w = count
-        light = y.new_zeros(colour.shape[-1], harmonics)
-        ridge = torch.zeros_like(light)
-        residual, middle = -y, LEAST
+        robust, residual, light, ridge, middle = count, -y, y.new_zeros(C, harmonics), y.new_zeros(C, harmonics), LEAST
         for _ in range(REWEIGHTED):
-            for c in range(len(light)):
-                curvature = (B[:, c] * w[:, None]).T @ B[:, c]
-                ridge[c] = RIDGE * curvature[0, 0] + 1e-9
-                ridge[c, 0] = 1e-9 + 1e-3 * ridge[c, 0]
-                light[c] = torch.linalg.solve(curvature + torch.diag(ridge[c]), (B[:, c] * w[:, None]).T @ y[:, c])
-            residual = torch.einsum("pcn,cn->pc", B, light) - y
-            e = residual.norm(dim=-1)
-            middle = max(float(e.median()) / _median(len(light)), LEAST)
-            w = count * (1.0 + (e / (3.0 * middle)).square()).pow(-2)
-        predicted = torch.einsum("hwcn,cn->hwc", basis, light)
-        slopes = slope(0.5 * (predicted + pictured))[inside]
+            weighted = B * robust
+            curvature = weighted @ B.mT
+            ridge = (RIDGE * curvature[:, :1, 0]).repeat(1, harmonics) + 1e-9
+            ridge[:, 0] = 1e-9 + 1e-3 * ridge[:, 0]
+            light = torch.linalg.solve(curvature + torch.diag_embed(ridge), weighted @ y[..., None])[..., 0]
+            residual = (light[:, None] @ B)[:, 0] - y
+            e = residual.square().sum(0).sqrt()
+            middle = max(_weighted_median(e, count) / _median(C), LEAST)
+            robust = count * (1.0 + (e / (3.0 * middle)).square()).pow(-2)
+        predicted = (light[:, None] @ basis.flatten(2)).reshape(C, h, w)
+        slopes = slope(0.5 * (predicted + pictured))[..., inside]
         # Beside the rim a blur reaches fewer pixels, and slopes are too low.
         whole = smoothed(inside[None].float(), BLUR)[0][inside] > WHOLE
-        return Lit(surface, predicted, light, residual, w * whole, middle, B, scale, slopes, ridge)
+        image = predicted.movedim(0, -1)
+        return Lit(surface, image, light, residual, robust * whole, middle, B, scale, slopes, ridge)
 
     @property
     def change(self) -> float:
@@ -93,23 +95,22 @@ class Lit:
 
     def difference(self, light: Tensor) -> Tensor:
         """(N,): how far the picture inside is from the surface in another light (C, n), scaled as `residual` is."""
-        return (torch.einsum("pcn,cn->pc", self._basis, light - self.coefficients) + self.residual).norm(dim=-1)
+        off = ((light - self.coefficients)[:, None] @ self._basis)[:, 0] + self.residual
+        return off.square().sum(0).sqrt()
 
     def term(self) -> Normal:
         """The equations of a step of the pose, of which those of the light are eliminated."""
         surface = self.surface
         inside, D = surface.inside, len(surface.motion)
-        flow, n = surface.flow(), surface.normals[inside]
+        (x, y), n = surface.flow().unbind(-1), surface.normals[inside]
         turned = surface.motion.of_directions(n.double()).float()
         slopes_of_light = spherical_slopes(n, turned)[..., : self.coefficients.shape[1]]
-        colour = surface.channels["image"].float()[inside]
+        colour = surface.channels["image"].float()[inside].T
         curvature, gradient = torch.zeros(D, D), torch.zeros(D)
         for c, light in enumerate(self.coefficients):
-            by_pose = (colour[:, c] * (slopes_of_light @ light) - (flow * self._slopes[:, c]).sum(-1)) * self._scale[
-                :, c
-            ]
-            J = torch.cat([by_pose, self._basis[:, c].T])
-            A, b = (J * self.robust) @ J.T, (J * self.robust) @ self.residual[:, c]
+            moved = x * self._slopes[0, c] + y * self._slopes[1, c]
+            J = torch.cat([(colour[c] * (slopes_of_light @ light) - moved) * self._scale[c], self._basis[c]])
+            A, b = (J * self.robust) @ J.T, (J * self.robust) @ self.residual[c]
             A[D:, D:] += torch.diag(self._ridge[c])
             b[D:] += self._ridge[c] * light
             eliminated = torch.linalg.solve(A[D:, D:], torch.cat([A[D:, :D], b[D:, None]], 1))
@@ -132,13 +133,21 @@ def spherical_slopes(n: Tensor, tangents: Tensor) -> Tensor:
     return torch.stack(parts, -1)
 
 
+def _weighted_median(values: Tensor, weights: Tensor) -> float:
+    """Of (N,): what is known to be covered may be most of a surface."""
+    if bool((weights == weights[0]).all()):
+        return float(values.median())
+    ordered, order = values.sort()
+    below = weights[order].cumsum(0)
+    return float(ordered[torch.searchsorted(below, 0.5 * below[-1]).clamp(max=len(values) - 1)])
+
+
 def _median(channels: int) -> float:
     """Of the length of so many normal numbers of variance 1 (Wilson and Hilferty, The Distribution of Chi-Square, 1931)."""
     return math.sqrt(channels * (1.0 - 2.0 / (9.0 * channels)) ** 3)
 
 
-def _blurred_inside(image: Tensor, inside: Tensor) -> Tensor:
-    """(h, w, C), the mean of what lies inside."""
+def _blurred_inside(images: Tensor, inside: Tensor) -> Tensor:
+    """Of images (n, h, w), blurred, the mean of what lies inside."""
     share = inside.float()
-    count = smoothed(share[None], BLUR)[0].clamp(min=1e-3)
-    return (smoothed(image.movedim(-1, 0) * share, BLUR) / count).movedim(0, -1)
+    return smoothed(images * share, BLUR) / smoothed(share[None], BLUR).clamp(min=1e-3)

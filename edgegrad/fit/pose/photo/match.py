@@ -12,6 +12,7 @@ once.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -24,11 +25,7 @@ from ..pose import Pose, angle
 from ..task import PoseTask
 from .views import ACROSS, RING, Views, across, pose_at
 
-SMALLEST, LARGEST, RATIO = (
-    0.25,
-    1.25,
-    1.2,
-)  # the object's diagonal in the picture's shorter sides, and between two sizes
+SIZES, RATIO = (0.25, 1.25), 1.2  # the object's diagonal in the picture's shorter sides, and between two sizes
 STRIDE = 2  # pixels between two places
 AT_ONCE = 128  # views
 NOISE = 0.06  # standard deviation of a pixel, sRGB values: of noise, and of what views lack by their spacing
@@ -56,13 +53,28 @@ class Match(NamedTuple):
     pixels: float  # of the picture, across the object
 
 
-def matches(task: PoseTask, views: Views) -> list[Pose]:
-    """The best poses in the first picture, distinct, the best first. The mask, where there is one, says where they are."""
+def matches(task: PoseTask, views: Views, sizes: tuple[float, float] = SIZES) -> list[Pose]:
+    """The best poses in the first picture, distinct, the best first. The mask, where there is one, says where they are, or else
+    they have `sizes` between two, of the object's diagonal in the picture's shorter sides."""
     masked = "alpha" in task.aovs and not task.clutter
     if masked:
         return _distinct(task, views, _in_mask(task, views), KEPT)
-    first, second = (_distinct(task, views, found, KEPT) for found in _everywhere(task, views))
+    first, second = (_distinct(task, views, found, KEPT) for found in _everywhere(task, views, sizes))
     return [pose for pair in zip(first, second, strict=False) for pose in pair]
+
+
+def look_alikes(task: PoseTask, views: Views, sizes: tuple[float, float]) -> list[Pose]:
+    """As matches(), of views whose colours are in the light of the picture: where they are alike inside, pixel by pixel."""
+    inside = torch.where(views.alpha > 0.5, views.alpha, torch.zeros_like(views.alpha))
+    area = inside.sum((1, 2)).clamp(min=1.0)[:, None, None]
+    weighted = (inside[..., None] * views.colours).movedim(-1, 1)
+    own = (weighted * views.colours.movedim(-1, 1)).sum((1, 2, 3))[:, None, None]
+    found = []
+    for picture, pixels, factors, margin in _sized(task, views, sizes):
+        squares = F.conv2d(picture.square().sum(0)[None, None], inside[:, None], stride=STRIDE)[0]
+        error = (squares - 2.0 * F.conv2d(picture[None], weighted, stride=STRIDE)[0] + own) / area
+        found += _best(-error, pixels, factors, margin, views)
+    return _distinct(task, views, found, KEPT)
 
 
 class _Filter:
@@ -136,30 +148,46 @@ def _with_prior(A: Tensor) -> Tensor:
     return full.reshape(n, 4 * C, 4 * C)
 
 
-def _everywhere(task: PoseTask, views: Views) -> list[list[Match]]:
+def _everywhere(task: PoseTask, views: Views, sizes: tuple[float, float]) -> list[list[Match]]:
     """By each of the ratios."""
+    filters = _Filter(views)
+    found: list[list[Match]] = [[], []]
+    for picture, pixels, factors, margin in _sized(task, views, sizes):
+        both = filters.scores(picture, _surprise(picture), STRIDE)
+        for kind, (scores, power) in enumerate(zip(both, POWERS, strict=True)):
+            found[kind] += _best(scores * pixels**power, pixels, factors, margin, views)
+    return found
+
+
+def _sized(
+    task: PoseTask, views: Views, sizes: tuple[float, float]
+) -> Iterator[tuple[Tensor, float, tuple[float, float], int]]:
+    """The first picture (C, h, w) at sizes at which objects have that of views; pixels across such objects in it, of how many
+    pixels of it one is a mean (x, y), and how many there are beside it."""
     shot = task.shots[0]
     H, W = shot.camera.size
     target = linear_to_srgb(shot.target.float().clamp(0.0, 1.0))
-    filters, T = _Filter(views), views.alpha.shape[-1]
+    T = views.alpha.shape[-1]
     margin = T // 3
-    found: list[list[Match]] = [[], []]
-    for k in range(1 + math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO))):
-        pixels = SMALLEST * RATIO**k * min(H, W)  # across the object, in the picture
+    for k in range(1 + math.floor(math.log(sizes[1] / sizes[0]) / math.log(RATIO))):
+        pixels = sizes[0] * RATIO**k * min(H, W)  # across the object, in the picture
         factor = min(1.0, ACROSS / pixels)
         size = max(1, round(H * factor)), max(1, round(W * factor))
         if min(size) + 2 * margin < T:
             continue
         picture = F.pad(area_mean(target, size).movedim(-1, 0)[None], (margin,) * 4, mode="replicate")[0]
-        both = filters.scores(picture, _surprise(picture), STRIDE)
-        h, w = both.shape[-2:]
-        for kind, (scores, power) in enumerate(zip(both, POWERS, strict=True)):
-            best, places = scores.flatten(1).topk(min(PLACES, h * w))
-            for n, (values, here) in enumerate(zip(best.tolist(), places.tolist(), strict=True)):
-                for value, place in zip(values, here, strict=True):
-                    middle = [STRIDE * (place % w) + 0.5 * T - margin, STRIDE * (place // w) + 0.5 * T - margin]
-                    position = torch.tensor([middle[0] * W / size[1], middle[1] * H / size[0]])
-                    found[kind].append(Match(value * pixels**power, n, position, pixels))
+        yield picture, pixels, (W / size[1], H / size[0]), margin
+
+
+def _best(scores: Tensor, pixels: float, factors: tuple[float, float], margin: int, views: Views) -> list[Match]:
+    """Of (n, h, w), the best places of each view."""
+    w, middle = scores.shape[-1], 0.5 * views.alpha.shape[-1] - margin
+    best, places = scores.flatten(1).topk(min(PLACES, scores[0].numel()))
+    found = []
+    for n, (values, here) in enumerate(zip(best.tolist(), places.tolist(), strict=True)):
+        for value, place in zip(values, here, strict=True):
+            x, y = STRIDE * (place % w) + middle, STRIDE * (place // w) + middle
+            found.append(Match(value, n, torch.tensor([x * factors[0], y * factors[1]]), pixels))
     return found
 
 

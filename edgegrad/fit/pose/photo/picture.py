@@ -43,6 +43,12 @@ class Picture:
         """(h, w)."""
         return self.camera.size
 
+    def part(self, rows: slice, columns: slice, camera: Camera) -> Picture:
+        """What lies in so many rows and columns, which the camera sees."""
+        mask, depth = (None if one is None else one[rows, columns] for one in (self.mask, self.depth))
+        radiance, display, weight = (one[rows, columns] for one in (self.radiance, self.display, self.weight))
+        return Picture(camera, radiance, display, mask, weight, depth)
+
     @property
     def outlined(self) -> Tensor:
         """(h, w, c), what shows the outline of the object: the mask, or else the colours."""

@@ -34,6 +34,7 @@ GAIN = 0.1  # a step that makes the pictures more likely by a smaller factor tha
 # Other starts: turned about the axes of the camera by so many radians.
 ASIDE = (0.2, 0.4)
 FOLLOWED = 3  # of them, the best on the coarsest level
+HOPELESS = 0.1  # of the edges there: noise shows none at all, clutter 0.3
 APART = 0.05  # radians between poses that are followed both
 AS_THEY_ARE = 0.05  # mean change of colours, in parts of them, by light that leaves them as they are
 NEAR = 0.1  # radians: a polished pose that is farther off is another one
@@ -139,7 +140,7 @@ class PhotoSearch:
         self._answered = True
         ends = [self._follow(coarse, self.task.moved(self.start, *turn))[0] for turn in _turns()]
         scores = self.journal.numbers(lambda: [coarse.explained(pose, self.seed) for pose in ends])
-        order = sorted(range(len(ends)), key=lambda k: -scores[k])
+        order = sorted((k for k in range(len(ends)) if scores[k] >= HOPELESS), key=lambda k: -scores[k])
         for pose in distinct([ends[k] for k in order], FOLLOWED, APART):
             before = len(self.history)
             found = self._judge(*self._down(pose, finer))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -37,13 +38,20 @@ class Surface:
 
     def flow(self) -> Tensor:
         """(D, N, 2) how the N points inside move in the image by the motion, pixels; by central differences, for any lens."""
-        points = self.points
-        ways = self.motion.of_points(points)
-        camera, found = self.camera.to(torch.float64), []
-        for k, way in enumerate(ways):
-            ends = [self._moved(camera, k, sign * STEP).project(points + sign * STEP * way) for sign in (1.0, -1.0)]
-            found.append((ends[0] - ends[1]) / (2.0 * STEP))
-        return torch.stack(found).nan_to_num(0.0, 0.0, 0.0).float()
+        points, camera = self.points, self.camera
+        if camera.K.dtype != torch.float64:
+            camera = camera.to(torch.float64)
+        along = torch.eye(3, dtype=torch.float64)
+        slopes = torch.stack(
+            [_difference(lambda h, e=e: camera.project(points + h * e)) for e in along], -1
+        )  # (N, 2, 3)
+        found = torch.einsum("nij,dnj->dni", slopes, self.motion.of_points(points))
+        if self.motion.K is not None or self.motion.distortion is not None:
+            lens = [
+                _difference(lambda h, k=k: self._moved(camera, k, h).project(points)) for k in range(len(self.motion))
+            ]
+            found = found + torch.stack(lens)
+        return found.nan_to_num(0.0, 0.0, 0.0).float()
 
     @property
     def normals(self) -> Tensor:
@@ -60,7 +68,11 @@ class Surface:
         return camera.replace(**fields) if fields else camera
 
 
+def _difference(f: Callable[[float], Tensor]) -> Tensor:
+    return (f(STEP) - f(-STEP)) / (2.0 * STEP)
+
+
 def slope(image: Tensor) -> Tensor:
-    """(h, w, C, 2), by columns and rows, central differences per pixel."""
-    padded = F.pad(image.movedim(-1, 0)[None], (1, 1, 1, 1), mode="replicate")[0].movedim(0, -1)
-    return 0.5 * torch.stack([padded[1:-1, 2:] - padded[1:-1, :-2], padded[2:, 1:-1] - padded[:-2, 1:-1]], -1)
+    """(2, n, h, w), by columns and rows, central differences per pixel of images (n, h, w)."""
+    p = F.pad(image[None], (1, 1, 1, 1), mode="replicate")[0]
+    return 0.5 * torch.stack([p[:, 1:-1, 2:] - p[:, 1:-1, :-2], p[:, 2:, 1:-1] - p[:, :-2, 1:-1]])
