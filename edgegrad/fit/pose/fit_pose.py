@@ -27,13 +27,15 @@ from ..checkpoints import Checkpoint, traits
 from ..options import check_checkpoint
 from ..upside_down import BETTER, say_upside_down
 from .journal import Journal
+from .photo.match import matches
 from .photo.search import PhotoSearch
-from .photo.starts import Starts, anywhere, around, everywhere
+from .photo.starts import Starts, Tell, around, everywhere
 from .place import placed
 from .pose import Pose, pose_from_matrix
 from .result import PoseFit
 from .search import Search
 from .task import Lens, Names, PoseTask
+from .uncertainty import Uncertainty
 
 MOST_STARTS = 1000
 
@@ -172,11 +174,12 @@ def search_pose(
     if starts == 1:
         ways = way(start, journal, search)
     else:
-        made = (
-            partial(anywhere, task, seed)
-            if starts == "global"
-            else partial(around if init is not None else everywhere, task, start, starts)
-        )
+
+        def made(tell: Tell) -> list[Pose]:
+            if starts == "global":
+                return matches(task, seed, tell)
+            return (around if init is not None else everywhere)(task, start, starts)
+
         ways = Starts(task, start, made, depths, max_size, seed, journal, partial(way, further=False))
     interrupted = False
 
@@ -191,9 +194,13 @@ def search_pose(
         best: Pose = ways.best if symmetries is None else ways.best.closest(symmetries, start)
         history = list(ways.history)
         cameras = [task.lens(one, best) for one in given_cameras]
+        known = None
+        if ways.curvature is not None:
+            known = Uncertainty.of(task, best, ways.curvature, task.free, symmetries)
+        sure = ways.converged and not interrupted and (known is None or not known.unknown)
         return PoseFit(
-            best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), seconds(),
-            ways.converged and not interrupted, interrupted, ways.explained, history, task, cameras,
+            best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), seconds(), sure, interrupted,
+            ways.explained, history, task, cameras, known,
         )  # fmt: skip
 
     total = max(ways.planned, journal.steps)
@@ -211,6 +218,8 @@ def search_pose(
             keep()
 
     ways.after_step = after_step
+    if isinstance(ways, Starts):
+        ways.tell = bar.set_postfix_str
     try:
         ways.run()
         if search and not isinstance(ways, Starts) and not ways.converged and ways.explained < ways.enough:
