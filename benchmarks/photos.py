@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -125,13 +126,16 @@ class Run:
     backgrounds: Sequence[Tensor]
 
     def fitted(
-        self, part: Part, case: Case, start: Placed, truth: Placed, label: str, search: bool = True
+        self, part: Part, case: Case, start: Placed | None, truth: Placed, label: str, mask: Tensor | None = None
     ) -> tuple[Trial, PoseFit]:
+        """Without a start, it is looked for."""
         fit = fit_pose(
-            case.mesh, case.picture, case.camera, init=start.matrix, depth=case.depth, search=search, progress=False
-        )
+            case.mesh, case.picture, case.camera, mask, None if start is None else start.matrix, depth=case.depth,
+            starts="global" if start is None else 1, progress=False,
+        )  # fmt: skip
         found, limits = Placed(fit.R, fit.t), part.limits
-        before, after = case.apart(start, truth), case.apart(found, truth)
+        before = (math.nan, math.nan) if start is None else case.apart(start, truth)
+        after = case.apart(found, truth)
         off = max(after[0] / limits.degrees, after[1] / case.size / limits.shift)
         trial = Trial(
             case.name, before[0], before[1] / case.size, after[0], after[1] / case.size, after[1], fit.explained,
@@ -145,10 +149,12 @@ class Run:
         return trial, fit
 
 
-def outlined(case: Case, start: Placed, found: Placed) -> Tensor:
+def outlined(case: Case, start: Placed | None, found: Placed) -> Tensor:
     """(H, W, 3): the photograph with the contour of the start in blue and that of the fit in yellow."""
     image = case.picture
     for pose, colour in ((start, (0.1, 0.3, 1.0)), (found, (1.0, 0.9, 0.0))):
+        if pose is None:
+            continue
         alpha = eg.render_aovs(case.mesh.transformed(pose.R, pose.t), case.camera, ["alpha"], 16)["alpha"]
         highest = F.max_pool2d(alpha.movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
         image = torch.where(highest - alpha > RIM, torch.tensor(colour), image)
@@ -169,6 +175,23 @@ def _scenes(kind: Kind, degrees: float, shift: float, limits: Limits) -> Callabl
             share = (rng.uniform(1 / 3, 1.0), rng.uniform()) if kind == "easy" else (1.0, 1.0)
             start = case.beside(case.truth, degrees * share[0], shift * case.size * share[1], rng)
             run.fitted(part, case, start, case.truth, f"{name}-{k:02d}")
+        return part
+
+    return run
+
+
+def _anywhere(masked: bool) -> Callable[[Run, str], Part]:
+    """Lit pictures without a start, with a mask or without."""
+
+    def run(run: Run, name: str) -> Part:
+        part = Part(name, Limits(1.0, 0.01, 0.90))
+        for k in range(run.starts):
+            number = k % len(run.meshes)
+            case = rendered(f"lit {number}", run.meshes[number], run.backgrounds, "lit", 200 + k)
+            placed, mask = case.mesh.transformed(case.truth.R, case.truth.t), None
+            if masked:
+                mask = (eg.render_aovs(placed, case.camera, ["alpha"], 16)["alpha"] >= 0.5).float()
+            run.fitted(part, case, None, case.truth, f"{name}-{k:02d}", mask)
         return part
 
     return run
@@ -227,6 +250,8 @@ MADE: dict[str, Callable[[Run, str], Part]] = {
     "shadow": _scenes("shadow", 15.0, 0.05, Limits(1.5, 0.03)),
     "covered": _scenes("covered", 15.0, 0.05, Limits(1.5, 0.03, 0.80)),
     "plain": _scenes("plain", 15.0, 0.05, Limits(2.0, 0.03, 0.80)),
+    "global": _anywhere(False),
+    "global-mask": _anywhere(True),
 }
 REAL: dict[str, Callable[[Run, Path], Iterator[Part]]] = {
     "squirrel": _squirrel, "gelatin_box": _gelatin_box, "cracker_box": _cracker_box, "bottle": _bottle,

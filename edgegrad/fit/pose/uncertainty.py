@@ -27,7 +27,8 @@ DEGREES, SHARE = 5.0, 0.05  # a direction that is known less exactly than this, 
 class Uncertainty:
     """Standard deviations of a pose about the object's centre, the middle of its bounding box.
 
-    covariance  (6, 6) float64 of a rotation vector in radians, and of a shift of the centre in world units; along the world's axes
+    covariance  (6, 6) float64, of a rotation vector in radians and a shift of the centre in world units, along the world's axes.
+                What was not sought, such as the distance with fit_scale, has zeros
     size        the diagonal of the object's bounding box, world units
     free        directions in the world (n, 3) about which a continuous symmetry makes all turns the same: none of them is unknown
     """
@@ -63,7 +64,9 @@ class Uncertainty:
         if self.degrees > DEGREES:
             parts.append(f"rotation about {_named(self.axis)} known to ±{self.degrees:.0f}° only")
         if self.shift > SHARE * self.size:
-            parts.append(f"place along {_named(self.direction)} known to ±{self.shift / self.size:.0%} of the size only")
+            parts.append(
+                f"place along {_named(self.direction)} known to ±{self.shift / self.size:.0%} of the size only"
+            )
         return ", ".join(parts)
 
     @property
@@ -75,7 +78,9 @@ class Uncertainty:
         return _widest(block)
 
     @staticmethod
-    def of(task: PoseTask, pose: Pose, curvature: Tensor, free: list[int], symmetries: Symmetries | None) -> Uncertainty:
+    def of(
+        task: PoseTask, pose: Pose, curvature: Tensor, free: list[int], symmetries: Symmetries | None
+    ) -> Uncertainty:
         """From JᵀJ (n, n) of the entries `free` of a step."""
         prior = torch.eye(len(free), dtype=torch.float64) / WIDEST**2
         inverse = torch.linalg.inv(curvature / TOGETHER**2 + prior)

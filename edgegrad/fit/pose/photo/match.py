@@ -45,8 +45,8 @@ class Matches:
         return Matches(self.rotations[rows], self.positions[rows], self.pixels[rows], self.scores[rows])
 
     def distinct(self, most: int, turned: float, placed: float, sized: float) -> Matches:
-        """The best ones, the best first, no two of which are nearer by all of an angle in radians, a distance in their size, and a
-        factor of size."""
+        """The best ones, the best first. Of two whose angle is below `turned` radians, whose distance is below `placed` of their
+        size, and whose sizes differ by less than the factor `sized`, the better one is kept."""
         ranked = self.of(self.scores.argsort(descending=True, stable=True)[:RANKED])
         flat = ranked.rotations.flatten(1)
         cosine = 0.5 * (flat @ flat.T - 1.0)
@@ -90,6 +90,7 @@ ROUNDS = (
     Round(32, 0.12, 0.07, 80, 0.1, 0.05),
     Round(32, 0.07, 0.04, 32, 0.15, 0.1),
 )  # fmt: skip
+MASKED = 4  # times fewer are kept with a mask, which says where the object is
 SIZED = 1.1  # factor between the sizes of matches that are kept both
 
 
@@ -130,7 +131,9 @@ class Mips:
             y = 2.0 * (positions[rows, 1:] + offsets) / H - 1.0
             at = torch.stack(torch.broadcast_tensors(x[:, None, :], y[:, :, None]), -1).float()
             padding = "zeros" if self.masked else "border"
-            seen = F.grid_sample(image[None].expand(len(rows), -1, -1, -1), at, align_corners=False, padding_mode=padding)
+            seen = F.grid_sample(
+                image[None].expand(len(rows), -1, -1, -1), at, align_corners=False, padding_mode=padding
+            )
             if found is None:
                 found = seen.new_empty(len(positions), *seen.shape[1:])
             found[rows] = seen
@@ -144,11 +147,12 @@ def matches(task: PoseTask, seed: int, tell: Callable[[str], object]) -> list[Po
     mips = Mips(task, max(one.across for one in ROUNDS))
     views = Views.of(task, all_sides(), ACROSS, seed)
     found = _in_mask(task, views, mips) if mips.masked else _everywhere(views, mips)
-    found = found.distinct(FIRST.kept, FIRST.turned, FIRST.placed, SIZED)
+    fewer = MASKED if mips.masked else 1
+    found = found.distinct(FIRST.kept // fewer, FIRST.turned, FIRST.placed, SIZED)
     for k, one in enumerate(ROUNDS):
         if len(found.scores):
             tell(f"views nearby, {k + 1} of {len(ROUNDS)}")
-            found = _closer(task, found, mips, one, seed).distinct(one.kept, one.turned, one.placed, SIZED)
+            found = _closer(task, found, mips, one, seed).distinct(one.kept // fewer, one.turned, one.placed, SIZED)
     return found.poses(task)
 
 
@@ -171,7 +175,9 @@ def _everywhere(views: Views, mips: Mips) -> Matches:
         sizes.append(torch.full((best.numel(),), pixels, dtype=torch.float64))
         values.append(best.flatten() * pixels)  # larger ones have more pixels, and those are alike
     if not values:
-        return Matches(torch.empty(0, 3, 3).double(), torch.empty(0, 2).double(), torch.empty(0).double(), torch.empty(0))
+        return Matches(
+            torch.empty(0, 3, 3).double(), torch.empty(0, 2).double(), torch.empty(0).double(), torch.empty(0)
+        )
     return Matches(torch.cat(rotations), torch.cat(positions), torch.cat(sizes), torch.cat(values))
 
 
