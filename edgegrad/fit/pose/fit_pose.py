@@ -97,11 +97,11 @@ def fit_pose(
                 box), and logarithms of scale and focal length
     seed        the same seed gives the same fit
     search      False for a start near the answer: one way down from there, whatever it ends at
-    starts      how many poses to start from; the best after a few steps are followed down, until an end shows 80 % of the
+    starts      how many poses to start from; the best after a few steps are followed down, until an end shows 85 % of the
                 render's edges. Around `init` they are turned by up to 45°; without it they are turned in all ways, at the place
                 that `init` says for None. "global" looks for the object in the whole first picture, seen by a perspective or
                 orthographic camera, from all sides and at sizes from 0.25 to 1.25 of the picture's shorter side, or in the
-                mask; `init` is None then. 1: the start alone, and what `search` does further; with more, `search` has no say
+                mask, in 10 … 30 s of processor time; `init` is None then. 1: the start alone, and what `search` does further; with more, `search` has no say
     progress    show a bar with the loss on standard error
     callback    called after each step with the best fit so far
     checkpoint  a file that holds the fit's state, written every `checkpoint_every` steps and at the end, never in part
@@ -115,8 +115,10 @@ def fit_pose(
     the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few times as long,
     less where nothing in the picture looks like the object; where they do, but something covers the object or it is of another
     colour, nearby, in about the same time again. Another pose is the answer only if its loss is lower than that of `init` in the
-    final comparison, and its edges are as well in the picture. KeyboardInterrupt, also from the callback, ends the fit and
-    returns the best so far with `interrupted` set.
+    final comparison, and its edges are as well in the picture. In photographs `uncertainty` says how exactly the terms show the
+    pose, and a rotation that is known less exactly than to 5°, or a place than to 5 % of the object's size, is not `converged`:
+    `reason` names the direction, which a continuous one of the `symmetries` makes known.
+    KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set.
     Works in torch.no_grad() and torch.inference_mode() too. Raises TypeError or ValueError that names the argument, also when
     the object leaves no trace in the picture at the start.
     """

@@ -28,7 +28,7 @@ FIRST_STEPS = 4  # from each start
 FOLLOWED = 6  # to the end
 APART = 0.15  # radians between poses that are followed both
 SPP = 8  # of these steps
-SURE = 0.8  # share of the render's edges: no other end is looked for
+SURE = 0.85  # share of the render's edges: no other end is looked for
 
 
 class Starts:
