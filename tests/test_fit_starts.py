@@ -114,11 +114,11 @@ def test_matches_come_closer_than_views_are_apart() -> None:
     mesh, picture, mask = pictured(R, t)
     task = PoseTask.of(mesh, picture, camera(), mask, None, None, Lens(), 1.0, Names())
     mips = Mips(task, ACROSS)
-    found = _in_mask(task, Views.of(task, all_sides()[::2], ACROSS, 0), mips).distinct(24, 0.2, 0.1, SIZED)
+    found = _in_mask(Views.of(task, all_sides()[::2], ACROSS, 0), mips).distinct(24, 0.2, 0.1, SIZED)
     coarse = found
     for one in ROUNDS:
         before = found
-        found = _closer(task, before, mips, one, 0)
+        found = _closer(task, before, mips, one, 0.0, 0)
         if one.across == ACROSS:  # the match itself is among those compared
             assert bool((found.scores >= before.scores - 1e-4).all())
             assert float((found.scores - before.scores).mean()) > 0.1

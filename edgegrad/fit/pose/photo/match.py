@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import torch
 import torch.nn.functional as F
@@ -26,8 +27,11 @@ from .views import Views, across, all_sides, pose_at
 SMALLEST, LARGEST, RATIO = 0.25, 1.25, 1.2
 ACROSS = 20  # pixels, the object's diagonal in the first views
 STRIDE = 2  # pixels between two places
+# How much rare colours count. Pixels nearby are alike, and not drawn one by one: of an object with colours of its own all of
+# them tell, of one with common colours hardly any.
+RARE = (0.4, 1.0)
 PLACES = 3  # of a view, at one size
-RANKED = 1500
+RANKED = 1500  # matches at most that are compared with one another
 MIP = 1.15  # between two sizes of the picture
 SHIFT = 2  # pixels to all sides that a match is moved by
 
@@ -84,13 +88,13 @@ class Round:
     placed: float
 
 
-FIRST = Round(ACROSS, 0.2, 0.1, 400, 0.2, 0.1)
+FIRST = Round(ACROSS, 0.2, 0.1, 200, 0.2, 0.1)
 ROUNDS = (
-    Round(20, 0.17, 0.1, 200, 0.1, 0.05),
-    Round(32, 0.12, 0.07, 80, 0.1, 0.05),
-    Round(32, 0.07, 0.04, 32, 0.15, 0.1),
+    Round(20, 0.17, 0.1, 100, 0.1, 0.05),
+    Round(32, 0.12, 0.07, 40, 0.1, 0.05),
+    Round(32, 0.07, 0.04, 16, 0.15, 0.1),
 )  # fmt: skip
-MASKED = 4  # times fewer are kept with a mask, which says where the object is
+MASKED = 2  # times fewer are kept with a mask, which says where the object is
 SIZED = 1.1  # factor between the sizes of matches that are kept both
 
 
@@ -143,21 +147,25 @@ class Mips:
 def matches(task: PoseTask, seed: int, tell: Callable[[str], object]) -> list[Pose]:
     """The best poses in the first picture, distinct, the best first. The mask, where there is one, says where they are. `tell` is
     called with what is done next."""
-    tell("views from all sides")
     mips = Mips(task, max(one.across for one in ROUNDS))
+    tell("views from all sides")
     views = Views.of(task, all_sides(), ACROSS, seed)
-    found = _in_mask(task, views, mips) if mips.masked else _everywhere(views, mips)
     fewer = MASKED if mips.masked else 1
-    found = found.distinct(FIRST.kept // fewer, FIRST.turned, FIRST.placed, SIZED)
-    for k, one in enumerate(ROUNDS):
-        if len(found.scores):
-            tell(f"views nearby, {k + 1} of {len(ROUNDS)}")
-            found = _closer(task, found, mips, one, seed).distinct(one.kept // fewer, one.turned, one.placed, SIZED)
-    return found.poses(task)
+    ways = []
+    for rare in RARE[:1] if mips.masked else RARE:
+        found = _in_mask(views, mips) if mips.masked else _everywhere(views, mips, rare)
+        found = found.distinct(FIRST.kept // fewer, FIRST.turned, FIRST.placed, SIZED)
+        for k, one in enumerate(ROUNDS):
+            if len(found.scores):
+                tell(f"views nearby, {k + 1} of {len(ROUNDS)}")
+                found = _closer(task, found, mips, one, rare, seed)
+                found = found.distinct(one.kept // fewer, one.turned, one.placed, SIZED)
+        ways.append(found.poses(task))
+    return [pose for pair in zip_longest(*ways) for pose in pair if pose is not None]
 
 
-def _everywhere(views: Views, mips: Mips) -> Matches:
-    (H, W), templates, T = mips.size, Templates(views), views.alpha.shape[-1]
+def _everywhere(views: Views, mips: Mips, rare: float) -> Matches:
+    (H, W), templates, T = mips.size, Templates(views, rare), views.alpha.shape[-1]
     margin = T // 3
     rotations, positions, sizes, values = [], [], [], []
     for k in range(1 + math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO))):
@@ -181,7 +189,7 @@ def _everywhere(views: Views, mips: Mips) -> Matches:
     return Matches(torch.cat(rotations), torch.cat(positions), torch.cat(sizes), torch.cat(values))
 
 
-def _in_mask(task: PoseTask, views: Views, mips: Mips) -> Matches:
+def _in_mask(views: Views, mips: Mips) -> Matches:
     """Each view as large as the mask, by their areas, and in its middle."""
     mask = mips.picture[..., -1]
     mass = mask.sum()
@@ -195,11 +203,11 @@ def _in_mask(task: PoseTask, views: Views, mips: Mips) -> Matches:
     ratio = (mass.clamp(min=1e-3) / area).sqrt()  # pixels of the picture in one of the view
     positions = (middle + (0.5 * T - offset) * ratio[:, None]).double()
     pixels = views.across * ratio.double()
-    scores = Templates(views).near(mips.crops(positions, pixels, views.across, T), True)[:, 0, 0]
+    scores = Templates(views, 0.0).near(mips.crops(positions, pixels, views.across, T), True)[:, 0, 0]
     return Matches(views.rotations, positions, pixels, scores)
 
 
-def _closer(task: PoseTask, found: Matches, mips: Mips, one: Round, seed: int) -> Matches:
+def _closer(task: PoseTask, found: Matches, mips: Mips, one: Round, rare: float, seed: int) -> Matches:
     """Each match at the best of the poses around it."""
     turns = [torch.zeros(3, dtype=torch.float64)]
     for axis in range(3):
@@ -208,7 +216,7 @@ def _closer(task: PoseTask, found: Matches, mips: Mips, one: Round, seed: int) -
     n, k = len(found.scores), len(turns)
     rotations = (torch.stack([rotation(turn) for turn in turns]) @ found.rotations[:, None]).flatten(0, 1)
     views = Views.of(task, rotations, one.across, seed)
-    templates, T = Templates(views), views.alpha.shape[-1]
+    templates, T = Templates(views, rare), views.alpha.shape[-1]
     origin, size = (x.repeat_interleave(k, 0) for x in (found.positions, found.pixels))
     best = Matches(rotations, origin, size, torch.full((n * k,), -math.inf))
     for factor in (1.0 - one.grow, 1.0, 1.0 + one.grow):

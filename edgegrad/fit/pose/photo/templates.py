@@ -23,7 +23,6 @@ NOISE = 0.06  # standard deviation of a pixel, sRGB values: of noise, and of wha
 SHADE = 0.3  # of the light's slopes, relative to its constant
 WHITE = 0.15  # of the light's colour
 SHAPE = 0.25  # of a mask's error beside that of colours
-RARE = 0.5  # of the ratio to the picture's colours beside that to one colour: pixels nearby are alike, and not drawn one by one
 ALIKE = 0.08  # standard deviation of colours that look alike, sRGB values
 COUNTED = 1500  # pixels that tell how frequent colours are
 
@@ -31,7 +30,9 @@ COUNTED = 1500  # pixels that tell how frequent colours are
 class Templates:
     """Views as filters of pictures with the channels C, which may be none."""
 
-    def __init__(self, views: Views) -> None:
+    def __init__(self, views: Views, rare: float) -> None:
+        """`rare`: how much the ratio to the picture's colours counts beside that to one colour."""
+        self.rare = rare
         alpha, colours, normals = views.alpha, views.colours, views.normals
         self.C = colours.shape[-1]
         self.alpha = alpha
@@ -104,7 +105,7 @@ class Templates:
         to_one = 0.5 * self.C * (inside + around) * torch.log((even + noise) / (error + beside + noise))
         variance = error / (self.C * inside) + NOISE**2
         to_all = rare - 0.5 * self.C * inside * (variance.log() + math.log(2.0 * math.pi) + 1.0)
-        return to_one + RARE * to_all
+        return to_one + self.rare * to_all
 
 
 def surprise(picture: Tensor) -> Tensor:
