@@ -18,8 +18,9 @@ from .pose import Pose
 from .task import GROW, TURN, PoseTask
 
 WIDEST = 1.0  # radian and object size, the standard deviation of what the pictures do not show at all
-# Edges and textures are missed by the same part of a pixel all along: of the standard deviations of independent pixels.
-TOGETHER = 3.0
+# Shadows, blur and errors of the light model are alike in pixels nearby: errors of fits to lit pictures are so many times the
+# standard deviations of independent pixels, as measured.
+TOGETHER = 8.0
 DEGREES, SHARE = 5.0, 0.05  # a direction that is known less exactly than this, in degrees or object sizes, is unknown
 
 
