@@ -101,7 +101,7 @@ def fit_pose(
                 render's edges. Around `init` they are turned by up to 45°; without it they are turned in all ways, at the place
                 that `init` says for None. "global" looks for the object in the whole first picture, seen by a perspective or
                 orthographic camera, from all sides and at sizes from 0.25 to 1.25 of the picture's shorter side, or in the
-                mask, in 10 … 30 s of processor time; `init` is None then. 1: the start alone, and what `search` does further;
+                mask, in 5 … 40 s of processor time; `init` is None then. 1: the start alone, and what `search` does further;
                 with more, `search` has no say
     progress    show a bar with the loss on standard error
     callback    called after each step with the best fit so far
