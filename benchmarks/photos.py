@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -129,21 +130,25 @@ class Run:
     backgrounds: Sequence[Tensor]
 
     def fitted(
-        self, part: Part, case: Case, start: Placed, truth: Placed, label: str, search: bool = True
-    ) -> tuple[Trial, PoseFit]:
+        self, part: Part, case: Case, start: Placed | None, truth: Placed, label: str,
+        mask: Tensor | None = None, search: bool = True,
+    ) -> tuple[Trial, PoseFit]:  # fmt: skip
+        """Without a start, it is looked for."""
         fit = fit_pose(
-            case.mesh, case.picture, case.camera, init=start.matrix, depth=case.depth, search=search, progress=False
-        )
+            case.mesh, case.picture, case.camera, mask, None if start is None else start.matrix, depth=case.depth,
+            search=search, starts="global" if start is None else 1, progress=False,
+        )  # fmt: skip
         found = Placed(fit.R, fit.t)
         return self.noted(part, case, start, found, truth, fit, label), fit
 
     def noted(
-        self, part: Part, case: Case, start: Placed, found: Placed, truth: Placed, fit: PoseFit, label: str,
+        self, part: Part, case: Case, start: Placed | None, found: Placed, truth: Placed, fit: PoseFit, label: str,
         camera: eg.Camera | None = None,
     ) -> Trial:  # fmt: skip
         """A trial of the part. `camera`: that of the fit, where it is not the case's."""
         limits = part.limits
-        before, after = case.apart(start, truth), case.apart(found, truth)
+        before = (math.nan, math.nan) if start is None else case.apart(start, truth)
+        after = case.apart(found, truth)
         off = max(after[0] / limits.degrees, after[1] / case.size / limits.shift)
         trial = Trial(
             case.name, before[0], before[1] / case.size, after[0], after[1] / case.size, after[1], fit.explained,
@@ -157,12 +162,14 @@ class Run:
         return trial
 
 
-def outlined(case: Case, start: Placed, found: Placed, camera: eg.Camera | None = None) -> Tensor:
+def outlined(case: Case, start: Placed | None, found: Placed, camera: eg.Camera | None = None) -> Tensor:
     """(H, W, 3): the photograph with the contour of the start in blue and that of the fit, by its own camera, in yellow."""
     image = case.picture
     for pose, seen, colour in (
         (start, case.camera, (0.1, 0.3, 1.0)), (found, camera or case.camera, (1.0, 0.9, 0.0)),
     ):  # fmt: skip
+        if pose is None:
+            continue
         alpha = eg.render_aovs(case.mesh.transformed(pose.R, pose.t), seen, ["alpha"], 16)["alpha"]
         highest = F.max_pool2d(alpha.movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
         image = torch.where(highest - alpha > RIM, torch.tensor(colour), image)
@@ -213,6 +220,23 @@ def _cameras(focal: bool, limits: Limits) -> Callable[[Run, str], Part]:
             if focal:
                 ratio = [float(one.K[0, 0] / case.camera.K[0, 0]) for one in (given, fit.camera)]
                 print(f"    focal length {ratio[0] - 1:+.1%} → {ratio[1] - 1:+.1%}", flush=True)
+        return part
+
+    return run
+
+
+def _anywhere(masked: bool) -> Callable[[Run, str], Part]:
+    """Lit pictures without a start, with a mask or without."""
+
+    def run(run: Run, name: str) -> Part:
+        part = Part(name, Limits(1.0, 0.01, 0.90))
+        for k in range(run.starts):
+            number = k % len(run.meshes)
+            case = rendered(f"lit {number}", run.meshes[number], run.backgrounds, "lit", 200 + k)
+            placed, mask = case.mesh.transformed(case.truth.R, case.truth.t), None
+            if masked:
+                mask = (eg.render_aovs(placed, case.camera, ["alpha"], 16)["alpha"] >= 0.5).float()
+            run.fitted(part, case, None, case.truth, f"{name}-{k:02d}", mask)
         return part
 
     return run
@@ -273,6 +297,8 @@ MADE: dict[str, Callable[[Run, str], Part]] = {
     "plain": _scenes("plain", 15.0, 0.05, Limits(2.0, 0.03, 0.80)),
     "camera": _cameras(False, Limits(1.0, 0.01, 0.90)),
     "focal": _cameras(True, Limits(1.5, 0.1, 0.80)),  # its distance goes with the focal length
+    "global": _anywhere(False),
+    "global-mask": _anywhere(True),
 }
 REAL: dict[str, Callable[[Run, Path], Iterator[Part]]] = {
     "squirrel": _squirrel, "gelatin_box": _gelatin_box, "cracker_box": _cracker_box, "bottle": _bottle,

@@ -15,10 +15,11 @@ from .pose.fit_camera import CameraFit, fit_camera
 from .pose.fit_pose import fit_pose
 from .pose.result import PoseFit, Step
 from .pose.track import TrackedPose, track
+from .pose.uncertainty import Uncertainty
 from .unwrapping import unwrapped
 
 __all__ = [
     "CameraFit", "Ending", "Fit", "Measured", "Options", "Parameter", "Pose", "PoseFit", "PoseParameter", "Progress", "Record",
-    "Step", "TrackedPose", "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers", "track",
-    "unwrapped", "visual_hull",
+    "Step", "TrackedPose", "Uncertainty", "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses",
+    "regularizers", "track", "unwrapped", "visual_hull",
 ]  # fmt: skip

@@ -27,13 +27,15 @@ from ..checkpoints import Checkpoint, traits
 from ..options import check_checkpoint
 from ..upside_down import BETTER, say_upside_down
 from .journal import Journal
+from .photo.match import matches
 from .photo.search import PhotoSearch
-from .photo.starts import Starts, anywhere, around, everywhere
+from .photo.starts import Starts, Tell, around, everywhere
 from .place import placed
 from .pose import Pose, pose_from_matrix
 from .result import PoseFit
 from .search import Search
 from .task import Lens, Names, PoseTask
+from .uncertainty import Uncertainty
 
 MOST_STARTS = 1000
 
@@ -95,11 +97,12 @@ def fit_pose(
                 box), and logarithms of scale and focal length
     seed        the same seed gives the same fit
     search      False for a start near the answer: one way down from there, whatever it ends at
-    starts      how many poses to start from; the best after a few steps are followed down, until an end shows 80 % of the
+    starts      how many poses to start from; the best after a few steps are followed down, until an end shows 85 % of the
                 render's edges. Around `init` they are turned by up to 45°; without it they are turned in all ways, at the place
                 that `init` says for None. "global" looks for the object in the whole first picture, seen by a perspective or
                 orthographic camera, from all sides and at sizes from 0.25 to 1.25 of the picture's shorter side, or in the
-                mask; `init` is None then. 1: the start alone, and what `search` does further; with more, `search` has no say
+                mask, in 5 … 40 s of processor time; `init` is None then. 1: the start alone, and what `search` does further;
+                with more, `search` has no say
     progress    show a bar with the loss on standard error
     callback    called after each step with the best fit so far
     checkpoint  a file that holds the fit's state, written every `checkpoint_every` steps and at the end, never in part
@@ -113,8 +116,10 @@ def fit_pose(
     the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few times as long,
     less where nothing in the picture looks like the object; where they do, but something covers the object or it is of another
     colour, nearby, in about the same time again. Another pose is the answer only if its loss is lower than that of `init` in the
-    final comparison, and its edges are as well in the picture. KeyboardInterrupt, also from the callback, ends the fit and
-    returns the best so far with `interrupted` set.
+    final comparison, and its edges are as well in the picture. In photographs `uncertainty` says how exactly the terms show the
+    pose, and a rotation that is known less exactly than to 5°, or a place than to 5 % of the object's size, is not `converged`:
+    `reason` names the direction, which a continuous one of the `symmetries` makes known.
+    KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set.
     Works in torch.no_grad() and torch.inference_mode() too. Raises TypeError or ValueError that names the argument, also when
     the object leaves no trace in the picture at the start.
     """
@@ -172,11 +177,12 @@ def search_pose(
     if starts == 1:
         ways = way(start, journal, search)
     else:
-        made = (
-            partial(anywhere, task, seed)
-            if starts == "global"
-            else partial(around if init is not None else everywhere, task, start, starts)
-        )
+
+        def made(tell: Tell) -> list[Pose]:
+            if starts == "global":
+                return matches(task, seed, tell)
+            return (around if init is not None else everywhere)(task, start, starts)
+
         ways = Starts(task, start, made, depths, max_size, seed, journal, partial(way, further=False))
     interrupted = False
 
@@ -191,9 +197,13 @@ def search_pose(
         best: Pose = ways.best if symmetries is None else ways.best.closest(symmetries, start)
         history = list(ways.history)
         cameras = [task.lens(one, best) for one in given_cameras]
+        known = None
+        if ways.curvature is not None:
+            known = Uncertainty.of(task, best, ways.curvature, task.free, symmetries)
+        sure = ways.converged and not interrupted and (known is None or not known.unknown)
         return PoseFit(
-            best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), seconds(),
-            ways.converged and not interrupted, interrupted, ways.explained, history, task, cameras,
+            best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), seconds(), sure, interrupted,
+            ways.explained, history, task, cameras, known,
         )  # fmt: skip
 
     total = max(ways.planned, journal.steps)
@@ -211,6 +221,8 @@ def search_pose(
             keep()
 
     ways.after_step = after_step
+    if isinstance(ways, Starts):
+        ways.tell = bar.set_postfix_str
     try:
         ways.run()
         if search and not isinstance(ways, Starts) and not ways.converged and ways.explained < ways.enough:

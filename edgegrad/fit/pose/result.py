@@ -17,12 +17,14 @@ from ...camera.camera import Camera
 from ...files.paths import PathLike, replacing
 from ...optional import DRAWING, require
 from ..ending import Ending, reason_of
+from ..verdict import ENOUGH
 from .pose import Pose, pose_from_matrix
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from .task import PoseTask
+    from .uncertainty import Uncertainty
 
 
 class Step(NamedTuple):
@@ -62,6 +64,8 @@ class PoseFit:
     cameras: list[Camera] = field(
         default_factory=list, repr=False
     )  # all that were given, as `camera`; not kept in JSON
+    # How exactly the terms of photographs show the pose; None where others decided, or before the answer. Not kept in JSON
+    uncertainty: Uncertainty | None = field(default=None, repr=False)
 
     @property
     def matrix(self) -> Tensor:
@@ -71,9 +75,16 @@ class PoseFit:
 
     @property
     def reason(self) -> str:
-        """In words: "converged", or what kept the fit from that: "edges not explained: …", "steps ran out: …", "interrupted"."""
+        """In words: "converged", or what kept the fit from that: "edges not explained: …",
+        "directions unknown: …", "steps ran out: …", "interrupted"."""
         ending = Ending.INTERRUPTED if self.interrupted else Ending.FLAT if self.converged else Ending.STEPS
-        return reason_of(ending, self.explained, "mesh, camera or picture")
+        words = reason_of(ending, self.explained, "mesh, camera or picture")
+        if self.uncertainty is None or not self.uncertainty.unknown or self.interrupted or self.explained < ENOUGH:
+            return words
+        return (
+            f"directions unknown: {self.uncertainty.unknown}; give the mesh's colours, symmetries of the mesh, depth, or another "
+            "picture"
+        )
 
     def plot(self) -> Figure:
         """target | start | fit | difference, a row for each picture; with a mask all over black, as they were compared."""

@@ -69,6 +69,7 @@ class Search:
     search that is given it goes on from there."""
 
     enough = ENOUGH
+    curvature = None  # how exactly colours as they are show a pose is not known
 
     def __init__(
         self, task: PoseTask, levels: list[Level], start: Pose, steps: int, tolerance: float, seed: int,

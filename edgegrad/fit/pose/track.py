@@ -27,7 +27,7 @@ from ..views import check_image
 from .fit_pose import depth_image
 from .gauss_newton import Normal
 from .photo.level import PhotoLevel, Seen, photo_levels
-from .photo.match import look_alikes, matches
+from .photo.match import ACROSS, places
 from .photo.picture import Picture
 from .photo.remembered import Remembered
 from .photo.search import ALONE_ENOUGH, DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST
@@ -298,9 +298,9 @@ class Tracker:
         rotations = ball(VIEWS, TURNED) @ (camera.world_to_camera[:3, :3] @ self.good.R)
         far = self._distance(self.good)
         size = across(unit, camera, far) / min(camera.size)
-        views = self.remembered.shone_on(Views.of(unit, rotations, self.seed), camera)
-        look = matches if self.remembered.light is None else look_alikes
-        poses = [pose._replace(scale=scale) for pose in look(unit, views, (size / SIZES, size * SIZES))]
+        views = self.remembered.shone_on(Views.of(unit, rotations, ACROSS, self.seed), camera)
+        lit = self.remembered.light is not None
+        poses = [pose._replace(scale=scale) for pose in places(unit, views, (size / SIZES, size * SIZES), lit)]
         if camera.projection == "orthographic":  # which does not show it
             axis = camera.world_to_camera[2, :3]
             poses = [pose._replace(t=pose.t + (far - self._distance(pose)) * axis) for pose in poses]

@@ -1,256 +1,270 @@
-"""Where in a picture an object might be, and how it is turned: views of it, compared with the picture everywhere at low
-resolution.
+"""Where in a picture an object might be, and how it is turned.
 
-A view explains a part of a picture by the mesh's colours in the light that fits them best there. What it has to beat is, for one
-list of matches, one colour for all of the part, where the view has one around the object, and for another that the pixels are
-drawn from the colours of the whole picture: the first finds contours and patterns, the second rare colours. With the basis B of
-colours times harmonics inside the silhouette, the squared error is Σy² − bᵀA⁻¹b, with b = Σ B y and A = Σ B Bᵀ (a matched
-subspace filter, Scharf and Friedlander 1994). A does not depend on the place, and b is a correlation, so all places are had at
-once.
+Views of it from all sides are compared with the picture everywhere at low resolution, and the best matches are turned, moved and
+resized by ever smaller amounts, at higher resolution, of which ever fewer are kept (a beam search).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import zip_longest
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ....camera.poses import rotation
 from ....files.image import linear_to_srgb
 from ...views import area_mean
-from ..pose import Pose, angle
+from ..pose import Pose
 from ..task import PoseTask
-from .views import ACROSS, RING, Views, across, pose_at
+from .templates import Templates, surprise
+from .views import Views, across, all_sides, pose_at
 
-SIZES, RATIO = (0.25, 1.25), 1.2  # the object's diagonal in the picture's shorter sides, and between two sizes
+# Of the object's diagonal in the picture's shorter sides, and between two sizes.
+SMALLEST, LARGEST, RATIO = 0.25, 1.25, 1.2
+ACROSS = 20  # pixels, the object's diagonal in the first views
 STRIDE = 2  # pixels between two places
-AT_ONCE = 128  # views
-NOISE = 0.06  # standard deviation of a pixel, sRGB values: of noise, and of what views lack by their spacing
-SHADE = 0.3  # of the light's slopes, relative to its constant
-WHITE = 0.15  # of the light's colour
-SHAPE = 0.25  # of a mask's error beside that of colours
-POWERS = (
-    1.0,
-    1.4,
-)  # of the object's size, that the ratios are multiplied by: larger ones have more pixels, which are alike
+# How much rare colours count. Pixels nearby are alike, and not drawn one by one: of an object with colours of its own all of
+# them tell, of one with common colours hardly any.
+RARE = (0.4, 1.0)
 PLACES = 3  # of a view, at one size
-TURNED_APART, PLACED_APART, SIZED_APART = 0.3, 0.15, 1.3  # radians, object sizes, factor: poses that are kept both
-KEPT = 24
-ALIKE = 0.08  # standard deviation of colours that look alike, sRGB values
-COUNTED = 1500  # pixels that tell how frequent colours are
-RANKED = 2000
+RANKED = 1500  # matches at most that are compared with one another
+MIP = 1.15  # between two sizes of the picture
+SHIFT = 2  # pixels to all sides that a match is moved by
 
 
-class Match(NamedTuple):
-    """A view, somewhere in a picture."""
+@dataclass(frozen=True)
+class Matches:
+    """Views at places of a picture."""
 
-    score: float
-    view: int
-    position: Tensor  # (2,) of the object's centre, pixels of the picture
-    pixels: float  # of the picture, across the object
+    rotations: Tensor  # (n, 3, 3) float64, as Views have them
+    positions: Tensor  # (n, 2) float64 of the object's centre, pixels of the picture
+    pixels: Tensor  # (n,) float64 of the picture, across the object
+    scores: Tensor  # (n,)
+
+    def of(self, rows: Tensor) -> Matches:
+        return Matches(self.rotations[rows], self.positions[rows], self.pixels[rows], self.scores[rows])
+
+    def distinct(self, most: int, turned: float, placed: float, sized: float) -> Matches:
+        """The best ones, the best first. Of two whose angle is below `turned` radians, whose distance is below `placed` of their
+        size, and whose sizes differ by less than the factor `sized`, the better one is kept."""
+        ranked = self.of(self.scores.argsort(descending=True, stable=True)[:RANKED])
+        flat = ranked.rotations.flatten(1)
+        cosine = 0.5 * (flat @ flat.T - 1.0)
+        larger = torch.maximum(ranked.pixels[:, None], ranked.pixels)
+        alike = cosine > math.cos(turned)
+        alike &= torch.cdist(ranked.positions, ranked.positions) < placed * larger
+        alike &= larger < sized * torch.minimum(ranked.pixels[:, None], ranked.pixels)
+        kept: list[int] = []
+        free = torch.ones(len(flat), dtype=torch.bool)
+        while len(kept) < most and bool(free.any()):
+            first = int(free.int().argmax())
+            kept.append(first)
+            free &= ~alike[first]
+            free[first] = False
+        return ranked.of(torch.tensor(kept, dtype=torch.long))
+
+    def poses(self, task: PoseTask) -> list[Pose]:
+        camera = task.shots[0].camera
+        found = []
+        for R, position, pixels in zip(self.rotations, self.positions, self.pixels.tolist(), strict=True):
+            depth = 2.0 * task.size if camera.projection == "orthographic" else across(task, camera, 1.0) / pixels
+            found.append(pose_at(task, R, position, depth))
+        return found
 
 
-def matches(task: PoseTask, views: Views, sizes: tuple[float, float] = SIZES) -> list[Pose]:
-    """The best poses in the first picture, distinct, the best first. The mask, where there is one, says where they are, or else
-    they have `sizes` between two, of the object's diagonal in the picture's shorter sides."""
-    masked = "alpha" in task.aovs and not task.clutter
-    if masked:
-        return _distinct(task, views, _in_mask(task, views), KEPT)
-    first, second = (_distinct(task, views, found, KEPT) for found in _everywhere(task, views, sizes))
-    return [pose for pair in zip(first, second, strict=False) for pose in pair]
+@dataclass(frozen=True)
+class Round:
+    """Of the search near matches."""
+
+    across: int  # pixels, the object's diagonal in the views
+    turn: float  # radians, about each axis
+    grow: float  # share of the size
+    kept: int
+    turned: float  # radians, of those that are kept, as Matches.distinct() has them
+    placed: float
 
 
-def look_alikes(task: PoseTask, views: Views, sizes: tuple[float, float]) -> list[Pose]:
-    """As matches(), of views whose colours are in the light of the picture: where they are alike inside, pixel by pixel."""
+FIRST = Round(ACROSS, 0.2, 0.1, 200, 0.2, 0.1)
+ROUNDS = (
+    Round(20, 0.17, 0.1, 100, 0.1, 0.05),
+    Round(32, 0.12, 0.07, 40, 0.1, 0.05),
+    Round(32, 0.07, 0.04, 16, 0.15, 0.1),
+)  # fmt: skip
+MASKED = 2  # times fewer are kept with a mask, which says where the object is
+DISTINCT = 24, 0.3, 0.15, 1.3  # of the places of given views, as Matches.distinct() has them
+SIZED = 1.1  # factor between the sizes of matches that are kept both
+
+
+class Mips:
+    """The first picture at many sizes, from which what a match covers is taken. The last channel is surprise(), or the mask."""
+
+    def __init__(self, task: PoseTask, finest: int) -> None:
+        """`finest`: pixels across the smallest object."""
+        shot = task.shots[0]
+        self.masked = "alpha" in task.aovs and not task.clutter
+        target = shot.target.float().clamp(0.0, 1.0)
+        mask = target[..., -1:] if self.masked else None
+        colours = linear_to_srgb(target[..., :-1] * (mask > 0.0) if mask is not None else target)
+        self.picture = colours if mask is None else torch.cat([colours, mask], -1)
+        self.size = shot.camera.size
+        self.factor = 1.0 if self.masked else min(1.0, finest / (SMALLEST * min(self.size)))
+        self._levels: dict[int, Tensor] = {}
+
+    def reduced(self, factor: float) -> Tensor:
+        """(C + 1, h, w)."""
+        size = max(1, round(self.size[0] * factor)), max(1, round(self.size[1] * factor))
+        picture = area_mean(self.picture, size).movedim(-1, 0)
+        return picture if self.masked else torch.cat([picture, surprise(picture)[None]])
+
+    def crops(self, positions: Tensor, pixels: Tensor, across: int, side: int) -> Tensor:
+        """(n, C + 1, side, side) around positions (n, 2), `across` of whose pixels are as long as so many (n,) of the picture."""
+        wanted = ((self.factor * pixels / across).log() / math.log(MIP)).round().clamp(min=0).long()
+        steps = torch.arange(side, dtype=torch.float64) + 0.5 - 0.5 * side
+        H, W = self.size
+        found = None
+        for level in wanted.unique().tolist():
+            rows = (wanted == level).nonzero()[:, 0]
+            if level not in self._levels:
+                self._levels[level] = self.reduced(self.factor * MIP**-level)
+            image = self._levels[level]
+            offsets = (pixels[rows] / across)[:, None] * steps
+            x = 2.0 * (positions[rows, :1] + offsets) / W - 1.0
+            y = 2.0 * (positions[rows, 1:] + offsets) / H - 1.0
+            at = torch.stack(torch.broadcast_tensors(x[:, None, :], y[:, :, None]), -1).float()
+            padding = "zeros" if self.masked else "border"
+            seen = F.grid_sample(
+                image[None].expand(len(rows), -1, -1, -1), at, align_corners=False, padding_mode=padding
+            )
+            if found is None:
+                found = seen.new_empty(len(positions), *seen.shape[1:])
+            found[rows] = seen
+        return torch.empty(0) if found is None else found
+
+
+def matches(task: PoseTask, seed: int, tell: Callable[[str], object]) -> list[Pose]:
+    """The best poses in the first picture, distinct, the best first. The mask, where there is one, says where they are. `tell` is
+    called with what is done next."""
+    mips = Mips(task, max(one.across for one in ROUNDS))
+    tell("views from all sides")
+    views = Views.of(task, all_sides(), ACROSS, seed)
+    fewer = MASKED if mips.masked else 1
+    ways = []
+    for rare in RARE[:1] if mips.masked else RARE:
+        found = _in_mask(views, mips) if mips.masked else _everywhere(views, mips, _ratios(views, rare))
+        found = found.distinct(FIRST.kept // fewer, FIRST.turned, FIRST.placed, SIZED)
+        for k, one in enumerate(ROUNDS):
+            if len(found.scores):
+                tell(f"views nearby, {k + 1} of {len(ROUNDS)}")
+                found = _closer(task, found, mips, one, rare, seed)
+                found = found.distinct(one.kept // fewer, one.turned, one.placed, SIZED)
+        ways.append(found.poses(task))
+    return [pose for pair in zip_longest(*ways) for pose in pair if pose is not None]
+
+
+def places(task: PoseTask, views: Views, sizes: tuple[float, float], lit: bool) -> list[Pose]:
+    """The best of some views in the first picture, distinct, the best first, between two sizes of the object's diagonal in the
+    picture's shorter sides. `lit`: their colours are in the light of the picture."""
+    score = _errors(views) if lit else _ratios(views, RARE[0])
+    return _everywhere(views, Mips(task, views.across), score, sizes).distinct(*DISTINCT).poses(task)
+
+
+Score = Callable[
+    [Tensor, float], Tensor
+]  # of a picture (C + 1, h, w), in which so many of the whole one's are across the object
+
+
+def _ratios(views: Views, rare: float) -> Score:
+    """Log likelihood ratios, weighted: larger objects have more pixels, and those are alike."""
+    templates = Templates(views, rare)
+    return lambda picture, pixels: templates.everywhere(picture, STRIDE) * pixels
+
+
+def _errors(views: Views) -> Score:
+    """How alike views and picture are inside, pixel by pixel: the mean squared difference, negative."""
     inside = torch.where(views.alpha > 0.5, views.alpha, torch.zeros_like(views.alpha))
     area = inside.sum((1, 2)).clamp(min=1.0)[:, None, None]
     weighted = (inside[..., None] * views.colours).movedim(-1, 1)
     own = (weighted * views.colours.movedim(-1, 1)).sum((1, 2, 3))[:, None, None]
-    found = []
-    for picture, pixels, factors, margin in _sized(task, views, sizes):
-        squares = F.conv2d(picture.square().sum(0)[None, None], inside[:, None], stride=STRIDE)[0]
-        error = (squares - 2.0 * F.conv2d(picture[None], weighted, stride=STRIDE)[0] + own) / area
-        found += _best(-error, pixels, factors, margin, views)
-    return _distinct(task, views, found, KEPT)
+
+    def score(picture: Tensor, pixels: float) -> Tensor:
+        colours = picture[:-1]
+        squares = F.conv2d(colours.square().sum(0)[None, None], inside[:, None], stride=STRIDE)[0]
+        return -(squares - 2.0 * F.conv2d(colours[None], weighted, stride=STRIDE)[0] + own) / area
+
+    return score
 
 
-class _Filter:
-    """Views as filters of pictures with the channels C."""
-
-    def __init__(self, views: Views) -> None:
-        alpha, colours, normals = views.alpha, views.colours, views.normals
-        self.C = colours.shape[-1]
-        self.inside = torch.where(alpha > 0.5, alpha, torch.zeros_like(alpha))
-        near = F.max_pool2d((alpha > 0.02).float()[:, None], 2 * RING + 1, 1, RING)[:, 0]
-        self.around = near * (alpha < 0.02)
-        Y = torch.cat([torch.ones_like(normals[..., :1]), normals], -1)
-        basis = colours[..., None] * Y[..., None, :]  # (n, T, T, C, 4)
-        weighted = basis * self.inside[..., None, None]
-        A = torch.einsum("nijck,nijcl->nckl", weighted, basis)
-        self.inverse = torch.linalg.inv(_with_prior(A.double())).float()  # (n, 4C, 4C)
-        self.filters = weighted.permute(0, 3, 4, 1, 2)  # (n, C, 4, T, T)
-
-    def scores(self, picture: Tensor, surprise: Tensor, stride: int) -> Tensor:
-        """(2, n, h, w) of a picture (C, H, W), of whose pixels `surprise` (H, W) is −log of the density of their colours: log
-        likelihood ratios of the view to one colour for all, a pixel, and to the colours of the whole picture."""
-        parts = []
-        sides = torch.stack([self.inside, self.around], 1)
-        for at in range(0, len(self.inside), AT_ONCE):
-            rows = slice(at, at + AT_ONCE)
-            n = len(self.inside[rows])
-            b, sums = [], []
-            for c in range(self.C):
-                both = torch.cat([self.filters[rows, c], sides[rows]], 1).flatten(0, 1)[:, None]
-                out = F.conv2d(picture[None, c : c + 1], both, stride=stride)[0]
-                out = out.reshape(n, 6, *out.shape[1:])
-                b.append(out[:, :4])
-                sums.append(out[:, 4:])
-            squares = F.conv2d(picture.square().sum(0)[None, None], sides[rows].flatten(0, 1)[:, None], stride=stride)[
-                0
-            ]
-            squares = squares.reshape(n, 2, *squares.shape[1:])
-            rare = F.conv2d(surprise[None, None], self.inside[rows, None], stride=stride)[0]
-            parts.append(self._ratios(torch.cat(b, 1), torch.stack(sums, 2), squares, rare, rows))
-        return torch.cat(parts, 1)
-
-    def _ratios(self, b: Tensor, sums: Tensor, squares: Tensor, rare: Tensor, rows: slice) -> Tensor:
-        """b (n, 4C, h, w); sums (n, 2, C, h, w) and squares (n, 2, h, w) of what is inside and around; rare (n, h, w)."""
-        inside, around = (x[rows].sum((1, 2)).clamp(min=1e-3)[:, None, None] for x in (self.inside, self.around))
-        error = (squares[:, 0] - (b * torch.einsum("nkl,nlhw->nkhw", self.inverse[rows], b)).sum(1)).clamp(min=0.0)
-        beside = (squares[:, 1] - sums[:, 1].square().sum(1) / around).clamp(min=0.0)
-        even = (squares.sum(1) - sums.sum(1).square().sum(1) / (inside + around)).clamp(min=0.0)
-        noise = NOISE**2 * self.C * (inside + around)
-        variance = error / (self.C * inside) + NOISE**2
-        return torch.stack([
-            torch.log((even + noise) / (error + beside + noise)),
-            rare - 0.5 * self.C * inside * (variance.log() + math.log(2.0 * math.pi) + 1.0),
-        ])  # fmt: skip
-
-    def errors(self, crops: Tensor) -> Tensor:
-        """(n,) squared errors inside each view, of pictures (n, C, T, T)."""
-        b = torch.einsum("ncfij,ncij->ncf", self.filters, crops).flatten(1)
-        total = (crops.square().sum(1) * self.inside).sum((1, 2))
-        return (total - torch.einsum("nk,nkl,nl->n", b, self.inverse, b)).clamp(min=0.0)
-
-
-def _with_prior(A: Tensor) -> Tensor:
-    """(n, 4C, 4C) of (n, C, 4, 4): the light is about white, and its slopes are smaller than its constant."""
-    n, C = A.shape[:2]
-    full = torch.zeros(n, C, 4, C, 4, dtype=A.dtype)
-    differ = torch.eye(C, dtype=A.dtype) - 1.0 / C
-    full += (NOISE / WHITE) ** 2 * differ[None, :, None, :, None] * torch.eye(4, dtype=A.dtype)[None, None, :, None, :]
-    slopes = torch.tensor([1e-3, 1.0, 1.0, 1.0], dtype=A.dtype) * (NOISE / SHADE) ** 2
-    for c in range(C):
-        full[:, c, :, c] += A[:, c] + torch.diag(slopes)
-    return full.reshape(n, 4 * C, 4 * C)
-
-
-def _everywhere(task: PoseTask, views: Views, sizes: tuple[float, float]) -> list[list[Match]]:
-    """By each of the ratios."""
-    filters = _Filter(views)
-    found: list[list[Match]] = [[], []]
-    for picture, pixels, factors, margin in _sized(task, views, sizes):
-        both = filters.scores(picture, _surprise(picture), STRIDE)
-        for kind, (scores, power) in enumerate(zip(both, POWERS, strict=True)):
-            found[kind] += _best(scores * pixels**power, pixels, factors, margin, views)
-    return found
-
-
-def _sized(
-    task: PoseTask, views: Views, sizes: tuple[float, float]
-) -> Iterator[tuple[Tensor, float, tuple[float, float], int]]:
-    """The first picture (C, h, w) at sizes at which objects have that of views; pixels across such objects in it, of how many
-    pixels of it one is a mean (x, y), and how many there are beside it."""
-    shot = task.shots[0]
-    H, W = shot.camera.size
-    target = linear_to_srgb(shot.target.float().clamp(0.0, 1.0))
-    T = views.alpha.shape[-1]
+def _everywhere(views: Views, mips: Mips, score: Score, sizes: tuple[float, float] = (SMALLEST, LARGEST)) -> Matches:
+    (H, W), T = mips.size, views.alpha.shape[-1]
     margin = T // 3
+    rotations, positions, extents, values = [], [], [], []
     for k in range(1 + math.floor(math.log(sizes[1] / sizes[0]) / math.log(RATIO))):
         pixels = sizes[0] * RATIO**k * min(H, W)  # across the object, in the picture
-        factor = min(1.0, ACROSS / pixels)
-        size = max(1, round(H * factor)), max(1, round(W * factor))
-        if min(size) + 2 * margin < T:
+        picture = mips.reduced(min(1.0, views.across / pixels))
+        h, w = picture.shape[1:]
+        if min(h, w) + 2 * margin < T:
             continue
-        picture = F.pad(area_mean(target, size).movedim(-1, 0)[None], (margin,) * 4, mode="replicate")[0]
-        yield picture, pixels, (W / size[1], H / size[0]), margin
+        scores = score(F.pad(picture[None], (margin,) * 4, mode="replicate")[0], pixels)
+        columns = scores.shape[-1]
+        best, at = scores.flatten(1).topk(min(PLACES, scores[0].numel()))
+        middle = torch.stack([at % columns, at // columns], -1).double() * STRIDE + 0.5 * T - margin
+        positions.append((middle * torch.tensor([W / w, H / h], dtype=torch.float64)).flatten(0, 1))
+        rotations.append(views.rotations.repeat_interleave(best.shape[1], 0))
+        extents.append(torch.full((best.numel(),), pixels, dtype=torch.float64))
+        values.append(best.flatten())
+    if not values:
+        return Matches(
+            torch.empty(0, 3, 3).double(), torch.empty(0, 2).double(), torch.empty(0).double(), torch.empty(0)
+        )
+    return Matches(torch.cat(rotations), torch.cat(positions), torch.cat(extents), torch.cat(values))
 
 
-def _best(scores: Tensor, pixels: float, factors: tuple[float, float], margin: int, views: Views) -> list[Match]:
-    """Of (n, h, w), the best places of each view."""
-    w, middle = scores.shape[-1], 0.5 * views.alpha.shape[-1] - margin
-    best, places = scores.flatten(1).topk(min(PLACES, scores[0].numel()))
-    found = []
-    for n, (values, here) in enumerate(zip(best.tolist(), places.tolist(), strict=True)):
-        for value, place in zip(values, here, strict=True):
-            x, y = STRIDE * (place % w) + middle, STRIDE * (place // w) + middle
-            found.append(Match(value, n, torch.tensor([x * factors[0], y * factors[1]]), pixels))
-    return found
-
-
-def _surprise(picture: Tensor) -> Tensor:
-    """(H, W), −log of the density of each pixel's colour in (C, H, W)."""
-    C, H, W = picture.shape
-    pixels = picture.flatten(1).T
-    some = pixels[:: max(1, len(pixels) // COUNTED)]
-    log = (-0.5 * (torch.cdist(pixels, some) / ALIKE).square()).logsumexp(1) - math.log(len(some))
-    return (C * math.log(ALIKE * math.sqrt(2.0 * math.pi)) - log).reshape(H, W)
-
-
-def _in_mask(task: PoseTask, views: Views) -> list[Match]:
+def _in_mask(views: Views, mips: Mips) -> Matches:
     """Each view as large as the mask, by their areas, and in its middle."""
-    shot = task.shots[0]
-    target = shot.target.float()
-    mask = target[..., -1].clamp(0.0, 1.0)
+    mask = mips.picture[..., -1]
     mass = mask.sum()
-    if not float(mass) > 0.0:
-        return []
-    H, W = shot.camera.size
+    H, W = mips.size
     rows, columns = torch.arange(H) + 0.5, torch.arange(W) + 0.5
-    middle = torch.stack([(mask.sum(0) * columns).sum(), (mask.sum(1) * rows).sum()]) / mass
+    middle = torch.stack([(mask.sum(0) * columns).sum(), (mask.sum(1) * rows).sum()]) / mass.clamp(min=1e-3)
     T = views.alpha.shape[-1]
     area = views.alpha.sum((1, 2)).clamp(min=1.0)
     grid = torch.arange(T) + 0.5
     offset = torch.stack([(views.alpha.sum(1) * grid).sum(1), (views.alpha.sum(2) * grid).sum(1)], -1) / area[:, None]
-    ratio = (mass / area).sqrt()  # pixels of the picture in one of the view
-    # As small as the smallest view has it, so that what is sampled is a mean.
-    factor = min(1.0, 1.0 / float(ratio.median()))
-    size = max(1, round(H * factor)), max(1, round(W * factor))
-    colours = linear_to_srgb(target[..., :-1].clamp(0.0, 1.0)) if target.shape[-1] > 1 else torch.zeros(H, W, 0)
-    small = area_mean(torch.cat([colours * (mask[..., None] > 0.0), mask[..., None]], -1), size).movedim(-1, 0)
-    x = middle[0] + (grid[None] - offset[:, :1]) * ratio[:, None]  # (n, T)
-    y = middle[1] + (grid[None] - offset[:, 1:]) * ratio[:, None]
-    at = torch.stack(torch.broadcast_tensors(x[:, None, :] / W, y[:, :, None] / H), -1) * 2.0 - 1.0
-    seen = F.grid_sample(small[None].expand(len(at), -1, -1, -1), at, align_corners=False)  # (n, C + 1, T, T)
-    error = SHAPE * (seen[:, -1] - views.alpha).square().sum((1, 2))
-    if target.shape[-1] > 1:
-        error = error + _Filter(views).errors(seen[:, :-1])
-    scores = -torch.log(error / area + NOISE**2)
-    found = []
-    for n, value in enumerate(scores.tolist()):
-        position = middle + (0.5 * T - offset[n]) * ratio[n]
-        found.append(Match(value, n, position, ACROSS * float(ratio[n])))
-    return found
+    ratio = (mass.clamp(min=1e-3) / area).sqrt()  # pixels of the picture in one of the view
+    positions = (middle + (0.5 * T - offset) * ratio[:, None]).double()
+    pixels = views.across * ratio.double()
+    scores = Templates(views, 0.0).near(mips.crops(positions, pixels, views.across, T), True)[:, 0, 0]
+    return Matches(views.rotations, positions, pixels, scores)
 
 
-def _distinct(task: PoseTask, views: Views, found: list[Match], most: int) -> list[Pose]:
-    camera = task.shots[0].camera
-    kept: list[tuple[Match, Pose]] = []
-    for one in sorted(found, key=lambda one: -one.score)[:RANKED]:
-        depth = 2.0 * task.size if camera.projection == "orthographic" else across(task, camera, 1.0) / one.pixels
-        pose = pose_at(task, views.rotations[one.view], one.position, depth)
-        if all(_apart(one, pose, *other) for other in kept):
-            kept.append((one, pose))
-            if len(kept) == most:
-                break
-    return [pose for _, pose in kept]
-
-
-def _apart(one: Match, pose: Pose, other: Match, known: Pose) -> bool:
-    larger = max(one.pixels, other.pixels)
-    if float((one.position - other.position).norm()) > PLACED_APART * larger:
-        return True
-    return larger > SIZED_APART * min(one.pixels, other.pixels) or angle(pose.R, known.R) > TURNED_APART
+def _closer(task: PoseTask, found: Matches, mips: Mips, one: Round, rare: float, seed: int) -> Matches:
+    """Each match at the best of the poses around it."""
+    turns = [torch.zeros(3, dtype=torch.float64)]
+    for axis in range(3):
+        for sign in (one.turn, -one.turn):
+            turns.append(torch.zeros(3, dtype=torch.float64).index_fill(0, torch.tensor([axis]), sign))
+    n, k = len(found.scores), len(turns)
+    rotations = (torch.stack([rotation(turn) for turn in turns]) @ found.rotations[:, None]).flatten(0, 1)
+    views = Views.of(task, rotations, one.across, seed)
+    templates, T = Templates(views, rare), views.alpha.shape[-1]
+    origin, size = (x.repeat_interleave(k, 0) for x in (found.positions, found.pixels))
+    best = Matches(rotations, origin, size, torch.full((n * k,), -math.inf))
+    for factor in (1.0 - one.grow, 1.0, 1.0 + one.grow):
+        pixels = factor * size
+        scores = templates.near(mips.crops(origin, pixels, one.across, T + 2 * SHIFT), mips.masked)
+        values, places = scores.flatten(1).max(1)
+        if not mips.masked:
+            values = values * pixels.float()
+        side = 2 * SHIFT + 1
+        shift = torch.stack([places % side - SHIFT, places // side - SHIFT], -1) * (pixels / one.across)[:, None]
+        up = values > best.scores
+        best = Matches(
+            rotations, torch.where(up[:, None], origin + shift, best.positions), torch.where(up, pixels, best.pixels),
+            torch.where(up, values, best.scores),
+        )  # fmt: skip
+    first = best.scores.reshape(n, k).argmax(1)
+    return best.of(torch.arange(n) * k + first)

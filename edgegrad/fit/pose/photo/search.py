@@ -64,6 +64,7 @@ class PhotoSearch:
         self.max_size, self.spp, self.steps, self.tolerance = max_size, spp, steps, tolerance
         self.seed, self.further = seed, further
         self.best, self.loss, self.converged, self.explained = start, math.nan, False, math.nan
+        self.curvature: Tensor | None = None  # JᵀJ of the terms of photographs at the answer, where it is theirs
         self.history: list[Step] = []
         self.journal = journal or Journal()
         self.after_step: Callable[[], Any] = lambda: None
@@ -220,9 +221,15 @@ class PhotoSearch:
         return _End(share, pose, short)
 
     def _take(self, end: _End) -> None:
-        (self.loss,) = self.journal.numbers(lambda: [self.levels[-1].equations(end.pose, self.seed)[1]])
+        self.loss, *curvature = self.journal.numbers(lambda: self._at(end.pose))
+        self.curvature = torch.tensor(curvature, dtype=torch.float64).reshape((len(self.task.free),) * 2)
         self.explained, self.best, self._answered = end.explained, end.pose, True
         self.converged = end.short and end.explained >= self.enough
+
+    def _at(self, pose: Pose) -> list[float]:
+        """The loss, and the curvature by rows."""
+        normal, loss = self.levels[-1].equations(pose, self.seed)
+        return [loss, *normal.curvature.flatten().tolist()]
 
     def _as_they_are(self, pose: Pose) -> bool:
         """Whether the light leaves the mesh's colours as they are."""
@@ -252,7 +259,7 @@ class PhotoSearch:
 
     def _adopt(self, search: Search) -> None:
         self.best, self.loss, self._answered = search.best, search.loss, True
-        self.explained, self.converged = search.explained, search.converged
+        self.explained, self.converged, self.curvature = search.explained, search.converged, None
 
 
 def _turns() -> list[tuple[list[int], Tensor]]:

@@ -18,24 +18,25 @@ from ..result import Step
 from ..search import Search, distinct
 from ..task import PoseTask
 from .level import photo_levels
-from .match import matches
 from .search import DAMPING, FLOOR, LONGEST, PhotoSearch
-from .views import Views, all_sides, ball, spread
+from .views import ball, spread
+
+Tell = Callable[[str], Any]
 
 ASIDE = 0.8  # radians that starts around a pose are turned by at most
 FIRST_STEPS = 4  # from each start
 FOLLOWED = 6  # to the end
 APART = 0.15  # radians between poses that are followed both
 SPP = 8  # of these steps
-SURE = 0.8  # share of the render's edges: no other end is looked for
+SURE = 0.85  # share of the render's edges: no other end is looked for
 
 
 class Starts:
     """The state of a search, as Search has it."""
 
     def __init__(
-        self, task: PoseTask, start: Pose, starts: Callable[[], list[Pose]], depths: Sequence[Tensor | None], max_size: int,
-        seed: int, journal: Journal, search: Callable[[Pose, Journal], Search | PhotoSearch],
+        self, task: PoseTask, start: Pose, starts: Callable[[Tell], list[Pose]], depths: Sequence[Tensor | None],
+        max_size: int, seed: int, journal: Journal, search: Callable[[Pose, Journal], Search | PhotoSearch],
     ) -> None:  # fmt: skip
         """`starts` makes them, and `search` what follows one of them down."""
         self.task, self.start, self.starts, self.depths = task, start, starts, depths
@@ -45,8 +46,10 @@ class Starts:
         self.enough, self.steps, self.tolerance, self.planned = one.enough, one.steps, one.tolerance, one.planned
         self.colours_first = isinstance(one, PhotoSearch) and one.colours_first
         self.best, self.loss, self.converged, self.explained = start, math.nan, False, math.nan
+        self.curvature: Tensor | None = None
         self.history: list[Step] = []
         self.after_step: Callable[[], Any] = lambda: None
+        self.tell: Tell = lambda _: None  # called with what is done between steps
 
     def run(self) -> None:
         """Raises ValueError when nothing in the pictures depends on the pose, wherever it starts."""
@@ -85,6 +88,7 @@ class Starts:
             before = [step._replace(best=False) for step in before]
             self.history = [*before, *way.history]
             self.best, self.loss, self.explained, self.converged = way.best, way.loss, way.explained, way.converged
+            self.curvature = way.curvature
         else:
             self.history = [*before, *(step._replace(best=False) for step in way.history)]
         return way
@@ -97,7 +101,9 @@ class Starts:
 
     def _compared(self) -> list[float]:
         found = []
-        for pose in self.starts():
+        starts = self.starts(self.tell)
+        for k, pose in enumerate(starts):
+            self.tell(f"start {k + 1} of {len(starts)}")
             try:
                 found.append(self._near(pose))
             except ValueError:  # behind the camera, or out of view
@@ -126,11 +132,6 @@ def around(task: PoseTask, pose: Pose, count: int) -> list[Pose]:
 def everywhere(task: PoseTask, pose: Pose, count: int) -> list[Pose]:
     """At the place of a pose, turned in all ways."""
     return [_turned(task, pose, R) for R in spread(count)]
-
-
-def anywhere(task: PoseTask, seed: int) -> list[Pose]:
-    """Wherever the first picture looks like the object."""
-    return matches(task, Views.of(task, all_sides(), seed))
 
 
 def _turned(task: PoseTask, pose: Pose, R: Tensor) -> Pose:

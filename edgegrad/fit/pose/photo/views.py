@@ -18,8 +18,7 @@ from ....scene.scene import Scene
 from ..pose import Pose
 from ..task import PoseTask, focal_of
 
-ACROSS = 20  # pixels: the diagonal of the object's box in a view
-RING = 2  # pixels around it, which show what the object stands before
+RING = 0.1  # around the object's box, in its diagonal: shows what the object stands before
 SIDES, TURNS = 96, 18  # of views: directions, and turns about each; some 20° apart
 FILLS = 0.6  # of the picture's shorter side, an object as views see its perspective
 SPP = 4
@@ -31,20 +30,26 @@ class Views:
     """Renders at n rotations, of the object's centre in the middle of the image."""
 
     rotations: Tensor  # (n, 3, 3) float64, mesh to camera
+    across: int  # pixels, the diagonal of the object's box
     alpha: Tensor  # (n, T, T)
     colours: Tensor  # (n, T, T, C), sRGB values; 1 where the mesh has no colours
     normals: Tensor  # (n, T, T, 3), in mesh axes
 
+    @property
+    def ring(self) -> int:
+        """Pixels around the object's box."""
+        return round(RING * self.across)
+
     @staticmethod
-    def of(task: PoseTask, rotations: Tensor, seed: int) -> Views:
-        """As the first picture's camera would see the object on its axis, ACROSS pixels large."""
-        camera, side = task.shots[0].camera, ACROSS + 2 * RING
+    def of(task: PoseTask, rotations: Tensor, pixels: int, seed: int) -> Views:
+        """As the first picture's camera would see the object on its axis, so many pixels large."""
+        camera, side = task.shots[0].camera, pixels + 2 * round(RING * pixels)
         perspective = camera.projection != "orthographic"
         depth = 2.0 * task.size
         if perspective:
             depth = task.size * max(focal_of(camera) / (FILLS * min(camera.size)), LEAST_DEPTH)
         K = torch.eye(3, dtype=torch.float64)
-        K[:2, :2] = camera.K[:2, :2] * (ACROSS / across(task, camera, depth))
+        K[:2, :2] = camera.K[:2, :2] * (pixels / across(task, camera, depth))
         K[:2, 2] = 0.5 * side
         world = torch.eye(4, dtype=torch.float64).repeat(len(rotations), 1, 1)
         world[:, :3, :3] = rotations
@@ -62,7 +67,7 @@ class Views:
         colours = torch.ones(*alpha.shape[:3], channels)
         if not plain:
             colours = linear_to_srgb((seen["image"].float() / alpha.clamp(min=1e-3)).clamp(0.0, 1.0))
-        return Views(rotations, alpha[..., 0], colours, normals)
+        return Views(rotations, pixels, alpha[..., 0], colours, normals)
 
 
 def across(task: PoseTask, camera: Camera, depth: float) -> float:

@@ -1,0 +1,129 @@
+"""Views of an object as templates: how likely parts of a picture show them, in a light that nobody knows.
+
+A view explains a part of a picture by the mesh's colours in the light that fits them best there. With the basis B of colours
+times harmonics inside the silhouette, the squared error is Σy² − bᵀA⁻¹b, with b = Σ B y and A = Σ B Bᵀ (a matched subspace
+filter, Scharf and Friedlander 1994). A does not depend on the place, and b is a correlation, so all places are had at once.
+
+What a view has to beat is one colour for all of the part, while it has one for what is around the object, and that the pixels
+are drawn from the colours of the whole picture. The first finds contours and patterns, the second rare colours.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .views import Views
+
+AT_ONCE = 64  # views
+NOISE = 0.06  # standard deviation of a pixel, sRGB values: of noise, and of what views lack by their spacing
+SHADE = 0.3  # of the light's slopes, relative to its constant
+WHITE = 0.15  # of the light's colour
+SHAPE = 0.25  # of a mask's error beside that of colours
+ALIKE = 0.08  # standard deviation of colours that look alike, sRGB values
+COUNTED = 1500  # pixels that tell how frequent colours are
+
+
+class Templates:
+    """Views as filters of pictures with the channels C, which may be none."""
+
+    def __init__(self, views: Views, rare: float) -> None:
+        """`rare`: how much the ratio to the picture's colours counts beside that to one colour."""
+        self.rare = rare
+        alpha, colours, normals = views.alpha, views.colours, views.normals
+        self.C = colours.shape[-1]
+        self.alpha = alpha
+        self.inside = torch.where(alpha > 0.5, alpha, torch.zeros_like(alpha))
+        near = F.max_pool2d((alpha > 0.02).float()[:, None], 2 * views.ring + 1, 1, views.ring)[:, 0]
+        self.around = near * (alpha < 0.02)
+        Y = torch.cat([torch.ones_like(normals[..., :1]), normals], -1)
+        basis = colours[..., None] * Y[..., None, :]  # (n, T, T, C, 4)
+        weighted = basis * self.inside[..., None, None]
+        A = torch.einsum("nijck,nijcl->nckl", weighted, basis)
+        self.inverse = torch.linalg.inv(_with_prior(A.double())).float()  # (n, 4C, 4C)
+        self.filters = weighted.permute(0, 3, 4, 1, 2)  # (n, C, 4, T, T)
+
+    def everywhere(self, picture: Tensor, stride: int) -> Tensor:
+        """(n, h, w) log likelihood ratios, of a picture (C + 1, H, W) whose last channel is surprise()."""
+        parts = []
+        sides = torch.stack([self.inside, self.around], 1)
+        colours, surprise = picture[:-1], picture[-1]
+        for at in range(0, len(self.inside), 2 * AT_ONCE):
+            rows = slice(at, at + 2 * AT_ONCE)
+            n = len(self.inside[rows])
+            b, sums = [], []
+            for c in range(self.C):
+                both = torch.cat([self.filters[rows, c], sides[rows]], 1).flatten(0, 1)[:, None]
+                out = F.conv2d(colours[None, c : c + 1], both, stride=stride)[0]
+                out = out.reshape(n, 6, *out.shape[1:])
+                b.append(out[:, :4])
+                sums.append(out[:, 4:])
+            squares = F.conv2d(colours.square().sum(0)[None, None], sides[rows].flatten(0, 1)[:, None], stride=stride)
+            squares = squares[0].reshape(n, 2, *squares.shape[2:])
+            rare = F.conv2d(surprise[None, None], self.inside[rows, None], stride=stride)[0]
+            parts.append(self._ratios(torch.cat(b, 1), torch.stack(sums, 2), squares, rare, rows))
+        return torch.cat(parts)
+
+    def near(self, crops: Tensor, masked: bool) -> Tensor:
+        """(n, k, k) of a crop (n, C + 1, T + k − 1, T + k − 1) for each view, at k × k shifts. The last channel is surprise(), or
+        a mask; then it is how likely colours and mask are, for a view of the same size."""
+        T, parts = self.alpha.shape[-1], []
+        for at in range(0, len(crops), AT_ONCE):
+            rows = slice(at, at + AT_ONCE)
+            places = crops[rows].unfold(2, T, 1).unfold(3, T, 1)  # (n, C + 1, k, k, T, T)
+            n, k = len(places), places.shape[2]
+            pixels = places.permute(0, 2, 3, 1, 4, 5).reshape(n, k * k, self.C + 1, T * T)
+            colours, last = pixels[:, :, :-1], pixels[:, :, -1]
+            filters = self.filters[rows].reshape(n, self.C, 4, T * T)
+            b = torch.einsum("nscp,ncfp->ncfs", colours, filters).reshape(n, 4 * self.C, k, k)
+            sides = torch.stack([self.inside[rows], self.around[rows]], 1).flatten(2)
+            squares = torch.einsum("nsp,nop->nos", colours.square().sum(2), sides).reshape(n, 2, k, k)
+            if masked:
+                shape = (last - self.alpha[rows].flatten(1)[:, None]).square().sum(-1).reshape(n, k, k)
+                error = self._error(b, squares[:, 0], rows) + SHAPE * shape
+                parts.append(-torch.log(error / self.alpha[rows].sum((1, 2)).clamp(min=1.0)[:, None, None] + NOISE**2))
+                continue
+            sums = torch.einsum("nscp,nop->nocs", colours, sides).reshape(n, 2, self.C, k, k)
+            rare = torch.einsum("nsp,np->ns", last, sides[:, 0]).reshape(n, k, k)
+            parts.append(self._ratios(b, sums, squares, rare, rows))
+        return torch.cat(parts)
+
+    def _error(self, b: Tensor, squares: Tensor, rows: slice) -> Tensor:
+        """(n, h, w), inside."""
+        return (squares - (b * torch.einsum("nkl,nlhw->nkhw", self.inverse[rows], b)).sum(1)).clamp(min=0.0)
+
+    def _ratios(self, b: Tensor, sums: Tensor, squares: Tensor, rare: Tensor, rows: slice) -> Tensor:
+        """b (n, 4C, h, w); sums (n, 2, C, h, w) and squares (n, 2, h, w) of what is inside and around; rare (n, h, w)."""
+        inside, around = (x[rows].sum((1, 2)).clamp(min=1e-3)[:, None, None] for x in (self.inside, self.around))
+        error = self._error(b, squares[:, 0], rows)
+        beside = (squares[:, 1] - sums[:, 1].square().sum(1) / around).clamp(min=0.0)
+        even = (squares.sum(1) - sums.sum(1).square().sum(1) / (inside + around)).clamp(min=0.0)
+        noise = NOISE**2 * self.C * (inside + around)
+        to_one = 0.5 * self.C * (inside + around) * torch.log((even + noise) / (error + beside + noise))
+        variance = error / (self.C * inside) + NOISE**2
+        to_all = rare - 0.5 * self.C * inside * (variance.log() + math.log(2.0 * math.pi) + 1.0)
+        return to_one + self.rare * to_all
+
+
+def surprise(picture: Tensor) -> Tensor:
+    """(H, W), −log of the density of each pixel's colour in (C, H, W)."""
+    C, H, W = picture.shape
+    pixels = picture.flatten(1).T
+    some = pixels[torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))[:COUNTED]]
+    log = (-0.5 * (torch.cdist(pixels, some) / ALIKE).square()).logsumexp(1) - math.log(len(some))
+    return (C * math.log(ALIKE * math.sqrt(2.0 * math.pi)) - log).reshape(H, W)
+
+
+def _with_prior(A: Tensor) -> Tensor:
+    """(n, 4C, 4C) of (n, C, 4, 4): the light is about white, and its slopes are smaller than its constant."""
+    n, C = A.shape[:2]
+    full = torch.zeros(n, C, 4, C, 4, dtype=A.dtype)
+    differ = torch.eye(C, dtype=A.dtype) - 1.0 / max(C, 1)
+    full += (NOISE / WHITE) ** 2 * differ[None, :, None, :, None] * torch.eye(4, dtype=A.dtype)[None, None, :, None, :]
+    slopes = torch.tensor([1e-3, 1.0, 1.0, 1.0], dtype=A.dtype) * (NOISE / SHADE) ** 2
+    for c in range(C):
+        full[:, c, :, c] += A[:, c] + torch.diag(slopes)
+    return full.reshape(n, 4 * C, 4 * C)

@@ -1,0 +1,108 @@
+"""How exactly the pictures show a pose: from the curvature JᵀJ of the terms at the answer.
+
+Each term of a photograph is a log likelihood in units of its own noise, so JᵀJ is Fisher's information, and its inverse the
+covariance that no unbiased estimate is below (Cramér and Rao, 1946). It speaks of the place where the fit is: of another pose
+that looks alike it knows nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...scene.symmetries import Symmetries
+from .pose import Pose
+from .task import GROW, TURN, PoseTask
+
+WIDEST = 1.0  # radian and object size, the standard deviation of what the pictures do not show at all
+# Shadows, blur and errors of the light model are alike in pixels nearby: errors of fits to lit pictures are so many times the
+# standard deviations of independent pixels, as measured.
+TOGETHER = 8.0
+DEGREES, SHARE = 5.0, 0.05  # a direction that is known less exactly than this, in degrees or object sizes, is unknown
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Standard deviations of a pose about the object's centre, the middle of its bounding box.
+
+    covariance  (6, 6) float64, of a rotation vector in radians and a shift of the centre in world units, along the world's axes.
+                What was not sought, such as the distance with fit_scale, has zeros
+    size        the diagonal of the object's bounding box, world units
+    free        directions in the world (n, 3) about which a continuous symmetry makes all turns the same: none of them is unknown
+    """
+
+    covariance: Tensor
+    size: float
+    free: Tensor
+
+    @property
+    def degrees(self) -> float:
+        """Of the rotation about the axis about which it is known least."""
+        return math.degrees(float(self._turn[0]))
+
+    @property
+    def axis(self) -> Tensor:
+        """(3,) this axis, in the world, of length 1."""
+        return self._turn[1]
+
+    @property
+    def shift(self) -> float:
+        """Of the centre along the direction along which it is known least, world units."""
+        return float(_widest(self.covariance[3:, 3:])[0])
+
+    @property
+    def direction(self) -> Tensor:
+        """(3,) this direction, in the world, of length 1."""
+        return _widest(self.covariance[3:, 3:])[1]
+
+    @property
+    def unknown(self) -> str:
+        """In words, what is known less exactly than to 5° or 5 % of the object's size; empty where all is."""
+        parts = []
+        if self.degrees > DEGREES:
+            parts.append(f"rotation about {_named(self.axis)} known to ±{self.degrees:.0f}° only")
+        if self.shift > SHARE * self.size:
+            parts.append(
+                f"place along {_named(self.direction)} known to ±{self.shift / self.size:.0%} of the size only"
+            )
+        return ", ".join(parts)
+
+    @property
+    def _turn(self) -> tuple[Tensor, Tensor]:
+        block = self.covariance[:3, :3]
+        if len(self.free):
+            rest = torch.eye(3, dtype=torch.float64) - torch.linalg.pinv(self.free, rtol=1e-3) @ self.free
+            block = rest @ block @ rest
+        return _widest(block)
+
+    @staticmethod
+    def of(
+        task: PoseTask, pose: Pose, curvature: Tensor, free: list[int], symmetries: Symmetries | None
+    ) -> Uncertainty:
+        """From JᵀJ (n, n) of the entries `free` of a step."""
+        prior = torch.eye(len(free), dtype=torch.float64) / WIDEST**2
+        inverse = torch.linalg.inv(curvature / TOGETHER**2 + prior)
+        entries = torch.zeros(GROW, GROW, dtype=torch.float64)
+        known = [k for k, entry in enumerate(free) if TURN <= entry < GROW]
+        rows = torch.tensor([free[k] for k in known])
+        entries[rows[:, None], rows] = inverse[known][:, known]
+        axes = task.shots[0].camera.world_to_camera[:3, :3].T.double()
+        to_world = torch.block_diag(axes, task.size * axes)
+        ways = [pose.R.double() @ axis.direction for axis in ([] if symmetries is None else symmetries.continuous)]
+        spun = torch.stack(ways) if ways else torch.empty(0, 3, dtype=torch.float64)
+        return Uncertainty(to_world @ entries @ to_world.T, task.size, spun)
+
+
+def _widest(block: Tensor) -> tuple[Tensor, Tensor]:
+    """Standard deviation and direction (3,)."""
+    values, vectors = torch.linalg.eigh(0.5 * (block + block.T))
+    return values[-1].clamp(min=0.0).sqrt(), vectors[:, -1]
+
+
+def _named(way: Tensor) -> str:
+    """Its largest entry above zero."""
+    way = way * float(way[way.abs().argmax()].sign())
+    return "({})".format(", ".join(f"{x:.2f}" for x in (way + 0.0).tolist()))

@@ -1,0 +1,105 @@
+"""How exactly a picture shows a pose: covariances by hand, directions that nothing shows, and what a fit says of them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad.fit import PoseFit, Uncertainty, fit_pose
+from edgegrad.fit.pose.pose import Pose
+from edgegrad.fit.pose.task import Lens, Names, PoseTask
+from edgegrad.fit.pose.uncertainty import TOGETHER
+from edgegrad.scene.symmetries import Symmetries, SymmetryAxis
+
+SIZE = 112
+
+
+def vase() -> eg.Mesh:
+    """Turned on a lathe about y, without colours."""
+    heights = torch.tensor([-1.0, -0.99, -0.5, 0.1, 0.45, 0.6, 0.99, 1.0])
+    radii = torch.tensor([0.0, 0.45, 0.62, 0.5, 0.22, 0.2, 0.3, 0.0])
+    around = torch.arange(48) * (2.0 * math.pi / 48)
+    x, z = radii[:, None] * around.cos(), radii[:, None] * around.sin()
+    verts = torch.stack([x, heights[:, None].expand_as(x), z], -1).flatten(0, 1)
+    quads = [(r * 48 + k, r * 48 + (k + 1) % 48) for r in range(7) for k in range(48)]
+    faces = [face for a, b in quads for face in ((a, a + 48, b), (b, a + 48, b + 48))]
+    return eg.Mesh(verts, torch.tensor(faces))
+
+
+def camera() -> eg.Camera:
+    return eg.Camera.look_at((1.0, 0.6, 4.0), (0, 0, 0), fov_y=45.0, size=(SIZE, SIZE))
+
+
+def picture(mesh: eg.Mesh) -> Tensor:
+    """Grey in light, before boards of many colours."""
+    coarse = 0.05 + 0.3 * torch.rand(1, 3, 9, 9, generator=torch.Generator().manual_seed(3))
+    clutter = torch.nn.functional.interpolate(coarse, (SIZE, SIZE), mode="bilinear")[0].movedim(0, -1)
+    lit = mesh.replace(colors=torch.full((len(mesh.verts), 3), 0.8), material=eg.Material())
+    lights = [eg.Environment(torch.tensor([0.9, 0.9, 1.0]), visible=False)]
+    with torch.no_grad():
+        return eg.render(eg.Scene([lit], background=clutter, lights=lights), camera(), spp=32)
+
+
+def task() -> PoseTask:
+    return PoseTask.of(vase(), picture(vase()), camera(), None, None, None, Lens(), 1.0, Names())
+
+
+def standing() -> Pose:
+    one = torch.ones((), dtype=torch.float64)
+    return Pose(torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64), one, one)
+
+
+def test_a_covariance_is_the_inverse_of_the_curvature_in_the_worlds_axes() -> None:
+    given = task()
+    axes = camera().world_to_camera[:3, :3].double()
+    deviations = torch.tensor([0.01, 0.02, 0.12, 0.001, 0.002, 0.08], dtype=torch.float64)
+    known = Uncertainty.of(given, standing(), torch.diag(TOGETHER**2 / deviations**2), list(range(6)), None)
+    assert known.degrees == pytest.approx(math.degrees(0.12), rel=0.02)
+    assert abs(float(known.axis @ axes[2])) == pytest.approx(1.0, abs=1e-6)
+    assert known.shift == pytest.approx(0.08 * given.size, rel=0.02)
+    assert abs(float(known.direction @ axes[2])) == pytest.approx(1.0, abs=1e-6)
+    assert "rotation about (" in known.unknown and "±7° only" in known.unknown and "±8% of the size" in known.unknown
+    # Of two directions that belong together, each is known less exactly than its entry alone says.
+    curvature = torch.diag(TOGETHER**2 / deviations**2)
+    curvature[0, 3] = curvature[3, 0] = 0.9 * (curvature[0, 0] * curvature[3, 3]).sqrt()
+    both = Uncertainty.of(given, standing(), curvature, list(range(6)), None)
+    expected = 0.01 / math.sqrt(1.0 - 0.9**2)
+    assert float((axes @ both.covariance[:3, :3] @ axes.T)[0, 0].sqrt()) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_continuous_symmetry_makes_its_axis_known() -> None:
+    given = task()
+    axes = camera().world_to_camera[:3, :3].double()
+    up = axes @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    curvature = torch.zeros(6, 6, dtype=torch.float64)
+    curvature[:3, :3] = 1e6 * (torch.eye(3) - torch.outer(up, up))  # nothing of turns about y
+    curvature[3:, 3:] = 1e6 * torch.eye(3)
+    known = Uncertainty.of(given, standing(), curvature, list(range(6)), None)
+    assert known.degrees > 45.0 and abs(float(known.axis[1])) > 0.999
+    spun = Symmetries(continuous=[SymmetryAxis(torch.tensor([0.0, 1.0, 0.0]))])
+    free = Uncertainty.of(given, standing(), curvature, list(range(6)), spun)
+    assert free.degrees < 1.0 and free.unknown == ""
+    other = Symmetries(continuous=[SymmetryAxis(torch.tensor([1.0, 0.0, 0.0]))])
+    assert Uncertainty.of(given, standing(), curvature, list(range(6)), other).unknown != ""
+
+
+def test_a_vase_is_not_converged_about_its_axis_unless_that_is_a_symmetry() -> None:
+    shot = picture(vase())
+    start = torch.eye(4, dtype=torch.float64)
+    start[0, 3] = 0.05
+    spun = Symmetries(continuous=[SymmetryAxis(torch.tensor([0.0, 1.0, 0.0]))])
+
+    def fitted(symmetries: Symmetries | None) -> PoseFit:
+        return fit_pose(vase(), shot, camera(), init=start, search=False, symmetries=symmetries, progress=False)
+
+    alone, known = fitted(None), fitted(spun)
+    for fit in (alone, known):
+        tilt = fit.R.double() @ torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+        assert math.degrees(math.acos(min(1.0, float(tilt[1])))) < 3.0 and fit.explained > 0.85
+    assert not alone.converged and alone.reason.startswith("directions unknown: rotation about (")
+    assert alone.uncertainty is not None and abs(float(alone.uncertainty.axis[1])) > 0.95
+    assert known.converged and known.reason == "converged"
