@@ -13,12 +13,13 @@ from .options import Options, Parameter
 from .placement import Pose, PoseParameter
 from .pose.fit_camera import CameraFit, fit_camera
 from .pose.fit_pose import fit_pose
+from .pose.fit_poses import fit_poses
 from .pose.result import PoseFit, Step
 from .pose.track import TrackedPose, track
 from .unwrapping import unwrapped
 
 __all__ = [
     "CameraFit", "Ending", "Fit", "Measured", "Options", "Parameter", "Pose", "PoseFit", "PoseParameter", "Progress", "Record",
-    "Step", "TrackedPose", "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers", "track",
+    "Step", "TrackedPose", "fit_camera", "fit_pose", "fit_poses", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers", "track",
     "unwrapped", "visual_hull",
 ]  # fmt: skip

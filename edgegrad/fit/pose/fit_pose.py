@@ -122,7 +122,7 @@ def fit_pose(
     return search_pose(
         mesh, target, camera, mask, init, lens, background, weight, depth, Names(), max_size=max_size, steps=steps, spp=spp,
         tolerance=tolerance, seed=seed, search=search, progress=progress, callback=callback, checkpoint=checkpoint,
-        checkpoint_every=checkpoint_every, resume=resume, symmetries=_symmetries(symmetries, mesh),
+        checkpoint_every=checkpoint_every, resume=resume, symmetries=symmetries_of(symmetries, mesh),
         starts=starts,
     )  # fmt: skip
 
@@ -141,13 +141,8 @@ def search_pose(
     for name, count in (("max_size", max_size), ("steps", steps), ("spp", spp)):
         check_positive_int(name, count)
     check_int("seed", seed, 0, 2**32 - 1)
-    if not isinstance(tolerance, (int, float)):
-        raise TypeError(f"tolerance: expected a number, got {type(tolerance).__name__} ({tolerance!r})")
-    if not tolerance > 0.0:
-        raise ValueError(f"tolerance: expected a number above 0, got {tolerance:g}")
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback: expected a function of a PoseFit, got {type(callback).__name__}")
-    check_checkpoint(checkpoint, checkpoint_every, check_flag("resume", resume))
+    check_tolerance(tolerance)
+    check_callback(callback, "a PoseFit")
     _check_starts(starts, init, camera, names.init)
     given = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
     task = PoseTask.of(mesh, target, camera, mask, weight, background, lens, float(given.scale), names)
@@ -161,7 +156,7 @@ def search_pose(
     })  # fmt: skip
     saved = file.read()
     journal, earlier = (Journal(), 0.0) if saved is None else (Journal(saved["journal"]), saved["seconds"])
-    depths = _depths(depth, task)
+    depths = depth_images(depth, task)
 
     def way(start: Pose, journal: Journal, further: bool) -> Search | PhotoSearch:
         if task.aovs == ("alpha",) and depth is None:
@@ -223,7 +218,21 @@ def search_pose(
     return result()
 
 
-def _depths(depth: object, task: PoseTask) -> list[Tensor | None]:
+def check_tolerance(tolerance: object) -> None:
+    """Raises TypeError or ValueError."""
+    if not isinstance(tolerance, (int, float)):
+        raise TypeError(f"tolerance: expected a number, got {type(tolerance).__name__} ({tolerance!r})")
+    if not tolerance > 0.0:
+        raise ValueError(f"tolerance: expected a number above 0, got {tolerance:g}")
+
+
+def check_callback(callback: object, of: str) -> None:
+    """Raises TypeError."""
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback: expected a function of {of}, got {type(callback).__name__}")
+
+
+def depth_images(depth: object, task: PoseTask) -> list[Tensor | None]:
     """Of each picture (H, W), NaN where it was not measured. Raises TypeError or ValueError."""
     count = len(task.shots)
     if depth is None:
@@ -272,15 +281,15 @@ def _check_starts(starts: object, init: object, camera: object, name: str) -> No
         check_int("starts", starts, 1, MOST_STARTS)
 
 
-def _symmetries(given: object, mesh: Mesh | Scene) -> Symmetries | None:
+def symmetries_of(given: object, mesh: Mesh | Scene, name: str = "symmetries") -> Symmetries | None:
     """Raises TypeError or ValueError, or what find_symmetries() raises."""
     if given is None or isinstance(given, Symmetries):
         return given
     if given == "find":
         return find_symmetries(mesh)
     if isinstance(given, str):
-        raise ValueError(f'symmetries: expected Symmetries, "find" or None, got {given!r}')
-    raise TypeError(f'symmetries: expected Symmetries, "find" or None, got {type(given).__name__}')
+        raise ValueError(f'{name}: expected Symmetries, "find" or None, got {given!r}')
+    raise TypeError(f'{name}: expected Symmetries, "find" or None, got {type(given).__name__}')
 
 
 def _warn_if_upside_down(task: PoseTask, search: Search | PhotoSearch, place: bool, max_size: int, spp: int) -> None:

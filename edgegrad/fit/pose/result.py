@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from .task import PoseTask
 
 
+HIDDEN = 0.1  # share of an object that others must leave to be seen for its pose to be believed
+
+
 class Step(NamedTuple):
     """One render of the fit."""
 
@@ -62,6 +65,7 @@ class PoseFit:
     cameras: list[Camera] = field(
         default_factory=list, repr=False
     )  # all that were given, as `camera`; not kept in JSON
+    visible: float = 1.0  # of a fit of several objects, how much of this one the others leave to be seen, 0 … 1; not kept in JSON
 
     @property
     def matrix(self) -> Tensor:
@@ -71,7 +75,10 @@ class PoseFit:
 
     @property
     def reason(self) -> str:
-        """In words: "converged", or what kept the fit from that: "edges not explained: …", "steps ran out: …", "interrupted"."""
+        """In words: "converged", or what kept the fit from that: "edges not explained: …", "hidden: …",
+        "steps ran out: …", "interrupted"."""
+        if not self.interrupted and not self.converged and self.visible < HIDDEN:
+            return f"hidden: the other objects leave {self.visible:.0%} of it to be seen; its pose is about its start's"
         ending = Ending.INTERRUPTED if self.interrupted else Ending.FLAT if self.converged else Ending.STEPS
         return reason_of(ending, self.explained, "mesh, camera or picture")
 

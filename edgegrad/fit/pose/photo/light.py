@@ -29,6 +29,7 @@ RIDGE = 5e-4  # of the constant's curvature: keeps what the picture does not sho
 WHOLE = 0.9  # share of a blur's window that lies inside
 FEWEST = 60  # pixels
 REWEIGHTED = 4  # times
+CLIPPED = 0.95  # linear radiance
 LEAST = 0.02  # standard deviation of a difference
 # Differences of neighbouring pixels are alike, for shadows and highlights have an extent: so many pixels count as one.
 TOGETHER = 8.0
@@ -62,19 +63,24 @@ class Lit:
         scale = (pictured + 0.02 + 0.1 * pictured[inside].mean()).clamp(min=1e-3).rsqrt()[inside]
         B, y = basis[inside] * scale[..., None], pictured[inside] * scale
         count = picture.weight[inside]
-        w = count
+        w, counted = count, count >= 0.5 * count.max()
         light = y.new_zeros(colour.shape[-1], harmonics)
         ridge = torch.zeros_like(light)
         residual, middle = -y, LEAST
+        # What a sensor shows as white may be any brighter colour.
+        clipped = (pictured[inside] > CLIPPED) & bool(picture.radiance.max() <= 1.0)
+        seen = y
         for _ in range(REWEIGHTED):
             for c in range(len(light)):
                 curvature = (B[:, c] * w[:, None]).T @ B[:, c]
                 ridge[c] = RIDGE * curvature[0, 0] + 1e-9
                 ridge[c, 0] = 1e-9 + 1e-3 * ridge[c, 0]
-                light[c] = torch.linalg.solve(curvature + torch.diag(ridge[c]), (B[:, c] * w[:, None]).T @ y[:, c])
-            residual = torch.einsum("pcn,cn->pc", B, light) - y
+                light[c] = torch.linalg.solve(curvature + torch.diag(ridge[c]), (B[:, c] * w[:, None]).T @ seen[:, c])
+            shown = torch.einsum("pcn,cn->pc", B, light)
+            seen = torch.where(clipped, torch.maximum(y, shown), y)
+            residual = shown - seen
             e = residual.norm(dim=-1)
-            middle = max(float(e.median()) / _median(len(light)), LEAST)
+            middle = max(float(e[counted].median()) / _median(len(light)), LEAST)
             w = count * (1.0 + (e / (3.0 * middle)).square()).pow(-2)
         predicted = torch.einsum("hwcn,cn->hwc", basis, light)
         slopes = slope(0.5 * (predicted + pictured))[inside]
