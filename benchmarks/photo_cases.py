@@ -144,9 +144,7 @@ def _shares(meshes: Sequence[eg.Mesh], camera: eg.Camera) -> list[float]:
     """Of each mesh, how much the others leave of it to be seen."""
     labels = torch.eye(len(meshes))
     bare = [eg.Mesh(mesh.verts, mesh.faces) for mesh in meshes]
-    painted = [
-        mesh.replace(colors=label.expand(len(mesh.verts), -1)) for mesh, label in zip(bare, labels, strict=True)
-    ]
+    painted = [mesh.replace(colors=label.expand(len(mesh.verts), -1)) for mesh, label in zip(bare, labels, strict=True)]
     seen = eg.render(eg.Scene(painted), camera, 4).sum((0, 1))
     alone = [float(eg.render_aovs(mesh, camera, ["alpha"], 4)["alpha"].sum()) for mesh in bare]
     return [float(one) / whole for one, whole in zip(seen, alone, strict=True)]
@@ -196,9 +194,7 @@ def _lit(
         eg.DirectionalLight(way, float(rng.uniform(1.5, 3.5))),
         eg.Environment(torch.from_numpy(rng.uniform(0.3, 0.6, 3)).float(), visible=False),
     ]
-    meshes = [
-        mesh.replace(material=eg.Material(), normals=eg.vertex_normals(mesh.verts, mesh.faces)) for mesh in given
-    ]
+    meshes = [mesh.replace(material=eg.Material(), normals=eg.vertex_normals(mesh.verts, mesh.faces)) for mesh in given]
     if shadow:
         across = F.normalize(torch.linalg.cross(way, torch.from_numpy(rng.normal(size=3)).float()), dim=0)
         along = torch.linalg.cross(way, across)

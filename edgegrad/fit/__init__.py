@@ -20,6 +20,6 @@ from .unwrapping import unwrapped
 
 __all__ = [
     "CameraFit", "Ending", "Fit", "Measured", "Options", "Parameter", "Pose", "PoseFit", "PoseParameter", "Progress", "Record",
-    "Step", "TrackedPose", "fit_camera", "fit_pose", "fit_poses", "fit_scene", "fit_shape", "fit_texture", "losses", "regularizers", "track",
-    "unwrapped", "visual_hull",
+    "Step", "TrackedPose", "fit_camera", "fit_pose", "fit_poses", "fit_scene", "fit_shape", "fit_texture", "losses",
+    "regularizers", "track", "unwrapped", "visual_hull",
 ]  # fmt: skip

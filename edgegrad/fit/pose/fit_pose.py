@@ -143,6 +143,7 @@ def search_pose(
     check_int("seed", seed, 0, 2**32 - 1)
     check_tolerance(tolerance)
     check_callback(callback, "a PoseFit")
+    check_checkpoint(checkpoint, checkpoint_every, check_flag("resume", resume))
     _check_starts(starts, init, camera, names.init)
     given = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
     task = PoseTask.of(mesh, target, camera, mask, weight, background, lens, float(given.scale), names)

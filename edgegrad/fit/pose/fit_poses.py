@@ -47,7 +47,7 @@ def fit_poses(
     callback: Callable[[list[PoseFit]], None] | None = None,
     symmetries: Sequence[Symmetries | None] | None = None,
 ) -> list[PoseFit]:
-    """Rotation and translation of several known meshes in a picture, or in several, in one fit: a PoseFit for each, in their order.
+    """Rotation and translation of several known meshes in a picture, or in several, in one fit: a PoseFit for each.
 
     meshes      the objects, each a Mesh, or a Scene whose meshes move together, with colours or without
     target      (H, W, C) linear radiance, as read_image gives it; or a list of pictures
@@ -55,8 +55,8 @@ def fit_poses(
     mask        where each object is seen, without what covers it: an image of labels (H, W) of integers, k + 1 where meshes[k] is
                 seen and 0 elsewhere; or a list with a mask (H, W) for each mesh, as read_mask gives it. Of several pictures
                 each of these is a list with one for each picture
-    init        the pose of each mesh to start from, within some 20° and 10 % of its size: earlier fits, or matrices (4, 4), mesh to
-                world, for column vectors; None: where the mesh files put them
+    init        the pose of each mesh to start from, within some 15° and 5 % of its size: earlier fits, or matrices (4, 4), mesh
+                to world, for column vectors; None: where the mesh files put them
     weight, depth, max_size, steps, spp, tolerance, seed, progress      as of fit_pose
     search      whether an object that ends where the pictures do not show its edges begins again from other poses
     callback    called after each step with the best fits so far
@@ -68,8 +68,8 @@ def fit_poses(
     not make others so. `visible` says how much of an object the others leave to be seen. With less than a tenth of it, it
     is not `converged`, and `reason` says that it is hidden; its pose is then little more than its start.
 
-    KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set. Raises TypeError or
-    ValueError that names the argument, also where an object is out of the picture, or inside another one, at the start.
+    KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set. Raises TypeError
+    or ValueError that names the argument, also where an object is out of the picture, or inside another one, at the start.
     """
     began = time.perf_counter()
     for name, number in (("max_size", max_size), ("steps", steps), ("spp", spp)):
@@ -81,7 +81,9 @@ def fit_poses(
     starts = _starts(init, count)
     masks = _masks(mask, count, isinstance(camera, Sequence))
     known = _each("symmetries", symmetries, count)
-    found_symmetries = [symmetries_of(one, mesh, f"symmetries[{k}]") for k, (one, mesh) in enumerate(zip(known, meshes, strict=True))]
+    alike = [
+        symmetries_of(one, mesh, f"symmetries[{k}]") for k, (one, mesh) in enumerate(zip(known, meshes, strict=True))
+    ]
     tasks = [
         PoseTask.of(
             mesh, target, camera, own, weight, None, Lens(), float(start.scale),
@@ -104,7 +106,7 @@ def fit_poses(
     def results() -> list[PoseFit]:
         found = []
         for k, task in enumerate(tasks):
-            own = found_symmetries[k]
+            own = alike[k]
             best = ways.best[k] if own is None else ways.best[k].closest(own, starts[k])
             history = list(ways.history[k])
             found.append(PoseFit(
@@ -116,7 +118,9 @@ def fit_poses(
     bar = tqdm(total=None, desc="fit", unit="step", disable=not progress, leave=False)
 
     def after_step() -> None:
-        bar.set_postfix_str(f"{ways.levels[-1].size[1]} × {ways.levels[-1].size[0]} px, loss {ways.loss:.2e}", refresh=False)
+        bar.set_postfix_str(
+            f"{ways.levels[-1].size[1]} × {ways.levels[-1].size[0]} px, loss {ways.loss:.2e}", refresh=False
+        )
         bar.update()
         if callback is not None:
             callback(results())
@@ -191,8 +195,8 @@ def _of_labels(name: str, labels: object, count: int) -> list[Tensor]:
         if not bool(one.any()):
             there = sorted(int(label) for label in value.unique().tolist())[:10]
             raise ValueError(
-                f"{name}: expected the label {k + 1} where meshes[{k}] is seen, got only {there}; give a list of masks instead, or "
-                "leave out a mesh that is not seen"
+                f"{name}: expected the label {k + 1} where meshes[{k}] is seen, got only {there}; give a list of masks "
+                "instead, or leave out a mesh that is not seen"
             )
     return found
 
@@ -222,13 +226,15 @@ def _check_apart(tasks: Sequence[PoseTask], starts: Sequence[Pose]) -> None:
             if other == k:
                 continue
             if own.shape == points[other].shape and torch.allclose(own, points[other], atol=1e-6 * tasks[k].size):
-                raise ValueError(f"init[{k}]: expected the objects apart, got meshes[{k}] where meshes[{other}] is, vertex by vertex")
+                raise ValueError(
+                    f"init[{k}]: expected the objects apart, got meshes[{k}] where meshes[{other}] is, vertex by vertex"
+                )
             low, high = points[other].aminmax(dim=0)
             if not bool(((own > low) & (own < high)).all()):
                 continue
             solid = [trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False) for mesh in body]
             if any(one.is_watertight and bool(one.contains(some.numpy()).all()) for one in solid):
                 raise ValueError(
-                    f"init[{k}]: expected the objects beside one another, got meshes[{k}] inside meshes[{other}], where no camera "
-                    "sees it; move one of them, or leave it out"
+                    f"init[{k}]: expected the objects beside one another, got meshes[{k}] inside meshes[{other}], where no "
+                    "camera sees it; move one of them, or leave it out"
                 )

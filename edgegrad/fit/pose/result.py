@@ -65,7 +65,9 @@ class PoseFit:
     cameras: list[Camera] = field(
         default_factory=list, repr=False
     )  # all that were given, as `camera`; not kept in JSON
-    visible: float = 1.0  # of a fit of several objects, how much of this one the others leave to be seen, 0 … 1; not kept in JSON
+    visible: float = (
+        1.0  # of a fit of several objects, how much of this one the others leave to be seen, 0 … 1; not kept in JSON
+    )
 
     @property
     def matrix(self) -> Tensor:

@@ -78,8 +78,8 @@ class Names(NamedTuple):
     mesh: str = "mesh"
     target: str = "target"
     init: str = "init"
-    mask: str = "mask"
     lens: tuple[str, ...] = ("fit_scale", "fit_focal")  # of the entries of a Lens
+    mask: str = "mask"
 
 
 @dataclass(frozen=True)
@@ -168,8 +168,9 @@ class PoseTask:
         # A black object before nothing has no range of colours.
         extent = next((r for x in (colours, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
         if extent == 0.0:
+            given = names.target if mask is None else names.mask
             raise ValueError(
-                f"{names.mask if mask is not None else names.target}: expected a picture of the object, got the same in every pixel; "
+                f"{given}: expected a picture of the object, got the same in every pixel; "
                 "was it read or rendered right?"
             )
         bare = scene.replace(meshes=double, background=None)

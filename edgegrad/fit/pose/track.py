@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from os import PathLike as OsPath
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ...camera.camera import Camera
@@ -26,8 +25,9 @@ from ...scene.scene import Scene
 from ..views import check_image
 from .fit_pose import depth_image
 from .gauss_newton import Normal
+from .photo.cover import uncovered, weighted
 from .photo.level import PhotoLevel, Seen, photo_levels
-from .photo.picture import Picture, palette, smoothed
+from .photo.picture import Picture, palette
 from .photo.search import DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST, PhotoSearch
 from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit
@@ -43,8 +43,6 @@ PATIENCE = 4  # such pictures one after the other, and the object is lost
 AGAIN = 5  # pictures from one search for a lost object to the next
 RATE = 0.1  # of a picture, in the light of all
 LEARNT = 0.8  # of the edges, in pictures that light is learnt from
-# What covers the object: so many deviations off, over so many pixels; what it counts; how much of the object is near.
-OFF, ACROSS, COVERED, SEEN_FROM = 4.0, 1.5, 0.02, 0.05
 SEARCH_STEPS = 12  # on each level of it
 FARTHEST = 0.25  # radians and object sizes that steps lead from where they begin
 
@@ -201,21 +199,8 @@ class Tracker:
         (seen,) = levels[-2].see(pose, self.seed)
         if seen.lit is None or seen.lit.coefficients.shape != self.light.shape:
             return levels
-        inside = seen.lit.surface.inside
-        off = torch.zeros_like(inside, dtype=torch.float32)
-        off[inside] = (seen.lit.difference(self.light) > OFF * self.deviation).float()
-        # Edges that are a pixel off are thin; what covers the object is not.
-        share = smoothed(torch.stack([off, inside.float()]), ACROSS)
-        covered = (share[0] > 0.5 * share[1]) & (share[1] > SEEN_FROM)
-        weight = 1.0 - (1.0 - COVERED) * covered.float()
-        found = []
-        for level in levels:
-            pictures = []
-            for picture in level.pictures:
-                at = F.interpolate(weight[None, None], picture.size, mode="bilinear")[0, 0]
-                pictures.append(replace(picture, weight=picture.weight * at))
-            found.append(replace(level, pictures=pictures))
-        return found
+        weights = [uncovered(seen.lit, self.light, self.deviation)]
+        return [weighted(level, weights) for level in levels]
 
     def _learn(self, views: list[Seen]) -> None:
         """Takes in the light of a picture that shows the object."""

@@ -25,6 +25,7 @@ LEFT_OUT = 0.4  # of the object's pixels, at one side
 # A pixel that is so many deviations off is not of the object, if it is one of many in a window of so many pixels.
 OFF, ACROSS, MANY = 4.0, 1.5, 0.5
 CLEAR = 0.25  # of Lit's scaled differences: what shadows and highlights may make
+BESIDE = 2  # pixels
 SEEN_FROM = 0.05  # of a window inside the object, for which the same holds
 TURNS = 3
 LEAST = 0.02  # what covered pixels count
@@ -50,8 +51,10 @@ def uncovered(lit: Lit, light: Tensor | None = None, deviation: float | None = N
     far = lit.difference(lit.coefficients if light is None else light)
     off[inside] = (far > max(OFF * (lit.deviation if deviation is None else deviation), CLEAR)).float()
     share = smoothed(torch.stack([off, inside.float()]), ACROSS)
-    covered = (share[0] > MANY * share[1]) & (share[1] > SEEN_FROM)
-    return 1.0 - (1.0 - LEAST) * covered.float()
+    covered = ((share[0] > MANY * share[1]) & (share[1] > SEEN_FROM)).float()
+    # Along the silhouette beside it, contours of the object and of the cover are one in a blur.
+    beside = F.max_pool2d(covered[None, None], 2 * BESIDE + 1, 1, BESIDE)[0, 0]
+    return 1.0 - (1.0 - LEAST) * torch.where(inside, covered, beside)
 
 
 def weighted(level: PhotoLevel, weights: list[Tensor]) -> PhotoLevel:

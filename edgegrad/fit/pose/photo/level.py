@@ -130,8 +130,8 @@ class PhotoLevel:
     def surface(
         self, moved: Scene, camera: Camera, moves: Motion, picture: Picture, seed: int, visible: Tensor | None = None
     ) -> tuple[Surface | None, Lit | None]:  # fmt: skip
-        """Of the moved object beside a picture, and its light, where terms ask for them. `visible` (h, w): its alpha, where others
-        may cover it."""
+        """Of the moved object beside a picture, and its light, where terms ask for them. `visible` (h, w): its alpha, where
+        others may cover it."""
         if not self.harmonics and picture.depth is None:
             return None, None
         names = [name for name in AOVS if name != "image" or self.harmonics]

@@ -18,8 +18,21 @@ from ..result import HIDDEN, Step
 from ..search import distinct, norms_of
 from ..task import PoseTask
 from .search import (
-    ALONE_ENOUGH, APART, COARSE_STEPS, DAMPING, ENOUGH, FINE_STEPS, FLOOR, FOLLOWED, FULL_STEPS, GAIN, LAST_DAMPING, LAST_STEPS,
-    LONGEST, ROUNDS, turns,
+    ALONE_ENOUGH,
+    APART,
+    COARSE_STEPS,
+    DAMPING,
+    ENOUGH,
+    FINE_STEPS,
+    FLOOR,
+    FOLLOWED,
+    FULL_STEPS,
+    GAIN,
+    LAST_DAMPING,
+    LAST_STEPS,
+    LONGEST,
+    ROUNDS,
+    turns,
 )  # fmt: skip
 from .together import Together, together_levels
 
@@ -71,8 +84,8 @@ class PosesSearch:
             steps.append(Step(self.levels[-1].size, self.loss, pose, True, {}))
 
     def _surrounded(self) -> None:
-        """The last steps, with what surrounds the objects where they are now, and without what covers them: the end depends neither
-        on the start nor on the cover any more. Objects that it does not agree with stay."""
+        """The last steps, with what surrounds the objects where they are now, and without what covers them: the end depends
+        neither on the start nor on the cover any more. Where an object is lost by that, all stay where they were."""
         before = list(self.best), list(self.short), list(self.explained), list(self.visible)
         last = together_levels(self.tasks, self.best, self.depths, self.max_size, self.spp, self.seed)[-1]
         level = last

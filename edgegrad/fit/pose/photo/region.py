@@ -45,8 +45,8 @@ def posteriors(windows: Sequence[Windows], alphas: Tensor, near: Tensor) -> Tens
 def regions_term(
     posteriors: Tensor, alphas: Tensor, tangents: Tensor, near: Tensor, sigma: float
 ) -> tuple[Normal, float]:
-    """As region_term(), of N objects that may cover one another: posteriors (N + 1, h, w), alphas (N, h, w), and their derivatives
-    (n, N, h, w). A pixel has the likelihood Σ αₖ Pₖ, with what lies behind them as the last region (Schmaltz et al.,
+    """As region_term(), of N objects that may cover one another: posteriors (N + 1, h, w), alphas (N, h, w), and their
+    derivatives (n, N, h, w). A pixel has the likelihood Σ αₖ Pₖ, with what lies behind them as the last region (Schmaltz et al.,
     Region-Based Pose Tracking with Occlusions Using 3D Models, 2012)."""
     soft = smoothed(alphas, sigma)
     *objects, behind = posteriors

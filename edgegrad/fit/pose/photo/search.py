@@ -168,7 +168,7 @@ class PhotoSearch:
         return best
 
     def _from_covers(self, best: _End, begins: int) -> _End:
-        """Ways that leave out what may cover the object at one side, until one ends where the pictures show the render's edges."""
+        """Ways that leave out what may cover the object at one side, until the pictures show an end's edges for sure."""
         answered = self._answered
         self._answered = True
         coarse, *finer = self.levels
@@ -211,8 +211,8 @@ class PhotoSearch:
         return _End(share * min(1.0, kept / WHOLE), pose, short, kept)
 
     def _surrounded(self, best: _End) -> _End:
-        """The end, once more with what surrounds the object where it is now, and without what covers it: it does not depend on the
-        start any more."""
+        """The end, once more with what surrounds the object where it is now, and without what covers it: it does not depend
+        on the start any more."""
         last = photo_levels(self.task, best.pose, self.depths, self.max_size, self.spp, self.seed)[-1]
         before = len(self.history)
         found = self._uncovered(best.pose, [torch.ones(picture.size) for picture in last.pictures], [last] * ROUNDS)
@@ -259,7 +259,8 @@ class PhotoSearch:
         return way.pose, way.short
 
     def _most(self, level: PhotoLevel) -> int:
-        return min(self.steps, COARSE_STEPS if level.plain.coarseness == self.levels[0].plain.coarseness else LAST_STEPS if level.last else FINE_STEPS)
+        coarse = level.plain.coarseness == self.levels[0].plain.coarseness
+        return min(self.steps, LAST_STEPS if level.last else COARSE_STEPS if coarse else FINE_STEPS)
 
     def _note(self, step: Step) -> None:
         if not self._answered:

@@ -76,9 +76,7 @@ class Together:
                 picture = level.pictures[n]
                 near, extent = surroundings(alphas[k])
                 surface, lit = level.surface(scenes[k], shot.camera, ways[k], picture, seed, alphas[k])
-                found[k].append(
-                    Seen(picture, alphas[k], tangents[:, k], near * picture.weight, extent, surface, lit)
-                )
+                found[k].append(Seen(picture, alphas[k], tangents[:, k], near * picture.weight, extent, surface, lit))
         return found
 
     def equations(self, poses: Sequence[Pose], seed: int) -> tuple[Normal, float]:
@@ -113,9 +111,7 @@ class Together:
     def explained(self, poses: Sequence[Pose], seed: int) -> list[float]:
         """Of each object, PhotoLevel.explained() where it is seen."""
         views = self.see(poses, seed)
-        return [
-            level.explained(pose, seed, view) for level, pose, view in zip(self.objects, poses, views, strict=True)
-        ]
+        return [level.explained(pose, seed, view) for level, pose, view in zip(self.objects, poses, views, strict=True)]
 
     def visible(self, poses: Sequence[Pose], seed: int) -> list[float]:
         """Of each object, how much of what it covers of the pictures by itself the others leave to be seen, 0 … 1."""
@@ -152,7 +148,12 @@ class Together:
 
 
 def together_levels(
-    tasks: Sequence[PoseTask], poses: Sequence[Pose], depths: Sequence[Tensor | None], max_size: int, spp: int, seed: int
+    tasks: Sequence[PoseTask],
+    poses: Sequence[Pose],
+    depths: Sequence[Tensor | None],
+    max_size: int,
+    spp: int,
+    seed: int,
 ) -> list[Together]:
     """From coarse to fine, of what surrounds the objects."""
     crops = [Crop.around(tasks[0], shot, poses[0]) for shot in tasks[0].shots]
