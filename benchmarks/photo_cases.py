@@ -24,6 +24,7 @@ SIZE = 256  # pixels
 COVERED = 0.25  # of the object's pixels
 SMALLER, APART = 0.75, 0.32  # of several objects: their size, and how far they are from the middle
 OVERLAP = 0.55, 0.8  # share of the one that is seen least
+ALIKE = 0.02  # of its size: what turns a plain mesh onto itself but for so much looks alike
 BLUR, NOISE, QUALITY = 1.0, 0.02, 70  # pixels, sRGB values, of JPEG
 
 
@@ -52,6 +53,7 @@ class Case:
     camera: eg.Camera
     truth: Placed
     depth: Tensor | None = None  # (H, W)
+    symmetries: eg.Symmetries | None = None  # up to which poses look alike
 
     @property
     def center(self) -> Tensor:
@@ -72,7 +74,11 @@ class Case:
         return Placed(R, center - R @ self.center)
 
     def apart(self, a: Placed, b: Placed) -> tuple[float, float]:
-        """Degrees between two poses, and how far apart the object's centres are, in the mesh's units."""
+        """Degrees between two poses, and how far apart the object's centres are, in the mesh's units; of those that look alike,
+        between the nearest ones."""
+        if self.symmetries is not None:
+            M = self.symmetries.closest(a.matrix, b.matrix)
+            a = Placed(M[:3, :3], M[:3, 3])
         M = a.R.double() @ b.R.double().T
         sine = 0.5 * torch.stack([M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]]).norm()
         ways = [pose.R.double() @ self.center + pose.t.double() for pose in (a, b)]
@@ -112,7 +118,8 @@ def rendered(name: str, mesh: eg.Mesh, photographs: Sequence[Tensor], kind: Kind
         image = _covered(image, alpha, _view(photographs[(seed + 1) % len(photographs)], rng), rng)
     picture = _worn(image, 0.7, 0.0, 85, rng) if easy else _worn(image, BLUR, NOISE, QUALITY, rng)
     seen = eg.Mesh(mesh.verts, mesh.faces) if kind == "plain" else mesh
-    return Case(name, seen, picture, camera, truth)
+    alike = eg.find_symmetries(seen, ALIKE) if kind == "plain" else None
+    return Case(name, seen, picture, camera, truth, symmetries=alike)
 
 
 def several(meshes: Sequence[eg.Mesh], photographs: Sequence[Tensor], seed: int) -> list[Case]:

@@ -26,18 +26,18 @@ import json
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import photo_folder
 import torch
 import torch.nn.functional as F
-from photo_cases import Case, Kind, Placed, clutter, rendered
+from photo_cases import Case, Kind, Placed, clutter, rendered, several
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import PoseFit, fit_pose
+from edgegrad.fit import PoseFit, fit_pose, fit_poses
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
 
@@ -130,6 +130,26 @@ class Run:
         fit = fit_pose(
             case.mesh, case.picture, case.camera, init=start.matrix, depth=case.depth, search=search, progress=False
         )
+        trial = self.noted(part, case, start, truth, fit)
+        if self.pictures is not None:
+            self.pictures.mkdir(parents=True, exist_ok=True)
+            eg.write_image(self.pictures / f"{label}.png", outlined(case, start, Placed(fit.R, fit.t)))
+        return trial, fit
+
+    def together(self, part: Part, cases: Sequence[Case], starts: Sequence[Placed], label: str) -> None:
+        """Several objects of one picture in one fit."""
+        first = cases[0]
+        init = [start.matrix for start in starts]
+        fits = fit_poses([case.mesh for case in cases], first.picture, first.camera, init=init, progress=False)
+        image = first.picture
+        for case, start, fit in zip(cases, starts, fits, strict=True):
+            self.noted(part, case, start, case.truth, fit)
+            image = outlined(replace(case, picture=image), start, Placed(fit.R, fit.t))
+        if self.pictures is not None:
+            self.pictures.mkdir(parents=True, exist_ok=True)
+            eg.write_image(self.pictures / f"{label}.png", image)
+
+    def noted(self, part: Part, case: Case, start: Placed, truth: Placed, fit: PoseFit) -> Trial:
         found, limits = Placed(fit.R, fit.t), part.limits
         before, after = case.apart(start, truth), case.apart(found, truth)
         off = max(after[0] / limits.degrees, after[1] / case.size / limits.shift)
@@ -139,10 +159,7 @@ class Run:
         )  # fmt: skip
         part.trials.append(trial)
         print(trial.line(), flush=True)
-        if self.pictures is not None:
-            self.pictures.mkdir(parents=True, exist_ok=True)
-            eg.write_image(self.pictures / f"{label}.png", outlined(case, start, found))
-        return trial, fit
+        return trial
 
 
 def outlined(case: Case, start: Placed, found: Placed) -> Tensor:
@@ -169,6 +186,22 @@ def _scenes(kind: Kind, degrees: float, shift: float, limits: Limits) -> Callabl
             share = (rng.uniform(1 / 3, 1.0), rng.uniform()) if kind == "easy" else (1.0, 1.0)
             start = case.beside(case.truth, degrees * share[0], shift * case.size * share[1], rng)
             run.fitted(part, case, start, case.truth, f"{name}-{k:02d}")
+        return part
+
+    return run
+
+
+def _several(count: int, limits: Limits) -> Callable[[Run, str], Part]:
+    """So many objects that cover one another, each from a start of its own."""
+
+    def run(run: Run, name: str) -> Part:
+        part = Part(name, limits)
+        for k in range(run.starts):
+            meshes = [run.meshes[(k + n) % len(run.meshes)] for n in range(count)]
+            cases = several(meshes, run.backgrounds, 300 + k)
+            rng = np.random.default_rng([k, count])
+            starts = [case.beside(case.truth, 15.0, 0.05 * case.size, rng) for case in cases]
+            run.together(part, cases, starts, f"{name}-{k:02d}")
         return part
 
     return run
@@ -226,6 +259,8 @@ MADE: dict[str, Callable[[Run, str], Part]] = {
     "lit": _scenes("lit", 15.0, 0.05, Limits(1.0, 0.01, 0.90)),
     "shadow": _scenes("shadow", 15.0, 0.05, Limits(1.5, 0.03)),
     "covered": _scenes("covered", 15.0, 0.05, Limits(1.5, 0.03, 0.80)),
+    "two": _several(2, Limits(2.0, 0.03, 0.80)),
+    "three": _several(3, Limits(2.0, 0.03, 0.80)),
     "plain": _scenes("plain", 15.0, 0.05, Limits(2.0, 0.03, 0.80)),
 }
 REAL: dict[str, Callable[[Run, Path], Iterator[Part]]] = {

@@ -108,7 +108,8 @@ def fit_pose(
     symmetries  of the mesh: of the poses that they make the same, the one nearest to the start is reported, by its rotation.
                 "find" looks for them with find_symmetries(). They change nothing of the search itself
 
-    About a quarter of the object may be covered. The picture may be blurred by up to 1.4 pixels, and compressed: renders are made
+    About a quarter of the object may be covered by something that is not known; meshes that cover one another are for
+    fit_poses. The picture may be blurred by up to 1.4 pixels, and compressed: renders are made
     as soft. The start is followed first. The fit is `converged` if its last step was short and the pictures show at least 60 % of
     the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few times as long,
     less where nothing in the picture looks like the object; where they do, but something covers the object or it is of another
