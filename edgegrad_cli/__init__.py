@@ -1,4 +1,4 @@
-"""The command line: edgegrad fit-pose, fit-shape, fit-texture, fit-camera, track, render, bop, demo, report, doctor.
+"""The command line: edgegrad fit-pose, fit-poses, fit-shape, fit-texture, fit-camera, track, render, bop, demo, report, doctor.
 
 It lies beside the library rather than in it, for importing any part of that imports torch, which takes seconds: help and
 faults of arguments are said before. Each command imports what it uses when it runs.

@@ -65,15 +65,15 @@ def run(args: argparse.Namespace) -> int:
         scenes, picture, camera, mask, init, max_size=args.size, steps=args.steps, seed=args.seed
     )  # fmt: skip
     # Neither a full disk nor a closed terminal may lose the result, as in fit-pose.
+    folders = [args.out / str(k + 1) for k in range(len(fits))]
     try:
         for path, fit in zip(args.mesh, fits, strict=True):
             _print_fit(path, fit)
     finally:
-        for k, fit in enumerate(fits):
-            folder = args.out / str(k + 1)
+        for folder, fit in zip(folders, fits, strict=True):
             outputs.make_folder(folder)
-            written = outputs.write_outputs(folder, fit)
-    print(f"wrote {', '.join(written)} in {', '.join(str(args.out / str(k + 1)) for k in range(len(fits)))}")
+            outputs.write_outputs(folder, fit)
+    print(f"wrote {', '.join(map(str, folders))}")
     return INTERRUPTED if fits[0].interrupted else 0
 
 

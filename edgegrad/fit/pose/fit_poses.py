@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-import trimesh
 from torch import Tensor
 from tqdm import tqdm
 
@@ -218,6 +217,8 @@ def _check_in_front(tasks: Sequence[PoseTask], starts: Sequence[Pose]) -> None:
 
 def _check_apart(tasks: Sequence[PoseTask], starts: Sequence[Pose]) -> None:
     """Raises ValueError where an object lies inside another one, or two are one."""
+    import trimesh  # takes longer to import than a step of a fit
+
     bodies = [_moved(task, start) for task, start in zip(tasks, starts, strict=True)]
     points = [torch.cat([mesh.verts for mesh in body]).double() for body in bodies]
     for k, own in enumerate(points):

@@ -24,7 +24,7 @@ SIDES = 8  # from which something may cover the object
 LEFT_OUT = 0.4  # of the object's pixels, at one side
 # A pixel that is so many deviations off is not of the object, if it is one of many in a window of so many pixels.
 OFF, ACROSS, MANY = 4.0, 1.5, 0.5
-CLEAR = 0.25  # of Lit's scaled differences: what shadows and highlights may make
+CLEAR = 0.45  # of Lit's scaled differences: what shadows and highlights may make
 BESIDE = 2  # pixels
 SEEN_FROM = 0.05  # of a window inside the object, for which the same holds
 TURNS = 3

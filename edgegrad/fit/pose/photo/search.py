@@ -38,7 +38,7 @@ FOLLOWED, COVERS_FOLLOWED = 3, 4  # of them, the best on the coarsest level
 ROUNDS = 2  # of the last level, each without what covers the object in the light of the round before
 APART = 0.05  # radians between poses that are followed both
 AS_THEY_ARE = 0.05  # mean change of colours, in parts of them, by light that leaves them as they are
-UNCOVERED = 0.9  # of the object's pixels: with fewer, something covers it
+UNCOVERED = 0.85  # of the object's pixels: with fewer, something covers it
 NEAR = 0.1  # radians: a polished pose that is farther off is another one
 
 
