@@ -22,6 +22,9 @@ from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 Kind = Literal["easy", "lit", "shadow", "covered", "plain"]
 SIZE = 256  # pixels
 COVERED = 0.25  # of the object's pixels
+SMALLER, APART = 0.75, 0.32  # of several objects: their size, and how far they are from the middle
+OVERLAP = 0.55, 0.8  # share of the one that is seen least
+ALIKE = 0.02  # of its size: what turns a plain mesh onto itself but for so much looks alike
 BLUR, NOISE, QUALITY = 1.0, 0.02, 70  # pixels, sRGB values, of JPEG
 
 
@@ -50,6 +53,7 @@ class Case:
     camera: eg.Camera
     truth: Placed
     depth: Tensor | None = None  # (H, W)
+    symmetries: eg.Symmetries | None = None  # up to which poses look alike
 
     @property
     def center(self) -> Tensor:
@@ -70,7 +74,11 @@ class Case:
         return Placed(R, center - R @ self.center)
 
     def apart(self, a: Placed, b: Placed) -> tuple[float, float]:
-        """Degrees between two poses, and how far apart the object's centres are, in the mesh's units."""
+        """Degrees between two poses, and how far apart the object's centres are, in the mesh's units; of those that look alike,
+        between the nearest ones."""
+        if self.symmetries is not None:
+            M = self.symmetries.closest(a.matrix, b.matrix)
+            a = Placed(M[:3, :3], M[:3, 3])
         M = a.R.double() @ b.R.double().T
         sine = 0.5 * torch.stack([M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]]).norm()
         ways = [pose.R.double() @ self.center + pose.t.double() for pose in (a, b)]
@@ -102,7 +110,7 @@ def rendered(name: str, mesh: eg.Mesh, photographs: Sequence[Tensor], kind: Kind
     camera = eg.Camera.look_at((0, 0.4, -3.4), (0, 0, 0), (0, 1, 0), fov_y=40.0, size=(SIZE, SIZE))
     truth = Placed(turned(30.0 if easy else rng.uniform(0.0, 180.0), rng), 0.05 * torch.from_numpy(rng.normal(size=3)))
     behind = _view(photographs[0 if easy else seed % len(photographs)], rng)
-    image = _lit(mesh.transformed(truth.R, truth.t), camera, behind, kind == "shadow", rng)
+    image = _lit([mesh.transformed(truth.R, truth.t)], camera, behind, kind == "shadow", rng)
     if not easy:
         image = image * torch.from_numpy(2.0 ** rng.uniform(-1.0, 1.0) * rng.uniform(0.8, 1.2, 3)).float()
     if kind == "covered":
@@ -110,7 +118,43 @@ def rendered(name: str, mesh: eg.Mesh, photographs: Sequence[Tensor], kind: Kind
         image = _covered(image, alpha, _view(photographs[(seed + 1) % len(photographs)], rng), rng)
     picture = _worn(image, 0.7, 0.0, 85, rng) if easy else _worn(image, BLUR, NOISE, QUALITY, rng)
     seen = eg.Mesh(mesh.verts, mesh.faces) if kind == "plain" else mesh
-    return Case(name, seen, picture, camera, truth)
+    alike = eg.find_symmetries(seen, ALIKE) if kind == "plain" else None
+    return Case(name, seen, picture, camera, truth, symmetries=alike)
+
+
+def several(meshes: Sequence[eg.Mesh], photographs: Sequence[Tensor], seed: int) -> list[Case]:
+    """A picture of several meshes, as `lit` ones, of which one covers OVERLAP of another: a case for each."""
+    rng = np.random.default_rng(seed)
+    camera = eg.Camera.look_at((0, 0.4, -3.4), (0, 0, 0), (0, 1, 0), fov_y=40.0, size=(SIZE, SIZE))
+    small = [mesh.replace(verts=mesh.verts * SMALLER) for mesh in map(_centred, meshes)]
+    placed: list[Placed] = []
+    shares = [0.0]
+    while not (OVERLAP[0] <= min(shares) <= OVERLAP[1]):
+        ways = rng.uniform(0.0, 2.0 * math.pi) + 2.0 * math.pi * np.arange(len(small)) / len(small)
+        placed = [
+            Placed(
+                turned(rng.uniform(0.0, 180.0), rng),
+                torch.tensor([APART * math.cos(way), APART * math.sin(way), rng.uniform(-0.5, 0.5)]).double(),
+            )
+            for way in ways
+        ]
+        shares = _shares([mesh.transformed(pose.R, pose.t) for mesh, pose in zip(small, placed, strict=True)], camera)
+    moved = [mesh.transformed(pose.R, pose.t) for mesh, pose in zip(small, placed, strict=True)]
+    image = _lit(moved, camera, _view(photographs[seed % len(photographs)], rng), False, rng)
+    image = image * torch.from_numpy(2.0 ** rng.uniform(-1.0, 1.0) * rng.uniform(0.8, 1.2, 3)).float()
+    picture = _worn(image, BLUR, NOISE, QUALITY, rng)
+    found = zip(small, placed, strict=True)
+    return [Case(f"{k + 1} of {len(small)}", mesh, picture, camera, pose) for k, (mesh, pose) in enumerate(found)]
+
+
+def _shares(meshes: Sequence[eg.Mesh], camera: eg.Camera) -> list[float]:
+    """Of each mesh, how much the others leave of it to be seen."""
+    labels = torch.eye(len(meshes))
+    bare = [eg.Mesh(mesh.verts, mesh.faces) for mesh in meshes]
+    painted = [mesh.replace(colors=label.expand(len(mesh.verts), -1)) for mesh, label in zip(bare, labels, strict=True)]
+    seen = eg.render(eg.Scene(painted), camera, 4).sum((0, 1))
+    alone = [float(eg.render_aovs(mesh, camera, ["alpha"], 4)["alpha"].sum()) for mesh in bare]
+    return [float(one) / whole for one, whole in zip(seen, alone, strict=True)]
 
 
 def clutter(seed: int, size: int = SIZE) -> Tensor:
@@ -146,8 +190,10 @@ def _view(photograph: Tensor, rng: np.random.Generator) -> Tensor:
     return F.interpolate(square, size=(SIZE, SIZE), mode="area")[0].movedim(0, -1).contiguous()
 
 
-def _lit(mesh: eg.Mesh, camera: eg.Camera, behind: Tensor, shadow: bool, rng: np.random.Generator) -> Tensor:
-    """(SIZE, SIZE, 3), matte, with the shadows that it casts on itself."""
+def _lit(
+    given: Sequence[eg.Mesh], camera: eg.Camera, behind: Tensor, shadow: bool, rng: np.random.Generator
+) -> Tensor:  # fmt: skip
+    """(SIZE, SIZE, 3), matte, with the shadows that they cast on themselves and on one another."""
     way = torch.from_numpy(rng.normal(size=3)).float()
     way[1], way[2] = -way[1].abs() - 0.3, 0.7 * way[2].abs()  # from above, and from the camera's side
     way = F.normalize(way, dim=0)
@@ -155,15 +201,14 @@ def _lit(mesh: eg.Mesh, camera: eg.Camera, behind: Tensor, shadow: bool, rng: np
         eg.DirectionalLight(way, float(rng.uniform(1.5, 3.5))),
         eg.Environment(torch.from_numpy(rng.uniform(0.3, 0.6, 3)).float(), visible=False),
     ]
-    matte = mesh.replace(material=eg.Material(), normals=eg.vertex_normals(mesh.verts, mesh.faces))
-    meshes = [matte]
+    meshes = [mesh.replace(material=eg.Material(), normals=eg.vertex_normals(mesh.verts, mesh.faces)) for mesh in given]
     if shadow:
         across = F.normalize(torch.linalg.cross(way, torch.from_numpy(rng.normal(size=3)).float()), dim=0)
         along = torch.linalg.cross(way, across)
         place = -12.0 * way + float(rng.uniform(-0.3, 0.3)) * across
         ends = [place + a * across + b * along for a, b in ((-0.15, -3.0), (0.15, -3.0), (0.15, 3.0), (-0.15, 3.0))]
         bar = eg.Mesh(torch.stack(ends), torch.tensor([[0, 1, 2], [0, 2, 3]]))
-        channels = mesh.channels or 3
+        channels = meshes[0].channels or 3
         meshes.append(bar.replace(face_colors=torch.zeros(2, channels), material=eg.Material()))
     with torch.no_grad():
         return eg.render(eg.Scene(meshes, background=behind, lights=lights), camera, spp=64, light_samples=2)

@@ -30,18 +30,18 @@ import math
 import statistics
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import photo_folder
 import torch
 import torch.nn.functional as F
-from photo_cases import Case, Kind, Placed, clutter, rendered
+from photo_cases import Case, Kind, Placed, clutter, rendered, several
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.fit import PoseFit, fit_camera, fit_pose
+from edgegrad.fit import PoseFit, fit_camera, fit_pose, fit_poses
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
 
@@ -139,13 +139,28 @@ class Run:
             search=search, starts="global" if start is None else 1, progress=False,
         )  # fmt: skip
         found = Placed(fit.R, fit.t)
-        return self.noted(part, case, start, found, truth, fit, label), fit
+        trial = self.noted(part, case, start, found, truth, fit)
+        self.drawn(label, outlined(case, start, found))
+        return trial, fit
 
-    def noted(
-        self, part: Part, case: Case, start: Placed | None, found: Placed, truth: Placed, fit: PoseFit, label: str,
-        camera: eg.Camera | None = None,
-    ) -> Trial:  # fmt: skip
-        """A trial of the part. `camera`: that of the fit, where it is not the case's."""
+    def together(self, part: Part, cases: Sequence[Case], starts: Sequence[Placed], label: str) -> None:
+        """Several objects of one picture in one fit."""
+        first = cases[0]
+        init = [start.matrix for start in starts]
+        fits = fit_poses([case.mesh for case in cases], first.picture, first.camera, init=init, progress=False)
+        image = first.picture
+        for case, start, fit in zip(cases, starts, fits, strict=True):
+            found = Placed(fit.R, fit.t)
+            self.noted(part, case, start, found, case.truth, fit)
+            image = outlined(replace(case, picture=image), start, found)
+        self.drawn(label, image)
+
+    def drawn(self, label: str, image: Tensor) -> None:
+        if self.pictures is not None:
+            self.pictures.mkdir(parents=True, exist_ok=True)
+            eg.write_image(self.pictures / f"{label}.png", image)
+
+    def noted(self, part: Part, case: Case, start: Placed | None, found: Placed, truth: Placed, fit: PoseFit) -> Trial:
         limits = part.limits
         before = (math.nan, math.nan) if start is None else case.apart(start, truth)
         after = case.apart(found, truth)
@@ -156,9 +171,6 @@ class Run:
         )  # fmt: skip
         part.trials.append(trial)
         print(trial.line(), flush=True)
-        if self.pictures is not None:
-            self.pictures.mkdir(parents=True, exist_ok=True)
-            eg.write_image(self.pictures / f"{label}.png", outlined(case, start, found, camera))
         return trial
 
 
@@ -195,6 +207,22 @@ def _scenes(kind: Kind, degrees: float, shift: float, limits: Limits) -> Callabl
     return run
 
 
+def _several(count: int, limits: Limits) -> Callable[[Run, str], Part]:
+    """So many objects that cover one another, each from a start of its own."""
+
+    def run(run: Run, name: str) -> Part:
+        part = Part(name, limits)
+        for k in range(run.starts):
+            meshes = [run.meshes[(k + n) % len(run.meshes)] for n in range(count)]
+            cases = several(meshes, run.backgrounds, 300 + k)
+            rng = np.random.default_rng([k, count])
+            starts = [case.beside(case.truth, 15.0, 0.05 * case.size, rng) for case in cases]
+            run.together(part, cases, starts, f"{name}-{k:02d}")
+        return part
+
+    return run
+
+
 def _cameras(focal: bool, limits: Limits) -> Callable[[Run, str], Part]:
     """Cameras 10° and 5 % of the object's size off the right one, and with `focal` through a lens that is off."""
 
@@ -216,7 +244,8 @@ def _cameras(focal: bool, limits: Limits) -> Callable[[Run, str], Part]:
             # As a pose of the object before the case's camera.
             back = torch.linalg.inv(W) @ fit.camera.world_to_camera.double() @ case.truth.matrix
             found, seen = Placed(back[:3, :3], back[:3, 3]), case.camera.replace(K=fit.camera.K)
-            run.noted(part, case, start, found, case.truth, fit.search, f"{name}-{k:02d}", seen)
+            run.noted(part, case, start, found, case.truth, fit.search)
+            run.drawn(f"{name}-{k:02d}", outlined(case, start, found, seen))
             if focal:
                 ratio = [float(one.K[0, 0] / case.camera.K[0, 0]) for one in (given, fit.camera)]
                 print(f"    focal length {ratio[0] - 1:+.1%} → {ratio[1] - 1:+.1%}", flush=True)
@@ -294,6 +323,8 @@ MADE: dict[str, Callable[[Run, str], Part]] = {
     "lit": _scenes("lit", 15.0, 0.05, Limits(1.0, 0.01, 0.90)),
     "shadow": _scenes("shadow", 15.0, 0.05, Limits(1.5, 0.03)),
     "covered": _scenes("covered", 15.0, 0.05, Limits(1.5, 0.03, 0.80)),
+    "two": _several(2, Limits(2.0, 0.03, 0.80)),
+    "three": _several(3, Limits(2.0, 0.03, 0.80)),
     "plain": _scenes("plain", 15.0, 0.05, Limits(2.0, 0.03, 0.80)),
     "camera": _cameras(False, Limits(1.0, 0.01, 0.90)),
     "focal": _cameras(True, Limits(1.5, 0.1, 0.80)),  # its distance goes with the focal length

@@ -13,6 +13,7 @@ from .options import Options, Parameter
 from .placement import Pose, PoseParameter
 from .pose.fit_camera import CameraFit, fit_camera
 from .pose.fit_pose import fit_pose
+from .pose.fit_poses import fit_poses
 from .pose.result import PoseFit, Step
 from .pose.track import TrackedPose, track
 from .pose.uncertainty import Uncertainty
@@ -20,6 +21,6 @@ from .unwrapping import unwrapped
 
 __all__ = [
     "CameraFit", "Ending", "Fit", "Measured", "Options", "Parameter", "Pose", "PoseFit", "PoseParameter", "Progress", "Record",
-    "Step", "TrackedPose", "Uncertainty", "fit_camera", "fit_pose", "fit_scene", "fit_shape", "fit_texture", "losses",
-    "regularizers", "track", "unwrapped", "visual_hull",
+    "Step", "TrackedPose", "Uncertainty", "fit_camera", "fit_pose", "fit_poses", "fit_scene", "fit_shape", "fit_texture",
+    "losses", "regularizers", "track", "unwrapped", "visual_hull",
 ]  # fmt: skip

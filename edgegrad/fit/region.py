@@ -101,6 +101,7 @@ class Windows:
     ALIKE = 0.06  # standard deviation of colours that look alike, in sRGB values
     WIDTH = 1.5  # standard deviation of a window, in cells
     LEAST = 1e-3  # pixels of all colours that every window has
+    PRESENT = 0.1  # pixels in a window's cell: with fewer, nothing is known of their colours
 
     def __init__(self, size: tuple[int, int], label: Tensor, colours: Tensor, radius: float) -> None:
         """`label` (h · w,): what Palette.labels() gives for the colours (n, C)."""
@@ -122,6 +123,14 @@ class Windows:
         windows = smoothed(rows.reshape(self.count, *self.shape), self.WIDTH)
         windows = (windows + self.LEAST / self.count) / (windows.sum(0) + self.LEAST)
         return windows.flatten()[self._index].reshape(self.size)
+
+    def present(self, share: Tensor) -> Tensor:
+        """(h, w): 1 where the window around a pixel has any of what `share` (h, w) counts, 0 where it has hardly a pixel."""
+        cells = torch.zeros(self.shape[0] * self.shape[1])
+        cell = self._index % (self.shape[0] * self.shape[1])
+        cells.index_add_(0, cell, share.flatten())
+        windows = smoothed(cells.reshape(1, *self.shape), self.WIDTH).flatten()
+        return (windows / (windows + self.PRESENT))[cell].reshape(self.size)
 
 
 def smoothed(images: Tensor, sigma: float) -> Tensor:

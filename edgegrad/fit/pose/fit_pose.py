@@ -111,7 +111,8 @@ def fit_pose(
     symmetries  of the mesh: of the poses that they make the same, the one nearest to the start is reported, by its rotation.
                 "find" looks for them with find_symmetries(). They change nothing of the search itself
 
-    About a quarter of the object may be covered. The picture may be blurred by up to 1.4 pixels, and compressed: renders are made
+    About a quarter of the object may be covered by something that is not known; meshes that cover one another are for
+    fit_poses. The picture may be blurred by up to 1.4 pixels, and compressed: renders are made
     as soft. The start is followed first. The fit is `converged` if its last step was short and the pictures show at least 60 % of
     the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few times as long,
     less where nothing in the picture looks like the object; where they do, but something covers the object or it is of another
@@ -127,7 +128,7 @@ def fit_pose(
     return search_pose(
         mesh, target, camera, mask, init, lens, background, weight, depth, Names(), max_size=max_size, steps=steps, spp=spp,
         tolerance=tolerance, seed=seed, search=search, progress=progress, callback=callback, checkpoint=checkpoint,
-        checkpoint_every=checkpoint_every, resume=resume, symmetries=_symmetries(symmetries, mesh),
+        checkpoint_every=checkpoint_every, resume=resume, symmetries=symmetries_of(symmetries, mesh),
         starts=starts,
     )  # fmt: skip
 
@@ -146,12 +147,8 @@ def search_pose(
     for name, count in (("max_size", max_size), ("steps", steps), ("spp", spp)):
         check_positive_int(name, count)
     check_int("seed", seed, 0, 2**32 - 1)
-    if not isinstance(tolerance, (int, float)):
-        raise TypeError(f"tolerance: expected a number, got {type(tolerance).__name__} ({tolerance!r})")
-    if not tolerance > 0.0:
-        raise ValueError(f"tolerance: expected a number above 0, got {tolerance:g}")
-    if callback is not None and not callable(callback):
-        raise TypeError(f"callback: expected a function of a PoseFit, got {type(callback).__name__}")
+    check_tolerance(tolerance)
+    check_callback(callback, "a PoseFit")
     check_checkpoint(checkpoint, checkpoint_every, check_flag("resume", resume))
     _check_starts(starts, init, camera, names.init)
     given = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
@@ -166,7 +163,7 @@ def search_pose(
     })  # fmt: skip
     saved = file.read()
     journal, earlier = (Journal(), 0.0) if saved is None else (Journal(saved["journal"]), saved["seconds"])
-    depths = _depths(depth, task)
+    depths = depth_images(depth, task)
 
     def way(start: Pose, journal: Journal, further: bool) -> Search | PhotoSearch:
         if task.aovs == ("alpha",) and depth is None:
@@ -235,7 +232,21 @@ def search_pose(
     return result()
 
 
-def _depths(depth: object, task: PoseTask) -> list[Tensor | None]:
+def check_tolerance(tolerance: object) -> None:
+    """Raises TypeError or ValueError."""
+    if not isinstance(tolerance, (int, float)):
+        raise TypeError(f"tolerance: expected a number, got {type(tolerance).__name__} ({tolerance!r})")
+    if not tolerance > 0.0:
+        raise ValueError(f"tolerance: expected a number above 0, got {tolerance:g}")
+
+
+def check_callback(callback: object, of: str) -> None:
+    """Raises TypeError."""
+    if callback is not None and not callable(callback):
+        raise TypeError(f"callback: expected a function of {of}, got {type(callback).__name__}")
+
+
+def depth_images(depth: object, task: PoseTask) -> list[Tensor | None]:
     """Of each picture (H, W), NaN where it was not measured. Raises TypeError or ValueError."""
     count = len(task.shots)
     if depth is None:
@@ -284,15 +295,15 @@ def _check_starts(starts: object, init: object, camera: object, name: str) -> No
         check_int("starts", starts, 1, MOST_STARTS)
 
 
-def _symmetries(given: object, mesh: Mesh | Scene) -> Symmetries | None:
+def symmetries_of(given: object, mesh: Mesh | Scene, name: str = "symmetries") -> Symmetries | None:
     """Raises TypeError or ValueError, or what find_symmetries() raises."""
     if given is None or isinstance(given, Symmetries):
         return given
     if given == "find":
         return find_symmetries(mesh)
     if isinstance(given, str):
-        raise ValueError(f'symmetries: expected Symmetries, "find" or None, got {given!r}')
-    raise TypeError(f'symmetries: expected Symmetries, "find" or None, got {type(given).__name__}')
+        raise ValueError(f'{name}: expected Symmetries, "find" or None, got {given!r}')
+    raise TypeError(f'{name}: expected Symmetries, "find" or None, got {type(given).__name__}')
 
 
 def _warn_if_upside_down(task: PoseTask, search: Search | PhotoSearch, place: bool, max_size: int, spp: int) -> None:

@@ -10,7 +10,7 @@ image, are unbiased; JᵀJ is higher than its limit by the variance of J.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -53,6 +53,33 @@ class Motion:
         return directions @ turn.transpose(1, 2)
 
 
+@dataclass(frozen=True)
+class Motions:
+    """Several objects of a scene, one after the other, each with the directions in which it moves alone."""
+
+    parts: Sequence[Motion]  # of each object
+    counts: Sequence[int]  # of its vertices
+    K: None = None  # the camera stays
+    distortion: None = None
+
+    def __len__(self) -> int:
+        return sum(map(len, self.parts))
+
+    def of_points(self, points: Tensor) -> Tensor:
+        """(D, n, 3) of points (n, 3) of the world, those of the objects one after the other."""
+        found, first = points.new_zeros(len(self), len(points), 3), 0
+        for part, own, rows in zip(self.parts, points.split(list(self.counts)), self._vertices(), strict=True):
+            found[first : first + len(part), rows] = part.of_points(own)
+            first += len(part)
+        return found
+
+    def _vertices(self) -> Iterator[slice]:
+        first = 0
+        for count in self.counts:
+            yield slice(first, first + count)
+            first += count
+
+
 class Rendered:
     """Channels of a scene, as render_aovs() gives them to the bit, and then their derivatives by motions.
 
@@ -73,13 +100,13 @@ class Rendered:
             image, self._hits, _ = forward_kernel(self._request)
         self.images = by_name(scene, aovs, image[0])  # (H, W, c) by name
 
-    def derivatives(self, motion: Motion) -> dict[str, Tensor]:
-        """(D, H, W, c) by name."""
+    def derivatives(self, motion: Motion | Motions) -> dict[str, Tensor]:
+        """(D, H, W, c) by name; of several objects that move alone for "image" and "alpha"."""
         with torch.no_grad():
             dots = jvp_kernel(self._hits, self._request, self._tangents(motion), len(motion))
         return by_name(self.scene, self.aovs, dots[:, 0])
 
-    def _tangents(self, motion: Motion) -> dict[str, Tensor]:
+    def _tangents(self, motion: Motion | Motions) -> dict[str, Tensor]:
         """Of what the kernel is given."""
         flat, camera, beside = self._request.scene, self._request.camera, self._request.beside
         points = motion.of_points(flat.verts)
@@ -89,6 +116,8 @@ class Rendered:
         if motion.distortion is not None:
             unsought = MOST - motion.distortion.shape[1]
             tangents["distortion"] = torch.nn.functional.pad(motion.distortion, (0, unsought))[:, None]
+        if isinstance(motion, Motions):
+            return tangents  # of silhouettes and colours alone
         parts = []
         if "position" in self.aovs:
             parts.append(points)

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from .uncertainty import Uncertainty
 
 
+HIDDEN = 0.1  # share of an object that others must leave to be seen for its pose to be believed
+
+
 class Step(NamedTuple):
     """One render of the fit."""
 
@@ -66,6 +69,8 @@ class PoseFit:
     )  # all that were given, as `camera`; not kept in JSON
     # How exactly the terms of photographs show the pose; None where others decided, or before the answer. Not kept in JSON
     uncertainty: Uncertainty | None = field(default=None, repr=False)
+    # Of a fit of several objects, how much of this one the others leave to be seen, 0 … 1. Not kept in JSON
+    visible: float = 1.0
 
     @property
     def matrix(self) -> Tensor:
@@ -75,8 +80,10 @@ class PoseFit:
 
     @property
     def reason(self) -> str:
-        """In words: "converged", or what kept the fit from that: "edges not explained: …",
+        """In words: "converged", or what kept the fit from that: "edges not explained: …", "hidden: …",
         "directions unknown: …", "steps ran out: …", "interrupted"."""
+        if not self.interrupted and not self.converged and self.visible < HIDDEN:
+            return f"hidden: the other objects leave {self.visible:.0%} of it to be seen; its pose is about its start's"
         ending = Ending.INTERRUPTED if self.interrupted else Ending.FLAT if self.converged else Ending.STEPS
         words = reason_of(ending, self.explained, "mesh, camera or picture")
         if self.uncertainty is None or not self.uncertainty.unknown or self.interrupted or self.explained < ENOUGH:

@@ -79,6 +79,7 @@ class Names(NamedTuple):
     target: str = "target"
     init: str = "init"
     lens: tuple[str, ...] = ("fit_scale", "fit_focal")  # of the entries of a Lens
+    mask: str = "mask"
 
 
 @dataclass(frozen=True)
@@ -127,8 +128,8 @@ class PoseTask:
                     raise ValueError(f"weight{name}: expected numbers from 0 up, got {float(count.min()):g}")
             behind = None
             if mask is not None:
-                shape = check_image(f"mask{name}", shape, view.size)
-                check_shape(f"mask{name}", shape, (*view.size, 1))
+                shape = check_image(f"{names.mask}{name}", shape, view.size)
+                check_shape(f"{names.mask}{name}", shape, (*view.size, 1))
                 masks.append(shape)
                 image = shape if plain else torch.cat([before_black(image, shape)[0], shape], -1)
             else:
@@ -138,7 +139,7 @@ class PoseTask:
                     clutter = clutter or is_clutter(image)
                 behind = _background(behind, image)
             shots.append(Shot(view.to("cpu", torch.float64, copy=True), image, behind, count))
-        warn_of_faint("mask", masks)
+        warn_of_faint(names.mask, masks)
         if colourless := plain and mask is None:
             scene = scene.replace(meshes=[_grey(part, shots[0].target.shape[-1]) for part in scene.meshes])
         if clutter:
@@ -167,8 +168,9 @@ class PoseTask:
         # A black object before nothing has no range of colours.
         extent = next((r for x in (colours, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
         if extent == 0.0:
+            given = names.target if mask is None else names.mask
             raise ValueError(
-                f"{'mask' if mask is not None else names.target}: expected a picture of the object, got the same in every pixel; "
+                f"{given}: expected a picture of the object, got the same in every pixel; "
                 "was it read or rendered right?"
             )
         bare = scene.replace(meshes=double, background=None)
@@ -309,7 +311,7 @@ def _shots(camera: Any, target: Any, mask: Any, weight: Any, names: Names) -> li
     if not cameras:
         raise ValueError("camera: expected at least one, got none")
     columns = []
-    for name, value, needed in ((names.target, target, True), ("mask", mask, False), ("weight", weight, False)):
+    for name, value, needed in ((names.target, target, True), (names.mask, mask, False), ("weight", weight, False)):
         if value is None and not needed:
             columns.append([None] * len(cameras))
         elif not several:

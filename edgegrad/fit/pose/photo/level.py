@@ -6,11 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ....aovs import render_aovs
+from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
 from ....scene.mesh import Mesh
 from ....scene.scene import Scene
@@ -19,7 +21,7 @@ from ...sides import ALONE_SHOWN, CONTRAST, PURE, Sides
 from ...sides import BLUR as CONTOUR_BLUR
 from ...verdict import explained
 from ..gauss_newton import Normal
-from ..jacobian import Rendered
+from ..jacobian import Motion, Rendered
 from ..observed import motion
 from ..pose import Pose
 from ..task import ZOOM, Level, PoseTask, Shot
@@ -40,6 +42,41 @@ BESIDE = 12  # pixels around the silhouette: the windows that the contour's colo
 MASKED = 0.01  # probability that a mask is wrong
 RESOLVED = 40.0  # pixels across the object: light and colours that are fitted to fewer explain any picture
 SHOWN = 0.5  # share of the contour that has to show beside what is inside; with less, less is explained
+
+
+class Crop(NamedTuple):
+    """What is used of a picture: rows and columns of pixels, and the object's extent there."""
+
+    top: int
+    left: int
+    bottom: int
+    right: int
+    extent: float  # pixels
+
+    @staticmethod
+    def around(task: PoseTask, shot: Shot, pose: Pose) -> Crop:
+        H, W = shot.camera.size
+        whole = Crop(0, 0, H, W, float(max(H, W)) / 2)
+        camera = task.lens(shot.camera, pose)
+        verts = torch.cat([mesh.verts for mesh in task.scene.meshes])
+        seen = camera.project(pose.scale * verts @ pose.R.T + pose.t)
+        if camera.projection == "panorama" or not bool(seen.isfinite().all()):
+            return whole
+        low, high = seen.amin(0), seen.amax(0)
+        extent = float((high - low).norm())
+        left, top = (max(0, GRID * math.floor((float(v) - MARGIN * extent) / GRID)) for v in low)
+        ends = (GRID * math.ceil((float(v) + MARGIN * extent) / GRID) for v in high)
+        right, bottom = (min(side, end) for end, side in zip(ends, (W, H), strict=True))
+        if right - left < SMALLEST or bottom - top < SMALLEST:
+            return whole
+        return Crop(top, left, bottom, right, extent)
+
+    def joined(self, other: Crop) -> Crop:
+        """Both; the extent is that of the smaller object."""
+        return Crop(
+            min(self.top, other.top), min(self.left, other.left), max(self.bottom, other.bottom), max(self.right, other.right),
+            min(self.extent, other.extent),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -88,19 +125,27 @@ class PhotoLevel:
             rendered = Rendered(bare, camera, ["alpha"], self.plain.spp, seed)
             alpha = rendered.images["alpha"][..., 0].float()
             tangents = rendered.derivatives(moves)["alpha"][..., 0].float()
-            rows, columns = box = _box(alpha)
-            cut = camera.crop(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
-            part = picture.part(rows, columns, cut)
-            surface = None
-            if self.harmonics or picture.depth is not None:
-                names = [name for name in AOVS if name != "image" or self.harmonics]
-                with torch.no_grad():
-                    channels = render_aovs(moved, cut, names, self.plain.spp, seed)
-                surface = Surface.of(cut, channels, moves)
-            lit = Lit.of(part, surface, self.harmonics) if surface is not None and self.harmonics else None
-            near, extent = around(alpha)
-            found.append(Seen(picture, box, part, alpha, tangents, near * picture.weight, extent, surface, lit))
+            found.append(self.beside(moved, camera, moves, picture, alpha, tangents, seed))
         return found
+
+    def beside(
+        self, moved: Scene, camera: Camera, moves: Motion, picture: Picture, alpha: Tensor, tangents: Tensor, seed: int,
+        others: bool = False,
+    ) -> Seen:  # fmt: skip
+        """The moved object, whose silhouette is alpha (h, w), beside a picture. `others` may cover it: alpha is then what they
+        leave to be seen."""
+        rows, columns = box = _box(alpha)
+        cut = camera.crop(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start)
+        part = picture.part(rows, columns, cut)
+        surface = None
+        if self.harmonics or picture.depth is not None:
+            names = [name for name in AOVS if name != "image" or self.harmonics]
+            with torch.no_grad():
+                channels = render_aovs(moved, cut, names, self.plain.spp, seed)
+            surface = Surface.of(cut, channels, moves, alpha[box] if others else None)
+        lit = Lit.of(part, surface, self.harmonics) if surface is not None and self.harmonics else None
+        near, extent = around(alpha)
+        return Seen(picture, box, part, alpha, tangents, near * picture.weight, extent, surface, lit)
 
     def equations(self, pose: Pose, seed: int, views: list[Seen] | None = None) -> tuple[Normal, float]:
         """Of all terms and pictures, and the mean loss of the region term. Each term is a likelihood in units of its own noise,
@@ -126,6 +171,16 @@ class PhotoLevel:
                 if term is not None:
                     curvature, gradient = curvature + term.curvature, gradient + term.gradient
         return Normal(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
+
+    def covered(self, pose: Pose, seed: int) -> float:
+        """Pixels of the pictures that the object covers by itself."""
+        moved = self.task.scene.transformed(pose.R, pose.t, pose.scale)
+        bare = Scene([Mesh(mesh.verts, mesh.faces) for mesh in moved.meshes])
+        with torch.no_grad():
+            return sum(
+                float(render_aovs(bare, picture.camera, ["alpha"], self.plain.spp, seed)["alpha"].sum())
+                for picture in self.pictures
+            )
 
     def explained(self, pose: Pose, seed: int, views: list[Seen] | None = None) -> float:
         """The share, 0 … 1, of the edges that the render should have in the pictures, of contours and of what is inside, that
@@ -154,7 +209,7 @@ class PhotoLevel:
         return explained(pairs) * min(1.0, shown / length / needed) * min(1.0, extent / RESOLVED)
 
     @cached_property
-    def _labels(self) -> list[Tensor]:
+    def labels(self) -> list[Tensor]:
         """Of the pixels of each picture; they are the same at each step."""
         return [colours.labels(picture.display) for picture, colours in zip(self.pictures, self.palettes, strict=True)]
 
@@ -163,23 +218,25 @@ class PhotoLevel:
         mask = seen.picture.mask
         if mask is not None:
             return mask.clamp(MASKED, 1.0 - MASKED)
-        windows = Windows(seen.picture.size, self._labels[k], self.palettes[k].colours, RADIUS * seen.extent)
+        windows = Windows(seen.picture.size, self.labels[k], self.palettes[k].colours, RADIUS * seen.extent)
         return posterior(windows, seen.alpha, seen.near)
 
 
 def photo_levels(
     task: PoseTask, start: Pose, depths: Sequence[Tensor | None], max_size: int, spp: int, seed: int,
-    palettes: list[Palette] | None = None,
+    palettes: list[Palette] | None = None, crops: Sequence[Crop] | None = None,
 ) -> list[PhotoLevel]:  # fmt: skip
-    """From coarse to fine, of what surrounds the object at the start. `palettes`: of the pictures, where they are known."""
-    crops = [_crop(task, shot, start) for shot in task.shots]
+    """From coarse to fine, of what surrounds the object at the start. `palettes` of the pictures, and `crops`, what is used of
+    them, where they are known."""
+    crops = crops or [Crop.around(task, shot, start) for shot in task.shots]
     shots, cut, across = [], [], []
-    for shot, depth, (top, left, h, w, extent) in zip(task.shots, depths, crops, strict=True):
-        rows, columns = slice(top, top + h), slice(left, left + w)
+    for shot, depth, crop in zip(task.shots, depths, crops, strict=True):
+        rows, columns = slice(crop.top, crop.bottom), slice(crop.left, crop.right)
         weight = None if shot.weight is None else shot.weight[rows, columns]
-        shots.append(Shot(shot.camera.crop(top, left, h, w), shot.target[rows, columns], None, weight))
+        camera = shot.camera.crop(crop.top, crop.left, crop.bottom - crop.top, crop.right - crop.left)
+        shots.append(Shot(camera, shot.target[rows, columns], None, weight))
         cut.append(None if depth is None else depth[rows, columns])
-        across.append(extent)
+        across.append(crop.extent)
     finest = [min(1.0, max_size / max(shot.camera.size)) for shot in shots]
     shorter = min(factor * min(shot.camera.size) for factor, shot in zip(finest, shots, strict=True))
     largest = max(factor * extent for factor, extent in zip(finest, across, strict=True))
@@ -206,24 +263,6 @@ def photo_levels(
 
 def _reduced(size: tuple[int, int], factor: float) -> tuple[int, int]:
     return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
-
-
-def _crop(task: PoseTask, shot: Shot, pose: Pose) -> tuple[int, int, int, int, float]:
-    """Top, left, height and width of what is used of a picture, and the object's extent in it, pixels."""
-    H, W = shot.camera.size
-    camera = task.lens(shot.camera, pose)
-    verts = torch.cat([mesh.verts for mesh in task.scene.meshes])
-    seen = camera.project(pose.scale * verts @ pose.R.T + pose.t)
-    if camera.projection == "panorama" or not bool(seen.isfinite().all()):
-        return 0, 0, H, W, float(max(H, W)) / 2
-    low, high = seen.amin(0), seen.amax(0)
-    extent = float((high - low).norm())
-    left, top = (max(0, GRID * math.floor((float(v) - MARGIN * extent) / GRID)) for v in low)
-    ends = (GRID * math.ceil((float(v) + MARGIN * extent) / GRID) for v in high)
-    right, bottom = (min(side, end) for end, side in zip(ends, (W, H), strict=True))
-    if right - left < SMALLEST or bottom - top < SMALLEST:
-        return 0, 0, H, W, float(max(H, W)) / 2
-    return top, left, bottom - top, right - left, extent
 
 
 def _box(alpha: Tensor) -> tuple[slice, slice]:

@@ -30,6 +30,7 @@ RIDGE = 5e-4  # of the constant's curvature: keeps what the picture does not sho
 WHOLE = 0.9  # share of a blur's window that lies inside
 FEWEST = 60  # pixels
 REWEIGHTED = 4  # times
+CLIPPED = 0.95  # linear radiance
 LEAST = 0.02  # standard deviation of a difference
 # Differences of neighbouring pixels are alike, for shadows and highlights have an extent: so many pixels count as one.
 TOGETHER = 8.0
@@ -67,14 +68,19 @@ class Lit:
         scale = (y + 0.02 + 0.1 * y.mean()).clamp(min=1e-3).rsqrt()
         B, y = basis[:, :, inside] * scale[:, None], y * scale
         count = picture.weight[inside]
+        # What a sensor shows as white may be any brighter colour.
+        clipped = (pictured[:, inside] > CLIPPED) & bool(picture.radiance.max() <= 1.0)
         robust, residual, light, ridge, middle = count, -y, y.new_zeros(C, harmonics), y.new_zeros(C, harmonics), LEAST
+        seen = y
         for _ in range(REWEIGHTED):
             weighted = B * robust
             curvature = weighted @ B.mT
             ridge = (RIDGE * curvature[:, :1, 0]).repeat(1, harmonics) + 1e-9
             ridge[:, 0] = 1e-9 + 1e-3 * ridge[:, 0]
-            light = torch.linalg.solve(curvature + torch.diag_embed(ridge), weighted @ y[..., None])[..., 0]
-            residual = (light[:, None] @ B)[:, 0] - y
+            light = torch.linalg.solve(curvature + torch.diag_embed(ridge), weighted @ seen[..., None])[..., 0]
+            shown = (light[:, None] @ B)[:, 0]
+            seen = torch.where(clipped, torch.maximum(y, shown), y)
+            residual = shown - seen
             e = residual.square().sum(0).sqrt()
             middle = max(_weighted_median(e, count) / _median(C), LEAST)
             robust = count * (1.0 + (e / (3.0 * middle)).square()).pow(-2)

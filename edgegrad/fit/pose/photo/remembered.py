@@ -11,19 +11,16 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from ....camera.camera import Camera
 from ....files.image import linear_to_srgb, srgb_to_linear
-from ...region import smoothed
+from .cover import LEAST, OFF, covered, weighted
 from .level import PhotoLevel, Seen
 from .light import Lit, spherical
 from .views import Views
 
 RATE = 0.1  # of a picture, in the light of all
-# What covers the object: so many deviations off, over so many pixels; what it counts; how much of the object is near.
-OFF, ACROSS, COVERED, SEEN_FROM = 4.0, 1.5, 0.02, 0.05
 
 
 class Cover(NamedTuple):
@@ -34,11 +31,7 @@ class Cover(NamedTuple):
 
     def left_out(self, level: PhotoLevel) -> PhotoLevel:
         """Of one picture, of any size."""
-        pictures = []
-        for picture in level.pictures:
-            at = F.interpolate(self.weight[None, None], picture.size, mode="bilinear")[0, 0]
-            pictures.append(replace(picture, weight=picture.weight * at))
-        return replace(level, pictures=pictures)
+        return weighted(level, [self.weight])
 
 
 class Remembered:
@@ -63,14 +56,10 @@ class Remembered:
         if seen.lit is None or self.light is None or not self._knows(seen.lit):
             return None
         inside = seen.lit.surface.inside
-        off = torch.zeros_like(inside, dtype=torch.float32)
-        off[inside] = (seen.lit.difference(self.light) > OFF * self.deviation).float()
-        # Edges that are a pixel off are thin; what covers the object is not.
-        share = smoothed(torch.stack([off, inside.float()]), ACROSS)
-        covered = (share[0] > 0.5 * share[1]) & (share[1] > SEEN_FROM)
+        hidden = covered(seen.lit, self.light, OFF * self.deviation)
         weight = torch.ones_like(seen.alpha)
-        weight[seen.box][covered] = COVERED
-        return Cover(weight, float(covered[inside].float().mean()))
+        weight[seen.box][hidden] = LEAST
+        return Cover(weight, float(hidden[inside].float().mean()))
 
     def shone_on(self, views: Views, camera: Camera) -> Views:
         """The views, in the light."""

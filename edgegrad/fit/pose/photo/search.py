@@ -19,6 +19,7 @@ from ..pose import Pose, angle
 from ..result import Step
 from ..search import Search, distinct, norms_of
 from ..task import SHIFT, TURN, Level, PoseTask
+from .cover import SIDES, WHOLE, at_one_side, covers, left, weighted
 from .level import PhotoLevel, photo_levels
 
 ENOUGH = 0.65  # share of the render's edges: wrong poses reach 0.57, right ones 0.83 and more
@@ -33,10 +34,12 @@ FULL_STEPS = 8  # of full length on the last level
 GAIN = 0.1  # a step that makes the pictures more likely by a smaller factor than exp(this / 2) is short: noise moves poses as far
 # Other starts: turned about the axes of the camera by so many radians.
 ASIDE = (0.2, 0.4)
-FOLLOWED = 3  # of them, the best on the coarsest level
+FOLLOWED, COVERS_FOLLOWED = 3, 4  # of them, the best on the coarsest level
 HOPELESS = 0.1  # of the edges there: noise shows none at all, clutter 0.3
+ROUNDS = 2  # of the last level, each without what covers the object in the light of the round before
 APART = 0.05  # radians between poses that are followed both
 AS_THEY_ARE = 0.05  # mean change of colours, in parts of them, by light that leaves them as they are
+UNCOVERED = 0.85  # of the object's pixels: with fewer, something covers it
 NEAR = 0.1  # radians: a polished pose that is farther off is another one
 
 
@@ -46,6 +49,7 @@ class _End(NamedTuple):
     explained: float
     pose: Pose
     short: bool  # the last step
+    left: float = 1.0  # of the object, by what covers it
 
 
 class PhotoSearch:
@@ -126,8 +130,17 @@ class PhotoSearch:
         best = max(start, found, key=lambda end: end.explained)
         if not self.colours_first:
             self._take(best)
-        best = self._from_aside(best, begins) if self.further and best.explained < self.enough else best
-        return self._surrounded(best) if best.explained >= self.enough and best is not start else best
+        if self.further and best.explained < self.enough:
+            best = self._from_covers(best, begins)
+        if self.further and best.explained < self.enough:
+            best = self._from_aside(best, begins)
+        if best.explained < self.enough or best is start:
+            return best
+        best = self._surrounded(best)
+        if self.further and best.explained < SURE and best.left < UNCOVERED:
+            again = self._from_covers(best, begins)
+            best = best if again is best else self._surrounded(again)
+        return best
 
     def first_end(self) -> float:
         """The share of the render's edges that the pictures show where the way down from the start alone ends."""
@@ -139,7 +152,7 @@ class PhotoSearch:
         coarse, *finer = self.levels
         answered = self._answered
         self._answered = True
-        ends = [self._follow(coarse, self.task.moved(self.start, *turn))[0] for turn in _turns()]
+        ends = [self._follow(coarse, self.task.moved(self.start, *turn))[0] for turn in turns()]
         scores = self.journal.numbers(lambda: [coarse.explained(pose, self.seed) for pose in ends])
         order = sorted((k for k in range(len(ends)) if scores[k] >= HOPELESS), key=lambda k: -scores[k])
         for pose in distinct([ends[k] for k in order], FOLLOWED, APART):
@@ -156,17 +169,60 @@ class PhotoSearch:
                 break
         return best
 
+    def _from_covers(self, best: _End, begins: int) -> _End:
+        """Ways that leave out what may cover the object at one side, until the pictures show an end's edges for sure."""
+        answered = self._answered
+        self._answered = True
+        coarse, *finer = self.levels
+        first = coarse.see(self.start, self.seed)
+        ways = [[at_one_side(seen.alpha, side) for seen in first] for side in range(SIDES)]
+        ends = [self._follow(weighted(coarse, weights), self.start)[0] for weights in ways]
+        scores = self.journal.numbers(
+            lambda: [
+                weighted(coarse, weights).explained(pose, self.seed) for pose, weights in zip(ends, ways, strict=True)
+            ]
+        )
+        hopeful = [k for k in range(SIDES) if scores[k] >= HOPELESS]
+        for k in sorted(hopeful, key=lambda k: -scores[k])[:COVERS_FOLLOWED]:
+            before = len(self.history)
+            found = self._uncovered(ends[k], ways[k], finer)
+            if found.explained > best.explained:
+                best = found
+                self._forget(slice(begins, before))
+                if answered:
+                    self._take(best)
+            else:
+                self._forget(slice(before, None))
+            if best.explained >= SURE:
+                break
+        return best
+
+    def _uncovered(self, pose: Pose, weights: list[Tensor], levels: list[PhotoLevel]) -> _End:
+        """Down from a pose, with `weights` (h, w) of each picture until the light tells what covers the object."""
+        short, last = False, levels[-1]
+        for level in levels:
+            if level.last:
+                weights = covers(weighted(level, weights).see(pose, self.seed)) or weights
+            pose, short = self._follow(last := weighted(level, weights), pose)
+        weights = covers(last.see(pose, self.seed)) or weights
+        share, kept = self.journal.numbers(
+            lambda: [
+                weighted(levels[-1], weights).explained(pose, self.seed),
+                left(levels[-1].see(pose, self.seed), weights),
+            ]
+        )
+        return _End(share * min(1.0, kept / WHOLE), pose, short, kept)
+
     def _surrounded(self, best: _End) -> _End:
-        """The end, once more with what surrounds the object where it is now: it does not depend on the start any more."""
+        """The end, once more with what surrounds the object where it is now, and without what covers it: it does not depend
+        on the start any more."""
         last = photo_levels(self.task, best.pose, self.depths, self.max_size, self.spp, self.seed)[-1]
         before = len(self.history)
-        pose, short = self._follow(last, best.pose)
-        (share,) = self.journal.numbers(lambda: [last.explained(pose, self.seed)])
-        if share < self.enough:
+        found = self._uncovered(best.pose, [torch.ones(picture.size) for picture in last.pictures], [last] * ROUNDS)
+        if found.explained < self.enough:
             self._forget(slice(before, None))
             return best
         self.levels = [*self.levels[:-1], last]
-        found = _End(share, pose, short)
         if not self.colours_first:
             self._take(found)
         return found
@@ -206,7 +262,8 @@ class PhotoSearch:
         return way.pose, way.short
 
     def _most(self, level: PhotoLevel) -> int:
-        return min(self.steps, COARSE_STEPS if level is self.levels[0] else LAST_STEPS if level.last else FINE_STEPS)
+        coarse = level.plain.coarseness == self.levels[0].plain.coarseness
+        return min(self.steps, LAST_STEPS if level.last else COARSE_STEPS if coarse else FINE_STEPS)
 
     def _note(self, step: Step) -> None:
         if not self._answered:
@@ -262,7 +319,7 @@ class PhotoSearch:
         self.explained, self.converged, self.curvature = search.explained, search.converged, None
 
 
-def _turns() -> list[tuple[list[int], Tensor]]:
+def turns() -> list[tuple[list[int], Tensor]]:
     """Entries of a step and their values, for each other start."""
     found = []
     for size in ASIDE:

@@ -27,8 +27,10 @@ class Surface:
     motion: Motion
 
     @staticmethod
-    def of(camera: Camera, channels: dict[str, Tensor], motion: Motion) -> Surface:
-        open_ = (channels["alpha"][..., 0] < COVERED).float()
+    def of(camera: Camera, channels: dict[str, Tensor], motion: Motion, visible: Tensor | None = None) -> Surface:
+        """`visible` (h, w): the surface's alpha where something else that is rendered may cover it."""
+        alpha = channels["alpha"][..., 0]
+        open_ = ((alpha if visible is None else visible) < COVERED).float()
         return Surface(camera, channels, F.max_pool2d(open_[None, None], 3, 1, 1)[0, 0] == 0.0, motion)
 
     @property

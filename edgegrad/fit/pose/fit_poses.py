@@ -1,0 +1,242 @@
+"""fit_poses(): where several known meshes stand in a photograph in which they may cover one another."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from ...camera.camera import Camera
+from ...check import as_tensor, check_flag, check_int, check_positive_int
+from ...scene.mesh import Mesh
+from ...scene.scene import Scene
+from ...scene.symmetries import Symmetries
+from ..region import VISIBLE
+from .fit_pose import check_callback, check_tolerance, depth_images, symmetries_of
+from .photo.poses import PosesSearch
+from .pose import Pose, pose_from_matrix
+from .result import PoseFit
+from .task import Lens, Names, PoseTask, depth_of
+
+INSIDE = 64  # vertices of a mesh that are asked whether they lie in another
+
+
+@torch.inference_mode(False)
+@torch.enable_grad()
+def fit_poses(
+    meshes: Sequence[Mesh | Scene],
+    target: Tensor | Sequence[Tensor],
+    camera: Camera | Sequence[Camera],
+    mask: Tensor | Sequence[Any] | None = None,
+    init: Sequence[PoseFit | Tensor] | None = None,
+    *,
+    weight: Tensor | Sequence[Tensor] | None = None,
+    depth: Tensor | Sequence[Tensor] | None = None,
+    max_size: int = 256,
+    steps: int = 40,
+    spp: int = 16,
+    tolerance: float = 3e-4,
+    seed: int = 0,
+    search: bool = True,
+    progress: bool = True,
+    callback: Callable[[list[PoseFit]], None] | None = None,
+    symmetries: Sequence[Symmetries | None] | None = None,
+) -> list[PoseFit]:
+    """Rotation and translation of several known meshes in a picture, or in several, in one fit: a PoseFit for each.
+
+    meshes      the objects, each a Mesh, or a Scene whose meshes move together, with colours or without
+    target      (H, W, C) linear radiance, as read_image gives it; or a list of pictures
+    camera      the camera of the picture, of size (H, W), or a list of them
+    mask        where each object is seen, without what covers it: an image of labels (H, W) of integers, k + 1 where meshes[k] is
+                seen and 0 elsewhere; or a list with a mask (H, W) for each mesh, as read_mask gives it. Of several pictures
+                each of these is a list with one for each picture
+    init        the pose of each mesh to start from, within some 15° and 5 % of its size: earlier fits, or matrices (4, 4), mesh
+                to world, for column vectors; None: where the mesh files put them
+    weight, depth, max_size, steps, spp, tolerance, seed, progress      as of fit_pose
+    search      whether an object that ends where the pictures do not show its edges begins again from other poses
+    callback    called after each step with the best fits so far
+    symmetries  of each mesh, or None for one without; poses are reported as of fit_pose
+
+    What stands in front of what is part of the fit: an object is compared where the others leave it to be seen, and the contours
+    at which one covers another move both. The light and what stands behind the objects need not be known, and something that is
+    none of the meshes may cover a part of them. Each fit is `converged` and `explained` by itself: one that is wrong does
+    not make others so. `visible` says how much of an object the others leave to be seen. With less than a tenth of it, it
+    is not `converged`, and `reason` says that it is hidden; its pose is then little more than its start.
+
+    KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set. Raises TypeError
+    or ValueError that names the argument, also where an object is out of the picture, or inside another one, at the start.
+    """
+    began = time.perf_counter()
+    for name, number in (("max_size", max_size), ("steps", steps), ("spp", spp)):
+        check_positive_int(name, number)
+    check_int("seed", seed, 0, 2**32 - 1)
+    check_tolerance(tolerance)
+    check_callback(callback, "a list of PoseFits")
+    count = _counted(meshes)
+    starts = _starts(init, count)
+    masks = _masks(mask, count, isinstance(camera, Sequence))
+    known = _each("symmetries", symmetries, count)
+    alike = [
+        symmetries_of(one, mesh, f"symmetries[{k}]") for k, (one, mesh) in enumerate(zip(known, meshes, strict=True))
+    ]
+    tasks = [
+        PoseTask.of(
+            mesh, target, camera, own, weight, None, Lens(), float(start.scale),
+            Names(f"meshes[{k}]", init=f"init[{k}]", mask=f"mask[{k}]"),
+        )
+        for k, (mesh, own, start) in enumerate(zip(meshes, masks, starts, strict=True))
+    ]  # fmt: skip
+    depths = depth_images(depth, tasks[0])
+    _check_in_front(tasks, starts)
+    _check_apart(tasks, starts)
+    ways = PosesSearch(tasks, starts, depths, max_size, spp, steps, tolerance, seed, check_flag("search", search))
+    for k, (level, start) in enumerate(zip(ways.levels[-1].objects, starts, strict=True)):
+        if level.covered(start, seed) < VISIBLE:
+            raise ValueError(
+                f"init[{k}]: expected a pose at which the camera sees the mesh, got one out of the picture; start where it is"
+            )
+    cameras: list[Camera] = list(camera) if isinstance(camera, Sequence) else [camera]
+    interrupted = False
+
+    def results() -> list[PoseFit]:
+        found = []
+        for k, task in enumerate(tasks):
+            own = alike[k]
+            best = ways.best[k] if own is None else ways.best[k].closest(own, starts[k])
+            history = list(ways.history[k])
+            found.append(PoseFit(
+                best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), time.perf_counter() - began,
+                ways.converged[k] and not interrupted, interrupted, ways.explained[k], history, task, cameras,
+                visible=ways.visible[k],
+            ))  # fmt: skip
+        return found
+
+    bar = tqdm(total=None, desc="fit", unit="step", disable=not progress, leave=False)
+
+    def after_step() -> None:
+        bar.set_postfix_str(
+            f"{ways.levels[-1].size[1]} × {ways.levels[-1].size[0]} px, loss {ways.loss:.2e}", refresh=False
+        )
+        bar.update()
+        if callback is not None:
+            callback(results())
+
+    ways.after_step = after_step
+    try:
+        ways.run()
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        bar.close()
+    return results()
+
+
+def _counted(meshes: object) -> int:
+    """Raises TypeError or ValueError."""
+    if not isinstance(meshes, Sequence) or isinstance(meshes, str):
+        raise TypeError(f"meshes: expected a list of meshes, got {type(meshes).__name__}; for one, call fit_pose")
+    if not meshes:
+        raise ValueError("meshes: expected at least one, got none")
+    return len(meshes)
+
+
+def _each(name: str, given: object, count: int) -> list[Any]:
+    """One for each mesh, None where none is given. Raises TypeError or ValueError."""
+    if given is None:
+        return [None] * count
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise TypeError(f"{name}: expected a list with one for each mesh, got {type(given).__name__}")
+    if len(given) != count:
+        raise ValueError(f"{name}: expected {count}, one for each mesh, got {len(given)}")
+    return list(given)
+
+
+def _starts(init: object, count: int) -> list[Pose]:
+    if isinstance(init, Tensor) and init.dim() == 3:
+        init = list(init)
+    given = _each("init", init, count)
+    return [
+        pose_from_matrix(f"init[{k}]", torch.eye(4) if one is None else getattr(one, "matrix", one))
+        for k, one in enumerate(given)
+    ]
+
+
+def _masks(mask: object, count: int, several: bool) -> list[Any]:
+    """What fit_pose calls the mask, of each mesh. Raises TypeError or ValueError."""
+    if isinstance(mask, Tensor):
+        if several:
+            raise ValueError("mask: expected a list of images of labels, one for each camera, got a tensor")
+        return _of_labels("mask", mask, count)
+    if several and isinstance(mask, Sequence) and all(_is_labels(one) for one in mask):
+        columns = [_of_labels(f"mask[{k}]", one, count) for k, one in enumerate(mask)]
+        return [list(row) for row in zip(*columns, strict=True)]
+    found = _each("mask", mask, count)
+    if 0 < (missing := sum(one is None for one in found)) < count:
+        raise ValueError(f"mask: expected a mask for each mesh or for none, got {count - missing} of {count}")
+    return found
+
+
+def _is_labels(given: object) -> bool:
+    return isinstance(given, Tensor) and not given.is_floating_point() and given.dtype != torch.bool
+
+
+def _of_labels(name: str, labels: object, count: int) -> list[Tensor]:
+    value = as_tensor(name, labels).detach().cpu()
+    if not _is_labels(value):
+        raise TypeError(
+            f"{name}: expected an image of labels, of integers, or a list with a mask for each mesh, got {value.dtype}"
+        )
+    found = [(value == k + 1).float() for k in range(count)]
+    for k, one in enumerate(found):
+        if not bool(one.any()):
+            there = sorted(int(label) for label in value.unique().tolist())[:10]
+            raise ValueError(
+                f"{name}: expected the label {k + 1} where meshes[{k}] is seen, got only {there}; give a list of masks "
+                "instead, or leave out a mesh that is not seen"
+            )
+    return found
+
+
+def _moved(task: PoseTask, pose: Pose) -> list[Mesh]:
+    return list(task.scene.transformed(pose.R, pose.t, pose.scale).meshes)
+
+
+def _check_in_front(tasks: Sequence[PoseTask], starts: Sequence[Pose]) -> None:
+    """Raises ValueError."""
+    for task, start in zip(tasks, starts, strict=True):
+        for shot in task.shots:
+            depth = float(depth_of(shot.camera, start, task.center))
+            if shot.camera.projection == "perspective" and depth <= 0.0:
+                raise ValueError(
+                    f"{task.names.init}: expected the object in front of the camera, got its centre at depth {depth:.3g}"
+                )
+
+
+def _check_apart(tasks: Sequence[PoseTask], starts: Sequence[Pose]) -> None:
+    """Raises ValueError where an object lies inside another one, or two are one."""
+    import trimesh  # takes longer to import than a step of a fit
+
+    bodies = [_moved(task, start) for task, start in zip(tasks, starts, strict=True)]
+    points = [torch.cat([mesh.verts for mesh in body]).double() for body in bodies]
+    for k, own in enumerate(points):
+        some = own[:: max(1, len(own) // INSIDE)]
+        for other, body in enumerate(bodies):
+            if other == k:
+                continue
+            if own.shape == points[other].shape and torch.allclose(own, points[other], atol=1e-6 * tasks[k].size):
+                raise ValueError(
+                    f"init[{k}]: expected the objects apart, got meshes[{k}] where meshes[{other}] is, vertex by vertex"
+                )
+            low, high = points[other].aminmax(dim=0)
+            if not bool(((own > low) & (own < high)).all()):
+                continue
+            solid = [trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False) for mesh in body]
+            if any(one.is_watertight and bool(one.contains(some.numpy()).all()) for one in solid):
+                raise ValueError(
+                    f"init[{k}]: expected the objects beside one another, got meshes[{k}] inside meshes[{other}], where no "
+                    "camera sees it; move one of them, or leave it out"
+                )

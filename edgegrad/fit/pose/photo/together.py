@@ -1,0 +1,183 @@
+"""Several objects in one photograph: what is compared at one resolution, and the normal equations of a step of all poses.
+
+One render has a channel for each object, which is 1 where it is seen: its alpha behind and before the others, with derivatives by
+the motion of each, for where one covers another the contour moves with what is in front. The region term asks for each pixel
+which object it shows, or what lies behind them all; light and depth are those of each object where it is seen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ....scene.mesh import Mesh
+from ....scene.scene import Scene
+from ...region import RADIUS, Windows, smoothed
+from ..gauss_newton import Normal
+from ..jacobian import Motions, Rendered
+from ..observed import motion
+from ..pose import Pose
+from ..task import PoseTask
+from .contour import contour_term
+from .cover import covers, weighted
+from .depth import depth_term
+from .level import CONTOUR_BLUR, MASKED, Crop, PhotoLevel, Seen, photo_levels
+from .region import posteriors, regions_term
+
+
+@dataclass(frozen=True)
+class Together:
+    """The same pictures at one resolution, as they are compared with each object."""
+
+    objects: list[PhotoLevel]
+
+    @property
+    def last(self) -> bool:
+        return self.objects[0].last
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.objects[0].size
+
+    def parts(self) -> list[slice]:
+        """The entries of a step that each object has."""
+        found, first = [], 0
+        for level in self.objects:
+            found.append(slice(first, first := first + len(level.plain.free)))
+        return found
+
+    def see(self, poses: Sequence[Pose], seed: int) -> list[list[Seen]]:
+        """Of each object, each picture; tangents (D, h, w) by the entries of all."""
+        scenes = [
+            level.task.scene.transformed(pose.R, pose.t, pose.scale)
+            for level, pose in zip(self.objects, poses, strict=True)
+        ]
+        labels = torch.eye(len(scenes), dtype=torch.float64)
+        labelled = Scene([
+            Mesh(mesh.verts, mesh.faces, colors=label.expand(len(mesh.verts), -1))
+            for scene, label in zip(scenes, labels, strict=True) for mesh in scene.meshes
+        ])  # fmt: skip
+        counts = [sum(len(mesh.verts) for mesh in scene.meshes) for scene in scenes]
+        found: list[list[Seen]] = [[] for _ in scenes]
+        first = self.objects[0]
+        for n, shot in enumerate(first.plain.shots):
+            ways = [
+                motion(level.task, level.plain, level.plain.shots[n], pose)
+                for level, pose in zip(self.objects, poses, strict=True)
+            ]
+            rendered = Rendered(labelled, shot.camera, ["image"], first.plain.spp, seed)
+            alphas = rendered.images["image"].float().movedim(-1, 0)
+            tangents = rendered.derivatives(Motions(ways, counts))["image"].float().movedim(-1, 1)
+            for k, level in enumerate(self.objects):
+                found[k].append(
+                    level.beside(
+                        scenes[k], shot.camera, ways[k], level.pictures[n], alphas[k], tangents[:, k], seed, others=True
+                    )
+                )
+        return found
+
+    def equations(self, poses: Sequence[Pose], seed: int) -> tuple[Normal, float]:
+        """Of all terms and pictures by the entries of all objects, and the mean loss of the region term."""
+        views, parts = self.see(poses, seed), self.parts()
+        D = parts[-1].stop
+        curvature, gradient = torch.zeros(D, D, dtype=torch.float64), torch.zeros(D, dtype=torch.float64)
+        losses = []
+        for n in range(len(views[0])):
+            seen = [view[n] for view in views]
+            if all(one.extent == 0.0 for one in seen):
+                continue
+            alphas, near = torch.stack([one.alpha for one in seen]), torch.stack([one.near for one in seen]).amax(0)
+            tangents = torch.stack([one.tangents for one in seen], 1)
+            region, loss = regions_term(self._posteriors(n, seen, near), alphas, tangents, near, self.objects[0].blur)
+            losses.append(loss)
+            terms: list[tuple[slice, Normal | None]] = [(slice(0, D), region)]
+            for part, level, one in zip(parts, self.objects, seen, strict=True):
+                if one.lit is not None:
+                    terms.append((part, one.lit.term()))
+                if one.surface is not None and one.part.depth is not None:
+                    size = level.task.size
+                    terms.append((part, depth_term(one.surface, one.part.depth, one.part.weight, size)))
+            if self.last:
+                terms += [(slice(0, D), term) for term in _contours(seen)]
+            for part, term in terms:
+                if term is not None:
+                    curvature[part, part] += term.curvature
+                    gradient[part] += term.gradient
+        return Normal(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
+
+    def explained(self, poses: Sequence[Pose], seed: int) -> list[float]:
+        """Of each object, PhotoLevel.explained() where it is seen."""
+        views = self.see(poses, seed)
+        return [level.explained(pose, seed, view) for level, pose, view in zip(self.objects, poses, views, strict=True)]
+
+    def visible(self, poses: Sequence[Pose], seed: int) -> list[float]:
+        """Of each object, how much of what it covers of the pictures by itself the others leave to be seen, 0 … 1."""
+        views = self.see(poses, seed)
+        found = []
+        for level, pose, view in zip(self.objects, poses, views, strict=True):
+            alone = level.covered(pose, seed)
+            found.append(min(1.0, sum(float(one.alpha.sum()) for one in view) / alone) if alone > 0.0 else 0.0)
+        return found
+
+    def uncovered(self, poses: Sequence[Pose], seed: int) -> Together:
+        """Without what covers the objects and is none of them."""
+        weights = [torch.ones(picture.size) for picture in self.objects[0].pictures]
+        for view in self.see(poses, seed):
+            if (own := covers(view)) is not None:
+                weights = [torch.minimum(a, b) for a, b in zip(weights, own, strict=True)]
+        return Together([weighted(level, weights) for level in self.objects])
+
+    def _posteriors(self, n: int, seen: list[Seen], near: Tensor) -> Tensor:
+        """(N + 1, h, w) of picture n: by the masks, or else by colours."""
+        masks = [one.picture.mask for one in seen if one.picture.mask is not None]
+        if masks:
+            shares = torch.stack(masks)
+            likely = torch.cat([shares, 1.0 - shares.sum(0, keepdim=True)]).clamp(min=MASKED)
+            return likely / likely.sum(0)
+        extents = [one.extent for one in seen if one.extent > 0.0]
+        middle = math.exp(sum(map(math.log, extents)) / len(extents))
+        first = self.objects[0]
+        windows = [
+            Windows(first.pictures[n].size, first.labels[n], first.palettes[n].colours, RADIUS * (extent or middle))
+            for extent in (*(one.extent for one in seen), middle)
+        ]
+        return posteriors(windows, torch.stack([one.alpha for one in seen]), near)
+
+
+def together_levels(
+    tasks: Sequence[PoseTask],
+    poses: Sequence[Pose],
+    depths: Sequence[Tensor | None],
+    max_size: int,
+    spp: int,
+    seed: int,
+) -> list[Together]:
+    """From coarse to fine, of what surrounds the objects."""
+    crops = [Crop.around(tasks[0], shot, poses[0]) for shot in tasks[0].shots]
+    for task, pose in zip(tasks[1:], poses[1:], strict=True):
+        own = [Crop.around(task, shot, pose) for shot in task.shots]
+        crops = [crop.joined(other) for crop, other in zip(crops, own, strict=True)]
+    columns = [
+        photo_levels(task, pose, depths, max_size, spp, seed, crops=crops)
+        for task, pose in zip(tasks, poses, strict=True)
+    ]
+    return [Together(list(objects)) for objects in zip(*columns, strict=True)]
+
+
+def _contours(seen: list[Seen]) -> list[Normal | None]:
+    """The contour term of each object. Where two of them meet, each has half a say."""
+    sides = [one.sides() for one in seen]
+    count = torch.zeros(seen[0].picture.size)
+    for one, side in zip(seen, sides, strict=True):
+        count[one.box] += side.band
+    return [
+        contour_term(
+            replace(one.part, weight=one.part.weight / count[one.box].clamp(min=1.0)), side,
+            smoothed(one.tangents[:, one.box[0], one.box[1]], CONTOUR_BLUR),
+        )
+        for one, side in zip(seen, sides, strict=True)
+    ]  # fmt: skip

@@ -1,0 +1,364 @@
+"""fit_poses: several objects that cover one another in one photograph, with equations against oracles and poses end to end; and
+what covers an object that fit_pose looks for."""
+
+import io
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from test_fit import bracket, rotation
+from test_fit_photo import clutter
+
+import edgegrad as eg
+from edgegrad.camera.poses import rotation as turned
+from edgegrad.files.image import linear_to_srgb, srgb_to_linear
+from edgegrad.fit import PoseFit, fit_pose, fit_poses
+from edgegrad.fit.pose.jacobian import Motion, Motions, Rendered
+from edgegrad.fit.pose.photo.cover import covers
+from edgegrad.fit.pose.photo.cover import left as left_of
+from edgegrad.fit.pose.photo.level import photo_levels
+from edgegrad.fit.pose.photo.light import Lit
+from edgegrad.fit.pose.photo.picture import Picture
+from edgegrad.fit.pose.photo.region import regions_term
+from edgegrad.fit.pose.photo.surface import AOVS, Surface
+from edgegrad.fit.pose.pose import pose_from_matrix
+from edgegrad.fit.pose.task import Lens, Names, PoseTask
+from edgegrad.fit.region import OUTLIERS, smoothed
+from edgegrad_cli import main
+
+MIDDLE = torch.tensor([1.0, 0.75, 0.4]).double()
+BESIDE = torch.tensor([1.0, -0.35, 0.75]).double()  # of the box, which covers a part of the bracket
+
+
+def view_of(size=96, distance=6.0):
+    eye = MIDDLE + distance * torch.tensor([0.35, 0.3, 0.89]).double()
+    return eg.Camera.look_at(eye, MIDDLE, fov_y=40.0, size=(size, size))
+
+
+def box(extents=(1.3, 1.0, 1.2), plain=False, seed=3):
+    """With two colours a side, so that no two poses look alike."""
+    body = trimesh.creation.box(extents=extents)
+    colors = torch.rand(12, 3, generator=torch.Generator().manual_seed(seed)) * 0.8 + 0.1
+    verts, faces = torch.from_numpy(np.array(body.vertices)), torch.from_numpy(np.array(body.faces))
+    return eg.Mesh(verts, faces, face_colors=None if plain else colors)
+
+
+def at(R, t):
+    M = torch.eye(4, dtype=torch.float64)
+    M[:3, :3], M[:3, 3] = R, t
+    return M
+
+
+def centre(mesh):
+    low, high = mesh.verts.double().aminmax(dim=0)
+    return 0.5 * (low + high)
+
+
+def beside(mesh, pose, turn, shift):
+    """Turned about the object's centre, and shifted."""
+    R = rotation(*turn) @ pose[:3, :3]
+    where = pose[:3, :3] @ centre(mesh) + pose[:3, 3] + torch.tensor(shift).double()
+    return at(R, where - R @ centre(mesh))
+
+
+def errors(fit, mesh, truth):
+    """Degrees, and the way between the centres in % of the size."""
+    low, high = mesh.verts.double().aminmax(dim=0)
+    cosine = 0.5 * (float((fit.R.T @ truth[:3, :3]).trace()) - 1.0)
+    way = (fit.R @ centre(mesh) + fit.t) - (truth[:3, :3] @ centre(mesh) + truth[:3, 3])
+    return math.degrees(math.acos(max(-1.0, min(1.0, cosine)))), 100.0 * float(way.norm() / (high - low).norm())
+
+
+MESHES = [bracket(), box(), box((0.7, 0.9, 0.6), seed=8)]
+TRUTHS = [
+    at(torch.eye(3).double(), torch.zeros(3).double()),
+    at(rotation(0.5, 0.7, 0.2), MIDDLE + BESIDE),
+    at(rotation(-0.4, 0.3, 0.6), MIDDLE + torch.tensor([-1.15, 0.6, 0.5]).double()),
+]
+STARTS = [
+    beside(MESHES[0], TRUTHS[0], (0.1, -0.12, 0.08), (0.08, -0.06, 0.08)),
+    beside(MESHES[1], TRUTHS[1], (-0.1, 0.08, 0.1), (-0.05, 0.05, 0.06)),
+    beside(MESHES[2], TRUTHS[2], (0.09, 0.1, -0.08), (0.03, 0.04, -0.04)),
+]
+
+
+def scene_of(count, light=True):
+    moved = [mesh.transformed(M[:3, :3], M[:3, 3]) for mesh, M in zip(MESHES[:count], TRUTHS, strict=False)]
+    return [mesh.replace(material=eg.Material()) for mesh in moved] if light else moved
+
+
+def photograph(view, meshes, seed=0):
+    """In the light of a sun and a sky, before clutter, blurred, noisy, compressed."""
+    lights = [
+        eg.DirectionalLight(torch.tensor([-0.5, -1.0, -0.8]).double(), 2.0),
+        eg.Environment(torch.full((3,), 0.35), visible=False),
+    ]
+    with torch.no_grad():
+        image = eg.render(eg.Scene(meshes, clutter(view.size[0], seed), lights), view, spp=32, seed=1 << 40)
+    values = smoothed(linear_to_srgb((image * torch.tensor([1.3, 1.0, 0.8])).clamp(0, 1)).movedim(-1, 0), 0.7)
+    values = values.movedim(0, -1) + 0.015 * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed))
+    file = io.BytesIO()
+    Image.fromarray((255 * values.clamp(0, 1)).round().byte().numpy()).save(file, "JPEG", quality=85)
+    return srgb_to_linear(torch.from_numpy(np.array(Image.open(file))).float() / 255)
+
+
+def labels_of(view, meshes):
+    """(H, W) of integers."""
+    colours = torch.eye(len(meshes))
+    painted = [
+        eg.Mesh(mesh.verts, mesh.faces, colors=colour.expand(len(mesh.verts), -1))
+        for mesh, colour in zip(meshes, colours, strict=True)
+    ]
+    shares = eg.render(eg.Scene(painted), view, 32)
+    return torch.where(shares.sum(-1) > 0.5, shares.argmax(-1) + 1, 0)
+
+
+@pytest.fixture(scope="module")
+def two():
+    view = view_of(160)
+    return view, photograph(view, scene_of(2), seed=2)
+
+
+# Equations
+
+
+def test_the_region_terms_gradient_is_that_of_its_loss():
+    """Of two objects, of which one covers the other: against central differences of renders with many samples."""
+    view, h, sigma = view_of(48), 0.004, 0.7
+    meshes = [mesh.replace(material=None) for mesh in scene_of(2, light=False)]
+    axes, colours = view.world_to_camera[:3, :3].double(), torch.eye(2, dtype=torch.float64)
+    centres, size = [centre(mesh) for mesh in meshes], 2.0
+    posteriors = torch.rand(3, 1, 6, 6, generator=torch.Generator().manual_seed(3))
+    posteriors = torch.nn.functional.interpolate(posteriors, size=(48, 48), mode="bilinear")[:, 0] + 0.1
+    posteriors = posteriors / posteriors.sum(0)
+    near = (torch.arange(48) < 40).float().expand(48, 48)
+
+    def painted(step):
+        found = []
+        for k, mesh in enumerate(meshes):
+            turn, shift = step[6 * k : 6 * k + 3], step[6 * k + 3 : 6 * k + 6]
+            R = turned(axes.T @ turn)
+            moved = mesh.transformed(R, centres[k] + size * axes.T @ shift - R @ centres[k])
+            found.append(eg.Mesh(moved.verts, moved.faces, colors=colours[k].expand(len(moved.verts), -1)))
+        return eg.Scene(found)
+
+    def loss(step):
+        with torch.no_grad():
+            alphas = eg.render(painted(step), view, spp=2048, seed=5).float().movedim(-1, 0)
+        soft = smoothed(alphas, sigma).double()
+        f = (soft * posteriors[:2]).sum(0) + (1 - soft.sum(0)) * posteriors[2]
+        return -float((near * (f + OUTLIERS).log()).sum())
+
+    zero = torch.zeros(12, dtype=torch.float64)
+    rendered = Rendered(painted(zero), view, ["image"], 512, 2)
+    ways = Motions([Motion.about(middle, axes, size) for middle in centres], [len(mesh.verts) for mesh in meshes])
+    tangents = rendered.derivatives(ways)["image"].float().movedim(-1, 1)
+    alphas = rendered.images["image"].float().movedim(-1, 0)
+    normal, mean = regions_term(posteriors, alphas, tangents, near, sigma)
+    steps = h * torch.eye(12, dtype=torch.float64)
+    expected = torch.tensor([(loss(step) - loss(-step)) / (2 * h) for step in steps]).double()
+    assert float((normal.gradient - expected).norm() / expected.norm()) < 0.03, (normal.gradient, expected)
+    for own in (slice(0, 6), slice(6, 12)):  # each object by itself
+        off = float((normal.gradient[own] - expected[own]).norm() / expected[own].norm())
+        assert off < 0.04, (own, normal.gradient, expected)
+    assert mean == pytest.approx(loss(zero) / float(near.sum()), rel=1e-3)
+    # Where the box covers the bracket, both move the same contour.
+    assert float(normal.curvature[:6, 6:].abs().max()) > 0.01 * float(normal.curvature.abs().max())
+
+
+# Fits
+
+
+def depth_of(view, count):
+    seen = eg.render_aovs(eg.Scene(scene_of(count, light=False)), view, ["alpha", "depth"], spp=16)
+    return torch.where(seen["alpha"] > 0.99, seen["depth"] / seen["alpha"].clamp(min=0.01), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "degrees", "percent"),
+    [
+        ("colours", 2.5, 1.0),
+        pytest.param("labels", 2.3, 1.3, marks=pytest.mark.slow),
+        ("depth", 0.2, 0.1),
+        ("plain", 2.5, 1.4),
+    ],
+)
+def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
+    """40 % of the first one are covered; the starts are 10° and 5 % off."""
+    view, image = two
+    given = {}
+    if kind == "labels":
+        given = {"mask": labels_of(view, scene_of(2))}
+    if kind == "depth":
+        given = {"depth": depth_of(view, 2)}
+    meshes = [mesh.replace(face_colors=None) for mesh in MESHES[:2]] if kind == "plain" else MESHES[:2]
+    fits = fit_poses(meshes, image, view, init=STARTS[:2], progress=False, **given)
+    for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=False):
+        off = errors(fit, mesh, truth)
+        assert off[0] < degrees and off[1] < percent, (kind, off, fit.explained)
+        assert fit.converged and fit.reason == "converged", (kind, off, fit.explained)
+    assert 0.5 < fits[0].visible < 0.7 and fits[1].visible > 0.98
+
+
+@pytest.mark.slow
+def test_three_objects():
+    view = view_of(96)
+    image = photograph(view, scene_of(3), seed=1)
+    fits = fit_poses(MESHES, image, view, init=STARTS, depth=depth_of(view, 3), progress=False)
+    for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=True):
+        off = errors(fit, mesh, truth)
+        assert off[0] < 0.3 and off[1] < 0.1 and fit.converged, (off, fit.explained)
+
+
+@pytest.mark.slow
+def test_a_mesh_that_is_not_there_makes_no_other_wrong(two):
+    view, image = two
+    absent = at(rotation(0.2, 0.3, 0.1), MIDDLE + torch.tensor([-1.2, -1.0, 0.2]).double())
+    fits = fit_poses(MESHES, image, view, init=[*STARTS[:2], absent], search=False, progress=False)
+    assert fits[0].converged and fits[1].converged and not fits[2].converged, [fit.explained for fit in fits]
+    assert fits[2].explained < 0.65 and fits[2].reason.startswith(("edges not explained", "steps ran out"))
+    assert errors(fits[1], MESHES[1], TRUTHS[1])[0] < 1.5
+
+
+def test_a_hidden_mesh_is_said_to_be_hidden(two):
+    """Behind the box as the camera sees it."""
+    view, image = two
+    eye = torch.linalg.inv(view.world_to_camera.double())[:3, 3]
+    away = torch.nn.functional.normalize(MIDDLE + BESIDE - eye, dim=0)
+    small = box((0.3, 0.3, 0.3), seed=5)
+    hidden = at(torch.eye(3).double(), MIDDLE + BESIDE + 1.3 * away)
+    fits = fit_poses([*MESHES[:2], small], image, view, init=[*STARTS[:2], hidden], search=False, progress=False)
+    assert fits[0].converged and fits[1].converged and not fits[2].converged
+    assert fits[2].visible < 0.1 and fits[2].reason.startswith("hidden: the other objects leave"), fits[2].reason
+    torch.testing.assert_close(fits[2].matrix, hidden, atol=0.05, rtol=0.0)
+
+
+def test_a_stopped_fit_keeps_the_poses_so_far(two):
+    view, image = two
+    seen = []
+
+    def stop(fits):
+        seen.append(fits)
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+
+    fits = fit_poses(MESHES[:2], image, view, init=STARTS[:2], callback=stop, progress=False)
+    assert len(seen) == 3 and all(fit.interrupted and not fit.converged and fit.steps == 3 for fit in fits)
+    assert all(fit.reason == "interrupted" for fit in fits)
+    assert not torch.equal(fits[0].matrix, STARTS[0])
+
+
+BLANK = torch.zeros(160, 160, 3)
+FAR = at(torch.eye(3).double(), MIDDLE + 40.0 * view_of().world_to_camera[0, :3].double())
+BEHIND = at(torch.eye(3).double(), MIDDLE + 20.0 * torch.tensor([0.35, 0.3, 0.89]).double())
+WITHIN = at(torch.eye(3).double(), MIDDLE + BESIDE)
+
+
+@pytest.mark.parametrize(
+    ("meshes", "given", "error", "message"),
+    [
+        (MESHES[0], {}, TypeError, r"meshes: expected a list of meshes, got Mesh; for one, call fit_pose"),
+        ([], {}, ValueError, r"meshes: expected at least one, got none"),
+        ([MESHES[0], "box"], {"init": STARTS[:2]}, TypeError, r"meshes\[1\]: expected a Mesh or a Scene, got str"),
+        (MESHES[:2], {"init": STARTS}, ValueError, r"init: expected 2, one for each mesh, got 3"),
+        (MESHES[:2], {"init": [STARTS[0], FAR]}, ValueError, r"init\[1\]: expected a pose at which the camera sees"),
+        (MESHES[:2], {"init": [STARTS[0], BEHIND]}, ValueError, r"init\[1\]: expected the object in front of the camera"),
+        ([*MESHES[:2], box((0.3, 0.3, 0.3))], {"init": [*STARTS[:2], WITHIN]}, ValueError,
+         r"init\[2\]: expected the objects beside one another, got meshes\[2\] inside meshes\[1\]"),
+        ([MESHES[0]] * 2, {"init": [STARTS[0]] * 2}, ValueError, r"init\[0\]: expected the objects apart"),
+        (MESHES[:2], {"init": STARTS[:2], "mask": BLANK[..., 0]}, TypeError, r"mask: expected an image of labels, of integers"),
+        (MESHES[:2], {"init": STARTS[:2], "mask": [BLANK[..., 0]]}, ValueError, r"mask: expected 2, one for each mesh, got 1"),
+        (MESHES[:2], {"init": STARTS[:2], "mask": BLANK[..., 0].int() + 1}, ValueError, r"mask: expected the label 2 where"),
+        (MESHES[:2], {"init": STARTS[:2], "mask": [BLANK[:9, :9, 0]] * 2}, ValueError, r"mask\[0\]: expected .*160.*, got .*9"),
+        (MESHES[:2], {"init": STARTS[:2], "depth": BLANK[:9, :9, 0]}, ValueError, r"depth: expected shape .*160.*, got .*9"),
+        (MESHES[:2], {"init": STARTS[:2], "symmetries": ["find"]}, ValueError, r"symmetries: expected 2, .* got 1"),
+        (MESHES[:2], {"init": STARTS[:2], "callback": 3}, TypeError, r"callback: expected a function of a list of PoseFits"),
+    ],
+)  # fmt: skip
+def test_errors(two, meshes, given, error, message):
+    view, image = two
+    with pytest.raises(error, match=message):
+        fit_poses(meshes, image, view, progress=False, **given)
+
+
+def test_from_the_shell(two, tmp_path, capsys):
+    view, image = two
+    eg.write_image(tmp_path / "photo.png", image)
+    eg.save_camera(tmp_path / "camera.json", view)
+    given = [
+        "fit-poses",
+        str(tmp_path / "photo.png"),
+        "--camera",
+        str(tmp_path / "camera.json"),
+        "--out",
+        str(tmp_path),
+    ]
+    for k, (mesh, start) in enumerate(zip(MESHES[:2], STARTS, strict=False)):
+        eg.save_mesh(tmp_path / f"{k}.ply", mesh.replace(face_colors=None))
+        (tmp_path / f"{k}.json").write_text(json.dumps({"mesh_to_world": start.tolist()}))
+        given += ["--mesh", str(tmp_path / f"{k}.ply"), "--init", str(tmp_path / f"{k}.json")]
+    assert main(given) == 0
+    for k in range(2):
+        fit = PoseFit.from_json((tmp_path / str(k + 1) / "pose.json").read_text())
+        off = errors(fit, MESHES[k], TRUTHS[k])
+        assert off[0] < 2.5 and off[1] < 1.4 and fit.converged, off
+    assert f"{tmp_path}/1.ply: converged" in capsys.readouterr().out
+    assert main(given[:-2]) == 2
+    assert "--init: expected 2, one for each --mesh, got 1" in capsys.readouterr().err
+
+
+# What covers an object and is none of the meshes
+
+
+@pytest.fixture(scope="module")
+def covered():
+    """Another clutter before a quarter of the bracket."""
+    view = view_of(160, 4.5)
+    image = photograph(view, [bracket().replace(material=eg.Material())], seed=2)
+    alpha = eg.render_aovs(bracket(), view, ["alpha"], 16)["alpha"][..., 0]
+    along = (torch.arange(160)[:, None] + 0.3 * torch.arange(160)).float()
+    over = along < along[alpha > 0.5].quantile(0.25)
+    return view, torch.where(over[..., None], clutter(160, 9).flip(1), image), over, alpha
+
+
+def test_what_covers_an_object_is_told_by_its_light(covered):
+    view, image, over, alpha = covered
+    task = PoseTask.of(bracket(), image, view, None, None, None, Lens(), 1.0, Names())
+    pose = pose_from_matrix("pose", torch.eye(4))
+    level = photo_levels(task, pose, [None], 256, 16, 0)[-1]
+    (weight,) = covers(level.see(pose, 0))
+    # The level is a part of the picture.
+    top, left = (
+        round(float(a - b)) for a, b in zip(view.K[[1, 0], 2], level.pictures[0].camera.K[[1, 0], 2], strict=True)
+    )
+    h, w = level.size
+    rows, columns = slice(top, top + h), slice(left, left + w)
+    inside = alpha[rows, columns] > 0.99
+    wrong = ((weight < 0.5) != over[rows, columns])[inside].float().mean()
+    assert float(wrong) < 0.08, float(wrong)  # 0.25 where nothing is told
+    assert left_of(level.see(pose, 0), [weight]) == pytest.approx(0.75, abs=0.08)
+
+
+def test_a_quarter_covered(covered):
+    view, image, _, _ = covered
+    fit = fit_pose(bracket(), image, view, init=STARTS[0], progress=False)
+    off = errors(fit, MESHES[0], TRUTHS[0])
+    assert off[0] < 1.5 and off[1] < 1.0 and fit.converged, (off, fit.explained)
+
+
+def test_white_may_be_any_brighter_colour():
+    """The light of a surface that a sensor shows in part as white is that of the part that it does not."""
+    view = view_of(96, 4.5)
+    mesh = bracket().replace(face_colors=bracket().face_colors * 0.0 + torch.tensor([0.9, 0.5, 0.2]))
+    with torch.no_grad():
+        seen = eg.render_aovs(mesh, view, list(AOVS), 32)
+    picture = (seen["image"] * 1.6 + (1 - seen["alpha"]) * 0.2).float().clamp(0, 1)
+    surface = Surface.of(view, seen, Motion.about(MIDDLE))
+    display = linear_to_srgb(picture)
+    lit = Lit.of(Picture(view, picture, display, None, torch.ones(96, 96), None), surface, 1)
+    torch.testing.assert_close(lit.coefficients[1:, 0], torch.tensor([1.6, 1.6]), atol=0.02, rtol=0.0)
+    assert float(lit.residual.abs().max()) < 0.02  # 0.44 too bright in red, of which 1 is all that is shown
