@@ -32,6 +32,8 @@ from .search import (
     LAST_STEPS,
     LONGEST,
     ROUNDS,
+    SURE,
+    UNCOVERED,
     turns,
 )  # fmt: skip
 from .together import Together, together_levels
@@ -60,7 +62,11 @@ class PosesSearch:
     @property
     def converged(self) -> list[bool]:
         found = zip(self.short, self.explained, self.enough, self.visible, strict=True)
-        return [short and share >= enough and seen >= HIDDEN for short, share, enough, seen in found]
+        # What is left of a covered object looks alike from more sides.
+        return [
+            short and share >= (enough if seen >= UNCOVERED else max(enough, SURE)) and seen >= HIDDEN
+            for short, share, enough, seen in found
+        ]
 
     @property
     def planned(self) -> int:

@@ -40,6 +40,7 @@ ROUNDS = 2  # of the last level, each without what covers the object in the ligh
 APART = 0.05  # radians between poses that are followed both
 AS_THEY_ARE = 0.05  # mean change of colours, in parts of them, by light that leaves them as they are
 UNCOVERED = 0.85  # of the object's pixels: with fewer, something covers it
+COVERED_ENOUGH = 0.7  # of the edges, where a way that leaves out a side of the object ends
 NEAR = 0.1  # radians: a polished pose that is farther off is another one
 
 
@@ -158,7 +159,8 @@ class PhotoSearch:
         for pose in distinct([ends[k] for k in order], FOLLOWED, APART):
             before = len(self.history)
             found = self._judge(*self._down(pose, finer))
-            if found.explained > best.explained:
+            # Of so many ways, one may end where something is alike by chance.
+            if found.explained > max(best.explained, COVERED_ENOUGH):
                 best = found
                 self._forget(slice(begins, before))
                 if answered:
