@@ -39,8 +39,8 @@ inline LightPoint above(const std::vector<Table>& tables, const Lamp& lamp, cons
     return chosen;
 }
 
-// Calls visit(texel, its weight) for the texels around a place in the image, which counts texels: bilinear between their
-// centres, around the whole turn.
+// Calls visit(texel, its weight) for the texels around a place in the image, which counts texels: bilinear between
+// their centres, around the whole turn.
 template <class Visit>
 void each_texel(const Lamp& lamp, double column, double row, Visit visit) {
     column -= 0.5, row -= 0.5;

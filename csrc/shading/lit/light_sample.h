@@ -59,8 +59,8 @@ inline Vec3 place(const LitScene& lit, const Lamp& lamp, const LightPoint& p) {
     }
 }
 
-// Uniform numbers of one point and lamp, that fill the unit cube evenly (edgegrad/points/seeds.py): number k of part j of
-// so many.
+// Uniform numbers of one point and lamp, that fill the unit cube evenly (edgegrad/points/seeds.py): number k of part j
+// of so many.
 struct Numbers {
     const LitScene& lit;
     const Lamp& lamp;
@@ -73,9 +73,9 @@ struct Numbers {
 };
 
 // Points of an environment, drawn by what they give to a glossy surface where nothing lies between, the target: of
-// candidates that the light and the lobe have drawn, and that the power heuristic weights (Veach and Guibas 1995), `count`
-// are kept in proportion to target / density (resampled importance sampling, Talbot et al. 2005). Their density is the
-// target over its integral as the candidates estimate it.
+// candidates that the light and the lobe have drawn, and that the power heuristic weights (Veach and Guibas 1995),
+// `count` are kept in proportion to target / density (resampled importance sampling, Talbot et al. 2005). Their density
+// is the target over its integral as the candidates estimate it.
 class Resampled {
    public:
     static constexpr int each = 8;  // candidates for one that is kept, half of them by the lobe if it is narrow

@@ -21,7 +21,8 @@ void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster&
         const size_t first = i * buffers.lights.size();
         Surface<double>& o = buffers.surfaces[i];
         if (o.scattering.lambertian) look_up_material(lit, o);
-        radiance(lit, options, buffers.lights, &buffers.points[first], o, seen + first, radiance_out + i * lit.channels);
+        radiance(lit, options, buffers.lights, buffers.points.data() + first, o, seen + first,
+                 radiance_out + i * lit.channels);
     }
 }
 
@@ -91,7 +92,7 @@ void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const R
                 const int8_t* sees = seen.data() + i * K;
                 if (!wanted(i) || o.is_black() || is_unlit(lit, *o.mesh, sees, K)) continue;
                 if (o.scattering.lambertian) look_up_material(lit, o);
-                radiance_vjp(lit, options, buffers->lights, &buffers->points[i * K], o, sees,
+                radiance_vjp(lit, options, buffers->lights, buffers->points.data() + i * K, o, sees,
                              bar + (first + i) * lit.channels, b_bar + 3 * (first + i), chunk);
             }
         }
@@ -109,7 +110,8 @@ void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& o
             Surface<Dual> o;
             set_surface<Dual>(lit, points.face[i], b, o);
             look_up_material(lit, o);
-            if (o.mesh->has_material && !o.is_black()) light_points(lit, points, options, lights, i, o, of_lights.data());
+            if (o.mesh->has_material && !o.is_black())
+                light_points(lit, points, options, lights, i, o, of_lights.data());
             radiance(lit, options, lights, of_lights.data(), o, seen + i * lights.size(), total);
             for (int c = 0; c < lit.channels; ++c) radiance_dot[i * lit.channels + c] = total[c].dot;
         }

@@ -54,8 +54,7 @@ void radiance(const LitScene& lit, const LitOptions& options, const std::vector<
     if (o.is_black()) return;
     if (options.only < 0) add_unshadowed(lit, o, total);
     for (size_t k = 0; k < lights.size(); ++k)
-        if (seen[k] > 0)
-            add_light<S>(lit, lit.lamps[lights[k].lamp], points[k], 1.0 / lights[k].count, o, total);
+        if (seen[k] > 0) add_light<S>(lit, lit.lamps[lights[k].lamp], points[k], 1.0 / lights[k].count, o, total);
 }
 // Whether no light that a point sees, nor anything else, gives it radiance: then it has no derivatives either.
 inline bool is_unlit(const LitScene& lit, const LitMesh& mesh, const int8_t* seen, size_t lights) {

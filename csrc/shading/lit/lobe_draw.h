@@ -25,8 +25,8 @@ class DrawnLobe {
         const double nv = dot(n_, v);
         v_ = nv >= 0 ? v : unit(v - nv * n_);
         nv_ = std::max(nv, 0.0);
-        // The cap of normals whose mirrored directions are above (Tokuyoshi and Eto 2024, "Bounded VNDF sampling for the
-        // Smith-GGX BRDF", eq. 6).
+        // The cap of normals whose mirrored directions are above (Tokuyoshi and Eto 2024, "Bounded VNDF sampling for
+        // the Smith-GGX BRDF", eq. 6).
         const double a2 = alpha_ * alpha_, s = 1 + std::sqrt(std::max(0.0, 1 - nv_ * nv_));
         bound_ = (1 - a2) * s * s / (s * s + a2 * nv_ * nv_);
     }
@@ -40,8 +40,8 @@ class DrawnLobe {
         return a2 / (M_PI * d * d) / (2 * (bound_ * nv_ + std::sqrt(a2 + (1 - a2) * nv_ * nv_)));
     }
 
-    // From numbers in [0, 1): where the hemisphere of normals is a sphere, they fill a cap of it evenly (Dupuy and Benyoub
-    // 2023, "Sampling visible GGX normals with spherical caps").
+    // From numbers in [0, 1): where the hemisphere of normals is a sphere, they fill a cap of it evenly (Dupuy and
+    // Benyoub 2023, "Sampling visible GGX normals with spherical caps").
     Vec3 draw(double u1, double u2) const {
         const Mat3 axes = axes_around(n_);
         const Vec3 own = axes * v_, wide = unit({alpha_ * own.x, alpha_ * own.y, std::max(own.z, 0.0)});

@@ -60,7 +60,7 @@ void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayC
             set_surface<double>(lit, points.face[i], points.b + 3 * i, o);
             if (!o.mesh->has_material || o.is_black()) continue;
             if (!o.scattering.lambertian) look_up_material(lit, o);
-            light_points(lit, points, options, lights, i, o, &buffers.points[i * K]);
+            light_points(lit, points, options, lights, i, o, buffers.points.data() + i * K);
         }
     // Light by light, for rays that are cast together are the faster the more alike they are.
     for (size_t k = 0; k < K; ++k) {
