@@ -418,7 +418,7 @@ def test_faults_of_pose_json(text, message):
         ),
         ({"steps": 0}, ValueError, "steps: expected an int from 1"),
         ({"spp": 1.5}, TypeError, "spp: expected an int"),
-        ({"tolerance": 0.0}, ValueError, "tolerance: expected a number above 0, got 0"),
+        ({"tolerance": 0.0}, ValueError, "tolerance: expected a number above 0 and below 1, got 0"),
     ],
 )
 def test_errors_name_the_argument(change, error, message):

@@ -362,3 +362,21 @@ def test_white_may_be_any_brighter_colour():
     lit = Lit.of(Picture(view, picture, display, None, torch.ones(96, 96), None), surface, 1)
     torch.testing.assert_close(lit.coefficients[1:, 0], torch.tensor([1.6, 1.6]), atol=0.02, rtol=0.0)
     assert float(lit.residual.abs().max()) < 0.02  # 0.44 too bright in red, of which 1 is all that is shown
+
+
+def test_two_meshes_that_end_in_one_place_have_not_converged():
+    """The picture shows one of them."""
+    view = view_of(96)
+    beside_it = beside(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.1), (0.3, 0.2, 0.2))
+    image = photograph(view, scene_of(1), seed=4)
+    fits = fit_poses([MESHES[0]] * 2, image, view, init=[STARTS[0], beside_it], spp=8, progress=False)
+    for k, fit in enumerate(fits):
+        assert not fit.converged and fit.reason.startswith(f"in one place: meshes[{k}] ends where")
+
+
+def test_a_direction_that_contours_do_not_show_is_unknown():
+    view = view_of(96)
+    plain = [mesh.replace(face_colors=None) for mesh in MESHES[:2]]
+    first, _ = fit_poses(plain, photograph(view, scene_of(2), seed=2), view, init=STARTS[:2], spp=8, progress=False)
+    assert not first.converged and first.uncertainty is not None and first.uncertainty.unknown
+    assert first.reason.startswith("directions unknown")

@@ -68,7 +68,12 @@ def _looked_up(table: Tensor, values: Tensor) -> Tensor:
 
 def _called(curve: Callable[[Tensor], Any], values: Tensor) -> Tensor:
     found = curve(values.clone())
-    made = torch.as_tensor(found)
+    try:
+        made = torch.as_tensor(found)
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"curve: expected a function that gives numbers, got {type(found).__name__} from it") from None
+    if made.is_complex():
+        raise TypeError("curve: expected a function that gives real numbers, got complex ones from it")
     if made.shape != values.shape:
         raise ValueError(
             f"curve: expected a function that gives radiances in the shape of the values, {tuple(values.shape)}, got "

@@ -234,10 +234,10 @@ def search_pose(
 
 def check_tolerance(tolerance: object) -> None:
     """Raises TypeError or ValueError."""
-    if not isinstance(tolerance, (int, float)):
+    if not isinstance(tolerance, (int, float)) or isinstance(tolerance, bool):
         raise TypeError(f"tolerance: expected a number, got {type(tolerance).__name__} ({tolerance!r})")
-    if not tolerance > 0.0:
-        raise ValueError(f"tolerance: expected a number above 0, got {tolerance:g}")
+    if not 0.0 < tolerance < 1.0:
+        raise ValueError(f"tolerance: expected a number above 0 and below 1, got {tolerance:g}")
 
 
 def check_callback(callback: object, of: str) -> None:

@@ -21,8 +21,10 @@ from .photo.poses import PosesSearch
 from .pose import Pose, pose_from_matrix
 from .result import PoseFit
 from .task import Lens, Names, PoseTask, depth_of
+from .uncertainty import Uncertainty
 
 INSIDE = 64  # vertices of a mesh that are asked whether they lie in another
+WITHIN = 0.9  # share of the distance from their mean at which they are asked at the end
 
 
 @torch.inference_mode(False)
@@ -65,7 +67,8 @@ def fit_poses(
     at which one covers another move both. The light and what stands behind the objects need not be known, and something that is
     none of the meshes may cover a part of them. Each fit is `converged` and `explained` by itself: one that is wrong does
     not make others so. `visible` says how much of an object the others leave to be seen. With less than a tenth of it, it
-    is not `converged`, and `reason` says that it is hidden; its pose is then little more than its start.
+    is not `converged`, and `reason` says that it is hidden; its pose is then little more than its start. Nor is one that ends
+    inside another one, or whose pose the pictures do not show exactly, as of fit_pose.
 
     KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set. Raises TypeError
     or ValueError that names the argument, also where an object is out of the picture, or inside another one, at the start.
@@ -107,11 +110,13 @@ def fit_poses(
         for k, task in enumerate(tasks):
             own = alike[k]
             best = ways.best[k] if own is None else ways.best[k].closest(own, starts[k])
-            history = list(ways.history[k])
+            history, curvature = list(ways.history[k]), ways.known(k)
+            known = None if curvature is None else Uncertainty.of(task, best, curvature, task.free, own)
+            conflict = _conflict(tasks, ways.best, k) if curvature is not None else ""
+            sure = ways.converged[k] and not interrupted and not conflict and (known is None or not known.unknown)
             found.append(PoseFit(
                 best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), time.perf_counter() - began,
-                ways.converged[k] and not interrupted, interrupted, ways.explained[k], history, task, cameras,
-                visible=ways.visible[k],
+                sure, interrupted, ways.explained[k], history, task, cameras, known, ways.visible[k], conflict,
             ))  # fmt: skip
         return found
 
@@ -171,7 +176,7 @@ def _masks(mask: object, count: int, several: bool) -> list[Any]:
         if several:
             raise ValueError("mask: expected a list of images of labels, one for each camera, got a tensor")
         return _of_labels("mask", mask, count)
-    if several and isinstance(mask, Sequence) and all(_is_labels(one) for one in mask):
+    if several and isinstance(mask, Sequence) and len(mask) > 0 and all(_is_labels(one) for one in mask):
         columns = [_of_labels(f"mask[{k}]", one, count) for k, one in enumerate(mask)]
         return [list(row) for row in zip(*columns, strict=True)]
     found = _each("mask", mask, count)
@@ -214,6 +219,33 @@ def _check_in_front(tasks: Sequence[PoseTask], starts: Sequence[Pose]) -> None:
                 raise ValueError(
                     f"{task.names.init}: expected the object in front of the camera, got its centre at depth {depth:.3g}"
                 )
+
+
+def _conflict(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int) -> str:
+    """In words, whether an object ends where another one is: half of its vertices or more, or of the other's, lie inside."""
+    import trimesh  # takes longer to import than a step of a fit
+
+    bodies = [_moved(task, pose) for task, pose in zip(tasks, poses, strict=True)]
+    for other in range(len(bodies)):
+        for a, b in ((k, other), (other, k)):
+            if a == b:
+                continue
+            points = torch.cat([mesh.verts for mesh in bodies[a]]).double()
+            some = points[:: max(1, len(points) // INSIDE)]
+            # A little smaller, so that two that are one count as well.
+            some = some.mean(0) + WITHIN * (some - some.mean(0))
+            inside = torch.zeros(len(some), dtype=torch.bool)
+            for mesh in bodies[b]:
+                solid = trimesh.Trimesh(mesh.verts.numpy(), mesh.faces.numpy(), process=False)
+                low, high = mesh.verts.double().aminmax(dim=0)
+                near = ((some > low) & (some < high)).all(1)
+                if solid.is_watertight and bool(near.any()):
+                    inside[near] |= torch.from_numpy(solid.contains(some[near].numpy()))
+            if float(inside.double().mean()) >= 0.5:
+                return (
+                    f"in one place: meshes[{k}] ends where meshes[{other}] does; leave one out, or start them elsewhere"
+                )
+    return ""
 
 
 def _check_apart(tasks: Sequence[PoseTask], starts: Sequence[Pose]) -> None:

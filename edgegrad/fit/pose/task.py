@@ -119,7 +119,7 @@ class PoseTask:
             if image.shape[-1] != C:
                 raise ValueError(
                     f"{names.target}{name}: expected {C} channels like the mesh's colours, got {image.shape[-1]}; "
-                    "read it with read_image(path, channels=3), or give its alpha as the mask"
+                    f"read it with read_image(path, channels={C}), or give its alpha as the mask"
                 )
             if count is not None:
                 count = check_image(f"weight{name}", count, view.size)

@@ -57,6 +57,7 @@ class PosesSearch:
         self.explained = [math.nan] * len(tasks)
         self.visible = [math.nan] * len(tasks)
         self.history: list[list[Step]] = [[] for _ in tasks]
+        self.curvature: Tensor | None = None  # JᵀJ of the terms at the answer, of the entries of all
         self.after_step: Callable[[], Any] = lambda: None
 
     @property
@@ -73,6 +74,16 @@ class PosesSearch:
         """Steps of the first way at most."""
         return sum(map(self._most, self.levels))
 
+    def known(self, k: int) -> Tensor | None:
+        """JᵀJ (n, n) of the entries of one object, with those of the others as unknown as they are: the Schur complement."""
+        if self.curvature is None:
+            return None
+        own = self.levels[-1].parts()[k]
+        others = torch.ones(len(self.curvature), dtype=torch.bool)
+        others[own] = False
+        between, rest = self.curvature[own][:, others], self.curvature[others][:, others]
+        return self.curvature[own, own] - between @ torch.linalg.pinv(rest, rtol=1e-9, hermitian=True) @ between.T
+
     def run(self) -> None:
         """Raises ValueError when nothing in the pictures depends on the poses."""
         everything = list(range(len(self.tasks)))
@@ -86,6 +97,7 @@ class PosesSearch:
                 if self.explained[k] < self.enough[k] and self.visible[k] >= HIDDEN:
                     self._from_aside(k)
         self._surrounded()
+        self.curvature = self.levels[-1].equations(self.best, self.seed)[0].curvature
         for steps, pose in zip(self.history, self.best, strict=True):
             steps.append(Step(self.levels[-1].size, self.loss, pose, True, {}))
 
