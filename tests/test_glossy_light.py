@@ -195,4 +195,4 @@ SPIN = torch.tensor([[0.0, 0.5, -0.3], [-0.5, 0.0, 0.4], [0.3, -0.4, 0.0]], dtyp
 )
 def test_gradients_are_finite_differences(name: str):
     samples = {"surface_samples": 60_000, "edge_samples": 10_000 if name == "translation" else 500}
-    check_ratio(by(name), 0.1, spp=256, seeds=32, filter="box", light_samples=4, **samples)
+    check_ratio(by(name), 0.1, spp=256, seeds=64, filter="box", light_samples=4, **samples)
