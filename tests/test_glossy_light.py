@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 import edgegrad as eg
 from edgegrad.light.bsdf import Scattering
 from edgegrad.light.lobes import WIDEST_LOBE, Lobes
-from edgegrad.light.resampled import DARK, EACH, Glossy, resampled
+from edgegrad.light.resampled import Glossy, resampled
 
 N = normalize(vector(0.2, -0.3, 0.8), dim=0)
 ACROSS = normalize(torch.linalg.cross(N, vector(1, 0, 0)), dim=0)
@@ -141,7 +141,8 @@ def test_noise_under_an_even_sky(roughness: float, most: float):
     images = torch.stack([eg.render(scene, camera, spp=16, light_samples=4, seed=seed) for seed in range(8)])
     inside = images[:, 10:22, 10:22].double()
     assert 0 < float((inside.std(0) / inside.mean(0)).mean()) < most
-    assert float(inside.mean()) == pytest.approx(1.0, abs=0.15)
+    # White metal gives back all but what it would scatter more than once.
+    assert 0.85 < float(inside.mean()) < 1.001
 
 
 def test_the_same_bits_at_any_number_of_threads():
@@ -158,7 +159,6 @@ def test_the_same_bits_at_any_number_of_threads():
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
-    assert EACH % 2 == 0 and 0 < DARK < 1
 
 
 def by(name: str) -> Case:

@@ -158,18 +158,21 @@ class PhotoSearch:
         order = sorted((k for k in range(len(ends)) if scores[k] >= HOPELESS), key=lambda k: -scores[k])
         for pose in distinct([ends[k] for k in order], FOLLOWED, APART):
             before = len(self.history)
-            found = self._judge(*self._down(pose, finer))
-            # Of so many ways, one may end where something is alike by chance.
-            if found.explained > max(best.explained, COVERED_ENOUGH):
-                best = found
-                self._forget(slice(begins, before))
-                if answered:
-                    self._take(best)
-            else:
-                self._forget(slice(before, None))
+            best = self._better(best, self._judge(*self._down(pose, finer)), slice(begins, before), answered)
             if best.explained >= self.enough:
                 break
         return best
+
+    def _better(self, best: _End, found: _End, earlier: slice, answered: bool) -> _End:
+        """The one that explains more of the edges. Of the other one the history keeps no steps; those `earlier` than the steps to
+        the found one led to the best."""
+        if found.explained <= best.explained:
+            self._forget(slice(earlier.stop, None))
+            return best
+        self._forget(earlier)
+        if answered:
+            self._take(found)
+        return found
 
     def _from_covers(self, best: _End, begins: int) -> _End:
         """Ways that leave out what may cover the object at one side, until the pictures show an end's edges for sure."""
@@ -188,13 +191,11 @@ class PhotoSearch:
         for k in sorted(hopeful, key=lambda k: -scores[k])[:COVERS_FOLLOWED]:
             before = len(self.history)
             found = self._uncovered(ends[k], ways[k], finer)
-            if found.explained > best.explained:
-                best = found
-                self._forget(slice(begins, before))
-                if answered:
-                    self._take(best)
-            else:
+            # Of so many ways, one may end where something is alike by chance.
+            if found.explained < COVERED_ENOUGH:
                 self._forget(slice(before, None))
+                continue
+            best = self._better(best, found, slice(begins, before), answered)
             if best.explained >= SURE:
                 break
         return best
