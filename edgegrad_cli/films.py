@@ -13,18 +13,18 @@ if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
 
-PICTURES = ".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".exr", ".hdr"
 VIDEO = "edgegrad[video]", "reading or writing a video"
 CODECS = "libx264", "mpeg4"  # of film.mp4; not every build of FFmpeg has the first
 BITS = 2.0  # a pixel, of codecs that do not take a quality
 USUAL_FPS = 25
+MOST_FPS = 1000  # of films: more is an error of a header, or of a finger
 
 
 class Film(NamedTuple):
     """Pictures (H, W, 3) of linear radiance, one after the other."""
 
     frames: Iterator[Tensor]
-    fps: Fraction | None  # None of a folder
+    fps: Fraction | None  # None of a folder, and of a video that does not tell
 
 
 def read_film(path: Path) -> Film:
@@ -38,10 +38,11 @@ def read_film(path: Path) -> Film:
 
 def _folder(folder: Path) -> Film:
     from edgegrad import read_image
+    from edgegrad.files.image import READABLE
 
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in READABLE)
     if not paths:
-        raise ValueError(f"{folder}: expected a folder with images, got none of {', '.join(PICTURES)} in it")
+        raise ValueError(f"{folder}: expected a folder with images, got none of {', '.join(READABLE)} in it")
     return Film((read_image(path, channels=3) for path in paths), None)
 
 
@@ -61,7 +62,7 @@ def _video(path: Path) -> Film:
     first = next(frames, None)
     if first is None:
         raise ValueError(f"{path}: expected a video, got one without frames")
-    return Film(chain([first], frames), fps)
+    return Film(chain([first], frames), fps if fps is not None and 0 < fps <= MOST_FPS else None)
 
 
 def _decoded(path: Path, av: Any) -> Iterator[Tensor]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import outputs
 from .arguments import add_view, count, number
-from .inputs import check_size, read_coverage, read_picture, read_pose, read_view
+from .inputs import check_size, read_labels, read_picture, read_pose, read_view
 
 if TYPE_CHECKING:
     from edgegrad.fit import PoseFit
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     picture, _ = read_picture(args.image)
     mask = None
     if args.mask is not None:
-        mask = [read_coverage(args.mask, k + 1) for k in range(len(scenes))]
+        mask = read_labels(args.mask, len(scenes))
         check_size(mask[0], picture, args.mask, args.image)
     init = [read_pose(path).matrix for path in args.init] or None
     everything = Scene([mesh for scene in scenes for mesh in scene.meshes])

@@ -63,6 +63,20 @@ def read_coverage(path: Path, label: int | None = None) -> Tensor:
         return read_mask(path, label)
 
 
+def read_labels(path: Path, count: int) -> list[Tensor]:
+    """Of each of so many meshes (H, W), where an image of labels has its number, from 1. Raises what read_mask raises."""
+    from edgegrad import read_mask
+
+    found = []
+    for number in range(1, count + 1):
+        try:
+            found.append(read_mask(path, number))
+        except ValueError as error:
+            fix = "number the meshes in the order of --mesh, from 1, and leave out those that are not seen"
+            raise ValueError(str(error).replace("choose one with label=", fix).replace(" for label=", "")) from error
+    return found
+
+
 def read_weight(path: Path) -> Tensor:
     """(H, W), how much a pixel counts. Raises what edgegrad.read_mask raises."""
     from edgegrad.files.mask import read_weight

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import outputs
 from .arguments import add_mesh, add_view, count, number
-from .films import USUAL_FPS, read_film, write_film
+from .films import MOST_FPS, USUAL_FPS, read_film, write_film
 from .inputs import read_pose, read_scene, read_view
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--spp", type=count, default=8, help="samples a pixel (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
     parser.add_argument(
-        "--fps", type=count, help=f"frames a second of the film that is written (the video's; of a folder {USUAL_FPS})"
+        "--fps", type=_rate, help=f"frames a second of the film that is written (the video's; of a folder {USUAL_FPS})"
     )
     parser.add_argument(
         "--out",
@@ -51,6 +51,12 @@ def add(commands: Any) -> None:
         help="for poses.json, frames with contours, and film.mp4 or .webp",
     )
     parser.set_defaults(run=run)
+
+
+def _rate(text: str) -> int:
+    if (found := count(text)) > MOST_FPS:
+        raise argparse.ArgumentTypeError(f"expected 1 to {MOST_FPS} frames a second, got {text!r}")
+    return found
 
 
 def run(args: argparse.Namespace) -> int:

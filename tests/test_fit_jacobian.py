@@ -9,10 +9,11 @@ import torch
 from test_fit import BACKGROUND, START, about_center, bracket, camera
 
 import edgegrad as eg
+from edgegrad.fit.pose.given import Names
 from edgegrad.fit.pose.jacobian import Motion, derivatives
 from edgegrad.fit.pose.observed import motion
 from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.task import BEND, Lens, Names, PoseTask
+from edgegrad.fit.pose.task import BEND, Lens, PoseTask
 
 CENTER = torch.tensor([1.0, 0.75, 0.4], dtype=torch.float64)
 CHANNELS = ["image", "alpha", "position", "depth", "shading_normal", "normal"]

@@ -17,6 +17,7 @@ import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import PoseFit, fit_pose, fit_poses
+from edgegrad.fit.pose.given import Names
 from edgegrad.fit.pose.jacobian import Motion, Motions, Rendered
 from edgegrad.fit.pose.photo.cover import covers
 from edgegrad.fit.pose.photo.cover import left as left_of
@@ -26,7 +27,7 @@ from edgegrad.fit.pose.photo.picture import Picture
 from edgegrad.fit.pose.photo.region import regions_term
 from edgegrad.fit.pose.photo.surface import AOVS, Surface
 from edgegrad.fit.pose.pose import pose_from_matrix
-from edgegrad.fit.pose.task import Lens, Names, PoseTask
+from edgegrad.fit.pose.task import Lens, PoseTask
 from edgegrad.fit.region import OUTLIERS, smoothed
 from edgegrad_cli import main
 

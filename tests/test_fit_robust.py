@@ -15,10 +15,11 @@ import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import fit_camera, fit_pose, fit_scene, fit_texture
 from edgegrad.fit.pose import search
+from edgegrad.fit.pose.given import Names
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.robust import Comparison
 from edgegrad.fit.pose.soft import softness
-from edgegrad.fit.pose.task import PARTS, Lens, Names, PoseTask, blurred, is_clutter
+from edgegrad.fit.pose.task import PARTS, Lens, PoseTask, blurred, is_clutter
 from edgegrad.fit.views import before_black
 
 

@@ -14,10 +14,11 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.camera.poses import rotation
 from edgegrad.fit import fit_pose
+from edgegrad.fit.pose.given import Names
 from edgegrad.fit.pose.photo.match import ACROSS, ROUNDS, SIZED, Matches, Mips, _closer, _in_mask
 from edgegrad.fit.pose.photo.views import Views, all_sides, ball, pose_at, spread
 from edgegrad.fit.pose.pose import Pose, angle
-from edgegrad.fit.pose.task import Lens, Names, PoseTask
+from edgegrad.fit.pose.task import Lens, PoseTask
 
 sys.path += [str(Path(__file__).parents[1] / folder) for folder in ("benchmarks", "examples")]
 import photo_cases

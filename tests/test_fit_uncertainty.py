@@ -10,8 +10,9 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.fit import PoseFit, Uncertainty, fit_pose
+from edgegrad.fit.pose.given import Names
 from edgegrad.fit.pose.pose import Pose
-from edgegrad.fit.pose.task import Lens, Names, PoseTask
+from edgegrad.fit.pose.task import Lens, PoseTask
 from edgegrad.fit.pose.uncertainty import TOGETHER
 from edgegrad.scene.symmetries import Symmetries, SymmetryAxis
 

@@ -18,7 +18,8 @@ from .paths import PathLike, check_readable, check_suffix, replacing
 DISPLAY = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # 8 bit, sRGB
 RADIANCE = (".exr", ".hdr")  # floating point, linear
 IMAGES = (*DISPLAY, *RADIANCE)
-SEVERAL = (".tif", ".tiff", ".exr")  # may hold more images than one
+READABLE = (*IMAGES, ".webp")
+SEVERAL = (".tif", ".tiff", ".exr", ".webp")  # may hold more images than one
 MOST_NUMBERS = 1 << 30  # pixels times channels, four bytes each; a small file may announce more
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec. 709 primaries, which sRGB shares
 
@@ -47,7 +48,7 @@ class Stored(NamedTuple):
 
 def read_stored(path: PathLike, exact: bool = False) -> Stored:
     """`exact`: integers of 32 bits in float64, which holds them all. Raises what read_image does."""
-    file = check_readable(path, IMAGES)
+    file = check_readable(path, READABLE)
     oiio = require("OpenImageIO", "OpenImageIO", "reading images")
     hint = oiio.ImageSpec()
     hint["oiio:UnassociatedAlpha"] = 1
@@ -93,7 +94,7 @@ def read_stored(path: PathLike, exact: bool = False) -> Stored:
 def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb") -> Tensor:
     """(H, W, C) float32 from an image file: linear radiance, row 0 on top, upright as its EXIF orientation says.
 
-    Integer pixels (PNG, JPEG, BMP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1;
+    Integer pixels (PNG, JPEG, BMP, WebP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1;
     floating-point pixels (EXR, HDR, float TIFF) are linear as they are. Alpha is the last channel, not gamma-corrected and
     not multiplied into the colours: those of a TIFF with associated alpha are divided by it, where it is above 0. EXR files
     hold colours times alpha, and these stay so. At most 2³⁰ pixels times channels. read_mask() reads masks.
@@ -136,7 +137,7 @@ def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb
 
 def read_size(path: PathLike) -> tuple[int, int]:
     """(H, W) of an image file as read_image reads it, by its header alone. Raises what read_image does."""
-    file = check_readable(path, IMAGES)
+    file = check_readable(path, READABLE)
     stored = require("OpenImageIO", "OpenImageIO", "reading images").ImageBuf(str(file))
     spec = stored.spec()
     if not spec.full_width or not spec.full_height:

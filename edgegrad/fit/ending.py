@@ -16,13 +16,15 @@ class Ending(Enum):
     INTERRUPTED = "interrupted"
 
 
-def reason_of(ending: Ending, explained: float, suspects: str = "scene, cameras or pictures") -> str:
+def reason_of(
+    ending: Ending, explained: float, suspects: str = "scene, cameras or pictures", enough: float = ENOUGH
+) -> str:
     """In words: "converged", or what kept the fit from that, and after a colon how to mend it."""
     if ending is Ending.INTERRUPTED:
         return "interrupted"
     if ending is Ending.FALLING:
         return "loss still falling: give it more steps, or larger learning rates"
-    if explained < ENOUGH:
+    if explained < enough:
         return (
             f"edges not explained: the pictures show {explained:.0%} of the render's edges; start nearer, or look for what is "
             f"wrong in {suspects}"

@@ -151,8 +151,10 @@ def _counted(measured: dict[str, Measurement], mask: Tensor | None, weight: Tens
 def cameras_of(cameras: object) -> list[Camera]:
     """One by one, as copies on the CPU. Raises TypeError."""
     given = [cameras] if isinstance(cameras, Camera) else cameras
-    if not isinstance(given, Sequence) or not given:
+    if not isinstance(given, Sequence):
         raise TypeError(f"cameras: expected a Camera or a sequence of them, got {type(cameras).__name__}")
+    if not given:
+        raise ValueError("cameras: expected one for each picture, got an empty list; give at least one")
     split: list[Camera] = []
     for i, camera in enumerate(given):
         if not isinstance(camera, Camera):

@@ -96,13 +96,23 @@ def like(name: str, names: Sequence[str]) -> str:
 
 def checked_parameters(parameters: object, known: Known | None) -> dict[str, Parameter | Placement]:
     """Each with a value to start from. Raises TypeError or ValueError."""
-    if not isinstance(parameters, Mapping) or not parameters:
-        raise TypeError("parameters: expected a mapping of names to learning rates or Parameters, got none")
+    if not isinstance(parameters, Mapping):
+        raise TypeError(
+            f"parameters: expected a mapping of names to learning rates or Parameters, got {type(parameters).__name__}; give "
+            '{"meshes.0.verts": 0.01}, say'
+        )
+    if not parameters:
+        raise ValueError("parameters: expected a name or more of what is sought, got none; nothing would change")
     found: dict[str, Parameter | Placement] = {}
     for name, given in parameters.items():
         if isinstance(given, PoseParameter):
             found[name] = _placement(name, given, known)
             continue
+        if isinstance(given, bool) or not isinstance(given, (Parameter, int, float)):
+            raise TypeError(
+                f"{name}: expected a learning rate or a Parameter, got {type(given).__name__}; a value to start from is given by "
+                "Parameter(lr, value)"
+            )
         parameter = given if isinstance(given, Parameter) else Parameter(given)
         if known is not None:
             if name in known.movable:

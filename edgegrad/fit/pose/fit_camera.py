@@ -20,8 +20,9 @@ from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..history import Record, plain_history
 from .fit_pose import search_pose
+from .given import Names, bare
 from .result import PoseFit, Step
-from .task import PARTS, Lens, Names
+from .task import PARTS, Lens
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -189,7 +190,7 @@ def fit_camera(
     if image is None:
         if mask is None:
             raise ValueError("image: expected a picture, or a mask, to compare with, got neither")
-        scene, target = _bare(scene), mask
+        scene, target = bare(scene), mask
 
     def result(search: PoseFit) -> CameraFit:
         return CameraFit([moved(seen, search.matrix) for seen in search.cameras], search)
@@ -211,9 +212,3 @@ def moved(camera: Camera, matrix: Tensor) -> Camera:
     """The camera that sees a scene at rest as this one W sees it moved by the matrix M (4, 4): W M."""
     W = camera.world_to_camera
     return camera.replace(world_to_camera=(W.detach().double() @ matrix).to(W))
-
-
-def _bare(scene: Mesh | Scene) -> Scene:
-    """Shapes alone."""
-    meshes: Sequence[Mesh] = [scene] if isinstance(scene, Mesh) else scene.meshes
-    return Scene([Mesh(mesh.verts, mesh.faces) for mesh in meshes])

@@ -26,7 +26,9 @@ from ...scene.symmetries import Symmetries
 from ..checkpoints import Checkpoint, traits
 from ..options import check_checkpoint
 from ..upside_down import BETTER, say_upside_down
+from .given import Names, check_max_size
 from .journal import Journal
+from .photo.depth import warn_of_units
 from .photo.match import matches
 from .photo.search import PhotoSearch
 from .photo.starts import Starts, Tell, around, everywhere
@@ -34,7 +36,7 @@ from .place import placed
 from .pose import Pose, pose_from_matrix
 from .result import PoseFit
 from .search import Search
-from .task import Lens, Names, PoseTask
+from .task import Lens, PoseTask
 from .uncertainty import Uncertainty
 
 MOST_STARTS = 1000
@@ -144,7 +146,8 @@ def search_pose(
 ) -> PoseFit:  # fmt: skip
     """fit_pose(), with whatever is sought of the lens."""
     began = time.perf_counter()
-    for name, count in (("max_size", max_size), ("steps", steps), ("spp", spp)):
+    check_max_size(max_size)
+    for name, count in (("steps", steps), ("spp", spp)):
         check_positive_int(name, count)
     check_int("seed", seed, 0, 2**32 - 1)
     check_tolerance(tolerance)
@@ -164,6 +167,9 @@ def search_pose(
     saved = file.read()
     journal, earlier = (Journal(), 0.0) if saved is None else (Journal(saved["journal"]), saved["seconds"])
     depths = depth_images(depth, task)
+    seen = [shot.camera for shot in task.shots]
+    if starts != "global":
+        warn_of_units(task.scene.transformed(start.R, start.t, start.scale), seen, depths, "at the start")
 
     def way(start: Pose, journal: Journal, further: bool) -> Search | PhotoSearch:
         if task.aovs == ("alpha",) and depth is None:
@@ -200,7 +206,7 @@ def search_pose(
         sure = ways.converged and not interrupted and (known is None or not known.unknown)
         return PoseFit(
             best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), seconds(), sure, interrupted,
-            ways.explained, history, task, cameras, known,
+            ways.explained, history, task, cameras, known, enough=ways.enough,
         )  # fmt: skip
 
     total = max(ways.planned, journal.steps)
@@ -222,6 +228,8 @@ def search_pose(
         ways.tell = bar.set_postfix_str
     try:
         ways.run()
+        if starts == "global":
+            warn_of_units(task.scene.transformed(ways.best.R, ways.best.t, ways.best.scale), seen, depths, "found")
         if search and not isinstance(ways, Starts) and not ways.converged and ways.explained < ways.enough:
             _warn_if_upside_down(task, ways, init is None, max_size, spp)
     except KeyboardInterrupt:

@@ -11,16 +11,17 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...camera.camera import Camera
-from ...check import as_tensor, check_flag, check_int, check_positive_int
+from ...check import as_tensor, check_flag, check_int, check_positive_int, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
-from ..region import VISIBLE
 from .fit_pose import check_callback, check_tolerance, depth_images, symmetries_of
+from .given import Names, check_in_front, check_max_size, check_seen, one_for_each
+from .photo.depth import warn_of_units
 from .photo.poses import PosesSearch
 from .pose import Pose, pose_from_matrix
 from .result import PoseFit
-from .task import Lens, Names, PoseTask, depth_of
+from .task import Lens, PoseTask
 from .uncertainty import Uncertainty
 
 INSIDE = 64  # vertices of a mesh that are asked whether they lie in another
@@ -74,14 +75,15 @@ def fit_poses(
     or ValueError that names the argument, also where an object is out of the picture, or inside another one, at the start.
     """
     began = time.perf_counter()
-    for name, number in (("max_size", max_size), ("steps", steps), ("spp", spp)):
+    check_max_size(max_size)
+    for name, number in (("steps", steps), ("spp", spp)):
         check_positive_int(name, number)
     check_int("seed", seed, 0, 2**32 - 1)
     check_tolerance(tolerance)
     check_callback(callback, "a list of PoseFits")
     count = _counted(meshes)
     starts = _starts(init, count)
-    masks = _masks(mask, count, isinstance(camera, Sequence))
+    masks = _masks(mask, count, camera)
     known = _each("symmetries", symmetries, count)
     alike = [
         symmetries_of(one, mesh, f"symmetries[{k}]") for k, (one, mesh) in enumerate(zip(known, meshes, strict=True))
@@ -94,14 +96,15 @@ def fit_poses(
         for k, (mesh, own, start) in enumerate(zip(meshes, masks, starts, strict=True))
     ]  # fmt: skip
     depths = depth_images(depth, tasks[0])
-    _check_in_front(tasks, starts)
+    for task, start in zip(tasks, starts, strict=True):
+        for shot in task.shots:
+            check_in_front(task.names.init, shot.camera, start, task.center)
     _check_apart(tasks, starts)
+    for task, start in zip(tasks, starts, strict=True):
+        check_seen(task.names.init, task.scene, [shot.camera for shot in task.shots], start)
+    moved = [mesh for task, start in zip(tasks, starts, strict=True) for mesh in _moved(task, start)]
+    warn_of_units(Scene(moved), [shot.camera for shot in tasks[0].shots], depths, "at the start")
     ways = PosesSearch(tasks, starts, depths, max_size, spp, steps, tolerance, seed, check_flag("search", search))
-    for k, (level, start) in enumerate(zip(ways.levels[-1].objects, starts, strict=True)):
-        if level.covered(start, seed) < VISIBLE:
-            raise ValueError(
-                f"init[{k}]: expected a pose at which the camera sees the mesh, got one out of the picture; start where it is"
-            )
     cameras: list[Camera] = list(camera) if isinstance(camera, Sequence) else [camera]
     interrupted = False
 
@@ -117,6 +120,7 @@ def fit_poses(
             found.append(PoseFit(
                 best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), time.perf_counter() - began,
                 sure, interrupted, ways.explained[k], history, task, cameras, known, ways.visible[k], conflict,
+                ways.needed[k],
             ))  # fmt: skip
         return found
 
@@ -154,15 +158,17 @@ def _each(name: str, given: object, count: int) -> list[Any]:
     if given is None:
         return [None] * count
     if not isinstance(given, Sequence) or isinstance(given, str):
-        raise TypeError(f"{name}: expected a list with one for each mesh, got {type(given).__name__}")
+        raise TypeError(
+            f"{name}: expected a list with one for each mesh, got {type(given).__name__}; give [{name}] for one mesh"
+        )
     if len(given) != count:
         raise ValueError(f"{name}: expected {count}, one for each mesh, got {len(given)}")
     return list(given)
 
 
 def _starts(init: object, count: int) -> list[Pose]:
-    if isinstance(init, Tensor) and init.dim() == 3:
-        init = list(init)
+    if getattr(init, "ndim", 0) == 3:  # (N, 4, 4)
+        init = list(init)  # type: ignore[call-overload]
     given = _each("init", init, count)
     return [
         pose_from_matrix(f"init[{k}]", torch.eye(4) if one is None else getattr(one, "matrix", one))
@@ -170,31 +176,42 @@ def _starts(init: object, count: int) -> list[Pose]:
     ]
 
 
-def _masks(mask: object, count: int, several: bool) -> list[Any]:
+def _masks(mask: object, count: int, camera: object) -> list[Any]:
     """What fit_pose calls the mask, of each mesh. Raises TypeError or ValueError."""
-    if isinstance(mask, Tensor):
-        if several:
-            raise ValueError("mask: expected a list of images of labels, one for each camera, got a tensor")
-        return _of_labels("mask", mask, count)
-    if several and isinstance(mask, Sequence) and len(mask) > 0 and all(_is_labels(one) for one in mask):
-        columns = [_of_labels(f"mask[{k}]", one, count) for k, one in enumerate(mask)]
-        return [list(row) for row in zip(*columns, strict=True)]
-    found = _each("mask", mask, count)
-    if 0 < (missing := sum(one is None for one in found)) < count:
-        raise ValueError(f"mask: expected a mask for each mesh or for none, got {count - missing} of {count}")
-    return found
+    cameras: list[Any] = list(camera) if isinstance(camera, Sequence) else [camera]
+    if hasattr(mask, "ndim"):  # of a tensor or an array
+        labels = one_for_each("mask", mask, len(cameras), 2) if isinstance(camera, Sequence) else [mask]
+    elif isinstance(camera, Sequence) and isinstance(mask, Sequence) and mask and all(map(_is_labels, mask)):
+        labels = one_for_each("mask", mask, len(cameras), 2)
+    else:
+        found = _each("mask", mask, count)
+        if 0 < (missing := sum(one is None for one in found)) < count:
+            raise ValueError(f"mask: expected a mask for each mesh or for none, got {count - missing} of {count}")
+        return found
+    names = ["mask"] if not isinstance(camera, Sequence) else [f"mask[{k}]" for k in range(len(labels))]
+    columns = [
+        _of_labels(name, one, count, getattr(view, "size", None))
+        for name, one, view in zip(names, labels, cameras, strict=True)
+    ]
+    return [list(row) for row in zip(*columns, strict=True)] if isinstance(camera, Sequence) else list(columns[0])
 
 
 def _is_labels(given: object) -> bool:
-    return isinstance(given, Tensor) and not given.is_floating_point() and given.dtype != torch.bool
+    if not hasattr(given, "ndim"):
+        return False
+    value = as_tensor("mask", given)
+    return not value.is_floating_point() and value.dtype != torch.bool
 
 
-def _of_labels(name: str, labels: object, count: int) -> list[Tensor]:
+def _of_labels(name: str, labels: object, count: int, size: tuple[int, int] | None) -> list[Tensor]:
+    """A mask for each mesh, of a camera of that size."""
     value = as_tensor(name, labels).detach().cpu()
     if not _is_labels(value):
         raise TypeError(
             f"{name}: expected an image of labels, of integers, or a list with a mask for each mesh, got {value.dtype}"
         )
+    if size is not None:
+        check_shape(name, value, size, (*size, 1), fix="an image of labels needs the picture's size")
     found = [(value == k + 1).float() for k in range(count)]
     for k, one in enumerate(found):
         if not bool(one.any()):
@@ -208,17 +225,6 @@ def _of_labels(name: str, labels: object, count: int) -> list[Tensor]:
 
 def _moved(task: PoseTask, pose: Pose) -> list[Mesh]:
     return list(task.scene.transformed(pose.R, pose.t, pose.scale).meshes)
-
-
-def _check_in_front(tasks: Sequence[PoseTask], starts: Sequence[Pose]) -> None:
-    """Raises ValueError."""
-    for task, start in zip(tasks, starts, strict=True):
-        for shot in task.shots:
-            depth = float(depth_of(shot.camera, start, task.center))
-            if shot.camera.projection == "perspective" and depth <= 0.0:
-                raise ValueError(
-                    f"{task.names.init}: expected the object in front of the camera, got its centre at depth {depth:.3g}"
-                )
 
 
 def _conflict(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int) -> str:

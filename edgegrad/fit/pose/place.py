@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .given import depth_of
 from .pose import Pose
-from .task import PoseTask, Shot, depth_of, focal_of
+from .task import PoseTask, Shot, focal_of
 
 FILLS = 0.5  # of the picture's shorter side, an object of which nothing else is known
 AGREES = 0.3  # smallest intersection over union of the object's box with the mask's at which the mesh file is believed

@@ -72,6 +72,7 @@ class PoseFit:
     # Of a fit of several objects, how much of this one the others leave to be seen, 0 … 1. Not kept in JSON
     visible: float = 1.0
     conflict: str = ""  # of such a fit, in words, with which other object it cannot be; not kept in JSON
+    enough: float = ENOUGH  # of `explained`, for this mesh and picture; not kept in JSON
 
     @property
     def matrix(self) -> Tensor:
@@ -88,8 +89,8 @@ class PoseFit:
         if self.conflict and not self.interrupted:
             return self.conflict
         ending = Ending.INTERRUPTED if self.interrupted else Ending.FLAT if self.converged else Ending.STEPS
-        words = reason_of(ending, self.explained, "mesh, camera or picture")
-        if self.uncertainty is None or not self.uncertainty.unknown or self.interrupted or self.explained < ENOUGH:
+        words = reason_of(ending, self.explained, "mesh, camera or picture", self.enough)
+        if self.uncertainty is None or not self.uncertainty.unknown or self.interrupted or self.explained < self.enough:
             return words
         return (
             f"directions unknown: {self.uncertainty.unknown}; give the mesh's colours, symmetries of the mesh, depth, or another "

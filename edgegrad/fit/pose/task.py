@@ -17,7 +17,9 @@ from ...camera.poses import rotation
 from ...check import as_tensor, check_finite, check_float, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
+from ..region import VISIBLE
 from ..views import area_mean, before_black, check_image, warn_of_faint
+from .given import LEAST, Names, depth_of, shots_of
 from .pose import Pose
 
 COARSEST = 24  # pixels across the object where the fit begins: 15 % of its size is then a few pixels
@@ -72,16 +74,6 @@ class Level(NamedTuple):
         return self.shots[0].camera.size
 
 
-class Names(NamedTuple):
-    """What a function calls its arguments, for errors."""
-
-    mesh: str = "mesh"
-    target: str = "target"
-    init: str = "init"
-    lens: tuple[str, ...] = ("fit_scale", "fit_focal")  # of the entries of a Lens
-    mask: str = "mask"
-
-
 @dataclass(frozen=True)
 class PoseTask:
     """What is compared, and how a pose moves. Geometry is float64."""
@@ -113,8 +105,13 @@ class PoseTask:
         if mask is not None and background is not None:
             raise ValueError("background: expected None with a mask, got both; the mask leaves no background")
         shots, masks, clutter = [], [], False
-        for name, view, picture, shape, count in _shots(camera, target, mask, weight, names):
+        for name, view, picture, shape, count in shots_of(camera, target, mask, weight, names):
             image = check_image(f"{names.target}{name}", picture, view.size)
+            if min(view.size) < LEAST:
+                raise ValueError(
+                    f"{names.target}{name}: expected a picture of {LEAST} × {LEAST} pixels or more, got {view.size[1]} × "
+                    f"{view.size[0]}; take a larger one"
+                )
             C = image.shape[-1] if plain else scene.channels
             if image.shape[-1] != C:
                 raise ValueError(
@@ -140,6 +137,10 @@ class PoseTask:
                 behind = _background(behind, image)
             shots.append(Shot(view.to("cpu", torch.float64, copy=True), image, behind, count))
         warn_of_faint(names.mask, masks)
+        if all(shot.weight is not None and not bool((shot.weight > 0).any()) for shot in shots):
+            raise ValueError(
+                "weight: expected numbers above 0 somewhere, got zero in every pixel; there is nothing to fit"
+            )
         if colourless := plain and mask is None:
             scene = scene.replace(meshes=[_grey(part, shots[0].target.shape[-1]) for part in scene.meshes])
         if clutter:
@@ -172,6 +173,10 @@ class PoseTask:
             raise ValueError(
                 f"{given}: expected a picture of the object, got the same in every pixel; "
                 "was it read or rendered right?"
+            )
+        if masks and (most := max(int((one > 0.0).sum()) for one in masks)) < VISIBLE:
+            raise ValueError(
+                f"{names.mask}: expected the object in {VISIBLE} pixels or more, got it in {most}; is it the object's mask?"
             )
         bare = scene.replace(meshes=double, background=None)
         return PoseTask(bare, aovs, shots, clutter, colourless, extent, (low + high) / 2, size, free, names)
@@ -302,40 +307,6 @@ class PoseTask:
 
 def _grey(mesh: Mesh, channels: int) -> Mesh:
     return mesh.replace(colors=mesh.verts.new_full((len(mesh.verts), channels), 0.5, dtype=torch.float32))
-
-
-def _shots(camera: Any, target: Any, mask: Any, weight: Any, names: Names) -> list[tuple[str, Camera, Any, Any, Any]]:
-    """Suffix of the arguments' names, camera, picture, mask and weight of each view. Raises TypeError or ValueError."""
-    several = isinstance(camera, Sequence) and not isinstance(camera, str)
-    cameras: list[Any] = list(camera) if several else [camera]
-    if not cameras:
-        raise ValueError("camera: expected at least one, got none")
-    columns = []
-    for name, value, needed in ((names.target, target, True), (names.mask, mask, False), ("weight", weight, False)):
-        if value is None and not needed:
-            columns.append([None] * len(cameras))
-        elif not several:
-            columns.append([value])
-        elif not isinstance(value, (Sequence, Tensor)) or len(value) != len(cameras):
-            got = len(value) if isinstance(value, (Sequence, Tensor)) else type(value).__name__
-            raise ValueError(f"{name}: expected {len(cameras)}, one for each camera, got {got}")
-        else:
-            columns.append(list(value))
-    for i, one in enumerate(cameras):
-        if not isinstance(one, Camera):
-            raise TypeError(f"camera: expected a Camera, got {type(one).__name__}; make one with Camera.look_at(…)")
-        if one.batch is not None:
-            raise ValueError(f"camera: expected one camera, got {one.batch}; give a list of cameras, and of pictures")
-        if one.world_to_camera.dtype != one.K.dtype:
-            cameras[i] = one.to(torch.float64)
-    suffixes = [f"[{i}]" for i in range(len(cameras))] if several else [""]
-    return list(zip(suffixes, cameras, *columns, strict=True))
-
-
-def depth_of(camera: Camera, pose: Pose, point: Tensor) -> Tensor:
-    """Of a point of the mesh, along the camera's axis."""
-    view = camera.world_to_camera.double()
-    return (view[:3, :3] @ (pose.matrix[:3, :3] @ point + pose.t) + view[:3, 3])[2]
 
 
 def focal_of(camera: Camera) -> float:

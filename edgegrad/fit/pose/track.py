@@ -26,6 +26,8 @@ from ..region import Palette, palette
 from ..views import check_image
 from .fit_pose import depth_image
 from .gauss_newton import Normal
+from .given import Names, check_in_front, check_max_size, check_seen, depth_of
+from .photo.depth import warn_of_units
 from .photo.level import PhotoLevel, Seen, photo_levels
 from .photo.match import ACROSS, places
 from .photo.picture import Picture
@@ -34,7 +36,7 @@ from .photo.search import ALONE_ENOUGH, DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LO
 from .photo.views import Views, across, ball
 from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit
-from .task import Lens, Names, PoseTask, depth_of
+from .task import Lens, PoseTask
 
 Frame = Tensor | PathLike
 STEPS = 4  # on the last level but one and on the last, where the prediction is good
@@ -121,7 +123,7 @@ def track(
     picture, and in every fifth all over it, turned by up to some 60° and up to a fifth larger or smaller, by perspective and
     orthographic cameras.
 
-    Arguments are checked at once. A picture that cannot be used (another size, numbers that are not finite, a file that
+    Arguments are checked at once; an `init` at which the camera sees nothing of the object is refused. A picture that cannot be used (another size, numbers that are not finite, a file that
     is not there) is an error, ValueError, TypeError or OSError, that names it as `frames[k]`, raised when it is asked
     for; the poses of those before it have been given by then.
     """
@@ -139,10 +141,14 @@ def track(
         raise ValueError(f"frames: expected (T, H, W, C), got {tuple(frames.shape)}; give a list of pictures")
     if depth is not None and not isinstance(depth, (Iterable, Tensor)):
         raise TypeError(f"depth: expected one for each frame or None, got {type(depth).__name__}")
-    for name, count in (("max_size", max_size), ("spp", spp)):
-        check_positive_int(name, count)
+    check_max_size(max_size)
+    check_positive_int("spp", spp)
     check_int("seed", seed, 0, 2**32 - 1)
     start = pose_from_matrix("init", getattr(init, "matrix", init))
+    scene = (Scene([mesh]) if isinstance(mesh, Mesh) else mesh).to("cpu").detach()
+    low, high = torch.cat([part.verts.double() for part in scene.meshes]).aminmax(dim=0)
+    check_in_front("init", camera.to("cpu"), start, (low + high) / 2)
+    check_seen("init", scene, [camera.to("cpu")], start)
     return _poses(Tracker(mesh, camera, start, max_size, spp, seed), frames, depth)
 
 
@@ -198,6 +204,9 @@ class Tracker:
             self.task = self._task(name, picture)
         task = replace(self.task, shots=[self.task.shots[0]._replace(target=picture)])
         near = None if measured is None else depth_image(f"depth[{index}]", measured, self.camera.size)
+        if self.first:
+            there = task.scene.transformed(self.pose.R, self.pose.t, self.pose.scale)
+            warn_of_units(there, [task.shots[0].camera], [near], "at the start")
         predicted = self._predicted()
         pose, share, self.covered, _ = self._found(task, near, predicted)
         if self.first or share >= POOR:

@@ -6,14 +6,25 @@ depth of a pixel changes by that of the surface's point, less what the point tak
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
+import torch
 from torch import Tensor
 
+from ....aovs import render_aovs
+from ....camera.camera import Camera
+from ....scene.scene import Scene
+from ....warnings import warn
 from ..gauss_newton import Normal
+from ..given import bare
 from .surface import Surface, slope
 
 FEWEST = 30  # pixels
 LEAST = 0.002  # standard deviation of a measurement, in sizes of the object
 WIDEST = 0.05  # the same, at most: what is farther off is not the object
+UNITS = 4.0  # what is measured where the object is, farther or nearer than it by this factor: other units
+SAMPLES = 4  # a pixel, of a render that only tells them
 TOGETHER = 4.0  # so many pixels count as one, for errors of a sensor are alike nearby
 
 
@@ -34,3 +45,30 @@ def depth_term(surface: Surface, measured: Tensor, weight: Tensor, size: float) 
     information = 1.0 / (TOGETHER * deviation**2)
     weighted = (J * robust).double()
     return Normal(information * weighted @ J.T.double(), information * weighted @ residual.double())
+
+
+def warn_of_units(scene: Scene, cameras: Sequence[Camera], depths: Sequence[Tensor | None], where: str) -> None:
+    """Where depth images (H, W), NaN where nothing was measured, tell distances in other units than the scene, whose meshes are
+    where they are looked for: the depth term would leave them all out."""
+    measured, expected = [], []
+    for camera, depth in zip(cameras, depths, strict=True):
+        if depth is None:
+            continue
+        with torch.no_grad():
+            seen = render_aovs(bare(scene), camera, ["depth", "alpha"], SAMPLES)
+        alpha = seen["alpha"][..., 0]
+        inside = (alpha > 0.5) & depth.isfinite()
+        measured.append(depth[inside].double())
+        expected.append((seen["depth"][..., 0] / alpha.clamp(min=0.5))[inside].double())
+    if sum(map(len, measured)) < FEWEST:
+        return
+    there, here = (float(torch.cat(values).median()) for values in (measured, expected))
+    ratio = here / there
+    if not 1.0 / UNITS < ratio < UNITS:
+        power = round(math.log10(ratio))
+        scale = 10.0**power if abs(math.log10(ratio) - power) < 0.15 else ratio
+        warn(
+            f"units of depth {scale:.2g}",
+            f"depth: expected distances in world units, those of the mesh and the camera, got {there:.3g} in the middle where the "
+            f"object is {where}, {here:.3g} away; so depth counts for nothing. If its units are others, multiply it by {scale:.2g}",
+        )

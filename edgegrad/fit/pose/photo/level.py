@@ -14,13 +14,13 @@ from torch import Tensor
 from ....aovs import render_aovs
 from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
-from ....scene.mesh import Mesh
 from ....scene.scene import Scene
 from ...region import RADIUS, Palette, Windows, around, palette, posterior, smoothed
 from ...sides import ALONE_SHOWN, CONTRAST, PURE, Sides
 from ...sides import BLUR as CONTOUR_BLUR
 from ...verdict import explained
 from ..gauss_newton import Normal
+from ..given import bare
 from ..jacobian import Motion, Rendered
 from ..observed import motion
 from ..pose import Pose
@@ -117,12 +117,11 @@ class PhotoLevel:
     def see(self, pose: Pose, seed: int) -> list[Seen]:
         """Raises ValueError when the object leaves no trace in a picture."""
         moved = self.task.scene.transformed(pose.R, pose.t, pose.scale)
-        bare = Scene([Mesh(mesh.verts, mesh.faces) for mesh in moved.meshes])
-        found = []
+        shapes, found = bare(moved), []
         for shot, picture in zip(self.plain.shots, self.pictures, strict=True):
             camera = self.task.lens(picture.camera, pose)
             moves = motion(self.task, self.plain, shot, pose)
-            rendered = Rendered(bare, camera, ["alpha"], self.plain.spp, seed)
+            rendered = Rendered(shapes, camera, ["alpha"], self.plain.spp, seed)
             alpha = rendered.images["alpha"][..., 0].float()
             tangents = rendered.derivatives(moves)["alpha"][..., 0].float()
             found.append(self.beside(moved, camera, moves, picture, alpha, tangents, seed))
@@ -175,10 +174,9 @@ class PhotoLevel:
     def covered(self, pose: Pose, seed: int) -> float:
         """Pixels of the pictures that the object covers by itself."""
         moved = self.task.scene.transformed(pose.R, pose.t, pose.scale)
-        bare = Scene([Mesh(mesh.verts, mesh.faces) for mesh in moved.meshes])
         with torch.no_grad():
             return sum(
-                float(render_aovs(bare, picture.camera, ["alpha"], self.plain.spp, seed)["alpha"].sum())
+                float(render_aovs(bare(moved), picture.camera, ["alpha"], self.plain.spp, seed)["alpha"].sum())
                 for picture in self.pictures
             )
 

@@ -20,20 +20,18 @@ from ..task import PoseTask
 from .search import (
     ALONE_ENOUGH,
     APART,
-    COARSE_STEPS,
     DAMPING,
     ENOUGH,
-    FINE_STEPS,
     FLOOR,
     FOLLOWED,
     FULL_STEPS,
     GAIN,
     LAST_DAMPING,
-    LAST_STEPS,
     LONGEST,
     ROUNDS,
     SURE,
     UNCOVERED,
+    most_steps,
     turns,
 )  # fmt: skip
 from .together import Together, together_levels
@@ -61,13 +59,15 @@ class PosesSearch:
         self.after_step: Callable[[], Any] = lambda: None
 
     @property
+    def needed(self) -> list[float]:
+        """The share of its edges that each object must show. What is left of a covered one looks alike from more sides."""
+        found = zip(self.enough, self.visible, strict=True)
+        return [max(enough, SURE) if seen < UNCOVERED else enough for enough, seen in found]
+
+    @property
     def converged(self) -> list[bool]:
-        found = zip(self.short, self.explained, self.enough, self.visible, strict=True)
-        # What is left of a covered object looks alike from more sides.
-        return [
-            short and share >= (enough if seen >= UNCOVERED else max(enough, SURE)) and seen >= HIDDEN
-            for short, share, enough, seen in found
-        ]
+        found = zip(self.short, self.explained, self.needed, self.visible, strict=True)
+        return [short and share >= needed and seen >= HIDDEN for short, share, needed, seen in found]
 
     @property
     def planned(self) -> int:
@@ -168,8 +168,8 @@ class PosesSearch:
             self.after_step()
 
     def _most(self, level: Together) -> int:
-        coarse = level.objects[0].plain.coarseness == self.levels[0].objects[0].plain.coarseness
-        return min(self.steps, LAST_STEPS if level.last else COARSE_STEPS if coarse else FINE_STEPS)
+        coarsest = level.objects[0].plain.coarseness == self.levels[0].objects[0].plain.coarseness
+        return most_steps(self.steps, level.last, coarsest)
 
     def _judge(self, level: Together) -> None:
         self.explained = level.explained(self.best, self.seed)

@@ -29,7 +29,7 @@ SURE = 0.85  # the same, where a picture before an even background shows less th
 # Of the curvature's diagonal, where colours are still counted beside the object and where it is found, and of its largest entry.
 DAMPING, LAST_DAMPING, FLOOR = 0.1, 0.01, 1e-5
 LONGEST = 0.1  # of any entry of a step
-COARSE_STEPS, FINE_STEPS, LAST_STEPS = 12, 8, 20  # on a level, at most
+COARSE_STEPS, FINE_STEPS, LAST_STEPS, USUAL = 12, 8, 20, 40  # on a level, of the USUAL `steps`; more of these make it more
 FULL_STEPS = 8  # of full length on the last level
 GAIN = 0.1  # a step that makes the pictures more likely by a smaller factor than exp(this / 2) is short: noise moves poses as far
 # Other starts: turned about the axes of the camera by so many radians.
@@ -265,8 +265,7 @@ class PhotoSearch:
         return way.pose, way.short
 
     def _most(self, level: PhotoLevel) -> int:
-        coarse = level.plain.coarseness == self.levels[0].plain.coarseness
-        return min(self.steps, LAST_STEPS if level.last else COARSE_STEPS if coarse else FINE_STEPS)
+        return most_steps(self.steps, level.last, level.plain.coarseness == self.levels[0].plain.coarseness)
 
     def _note(self, step: Step) -> None:
         if not self._answered:
@@ -320,6 +319,13 @@ class PhotoSearch:
     def _adopt(self, search: Search) -> None:
         self.best, self.loss, self._answered = search.best, search.loss, True
         self.explained, self.converged, self.curvature = search.explained, search.converged, None
+
+
+def most_steps(steps: int, last: bool, coarsest: bool) -> int:
+    """On a level, of what the user allows. Few lead from one level to the next, and where they do not come to rest, more do not
+    help either, unless somebody asks for them."""
+    usual = LAST_STEPS if last else COARSE_STEPS if coarsest else FINE_STEPS
+    return min(steps, round(usual * max(1.0, steps / USUAL)))
 
 
 def turns() -> list[tuple[list[int], Tensor]]:

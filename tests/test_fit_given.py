@@ -1,0 +1,167 @@
+"""What a search for poses is given: arrays of any kind that work, and errors that name what is wrong with the others."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from test_fit import START, bracket, camera
+from test_fit_photo import depth_of, photograph, silhouette
+
+import edgegrad as eg
+from edgegrad.fit import fit_camera, fit_pose, fit_poses, track
+from edgegrad.fit.pose.fit_poses import _masks
+from edgegrad.fit.pose.given import Names, shots_of
+from edgegrad.fit.pose.photo import search
+from edgegrad.fit.pose.photo.depth import warn_of_units
+
+SIZE = 48
+QUICK = {"init": START, "search": False, "progress": False, "steps": 1, "spp": 2, "max_size": 24}
+
+
+@pytest.fixture(scope="module")
+def taken():
+    view = camera(SIZE)
+    return view, photograph(view)
+
+
+def one_pixel(value=1.0):
+    mask = torch.zeros(SIZE, SIZE)
+    mask[20, 20] = value
+    return mask
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"weight": torch.zeros(SIZE, SIZE)}, r"weight: expected numbers above 0 somewhere, got zero"),
+        ({"mask": one_pixel()}, r"mask: expected the object in 10 pixels or more, got it in 1;"),
+        ({"mask": one_pixel(), "init": None}, r"mask: expected the object in 10 pixels"),
+        ({"max_size": 1}, r"max_size: expected an int from 8 "),
+    ],
+)
+def test_what_shows_nothing_is_named(taken, given, message):
+    view, image = taken
+    with pytest.raises(ValueError, match=message):
+        fit_pose(bracket(), image, view, **{**QUICK, **given})
+    if "mask" in given:
+        given = {**given, "mask": given["mask"].int()}
+    with pytest.raises(ValueError, match=message.replace("mask:", r"mask\[0\]:")):
+        fit_poses([bracket()], image, view, **{**QUICK, **given, "init": [START]})
+
+
+@pytest.mark.parametrize("side", [1, 3, 7])
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_tiny_picture_is_named(side, plain):
+    picture = torch.rand(side, side, 3, generator=torch.Generator().manual_seed(0))
+    message = rf"{{}}: expected a picture of 8 × 8 pixels or more, got {side} × {side}"
+    with pytest.raises(ValueError, match=message.format("target")):
+        fit_pose(bracket(plain), picture, camera(side), **QUICK)
+    with pytest.raises(ValueError, match=message.format("image")):
+        fit_camera(bracket(plain), picture, camera(side), progress=False)
+
+
+def test_arrays_of_numpy_and_single_pictures_of_a_list(taken):
+    """Labels and masks as tensors, as arrays and as lists of one all come to a mask for each mesh and camera."""
+    view, _ = taken
+    labels = (torch.arange(SIZE) // 20).expand(SIZE, SIZE)
+    masks = [(labels == 1).float(), (labels == 2).float()]
+    one, several = labels.numpy(), [view]
+    for mask, cameras in (
+        (labels, view), (one, view), (one.astype(np.uint16), view), (masks, view), ([m.numpy() for m in masks], view),
+        (labels, several), (one, several), (one[..., None], several), ([one.astype(np.uint8)], several), (one[None], several),
+        (masks, several), ([[m] for m in masks], several), ([m[None].numpy() for m in masks], several),
+    ):  # fmt: skip
+        for own, expected in zip(_masks(mask, 2, cameras), masks, strict=True):
+            picture = torch.zeros(SIZE, SIZE, 3)
+            ((_, _, _, found, _),) = shots_of(cameras, picture, own, None, Names())
+            assert torch.equal(torch.as_tensor(found).reshape(SIZE, SIZE), expected), (type(mask), cameras)
+    for target in (torch.zeros(SIZE, SIZE, 3), np.zeros((1, SIZE, SIZE, 3)), [np.zeros((SIZE, SIZE, 3))]):
+        ((_, _, found, _, _),) = shots_of([view], target, None, None, Names())
+        assert found.shape == (SIZE, SIZE, 3)
+
+
+def test_poses_to_start_from_may_be_an_array(taken):
+    view, image = taken
+    labels = (silhouette(view)[..., 0] > 0.5).numpy().astype(np.int32)
+    (fit,) = fit_poses([bracket()], image, view, labels, **{**QUICK, "init": START[None].numpy()})
+    assert fit.steps > 0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"mask": torch.ones(9, 9).int()}, r"mask: expected shape \(48, 48\) .*, got \(9, 9\); an image of labels"),
+        ({"mask": np.ones((9, 9), int)}, r"mask: expected shape \(48, 48\) .*, got \(9, 9\)"),
+        ({"mask": np.ones((SIZE, SIZE))}, r"mask: expected an image of labels, of integers.*float64"),
+        ({"init": START}, r"init: expected a list with one for each mesh, got Tensor; give \[init\]"),
+    ],
+)
+def test_errors_of_labels(taken, given, message):
+    view, image = taken
+    with pytest.raises((TypeError, ValueError), match=message):
+        fit_poses([bracket()], image, view, **{**QUICK, "init": [START], **given})
+
+
+def test_one_picture_for_two_cameras(taken):
+    view, image = taken
+    with pytest.raises(ValueError, match=r"target: expected 2, one for each camera, got one of shape \(48, 48, 3\)"):
+        fit_pose(bracket(), image, [view, view], **QUICK)
+    mask = silhouette(view)[..., 0]
+    for given in (mask, [mask]):
+        with pytest.raises(ValueError, match=r"mask.*: expected 2, one for each camera, got one of shape \(48, 48\)"):
+            fit_poses([bracket()], [image] * 2, [view] * 2, given, **{**QUICK, "init": [START]})
+
+
+def test_units_of_depth(taken):
+    view, _ = taken
+    depth, scene = depth_of(view)[..., 0], eg.Scene([bracket()])
+    depth[depth == 0.0] = torch.nan
+    for factor, scale in ((1e-3, r"1e\+03"), (10.0, r"0\.1"), (6.56, r"0\.15")):
+        with pytest.warns(UserWarning, match=rf"depth: expected distances in world units.* multiply it by {scale}"):
+            warn_of_units(scene, [view], [factor * depth], "at the start")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for given in (depth, 1.5 * depth, None, torch.full_like(depth, torch.nan)):
+            warn_of_units(scene, [view], [given], "at the start")
+
+
+@pytest.mark.parametrize("fit", [fit_pose, fit_poses, track])
+def test_depth_in_other_units_is_warned_of(taken, fit):
+    view, image = taken
+    depth = 1000.0 * depth_of(view)[..., 0]
+    with pytest.warns(UserWarning, match=r"depth: expected .* multiply it by 0\.001"):
+        if fit is track:
+            next(track(bracket(), [image], view, START, depth=[depth]))
+        elif fit is fit_poses:
+            fit_poses([bracket()], image, view, depth=depth, **{**QUICK, "init": [START]})
+        else:
+            fit_pose(bracket(), image, view, depth=depth, **QUICK)
+
+
+@pytest.mark.parametrize(
+    ("along", "message"),
+    [(0, "init: expected a pose at which the camera sees the mesh"), (2, "init: expected the object in front of")],
+)
+def test_a_film_begins_where_the_object_is_seen(taken, along, message):
+    view, image = taken
+    init = START.clone()
+    init[:3, 3] -= 50.0 * view.world_to_camera[along, :3].double()
+    with pytest.raises(ValueError, match=message):
+        track(bracket(), [image], view, init)  # at once
+
+
+def test_more_steps_are_taken_where_they_are_asked_for():
+    assert [search.most_steps(40, *level) for level in ((False, True), (False, False), (True, False))] == [12, 8, 20]
+    assert [search.most_steps(5, *level) for level in ((False, True), (False, False), (True, False))] == [5, 5, 5]
+    assert search.most_steps(80, True, False) == 40 and search.most_steps(80, False, True) == 24
+
+
+def test_what_is_not_explained_is_not_blamed_on_steps(taken):
+    """A plain mesh has to show more of its edges than one with colours."""
+    view, image = taken
+    fit = fit_pose(bracket(True), image, view, init=START, search=False, progress=False, steps=2)
+    assert 0.6 < fit.explained < search.ALONE_ENOUGH and not fit.converged, fit.explained
+    assert fit.reason.startswith("edges not explained"), fit.reason
