@@ -310,6 +310,11 @@ def test_from_the_shell(two, tmp_path, capsys):
     assert f"{tmp_path}/1.ply: converged" in capsys.readouterr().out
     assert main(given[:-2]) == 2
     assert "--init: expected 2, one for each --mesh, got 1" in capsys.readouterr().err
+    Image.fromarray((labels_of(view, scene_of(2)) == 1).byte().numpy()).save(tmp_path / "labels.png")
+    assert main([*given, "--mask", str(tmp_path / "labels.png")]) == 2
+    said = capsys.readouterr().err
+    assert "expected label 2 in it, got the labels 0, 1; number the meshes in the order of --mesh" in said
+    assert "--label" not in said
 
 
 # What covers an object and is none of the meshes

@@ -12,7 +12,7 @@ import edgegrad as eg
 from edgegrad.fit import PoseFit, Uncertainty, fit_pose
 from edgegrad.fit.pose.given import Names
 from edgegrad.fit.pose.pose import Pose
-from edgegrad.fit.pose.task import Lens, PoseTask
+from edgegrad.fit.pose.task import ZOOM, Lens, PoseTask
 from edgegrad.fit.pose.uncertainty import TOGETHER
 from edgegrad.scene.symmetries import Symmetries, SymmetryAxis
 
@@ -86,6 +86,21 @@ def test_a_continuous_symmetry_makes_its_axis_known() -> None:
     assert free.degrees < 1.0 and free.unknown == ""
     other = Symmetries(continuous=[SymmetryAxis(torch.tensor([1.0, 0.0, 0.0]))])
     assert Uncertainty.of(given, standing(), curvature, list(range(6)), other).unknown != ""
+
+
+def test_a_focal_length_that_is_not_known_is_said() -> None:
+    """Where perspective hardly shows, its curvature is that of the distance."""
+    given = task()
+    free = [*range(6), ZOOM]
+    curvature = 1e6 * torch.eye(7, dtype=torch.float64)
+    curvature[6, 6] = (TOGETHER / 0.08) ** 2
+    known = Uncertainty.of(given, standing(), curvature, free, None)
+    assert known.focal == pytest.approx(0.08, rel=0.01) and known.unknown == "focal length known to ±8% only"
+    curvature[5, 6] = curvature[6, 5] = 0.9 * (curvature[5, 5] * curvature[6, 6]).sqrt()
+    assert Uncertainty.of(given, standing(), curvature, free, None).focal == pytest.approx(0.08 / 0.19**0.5, rel=0.03)
+    curvature[6, 6], curvature[5, 6], curvature[6, 5] = 1e6, 0.0, 0.0
+    assert Uncertainty.of(given, standing(), curvature, free, None).unknown == ""
+    assert Uncertainty.of(given, standing(), curvature[:6, :6], free[:6], None).focal == 0.0
 
 
 def test_a_vase_is_not_converged_about_its_axis_unless_that_is_a_symmetry() -> None:

@@ -30,6 +30,19 @@ def test_srgb_curve_has_finite_gradients_at_zero():
         assert torch.isfinite(x.grad).all() and (x.grad > 0).all()
 
 
+def test_webp_is_read(tmp_path):
+    """As it was stored, with its alpha; one that ends early is no image."""
+    pixels = np.random.default_rng(0).integers(40, 256, (20, 30, 4)).astype(np.uint8)
+    file = tmp_path / "a.webp"
+    Image.fromarray(pixels).save(file, lossless=True, exact=True)
+    read = read_image(file)
+    assert torch.equal((linear_to_srgb(read[..., :3]) * 255.0).round().byte(), torch.from_numpy(pixels[..., :3]))
+    assert torch.equal((read[..., 3] * 255.0).round().byte(), torch.from_numpy(pixels[..., 3]))
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"a\.webp: expected a whole image"):
+        read_image(file)
+
+
 @pytest.mark.parametrize("suffix", ["png", "bmp", "tif", "exr", "hdr", "jpg"])
 def test_image_round_trip(tmp_path, suffix):
     generator = torch.Generator().manual_seed(1)

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 from moving import DISTANCE, Film, errors, worst
+from PIL import Image
 
 import edgegrad as eg
 from edgegrad.camera.poses import rotation
@@ -133,6 +134,9 @@ def test_command_line_on_a_folder(film, frames, tmp_path, capsys):
     folder.mkdir()
     for k, frame in enumerate(frames[:3]):
         eg.write_image(folder / f"{k}.png", frame)
+    with Image.open(folder / "1.png") as picture:
+        picture.save(folder / "1.webp", lossless=True)
+    (folder / "1.png").unlink()
     out = tmp_path / "out"
     arguments = ["track", str(tmp_path / "stone.ply"), str(folder), "--camera", str(tmp_path / "camera.json")]
     arguments += ["--init", str(tmp_path / "init.json"), "--out", str(out)]
@@ -153,6 +157,9 @@ def test_command_line_on_a_folder(film, frames, tmp_path, capsys):
     assert "frames[3]: expected" in capsys.readouterr().err
     assert len(json.loads((out / "poses.json").read_text())["poses"]) == 3
     assert main([*arguments[:2], str(tmp_path / "nothing"), *arguments[3:]]) == 2
+    with pytest.raises(SystemExit):  # before the first frame
+        main([*arguments, "--fps", "100000"])
+    assert "--fps: expected 1 to 1000 frames a second, got '100000'" in capsys.readouterr().err
 
 
 def test_a_hand_that_covers_more_than_half(film):

@@ -16,7 +16,7 @@ from .paths import PathLike
 
 GREY = 8 / 255  # by which channels of a grey image may differ, for JPEG does not keep them equal; unless all are faint
 FAINT = 1 / 8  # whole numbers below this share of their range are labels: no mask covers so little at most
-LOSSY = (".jpg", ".jpeg")  # whose black is noise, and no label
+LOSSY = (".jpg", ".jpeg", ".webp")  # whose black is noise, and no label
 ROUNDING = 1e-3  # of coverage outside 0 … 1
 FLAT = 0.5  # of pixels of labels that have the same all around; of those of a smooth border there are far fewer
 MOST_LABELS = 64

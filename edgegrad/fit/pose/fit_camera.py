@@ -23,6 +23,7 @@ from .fit_pose import search_pose
 from .given import Names, bare
 from .result import PoseFit, Step
 from .task import PARTS, Lens
+from .uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,6 +87,11 @@ class CameraFit:
     def reason(self) -> str:
         """As of PoseFit."""
         return self.search.reason
+
+    @property
+    def uncertainty(self) -> Uncertainty | None:
+        """As of PoseFit, of the scene before the cameras; `focal` says how exactly the focal length is known."""
+        return self.search.uncertainty
 
     def plot(self) -> Figure:
         """target | start | fit | difference."""
@@ -165,7 +171,8 @@ def fit_camera(
 
     mask, weight, background, search, checkpoint, resume and the rest are as for fit_pose(), whose search this is. What a
     picture does not show stays uncertain: focal length against distance where there is hardly any perspective, the
-    principal point against a turn of the camera. Raises TypeError or ValueError that names the argument.
+    principal point against a turn of the camera. In photographs `uncertainty` says how exactly pose and focal length are known,
+    and one that is not known to 5 % is not `converged`. Raises TypeError or ValueError that names the argument.
     """
     projections = set()
     for one in camera if isinstance(camera, (list, tuple)) else [camera]:

@@ -19,12 +19,12 @@ from ...optional import DRAWING, require
 from ..ending import Ending, reason_of
 from ..verdict import ENOUGH
 from .pose import Pose, pose_from_matrix
+from .uncertainty import FOCAL, Uncertainty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from .task import PoseTask
-    from .uncertainty import Uncertainty
 
 
 HIDDEN = 0.1  # share of an object that others must leave to be seen for its pose to be believed
@@ -92,10 +92,10 @@ class PoseFit:
         words = reason_of(ending, self.explained, "mesh, camera or picture", self.enough)
         if self.uncertainty is None or not self.uncertainty.unknown or self.interrupted or self.explained < self.enough:
             return words
-        return (
-            f"directions unknown: {self.uncertainty.unknown}; give the mesh's colours, symmetries of the mesh, depth, or another "
-            "picture"
-        )
+        fix = "give the mesh's colours, symmetries of the mesh, depth, or another picture"
+        if self.uncertainty.focal > FOCAL:
+            fix = "give a picture from nearer, where perspective shows, or the lens as it was calibrated"
+        return f"directions unknown: {self.uncertainty.unknown}; {fix}"
 
     def plot(self) -> Figure:
         """target | start | fit | difference, a row for each picture; with a mask all over black, as they were compared."""

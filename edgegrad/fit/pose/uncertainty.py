@@ -15,13 +15,14 @@ from torch import Tensor
 
 from ...scene.symmetries import Symmetries
 from .pose import Pose
-from .task import GROW, TURN, PoseTask
+from .task import GROW, TURN, ZOOM, PoseTask
 
 WIDEST = 1.0  # radian and object size, the standard deviation of what the pictures do not show at all
 # Shadows, blur and errors of the light model are alike in pixels nearby: errors of fits to lit pictures are so many times the
 # standard deviations of independent pixels, as measured.
 TOGETHER = 8.0
-DEGREES, SHARE = 5.0, 0.05  # a direction that is known less exactly than this, in degrees or object sizes, is unknown
+# A direction that is known less exactly than this, in degrees or object sizes, is unknown, and so is a focal length in parts of it.
+DEGREES, SHARE, FOCAL = 5.0, 0.05, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,14 +30,17 @@ class Uncertainty:
     """Standard deviations of a pose about the object's centre, the middle of its bounding box.
 
     covariance  (6, 6) float64, of a rotation vector in radians and a shift of the centre in world units, along the world's axes.
-                What was not sought, such as the distance with fit_scale, has zeros
+                What was not sought, such as the distance with fit_scale, has zeros. With a focal length that is sought, places
+                are those at the one found: distance goes with it
     size        the diagonal of the object's bounding box, world units
+    focal       of the focal length, as a part of it; 0 where it was not sought
     free        directions in the world (n, 3) about which a continuous symmetry makes all turns the same: none of them is unknown
     """
 
     covariance: Tensor
     size: float
     free: Tensor
+    focal: float = 0.0
 
     @property
     def degrees(self) -> float:
@@ -60,7 +64,8 @@ class Uncertainty:
 
     @property
     def unknown(self) -> str:
-        """In words, what is known less exactly than to 5° or 5 % of the object's size; empty where all is."""
+        """In words, what is known less exactly than to 5°, 5 % of the object's size, or 5 % of the focal length; empty where all
+        is."""
         parts = []
         if self.degrees > DEGREES:
             parts.append(f"rotation about {_named(self.axis)} known to ±{self.degrees:.0f}° only")
@@ -68,6 +73,8 @@ class Uncertainty:
             parts.append(
                 f"place along {_named(self.direction)} known to ±{self.shift / self.size:.0%} of the size only"
             )
+        if self.focal > FOCAL:
+            parts.append(f"focal length known to ±{self.focal:.0%} only")
         return ", ".join(parts)
 
     @property
@@ -93,7 +100,8 @@ class Uncertainty:
         to_world = torch.block_diag(axes, task.size * axes)
         ways = [pose.R.double() @ axis.direction for axis in ([] if symmetries is None else symmetries.continuous)]
         spun = torch.stack(ways) if ways else torch.empty(0, 3, dtype=torch.float64)
-        return Uncertainty(to_world @ entries @ to_world.T, task.size, spun)
+        focal = float(inverse[free.index(ZOOM), free.index(ZOOM)].sqrt()) if ZOOM in free else 0.0
+        return Uncertainty(to_world @ entries @ to_world.T, task.size, spun, focal)
 
 
 def _widest(block: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
 from ....scene.scene import Scene
 from ...region import RADIUS, Palette, Windows, around, palette, posterior, smoothed
-from ...sides import ALONE_SHOWN, CONTRAST, PURE, Sides
+from ...sides import ALONE_CONTRAST, ALONE_SHOWN, CONTRAST, PURE, Sides
 from ...sides import BLUR as CONTOUR_BLUR
 from ...verdict import explained
 from ..gauss_newton import Normal
@@ -183,7 +183,7 @@ class PhotoLevel:
     def explained(self, pose: Pose, seed: int, views: list[Seen] | None = None) -> float:
         """The share, 0 … 1, of the edges that the render should have in the pictures, of contours and of what is inside, that
         they have. `views`: as of equations()."""
-        pairs, shown, length, extent = [], 0.0, 0.0, 0.0
+        pairs, contrasts, shown, length, extent = [], [], 0.0, 0.0, 0.0
         for seen in self.see(pose, seed) if views is None else views:
             picture, sides = seen.part, seen.sides()
             contour = sides.alpha
@@ -191,6 +191,7 @@ class PhotoLevel:
             on = ((contour > PURE) & (contour < 1.0 - PURE)).float() * picture.weight
             length += float(on.sum())
             shown += float((on * (sides.contrast > CONTRAST) * sides.band).sum())
+            contrasts.append(sides.contrast[sides.band & (picture.weight > 0.0)])
             band = sides.band.float() * picture.weight
             if seen.lit is None or picture.mask is not None:
                 pairs.append((sides.mixed, sides.mixed, picture.outlined, band[..., None]))
@@ -203,8 +204,12 @@ class PhotoLevel:
                 pairs.append((expected, expected, picture.display, weight[..., None]))
         if length == 0.0:
             return 0.0
-        needed = SHOWN if self.harmonics else ALONE_SHOWN
-        return explained(pairs) * min(1.0, shown / length / needed) * min(1.0, extent / RESOLVED)
+        share = explained(pairs) * min(1.0, extent / RESOLVED)
+        if self.harmonics:
+            return share * min(1.0, shown / length / SHOWN)
+        along = torch.cat(contrasts)
+        middle = float(along.median()) if len(along) else 0.0
+        return share * min(1.0, shown / length / ALONE_SHOWN) * min(1.0, middle / ALONE_CONTRAST)
 
     @cached_property
     def labels(self) -> list[Tensor]:
