@@ -11,22 +11,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from bop_scenes import SIZE, TRUTHS, K, camera, estimates, make, meshes, pose
+from bop_scenes import SIZE, TRUTHS, K, camera, estimates, meshes, pose
 
 import edgegrad as eg
 import edgegrad_cli as cli
 from edgegrad import bop
 
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make(tmp_path_factory.mktemp("bop"))
-
-
-@pytest.fixture
-def folder(made: Path, tmp_path: Path) -> Path:
-    """To be spoilt."""
-    return Path(shutil.copytree(made, tmp_path / "data"))
+pytest_plugins = "bop_fixtures"
 
 
 def run(*arguments: object) -> int:

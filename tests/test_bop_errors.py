@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from bop_scenes import SIZE, TRUTHS, K, camera, estimates, make, meshes, pose
+from bop_scenes import SIZE, TRUTHS, K, camera, estimates, meshes, pose
 
 import edgegrad as eg
 from edgegrad import bop
@@ -19,15 +19,7 @@ from edgegrad.bop.evaluate import matched
 CAMERA = camera()
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make(tmp_path_factory.mktemp("bop"))
-
-
-@pytest.fixture
-def folder(made: Path, tmp_path: Path) -> Path:
-    """To be changed."""
-    return Path(shutil.copytree(made, tmp_path / "data"))
+pytest_plugins = "bop_fixtures"
 
 
 # -- errors, against plain formulas ------------------------------------------------------------------------------------------

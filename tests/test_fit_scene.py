@@ -327,10 +327,22 @@ def test_saves_the_materials_it_found(tmp_path):
     [
         ({"parameters": {"meshes.0.vert": 1e-3}}, ValueError, "did you mean 'meshes.0.verts'"),
         ({"parameters": {}}, ValueError, "parameters: expected a name or more of what is sought, got none"),
-        ({"parameters": ["background"]}, TypeError, "parameters: expected a mapping of names to learning rates or Parameters, got list; give"),
-        ({"parameters": {"background": [0.1]}}, TypeError, "background: expected a learning rate or a Parameter, got list"),
+        (
+            {"parameters": ["background"]},
+            TypeError,
+            "parameters: expected a mapping of names to learning rates or Parameters, got list",
+        ),
+        (
+            {"parameters": {"background": [0.1]}},
+            TypeError,
+            "background: expected a learning rate or a Parameter, got list",
+        ),
         ({"cameras": []}, ValueError, "cameras: expected one for each picture, got an empty list"),
-        ({"parameters": {"background": "fast"}}, TypeError, "background: expected a learning rate or a Parameter, got str"),
+        (
+            {"parameters": {"background": "fast"}},
+            TypeError,
+            "background: expected a learning rate or a Parameter, got str",
+        ),
         ({"parameters": {"background": Parameter(0.1, torch.zeros(4))}}, ValueError, "background: expected shape (3,)"),
         (
             {"parameters": {"background": Parameter(0.1, low=1.0, high=0.0)}},

@@ -16,17 +16,8 @@ from edgegrad.camera.poses import rotation
 from edgegrad.fit import track
 from edgegrad_cli import main
 
-SIZE, COUNT = 80, 7
-
-
-@pytest.fixture(scope="module")
-def film() -> Film:
-    return Film.turning(SIZE, COUNT, spp=8)
-
-
-@pytest.fixture(scope="module")
-def frames(film: Film) -> list[torch.Tensor]:
-    return list(film)
+pytest_plugins = "film_fixtures"
+SIZE, COUNT = 80, 7  # of its film
 
 
 def test_a_stone_that_turns(film, frames):
@@ -126,10 +117,7 @@ def test_depth_for_each_frame(film, frames):
         assert degrees < 0.3 and percent < 0.1
 
 
-def test_command_line_on_a_folder(film, frames, tmp_path, capsys):
-    eg.save_mesh(tmp_path / "stone.ply", film.mesh)
-    eg.save_camera(tmp_path / "camera.json", film.camera)
-    (tmp_path / "init.json").write_text(json.dumps({"mesh_to_world": film.poses[0].tolist()}))
+def test_command_line_on_a_folder(film, frames, arguments, tmp_path, capsys):
     folder = tmp_path / "film"
     folder.mkdir()
     for k, frame in enumerate(frames[:3]):
@@ -138,9 +126,7 @@ def test_command_line_on_a_folder(film, frames, tmp_path, capsys):
         picture.save(folder / "1.webp", lossless=True)
     (folder / "1.png").unlink()
     out = tmp_path / "out"
-    arguments = ["track", str(tmp_path / "stone.ply"), str(folder), "--camera", str(tmp_path / "camera.json")]
-    arguments += ["--init", str(tmp_path / "init.json"), "--out", str(out)]
-    assert main(arguments) == 0
+    assert main(arguments("film")) == 0
     rows = json.loads((out / "poses.json").read_text())["poses"]
     for row in rows:
         M = torch.tensor(row["mesh_to_world"], dtype=torch.float64)
@@ -153,12 +139,12 @@ def test_command_line_on_a_folder(film, frames, tmp_path, capsys):
     assert 0.01 < float(drawn.float().mean()) < 0.2
 
     eg.write_image(folder / "3.png", frames[3][:-4])  # of another size
-    assert main(arguments) == 2
+    assert main(arguments("film")) == 2
     assert "frames[3]: expected" in capsys.readouterr().err
     assert len(json.loads((out / "poses.json").read_text())["poses"]) == 3
-    assert main([*arguments[:2], str(tmp_path / "nothing"), *arguments[3:]]) == 2
+    assert main(arguments("nothing")) == 2
     with pytest.raises(SystemExit):  # before the first frame
-        main([*arguments, "--fps", "100000"])
+        main([*arguments("film"), "--fps", "100000"])
     assert "--fps: expected 1 to 1000 frames a second, got '100000'" in capsys.readouterr().err
 
 

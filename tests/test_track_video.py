@@ -9,7 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import torch
-from moving import Film, errors
+from moving import errors
 
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb
@@ -18,17 +18,14 @@ from edgegrad_cli.films import read_film, upright
 
 av = pytest.importorskip("av", reason="videos need the extra edgegrad[video]")
 
-SIZE, COUNT = 80, 4
+pytest_plugins = "film_fixtures"
+COUNT = 4
 
 
 @pytest.fixture(scope="module")
-def film() -> Film:
-    return Film.turning(SIZE, COUNT, spp=8)
-
-
-@pytest.fixture(scope="module")
-def frames(film: Film) -> list[np.ndarray]:
-    return [(linear_to_srgb(frame) * 255.0).round().byte().numpy() for frame in film]
+def pictures(frames: list[torch.Tensor]) -> list[np.ndarray]:
+    """Of 8 bits."""
+    return [(linear_to_srgb(frame) * 255.0).round().byte().numpy() for frame in frames[:COUNT]]
 
 
 def write_video(path, pictures, codec, fps=12):
@@ -51,28 +48,14 @@ def write_sound(path):
         container.mux(stream.encode())
 
 
-@pytest.fixture()
-def arguments(film, tmp_path):
-    """Of the command, for a video by its name."""
-    eg.save_mesh(tmp_path / "stone.ply", film.mesh)
-    eg.save_camera(tmp_path / "camera.json", film.camera)
-    (tmp_path / "init.json").write_text(json.dumps({"mesh_to_world": film.poses[0].tolist()}))
-
-    def of(name):
-        given = ["track", str(tmp_path / "stone.ply"), str(tmp_path / name), "--out", str(tmp_path / "out")]
-        return [*given, "--camera", str(tmp_path / "camera.json"), "--init", str(tmp_path / "init.json")]
-
-    return of
-
-
 CODECS = [("film.mp4", "libx264"), ("film.avi", "mpeg4")]
 
 
 @pytest.mark.parametrize(("name", "codec"), CODECS)
-def test_a_video_is_followed(film, frames, arguments, tmp_path, monkeypatch, name, codec):
+def test_a_video_is_followed(film, pictures, arguments, tmp_path, monkeypatch, name, codec):
     if codec not in av.codecs_available:
         pytest.skip(f"FFmpeg was built without {codec}")
-    write_video(tmp_path / name, frames, codec)
+    write_video(tmp_path / name, pictures, codec)
     monkeypatch.setattr(films, "CODECS", (codec,))  # of what is written
     assert main(arguments(name)) == 0
     rows = json.loads((tmp_path / "out" / "poses.json").read_text())["poses"]
@@ -86,7 +69,7 @@ def test_a_video_is_followed(film, frames, arguments, tmp_path, monkeypatch, nam
         assert container.streams.video[0].average_rate == Fraction(12)
         written = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert len(written) == COUNT
-    for k, (picture, frame) in enumerate(zip(written, frames, strict=True)):
+    for k, (picture, frame) in enumerate(zip(written, pictures, strict=True)):
         drawn = eg.read_image(tmp_path / "out" / "frames" / f"{k:05d}.png", channels=3)
         drawn = (linear_to_srgb(drawn) * 255.0).round().numpy()
         contour = np.abs(drawn - frame).max(-1) > 60.0
@@ -97,12 +80,12 @@ def test_a_video_is_followed(film, frames, arguments, tmp_path, monkeypatch, nam
         assert green[contour].mean() > 20.0
 
 
-def test_frames_of_a_video_are_read_as_they_were_written(frames, tmp_path):
-    write_video(tmp_path / "film.mp4", frames, "mpeg4")
+def test_frames_of_a_video_are_read_as_they_were_written(pictures, tmp_path):
+    write_video(tmp_path / "film.mp4", pictures, "mpeg4")
     film = read_film(tmp_path / "film.mp4")
     read = [linear_to_srgb(frame) * 255.0 for frame in film.frames]
     assert film.fps == 12 and len(read) == COUNT
-    for picture, frame in zip(read, frames, strict=True):
+    for picture, frame in zip(read, pictures, strict=True):
         # Means over 8 × 8 pixels: colours lose their detail.
         means = [torch.nn.functional.avg_pool2d(x.movedim(-1, 0), 8) for x in (picture, torch.tensor(frame).float())]
         off = (means[0] - means[1]).abs()
@@ -134,10 +117,10 @@ def test_what_is_no_video_of_the_camera_is_named(arguments, tmp_path, capsys, ma
     assert not (tmp_path / "out" / "poses.json").exists()
 
 
-def test_frames_of_another_size_end_what_is_kept(film, frames, arguments, tmp_path, capsys):
+def test_frames_of_another_size_end_what_is_kept(film, pictures, arguments, tmp_path, capsys):
     """Joined streams may change their size on the way."""
-    write_video(tmp_path / "a.mjpeg", frames[:2], "mjpeg")
-    write_video(tmp_path / "b.mjpeg", [frame[:64, :64] for frame in frames[2:]], "mjpeg")
+    write_video(tmp_path / "a.mjpeg", pictures[:2], "mjpeg")
+    write_video(tmp_path / "b.mjpeg", [frame[:64, :64] for frame in pictures[2:]], "mjpeg")
     (tmp_path / "film.mjpeg").write_bytes((tmp_path / "a.mjpeg").read_bytes() + (tmp_path / "b.mjpeg").read_bytes())
     assert main(arguments("film.mjpeg")) == 2
     assert "frames[2]: expected shape" in capsys.readouterr().err
@@ -146,8 +129,8 @@ def test_frames_of_another_size_end_what_is_kept(film, frames, arguments, tmp_pa
         assert sum(1 for _ in container.decode(video=0)) == 2
 
 
-def test_without_the_library(frames, arguments, tmp_path, capsys, monkeypatch):
-    write_video(tmp_path / "film.mp4", frames, "mpeg4")
+def test_without_the_library(pictures, arguments, tmp_path, capsys, monkeypatch):
+    write_video(tmp_path / "film.mp4", pictures, "mpeg4")
     monkeypatch.setitem(sys.modules, "av", None)
     assert main(arguments("film.mp4")) == 2
     assert "pip install 'edgegrad[video]'" in capsys.readouterr().err

@@ -123,9 +123,9 @@ def track(
     picture, and in every fifth all over it, turned by up to some 60° and up to a fifth larger or smaller, by perspective and
     orthographic cameras.
 
-    Arguments are checked at once; an `init` at which the camera sees nothing of the object is refused. A picture that cannot be used (another size, numbers that are not finite, a file that
-    is not there) is an error, ValueError, TypeError or OSError, that names it as `frames[k]`, raised when it is asked
-    for; the poses of those before it have been given by then.
+    Arguments are checked at once; an `init` at which the camera sees nothing of the object is refused. A picture that cannot be
+    used (another size, numbers that are not finite, a file that is not there) is an error, ValueError, TypeError or OSError,
+    that names it as `frames[k]`, raised when it is asked for; the poses of those before it have been given by then.
     """
     if not isinstance(camera, Camera) or camera.batch is not None:
         got = type(camera).__name__ if not isinstance(camera, Camera) else f"a batch of {camera.batch}"

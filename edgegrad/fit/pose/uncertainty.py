@@ -21,7 +21,7 @@ WIDEST = 1.0  # radian and object size, the standard deviation of what the pictu
 # Shadows, blur and errors of the light model are alike in pixels nearby: errors of fits to lit pictures are so many times the
 # standard deviations of independent pixels, as measured.
 TOGETHER = 8.0
-# A direction that is known less exactly than this, in degrees or object sizes, is unknown, and so is a focal length in parts of it.
+# A direction that is known less exactly than this, in degrees or object sizes, is unknown; so is a focal length, in parts of it.
 DEGREES, SHARE, FOCAL = 5.0, 0.05, 0.05
 
 

@@ -29,7 +29,12 @@ SURE = 0.85  # the same, where a picture before an even background shows less th
 # Of the curvature's diagonal, where colours are still counted beside the object and where it is found, and of its largest entry.
 DAMPING, LAST_DAMPING, FLOOR = 0.1, 0.01, 1e-5
 LONGEST = 0.1  # of any entry of a step
-COARSE_STEPS, FINE_STEPS, LAST_STEPS, USUAL = 12, 8, 20, 40  # on a level, of the USUAL `steps`; more of these make it more
+COARSE_STEPS, FINE_STEPS, LAST_STEPS, USUAL = (
+    12,
+    8,
+    20,
+    40,
+)  # on a level, of the USUAL `steps`; more of these make it more
 FULL_STEPS = 8  # of full length on the last level
 GAIN = 0.1  # a step that makes the pictures more likely by a smaller factor than exp(this / 2) is short: noise moves poses as far
 # Other starts: turned about the axes of the camera by so many radians.
