@@ -93,7 +93,7 @@ def fit_pose(
     depth       (H, W) or (H, W, 1), as a depth camera measures it from where the picture was taken: distances along +Z of the
                 camera in world units, 0 or NaN where there is none; or a list of them
     max_size    a larger picture is reduced to so many pixels on its longer side
-    steps       at most so many on each level of the pyramid
+    steps       at most so many on each level of the pyramid; in photographs 8, 12 or 20 of 40, and as much more of more
     spp         samples a pixel of each render on the finest level; the others take as many in all
     tolerance   a step on the finest level is short when it is below this: in radians, object sizes (the diagonal of the bounding
                 box), and logarithms of scale and focal length
