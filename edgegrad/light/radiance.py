@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..camera.camera import Camera
-from ..check import all_finite, check_positive_int, values_visible
+from ..check import all_finite, check_positive_int
 from ..kernel.derivatives import differentiates, moves
 from ..kernel.first_order import unreached
 from ..kernel.flat import image_dtype
@@ -56,12 +56,7 @@ class Lighting(NamedTuple):
         return cls(shadows, check_positive_int("light_samples", light_samples, most=1 << 16))
 
     def image(self, scene: Scene, camera: Camera, request: Request, creases: bool | str = "auto") -> Tensor:
-        """(H, W, C), or (B, H, W, C) for a batch of cameras. Raises RuntimeError for a batch of torch.vmap."""
-        if not torch.compiler.is_compiling() and not values_visible(*tensors_in(scene)):
-            raise RuntimeError(
-                "render: expected tensors with values where a scene is lit or has mipmaps, got those of torch.vmap or "
-                "torch.compile; render a batch one by one, and leave render() out of what is compiled"
-            )
+        """(H, W, C), or (B, H, W, C) for a batch of cameras, of tensors with values; see lit_image()."""
         if scene.is_lit and not (scene.lights or scene.casting):
             warn(
                 "no light",

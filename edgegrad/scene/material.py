@@ -166,8 +166,8 @@ class Material:
     @property
     def channels(self) -> int | None:
         """C, or None where all is grey."""
-        counts = [n for p in (self.base_color, self.emission) if (n := _channels(p)) not in (None, 1)]
-        return counts[0] if counts else None
+        counts = (_channels(self.base_color), _channels(self.emission))
+        return next((count for count in counts if count not in (None, 1)), None)
 
     @property
     def is_glossy(self) -> bool:
