@@ -92,8 +92,7 @@ def render(
     `shader`, and its image has the dtype of the vertices.
 
     Differentiable once, in reverse and in forward mode, in every floating-point tensor of the scene and the camera; torch.vmap
-    (of scenes that are not lit) and torch.func's transforms work, one element of the batch at a time, all with the same seed;
-    tangents of one image
+    and torch.func's transforms work, one element of the batch at a time, all with the same seed; tangents of one image
     (torch.func.jacfwd) in one pass. The image has the dtype of
     the colours and comes back on the scene's device. Raises TypeError or ValueError that names the argument, and MemoryError,
     before it allocates, with the figure and what to lower; so does its backward pass. A second derivative raises

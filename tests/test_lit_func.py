@@ -38,7 +38,9 @@ def lit(
 
 def mipmapped(image: Tensor) -> Tensor:
     """Not lit, but shaded by PyTorch."""
-    return eg.render(eg.Mesh(BALL.verts, BALL.faces, texture=image, uvs=UVS, uv_faces=BALL.faces, filter="mipmap"), CAMERA)
+    return eg.render(
+        eg.Mesh(BALL.verts, BALL.faces, texture=image, uvs=UVS, uv_faces=BALL.faces, filter="mipmap"), CAMERA
+    )
 
 
 def lamp(radiance: Tensor) -> Tensor:
@@ -72,8 +74,12 @@ def test_vmap(name: str) -> None:
     expected = torch.autograd.grad(sum(loss(x) for x in leaves.unbind()), leaves)[0]
     assert expected.any()
     torch.testing.assert_close(torch.vmap(torch.func.grad(loss))(batch), expected, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(torch.func.grad(lambda x: torch.vmap(loss)(x).sum())(batch), expected, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(torch.autograd.grad(torch.vmap(loss)(leaves).sum(), leaves)[0], expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        torch.func.grad(lambda x: torch.vmap(loss)(x).sum())(batch), expected, rtol=1e-12, atol=1e-12
+    )
+    torch.testing.assert_close(
+        torch.autograd.grad(torch.vmap(loss)(leaves).sum(), leaves)[0], expected, rtol=1e-12, atol=1e-12
+    )
 
 
 def test_forward_mode_of_a_batch() -> None:

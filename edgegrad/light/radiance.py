@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..camera.camera import Camera
 from ..check import all_finite, check_positive_int
+from ..kernel.counts import Watch
 from ..kernel.derivatives import differentiates, moves
 from ..kernel.first_order import unreached
 from ..kernel.flat import image_dtype
@@ -55,7 +56,14 @@ class Lighting(NamedTuple):
             raise TypeError(f"shadows: expected True or False, got {type(shadows).__name__} ({shadows!r})")
         return cls(shadows, check_positive_int("light_samples", light_samples, most=1 << 16))
 
-    def image(self, scene: Scene, camera: Camera, request: Request, creases: bool | str = "auto") -> Tensor:
+    def image(
+        self,
+        scene: Scene,
+        camera: Camera,
+        request: Request,
+        creases: bool | str = "auto",
+        watch: Watch = Watch(),  # noqa: B008  it keeps nothing
+    ) -> Tensor:
         """(H, W, C), or (B, H, W, C) for a batch of cameras, of tensors with values; see lit_image()."""
         if scene.is_lit and not (scene.lights or scene.casting):
             warn(
@@ -79,6 +87,7 @@ class Lighting(NamedTuple):
             gives_derivatives=fused and additive,
             additive=additive,
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
+            watch=watch,
         )
         image = render_shaded(scene, camera, self, request, creases, False, effort)
         if not scene.is_lit:  # as the kernel has it where there are no mipmaps
