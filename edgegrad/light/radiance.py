@@ -208,7 +208,11 @@ def _of_each_mesh(hits: Hits, of_mesh: Callable[[Hits, int], Tensor]) -> Tensor:
 def _on_mesh(hits: Hits, index: int) -> OnMesh:
     surfaces = hits._surfaces
     return OnMesh(
-        surfaces.scene.meshes[index], hits._face - surfaces.first_faces[index], hits._barycentrics, hits._look_up
+        surfaces.scene.meshes[index],
+        hits._face - surfaces.first_faces[index],
+        hits._barycentrics,
+        hits._look_up,
+        lambda: surfaces.tangents(index),  # pyright: ignore[reportArgumentType]: asked for where there are some
     )
 
 
