@@ -16,6 +16,7 @@ from ..scene.appearance import coordinates
 from ..scene.mikktspace import Fans
 from ..scene.rows import columns, dot, rows_of, scaled
 from ..scene.scene import Scene
+from ..scene.textures import Pyramid
 from .moving import barycentrics, barycentrics_by
 from .records import bare, values_of
 
@@ -39,7 +40,7 @@ class Surfaces:
         self._bare = bare
         self.jumping: dict[Any, Callable[[], Tensor]] = {}  # values (F, 3, K) at corners, of properties that may jump
         self.shadowing: set[int] = set()  # lights, by their place in scene.casting, whose shadows a shader asks for
-        self.pyramids: dict[int, tuple[Tensor, list[Tensor]]] = {}  # of textures, by their ids
+        self.pyramids: dict[int, tuple[Tensor, Pyramid]] = {}  # of textures, by their ids
         self._tangents: dict[int, Tensor] = {}  # of meshes
         self._moving: Surfaces | None = None  # the surfaces of which detach() made these
         self.layout: Any = None  # of light/in_kernel.py, kept where nothing has derivatives
