@@ -42,6 +42,21 @@ def test_tangents_are_those_of_mikktspace(name: str) -> None:
     torch.testing.assert_close(found[~none], expected[~none], rtol=0, atol=5e-4)  # of float32: angles of thin images
 
 
+def test_rows_that_no_corner_has_change_nothing() -> None:
+    verts, faces, normals = (part.numpy() for part in bowl(5))
+    uvs, more = np.abs(verts[:, :2]), np.ones((1, 3))
+    own = [fans.of_corner for fans in (
+        Fans.of((verts, faces), (normals, faces), (uvs, faces)),
+        Fans.of((verts, faces), (np.concatenate([normals, more]), faces), (uvs, faces)),
+        Fans.of((verts, faces), (np.concatenate([more, normals]), faces + 1), (uvs, faces)),
+        fans_of(verts[faces], normals[faces], uvs[faces]),
+    )]  # fmt: skip
+    assert len(verts) < int(own[0].max()) + 1 < 3 * len(faces)
+    for other in own[1:]:
+        pairs = torch.stack([own[0], other], -1).reshape(-1, 2).unique(dim=0)
+        assert len(pairs) == int(own[0].max()) + 1 == int(other.max()) + 1
+
+
 def test_derivatives_of_tangents() -> None:
     position, normal, uv = (
         torch.from_numpy(part[:12]).double().requires_grad_()

@@ -20,7 +20,7 @@ Rows = tuple[np.ndarray, np.ndarray]  # values (N, K), and the indices (F, 3) of
 class Fans(NamedTuple):
     """Which corners share a tangent."""
 
-    of_corner: Tensor  # (F, 3) int64, from 0
+    of_corner: Tensor  # (F, 3) int32, from 0
     hand: Tensor  # (F,) float64, −1 where the image is mirrored on the face
     counts: Tensor  # (F,) bool: whether the face has an area in the texture
 
@@ -29,7 +29,8 @@ class Fans(NamedTuple):
         """Of faces whose corners have these values (N, K), by indices (F, 3)."""
         (_, faces), (_, normal_faces), (coordinates, uv_faces) = position, normal, uv
         place, turn, image = (same_rows(values) for values, _ in (position, normal, uv))
-        if np.array_equal(faces, normal_faces) and np.array_equal(faces, uv_faces):
+        same = np.array_equal(faces, normal_faces) and np.array_equal(faces, uv_faces)
+        if same and len(place) == len(turn) == len(image):
             vertex = _pairs(_pairs(place, turn), image)[faces]
         else:
             vertex = _pairs(_pairs(place[faces], turn[normal_faces]), image[uv_faces])
@@ -41,7 +42,7 @@ class Fans(NamedTuple):
         hand = np.where(flat, 0, np.sign(area)).astype(np.int8)
         own = place[faces]
         solid = (own != np.roll(own, 1, 1)).all(1)
-        fan, hand = _fans(vertex.tobytes(), hand.tobytes(), solid.tobytes())
+        fan, hand = _fans(vertex.astype(np.int32).tobytes(), hand.tobytes(), solid.tobytes())
         return cls(torch.from_numpy(fan), torch.from_numpy(hand), torch.from_numpy(~flat))
 
     def tangents(self, corners: Tensor, normal: Tensor, uv: Tensor) -> Tensor:
@@ -74,9 +75,10 @@ def tangents(corners: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=8)  # each step of a fit asks for the same
 def _fans(vertices: bytes, hands: bytes, solids: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """(F, 3) numbers of fans and (F,) handedness from the vertices (F, 3) int64 of faces, their handedness (F,) int8, 0 where
+    """(F, 3) numbers of fans and (F,) handedness from the vertices (F, 3) int32 of faces, their handedness (F,) int8, 0 where
     there is none, and whether they have three different corners (F,) bool: others join nothing."""
-    vertex, hand = np.frombuffer(vertices, np.int64).reshape(-1, 3), np.frombuffer(hands, np.int8).astype(np.float64)
+    vertex = np.frombuffer(vertices, np.int32).astype(np.int64).reshape(-1, 3)
+    hand = np.frombuffer(hands, np.int8).astype(np.float64)
     face, corner, other, other_corner = _neighbours(vertex, np.frombuffer(solids, bool))
     begin, end = 3 * face + corner, 3 * other + (other_corner + 1) % 3
     while True:
@@ -90,7 +92,7 @@ def _fans(vertices: bytes, hands: bytes, solids: bytes) -> tuple[np.ndarray, np.
         open_ = open_[np.argsort(-first, kind="stable")]  # of what is written to one place the last stays
         hand[face[open_]] = hand[other[open_]]
     number = np.cumsum(fan == np.arange(len(fan))) - 1
-    return number[fan].reshape(-1, 3), np.where(hand < 0, -1.0, 1.0)
+    return number[fan].reshape(-1, 3).astype(np.int32), np.where(hand < 0, -1.0, 1.0)
 
 
 def same_rows(rows: np.ndarray) -> np.ndarray:
