@@ -17,8 +17,10 @@ from .kernel.autograd import faces_at_centers, render_image
 from .kernel.flat import image_dtype
 from .kernel.request import Channels, Request, make_request
 from .light.radiance import Lighting
+from .light.whole import lit_image
 from .scene.mesh import Mesh
 from .scene.scene import Scene, as_scene
+from .scene.tree import savable
 
 IDS = ("mesh_id", "face_id")
 # In the order in which the kernel has them (csrc/scene/scene.h).
@@ -80,8 +82,9 @@ def render_aovs(
     found: dict[str, Tensor] = {}
     shaded = scene.is_shaded and "image" in names
     if shaded:
+        scene, camera = savable(scene), savable(camera)
         request = make_request(scene, camera, spp, seed, **options)
-        found["image"] = lighting.image(scene, camera, request)
+        found["image"] = lit_image(lighting, scene, camera, request)
         if names == ["image"]:
             return found
     radiance = "image" in names and not shaded

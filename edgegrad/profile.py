@@ -4,27 +4,32 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from .camera.camera import Camera
 from .check import as_tensor, check_finite, check_float, check_positive_int, check_shape
 from .kernel import memory as memory
-from .kernel.counts import CURVES, table
+from .kernel.counts import CURVES, Watch, table
 from .kernel.operators import backward_kernel, forward_kernel
 from .kernel.request import Request, make_request, required
-from .light.radiance import check_unlit
+from .light.radiance import Lighting
 from .render import SHADING, check_options
 from .scene.mesh import Mesh
 from .scene.scene import Scene, as_scene
+from .scene.tree import map_tensors, tensors_in
 
 # What the kernel measures, in the order of a step.
 _PARTS = (
     "update", "forward", "view", "surface measure", "surface rays", "surface scatter", "curves", "edge rays",
     "edge scatter", "step rays", "step scatter", "world",
 )  # fmt: skip
+# The same where points are shaded: in lit scenes, and around mipmaps.
+_SHADED = ("image", "samples", "surface shading", "edge shading", "steps", "shadows", "backward")
 _BAR = 24  # characters of a bar of 100 %
 
 
@@ -39,6 +44,16 @@ class Profile(Mapping[str, float]):
     step …           the same at steps within faces
     world            from camera coordinates to the user's arrays
     python           all the rest: checks and copies of tensors
+
+    In lit scenes, and where textures have mipmaps, points are shaded, and their shading is differentiated by autograd:
+
+    image              with what is made for vertices that moved
+    samples            of the gradient, inside faces and at edges, and their rays
+    surface shading    inside faces
+    edge shading       on both sides of edges
+    steps, shadows     finding, and shading on both sides of, borders of nearest texels and of shadows
+    backward           what autograd runs
+    python             all the rest
     """
 
     def __init__(self, seconds: Mapping[str, float], samples: Mapping[str, int]) -> None:
@@ -89,12 +104,16 @@ def profile(
     repeats   steps of which the medians are taken
 
     The other arguments are those of render(). If nothing requires a gradient, that of the vertices is taken. A batch of
-    cameras counts as one step. Autograd itself is not run, so what it costs is not here. Raises what render() raises.
+    cameras counts as one step. Of scenes that are not lit, autograd itself is not run, so what it costs is not here. Raises what
+    render() raises.
     """
     check_options("profile", options)
     if options.get("shader") is not None:
         raise ValueError("shader: expected None, for profile() measures the kernel alone; torch.profiler sees a shader")
-    check_unlit("profile", as_scene(scene), "it measures the kernel alone; torch.profiler sees what shades")
+    if as_scene(scene).is_shaded:
+        return _of_shaded(
+            as_scene(scene), camera, adjoint, (spp, seed), check_positive_int("repeats", repeats), options
+        )
     options = {name: value for name, value in options.items() if name not in SHADING}
     scene, repeats = as_scene(scene), check_positive_int("repeats", repeats)
     # What is kept between calls must not help: before each step the vertices are elsewhere, each time somewhere else.
@@ -120,6 +139,67 @@ def profile(
         **{name: int(runs[-1][name]) for name in ("surface_samples", "edge_samples", "step_lines", *CURVES)},
     }
     return Profile(seconds, samples)
+
+
+def _of_shaded(
+    scene: Scene,
+    camera: Camera,
+    adjoint: Tensor | None,
+    spp_and_seed: tuple[int, int],
+    repeats: int,
+    options: Mapping[str, Any],
+) -> Profile:
+    """Of a scene of which points are shaded."""
+    lighting = Lighting.of(options.get("shadows", True), options.get("light_samples", 1))
+    creases, own = options.get("creases", "auto"), {n: v for n, v in options.items() if n not in SHADING}
+    scene, camera, leaves = _leaves(scene, camera)
+    request = make_request(scene, camera, *spp_and_seed, **own)
+    adjoint = _adjoint(adjoint, camera, request)
+    runs, watch = [], _Kept()
+    for repeat in range(repeats):
+        elsewhere = scene.replace(meshes=[m.replace(verts=m.verts * (1.001 + 1e-6 * repeat)) for m in scene.meshes])
+        with torch.no_grad():
+            lighting.image(elsewhere, camera, make_request(elsewhere, camera, 1, **own), creases)
+        watch = _Kept()
+        begin = time.perf_counter()
+        with torch.enable_grad():
+            step = make_request(scene, camera, *spp_and_seed, **own)
+            image = lighting.image(scene, camera, step, creases, watch)
+            with watch.part("backward"):
+                torch.autograd.grad(image, leaves, adjoint.reshape(image.shape).to(image))
+        runs.append({**watch.seconds, "python": time.perf_counter() - begin - sum(watch.seconds.values())})
+    seconds = {part: statistics.median(run.get(part, 0.0) for run in runs) for part in (*_SHADED, "python")}
+    image_samples = adjoint.shape[:-1].numel() * request.image.spp
+    return Profile(seconds, {"image_samples": image_samples, **watch.samples})
+
+
+def _leaves(scene: Scene, camera: Camera) -> tuple[Scene, Camera, Sequence[Tensor]]:
+    """The scene and the camera with leaves in place of what requires a gradient, the vertices if nothing does, and these."""
+    wanted = [t for t in tensors_in((scene, camera)) if torch.is_grad_enabled() and t.requires_grad]
+    wanted = wanted or [mesh.verts for mesh in scene.meshes]
+    leaves = {id(t): t.detach().requires_grad_() for t in wanted}
+
+    def leaf(tensor: Tensor) -> Tensor:
+        return leaves.get(id(tensor), tensor)
+
+    return map_tensors(scene, leaf), map_tensors(camera, leaf), list(leaves.values())
+
+
+class _Kept(Watch):
+    """Keeps it."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.samples: dict[str, int] = {}
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+    def count(self, name: str, number: int) -> None:
+        self.samples[name] = self.samples.get(name, 0) + number
 
 
 def _adjoint(adjoint: Tensor | None, camera: Camera, request: Request) -> Tensor:

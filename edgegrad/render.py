@@ -21,9 +21,10 @@ from .kernel.autograd import render_image
 from .kernel.operators import forward_kernel, screen_gradient_kernel
 from .kernel.request import make_request
 from .light.radiance import Lighting, check_unlit
+from .light.whole import lit_image
 from .scene.mesh import Mesh
 from .scene.scene import Scene, as_scene
-from .scene.tree import map_tensors, tensors_in
+from .scene.tree import map_tensors, savable, tensors_in
 from .shader import Shader, render_shaded
 
 SHADING = ("shader", "creases", "check_shader", "shadows", "light_samples")  # the options of shaders and of lit scenes
@@ -91,20 +92,21 @@ def render(
     `shader`, and its image has the dtype of the vertices.
 
     Differentiable once, in reverse and in forward mode, in every floating-point tensor of the scene and the camera; torch.vmap
-    (of scenes that are not lit) and torch.func's transforms work, one element of the batch at a time, all with the same seed;
-    tangents of one image
+    and torch.func's transforms work, one element of the batch at a time, all with the same seed; tangents of one image
     (torch.func.jacfwd) in one pass. The image has the dtype of
     the colours and comes back on the scene's device. Raises TypeError or ValueError that names the argument, and MemoryError,
     before it allocates, with the figure and what to lower; so does its backward pass. A second derivative raises
     RuntimeError.
     """
+    if shader is not None or as_scene(scene).is_shaded:
+        scene, camera = savable(as_scene(scene)), savable(camera)
     request = make_request(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
         filter=filter, grad_seed=grad_seed, step_spacing=step_spacing,
     )  # fmt: skip
     lighting = Lighting.of(shadows, light_samples)
     if shader is None and as_scene(scene).is_shaded:
-        return lighting.image(as_scene(scene), camera, request, creases)
+        return lit_image(lighting, as_scene(scene), camera, request, creases)
     if shader is not None:
         return render_shaded(as_scene(scene), camera, shader, request, creases, check_shader)
     image = render_image(request, batched=camera.batch is not None)

@@ -22,6 +22,7 @@ from torch.utils.checkpoint import checkpoint
 
 from .camera.camera import Camera
 from .check import all_finite, values_visible
+from .kernel.counts import Watch
 from .kernel.derivatives import differentiates, moves, transformed
 from .kernel.flat import Flat
 from .kernel.request import Request, derived_seed
@@ -66,6 +67,7 @@ class Effort(NamedTuple):
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
+    watch: Watch = Watch()  # is told what it takes
 
     @property
     def at_once(self) -> int:
@@ -105,7 +107,9 @@ class _Image:
         self._kinds: list[str] | None = None  # of the steps that the shader declares
 
     def render(self) -> Tensor:
-        image = self._values()
+        watch = self._effort.watch
+        with watch.part("image"):
+            image = self._values()
         if not differentiates():
             return image
         if self._effort.steps is not None:
@@ -117,21 +121,28 @@ class _Image:
         moving = visibility and moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
         flat = frame.request.scene
         cut = visibility and flat.has_steps and (moving or moves(flat.uvs, flat.alphas))
-        surface, curves = frame.sampler.samples(
-            self._with_creases(),
-            interior=True,
-            boundary=moving,
-            intrinsics=moves(frame.intrinsics),
-            steps=cut,
-            lit=frame.surfaces.scene if self._effort.lit else None,
-        )
-        terms = self._interior(SurfaceSamples(frame, surface))
+        with watch.part("samples"):
+            surface, curves = frame.sampler.samples(
+                self._with_creases(),
+                interior=True,
+                boundary=moving,
+                intrinsics=moves(frame.intrinsics),
+                steps=cut,
+                lit=frame.surfaces.scene if self._effort.lit else None,
+            )
+        watch.count("surface_samples", len(surface.x))
+        with watch.part("surface shading"):
+            terms = self._interior(SurfaceSamples(frame, surface))
         if moving or cut:
-            terms += self._boundary(EdgeSamples(frame, curves))
+            watch.count("edge_samples", len(curves.x))
+            with watch.part("edge shading"):
+                terms += self._boundary(EdgeSamples(frame, curves))
         if visibility and self._kinds:
-            terms += self._steps()
+            with watch.part("steps"):
+                terms += self._steps()
         if visibility:
-            terms += self._shadows()
+            with watch.part("shadows"):
+                terms += self._shadows()
         return frame.attached(image, terms)
 
     # -- the image -----------------------------------------------------------------------------------------------------
@@ -233,6 +244,7 @@ class _Image:
                 one = self._effort.additive
                 casters = frame.fixed.casters if frame.surfaces.scene.blends else None
                 records = frame.sampler.shadow_samples(light.parts, seed, count, moves(frame.intrinsics), one, casters)
+                self._effort.watch.count("shadow_samples", len(records.x))
                 if len(records.x):
                     terms += self._boundary(EdgeSamples(frame, records, light, one))
         return terms
@@ -254,6 +266,7 @@ class _Image:
         """Σ k(x − c) [L₊ − L₋] δs / |∇ₓs| · weight over where lines cross steps s = 0 of the shader."""
         frame = self._frame
         found = self._crossings()
+        self._effort.watch.count("step_samples", len(found.x))
         rays = frame.sampler.rays_at(found.x)
         seed = frame.seeds("steps", len(found.x))
         step = frame.here(found.step)[:, None]

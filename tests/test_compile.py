@@ -87,6 +87,76 @@ def test_compile_still_refuses_what_is_not_finite():
         function(broken)
 
 
+QUAD = torch.tensor([[-2.0, -2.0, -1.0], [2.0, -2.0, -1.0], [2.0, 2.0, -1.2], [-2.0, 2.0, -1.0]], dtype=F64)
+SQUARE = torch.tensor([[0, 1, 2], [0, 2, 3]])
+
+
+def test_compile_lit_scene(compiled):
+    def function(verts, place, roughness, seed):
+        mesh = eg.Mesh(verts, MESH.faces, material=eg.Material(roughness=roughness))
+        return eg.render(eg.Scene(mesh, lights=[eg.PointLight(place, 9.0)]), CAMERA, 1, seed)
+
+    values = (MESH.verts, torch.tensor([1.0, 1.5, 4.0], dtype=F64), torch.tensor(0.4, dtype=F64))
+    compiled(function, [*map(leaf, values), 3])
+
+
+@pytest.mark.slow
+def test_compile_all_that_lights_a_scene(compiled):
+    """Materials, textures and lights of every kind from their tensors; seeds and numbers of samples become symbols."""
+
+    def function(verts, roughness, image, normals, sky, place, power, eye, seed, samples):
+        shiny = eg.Material(verts.sigmoid(), 0.3, roughness)
+        uvs = QUAD[:, :2] / 4 + 0.5
+        painted = eg.Material(
+            eg.Texture(image, wrap=("clamp", "mirror")), normal_map=eg.Texture(normals), normal_scale=0.5
+        )
+        meshes = [
+            eg.Mesh(verts, MESH.faces, material=shiny, name='"\\'),
+            eg.Mesh(QUAD, SQUARE, uvs=uvs, uv_faces=SQUARE, material=painted, wrap=["repeat", "clamp"]),
+        ]
+        lights = [
+            eg.PointLight(place, power, color=sky[0, 0]),
+            eg.SpotLight(place + 1, -place, power, inner_angle=0.2),
+            eg.DirectionalLight(-place, 0.5),
+            eg.Environment(sky, torch.eye(3, dtype=F64), visible=False),
+            eg.SphericalHarmonics(sky[:1, :1].expand(9, 1, 3)[:, 0] * 0.1),
+            eg.AreaLight.rectangle(place, sky[0, 0] / 4, sky[1, 0] / 4, power),
+        ]
+        camera = eg.Camera.look_at(eye, (0.0, 0.0, 0.0), fov_y=40.0, size=(10, 8))
+        return eg.render(eg.Scene(meshes, lights=lights), camera, 2, seed, surface_samples=samples, shadows=seed < 9)
+
+    draw = torch.Generator().manual_seed(3)
+    sky = 0.2 + torch.rand((3, 4, 3), dtype=F64, generator=draw)
+    normals = torch.tensor([0.5, 0.5, 1.0], dtype=F64) + 0.1 * torch.rand((2, 2, 3), dtype=F64, generator=draw)
+    place = torch.tensor([1.0, 1.5, 4.0], dtype=F64)
+    power = torch.tensor(9.0, dtype=F64)
+    values = (MESH.verts, power / 20, sky[:, :, [1]] + 0 * sky, normals, sky, place, power, CAMERA.K[2] * 4 + 0.5)
+    compiled(function, *[([*map(leaf, values), *call]) for call in [(0, 100), (7, 101)]])
+
+
+@pytest.mark.slow
+def test_compile_mipmaps_and_batches(compiled):
+    def function(verts, texture, K):
+        mesh = eg.Mesh(verts, MESH.faces, texture=texture, uvs=verts[:, :2], uv_faces=MESH.faces, filter="mipmap")
+        return eg.render(mesh, CAMERA.replace(K=K), 4)
+
+    compiled(function, [leaf(MESH.verts), leaf(ADJOINT.to(F32)), leaf(CAMERA.K.expand(2, 3, 3))])
+
+
+def test_compile_of_lit_scenes_refuses_what_is_not_finite():
+    torch._dynamo.reset()
+    lit = eg.Scene(MESH.replace(material=eg.Material()), lights=[eg.DirectionalLight((0.0, 0.0, -1.0))])
+
+    def function(verts):
+        return eg.render(lit.replace(meshes=[lit.meshes[0].replace(verts=verts)]), CAMERA, 1)
+
+    function = torch.compile(function, fullgraph=True, backend="aot_eager")
+    broken = MESH.verts.clone()
+    broken[1, 2] = torch.nan
+    with pytest.raises(ValueError, match=r"verts: expected finite numbers, got nan at \[1, 2\]"):
+        function(broken)
+
+
 @pytest.mark.slow  # the C++ compiler takes up to a minute the first time
 def test_compile_inductor(compiled):
     def function(verts, t):

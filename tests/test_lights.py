@@ -380,12 +380,8 @@ def test_renders_in_every_way():
     assert not eg.plan(scene, camera, shadows=False)["shadows"].on
     with pytest.raises(ValueError, match="screen_gradient: expected a scene without materials"):
         eg.screen_gradient(scene, camera, image)
-    with pytest.raises(ValueError, match="profile: expected a scene without materials"):
-        eg.profile(scene, camera)
     with pytest.raises(ValueError, match="reference: expected a scene without materials"):
         eg.reference.render(scene, camera)
-    with pytest.raises(RuntimeError, match=r"got those of torch\.vmap"):
-        torch.vmap(lambda x: eg.render(scene.replace(lights=[eg.PointLight(x)]), camera))(torch.rand(2, 3))
     with pytest.raises(ValueError, match="intensity: expected numbers, got a meta tensor"):
         eg.render(scene.replace(lights=[eg.PointLight([0.0, 0, 1], torch.ones((), device="meta"))]), camera)
 
@@ -564,14 +560,17 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: eg.DirectionalLight([0.0, 1]), ValueError, r"direction: expected shape \(3,\)"),
     (lambda: eg.PointLight("here"), TypeError, "position: expected"),
     (lambda: eg.PointLight([0.0, 0, float("nan")]), ValueError, "position: expected finite"),
-    (lambda: eg.PointLight([0.0, 0, 1], [1.0, 2.0]), ValueError, "intensity: expected one number"),
-    (lambda: eg.PointLight([0.0, 0, 1], 1.0, 3.0), ValueError, "color: expected shape"),
+    (lambda: eg.PointLight([0.0, 0, 1], [1.0, 2.0]), ValueError, "intensity: expected one number.*color="),
+    (lambda: eg.SpotLight([0.0, 0, 1], [0, 0, -1.0], torch.ones(1, 3)), ValueError, "give the colour as color="),
+    (lambda: eg.DirectionalLight([0.0, 0, 1], (1, 2, 3)), ValueError, "give the colour as color="),
+    (lambda: eg.PointLight([0.0, 0, 1], 1.0, 3.0), ValueError, "color: expected shape.*is intensity="),
     (lambda: eg.SpotLight([0.0, 0, 1], [0, 0, -1.0], inner_angle=1.0), ValueError, "inner_angle: expected 0 ≤"),
     (lambda: eg.SpotLight([0.0, 0, 1], [0, 0, -1.0], outer_angle=2.0), ValueError, "outer_angle"),
-    (lambda: eg.Environment(torch.ones(4, 3)), ValueError, "radiance: expected shape"),
+    (lambda: eg.Environment(torch.ones(4, 3)), ValueError, "radiance: expected shape.*one channel is"),
     (lambda: eg.Environment([1.0], 2 * torch.eye(3)), ValueError, "rotation: expected a rotation"),
     (lambda: eg.Environment([1.0], visible=1), TypeError, "visible: expected True or False"),
     (lambda: eg.SphericalHarmonics(torch.ones(4, 3)), ValueError, r"coefficients: expected shape \(9, C\)"),
+    (lambda: eg.SphericalHarmonics(torch.ones(9)), ValueError, r"of one, coefficients\[:, None\]"),
     (
         lambda: eg.AreaLight.disc([0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], 1.0, 2),
         ValueError,
@@ -597,6 +596,22 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
 def test_what_is_refused(make: Callable[[], Any], error: type[Exception], text: str):
     with pytest.raises(error, match=text):
         make()
+
+
+def test_one_number_for_all_channels():
+    """Of lights of every kind: as much as of each channel."""
+    make: list[Callable[[Any], Any]] = [
+        lambda c: eg.PointLight([1.0, 0, 1], c) if isinstance(c, float) else eg.PointLight([1.0, 0, 1], color=c),
+        eg.Environment,
+        lambda c: eg.SphericalHarmonics(torch.ones(9, 1) * torch.as_tensor(c)),
+        lambda c: eg.AreaLight.rectangle([1.0, 0, 1], [0.2, 0, 0], [0, 0.2, 0], c),
+    ]
+    for light in make:
+        images = [
+            eg.render(eg.Scene([ball(1, material=WHITE)], lights=[light(c)]), from_above(8), 1)
+            for c in (2.0, torch.full((3,), 2.0))
+        ]
+        assert torch.equal(*images) and images[0].any()
 
 
 @pytest.mark.parametrize("image", [False, True])

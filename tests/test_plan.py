@@ -472,6 +472,41 @@ def test_profile_rebuilds_for_every_repeat(monkeypatch):
     assert built == [True] * 6
 
 
+def test_profile_of_a_lit_scene():
+    light = eg.PointLight(torch.tensor([1.0, 2.0, 4.0]))
+    mesh = cube(0.5).replace(material=eg.Material(), face_colors=None)
+    scene = eg.Scene([mesh, mesh.transformed(t=torch.tensor([0.5, 1.0, 2.0]), scale=0.2)], lights=[light])
+    found = eg.profile(scene, CAMERA, spp=4, repeats=2)
+    assert list(found) == [
+        "image",
+        "samples",
+        "surface shading",
+        "edge shading",
+        "steps",
+        "shadows",
+        "backward",
+        "python",
+    ]
+    assert all((seconds > 0) == (name != "steps") for name, seconds in found.items())
+    assert found.samples["image_samples"] == eg.plan(scene, CAMERA, 4)["image"].samples
+    assert min(found.samples[name] for name in ("surface_samples", "edge_samples", "shadow_samples")) > 0
+    unshadowed = eg.profile(scene, CAMERA, spp=4, repeats=1, shadows=False).samples
+    assert "shadow_samples" not in unshadowed and unshadowed["edge_samples"] == found.samples["edge_samples"]
+    lit = scene.replace(lights=[light.replace(intensity=torch.ones((), requires_grad=True))])
+    still = eg.profile(lit, CAMERA, spp=4, repeats=1)
+    assert "edge_samples" not in still.samples and still["edge shading"] == 0 and still["backward"] > 0
+    with pytest.raises(ValueError, match="adjoint"):
+        eg.profile(scene, CAMERA, torch.ones(2, 2, 3))
+
+
+def test_profile_of_mipmaps():
+    mesh = eg.Mesh(
+        cube().verts, cube().faces, texture=torch.rand(8, 8, 3), uvs=cube().verts[:, :2], uv_faces=cube().faces
+    )
+    found = eg.profile(mesh.replace(filter="mipmap"), CAMERA, spp=1, repeats=1)
+    assert found["surface shading"] > 0 and found["shadows"] < found["surface shading"]
+
+
 def test_with_a_shader():
     scene, camera = requiring(creased(), CAMERA, ("verts",))
     planned = eg.plan(scene, camera, 4, shader=lambda hits: hits.normal)

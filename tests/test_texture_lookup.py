@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from adjoints import check_vjp, pieces, random
+
+from edgegrad.scene.textures import Pyramid, bilinear
 
 
 def texels(height: int = 4, width: int = 5, channels: int = 3) -> np.ndarray:
@@ -52,3 +55,26 @@ def test_texture_far_out():
     """Beyond what an integer holds a coordinate has no fraction left, and must still find a texel."""
     for uv in ([1e30, 0.5], [-1e30, 1e25], [2.0**62, -(2.0**63)]):
         assert np.isfinite(pieces.texture_eval(texels(), uv)).all()
+
+
+@pytest.mark.parametrize("wraps", [("repeat", "mirror"), ("clamp", "repeat"), ("mirror", "clamp")])
+def test_pyramids(wraps: tuple[str, str]) -> None:
+    """Between the two levels of each point, as lookups in images of their own say; beyond the last it is one texel."""
+    draw = torch.Generator().manual_seed(2)
+    image = torch.rand((5, 12, 2), dtype=torch.float64, generator=draw).requires_grad_()
+    uv = (5 * torch.rand((40, 2), dtype=torch.float64, generator=draw) - 2).requires_grad_()
+    level = (4.5 * torch.rand(40, dtype=torch.float64, generator=draw) - 0.5).requires_grad_()
+    levels = [image]
+    for size in ((2, 6), (1, 3), (1, 1)):
+        pooled = torch.nn.functional.adaptive_avg_pool2d(levels[-1].movedim(-1, 0), size)
+        levels.append(pooled.movedim(0, -1))
+    tents = [(1 - (level.clamp(0, 3) - k).abs()).clamp(min=0)[:, None] for k in range(4)]
+    expected = sum(tent * bilinear(one, uv, wraps) for tent, one in zip(tents, levels, strict=True))
+    found = Pyramid.of(image).look_up(level, uv, wraps)
+    assert isinstance(expected, torch.Tensor)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-14)
+    weights = torch.rand(found.shape, dtype=torch.float64, generator=draw)
+    of_found, of_expected = (torch.autograd.grad((v * weights).sum(), (image, uv, level)) for v in (found, expected))
+    for own, other in zip(of_found, of_expected, strict=True):
+        torch.testing.assert_close(own, other, rtol=0, atol=1e-12)
+        assert other.any()

@@ -41,11 +41,11 @@ SourceArrays make_source(const std::string& kind, int value, int factor, int uvs
 MeshArrays make_mesh(int64_t first_face, int64_t faces, int32_t first_vertex, bool has_material, bool two_sided,
                      bool lambertian, const SourceArrays& color, const SourceArrays& base, const SourceArrays& metallic,
                      const SourceArrays& roughness, const SourceArrays& emission, const SourceArrays& normal_map,
-                     int normal_scale, int normals, std::optional<Rows> normal_faces) {
+                     int normal_scale, const SourceArrays& tangents, int normals, std::optional<Rows> normal_faces) {
     LitMesh mesh{first_face, faces,     first_vertex,  has_material,   two_sided,     lambertian,
                  color.view, base.view, metallic.view, roughness.view, emission.view, {}};
-    mesh.normal = {normals, data_of(normal_faces), normal_map.view, normal_scale};
-    return {mesh, {color, base, metallic, roughness, emission, normal_map}, normal_faces};
+    mesh.normal = {normals, data_of(normal_faces), normal_map.view, normal_scale, tangents.view};
+    return {mesh, {color, base, metallic, roughness, emission, normal_map, tangents}, normal_faces};
 }
 
 LampArrays make_lamp(const std::string& kind, int position, int direction, int intensity, int color, int inner_angle,
@@ -141,12 +141,13 @@ void LitArrays::check_mesh(const MeshArrays& arrays) const {
     const LitMesh& m = arrays.view;
     if (m.first_face < 0 || m.faces < 1 || m.first_face + m.faces > int64_t(faces_.shape(0)))
         refuse("meshes: expected faces of the scene");
-    const char* names[] = {"color", "base_color", "metallic", "roughness", "emission", "normal_map"};
-    const int channels[] = {scene.channels, scene.channels, 1, 1, scene.channels, 3};
-    for (int i = 0; i < 6; ++i) check_source(names[i], arrays.kept[size_t(i)], m, channels[i]);
+    const char* names[] = {"color", "base_color", "metallic", "roughness", "emission", "normal_map", "tangents"};
+    const int channels[] = {scene.channels, scene.channels, 1, 1, scene.channels, 3, 4};
+    for (int i = 0; i < 7; ++i) check_source(names[i], arrays.kept[size_t(i)], m, channels[i]);
     if (m.normal.map.exists()) {
         check_table("normal_scale", m.normal.map_scale, 1, 1);
         if (m.normal.map.kind != Source::Kind::texture) refuse("normal_map: expected a texture");
+        if (m.normal.tangents.exists()) check_table("tangents", m.normal.tangents.value, 3 * m.faces, 4);
     }
     if (m.normal.normals == no_table) return;
     check_table("normals", m.normal.normals, 1, 3);
@@ -206,7 +207,7 @@ void bind_lit_arrays(nb::module_& m) {
     nb::class_<MeshArrays>(m, "LitMesh")
         .def(nb::new_(&make_mesh), nb::kw_only(), "first_face"_a, "faces"_a, "first_vertex"_a, "has_material"_a,
              "two_sided"_a, "lambertian"_a, "color"_a, "base_color"_a, "metallic"_a, "roughness"_a, "emission"_a,
-             "normal_map"_a, "normal_scale"_a, "normals"_a, "normal_faces"_a.noconvert());
+             "normal_map"_a, "normal_scale"_a, "tangents"_a, "normals"_a, "normal_faces"_a.noconvert());
     nb::class_<LampArrays>(m, "Lamp").def(
         nb::new_(&make_lamp), "kind"_a, nb::kw_only(), "position"_a = no_table, "direction"_a = no_table,
         "intensity"_a = no_table, "color"_a = no_table, "inner_angle"_a = no_table, "outer_angle"_a = no_table,

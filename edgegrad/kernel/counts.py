@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 # What the kernel counts.
 CURVES = ("silhouettes", "creases", "intersections", "rim")
 COUNTS = (
     "surface_samples", "edge_samples", "surface_wanted", "edge_wanted", "step_lines", *CURVES,
 )  # fmt: skip
+
+
+class Watch:
+    """Is told what an image and its gradient take, where points are shaded. This one does not listen."""
+
+    def part(self, name: str) -> AbstractContextManager[None]:
+        """Around a part of the work; parts of one name add up."""
+        return nullcontext()
+
+    def count(self, name: str, number: int) -> None:
+        """Of samples; those of one name add up."""
 
 
 def table(rows: Sequence[Sequence[str]], align: str) -> str:

@@ -23,7 +23,7 @@ def note_jumps(hits: Hits) -> None:
     if len(scene.meshes) > 1:
         hits._note_jump("mesh", lambda: surfaces.mesh_of_face[:, None, None].expand(-1, 3, 1))
     for index, mesh in enumerate(scene.meshes):
-        hits._note_jump(("appearance", index), _of_scene(surfaces, index, lambda mesh=mesh: jumps(mesh)))
+        hits._note_jump(("appearance", index), _of_scene(surfaces, index, lambda i=index: _looks(surfaces, i)))
         if mesh.material is None or not (scene.lights or scene.casting):
             continue
         if mesh.normals is None:
@@ -54,6 +54,10 @@ def _of_scene(surfaces: Surfaces, index: int, of_mesh: Callable[[], Tensor]) -> 
         return torch.cat([before, own, behind])  # pad() of torch 2.4 refuses what has no columns
 
     return corners
+
+
+def _looks(surfaces: Surfaces, index: int) -> Tensor:
+    return jumps(surfaces.scene.meshes[index], surfaces.tangents(index))
 
 
 def _faces_of(surfaces: Surfaces, index: int) -> Tensor:

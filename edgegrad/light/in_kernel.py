@@ -186,10 +186,7 @@ class _Layout(NamedTuple):
         scene = surfaces.scene
         verts, seen_from = tables.add(surfaces.bare.verts, 3), tables.add(view.eye, 3)
         firsts = np.cumsum([0, *(len(mesh.verts) for mesh in scene.meshes)])
-        meshes = [
-            _mesh(mesh, first, int(vertex), tables)
-            for mesh, first, vertex in zip(scene.meshes, surfaces.first_faces, firsts[:-1], strict=True)
-        ]
+        meshes = [_mesh(surfaces, index, int(vertex), tables) for index, vertex in enumerate(firsts[:-1])]
         eps = torch.finfo(surfaces.verts.dtype).eps
         still = (light for light in scene.lights if isinstance(light, SphericalHarmonics))
         lamps = [_lamp(scene, light, k, eps, tables) for k, light in enumerate((*scene.casting, *still))]
@@ -215,7 +212,8 @@ def _layout(surfaces: Surfaces, view: View) -> tuple[_Layout, list[Tensor]]:
     return surfaces.layout[1:]
 
 
-def _mesh(mesh: Mesh, first_face: int, first_vertex: int, tables: _Tables) -> Any:
+def _mesh(surfaces: Surfaces, index: int, first_vertex: int, tables: _Tables) -> Any:
+    mesh, tangents = surfaces.scene.meshes[index], surfaces.tangents(index)
     none, material = core.LitSource("constant"), mesh.material
 
     def source(parameter: Parameter | float | None) -> Any:
@@ -233,7 +231,7 @@ def _mesh(mesh: Mesh, first_face: int, first_vertex: int, tables: _Tables) -> An
     normal_rows = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
     map_ = None if material is None else material.normal_map
     return core.LitMesh(
-        first_face=first_face,
+        first_face=surfaces.first_faces[index],
         faces=len(mesh.faces),
         first_vertex=first_vertex,
         has_material=material is not None,
@@ -246,6 +244,7 @@ def _mesh(mesh: Mesh, first_face: int, first_vertex: int, tables: _Tables) -> An
         emission=source(None if material is None else material.emission),
         normal_map=source(map_),
         normal_scale=-1 if map_ is None or material is None else tables.add(material.normal_scale, 1),
+        tangents=none if tangents is None else core.LitSource("corner", tables.add(tangents, 4)),
         normals=tables.add(mesh.normals, 3),
         normal_faces=None if mesh.normals is None else _rows(normal_rows),
     )

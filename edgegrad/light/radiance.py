@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from ..camera.camera import Camera
-from ..check import all_finite, check_positive_int, values_visible
+from ..check import all_finite, check_positive_int
+from ..kernel.counts import Watch
 from ..kernel.derivatives import differentiates, moves
 from ..kernel.first_order import unreached
 from ..kernel.flat import image_dtype
@@ -55,13 +56,15 @@ class Lighting(NamedTuple):
             raise TypeError(f"shadows: expected True or False, got {type(shadows).__name__} ({shadows!r})")
         return cls(shadows, check_positive_int("light_samples", light_samples, most=1 << 16))
 
-    def image(self, scene: Scene, camera: Camera, request: Request, creases: bool | str = "auto") -> Tensor:
-        """(H, W, C), or (B, H, W, C) for a batch of cameras. Raises RuntimeError for a batch of torch.vmap."""
-        if not torch.compiler.is_compiling() and not values_visible(*tensors_in(scene)):
-            raise RuntimeError(
-                "render: expected tensors with values where a scene is lit or has mipmaps, got those of torch.vmap or "
-                "torch.compile; render a batch one by one, and leave render() out of what is compiled"
-            )
+    def image(
+        self,
+        scene: Scene,
+        camera: Camera,
+        request: Request,
+        creases: bool | str = "auto",
+        watch: Watch = Watch(),  # noqa: B008  it keeps nothing
+    ) -> Tensor:
+        """(H, W, C), or (B, H, W, C) for a batch of cameras, of tensors with values; see lit_image()."""
         if scene.is_lit and not (scene.lights or scene.casting):
             warn(
                 "no light",
@@ -84,6 +87,7 @@ class Lighting(NamedTuple):
             gives_derivatives=fused and additive,
             additive=additive,
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
+            watch=watch,
         )
         image = render_shaded(scene, camera, self, request, creases, False, effort)
         if not scene.is_lit:  # as the kernel has it where there are no mipmaps
@@ -204,7 +208,11 @@ def _of_each_mesh(hits: Hits, of_mesh: Callable[[Hits, int], Tensor]) -> Tensor:
 def _on_mesh(hits: Hits, index: int) -> OnMesh:
     surfaces = hits._surfaces
     return OnMesh(
-        surfaces.scene.meshes[index], hits._face - surfaces.first_faces[index], hits._barycentrics, hits._look_up
+        surfaces.scene.meshes[index],
+        hits._face - surfaces.first_faces[index],
+        hits._barycentrics,
+        hits._look_up,
+        lambda: surfaces.tangents(index),  # pyright: ignore[reportArgumentType]: asked for where there are some
     )
 
 

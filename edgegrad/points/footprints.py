@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..kernel.derivatives import moves
 from ..scene.rows import interpolated
-from ..scene.textures import pyramid
+from ..scene.textures import Pyramid
 from .records import RayRecords
 from .surfaces import Surfaces, View
 
@@ -51,10 +51,10 @@ class Footprints(NamedTuple):
         return 0.5 * most.log2()
 
 
-def pyramid_of(surfaces: Surfaces, texture: Tensor) -> list[Tensor]:
-    """The levels of a texture, kept with the surfaces where they have no graph."""
+def pyramid_of(surfaces: Surfaces, texture: Tensor) -> Pyramid:
+    """That of a texture, kept with the surfaces where they have no graph."""
     if torch.is_grad_enabled():
-        return pyramid(texture)
+        return Pyramid.of(texture)
     if id(texture) not in surfaces.pyramids:
-        surfaces.pyramids[id(texture)] = texture, pyramid(texture)
+        surfaces.pyramids[id(texture)] = texture, Pyramid.of(texture)
     return surfaces.pyramids[id(texture)][1]

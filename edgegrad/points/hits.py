@@ -15,7 +15,7 @@ from ..scene.lights import Light, LightPoints
 from ..scene.material import WRAPS
 from ..scene.mesh import FILTERS
 from ..scene.rows import interpolated, rows_of
-from ..scene.textures import bilinear, in_texels, nearest, trilinear
+from ..scene.textures import bilinear, in_texels, nearest
 from .footprints import Footprints, pyramid_of
 from .records import RayRecords, visible
 from .seeds import uniform
@@ -268,7 +268,7 @@ class Hits:
             raise ValueError("mipmap: expected hits of a camera, for rays of trace() have no neighbours; leave it out")
         assert corners is not None
         footprints = Footprints(self._surfaces, self._view, self._face, self._pixel, self._rays_at)
-        return trilinear(pyramid_of(self._surfaces, texture), footprints.level(texture, corners), uv, wraps)
+        return pyramid_of(self._surfaces, texture).look_up(footprints.level(texture, corners), uv, wraps)
 
     # -- steps ---------------------------------------------------------------------------------------------------------
 

@@ -12,10 +12,13 @@ from torch.nn.functional import normalize
 
 from ..kernel.derivatives import transformed
 from ..kernel.flat import Flat
+from ..scene.appearance import coordinates
+from ..scene.mikktspace import Fans
 from ..scene.rows import columns, dot, rows_of, scaled
 from ..scene.scene import Scene
+from ..scene.textures import Pyramid
 from .moving import barycentrics, barycentrics_by
-from .records import bare
+from .records import bare, values_of
 
 
 class Surfaces:
@@ -37,7 +40,8 @@ class Surfaces:
         self._bare = bare
         self.jumping: dict[Any, Callable[[], Tensor]] = {}  # values (F, 3, K) at corners, of properties that may jump
         self.shadowing: set[int] = set()  # lights, by their place in scene.casting, whose shadows a shader asks for
-        self.pyramids: dict[int, tuple[Tensor, list[Tensor]]] = {}  # of textures, by their ids
+        self.pyramids: dict[int, tuple[Tensor, Pyramid]] = {}  # of textures, by their ids
+        self._tangents: dict[int, Tensor] = {}  # of meshes
         self._moving: Surfaces | None = None  # the surfaces of which detach() made these
         self.layout: Any = None  # of light/in_kernel.py, kept where nothing has derivatives
         self.has_derivatives = True
@@ -51,7 +55,7 @@ class Surfaces:
         if self._bare is not None:
             parts = self._bare._asdict().items()
             other._bare = self._bare._replace(**{k: v.detach() for k, v in parts if isinstance(v, Tensor)})
-        other.verts, other.scene, other.pyramids = self.verts.detach(), self.scene.detach(), {}
+        other.verts, other.scene, other.pyramids, other._tangents = self.verts.detach(), self.scene.detach(), {}, {}
         other.layout, other.has_derivatives, other._moving = None, False, self
         return other
 
@@ -99,6 +103,24 @@ class Surfaces:
         area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         index = self.faces.reshape(-1)
         return normalize(torch.zeros_like(self.verts).index_add(0, index, area.repeat_interleave(3, 0)), dim=-1)
+
+    def tangents(self, index: int) -> Tensor | None:
+        """(F, 3, 4) of a mesh whose normals are interpolated and bent by a map: see Fans."""
+        mesh = self.scene.meshes[index]
+        if mesh.normals is None or mesh.material is None or mesh.material.normal_map is None:
+            return None
+        if index not in self._tangents and self._moving is not None:
+            tangents = self._moving.tangents(index)
+            assert tangents is not None
+            self._tangents[index] = tangents.detach()
+        elif index not in self._tangents:
+            uvs, uv_faces = coordinates(mesh, mesh.material.normal_map)
+            normal_faces = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
+            given = (mesh.verts, mesh.faces), (mesh.normals, normal_faces), (uvs, uv_faces)
+            values = values_of(*(tensor for pair in given for tensor in pair))
+            fans = Fans.of(*zip(values[::2], values[1::2], strict=True))
+            self._tangents[index] = fans.tangents(*(rows_of(x.to(mesh.verts.device), at.long()) for x, at in given))
+        return self._tangents[index]
 
     def corners(self, face: Tensor) -> Tensor:
         """(N, 3, 3) world coordinates of the corners of faces (N,)."""

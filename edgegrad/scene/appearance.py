@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 
 from .material import Parameter, Texture
 from .mesh import PLAIN, Mesh
+from .mikktspace import tangents
 from .rows import columns, rows_of, scaled
 from .textures import look_up
 
@@ -25,6 +26,7 @@ class OnMesh(NamedTuple):
     face: Tensor  # (N,) int64, as the mesh counts them
     b: Tensor  # (N, 3), barycentrics
     look_up: LookUp | None = None  # of textures, by footprints of pixels; None: by texture coordinates alone
+    tangents: Callable[[], Tensor] | None = None  # (F, 3, 4) at corners, of a normal map where normals are interpolated
 
     def interpolated(self, rows: Tensor, index: Tensor) -> Tensor:
         """(N, K) from rows (R, K) by the corners of faces, index (F, 3)."""
@@ -115,18 +117,15 @@ class OnMesh(NamedTuple):
         return normalize(m, dim=-1)
 
     def _tangent(self, texture: Texture) -> tuple[Tensor, Tensor]:
-        """(N, 3) along which u grows on the face, of any length, and (N, 1) 1, or −1 where the image is mirrored."""
+        """(N, 3) along which u grows, of any length, and (N, 1) 1, or −1 where the image is mirrored: of the face, or
+        interpolated as normals are."""
+        if self.mesh.normals is not None:
+            assert self.tangents is not None
+            corners = rows_of(self.tangents(), self.face).to(self.b)
+            found = (self.b[:, :, None] * corners[:, :, :3]).sum(1)
+            return found, corners[:, 0, 3:]
         uvs, uv_faces = coordinates(self.mesh, texture)
         return tangents(self.corners(), uvs.to(self.b)[uv_faces[self.face].long()])
-
-
-def tangents(corners: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
-    """Of faces with corners (N, 3, 3) and texture coordinates (N, 3, 2): ∂x/∂u times the determinant's size, and its sign."""
-    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    d1, d2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    determinant = (d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0])[:, None]
-    sign = torch.where(determinant.detach() < 0, -1.0, 1.0).to(uv)
-    return sign * (d2[:, 1:2] * e1 - d1[:, 1:2] * e2), sign
 
 
 def coordinates(mesh: Mesh, texture: Texture | None) -> tuple[Tensor, Tensor]:
@@ -137,8 +136,9 @@ def coordinates(mesh: Mesh, texture: Texture | None) -> tuple[Tensor, Tensor]:
     return mesh.uvs, mesh.uv_faces
 
 
-def jumps(mesh: Mesh) -> Tensor:
-    """(F, 3, K) at the corners of faces: what of the mesh's looks may jump at edges, but for normals; each of a size near 1."""
+def jumps(mesh: Mesh, of_corners: Tensor | None) -> Tensor:
+    """(F, 3, K) at the corners of faces: what of the mesh's looks may jump at edges, but for normals; each of a size near 1.
+    `of_corners`: the tangents (F, 3, 4), if there are some."""
     found: list[Tensor] = []
     if mesh.corner_colors is not None:
         found.append(mesh.corner_colors)
@@ -149,8 +149,10 @@ def jumps(mesh: Mesh) -> Tensor:
         uvs, uv_faces = coordinates(mesh, texture)
         found.append(rows_of(uvs, uv_faces.long()))
     material = mesh.material
-    if material is not None and material.normal_map is not None:
-        # Frames of tangents are of each face: on curved meshes they jump at every edge.
+    if of_corners is not None:
+        found.append(torch.cat([of_corners[..., 3:] * of_corners[..., :3], of_corners[..., 3:]], -1))
+    elif material is not None and material.normal_map is not None:
+        # Of each face, they jump at every edge of a curved mesh.
         uvs, uv_faces = coordinates(mesh, material.normal_map)
         tangent, hand = tangents(mesh.verts[mesh.faces.long()], uvs.to(mesh.verts)[uv_faces.long()])
         found.append((hand * normalize(tangent, dim=-1))[:, None].expand(-1, 3, -1))

@@ -22,9 +22,9 @@ EVEN = 0.1  # the share of points of a light that is drawn evenly, so that what 
 class Environment(Light):
     """Light from infinitely far away, from all around.
 
-    radiance  (C,), the same from all around, or (h, w, C), an image of directions, linear, in the equirectangular projection:
-              row 0 is around +Y, the last one around −Y, the middle looks along −Z, and +X is to the right of it. Between the
-              centres of texels it is bilinear, around the whole turn
+    radiance  a number or (C,), the same from all around, or (h, w, C), an image of directions, linear, in the equirectangular
+              projection: row 0 is around +Y, the last one around −Y, the middle looks along −Z, and +X is to the right of it.
+              Between the centres of texels it is bilinear, around the whole turn
     rotation  (3, 3)  from that frame to the world; the identity when None
     visible   shown behind all surfaces where the scene has no background of its own
 
@@ -44,7 +44,8 @@ class Environment(Light):
 
     def __post_init__(self) -> None:
         radiance = numbers("radiance", self.radiance)
-        check_shape("radiance", radiance, ("C",), ("h", "w", "C"))
+        radiance = radiance.reshape(1) if radiance.dim() == 0 else radiance
+        check_shape("radiance", radiance, ("C",), ("h", "w", "C"), fix="an image of one channel is radiance[..., None]")
         object.__setattr__(self, "radiance", radiance)
         if self.rotation is not None:
             self._set("rotation", 3, 3)

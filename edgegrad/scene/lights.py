@@ -86,15 +86,15 @@ class Light:
 
     # -- what the classes share ---------------------------------------------------------------------------------------
 
-    def _set(self, name: str, *shape: int | str, unit: bool = False) -> None:
+    def _set(self, name: str, *shape: int | str, unit: bool = False, fix: str = "") -> None:
         value = numbers(name, getattr(self, name))
         if shape == ():
             if value.numel() != 1:
-                color = "; give the colour as color=" if name == "intensity" and value.dim() == 1 else ""
+                color = "; give the colour as color=" if name == "intensity" else ""
                 raise ValueError(f"{name}: expected one number, got shape {tuple(value.shape)}{color}")
             value = value if value.dim() == 0 else value.reshape(())  # a leaf stays one
         else:
-            check_shape(name, value, shape)
+            check_shape(name, value, shape, fix=fix)
         if unit and values_visible(value) and not bool((value.detach() != 0).any()):
             raise ValueError(f"{name}: expected a direction, got zeros")
         object.__setattr__(self, name, value)
@@ -102,7 +102,7 @@ class Light:
     def _set_power(self) -> None:
         self._set("intensity")
         if getattr(self, "color") is not None:  # noqa: B009
-            self._set("color", "C")
+            self._set("color", "C", fix="a number for all channels is intensity=")
 
     def _power(self, like: Tensor) -> Tensor:
         """(1, C) or (1, 1): intensity times colour."""
@@ -258,7 +258,7 @@ class SphericalHarmonics(Light):
     infinite = True
 
     def __post_init__(self) -> None:
-        self._set("coefficients", 9, "C")
+        self._set("coefficients", 9, "C", fix="a column for each channel: of one, coefficients[:, None]")
         if self.rotation is not None:
             self._set("rotation", 3, 3)
             assert self.rotation is not None

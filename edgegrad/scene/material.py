@@ -108,7 +108,8 @@ class Material:
     roughness     0 … 1: see below
     emission      radiance of its own, W/(sr m²) or whatever unit the lights have; a mesh with emission is a light
     normal_map    Texture (h, w, 3) of linear numbers in [0, 1], of which 2 n − 1 is the normal in the tangent frame of its uvs,
-                  as in glTF: red along u, green along v (upwards), blue along the normal
+                  as in glTF: red along u, green along v (upwards), blue along the normal. Of a mesh with normals, the frames at
+                  the corners of faces are MikkTSpace's
     normal_scale  multiplies the first two of these
     two_sided     False: seen from behind (vertices clockwise), faces are black and emit nothing
     alpha_mode    "MASK": the mesh's alpha, if it has one, cuts out where it is below its cutoff. "OPAQUE": it must have none.
@@ -166,8 +167,8 @@ class Material:
     @property
     def channels(self) -> int | None:
         """C, or None where all is grey."""
-        counts = [n for p in (self.base_color, self.emission) if (n := _channels(p)) not in (None, 1)]
-        return counts[0] if counts else None
+        counts = (_channels(self.base_color), _channels(self.emission))
+        return next((count for count in counts if count not in (None, 1)), None)
 
     @property
     def is_glossy(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,30 +10,38 @@ from torch import Tensor
 from .rows import rows_of
 
 
-def wrapped(cell: Tensor, count: int, wrap: str) -> Tensor:
-    """Texels as they are counted in the texture, int64."""
+def wrapped(cell: Tensor, count: int | Tensor, wrap: str) -> Tensor:
+    """Texels as they are counted in the texture, int64; `count` of them, or (N,) of textures of their own."""
     i = cell.detach().long()
     if wrap == "repeat":
         return i % count
     if wrap == "clamp":
-        return i.clamp(0, count - 1)
+        return torch.minimum(i.clamp(min=0), torch.as_tensor(count - 1, device=i.device))
     i = i % (2 * count)
     return torch.minimum(i, 2 * count - 1 - i)
 
 
 def bilinear(texture: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
     h, w = texture.shape[:2]
+    return _bilinear(texture.reshape(h * w, -1), 0, h, w, uv, wraps)
+
+
+def _bilinear(
+    texels: Tensor, first: int | Tensor, h: int | Tensor, w: int | Tensor, uv: Tensor, wraps: tuple[str, ...]
+) -> Tensor:
+    """Of textures h by w, row by row from the row `first` of texels (M, K): of one, or (N,) of one for each point."""
     x, y = uv[:, 0].double() * w - 0.5, (1 - uv[:, 1].double()) * h - 0.5
     x0, y0 = x.detach().floor(), y.detach().floor()
-    fx, fy = (x - x0).to(texture.dtype)[:, None], (y - y0).to(texture.dtype)[:, None]
-    flat = texture.reshape(h * w, -1)
+    fx, fy = (x - x0).to(texels.dtype)[:, None], (y - y0).to(texels.dtype)[:, None]
+    columns, rows = (
+        [wrapped(at + k, n, wrap) for k in (0, 1)] for at, n, wrap in ((x0, w, wraps[0]), (y0, h, wraps[1]))
+    )
 
-    def texels(dy: int, dx: int) -> Tensor:
-        return rows_of(flat, wrapped(y0 + dy, h, wraps[1]) * w + wrapped(x0 + dx, w, wraps[0]))
+    def across(row: Tensor) -> Tensor:
+        left, right = (rows_of(texels, first + row * w + column) for column in columns)
+        return (1 - fx) * left + fx * right
 
-    top = (1 - fx) * texels(0, 0) + fx * texels(0, 1)
-    bottom = (1 - fx) * texels(1, 0) + fx * texels(1, 1)
-    return (1 - fy) * top + fy * bottom
+    return (1 - fy) * across(rows[0]) + fy * across(rows[1])
 
 
 def nearest(texture: Tensor, cell: Tensor, wraps: tuple[str, ...]) -> Tensor:
@@ -55,22 +63,33 @@ def look_up(texture: Tensor, uv: Tensor, wraps: tuple[str, ...], filter: str) ->
     return bilinear(texture, uv, wraps)
 
 
-def pyramid(texture: Tensor) -> list[Tensor]:
-    """The texture, and its means over squares of 2, 4, 8 … texels."""
-    levels = [texture]
-    while max(levels[-1].shape[:2]) > 1:
-        image = levels[-1].movedim(-1, 0)[None]
-        size = max(1, image.shape[2] // 2), max(1, image.shape[3] // 2)
-        levels.append(torch.nn.functional.adaptive_avg_pool2d(image, size)[0].movedim(0, -1))
-    return levels
+class Pyramid(NamedTuple):
+    """A texture, and its means over squares of 2, 4, 8 … texels."""
 
+    texels: Tensor  # (M, K) of one level after the other, row by row
+    first: Tensor  # (L,) int64, the first row of a level
+    height: Tensor  # (L,) int64
+    width: Tensor  # (L,) int64
 
-def trilinear(levels: list[Tensor], level: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
-    """(N, K) between the two levels of a pyramid around `level` (N,)."""
-    level = level.clamp(0, len(levels) - 1)
-    below = level.floor()
-    value: Any = 0
-    for k, image in enumerate(levels):
-        weight = torch.where(below == k, 1 - (level - below), torch.where(below == k - 1, level - below, 0.0))
-        value = value + weight.to(image.dtype)[:, None] * bilinear(image, uv, wraps)
-    return value
+    @classmethod
+    def of(cls, texture: Tensor) -> Pyramid:
+        levels = [texture]
+        while max(levels[-1].shape[:2]) > 1:
+            image = levels[-1].movedim(-1, 0)[None]
+            size = max(1, image.shape[2] // 2), max(1, image.shape[3] // 2)
+            levels.append(torch.nn.functional.adaptive_avg_pool2d(image, size)[0].movedim(0, -1))
+        height, width = (torch.tensor([n.shape[axis] for n in levels], device=texture.device) for axis in (0, 1))
+        count = height * width
+        texels = torch.cat([level.reshape(-1, texture.shape[2]) for level in levels])
+        return cls(texels, count.cumsum(0) - count, height, width)
+
+    def look_up(self, level: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
+        """(N, K) at uv (N, 2), linear between the two levels around `level` (N,)."""
+        level = level.clamp(0, len(self.first) - 1)
+        below = level.detach().floor().long()
+        share = (level - below).to(self.texels.dtype)[:, None]
+        fine, coarse = (
+            _bilinear(self.texels, self.first[at], self.height[at], self.width[at], uv, wraps)
+            for at in (below, (below + 1).clamp(max=len(self.first) - 1))
+        )
+        return (1 - share) * fine + share * coarse

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -99,3 +100,45 @@ def _mapped(thing: Any, function: Callable[[Tensor], Tensor]) -> Any:
         if (new := _mapped(old, function)) is not old:
             fields[field.name] = new
     return dataclasses.replace(thing, **fields) if fields else thing
+
+
+def savable(thing: T) -> T:
+    """With copies of tensors that were made in torch.inference_mode(), which autograd does not save, unless that mode is on."""
+    if torch.compiler.is_compiling() or torch.is_inference_mode_enabled():
+        return thing
+    return _mapped(thing, lambda tensor: tensor.clone() if tensor.is_inference() else tensor)
+
+
+def to_text(thing: Any, tensors: list[Tensor]) -> str:
+    """What a dataclass is beside its tensors, which it adds to `tensors`: JSON that torch.compile can trace."""
+    if isinstance(thing, Tensor):
+        tensors.append(thing)
+        return f'{{"tensor": {len(tensors) - 1}}}'
+    if isinstance(thing, (tuple, list)):
+        return "[" + ", ".join([to_text(part, tensors) for part in thing]) + "]"
+    if dataclasses.is_dataclass(thing):
+        parts = [f'"{f.name}": {to_text(getattr(thing, f.name), tensors)}' for f in dataclasses.fields(thing)]
+        return f'{{"{type(thing).__name__}": {{{", ".join(parts)}}}}}'
+    if thing is None:
+        return "null"
+    if isinstance(thing, bool):
+        return "true" if thing else "false"
+    if isinstance(thing, (int, float)):
+        return f"{thing}"
+    escaped = thing.replace("\\", r"\\").replace('"', r"\"")
+    return f'"{escaped}"'
+
+
+def from_text(text: str, tensors: Sequence[Tensor], classes: Sequence[type]) -> Any:
+    """What to_text() was given, of dataclasses among `classes`."""
+    known = {kind.__name__: kind for kind in classes}
+
+    def whole(thing: Any) -> Any:
+        if isinstance(thing, list):
+            return tuple(whole(part) for part in thing)
+        if not isinstance(thing, dict):
+            return thing
+        ((kind, parts),) = thing.items()
+        return tensors[parts] if kind == "tensor" else known[kind](**{n: whole(part) for n, part in parts.items()})
+
+    return whole(json.loads(text, strict=False))

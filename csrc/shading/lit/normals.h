@@ -11,6 +11,7 @@ struct NormalSource {
     const int32_t* normal_faces = nullptr;  // (F, 3) rows of normals
     Source map;
     int map_scale = no_table;
+    Source tangents;  // at corners, with the handedness (edgegrad/scene/mikktspace.py); none: of faces
 
     bool is_flat() const { return normals == no_table && !map.exists(); }
 };
@@ -57,10 +58,10 @@ inline void smooth_normal_vjp(const std::vector<Table>& tables, const NormalSour
     }
 }
 
-// The frame of texture coordinates on the face, and what the map says in it.
+// The frame of texture coordinates at the point, and what the map says in it.
 template <class S>
 struct BentNormal {
-    S d1, d2;                               // how v changes along the edges from the first corner
+    S d1 = 0, d2 = 0;                       // how v changes along the edges from the first corner
     Vector<S> e1, e2;                       // these
     double hand = 1;                        // −1 where the image is mirrored
     Vector<S> along, across, t, bitangent;  // ∂x/∂u of any length; what of it is normal to n; unit vectors
@@ -72,12 +73,19 @@ template <class S>
 BentNormal<S> bent_normal(const std::vector<Table>& tables, const NormalSource& source, const FacePoint<S>& at,
                           const FaceFrame<Vector<S>>& frame, Vector<S> n) {
     BentNormal<S> o;
-    Uv<S> uv[3];
-    for (int i = 0; i < 3; ++i) uv[i] = corner_uv<S>(tables, source.map, at.face, i);
-    o.d1 = uv[1].v - uv[0].v, o.d2 = uv[2].v - uv[0].v;
-    o.e1 = frame.corner[1] - frame.corner[0], o.e2 = frame.corner[2] - frame.corner[0];
-    if (plain(uv[1].u - uv[0].u) * plain(o.d2) - plain(o.d1) * plain(uv[2].u - uv[0].u) < 0) o.hand = -1;
-    o.along = o.hand * (o.d2 * o.e1 - o.d1 * o.e2);
+    if (source.tangents.exists()) {
+        S tangent[4];
+        value(tables, source.tangents, at, 4, tangent);
+        o.along = vector(tangent[0], tangent[1], tangent[2]);
+        if (plain(tangent[3]) < 0) o.hand = -1;
+    } else {
+        Uv<S> uv[3];
+        for (int i = 0; i < 3; ++i) uv[i] = corner_uv<S>(tables, source.map, at.face, i);
+        o.d1 = uv[1].v - uv[0].v, o.d2 = uv[2].v - uv[0].v;
+        o.e1 = frame.corner[1] - frame.corner[0], o.e2 = frame.corner[2] - frame.corner[0];
+        if (plain(uv[1].u - uv[0].u) * plain(o.d2) - plain(o.d1) * plain(uv[2].u - uv[0].u) < 0) o.hand = -1;
+        o.along = o.hand * (o.d2 * o.e1 - o.d1 * o.e2);
+    }
     o.across = o.along - dot(n, o.along) * n;
     value(tables, source.map, at, 3, o.bent);
     for (S& x : o.bent) x = S(2) * x - S(1);
@@ -87,6 +95,19 @@ BentNormal<S> bent_normal(const std::vector<Table>& tables, const NormalSource& 
     o.m = o.scale * (o.bent[0] * o.t + o.bent[1] * o.bitangent) + o.bent[2] * n;
     o.exists = dot(plain(o.m), plain(o.m)) > 0;
     return o;
+}
+
+// Of d2 e1 − d1 e2.
+inline void face_tangent_vjp(const Source& map, const FacePoint<double>& at, const BentNormal<double>& o, Vec3 bar,
+                             FaceFrame<Vec3>& frame_bar, Cotangents& to) {
+    frame_bar.corner[0] -= (o.d2 - o.d1) * bar;
+    frame_bar.corner[1] += o.d2 * bar, frame_bar.corner[2] -= o.d1 * bar;
+    const double d1_bar = -dot(o.e2, bar), d2_bar = dot(o.e1, bar);
+    const double v_bar[3] = {-d1_bar - d2_bar, d1_bar, d2_bar};
+    for (int i = 0; i < 3; ++i) {
+        const double uv_bar[2] = {0, v_bar[i]};
+        to.add(map.uvs, map.uv_faces[3 * at.face + i], uv_bar);
+    }
 }
 
 template <class S>
@@ -120,16 +141,13 @@ inline void shading_normal_vjp(const std::vector<Table>& tables, const NormalSou
             // across = along − n (n · along)
             const Vec3 across_bar = unit_vjp(o.across, t_bar);
             const double kept = dot(n, across_bar);
-            const Vec3 along_bar = o.hand * (across_bar - kept * n);
+            const Vec3 along_bar = across_bar - kept * n;
             n_bar -= dot(n, o.along) * across_bar + kept * o.along;
-            // along = ± (d2 e1 − d1 e2)
-            frame_bar.corner[0] -= (o.d2 - o.d1) * along_bar;
-            frame_bar.corner[1] += o.d2 * along_bar, frame_bar.corner[2] -= o.d1 * along_bar;
-            const double d1_bar = -dot(o.e2, along_bar), d2_bar = dot(o.e1, along_bar);
-            const double v_bar[3] = {-d1_bar - d2_bar, d1_bar, d2_bar};
-            for (int i = 0; i < 3; ++i) {
-                const double uv_bar[2] = {0, v_bar[i]};
-                to.add(source.map.uvs, source.map.uv_faces[3 * at.face + i], uv_bar);
+            if (source.tangents.exists()) {
+                const double tangent_bar[4] = {along_bar.x, along_bar.y, along_bar.z, 0};
+                value_vjp(tables, source.tangents, at, 4, tangent_bar, b_bar, to);
+            } else {
+                face_tangent_vjp(source.map, at, o, o.hand * along_bar, frame_bar, to);
             }
         }
     }
