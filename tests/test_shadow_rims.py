@@ -1,0 +1,135 @@
+"""Shadows of rims of cut-outs: of a rectangle of which a ramp of alpha leaves a part, in closed form, and of curved rims against
+finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from cut_outs import disc, quad
+from finite_differences import Case, check, check_ratio, estimate
+from lit_scenes import plane
+from test_shadows import LIGHTS, exact, gradient, of_panel, of_sky, panel, sky, vector
+from test_shadows import Setting as Whole
+from torch import Tensor
+
+import edgegrad as eg
+
+
+class Setting(Whole):
+    """The rectangle is there where alpha, from one texel to the next, is at least ½."""
+
+    filter = "linear"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.u = vector(0.07, 0.9, 1.0, 0.15)  # of the corners: the rim is parallel to no side
+        self.alpha = vector(0.1, 0.8)
+
+    def scene(self, lights: Callable[[Whole], object]) -> eg.Scene:
+        scene = super().scene(lights)
+        ground, caster = scene.meshes
+        uvs = torch.stack([self.u, vector(0.1, 0.1, 0.9, 0.9)], 1)
+        look = {"alpha": self.alpha.expand(1, 2), "filter": self.filter, "wrap": "clamp"}
+        return scene.replace(meshes=[ground, caster.replace(uvs=uvs, uv_faces=caster.faces, **look)])
+
+    def outline(self) -> Tensor:
+        """The rim runs from the side 01 over the diagonal 02 to the side 32."""
+        c, u, (low, high) = self.corners, self.u, self.alpha
+        rim = vector(0.5) if self.filter == "nearest" else 0.25 + 0.5 * (0.5 - low) / (high - low)
+
+        def on(i: int, j: int) -> Tensor:
+            return c[i] + (rim - u[i]) / (u[j] - u[i]) * (c[j] - c[i])
+
+        return torch.stack([on(0, 1), c[1], c[2], on(3, 2), on(0, 2)])
+
+
+class Nearest(Setting):
+    filter = "nearest"
+
+
+Setting.motions = {
+    **Whole.motions,
+    "alpha rises": lambda s, t: setattr(s, "alpha", s.alpha + t * vector(0.3, 1.0)),
+    "u moves": lambda s, t: setattr(s, "u", s.u + t * vector(0.2, -0.7, -0.4, 0.5)),
+}
+FAST = ("one corner", "light moves", "ground rises", "alpha rises", "u moves")
+MOTIONS = [pytest.param(m, marks=[] if m in FAST else pytest.mark.slow) for m in Setting.motions]
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_shadow_of_a_rim(motion: str, light: str) -> None:
+    found = estimate([gradient(motion, LIGHTS[light], seed, Setting) for seed in range(6)])
+    check(f"{light}, {motion}", exact(motion, infinite=light == "sun", kind=Setting), found)
+
+
+@pytest.mark.parametrize("motion", ["one corner", "u moves"])
+def test_shadow_of_nearest_texels(motion: str) -> None:
+    found = estimate([gradient(motion, LIGHTS["point"], seed, Nearest) for seed in range(6)])
+    check(f"nearest, {motion}", exact(motion, kind=Nearest), found)
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_penumbra_of_a_rim(motion: str) -> None:
+    found = estimate([gradient(motion, panel, seed, Setting) for seed in range(8)])
+    check(f"panel, {motion}", of_panel(motion, Setting), found)
+
+
+@pytest.mark.parametrize("motion", ["alpha rises", "u moves"])
+def test_shadow_of_a_rim_before_an_even_sky(motion: str) -> None:
+    found = estimate([gradient(motion, sky, seed, Setting) for seed in range(32)])
+    check(f"sky, {motion}", of_sky(motion, Setting), found)
+
+
+# -- against finite differences ------------------------------------------------------------------------------------------
+
+
+def noise(*shape: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+
+
+def case(what: str, light: str, look: str = "MASK", filter: str = "linear") -> Case:
+    """A curved leaf with a disc of it there, tilted over a floor."""
+    leaf = quad(3, alpha=disc(12) if filter == "nearest" else disc(9), filter=filter)
+    x, y, _ = leaf.verts.unbind(1)
+    leaf = leaf.replace(
+        verts=0.6 * torch.stack([x, y, 0.3 * x * x + 0.4 * x], 1) + vector(0.1, 0, 1),
+        material=eg.Material(0.3, alpha_mode=look),
+    )
+    moved = {
+        "verts": lambda t: leaf.replace(verts=leaf.verts + t * (0.1 * noise(len(leaf.verts), 3) + vector(0.2, 0.1, 0))),
+        "uvs": lambda t: leaf.replace(uvs=leaf.uvs + t * (0.05 * noise(len(leaf.uvs), 2) + vector(0.2, 0.1))),
+        "alpha": lambda t: leaf.replace(alpha=leaf.alpha + 0.3 * t * noise(*leaf.alpha.shape).abs()),
+    }
+
+    def at(t: Tensor) -> tuple[eg.Scene, eg.Camera]:
+        place = vector(0.3, -0.2, 2.6) + (t * vector(0.6, 0.2, 0.3) if what == "light" else 0)
+        lights = {
+            "point": lambda: eg.PointLight(place, 10.0),
+            "sun": lambda: eg.DirectionalLight(-place, 2.0),
+            "panel": lambda: eg.AreaLight.rectangle(place, vector(0.3, 0, 0.1), vector(0, 0.3, 0), 12.0),
+        }
+        floor = plane(2.0, material=eg.Material(0.8))
+        camera = eg.Camera.look_at((0.2, -2.6, 0.9), (0.0, 0, 0.0), up=(0, 0, 1), fov_y=40, size=(48, 32))
+        return eg.Scene([moved.get(what, lambda t: leaf)(t), floor], lights=[lights[light]()]), camera.to(torch.float64)
+
+    return at
+
+
+FD_CASES = {
+    "alpha, point": case("alpha", "point"),
+    "verts, sun": case("verts", "sun"),
+    "uvs, point": case("uvs", "point"),
+    "light, point": case("light", "point"),
+    "alpha, blend, point": case("alpha", "point", "BLEND"),
+    "verts, nearest, point": case("verts", "point", filter="nearest"),
+    "alpha, panel": case("alpha", "panel"),
+}
+QUICK = ("alpha, point",)
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in FD_CASES])
+def test_curved_rims(name: str) -> None:
+    check_ratio(FD_CASES[name], 0.02, spp=512, seeds=6, step_spacing=1 / 8, edge_samples=8000, surface_samples=20_000)
