@@ -74,12 +74,10 @@ def panes(surfaces: Surfaces) -> Tensor:
 
 def let_through(frame: Frame, records: CurveRecords) -> Tensor:
     """(S,) float64: what the surfaces before samples on curves let through, Π (1 − α), without derivatives."""
+    sample = frame.here(records.pane_row_of)
+    passed = frame.fixed_hits(records.pane, records.pane_b, records.x[records.pane_row_of])
     total = torch.ones(len(records.x), dtype=torch.float64, device=frame.device)
-    if len(records.pane) == 0:
-        return total
-    sample = records.pane_row_of
-    passed = frame.fixed_hits(records.pane, records.pane_b, records.x[sample])
-    return total.index_reduce(0, frame.here(sample), 1 - opacity(passed)[:, 0].double(), "prod")
+    return total.scatter_reduce(0, sample, 1 - opacity(passed)[:, 0].double(), "prod")
 
 
 def opacity(hits: Hits) -> Tensor:
