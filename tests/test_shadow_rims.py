@@ -22,6 +22,7 @@ class Setting(Whole):
     """The rectangle is there where alpha, from one texel to the next, is at least ½."""
 
     filter = "linear"
+    wrap = "clamp"
 
     def __init__(self) -> None:
         super().__init__()
@@ -32,7 +33,7 @@ class Setting(Whole):
         scene = super().scene(lights)
         ground, caster, *others = scene.meshes
         uvs = torch.stack([self.u, vector(0.1, 0.1, 0.9, 0.9)], 1)
-        look = {"alpha": self.alpha.expand(1, 2), "filter": self.filter, "wrap": "clamp"}
+        look = {"alpha": self.alpha.expand(1, 2), "filter": self.filter, "wrap": self.wrap}
         return scene.replace(meshes=[ground, caster.replace(uvs=uvs, uv_faces=caster.faces, **look), *others])
 
     def outline(self) -> Tensor:
@@ -50,6 +51,29 @@ class Nearest(Setting):
     filter = "nearest"
 
 
+class Repeated(Nearest):
+    """Between texels at the ends of the rectangle there is a border too, but nothing beyond."""
+
+    wrap = "repeat"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.u = vector(0, 1, 1, 0)
+
+
+class Seam(Setting):
+    """Of the two triangles of the rectangle the first is there and the second cut out, up to the diagonal."""
+
+    def scene(self, lights: Callable[[Whole], object]) -> eg.Scene:
+        scene = super().scene(lights)
+        ground, caster, *others = scene.meshes
+        uvs, uv_faces = vector(0.9, 0.95, 0.05, 0.1)[:, None].expand(-1, 2), torch.tensor([[0, 1, 0], [2, 3, 2]])
+        return scene.replace(meshes=[ground, caster.replace(uvs=uvs, uv_faces=uv_faces), *others])
+
+    def outline(self) -> Tensor:
+        return self.corners[:3]
+
+
 Setting.motions = {
     **Whole.motions,
     "alpha rises": lambda s, t: setattr(s, "alpha", s.alpha + t * vector(0.3, 1.0)),
@@ -64,6 +88,13 @@ MOTIONS = [pytest.param(m, marks=[] if m in FAST else pytest.mark.slow) for m in
 def test_shadow_of_a_rim(motion: str, light: str) -> None:
     found = estimate([gradient(motion, LIGHTS[light], seed, Setting, edge_samples=12_000) for seed in range(4)])
     check(f"{light}, {motion}", exact(motion, infinite=light == "sun", kind=Setting), found)
+
+
+@pytest.mark.parametrize("kind", [Repeated, Seam])
+@pytest.mark.parametrize("motion", ["one corner", "light moves"])
+def test_shadow_of_rims_along_edges(motion: str, kind: type[Setting]) -> None:
+    found = estimate([gradient(motion, LIGHTS["point"], seed, kind, edge_samples=12_000) for seed in range(4)])
+    check(f"{kind.__name__}, {motion}", exact(motion, kind=kind), found)
 
 
 @pytest.mark.parametrize("motion", ["one corner", "u moves"])
@@ -148,3 +179,35 @@ def test_what_blends_casts_the_shadow_of_what_is_cut_out_at_one_half() -> None:
     blends, cut = (derivative(case("alpha", "point", look, camera=BESIDE), 2, **options) for look in ("BLEND", "MASK"))
     assert abs(cut.mean) > 10
     assert abs(blends.mean - cut.mean) < 0.005 * abs(cut.mean)
+
+
+def test_forward_mode_and_same_bits() -> None:
+    """By alpha alone, at any number of threads."""
+    floor, leaf = plane(2.0, material=eg.Material(0.8)), quad(alpha=disc(9), material=eg.Material(0.3))
+    leaf = leaf.replace(verts=0.6 * leaf.verts + vector(0, 0, 1))
+
+    def seen(alpha: Tensor) -> Tensor:
+        scene = eg.Scene([floor, leaf.replace(alpha=alpha)], lights=[eg.PointLight(vector(0.3, -0.2, 2.6), 10.0)])
+        return eg.render(scene, BESIDE, spp=4) * torch.linspace(0, 1, 32, dtype=torch.float64)[:, None]
+
+    alpha, found, before = disc(9), [], torch.get_num_threads()
+    moved = 0.2 + alpha
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            given = alpha.clone().requires_grad_()
+            found.append(torch.autograd.grad(seen(given).sum(), given)[0])
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*found)
+    _, forward = torch.func.jvp(seen, (alpha,), (moved,))
+    assert float(forward.sum()) == pytest.approx(float((found[0] * moved).sum()), rel=1e-6)
+    assert abs(float(forward.sum())) > 1
+
+
+def test_plan_says_that_rims_move() -> None:
+    floor, leaf = plane(material=eg.Material()), quad(alpha=disc(9), material=eg.Material())
+    scene = eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0, 0, 3))])
+    assert not eg.plan(scene, ABOVE)["shadow edges"].on
+    moving = leaf.replace(alpha=disc(9).requires_grad_())
+    assert eg.plan(scene.replace(meshes=[floor, moving]), ABOVE)["shadow edges"].on

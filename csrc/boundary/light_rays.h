@@ -103,7 +103,7 @@ class LightRays {
     }
 
     bool set_edge(int64_t edge, double t, Waiting& w) const {
-        if (!casts(edge, t)) return false;
+        if (!casts(edge, t, w.point)) return false;
         const HalfEdge& h = view_.geometry.topology().half_edges(edge)[0];
         const SceneView<T>& scene = view_.scene;
         const auto vertex_of = [&](int c) { return scene.faces[3 * int64_t(h.face) + c]; };
@@ -150,13 +150,21 @@ class LightRays {
     }
 
     // Whether a face beside the edge casts a shadow from that place of it: where none does, light passes on both sides.
-    bool casts(int64_t edge, double t) const {
-        for (const HalfEdge& h : view_.geometry.topology().half_edges(edge)) {
-            double b[3] = {};
-            b[h.first()] = 1 - t, b[h.second()] = t;
-            if (shows(casters_, h.face, {b[1], b[2]})) return true;
+    // Where some are there and others cut out, those that are must lie on one side, which then is known.
+    bool casts(int64_t edge, double t, ShadowPoint& point) const {
+        const auto halves = view_.geometry.topology().half_edges(edge);
+        const auto there = [&](const HalfEdge& h) { return shows(casters_, h.face, beside_edge(casters_, h, t)); };
+        if (!cut_outs_jump(casters_, view_.geometry.topology(), edge))
+            return std::any_of(halves.begin(), halves.end(), there);
+        bool on_side[2] = {};
+        for (const HalfEdge& h : halves) {
+            if (!there(h)) continue;
+            const Vec3 v = corner(casters_, h.face, 0), to = light_.infinite ? point.light : point.light - v;
+            const double height = dot(cross(corner(casters_, h.face, 1) - v, corner(casters_, h.face, 2) - v), to);
+            if (height != 0) on_side[(height < 0) != h.backwards] = true;
         }
-        return false;
+        point.side = on_side[1] ? -1 : 1;
+        return on_side[0] != on_side[1];
     }
 
     bool accept(const Waiting& w, int32_t face, Meeting& m) const {

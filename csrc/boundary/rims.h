@@ -148,7 +148,7 @@ class RimFinder {
 
    private:
     static constexpr double most_cells = 0x1p22;
-    static constexpr int64_t most_rims = 1 << 18;
+    static constexpr int64_t most_rims = 1 << 16;
 
     static double dot(Vec2 a, Vec2 b) { return a.x * b.x + a.y * b.y; }
     static Vec2 gradient_across(int border) {
@@ -220,10 +220,13 @@ class RimFinder {
         const double squared = dot(chord, chord);
         if (!(squared > 0)) return;
         // Where it meets the face's sides.
-        double part[8] = {0, 1};
+        double part[8] = {0, 1};  // ascends
         int n = 2;
         const auto cut = [&](double t) {
-            if (t > 0 && t < 1) part[n++] = t;
+            if (!(t > 0 && t < 1)) return;
+            int k = n++;
+            for (; part[k - 1] > t; --k) part[k] = part[k - 1];
+            part[k] = t;
         };
         for (int k = 0; k < 3; ++k) {
             const Vec2 a = cells.corner[k], along = cells.corner[(k + 1) % 3] - a;
@@ -236,7 +239,6 @@ class RimFinder {
                                  [&](double s) { cut(dot(a + s * along - end[0], chord) / squared); });
             }
         }
-        std::sort(part, part + n);
         const auto at = [&](double t) {
             const Vec2 q = end[0] + t * chord;
             return cell ? cell->on_rim(q, chord) : q;
@@ -244,13 +246,14 @@ class RimFinder {
         for (int k = 1; k < n; ++k) {
             if (!(part[k] > part[k - 1])) continue;
             const Vec2 middle = at(0.5 * (part[k - 1] + part[k]));
-            if (!lies_on(cells, middle, cell ? cell->gradient(middle) : gradient_across(border))) continue;
+            if (!lies_on(cells, middle, cell ? cell->gradient(middle) : Vec2{})) continue;
             out.push_back({face, border, cell ? cell->i : 0, cell ? cell->j : 0, cells.at(at(part[k - 1])),
                            cells.at(at(part[k])), every});
         }
     }
 
-    // Whether a point of the rim lies on the face. A rim along a side of it belongs to the face that is cut out there.
+    // Whether a point of the rim lies on the face. A rim along a side of it belongs to the face that is cut out there;
+    // between nearest texels it is the edge that casts the shadow.
     static bool lies_on(const FaceCells<T>& cells, Vec2 q, Vec2 gradient) {
         const double turn = cells.area > 0 ? 1 : -1;
         for (int k = 0; k < 3; ++k) {

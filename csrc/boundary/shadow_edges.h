@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "backward/view.h"
+#include "boundary/curve.h"
 #include "boundary/light_wedge.h"
 #include "boundary/rims.h"
 #include "core/sampler.h"
@@ -28,6 +29,15 @@ struct ShadowPiece {
     int64_t rim() const { return -1 - edge; }
     static int64_t of_rim(int64_t rim) { return -1 - rim; }
 };
+
+// Whether of two faces on an edge one may be there and the other cut out along it.
+template <class T>
+bool cut_outs_jump(const SceneView<T>& casters, const Topology& topology, int64_t edge) {
+    if (!casters.cut_outs.face) return false;
+    const auto halves = topology.half_edges(edge);
+    return std::any_of(halves.begin() + 1, halves.end(),
+                       [&](const HalfEdge& h) { return cut_outs_jump(casters, halves[0], h); });
+}
 
 // A light's parts as many edges ask for them.
 struct PartsBall {
@@ -107,8 +117,9 @@ class FacesBeforeLight {
 template <class T>
 class EdgeWedge {
    public:
-    EdgeWedge(const BackwardView<T>& view, const FacesBeforeLight<T>& faces, const std::vector<Rim>& rims)
-        : view_(view), faces_(faces), rims_(rims) {}
+    EdgeWedge(const BackwardView<T>& view, const SceneView<T>& casters, const FacesBeforeLight<T>& faces,
+              const std::vector<Rim>& rims)
+        : view_(view), casters_(casters), faces_(faces), rims_(rims) {}
 
     bool set(const ShadowPiece& piece) {
         return piece.is_rim() ? set_rim(rims_[piece.rim()].face, piece.part) : set(piece.edge, piece.part);
@@ -123,7 +134,7 @@ class EdgeWedge {
     }
 
     // False where the edge is a silhouette from nowhere, or only because faces that are seen edge-on are taken for
-    // turned.
+    // turned. Where not all of its faces may be there, it depends on the place from where it is one (LightRays).
     bool set(int64_t edge, int64_t part) {
         heights_.clear();
         bool known = false;
@@ -134,7 +145,8 @@ class EdgeWedge {
             heights_.push_back(half.backwards ? -h.at : h.at);
         }
         if (!known) return false;
-        wedge_.clip(heights_);
+        if (cut_outs_jump(casters_, view_.geometry.topology(), edge)) wedge_.all();
+        else wedge_.clip(heights_);
         return wedge_.fraction() > 0;
     }
     LightWedge& operator*() { return wedge_; }
@@ -142,6 +154,7 @@ class EdgeWedge {
 
    private:
     const BackwardView<T>& view_;
+    const SceneView<T>& casters_;
     const FacesBeforeLight<T>& faces_;
     const std::vector<Rim>& rims_;
     std::vector<Vec3> heights_;
@@ -153,9 +166,9 @@ class EdgeWedge {
 template <class T>
 class ShadowEdgeFinder {
    public:
-    ShadowEdgeFinder(const BackwardView<T>& view, const LightParts& light, const FacesBeforeLight<T>& faces,
-                     const std::vector<Rim>& rims)
-        : view_(view), light_(light), faces_(faces), rims_(rims) {}
+    ShadowEdgeFinder(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
+                     const FacesBeforeLight<T>& faces, const std::vector<Rim>& rims)
+        : view_(view), casters_(casters), light_(light), faces_(faces), rims_(rims) {}
 
     std::vector<ShadowPiece> find(int64_t tests) const {
         const int64_t edges = view_.geometry.topology().n_edges();
@@ -165,17 +178,17 @@ class ShadowEdgeFinder {
                 if (may_cast(e)) part.push_back(e);
             return part;
         });
-        int64_t asking = int64_t(rims_.size());
+        int64_t asking = 0;
         for (const auto& part : may) asking += int64_t(part.size());
         const int64_t asked = std::clamp<int64_t>(tests / std::max<int64_t>(asking, 1), 1, light_.count);
         std::vector<std::vector<ShadowPiece>> parts(may.size());
         view_.team.each(int64_t(may.size()), [&](int64_t k) {
-            EdgeWedge<T> wedge(view_, faces_, rims_);
+            EdgeWedge<T> wedge(view_, casters_, faces_, rims_);
             std::vector<ShadowPiece> part;
             for (const int64_t e : may[k]) add(e, asked, wedge, part);
             parts[k] = std::move(part);
         });
-        for (auto& block : of_rims(asked)) parts.push_back(std::move(block));
+        for (auto& block : of_rims(tests / 4)) parts.push_back(std::move(block));
         int64_t edges_found = 0;
         for (const auto& block : parts)
             for (size_t i = 0; i < block.size(); ++i) edges_found += i == 0 || block[i].edge != block[i - 1].edge;
@@ -202,6 +215,7 @@ class ShadowEdgeFinder {
     // False where all of the light surely sees both faces of an edge from the same sides.
     bool may_cast(int64_t edge) const {
         if (!view_.geometry.topology().joins_two(edge)) return true;
+        if (cut_outs_jump(casters_, view_.geometry.topology(), edge)) return true;
         const auto beside = view_.geometry.topology().faces(edge);
         const int one = faces_.side(beside[0]), other = faces_.side(beside[1]);
         return one == 0 || other == 0 || one != other;
@@ -239,11 +253,12 @@ class ShadowEdgeFinder {
         if (std::isfinite(measure) && measure > 0) out.push_back({e, int32_t(part), 0, 1, share, measure});
     }
 
-    std::vector<std::vector<ShadowPiece>> of_rims(int64_t asked) const {
+    std::vector<std::vector<ShadowPiece>> of_rims(int64_t tests) const {
+        const int64_t asked = std::clamp<int64_t>(tests / std::max<int64_t>(int64_t(rims_.size()), 1), 1, light_.count);
         const Hash random(hash(view_.options.seed, 12, gradient_stream), 0);
         const double step = double(light_.count) / double(asked);
         return view_.team.of_blocks(int64_t(rims_.size()), [&](int64_t begin, int64_t end) {
-            EdgeWedge<T> wedge(view_, faces_, rims_);
+            EdgeWedge<T> wedge(view_, casters_, faces_, rims_);
             std::vector<ShadowPiece> out;
             for (int64_t k = begin; k < end; ++k) {
                 const Rim& rim = rims_[k];
@@ -265,6 +280,7 @@ class ShadowEdgeFinder {
     }
 
     const BackwardView<T>& view_;
+    const SceneView<T>& casters_;
     const LightParts& light_;
     const FacesBeforeLight<T>& faces_;
     const std::vector<Rim>& rims_;

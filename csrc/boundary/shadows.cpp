@@ -219,7 +219,7 @@ class ShadowChunk {
     ShadowChunk(const ShadowScene<T>& scene, uint64_t seed, Contraction& contraction)
         : scene_(scene),
           sequence_(seed),
-          wedge_(scene.view, scene.faces, scene.rims),
+          wedge_(scene.view, scene.casters, scene.faces, scene.rims),
           source_(scene.view, scene.light.infinite),
           light_rays_(scene.view, scene.casters, scene.light, scene.rims),
           samples_(scene.view, source_, contraction) {}
@@ -279,7 +279,7 @@ void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const
     const int64_t count = std::clamp(expected / samples_of_interval, fewest_intervals, most_intervals);
     const FacesBeforeLight<T> faces(view.scene, light, view.team);
     const std::vector<Rim> rims = RimFinder<T>(casters).find(hash(view.options.seed, 13, gradient_stream), view.team);
-    std::vector<ShadowPiece> found = ShadowEdgeFinder<T>(view, light, faces, rims).find(pair_tests);
+    std::vector<ShadowPiece> found = ShadowEdgeFinder<T>(view, casters, light, faces, rims).find(pair_tests);
     if (light.extended) found = cut(found, double(count));
     const Pieces pieces(std::move(found), view.team);
     if (pieces.empty()) return;
