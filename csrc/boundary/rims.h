@@ -74,12 +74,6 @@ class FaceCells {
 struct AlphaCell {
     double i, j, f[4];
 
-    template <class T>
-    AlphaCell(const FaceCells<T>& cells, double i, double j) : i(i), j(j) {
-        const Footprint around = footprint_at(cells.texture, i, j, 0, 0);
-        for (int k = 0; k < 4; ++k) f[k] = double(cells.texture.texels[around.texel[k]]) - cells.cutoff;
-    }
-
     bool there(int k) const { return f[k] >= 0; }
     bool has_rim() const { return there(0) != there(1) || there(0) != there(2) || there(0) != there(3); }
     double both() const { return f[0] - f[1] - f[2] + f[3]; }
@@ -134,7 +128,9 @@ class RimFinder {
         const Vec2 a = cells.place(rim.begin), b = cells.place(rim.end), chord = b - a;
         Vec2 q = a + t * chord, gradient;
         if (rim.border == 0) {
-            const AlphaCell cell(cells, rim.i, rim.j);
+            const double i = rim.i, j = rim.j;
+            const AlphaCell cell{
+                i, j, {cells.alpha(i, j), cells.alpha(i + 1, j), cells.alpha(i, j + 1), cells.alpha(i + 1, j + 1)}};
             q = cell.on_rim(q, chord), gradient = cell.gradient(q);
             out.alpha = footprint_at(cells.texture, cell.i, cell.j, q.x - cell.i, q.y - cell.j);
         } else gradient = gradient_across(rim.border);
@@ -177,9 +173,18 @@ class RimFinder {
                 for (const double y : {j, j + 1})
                     if ((a.y < y) != (b.y < y)) take(a.x + (y - a.y) / (b.y - a.y) * (b.x - a.x));
             }
-            for (double i = std::floor(low); i <= high; ++i)
-                if (cells.linear) add_cell(face, cells, {cells, i, j}, every, out);
-                else add_texel(face, cells, i, j, every, out);
+            if (!(low <= high)) continue;
+            double i = std::floor(low);
+            if (!cells.linear) {
+                for (; i <= high; ++i) add_texel(face, cells, i, j, every, out);
+                continue;
+            }
+            const auto column = [&](double i) { return Vec2{cells.alpha(i, j), cells.alpha(i, j + 1)}; };
+            for (Vec2 left = column(i); i <= high; ++i) {
+                const Vec2 right = column(i + 1);
+                add_cell(face, cells, {i, j, {left.x, right.x, left.y, right.y}}, every, out);
+                left = right;
+            }
         }
     }
 
