@@ -140,7 +140,7 @@ def case(what: str, light: str, look: str = "MASK", filter: str = "linear", came
     moved = {
         "verts": lambda t: leaf.replace(verts=leaf.verts + t * (0.1 * noise(len(leaf.verts), 3) + vector(0.2, 0.1, 0))),
         "uvs": lambda t: leaf.replace(uvs=leaf.uvs + t * (0.05 * noise(len(leaf.uvs), 2) + vector(0.2, 0.1))),
-        "alpha": lambda t: leaf.replace(alpha=leaf.alpha + 2.0 * t * torch.linspace(0.3, 1, len(leaf.alpha))),
+        "alpha": lambda t: leaf.replace(alpha=leaf.alpha + t * torch.linspace(0.3, 1, len(leaf.alpha))),
     }
 
     def at(t: Tensor) -> tuple[eg.Scene, eg.Camera]:
