@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstdlib>
 #include <limits>
 #include <vector>
 
@@ -96,7 +97,7 @@ class RimFinder {
    public:
     explicit RimFinder(const SceneView<T>& scene) : scene_(scene) {}
 
-    // All, but of more cells or pieces than fit some ten milliseconds those that a seed draws.
+    // All, but of very many cells or pieces those that a seed draws: these stand for all.
     std::vector<Rim> find(uint64_t seed, Team& team) const {
         std::vector<Rim> found;
         if (!scene_.cut_outs.face) return found;

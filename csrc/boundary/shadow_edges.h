@@ -162,7 +162,8 @@ class EdgeWedge {
 };
 
 // The edges and rims of a scene that cast shadows of a light. Each edge between whose faces some of the light may lie
-// is asked before as many of its parts, spread evenly over their order, as give about `tests` pairs in all.
+// is asked before as many of its parts, spread evenly over their order, as give about `tests` pairs in all; rims, a
+// quarter as many.
 template <class T>
 class ShadowEdgeFinder {
    public:
