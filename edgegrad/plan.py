@@ -16,7 +16,7 @@ from .kernel.counts import COUNTS, table
 from .kernel.derivatives import moves
 from .kernel.flat import Flat
 from .kernel.operators import Hits, backward_kernel, image_room, pass_size
-from .kernel.request import MOVING, SLOTS, Request, Work, label, make_request, required
+from .kernel.request import MOVING, SLOTS, STEPPING, Request, Work, label, make_request, required
 from .library import core
 from .light.radiance import Lighting
 from .points.records import CURVE_BYTES, SURFACE_BYTES, without_colors
@@ -163,7 +163,8 @@ def _shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
         return Term(False, "shadows=False" if scene.casting else "no lights")
     if not request.gradient.visibility:
         return Term(False, "visibility=False")
-    moving = [name for name in required(request) if name in MOVING]
+    cuts = any(mesh.alpha is not None for mesh in scene.meshes)
+    moving = [name for name in required(request) if name in (STEPPING if cuts else MOVING)]
     lights = [light for light in scene.casting if moving or ShadowLight.moves(light)]
     if not lights:
         return Term(False, "nothing that casts, receives or gives light moves, nor the camera")

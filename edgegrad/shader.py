@@ -24,10 +24,9 @@ from .camera.camera import Camera
 from .check import all_finite, values_visible
 from .kernel.counts import Watch
 from .kernel.derivatives import differentiates, moves, transformed
-from .kernel.flat import Flat
 from .kernel.request import Request, derived_seed
 from .points.background import environments
-from .points.blend import Blended
+from .points.blend import Blended, let_through, panes
 from .points.borders import Borders
 from .points.frame import Frame
 from .points.hits import Hits
@@ -37,6 +36,7 @@ from .points.shadows import ShadowLight
 from .points.splat import Term, boundary
 from .points.steps import UNEQUAL, Crossings, Points, Steps, find_crossings
 from .points.surfaces import every_face
+from .scene.mesh_light import MeshLight
 from .scene.scene import Scene
 from .warnings import warn
 
@@ -102,7 +102,10 @@ class _Image:
 
     def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool, effort: Effort) -> None:
         self._frame, self._creases, self._check, self._effort = frame, creases, check, effort
-        self._shader = Blended(frame, shader, lambda: self._behind_all) if effort.blended else shader
+        self._shader = shader
+        if effort.blended:
+            self._shader = Blended(frame, shader, lambda: self._behind_all)
+            frame.sampler.panes = panes(frame.surfaces)
         self._channels: int | None = None
         self._kinds: list[str] | None = None  # of the steps that the shader declares
 
@@ -230,16 +233,13 @@ class _Image:
         frame = self._frame
         terms: list[Term] = []
         count, flat = frame.request.gradient.edge_samples, frame.surfaces.casters
-        if frame.surfaces.shadowing and _has_rims(flat) and moves(frame.surfaces.verts, flat.alphas, flat.uvs):
-            warn(
-                "shadows of cut-outs",
-                "alpha: the rims of what alpha cuts out cast shadows, and end lamps; how that moves on what is lit has no "
-                "gradient yet, by alpha, uvs and verts; leave it out with shadows=False, or model the shape as faces",
-            )
+        moving = moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
+        if len(flat.cut_outs) and moves(flat.alphas, flat.uvs):
+            moving = True
+            _warn_of_lamps(frame)
         for index in sorted(frame.surfaces.shadowing):
             seed = derived_seed(frame.sampler.grad_seed, index + 2)
             light = ShadowLight.of(frame.surfaces, index, seed)
-            moving = moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics)
             if moving or ShadowLight.moves(light.light):
                 one = self._effort.additive
                 casters = frame.fixed.casters if frame.surfaces.scene.blends else None
@@ -259,8 +259,11 @@ class _Image:
                 if len(points) > at_once:
                     points = points._subset(slice(first, first + at_once))
                 parts.append(self._shade(points).detach())
-            jump = samples.sum(torch.cat(parts[1:] or parts))
-        return boundary(samples.x, samples.velocity, jump, samples.to_background, self._background)
+            jump, to_background = samples.sum(torch.cat(parts[1:] or parts)), samples.to_background
+            if self._effort.blended:
+                through = let_through(self._frame, samples._records)
+                jump, to_background = through[:, None].to(jump) * jump, through * to_background
+        return boundary(samples.x, samples.velocity, jump, to_background, self._background)
 
     def _steps(self) -> list[Term]:
         """Σ k(x − c) [L₊ − L₋] δs / |∇ₓs| · weight over where lines cross steps s = 0 of the shader."""
@@ -419,8 +422,16 @@ def _parts(found: Crossings) -> list[slice]:
     return [slice(first, first + AT_ONCE) for first in range(0, max(len(found.x), 1), AT_ONCE)]
 
 
-def _has_rims(flat: Flat) -> bool:
-    """Whether alpha cuts out some of a mesh, not all or nothing."""
-    rows = zip(flat.cut_outs.tolist(), flat.cutoffs, strict=True)
-    there = ((flat.alphas[first : first + h * w] >= cutoff).detach() for (first, h, w, *_), cutoff in rows)
-    return any(bool(texels.any()) and not bool(texels.all()) for texels in there)
+def _warn_of_lamps(frame: Frame) -> None:
+    """Of which alpha cuts out some, not all or nothing."""
+    lamps = (light.mesh for light in frame.surfaces.scene.casting if isinstance(light, MeshLight))
+    for mesh in lamps:
+        if mesh.alpha is None or mesh.uvs is None or not moves(mesh.alpha, mesh.uvs) or not values_visible(mesh.alpha):
+            continue
+        there = mesh.alpha.detach() >= (0.5 if mesh.blends else mesh.alpha_cutoff)
+        if bool(there.any()) and not bool(there.all()):
+            warn(
+                "cut-out lamps",
+                "alpha: the rim of what it cuts out ends a mesh that emits; how that moves on what is lit has no gradient, by "
+                "alpha and uvs; model the lamp's shape as faces, or paint it as emission",
+            )

@@ -659,12 +659,14 @@ def test_directions_of_any_length() -> None:
         assert torch.allclose(image, images[0], rtol=1e-6)
 
 
-def test_shadows_of_cut_outs_are_said_to_lack_a_gradient() -> None:
-    leaf = plane(0.5, material=eg.Material(), alpha=torch.eye(4, dtype=F64)).transformed(t=vector(0, 0, 1))
-    scene = eg.Scene([plane(material=eg.Material()), leaf], lights=[eg.PointLight(vector(0.3, 0.2, 3))])
-    moving = leaf.replace(verts=leaf.verts.clone().requires_grad_())
-    with pytest.warns(UserWarning, match="cast shadows, and end lamps; how that moves .* has no gradient"):
-        eg.render(scene.replace(meshes=[scene.meshes[0], moving]), from_above())
+def test_lamps_that_are_cut_out_are_said_to_lack_a_gradient() -> None:
+    floor, alpha = plane(material=eg.Material()), torch.eye(4, dtype=F64)
+    lamp = plane(0.5, material=eg.Material(emission=1.0, two_sided=True), alpha=alpha).transformed(t=vector(0, 0, 1))
+    moving = lamp.replace(alpha=alpha.clone().requires_grad_())
+    with pytest.warns(UserWarning, match="the rim of what it cuts out ends a mesh that emits"):
+        eg.render(eg.Scene([floor, moving]), from_above())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        eg.render(scene, from_above())
+        eg.render(eg.Scene([floor, lamp]), from_above())
+        leaf = moving.replace(material=eg.Material())
+        eg.render(eg.Scene([floor, leaf], lights=[eg.PointLight(vector(0.3, 0.2, 3))]), from_above())

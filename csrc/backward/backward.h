@@ -55,6 +55,8 @@ struct BackwardInput {
     HitBuffers<T> hits;         // of that image
     // (F,): faces that look as a texture says, which the scene's own colours need not; null: none.
     const uint8_t* detailed = nullptr;
+    // (F,): faces that one sees through, so that they hide no curve; null: none.
+    const uint8_t* panes = nullptr;
 };
 
 // The geometry that the terms of a derivative need.

@@ -31,6 +31,7 @@ struct BackwardView {
     Scatter& scatter;
     const CameraFrame& frame;
     const SeenThrough* cut_outs;  // null: there are none
+    const uint8_t* panes;         // BackwardInput::panes
     const OcclusionHint& occlusion;
     const ImageHits* hits;           // null where neither term asks
     const uint8_t* detailed;         // (F,), null: see BackwardInput
@@ -75,7 +76,7 @@ uint16_t cell_of(const BackwardView<T>& view, int32_t vertex) {
 template <class T>
 double where_unhit(const BackwardView<T>& view, int64_t face, double area) {
     constexpr OcclusionHint::Few unhit{.rays = 16, .share = 0, .least = 1.0 / 8};
-    return view.seen[face] ? 1 : view.occlusion.factor(unhit, area, view.image.spp);
+    return view.seen[face] || view.panes ? 1 : view.occlusion.factor(unhit, area, view.image.spp);
 }
 
 // px by which rays may miss a point, at most: by then the image shows floats, not faces. What runs along a silhouette

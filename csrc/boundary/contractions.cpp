@@ -188,6 +188,12 @@ class RecordBoundary final : public CurveContraction {
             records_.alpha_row_of.push_back(sample_index), records_.alpha.push_back(texel);
             records_.by_alpha.push_back(*by_alpha);
         });
+        if (sides)
+            for (const int32_t pane : sides->panes) {
+                const Barycentrics b = barycentrics_of_hit(face_map(camera_, corners_of(view_, pane).data()), sides->n);
+                records_.pane_row_of.push_back(sample_index), records_.pane.push_back(pane);
+                append(records_.pane_b, {b.u, b.v});
+            }
         if (const LightMotion& light = form_.light; light.part >= 0) {
             records_.light.push_back(light.part), append(records_.light_uv, {light.uv.x, light.uv.y});
             const Vec3 place = transposed_times(camera_.turn, light.by_place);

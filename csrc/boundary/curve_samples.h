@@ -1,7 +1,9 @@
 // Samples of one source of curves: one ray each, and what is found contracted.
 #pragma once
 
+#include <algorithm>
 #include <span>
+#include <vector>
 
 #include "boundary/contractions.h"
 #include "boundary/curve_source.h"
@@ -24,7 +26,7 @@ class CurveSamples {
         if (area_scale == 0 || !contraction_.wants(i, x)) return;
         typename Source::Sample& sample = sample_[i];
         sample.u = u, sample.n = normalised(view_.camera, u), sample.weight = weight;
-        sample.x = x, sample.area_scale = area_scale;
+        sample.x = x, sample.area_scale = area_scale, sample.panes.clear();
         if (!source_.place(curve, s, sample)) return;
         rays_.n_x[i] = sample.n.x, rays_.n_y[i] = sample.n.y;
         ignored_[i] = sample.ignored;
@@ -41,15 +43,40 @@ class CurveSamples {
         view_.frame.cast(rays_, ignored_);
         for (int i = 0; i < rays_.count; ++i) {
             typename Source::Sample& sample = sample_[i];
-            const int32_t hit = visibility_.beyond_float(sample, rays_.face[i]);
-            if (hit >= 0 && !visibility_.lies_behind(hit, source_.faces_of(sample), sample)) continue;
-            contraction_.add(i, source_, sample);
+            const int32_t hit = hiding(sample, rays_.face[i]);
+            if (hit < 0 || (view_.panes && is_seen_through(hit, sample))) contraction_.add(i, source_, sample);
         }
         rays_.count = 0;
         source_.cast();
     }
 
    private:
+    // The face that hides the point; −1: none. `face`: what the cast found.
+    int32_t hiding(typename Source::Sample& sample, int32_t face) const {
+        const int32_t hit = visibility_.beyond_float(sample, face);
+        return hit < 0 || visibility_.lies_behind(hit, source_.faces_of(sample), sample) ? -1 : hit;
+    }
+
+    // Whether nothing hides the point but faces that one sees through: `hit` and others behind it.
+    bool is_seen_through(int32_t hit, typename Source::Sample& sample) const {
+        constexpr size_t most = 7;  // that an image composes before another surface (edgegrad/points/blend.py)
+        const auto own = sample.ignored;
+        std::vector<int32_t> ignored(own.begin(), own.end());
+        std::sort(ignored.begin(), ignored.end());
+        while (hit >= 0 && view_.panes[hit] && sample.panes.size() < most) {
+            sample.panes.push_back(hit);
+            ignored.insert(std::upper_bound(ignored.begin(), ignored.end(), hit), hit);
+            sample.ignored = ignored;
+            CameraRays ray(view_.frame);
+            ray.n_x[0] = sample.n.x, ray.n_y[0] = sample.n.y, ray.count = 1;
+            ray.prepare();
+            view_.frame.cast(ray, &sample.ignored);
+            hit = hiding(sample, ray.face[0]);
+        }
+        sample.ignored = own;
+        return hit < 0;
+    }
+
     const BackwardView<T>& view_;
     const Visibility<T> visibility_;
     Source& source_;

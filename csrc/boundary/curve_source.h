@@ -43,6 +43,7 @@ struct CurveSample {
     // elsewhere.
     std::span<const int32_t> ignored;
     std::vector<int32_t> gathered;
+    std::vector<int32_t> panes;  // before it, through which it is seen
 };
 
 // The surfaces of which a sample needs the radiance: minus, plus, and at most one more.

@@ -1,4 +1,4 @@
-// Where light goes on past the edges that cast shadows.
+// Where light goes on past the edges and rims that cast shadows.
 #pragma once
 
 #include <algorithm>
@@ -17,33 +17,27 @@
 
 namespace edgegrad {
 
-// Rays from points of a light past edges, in batches, and what they meet behind.
+// Rays from points of a light past edges and rims, in batches, and what they meet behind.
 template <class T>
 class LightRays {
    public:
-    LightRays(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light)
-        : view_(view), casters_(casters), light_(light) {}
+    LightRays(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
+              const std::vector<Rim>& rims)
+        : view_(view), casters_(casters), light_(light), rims_(rims) {}
 
-    // The place t of an edge before a point of the light, for whoever knows the segment by this number.
+    // The place t of an edge or a rim before a point of the light, for whoever knows the segment by this number.
     void add(const ShadowPiece& piece, LightWedge::Point from, int64_t segment, double t, double weight) {
-        if (!casts(piece.edge, t)) return;
-        const HalfEdge& h = view_.geometry.topology().half_edges(piece.edge)[0];
-        const SceneView<T>& scene = view_.scene;
-        const auto vertex_of = [&](int c) { return scene.faces[3 * int64_t(h.face) + c]; };
-        const Vec3 a = corner(scene, h.face, h.first()), b = corner(scene, h.face, h.second());
-        const Vec3 light = light_.at(piece.part, from.uv);
         Waiting& w = waiting_[count_];
-        w.point = {.a = vertex_of(h.first()),
-                   .b = vertex_of(h.second()),
+        w.point = {.caster = {},
                    .part = piece.part,
                    .uv = from.uv,
-                   .light = light,
+                   .light = light_.at(piece.part, from.uv),
                    .side = from.side,
-                   .segment = segment,
-                   .t = t};
+                   .segment = segment};
         w.weight = weight;
         w.edge = piece.edge;
-        w.p = (1 - t) * a + t * b;
+        if (!(piece.is_rim() ? set_rim(rims_[piece.rim()], t, w) : set_edge(piece.edge, t, w))) return;
+        const Vec3 light = w.point.light;
         if (light_.infinite) {
             // From outside of the scene.
             const RayFrame& frame = view_.geometry.caster().frame();
@@ -54,7 +48,7 @@ class LightRays {
             w.ray = {light, w.p - light};
         }
         auto& without = without_[count_];
-        const auto beside = view_.geometry.topology().faces(piece.edge);
+        const auto beside = faces_beside(w);
         without.assign(beside.begin(), beside.end());
         if (const int32_t own = light_.face[piece.part]; own >= 0) without.push_back(own);
         std::sort(without.begin(), without.end());
@@ -92,7 +86,8 @@ class LightRays {
         ShadowPoint point;
         double weight;
         int64_t edge;
-        Vec3 p;  // of the edge, world coordinates
+        int32_t face;  // of a rim
+        Vec3 p;        // of the edge, world coordinates
         Ray ray;
         double before;  // where the edge lies on the ray, in lengths of its direction
     };
@@ -107,14 +102,69 @@ class LightRays {
         without_[k].swap(without);
     }
 
-    // Whether a face beside the edge casts a shadow from that place of it: where none does, light passes on both sides.
-    bool casts(int64_t edge, double t) const {
-        for (const HalfEdge& h : view_.geometry.topology().half_edges(edge)) {
-            double b[3] = {};
-            b[h.first()] = 1 - t, b[h.second()] = t;
-            if (shows(casters_, h.face, {b[1], b[2]})) return true;
+    bool set_edge(int64_t edge, double t, Waiting& w) const {
+        if (!casts(edge, t, w.point)) return false;
+        const HalfEdge& h = view_.geometry.topology().half_edges(edge)[0];
+        const SceneView<T>& scene = view_.scene;
+        const auto vertex_of = [&](int c) { return scene.faces[3 * int64_t(h.face) + c]; };
+        const Vec3 a = corner(scene, h.face, h.first()), b = corner(scene, h.face, h.second());
+        w.point.caster.vertex[0] = vertex_of(h.first()), w.point.caster.vertex[1] = vertex_of(h.second());
+        w.point.caster.weight[0] = 1 - t, w.point.caster.weight[1] = t;
+        w.point.caster.tangent[0] = -1, w.point.caster.tangent[1] = 1;
+        w.p = (1 - t) * a + t * b;
+        return true;
+    }
+
+    bool set_rim(const Rim& rim, double t, Waiting& w) const {
+        RimPlace place;
+        if (!RimFinder<T>(casters_).place(rim, t, place)) return false;
+        ShadowCaster& caster = w.point.caster;
+        caster.count = 3;
+        const Barycentrics tangent{-place.kappa * place.slope.v, place.kappa * place.slope.u};
+        Vec3 v[3], p;
+        for (int i = 0; i < 3; ++i) {
+            caster.vertex[i] = casters_.faces[3 * int64_t(rim.face) + i];
+            caster.uv_row[i] = casters_.uv_corners[3 * int64_t(rim.face) + i];
+            caster.weight[i] = place.b[i], v[i] = corner(casters_, rim.face, i), p += place.b[i] * v[i];
         }
-        return false;
+        caster.tangent[0] = -tangent.u - tangent.v, caster.tangent[1] = tangent.u, caster.tangent[2] = tangent.v;
+        caster.kappa = place.kappa, caster.by_uv = place.by_uv, caster.alpha = place.alpha;
+        caster.of_alpha = rim.border == 0;
+        // Dark is where f > 0, and there N · (y − p) has the sign of κ D (shadow_source.h).
+        const Vec3 d = light_.infinite ? -w.point.light : p - w.point.light;
+        const double turned = place.kappa * dot(d, cross(v[1] - v[0], v[2] - v[0]));
+        if (!(std::fabs(turned) > 0)) return false;
+        w.point.side = turned > 0 ? 1 : -1;
+        // The ray goes by where the face is cut out: a neighbour that has the rim in common, where it runs along their
+        // edge, is cut out there too, or not met.
+        constexpr double aside = 1e-7;
+        const double size = length(Vec2{place.slope.u, place.slope.v});
+        w.p = p - (aside / size) * (place.slope.u * (v[1] - v[0]) + place.slope.v * (v[2] - v[0]));
+        w.face = rim.face;
+        return true;
+    }
+
+    // Of the edge, or that of the rim.
+    std::span<const int32_t> faces_beside(const Waiting& w) const {
+        return w.edge < 0 ? std::span<const int32_t>(&w.face, 1) : view_.geometry.topology().faces(w.edge);
+    }
+
+    // Whether a face beside the edge casts a shadow from that place of it: where none does, light passes on both sides.
+    // Where some are there and others cut out, those that are must lie on one side, which then is known.
+    bool casts(int64_t edge, double t, ShadowPoint& point) const {
+        const auto halves = view_.geometry.topology().half_edges(edge);
+        const auto there = [&](const HalfEdge& h) { return shows(casters_, h.face, beside_edge(casters_, h, t)); };
+        if (!cut_outs_jump(casters_, view_.geometry.topology(), edge))
+            return std::any_of(halves.begin(), halves.end(), there);
+        bool on_side[2] = {};
+        for (const HalfEdge& h : halves) {
+            if (!there(h)) continue;
+            const Vec3 v = corner(casters_, h.face, 0), to = light_.infinite ? point.light : point.light - v;
+            const double height = dot(cross(corner(casters_, h.face, 1) - v, corner(casters_, h.face, 2) - v), to);
+            if (height != 0) on_side[(height < 0) != h.backwards] = true;
+        }
+        point.side = on_side[1] ? -1 : 1;
+        return on_side[0] != on_side[1];
     }
 
     bool accept(const Waiting& w, int32_t face, Meeting& m) const {
@@ -137,7 +187,7 @@ class LightRays {
     // How far along its ray an edge may lie from a face that it touches, up to the rounding of the input.
     double touching(const Waiting& w, int32_t face) const {
         const SceneView<T>& scene = view_.scene;
-        for (const int32_t beside : view_.geometry.topology().faces(w.edge))
+        for (const int32_t beside : faces_beside(w))
             if (share_vertex(scene, face, beside)) return Meeting::rounding * w.before;
         const int32_t* v = scene.faces + 3 * int64_t(face);
         double size = 0;
@@ -146,7 +196,7 @@ class LightRays {
                 size = std::max(size, std::fabs(scene.verts[3 * int64_t(v[i]) + axis]));
         const Vec3 q = corner(scene, face, 0);
         const Vec3 m = cross(corner(scene, face, 1) - q, corner(scene, face, 2) - q);
-        const double spacing = std::max(scene.spacing->of(v[0]), scene.spacing->of(w.point.a));
+        const double spacing = std::max(scene.spacing->of(v[0]), scene.spacing->of(w.point.caster.vertex[0]));
         // Across the face, so along the ray it is more the more this grazes it.
         return contact(spacing, size, size) * length(m) / std::fabs(dot(m, w.ray.direction));
     }
@@ -154,6 +204,7 @@ class LightRays {
     const BackwardView<T>& view_;
     const SceneView<T>& casters_;
     const LightParts& light_;
+    const std::vector<Rim>& rims_;
     Waiting waiting_[RayBatch::size];
     std::vector<int32_t> without_[RayBatch::size];
     int count_ = 0;

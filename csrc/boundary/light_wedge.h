@@ -45,6 +45,13 @@ class LightWedge {
         }
     }
 
+    // The whole triangle.
+    void all() {
+        along_ = {1, 0};
+        for (int k = 0; k < 2; ++k) polygon_[k].clear(), area_[k] = 0, sections_[k].clear();
+        polygon_[0] = {{0, 0}, {1, 0}, {0, 1}}, area_[0] = 1;
+    }
+
     // Of the triangle's area.
     double fraction() const { return area_[0] + area_[1]; }
 

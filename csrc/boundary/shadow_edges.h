@@ -1,4 +1,5 @@
-// Edges that cast shadows: those at which all faces lie on one side, as seen from a point of a light.
+// Edges that cast shadows: those at which all faces lie on one side, as seen from a point of a light. And rims of
+// cut-outs, which do before all points that do not lie in the plane of their face.
 #pragma once
 
 #include <algorithm>
@@ -7,21 +8,36 @@
 #include <vector>
 
 #include "backward/view.h"
+#include "boundary/curve.h"
 #include "boundary/light_wedge.h"
+#include "boundary/rims.h"
 #include "core/sampler.h"
 #include "rays/meeting.h"
 #include "scene/light_parts.h"
 
 namespace edgegrad {
 
-// A part of an edge before those points of a part of a light from which it is a silhouette.
+// A part of an edge or a rim before those points of a part of a light from which it casts a shadow.
 struct ShadowPiece {
-    int64_t edge;
+    int64_t edge;  // or, where it is negative, a rim
     int32_t part;
-    float t0, t1;    // on the edge
+    float t0, t1;    // on it
     double share;    // what it stands for: of all points of the light, and of the edge
     double measure;  // of its shadows, as far as they are known without a ray
+
+    bool is_rim() const { return edge < 0; }
+    int64_t rim() const { return -1 - edge; }
+    static int64_t of_rim(int64_t rim) { return -1 - rim; }
 };
+
+// Whether of two faces on an edge one may be there and the other cut out along it.
+template <class T>
+bool cut_outs_jump(const SceneView<T>& casters, const Topology& topology, int64_t edge) {
+    if (!casters.cut_outs.face) return false;
+    const auto halves = topology.half_edges(edge);
+    return std::any_of(halves.begin() + 1, halves.end(),
+                       [&](const HalfEdge& h) { return cut_outs_jump(casters, halves[0], h); });
+}
 
 // A light's parts as many edges ask for them.
 struct PartsBall {
@@ -97,14 +113,28 @@ class FacesBeforeLight {
     Array<Plane> plane_;
 };
 
-// The wedges of edges before parts of a light, one after another; each thread has its own.
+// The wedges of edges and rims before parts of a light, one after another; each thread has its own.
 template <class T>
 class EdgeWedge {
    public:
-    EdgeWedge(const BackwardView<T>& view, const FacesBeforeLight<T>& faces) : view_(view), faces_(faces) {}
+    EdgeWedge(const BackwardView<T>& view, const SceneView<T>& casters, const FacesBeforeLight<T>& faces,
+              const std::vector<Rim>& rims)
+        : view_(view), casters_(casters), faces_(faces), rims_(rims) {}
+
+    bool set(const ShadowPiece& piece) {
+        return piece.is_rim() ? set_rim(rims_[piece.rim()].face, piece.part) : set(piece.edge, piece.part);
+    }
+
+    // False where the light lies in the plane of the face.
+    bool set_rim(int64_t face, int64_t part) {
+        const auto h = faces_.heights(face, part);
+        if (h.flat() || h.edge_on) return false;
+        wedge_.all();
+        return true;
+    }
 
     // False where the edge is a silhouette from nowhere, or only because faces that are seen edge-on are taken for
-    // turned.
+    // turned. Where not all of its faces may be there, it depends on the place from where it is one (LightRays).
     bool set(int64_t edge, int64_t part) {
         heights_.clear();
         bool known = false;
@@ -115,7 +145,8 @@ class EdgeWedge {
             heights_.push_back(half.backwards ? -h.at : h.at);
         }
         if (!known) return false;
-        wedge_.clip(heights_);
+        if (cut_outs_jump(casters_, view_.geometry.topology(), edge)) wedge_.all();
+        else wedge_.clip(heights_);
         return wedge_.fraction() > 0;
     }
     LightWedge& operator*() { return wedge_; }
@@ -123,18 +154,22 @@ class EdgeWedge {
 
    private:
     const BackwardView<T>& view_;
+    const SceneView<T>& casters_;
     const FacesBeforeLight<T>& faces_;
+    const std::vector<Rim>& rims_;
     std::vector<Vec3> heights_;
     LightWedge wedge_;
 };
 
-// The edges of a scene that cast shadows of a light. Each edge between whose faces some of the light may lie is asked
-// before as many of its parts, spread evenly over their order, as give about `tests` pairs in all.
+// The edges and rims of a scene that cast shadows of a light. Each edge between whose faces some of the light may lie
+// is asked before as many of its parts, spread evenly over their order, as give about `tests` pairs in all; rims, a
+// quarter as many.
 template <class T>
 class ShadowEdgeFinder {
    public:
-    ShadowEdgeFinder(const BackwardView<T>& view, const LightParts& light, const FacesBeforeLight<T>& faces)
-        : view_(view), light_(light), faces_(faces) {}
+    ShadowEdgeFinder(const BackwardView<T>& view, const SceneView<T>& casters, const LightParts& light,
+                     const FacesBeforeLight<T>& faces, const std::vector<Rim>& rims)
+        : view_(view), casters_(casters), light_(light), faces_(faces), rims_(rims) {}
 
     std::vector<ShadowPiece> find(int64_t tests) const {
         const int64_t edges = view_.geometry.topology().n_edges();
@@ -149,11 +184,12 @@ class ShadowEdgeFinder {
         const int64_t asked = std::clamp<int64_t>(tests / std::max<int64_t>(asking, 1), 1, light_.count);
         std::vector<std::vector<ShadowPiece>> parts(may.size());
         view_.team.each(int64_t(may.size()), [&](int64_t k) {
-            EdgeWedge<T> wedge(view_, faces_);
+            EdgeWedge<T> wedge(view_, casters_, faces_, rims_);
             std::vector<ShadowPiece> part;
             for (const int64_t e : may[k]) add(e, asked, wedge, part);
             parts[k] = std::move(part);
         });
+        for (auto& block : of_rims(tests / 4)) parts.push_back(std::move(block));
         int64_t edges_found = 0;
         for (const auto& block : parts)
             for (size_t i = 0; i < block.size(); ++i) edges_found += i == 0 || block[i].edge != block[i - 1].edge;
@@ -180,6 +216,7 @@ class ShadowEdgeFinder {
     // False where all of the light surely sees both faces of an edge from the same sides.
     bool may_cast(int64_t edge) const {
         if (!view_.geometry.topology().joins_two(edge)) return true;
+        if (cut_outs_jump(casters_, view_.geometry.topology(), edge)) return true;
         const auto beside = view_.geometry.topology().faces(edge);
         const int one = faces_.side(beside[0]), other = faces_.side(beside[1]);
         return one == 0 || other == 0 || one != other;
@@ -204,17 +241,50 @@ class ShadowEdgeFinder {
         for (int64_t i = 0; i < asked; ++i) {
             const int64_t part = std::min(int64_t((double(i) + shift) * step), light_.count - 1);
             if (lies_in_plane(part, a, b) || !wedge.set(e, part)) continue;
-            const Vec3 from = light_.at(part, wedge->centre()), middle = 0.5 * (a + b);
-            const Vec3 d = light_.infinite ? -from : middle - from;
-            const double share = step * light_.chance[part] * wedge->fraction();
-            const double measure = share * light_.towards(part, from, middle) * length(cross(b - a, d)) / length(d);
-            if (std::isfinite(measure) && measure > 0) out.push_back({e, int32_t(part), 0, 1, share, measure});
+            add(e, part, a, b, step, *wedge, out);
         }
     }
 
+    void add(int64_t e, int64_t part, Vec3 a, Vec3 b, double standing_for, const LightWedge& wedge,
+             std::vector<ShadowPiece>& out) const {
+        const Vec3 from = light_.at(part, wedge.centre()), middle = 0.5 * (a + b);
+        const Vec3 d = light_.infinite ? -from : middle - from;
+        const double share = standing_for * light_.chance[part] * wedge.fraction();
+        const double measure = share * light_.towards(part, from, middle) * length(cross(b - a, d)) / length(d);
+        if (std::isfinite(measure) && measure > 0) out.push_back({e, int32_t(part), 0, 1, share, measure});
+    }
+
+    std::vector<std::vector<ShadowPiece>> of_rims(int64_t tests) const {
+        const int64_t asked = std::clamp<int64_t>(tests / std::max<int64_t>(int64_t(rims_.size()), 1), 1, light_.count);
+        const Hash random(hash(view_.options.seed, 12, gradient_stream), 0);
+        const double step = double(light_.count) / double(asked);
+        return view_.team.of_blocks(int64_t(rims_.size()), [&](int64_t begin, int64_t end) {
+            EdgeWedge<T> wedge(view_, casters_, faces_, rims_);
+            std::vector<ShadowPiece> out;
+            for (int64_t k = begin; k < end; ++k) {
+                const Rim& rim = rims_[k];
+                const Vec3 a = on_face(rim, rim.begin), b = on_face(rim, rim.end);
+                const double shift = to_unit(random(uint64_t(k)));
+                for (int64_t i = 0; i < asked; ++i) {
+                    const int64_t part = std::min(int64_t((double(i) + shift) * step), light_.count - 1);
+                    if (lies_in_plane(part, a, b) || !wedge.set_rim(rim.face, part)) continue;
+                    add(ShadowPiece::of_rim(k), part, a, b, step * rim.share, *wedge, out);
+                }
+            }
+            return out;
+        });
+    }
+    Vec3 on_face(const Rim& rim, Barycentrics b) const {
+        Vec3 p;
+        for (int i = 0; i < 3; ++i) p += b[i] * corner(view_.scene, rim.face, i);
+        return p;
+    }
+
     const BackwardView<T>& view_;
+    const SceneView<T>& casters_;
     const LightParts& light_;
     const FacesBeforeLight<T>& faces_;
+    const std::vector<Rim>& rims_;
 };
 
 }  // namespace edgegrad

@@ -14,6 +14,10 @@
 // δq(x) at a fixed depth. The last factor is also ∇F, by the place in the image. Per unit of t on the edge the border
 // has the length |y′| with y′ = S / (m·d) · m × N, S = |y − l| / |p − l|, or 1 if the light is at infinity: so all that
 // is asked of the place on the edge is that rays go there. A light at infinity moves by its direction towards it.
+//
+// A rim of a cut-out, f(b; uv, α) = 0 on a face with the sides e₁, e₂, does the same by its tangent in place of b − a.
+// With ∂p/∂t = κ (−f_v e₁ + f_u e₂) as it stands, N·e₁ = κ D f_u and N·e₂ = κ D f_v with D = d · (e₁ × e₂), so where f
+// grows by δf, the rim gives way by N·δp = −κ D δf, beside the motion N · Σ b_i δv_i of the face.
 #pragma once
 
 #include <algorithm>
@@ -22,19 +26,42 @@
 
 #include "backward/view.h"
 #include "boundary/curve_source.h"
+#include "boundary/rims.h"
 
 namespace edgegrad {
 
-// Where the ray of a light past an edge meets a face.
+// A place p of a curve that casts a shadow, and dp/dt along it, as sums of vertices: of the two of an edge, (1 − t) a +
+// t b and b − a, or of the three of a face with a rim.
+struct ShadowCaster {
+    int count = 2;
+    int32_t vertex[3];
+    double weight[3], tangent[3];
+    // Of a rim.
+    int32_t uv_row[3];
+    double kappa = 0;
+    Vec2 by_uv;       // ∂f/∂uv
+    Footprint alpha;  // of which f is made, if it is
+    bool of_alpha = false;
+
+    bool is_rim() const { return count == 3; }
+    // Of one vector a vertex.
+    template <class Values>
+    Vec3 sum(const double (&by)[3], Values values) const {
+        Vec3 out = by[0] * values(vertex[0]) + by[1] * values(vertex[1]);
+        if (count == 3) out += by[2] * values(vertex[2]);
+        return out;
+    }
+};
+
+// Where the ray of a light past an edge or a rim meets a face.
 struct ShadowPoint {
-    int32_t a, b;         // vertices of the edge
+    ShadowCaster caster;
     int32_t part;         // of the light
     Vec2 uv;              // on it
     Vec3 light;           // that place, world coordinates, or the direction towards it
-    int side;             // of the edge on which its faces lie as seen from there: 1, that of (b − a) × (p − l), or −1
+    int side;             // on which it is dark as seen from there: 1, that of dp/dt × (p − l), or −1
     int32_t face = -1;    // the receiver
     int64_t segment = 0;  // of the sampler (shadows.cpp)
-    double t;             // on the edge, (1 − t) a + t b
     Barycentrics on{};    // the receiver
     double along = 0;     // y = l + along · d, or p + along · d from a light at infinity
 };
@@ -48,9 +75,10 @@ class ShadowSource {
         ShadowPoint shadow;
         int32_t receiver;  // which the ray ignores
         CurveFaces faces;
-        Vec3 N, m;          // the latter times c
-        double by_a, by_b;  // w_a, w_b, w_l
+        Vec3 N, m;            // the latter times c
+        double by_caster[3];  // by its vertices, and by the light
         double by_light;
+        double by_rim;   // ∂F/∂f
         Vec2 by_n;       // ∂F/∂n
         double speed;    // |du/dt|, px of the straight image
         double scale;    // that over |∇F|
@@ -75,17 +103,24 @@ class ShadowSource {
         const Camera& camera = view_.camera;
         const auto v = corners_of(view_, curve.face);
         const Array<Vec3>& q = view_.vertices.q;
-        const Vec3 a = q[curve.a], b = q[curve.b], p = (1 - curve.t) * a + curve.t * b;
+        const auto of_vertex = [&](int32_t i) { return q[i]; };
+        const ShadowCaster& caster = curve.caster;
+        const Vec3 p = caster.sum(caster.weight, of_vertex), along = caster.sum(caster.tangent, of_vertex);
         const Vec3 light = light_of(curve);
         const Vec3 d = infinite_ ? -light : p - light, m = cross(v[1] - v[0], v[2] - v[0]);
-        const Vec3 N = cross(b - a, d), y = place_of(curve);
+        const Vec3 N = cross(along, d), y = place_of(curve);
         // What is lit from behind is dark on both sides of the border.
         if (!(dot(m, d) * dot(m, camera.view_direction(y)) > 0)) return false;
 
         sample.shadow = curve, sample.receiver = curve.face;
         sample.point = y, sample.behind = {};
         const double S = infinite_ ? 1 : curve.along;
-        sample.by_a = S * (1 - curve.t), sample.by_b = S * curve.t;
+        for (int i = 0; i < 3; ++i) sample.by_caster[i] = S * caster.weight[i];
+        sample.by_rim = 0;
+        if (caster.is_rim()) {
+            const Vec3 a = q[caster.vertex[0]];
+            sample.by_rim = S * caster.kappa * dot(d, cross(q[caster.vertex[1]] - a, q[caster.vertex[2]] - a));
+        }
         sample.by_light = infinite_ ? -curve.along : 1 - curve.along;
         sample.N = N, sample.m = (camera.along_ray(N, sample.n) / camera.along_ray(m, sample.n)) * m;
         const Vec3 slope = camera.unit_at_depth(y.z) * (N - sample.m);
@@ -131,10 +166,18 @@ class ShadowSource {
         const int32_t* vertex = view_.scene.faces + 3 * int64_t(sample.receiver);
         Vec3 receiver;
         for (int i = 0; i < 3; ++i) receiver += sample.shadow.on[i] * direction.q[vertex[i]];
-        const Vec3 caster = sample.by_a * direction.q[sample.shadow.a] + sample.by_b * direction.q[sample.shadow.b];
+        const ShadowCaster& edge = sample.shadow.caster;
+        const Vec3 caster = edge.sum(sample.by_caster, [&](int32_t i) { return direction.q[i]; });
         const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
-        const double F_dot =
+        double F_dot =
             dot(sample.m, receiver) - dot(sample.N, caster) + sample.by_n.x * n_dot.x + sample.by_n.y * n_dot.y;
+        if (const double* uvs = direction.tangents.uvs; uvs && edge.is_rim())
+            for (int i = 0; i < 3; ++i) {
+                const double* uv_dot = uvs + 2 * int64_t(edge.uv_row[i]);
+                F_dot += sample.by_rim * edge.weight[i] * (edge.by_uv.x * uv_dot[0] + edge.by_uv.y * uv_dot[1]);
+            }
+        if (const double* alphas = direction.tangents.alphas; alphas && edge.of_alpha)
+            for (int k = 0; k < 4; ++k) F_dot += sample.by_rim * edge.alpha.weight(k) * alphas[edge.alpha.texel[k]];
         return {sample.scale * sample.area_scale * F_dot, 0};
     }
 
@@ -145,8 +188,22 @@ class ShadowSource {
             const Vec3 bar = (F_bar * sample.shadow.on[i]) * sample.m;
             grad.q.add<3>(vertex[i], &bar.x);
         }
-        const Vec3 a_bar = (-F_bar * sample.by_a) * sample.N, b_bar = (-F_bar * sample.by_b) * sample.N;
-        grad.q.add<3>(sample.shadow.a, &a_bar.x), grad.q.add<3>(sample.shadow.b, &b_bar.x);
+        const ShadowCaster& caster = sample.shadow.caster;
+        for (int i = 0; i < caster.count; ++i) {
+            const Vec3 bar = (-F_bar * sample.by_caster[i]) * sample.N;
+            grad.q.add<3>(caster.vertex[i], &bar.x);
+        }
+        const double rim_bar = F_bar * sample.by_rim;
+        if (caster.is_rim() && grad.uvs.is_wanted())
+            for (int i = 0; i < 3; ++i) {
+                const Vec2 uv_bar = (rim_bar * caster.weight[i]) * caster.by_uv;
+                grad.uvs.add<2>(caster.uv_row[i], &uv_bar.x);
+            }
+        if (caster.of_alpha && grad.alphas.is_wanted())
+            for (int k = 0; k < 4; ++k) {
+                const double alpha_bar = rim_bar * caster.alpha.weight(k);
+                grad.alphas.add<1>(caster.alpha.texel[k], &alpha_bar);
+            }
         grad.light = {sample.shadow.part, sample.shadow.uv, (-F_bar * sample.by_light) * sample.N};
         normalised_vjp(view_.camera, sample.n, F_bar * sample.by_n, grad.k);
     }

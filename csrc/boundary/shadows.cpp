@@ -122,8 +122,9 @@ class Pilots {
         const double arriving = cosine * light_.towards(point.part, point.light, there);
         const double look = view_.importance.mean(sample.x, sample.x);
         // The area that the border sweeps as the edge moves: where light grazes a face it is much for little length.
-        const double swept = std::fabs(sample.weight * sample.scale * sample.area_scale) * (sample.by_a + sample.by_b) *
-                             length(sample.N);
+        double by_caster = sample.by_caster[0] + sample.by_caster[1];
+        if (point.caster.is_rim()) by_caster += sample.by_caster[2];
+        const double swept = std::fabs(sample.weight * sample.scale * sample.area_scale) * by_caster * length(sample.N);
         const double px = sample.weight * sample.speed * std::sqrt(std::fabs(sample.area_scale));
         const double value = swept * arriving * look;
         if (!std::isfinite(value)) return;
@@ -207,6 +208,7 @@ struct ShadowScene {
     const SceneView<T>& casters;
     const LightParts& light;
     const FacesBeforeLight<T>& faces;
+    const std::vector<Rim>& rims;
     const Pieces& pieces;
 };
 
@@ -217,9 +219,9 @@ class ShadowChunk {
     ShadowChunk(const ShadowScene<T>& scene, uint64_t seed, Contraction& contraction)
         : scene_(scene),
           sequence_(seed),
-          wedge_(scene.view, scene.faces),
+          wedge_(scene.view, scene.casters, scene.faces, scene.rims),
           source_(scene.view, scene.light.infinite),
-          light_rays_(scene.view, scene.casters, scene.light),
+          light_rays_(scene.view, scene.casters, scene.light, scene.rims),
           samples_(scene.view, source_, contraction) {}
 
     // The i-th of places that ascend, with so many samples: a second one mirrors the first on the edge. How samples
@@ -227,7 +229,7 @@ class ShadowChunk {
     void add(int64_t i, double position, int64_t interval, double weight, int64_t samples) {
         const auto place = scene_.pieces.at(position, piece_);
         const ShadowPiece& piece = scene_.pieces[place.piece];
-        if (place.piece != piece_) casts_ = wedge_.set(piece.edge, piece.part), piece_ = place.piece;
+        if (place.piece != piece_) casts_ = wedge_.set(piece), piece_ = place.piece;
         if (!casts_) return;
         const Vec2 other = sequence_(uint64_t(i));
         // Along the edge before a point, else along the wedge.
@@ -276,12 +278,13 @@ void add_shadows(const BackwardView<T>& view, const SceneView<T>& casters, const
     const int64_t expected = samples >= 0 ? samples : light.extended ? most : 0;
     const int64_t count = std::clamp(expected / samples_of_interval, fewest_intervals, most_intervals);
     const FacesBeforeLight<T> faces(view.scene, light, view.team);
-    std::vector<ShadowPiece> found = ShadowEdgeFinder<T>(view, light, faces).find(pair_tests);
+    const std::vector<Rim> rims = RimFinder<T>(casters).find(hash(view.options.seed, 13, gradient_stream), view.team);
+    std::vector<ShadowPiece> found = ShadowEdgeFinder<T>(view, casters, light, faces, rims).find(pair_tests);
     if (light.extended) found = cut(found, double(count));
     const Pieces pieces(std::move(found), view.team);
     if (pieces.empty()) return;
 
-    const ShadowScene<T> scene{view, casters, light, faces, pieces};
+    const ShadowScene<T> scene{view, casters, light, faces, rims, pieces};
     std::vector<Found> of_interval(count);
     const uint64_t pilot_seed = hash(view.options.seed, 10, gradient_stream);
     view.team.each((count + intervals_of_block - 1) / intervals_of_block, [&](int64_t block) {

@@ -62,6 +62,10 @@ struct CurveRecords {
     std::vector<int64_t> alpha_row_of;  // (Q,): the sample of each row
     std::vector<int64_t> alpha;         // (Q,)
     std::vector<double> by_alpha;       // (Q,)
+    // Of what is seen through faces: rows by these.
+    std::vector<int64_t> pane_row_of;  // the sample of each row
+    std::vector<int32_t> pane;         // the face
+    std::vector<double> pane_b;        // (2) where on it
     // Of borders of shadows, a row a sample: the point of the light, and the velocity by its place in camera
     // coordinates, or by the direction towards it. The first surface is that in the light, the second that in the
     // shadow.

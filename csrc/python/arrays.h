@@ -76,12 +76,13 @@ void check_image(const char* name, const Out<T, 3>& image, const Camera& camera,
         refuse(std::string(name) + ": expected an image of the camera's size and the scene's channels");
 }
 
-// See BackwardInput::detailed.
+// A number for each face; see BackwardInput::detailed and panes.
 template <class T>
-const uint8_t* detailed_faces(const SceneArrays<T>& scene, const std::optional<In<uint8_t, 1>>& detailed) {
-    if (!detailed) return nullptr;
-    if (detailed->size() != scene.faces.shape(0)) refuse("detailed: expected one number a face");
-    return detailed->data();
+const uint8_t* marked_faces(const char* name, const SceneArrays<T>& scene,
+                            const std::optional<In<uint8_t, 1>>& marked) {
+    if (!marked) return nullptr;
+    if (marked->size() != scene.faces.shape(0)) refuse(std::string(name) + ": expected one number a face");
+    return marked->data();
 }
 
 // Geometry as the terms of a derivative want it.

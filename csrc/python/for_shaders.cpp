@@ -61,6 +61,7 @@ nb::dict arrays_of(const std::vector<CurveRecords>& parts, double least, bool on
     add_rows("row_of", &C::row_of), add("vertex", &C::vertex), add("by_q", &C::by_q, {3});
     add_rows("uv_row_of", &C::uv_row_of), add("uv", &C::uv), add("by_uv", &C::by_uv, {2});
     add_rows("alpha_row_of", &C::alpha_row_of), add("alpha", &C::alpha), add("by_alpha", &C::by_alpha);
+    add_rows("pane_row_of", &C::pane_row_of), add("pane", &C::pane), add("pane_b", &C::pane_b, {2});
     add("light", &C::light), add("light_uv", &C::light_uv, {2}), add("by_light", &C::by_light, {3});
     return curves;
 }
@@ -69,13 +70,14 @@ nb::dict arrays_of(const std::vector<CurveRecords>& parts, double least, bool on
 template <class T>
 nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
                   const GradientOptions& options, double least, int threads, const HitArrays<T>& hits,
-                  const std::optional<In<uint8_t, 1>>& detailed) {
+                  const std::optional<In<uint8_t, 1>>& detailed, const std::optional<In<uint8_t, 1>>& panes) {
     hits.check(arrays, camera);
     const SceneView<T> scene = arrays.view();
     RecordList found;
     with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
         found = record_samples(
-            BackwardInput<T>{scene, camera, geometry, image, nullptr, hits.view(), detailed_faces(arrays, detailed)},
+            BackwardInput<T>{scene, camera, geometry, image, nullptr, hits.view(),
+                             marked_faces("detailed", arrays, detailed), marked_faces("panes", arrays, panes)},
             options, team);
     });
     nb::dict surface;
@@ -116,7 +118,8 @@ struct LightArrays {
 template <class T>
 nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const Camera& camera,
                         const ImageOptions& image, const GradientOptions& options, const LightArrays& light,
-                        int64_t samples, double least, bool one, int threads, const HitArrays<T>& hits) {
+                        int64_t samples, double least, bool one, int threads, const HitArrays<T>& hits,
+                        const std::optional<In<uint8_t, 1>>& panes) {
     hits.check(arrays, camera), light.check(int64_t(arrays.faces.shape(0)));
     if (casters.faces.shape(0) != arrays.faces.shape(0)) refuse("casters: expected the faces of the scene");
     const SceneView<T> scene = arrays.view(), casting = casters.view();
@@ -124,8 +127,9 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& cast
     unlocked(threads, [&](Team& team) {
         GeometryWork done;
         const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
-        found = record_shadows(BackwardInput<T>{scene, camera, *geometry, image, nullptr, hits.view()}, casting,
-                               options, light.view(), samples, team);
+        found = record_shadows(BackwardInput<T>{scene, camera, *geometry, image, nullptr, hits.view(), nullptr,
+                                                marked_faces("panes", arrays, panes)},
+                               casting, options, light.view(), samples, team);
     });
     return arrays_of(found, least, one, threads);
 }
@@ -247,9 +251,9 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
         .def("pixel_hits", &pixel_hits<T>, "camera"_a, "image"_a, "threads"_a, "first"_a, "end"_a, "most"_a,
              "only"_a.none(), "hits"_a)
         .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "least"_a, "threads"_a, "hits"_a,
-             "detailed"_a.none())
+             "detailed"_a.none(), "panes"_a.none())
         .def("shadow_samples", &shadow_samples<T>, "casters"_a, "camera"_a, "image"_a, "options"_a, "light"_a,
-             "samples"_a, "least"_a, "one"_a, "threads"_a, "hits"_a)
+             "samples"_a, "least"_a, "one"_a, "threads"_a, "hits"_a, "panes"_a.none())
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)
         .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(),
              "ignored"_a.noconvert().none(), "threads"_a)

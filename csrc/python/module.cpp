@@ -112,7 +112,7 @@ Profile backward(const SceneArrays<T>& arrays, const Camera& camera, const Chann
         const auto geometry = arrays.geometry(geometry_for(interior, boundary), team, work);
         update = watch.lap();
         return render_backward(BackwardInput<T>{scene, camera, *geometry, image, adjoint.data(), hits.view(),
-                                                detailed_faces(arrays, detailed)},
+                                                marked_faces("detailed", arrays, detailed)},
                                options, team, grad);
     });
     return {{"surface_samples", double(p.surface_samples)},

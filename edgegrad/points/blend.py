@@ -11,7 +11,8 @@ from ..scene.appearance import OnMesh
 from ..scene.textures import look_up
 from .frame import Frame
 from .hits import Hits
-from .records import trace
+from .records import CurveRecords, trace
+from .surfaces import Surfaces
 
 MOST = 8  # surfaces along a ray; what lies behind the last is left out
 
@@ -63,6 +64,20 @@ class Blended:
             return background.expand(len(x), -1)
         column, row = (x[:, k].floor().long().clamp(0, n - 1) for k, n in enumerate((frame.width, frame.height)))
         return background[frame.here(row), frame.here(column)]
+
+
+def panes(surfaces: Surfaces) -> Tensor:
+    """(F,) bool: the faces of meshes that blend."""
+    blends = torch.tensor([mesh.blends for mesh in surfaces.scene.meshes], device=surfaces.mesh_of_face.device)
+    return blends[surfaces.mesh_of_face]
+
+
+def let_through(frame: Frame, records: CurveRecords) -> Tensor:
+    """(S,) float64: what the surfaces before samples on curves let through, Π (1 − α), without derivatives."""
+    sample = frame.here(records.pane_row_of)
+    passed = frame.fixed_hits(records.pane, records.pane_b, records.x[records.pane_row_of])
+    total = torch.ones(len(records.x), dtype=torch.float64, device=frame.device)
+    return total.scatter_reduce(0, sample, 1 - opacity(passed)[:, 0].double(), "prod")
 
 
 def opacity(hits: Hits) -> Tensor:

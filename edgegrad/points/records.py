@@ -71,6 +71,9 @@ class CurveRecords(NamedTuple):
     alpha_row_of: Tensor  # (Q,) int64, the sample of a row by texels of alpha
     alpha: Tensor  # (Q,) int64
     by_alpha: Tensor  # (Q,) float64
+    pane_row_of: Tensor  # (P,) int64, the sample of a row by faces through which it is seen
+    pane: Tensor  # (P,) int64
+    pane_b: Tensor  # (P, 2) float64, the last two barycentrics there
     # For borders of shadows alone: the first point is the one in the light, the second the one in the shadow.
     light: Tensor  # (S,) int64, the part of the light
     light_uv: Tensor  # (S, 2) float64, where on it
@@ -240,6 +243,7 @@ class Sampler:
     def __init__(self, request: Request, camera: int, least: float) -> None:
         """`least`: the smallest barycentric of points on curves."""
         self._request, self._camera, self._least = request, camera, least
+        self.panes: Tensor | None = None  # (F,) bool: faces that hide no curve, for one sees through them
         self._kept: tuple[list[Any], Flat, Any] | None = None
         height, width, faces = request.camera.height, request.camera.width, len(request.scene.faces)
         dtype = request.scene.colors.dtype
@@ -258,6 +262,10 @@ class Sampler:
     @property
     def grad_seed(self) -> int:
         return camera_seed(self._request.gradient.grad_seed, self._camera)
+
+    @property
+    def _panes(self) -> np.ndarray | None:
+        return None if self.panes is None else self.panes.cpu().to(torch.uint8).numpy()
 
     def _scene(self, flat: Flat) -> Any:
         """The kernel's scene, checked once: most calls have the same arrays."""
@@ -356,6 +364,7 @@ class Sampler:
                 threads=torch.get_num_threads(),
                 hits=kernel_hits(self._hits),
                 detailed=faces_with_textures(lit),
+                panes=self._panes,
             )
             return (*_record(SurfaceRecords, surface), *_record(CurveRecords, curves))
 
@@ -394,6 +403,7 @@ class Sampler:
                 one=one,
                 threads=torch.get_num_threads(),
                 hits=kernel_hits(self._hits),
+                panes=self._panes,
             )
             return _record(CurveRecords, found)
 

@@ -145,7 +145,7 @@ class EdgeSamples:
             some = torch.ones_like(lit, dtype=torch.bool)
             forced = Forced(light.number, points.select(of_hits), lit, some, only)
         self.hits = frame.fixed_hits(records.hit_face, records.hit_b, records.hit_x, seed, forced=forced)
-        flat = frame.request.scene
+        flat = frame.request.scene if light is None else frame.surfaces.casters
         forms = [
             (Form(records.row_of, records.vertex, records.by_q), frame.view.in_camera(frame.surfaces.verts)),
             (Form(records.uv_row_of, records.uv, records.by_uv), flat.uvs),
