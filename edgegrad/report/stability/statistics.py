@@ -28,6 +28,7 @@ from ..scenes import (
 )
 from .cases import CASES
 from .cases.case import Problem, everything, rotation
+from .cases.glossy import GLOSSY
 from .cases.light import LIT
 from .cases.measure import Effort, Running, differences, exact, sample
 from .painted import PAINTED
@@ -75,9 +76,10 @@ def unbiased(quick: bool = False, say: Say = lambda text: None) -> dict[str, Any
     stats = require("scipy.stats", "edgegrad[report]", "the test of unbiasedness")
     seeds = SEEDS // 4 if quick else SEEDS
     rows, all_p = [], []
-    for name, build in (scenes() | LIT).items():
+    lit = LIT | GLOSSY
+    for name, build in (scenes() | lit).items():
         say(name)
-        z, freedom, deviation, reference = (lit_components if name in LIT else components)(build(), seeds)
+        z, freedom, deviation, reference = (lit_components if name in lit else components)(build(), seeds)
         p = 2.0 * stats.t.sf(z.abs().numpy(), freedom.numpy())
         all_p.append(torch.from_numpy(p))
         rows.append({

@@ -305,7 +305,7 @@ def bright_sky() -> Problem:
 # -- of the test of unbiasedness ----------------------------------------------------------------------------------------
 
 
-def _torus(major: float = 0.55, minor: float = 0.22, around: int = 32, across: int = 16) -> Mesh:
+def torus(major: float = 0.55, minor: float = 0.22, around: int = 32, across: int = 16) -> Mesh:
     """With interpolated normals, tilted, above the plane."""
     u, v = (2 * math.pi * torch.arange(n, dtype=F64) / n for n in (around, across))
     u, v = torch.meshgrid(u, v, indexing="ij")
@@ -347,5 +347,5 @@ LIT: dict[str, Callable[[], Problem]] = {
     "lit, sun": _closely(_sun),
     "lit, panel": _closely(panel()),
     "lit, environment": _closely(_sky),
-    "lit, torus that shadows itself": _closely(point(), caster=_torus()),
+    "lit, torus that shadows itself": _closely(point(), caster=torus()),
 }
