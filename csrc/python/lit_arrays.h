@@ -3,10 +3,12 @@
 #pragma once
 
 #include <cstdint>
+#include <memory>
 #include <optional>
 #include <vector>
 
 #include "python/checks.h"
+#include "shading/lit/lamp_tree.h"
 #include "shading/lit/lit_scene.h"
 
 namespace edgegrad {
@@ -28,6 +30,7 @@ struct MeshArrays {
 struct LampArrays {
     Lamp view;
     std::vector<std::optional<In<double, 1>>> arrays;  // that it refers to
+    std::shared_ptr<LampTree> tree;
 };
 
 // All of it, checked: what indexes what exists.

@@ -25,6 +25,7 @@ from ..scene.material import WRAPS, Parameter, Texture
 from ..scene.mesh import FILTERS, Mesh
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
+from .lamp_trees import hides, least_brightness, tree_of
 from .resampled import DARK
 
 _64_BITS = 2**64 - 1
@@ -285,8 +286,18 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
     if isinstance(light, MeshLight):
         mesh = next(i for i, mesh in enumerate(scene.meshes) if mesh is light.mesh)
         running, density = values_of(*light._table)
+        glossy = any(m.material is not None and m.material.is_glossy for m in scene.meshes)
         # Where a ray meets a thin face, its rounding error is many times the spacing of doubles: a lamp must not hide itself.
-        return lamp("mesh", mesh=mesh, running=running, density=density, eps=max(eps, 2.0**-40))
+        return lamp(
+            "mesh",
+            mesh=mesh,
+            running=running,
+            density=density,
+            brightness=np.array([least_brightness(light)]),
+            tree=tree_of(light) if glossy else None,
+            hides=hides(light),
+            eps=max(eps, 2.0**-40),
+        )
     if isinstance(light, Environment):
         running, density, brightness, cosines = values_of(*light._table, light._brightness, light._cosines)
         height, width = light._size

@@ -45,6 +45,10 @@ class Lobes(NamedTuple):
         """Each so many times."""
         return Lobes(*(part.repeat_interleave(times, 0) for part in self))
 
+    def mirrored(self) -> Tensor:
+        """(N, 3) where flat mirrors would look."""
+        return normalize(2 * dot(self.n, self.v).clamp(min=0) * self.n - self.v, dim=-1)
+
     def density(self, l: Tensor) -> Tensor:
         """(N,) by solid angle, of unit directions (N, 3): D(h) / 2 (k n·v + √(α² + (1 − α²) (n·v)²)), k the bound."""
         a2, nv = self.alpha * self.alpha, dot(self.n, self.v).clamp(min=0)

@@ -9,6 +9,8 @@
 
 namespace edgegrad {
 
+class LampTree;
+
 struct Lamp {
     enum class Kind { directional, point, spot, mesh, environment, harmonics };
     Kind kind = Kind::point;
@@ -21,7 +23,12 @@ struct Lamp {
     // Of lights with an extent: the running sum of the probabilities of faces or texels, and their densities.
     const double *running = nullptr, *density = nullptr;
     int64_t size = 0;
-    // Of an environment: how bright texels are, but none is black, and the cosines of where rows begin and end.
+    // Of a mesh: its faces by where they lie, if glossy surfaces ask; whether none is cut out, so that near ones hide far
+    // ones.
+    const LampTree* tree = nullptr;
+    bool hides = true;
+    // Of an environment: how bright texels are, but none is black, and the cosines of where rows begin and end. Of a mesh
+    // one number, which is added to how bright it is, for the same reason.
     const double *brightness = nullptr, *cosines = nullptr;
     uint64_t stream[6] = {};  // of its random numbers: three of the light, two of lobes, one of the choice
     double eps = 0;           // relative spacing of places of its points

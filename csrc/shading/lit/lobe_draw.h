@@ -33,6 +33,9 @@ class DrawnLobe {
 
     bool exists() const { return alpha_ > 0; }
 
+    // Where a flat mirror would look.
+    Vec3 mirrored() const { return unit(2 * nv_ * n_ - v_); }
+
     // By solid angle: D(h) / 2 (k n·v + √(α² + (1 − α²) (n·v)²)), k the bound.
     double density(Vec3 l) const {
         const Vec3 h = unit(v_ + l), sine = cross(n_, h);
