@@ -184,13 +184,13 @@ def studio(kind: str, roughness: float) -> tuple[eg.Scene, eg.Camera]:
         corners = vector(0, 2.5, -3), vector(2.5, 0, 0), vector(0, 1.6, 0.8)
         lamp = eg.AreaLight.rectangle(*corners, 2.0, two_sided=False)
     else:
-        lamp = eg.AreaLight.of(eg.Mesh(icosphere(2).verts * 0.5 + vector(-1, 2, -1.5), icosphere(2).faces), 10.0)
+        lamp = eg.AreaLight.of(eg.Mesh(icosphere(2).verts * 0.5 + vector(-1.2, 2.0, 1.5), icosphere(2).faces), 10.0)
     camera = eg.Camera.look_at((0.0, 1.6, 3.6), (0.0, 0.2, 0.0), (0.0, 1.0, 0.0), 36.0, (32, 32))
     return eg.Scene([ball(3, material=metal), lamp]), camera
 
 
-# Relative noise of the image as it was measured, and half as much again; by the lamp alone it is in parentheses.
-MOST = {("softbox", 0.2): 0.3, ("softbox", 0.6): 0.3, ("ball", 0.3): 0.3, ("ball", 1.0): 0.3}
+# Relative noise of the image as it was measured, and three tenths more. Drawn by the light alone it was 2.4, 0.135, 3.3, 0.28.
+MOST = {("softbox", 0.2): 0.14, ("softbox", 0.6): 0.126, ("ball", 0.3): 0.65, ("ball", 1.0): 0.128}
 
 
 @pytest.mark.parametrize(("kind", "roughness"), MOST)

@@ -22,7 +22,7 @@ from .lobes import Lobes
 
 LEAST_LAMP = 0.25  # solid angle over that of a lobe, below which nothing is drawn by the lobe
 FARTHEST_LOBE = 4.0  # between them, in half angles of the lobe
-SMALLEST_LAMP = 0.05  # sr: below, points of a flat lamp are alike
+SMALLEST_LAMP = 0.1  # solid angle over that of a lobe, below which points of a flat lamp are alike
 
 _trees: WeakKeyDictionary[MeshLight, Any] = WeakKeyDictionary()
 
@@ -73,18 +73,17 @@ class MeshTowards(NamedTuple):
     def _solid_angle(self, sine: Tensor) -> Tensor:
         return torch.where(sine < 1, 2 * math.pi * (1 - (1 - sine * sine).sqrt()), 4 * math.pi)
 
-    def is_small(self) -> Tensor:
+    def is_small(self, lobes: Lobes) -> Tensor:
         """(N,) bool: whether its points are so much alike that one is as good as another."""
         sine, _ = self._ball()
-        return (self._solid_angle(sine) < SMALLEST_LAMP)[:, 0] & tree_of(self.light).is_flat
+        return (self._solid_angle(sine) < SMALLEST_LAMP * lobes.solid_angle())[:, 0] & tree_of(self.light).is_flat
 
     def is_drawn_by(self, lobes: Lobes) -> Tensor:
         """(N,) bool: whether directions are drawn by lobes as well."""
         sine, middle = self._ball()
-        mirrored = lobes.mirrored()
-        wide = (1 / lobes.density(mirrored)[:, None]).clamp(max=2 * math.pi)
+        wide = lobes.solid_angle()
         half = torch.acos(1 - wide / (2 * math.pi))
-        near = torch.acos(dot(mirrored, middle).clamp(-1, 1)) < torch.asin(sine) + FARTHEST_LOBE * half
+        near = torch.acos(dot(lobes.mirrored(), middle).clamp(-1, 1)) < torch.asin(sine) + FARTHEST_LOBE * half
         some = (self._solid_angle(sine) >= LEAST_LAMP * wide) & ((sine >= 1) | near)
         return some[:, 0] & lobes.narrow
 

@@ -76,7 +76,7 @@ def resampled(
         uv, density = surfaces.n.new_zeros((N, count, 2)), surfaces.n.new_zeros((N, count))
         at_once = max(1, AT_ONCE // (EACH * count))
         asked = lobes.narrow if meets is None else meets.is_drawn_by(lobes)
-        small = torch.zeros_like(asked) if meets is None else meets.is_small()
+        small = torch.zeros_like(asked) if meets is None else meets.is_small(lobes)
         for all in (EACH * count, count):
             for ask_lobe in (True, False):
                 rows_ = every[(small == (all < EACH * count)) & (asked == ask_lobe)]

@@ -102,7 +102,7 @@ class Resampled {
         }
         const MeshTowards mesh(lit, lamp, plain(o.y), o.at.face + o.mesh->first_face);
         draw_candidates(
-            lamp, numbers, mesh.is_small() ? count : each * count, mesh.is_drawn_by(lobe_),
+            lamp, numbers, mesh.is_small(lobe_) ? count : each * count, mesh.is_drawn_by(lobe_),
             [&](const LightPoint& p) { return mesh.of(p); }, [&](Vec3 l, auto add) { mesh.each_towards(l, add); });
     }
 

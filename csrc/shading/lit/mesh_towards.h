@@ -27,9 +27,9 @@ struct Candidate {
 
 // Whether directions are drawn by the lobe as well: where all of the lamp lies within a part of it they would only miss,
 // and far off the lobe scatters alike to all of the lamp.
-constexpr double least_lamp = 0.25;   // solid angle over that of the lobe
-constexpr double farthest_lobe = 4;   // between them, in half angles of the lobe
-constexpr double smallest_lamp = 0.05;  // sr: below, points of a flat lamp are alike
+constexpr double least_lamp = 0.25;    // solid angle over that of the lobe
+constexpr double farthest_lobe = 4;    // between them, in half angles of the lobe
+constexpr double smallest_lamp = 0.1;  // solid angle over that of the lobe, below which points of a flat lamp are alike
 
 class MeshTowards {
    public:
@@ -47,13 +47,15 @@ class MeshTowards {
     }
 
     // Whether its points are so much alike that one is as good as another.
-    bool is_small() const { return tree_.is_flat() && solid_angle() < smallest_lamp; }
+    bool is_small(const DrawnLobe& lobe) const {
+        return tree_.is_flat() && solid_angle() < smallest_lamp * lobe.solid_angle();
+    }
 
     bool is_drawn_by(const DrawnLobe& lobe) const {
         if (!lobe.exists()) return false;
-        const Vec3 mirrored = lobe.mirrored();
-        const double wide = std::min(1 / lobe.density(mirrored), 2 * M_PI);
+        const double wide = lobe.solid_angle();
         if (solid_angle() < least_lamp * wide) return false;
+        const Vec3 mirrored = lobe.mirrored();
         if (sine_ >= 1) return true;
         const double half = std::acos(1 - wide / (2 * M_PI));
         return std::acos(std::clamp(dot(mirrored, middle_), -1.0, 1.0)) < std::asin(sine_) + farthest_lobe * half;
