@@ -22,7 +22,7 @@ from .io import (
     save_scene,
     write_image,
 )
-from .light.radiance import points_by_material
+from .light.by_material import points_by_material
 from .live import viewer
 from .plan import Plan, plan
 from .points.hits import Hits

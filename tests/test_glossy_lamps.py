@@ -158,7 +158,11 @@ def test_points_are_unbiased(name: str, roughness: float):
         value = reaching(points) / points.density[:, None]
         found += torch.where(torch.isfinite(points.density)[:, None], value, 0.0) / count
     error = found.std(0) / math.sqrt(seeds)
-    assert bool(((found.mean(0) - expected).abs() < 4 * error + 2e-3 * expected).all()), (found.mean(0), expected, error)
+    assert bool(((found.mean(0) - expected).abs() < 4 * error + 2e-3 * expected).all()), (
+        found.mean(0),
+        expected,
+        error,
+    )
     assert bool((error < 0.015 * expected).all()), error / expected
 
 

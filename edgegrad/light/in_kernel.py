@@ -3,6 +3,7 @@ forward mode; radiance.py computes the same in PyTorch."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from ..points.records import values_of
 from ..points.seeds import STEPS, mixed_bits
 from ..points.surfaces import Surfaces, View
 from ..scene.environment import Environment
-from ..scene.lights import DirectionalLight, Light, PointLight, SphericalHarmonics, SpotLight
+from ..scene.lights import DirectionalLight, Light, LightPoints, PointLight, SphericalHarmonics, SpotLight
 from ..scene.material import WRAPS, Parameter, Texture
 from ..scene.mesh import FILTERS, Mesh
 from ..scene.mesh_light import MeshLight
@@ -114,6 +115,27 @@ def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
         lights = range(len(frame.surfaces.scene.casting))
         frame.surfaces.shadowing.update(light for light in lights if asked[light, 0])
     return frame.here(found)
+
+
+def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
+    """`samples` points of a light for each of the hits, as radiance() draws them; where nothing arrives their density is
+    infinite."""
+    surfaces, view = hits._surfaces, hits._view
+    assert isinstance(view, View)
+    layout, tables = _layout(surfaces, view)
+
+    def compute(b: Tensor, face: Tensor, seed: Tensor, *tables_: Tensor) -> Sequence[Tensor]:
+        tables, faces = tables_[:-1], tables_[-1]
+        points = core.LitPoints(face=array(face), b=array(b), seed=array(seed))
+        options = core.LitOptions(shadows=False, samples=samples, only=-1, dark=DARK)
+        lit = layout.kernel(tables, faces)
+        found = core.light_points(lit, points, options, hits._index(light), torch.get_num_threads())
+        return [torch.from_numpy(x) for x in found]
+
+    given = [hits._exact.cpu(), hits._face.cpu(), hits._seed.cpu(), *tables, surfaces.bare.faces]
+    index, uv, density = (x.to(hits._face.device) for x in without_derivatives(compute, *given))
+    density = torch.where(density > 0, density, math.inf)
+    return [LightPoints(index[:, k], uv[:, k], density[:, k]) for k in range(samples)]
 
 
 def light_on_faces(

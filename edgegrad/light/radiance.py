@@ -265,25 +265,6 @@ def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> Itera
         yield from resampled(light, hits._index(light), glossy, count, meets)
 
 
-def points_by_material(hits: Hits, light: Light, count: int) -> list[LightPoints]:
-    """`count` points of a light for each of the hits, as they are drawn here."""
-    surfaces = hits._surfaces
-    index = torch.zeros((count, len(hits)), dtype=torch.int64, device=hits._face.device)
-    uv, density = hits._exact.new_zeros((count, len(hits), 2)), hits._exact.new_ones((count, len(hits)))
-    with torch.no_grad():
-        for number in range(len(surfaces.scene.meshes)):
-            rows = (surfaces.mesh_of_face[hits._face] == number).nonzero()[:, 0]
-            own = hits._subset(rows)  # with steps of its own: none is declared
-            at = _on_mesh(own, number)
-            if at.mesh.material is None:
-                drawn = [own.light_points(light, k, count) for k in range(count)]
-            else:
-                drawn = list(_points_of(own, light, count, _Surface.of(own, at, at.mesh.material)))
-            for k, points in enumerate(drawn):
-                index[k, rows], uv[k, rows], density[k, rows] = points
-    return [LightPoints(index[k], uv[k], density[k]) for k in range(count)]
-
-
 def _light_sample(hits: Hits, light: Light, points: LightPoints, surface: _Surface, shadows: bool) -> Tensor:
     """(N, C): f max(0, n·l) V E of one point of a light."""
     return _scattered(hits, light, points, surface, shadows, lambda rows, y: light.arriving(points.select(rows), y))

@@ -1,6 +1,6 @@
-"""Points of lights with an extent, drawn by what they give to glossy surfaces where nothing lies between, the target: of candidates that
-the light and the lobe have drawn some are kept in proportion to target / density (resampled importance sampling, Talbot et al.
-2005). csrc/shading/lit/light_sample.h does the same in the kernel."""
+"""Points of lights with an extent, drawn by what they give to glossy surfaces where nothing lies between, the target: of
+candidates that the light and the lobe have drawn some are kept in proportion to target / density (resampled importance sampling,
+Talbot et al. 2005). csrc/shading/lit/light_sample.h does the same in the kernel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""What scenes and hits can do with the help of packages that stand above them: each sets its function here (edgegrad/__init__.py)."""
+"""What scenes and hits can do with the help of packages that stand above them, which set their functions here
+(edgegrad/__init__.py)."""
 
 from __future__ import annotations
 
