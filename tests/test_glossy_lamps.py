@@ -205,6 +205,19 @@ def test_noise(kind: str, roughness: float):
     assert 0 < found < MOST[kind, roughness], found
 
 
+def test_the_plan_says_how_light_is_drawn():
+    def said(*lights: object, **material: float) -> str:
+        mesh = ball(1, material=eg.Material(**material))
+        return eg.plan(eg.Scene([mesh], lights=list(lights)), studio("ball", 0.3)[1])["lights"].why
+
+    lamp, sky = eg.AreaLight.of(plane(), 1.0), eg.Environment(torch.ones(3))
+    assert "drawn by the light, for no surface is glossy" in said(lamp, sky)
+    glossy = said(lamp, sky, metallic=1.0, roughness=0.3)
+    assert "8 candidates" in glossy and "(skies, meshes that emit)" in glossy and "by the light alone" in glossy
+    assert "by the light alone" not in said(sky, metallic=1.0, roughness=0.3)
+    assert "candidates" not in said(eg.PointLight(vector(0, 0, 1)), metallic=1.0, roughness=0.3)
+
+
 def by(name: str) -> Case:
     """A ball of brushed gold and a polished floor under a lamp, of which one number changes."""
 

@@ -14,14 +14,35 @@ from torch.nn.functional import normalize
 from ..points.seeds import uniform
 from ..scene.environment import Environment
 from ..scene.lights import Light, LightPoints
+from ..scene.mesh_light import MeshLight
+from ..scene.scene import Scene
 from .bsdf import DIELECTRIC, LEAST_ALPHA, Scattering, dot, ggx, masking
-from .lamp_trees import MeshTowards
-from .lobes import Lobes
+from .lamp_trees import MeshTowards, tree_of
+from .lobes import WIDEST_LOBE, Lobes
 
 EACH = 8  # candidates for one point that is kept, half of them by the lobe if it is narrow
 # Where radiance has derivatives, points are drawn as if no surface were darker, for what is black has derivatives too.
 DARK = 0.05
 AT_ONCE = 1 << 19  # candidates
+
+
+def how_drawn(scene: Scene) -> str:
+    """What plan() says of points of lights: by what they are drawn, and why."""
+    skies = sum(isinstance(light, Environment) for light in scene.casting)
+    lamps = [light for light in scene.casting if isinstance(light, MeshLight)]
+    if not (skies or lamps):
+        return ""
+    materials = [mesh.material for mesh in scene.meshes if mesh.material is not None]
+    if not any(material.is_glossy for material in materials):
+        return ", drawn by the light, for no surface is glossy"
+    of = ["skies"] * (skies > 0) + ["meshes that emit"] * (len(lamps) > 0)
+    said = f"; on glossy surfaces of {EACH} candidates for each, by light and, up to roughness {WIDEST_LOBE}, by lobe"
+    said += f", one is kept by what it gives ({', '.join(of)})"
+    if lamps:
+        said += "; a lamp well within the lobe by the light alone"
+    if any(tree_of(lamp) is None for lamp in lamps):
+        said += "; lamps of too many faces by the light alone"
+    return said
 
 
 class Glossy(NamedTuple):
