@@ -192,7 +192,8 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
 nb::tuple drawn_light_points(const LitArrays& lit, const PointArrays& points, const LitOptions& options, int lamp,
                              int threads) {
     const LitPoints view = points.view(lit.scene, faces_of(lit));
-    if (lamp < 0 || size_t(lamp) >= lit.scene.lamps.size() || options.samples < 1) refuse("lamp: expected one of the scene");
+    if (lamp < 0 || size_t(lamp) >= lit.scene.lamps.size() || options.samples < 1)
+        refuse("lamp: expected one of the scene");
     const size_t n = size_t(view.size), k = size_t(options.samples);
     std::vector<LightPoint> found(n * k);
     unlocked(threads, [&](Team& team) { draw_light_points(lit.scene, view, options, lamp, found.data(), team); });

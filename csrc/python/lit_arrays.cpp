@@ -81,7 +81,7 @@ LampArrays make_lamp(const std::string& kind, int position, int direction, int i
         if (!brightness || brightness->size() != 1) refuse("brightness: expected one number");
         lamp.brightness = brightness->data();
     }
-    if (stream.size() != std::size(lamp.stream)) refuse("stream: expected six numbers");
+    if (stream.size() != std::size(lamp.stream)) refuse("stream: expected three numbers");
     std::copy(stream.begin(), stream.end(), lamp.stream);
     return {lamp, {running, density, brightness, cosines}, tree};
 }
@@ -117,11 +117,10 @@ nb::tuple crossings(const LampTree& tree, In<double, 2> origins, In<double, 2> d
 }  // namespace
 
 LitArrays::LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshes, std::vector<LampArrays> lamps,
-                     Rows faces, int verts, int eye, bool perspective, int channels, const std::vector<double>& ball,
-                     const std::vector<uint64_t>& step)
+                     Rows faces, int verts, int eye, bool perspective, int channels, const std::vector<double>& ball)
     : tables_(std::move(tables)), meshes_(std::move(meshes)), lamps_(std::move(lamps)), faces_(faces) {
     if (channels < 1 || channels > most_lit_channels) refuse("channels: expected 1 to 16");
-    if (ball.size() != 4 || step.size() != 3) refuse("ball, step: expected 4 and 3 numbers");
+    if (ball.size() != 4) refuse("ball: expected 4 numbers");
     for (const AnyTable& t : tables_) {
         const bool wide = t.dtype() == nb::dtype<double>();
         if (!wide && t.dtype() != nb::dtype<float>()) refuse("tables: expected floats or doubles");
@@ -129,7 +128,6 @@ LitArrays::LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshe
     }
     scene.faces = faces_.data(), scene.verts = verts, scene.eye = eye, scene.perspective = perspective;
     scene.channels = channels, scene.center = {ball[0], ball[1], ball[2]}, scene.radius = ball[3];
-    std::copy(step.begin(), step.end(), scene.step);
     check_table("verts", verts, 1, 3), check_table("eye", eye, 1, 3);
     if (faces.shape(1) != 3) refuse("faces: expected three columns");
     check_indices("faces", faces.data(), faces.size(), size_t(table(verts).rows), "verts", 1);
@@ -257,9 +255,9 @@ void bind_lit_arrays(nb::module_& m) {
         "hides"_a = true, "stream"_a, "eps"_a);
     nb::class_<LitArrays>(m, "Lit").def(
         nb::init<std::vector<AnyTable>, std::vector<MeshArrays>, std::vector<LampArrays>, Rows, int, int, bool, int,
-                 const std::vector<double>&, const std::vector<uint64_t>&>(),
+                 const std::vector<double>&>(),
         nb::kw_only(), "tables"_a, "meshes"_a, "lamps"_a, "faces"_a.noconvert(), "verts"_a, "eye"_a, "perspective"_a,
-        "channels"_a, "ball"_a, "step"_a);
+        "channels"_a, "ball"_a);
     nb::class_<PointArrays>(m, "LitPoints")
         .def(nb::new_([](In<int64_t, 1> face, In<double, 2> b, In<int64_t, 1> seed, int forced_lamp,
                          std::optional<In<int64_t, 1>> index, std::optional<In<double, 2>> uv,
@@ -273,9 +271,10 @@ void bind_lit_arrays(nb::module_& m) {
         .def(nb::new_(&make_tree), "verts"_a.noconvert(), "faces"_a.noconvert())
         .def_prop_ro("is_flat", &LampTree::is_flat)
         .def_prop_ro("is_convex", &LampTree::is_convex)
-        .def_prop_ro("ball", [](const LampTree& t) {
-            return std::array<double, 5>{t.center().x, t.center().y, t.center().z, t.radius(), t.size()};
-        })
+        .def_prop_ro("ball",
+                     [](const LampTree& t) {
+                         return std::array<double, 5>{t.center().x, t.center().y, t.center().z, t.radius(), t.size()};
+                     })
         .def("crossings", &crossings, "origins"_a.noconvert(), "directions"_a.noconvert(), "start"_a.noconvert(),
              "end"_a.noconvert());
     nb::class_<LitOptions>(m, "LitOptions")

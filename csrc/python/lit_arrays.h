@@ -37,8 +37,7 @@ struct LampArrays {
 class LitArrays {
    public:
     LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshes, std::vector<LampArrays> lamps, Rows faces,
-              int verts, int eye, bool perspective, int channels, const std::vector<double>& ball,
-              const std::vector<uint64_t>& step);
+              int verts, int eye, bool perspective, int channels, const std::vector<double>& ball);
 
     LitScene scene;
 

@@ -18,7 +18,7 @@ from ..library import core
 from ..points.frame import Frame
 from ..points.hits import Hits
 from ..points.records import values_of
-from ..points.seeds import STEPS, mixed_bits
+from ..points.seeds import mixed_bits
 from ..points.surfaces import Surfaces, View
 from ..scene.environment import Environment
 from ..scene.lights import DirectionalLight, Light, LightPoints, PointLight, SphericalHarmonics, SpotLight
@@ -222,9 +222,7 @@ class _Layout(NamedTuple):
 
     def kernel(self, tables: Sequence[Tensor], faces: Tensor) -> Any:
         parts = self._asdict()
-        return core.Lit(
-            tables=[array(t) for t in tables], faces=array(faces), step=[s & _64_BITS for s in STEPS], **parts
-        )
+        return core.Lit(tables=[array(t) for t in tables], faces=array(faces), **parts)
 
 
 def _layout(surfaces: Surfaces, view: View) -> tuple[_Layout, list[Tensor]]:
@@ -300,7 +298,7 @@ def _texture(mesh: Mesh, texture: Texture, tables: _Tables) -> Any:
 
 
 def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) -> Any:
-    stream = [mixed_bits(number * 0x10001 + k) for k in range(6)]
+    stream = [mixed_bits(number * 0x10001 + k) for k in range(3)]
 
     def lamp(kind: str, **fields: Any) -> Any:
         return core.Lamp(kind, stream=stream, **{"eps": eps, **fields})

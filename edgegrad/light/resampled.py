@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ..points.seeds import uniform
+from ..points.sobol import key_of, sobol, sobol_parts
 from ..scene.environment import Environment
 from ..scene.lights import Light, LightPoints
 from ..scene.mesh_light import MeshLight
@@ -122,10 +122,10 @@ class _Drawn(NamedTuple):
         N, by_light = len(self.surfaces.n), all - by_lobe
         seed = self.surfaces.seed
         every = torch.arange(N, device=seed.device)
-        drawn = self.light.draw(uniform(_parts(seed, by_light), 3, self.stream))
+        drawn = self.light.draw(sobol_parts(seed, key_of(self.stream, 0), by_light))
         kinds = [self._weighted(every.repeat_interleave(by_light), drawn, by_light, by_lobe, False)]
         if by_lobe:
-            l = self.lobes.repeated(by_lobe).draw(uniform(_parts(seed, by_lobe), 5, self.stream)[:, 3:])
+            l = self.lobes.repeated(by_lobe).draw(sobol_parts(seed, key_of(self.stream, 1), by_lobe))
             if self.meets is None:
                 assert isinstance(self.light, Environment)
                 rows, points = every.repeat_interleave(by_lobe), self.light.points_at(l)
@@ -177,13 +177,8 @@ class _Candidates(NamedTuple):
     def kept(self, stream: int, seed: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
         """Of `count` points the index, uv and density, drawn with one random number each (systematic resampling)."""
         total = self.running[:, -1:]
-        u = uniform(seed, 6, stream)[:, 5:]
+        u = sobol(seed, key_of(stream, 2))[:, :1]
         at = (torch.arange(count, device=u.device) + u) / count * total
         j = torch.searchsorted(self.running, at, right=True).clamp(max=self.running.shape[1] - 1)
         density = torch.where(total > 0, self.target.gather(1, j) / total, math.inf)
         return self.index.gather(1, j), self.uv.gather(1, j[..., None].expand(-1, -1, 2)), density
-
-
-def _parts(seed: Tensor, parts: int) -> Tensor:
-    """(N · parts,): see Hits.random."""
-    return (seed[:, None] * parts + torch.arange(parts, device=seed.device)).reshape(-1)

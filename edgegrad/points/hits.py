@@ -21,6 +21,7 @@ from .footprints import Footprints, pyramid_of
 from .records import RayRecords, visible
 from .seeds import uniform
 from .shadow_rays import Forced, seen_from
+from .sobol import key_of, sobol
 from .steps import Steps, StepsOfSubset
 from .surfaces import Rays, Surfaces, View, every_face
 
@@ -363,7 +364,7 @@ class Hits:
             raise ValueError(f"sample: expected a number from 0 to {samples - 1}, below samples, got {sample}")
         if by == "material":
             return self._by_material(light, index, samples)[sample]
-        points = light.draw(self.random(3, index, sample, samples))
+        points = light.draw(sobol(self._seed, key_of(index, 0), sample, samples))
         forced = self._forced
         return points if forced is None or forced.light != index else forced.among(points)
 

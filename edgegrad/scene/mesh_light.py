@@ -79,10 +79,10 @@ class MeshLight(Light):
 
     def draw(self, u: Tensor) -> LightPoints:
         running, density = self._table
-        face = pick(running, u[:, 0])
+        face, within = pick(running, u[:, 0])
         # Uniform in a triangle (Turk 1990).
-        root = u[:, 1].double().sqrt()
-        uv = torch.stack([root * (1 - u[:, 2]), root * u[:, 2]], 1)
+        root, v = within.sqrt(), u[:, 1].double()
+        uv = torch.stack([root * (1 - v), root * v], 1)
         return LightPoints(face, uv, density[face])
 
     def _weights(self, points: LightPoints) -> Tensor:

@@ -120,7 +120,8 @@ class LampTree {
     void split(int32_t node, int32_t first, int32_t last) {
         Vec3 low = triangles_[first].q0, high = low, low_middle, high_middle;
         for (int32_t k = first; k < last; ++k) {
-            for (int i = 0; i < 3; ++i) low = least(low, triangles_[k].corner(i)), high = most(high, triangles_[k].corner(i));
+            for (int i = 0; i < 3; ++i)
+                low = least(low, triangles_[k].corner(i)), high = most(high, triangles_[k].corner(i));
             const Vec3 m = middle(triangles_[k]);
             low_middle = k == first ? m : least(low_middle, m), high_middle = k == first ? m : most(high_middle, m);
         }

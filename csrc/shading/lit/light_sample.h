@@ -4,6 +4,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "core/sobol.h"
 #include "shading/lit/environment.h"
 #include "shading/lit/lit_surface.h"
 #include "shading/lit/lobe_draw.h"
@@ -60,16 +61,22 @@ inline Vec3 place(const LitScene& lit, const Lamp& lamp, const LightPoint& p) {
     }
 }
 
-// Uniform numbers of one point and lamp, that fill the unit cube evenly (edgegrad/points/seeds.py): number k of part j
-// of so many.
+// Uniform numbers of one point and lamp, that fill the unit square evenly over the points of a pixel, and of blocks of
+// pixels (edgegrad/points/sobol.py). The upper half of a seed says which sequence, the lower which of its points: each
+// takes as many in a row as it has parts.
 struct Numbers {
-    const LitScene& lit;
     const Lamp& lamp;
     uint64_t seed;
 
-    double operator()(int k, int j, int count) const {
-        const uint64_t part = seed * uint64_t(count) + uint64_t(j);
-        return double((part * lit.step[k % 3] + lamp.stream[k]) >> 11) * 0x1p-53;
+    // Number j of so many.
+    Vec2 of_light(int j, int count) const { return at(0, j, count); }
+    Vec2 of_lobe(int j, int count) const { return at(1, j, count); }
+    double of_choice() const { return at(2, 0, 1).x; }
+
+   private:
+    Vec2 at(int k, int j, int count) const {
+        return ScrambledSobol(hash(seed >> 32, lamp.stream[k]))
+            .shuffled(uint32_t(seed) * uint32_t(count) + uint32_t(j));
     }
 };
 
@@ -145,19 +152,18 @@ class Resampled {
         double roughness_, diffuse_ = 0, head_on_ = 0;
     };
 
-    // So many, of which half are drawn by the lobe if it is asked: at(point) and towards(direction, add) say what they are.
+    // So many, of which half are drawn by the lobe if it is asked: at(point) and towards(direction, add) say what they
+    // are.
     template <class At, class Towards>
     void draw_candidates(const Lamp& lamp, const Numbers& numbers, int all, bool ask_lobe, At at, Towards towards) {
         const int by_lobe = ask_lobe ? all / 2 : 0, by_light = all - by_lobe;
         share_light_ = by_light, share_lobe_ = by_lobe;
         kept_.reserve(all), running_.reserve(all);
-        for (int j = 0; j < by_light; ++j) {
-            const double u[3] = {numbers(0, j, by_light), numbers(1, j, by_light), numbers(2, j, by_light)};
-            add(at(draw(lamp, u)), false);
+        for (int j = 0; j < by_light; ++j) add(at(draw(lamp, numbers.of_light(j, by_light))), false);
+        for (int j = 0; j < by_lobe; ++j) {
+            const Vec2 u = numbers.of_lobe(j, by_lobe);
+            towards(lobe_.draw(u.x, u.y), [&](const Candidate& c) { add(c, true); });
         }
-        for (int j = 0; j < by_lobe; ++j)
-            towards(lobe_.draw(numbers(3, j, by_lobe), numbers(4, j, by_lobe)),
-                    [&](const Candidate& c) { add(c, true); });
     }
 
     void add(const Candidate& c, bool of_lobe) {
@@ -185,18 +191,17 @@ void light_points(const LitScene& lit, const LitPoints& points, int64_t i, int n
                   const Surface<S>& o, LightPoint* out) {
     const Lamp& lamp = lit.lamps[number];
     const ForcedLight& forced = points.forced;
-    const Numbers numbers{lit, lamp, uint64_t(points.seed[i])};
+    const Numbers numbers{lamp, uint64_t(points.seed[i])};
     if (lamp.is_punctual()) {
         out[0] = {};
     } else if (forced.lamp == number) {
         std::fill(out, out + count,
                   LightPoint{forced.index[i], forced.uv[2 * i], forced.uv[2 * i + 1], forced.density[i]});
     } else if ((lamp.kind == Lamp::Kind::environment || lamp.tree) && !o.scattering.lambertian) {
-        Resampled(lit, lamp, numbers, o, count, dark).keep(numbers(5, 0, 1), count, out);
+        Resampled(lit, lamp, numbers, o, count, dark).keep(numbers.of_choice(), count, out);
     } else {
         for (int s = 0; s < count; ++s) {
-            const double u[3] = {numbers(0, s, count), numbers(1, s, count), numbers(2, s, count)};
-            out[s] = draw(lamp, u);
+            out[s] = draw(lamp, numbers.of_light(s, count));
             if (lamp.kind == Lamp::Kind::environment) out[s] = above(lit.tables, lamp, out[s], plain(o.g));
         }
     }

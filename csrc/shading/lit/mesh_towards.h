@@ -25,8 +25,8 @@ struct Candidate {
     double solid_angle = 1;  // |dl/dq| of the coordinates that its density counts
 };
 
-// Whether directions are drawn by the lobe as well: where all of the lamp lies within a part of it they would only miss,
-// and far off the lobe scatters alike to all of the lamp.
+// Whether directions are drawn by the lobe as well: where all of the lamp lies within a part of it they would only
+// miss, and far off the lobe scatters alike to all of the lamp.
 constexpr double least_lamp = 0.25;    // solid angle over that of the lobe
 constexpr double farthest_lobe = 4;    // between them, in half angles of the lobe
 constexpr double smallest_lamp = 0.1;  // solid angle over that of the lobe, below which points of a flat lamp are alike
@@ -92,9 +92,8 @@ class MeshTowards {
             return true;
         });
         // Whatever the tree's order: by distance, and of what is as far by number.
-        std::sort(crossings_.begin(), crossings_.end(), [](const auto& a, const auto& b) {
-            return a.t != b.t ? a.t < b.t : a.face < b.face;
-        });
+        std::sort(crossings_.begin(), crossings_.end(),
+                  [](const auto& a, const auto& b) { return a.t != b.t ? a.t < b.t : a.face < b.face; });
         for (const LampTree::Crossing& c : crossings_) {
             if (lamp_.hides && c.t > nearest + contact_) break;
             Candidate found_there = of({c.face, c.u, c.v, lamp_.density[c.face]});
