@@ -244,5 +244,5 @@ def by(name: str) -> Case:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["base color", "roughness", "lamp", "power"])
 def test_gradients_are_finite_differences(name: str):
-    truth = by_quadrature(by(name), 0.02, fine=2, light_samples=256)
+    truth = by_quadrature(by(name), 0.1 if name == "lamp" else 0.02, fine=2, light_samples=256)
     check(name, truth, gradient(by(name), 8, filter="box", surface_samples=20_000, light_samples=8))
