@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -206,7 +207,7 @@ def test_noise(kind: str, roughness: float):
 
 
 def test_the_plan_says_how_light_is_drawn():
-    def said(*lights: object, **material: float) -> str:
+    def said(*lights: Any, **material: Any) -> str:
         mesh = ball(1, material=eg.Material(**material))
         return eg.plan(eg.Scene([mesh], lights=list(lights)), studio("ball", 0.3)[1])["lights"].why
 

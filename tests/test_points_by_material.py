@@ -64,7 +64,7 @@ def test_a_shader_of_its_own_gives_what_render_gives():
                 some = hits.select(rows)
                 n = some.shading_normal if number == 0 else some.normal
                 of_mesh = torch.zeros((len(rows), 3), dtype=F64)
-                scattering = Scattering(*(None if x is None else x[None] for x in (base, metallic, roughness)))
+                scattering = Scattering(base[None], *(None if x is None else x[None] for x in (metallic, roughness)))
                 for light in some.lights:
                     points = some.light_points(light, by="material")
                     l = light.incident(points, some.position)
