@@ -1,4 +1,5 @@
-"""A metal ball under skies: how noisy its image is, beside Mitsuba's `direct` of as much time."""
+"""A metal ball under skies, and one on a metal floor under lamps: how noisy their images are, beside Mitsuba's `direct` of as
+much time."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ def sky(kind: str) -> Tensor:
 
 
 class Images:
-    """Of one ball, with a seed each."""
+    """Of one ball under a sky, with a seed each."""
 
     def __init__(self, kind: str, roughness: float, light_samples: int = 4) -> None:
         verts = torch.nn.functional.normalize(sphere(5).verts.float(), dim=1)
@@ -66,8 +67,72 @@ class MitsubaImages:
         return torch.from_numpy(np.array(self.mi.render(self.scene, spp=64, seed=seed)))
 
 
+FLOOR, BALL, LAMP_BALL = 3.0, ((0.0, 0.6, 0.0), 0.6), ((-1.0, 2.0, -1.5), 0.5)
+# Centre, half sides and radiance.
+QUADS = {
+    "a quad": ((0.0, 2.2, -1.8), (0.4, 0.0, 0.0), (0.0, 0.25, 0.3), 20.0),
+    "a softbox": ((0.0, 2.5, -3.0), (2.5, 0.0, 0.0), (0.0, 1.6, 0.8), 2.0),
+}
+
+
+class LampImages:
+    """Of a ball on a floor, both of metal, under a lamp."""
+
+    def __init__(self, kind: str, roughness: float) -> None:
+        metal = eg.Material(base_color=torch.ones(3), metallic=1.0, roughness=roughness)
+        unit = torch.nn.functional.normalize(sphere(5).verts.float(), dim=1)
+        place, size = BALL
+        ball = eg.Mesh(unit * size + torch.tensor(place), sphere(5).faces, normals=unit, material=metal)
+        corners = FLOOR * torch.tensor([[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
+        floor = eg.Mesh(corners, torch.tensor([[0, 2, 1], [0, 3, 2]]), material=metal)
+        if kind in QUADS:
+            *parts, radiance = QUADS[kind]
+            lamp = eg.AreaLight.rectangle(*map(torch.tensor, parts), radiance, two_sided=False)
+        else:
+            place, size = LAMP_BALL
+            verts = torch.nn.functional.normalize(sphere(3).verts.float(), dim=1) * size + torch.tensor(place)
+            lamp = eg.AreaLight.of(eg.Mesh(verts, sphere(3).faces), 10.0)
+        self.scene = eg.Scene([ball, floor, lamp])
+        self.camera = eg.Camera.look_at((0.0, 1.6, 3.6), (0.0, 0.35, 0.0), (0.0, 1.0, 0.0), 36.0, (SIZE, SIZE))
+
+    def __call__(self, seed: int) -> Tensor:
+        return eg.render(self.scene, self.camera, spp=16, light_samples=4, seed=seed)
+
+
+class MitsubaLampImages:
+    """The same by Mitsuba's `direct` at 64 samples a pixel."""
+
+    def __init__(self, mi: Any, kind: str, roughness: float) -> None:
+        turn = mi.ScalarTransform4f
+        to_world = turn().look_at([0, 1.6, 3.6], [0, 0.35, 0], [0, 1, 0])
+        film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+        metal = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2}
+        if kind in QUADS:
+            centre, u, v, radiance = QUADS[kind]
+            frame = np.eye(4)
+            frame[:3, 0], frame[:3, 1], frame[:3, 3] = u, v, centre
+            n = np.cross(u, v)
+            frame[:3, 2] = n / np.linalg.norm(n)
+            lamp: dict[str, Any] = {"type": "rectangle", "to_world": turn(frame)}
+        else:
+            (place, size), radiance = LAMP_BALL, 10.0
+            lamp = {"type": "sphere", "center": list(place), "radius": size}
+        lamp["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+        parts = {
+            "integrator": {"type": "direct"},
+            "sensor": {"type": "perspective", "fov": 36, "fov_axis": "y", "to_world": to_world, "film": film},
+            "ball": {"type": "sphere", "center": list(BALL[0]), "radius": BALL[1], "bsdf": metal},
+            "floor": {"type": "rectangle", "to_world": turn().rotate([1, 0, 0], -90).scale(FLOOR), "bsdf": dict(metal)},
+            "lamp": lamp,
+        }
+        self.mi, self.scene = mi, mi.load_dict({"type": "scene", **parts})
+
+    def __call__(self, seed: int) -> Tensor:
+        return torch.from_numpy(np.array(self.mi.render(self.scene, spp=64, seed=seed)))
+
+
 def drawn(images: Callable[[int], Tensor], count: int, first: int = 0) -> tuple[Tensor, list[float]]:
-    """(count, pixels of the ball, C) and seconds."""
+    """(count, pixels around the middle, C) and seconds."""
     images(first)
     found: list[Tensor] = []
     seconds = [seconds_of(lambda s=s: found.append(images(first + s))) for s in range(1, count + 1)]
@@ -108,12 +173,23 @@ def glossy(bench: Bench) -> list[Row]:
         return rows
     mi.set_variant("scalar_rgb")
     threads = torch.get_num_threads()
-    return rows + [beside(bench, mi, kind, r, threads) for kind in ("even", "lamps") for r in (0.5, 0.2, 0.1)]
+    skies = [
+        beside(bench, Images(kind, r), MitsubaImages(mi, kind, r), f"sky: {kind}, roughness {r}", threads)
+        for kind in ("even", "lamps")
+        for r in (0.5, 0.2, 0.1)
+    ]
+    lamps = [
+        beside(bench, LampImages(kind, r), MitsubaLampImages(mi, kind, r), f"lamp: {kind}, roughness {r}", threads)
+        for kind in (*QUADS, "a ball")
+        for r in (1.0, 0.5, 0.2, 0.05)
+    ]
+    return rows + skies + lamps
 
 
-def beside(bench: Bench, mi: Any, kind: str, roughness: float, threads: int) -> Row:
+def beside(
+    bench: Bench, ours: Callable[[int], Tensor], theirs: Callable[[int], Tensor], what: str, threads: int
+) -> Row:
     """Noise over Mitsuba's in as much time: of independent samples it falls with the root of the time."""
-    ours, theirs = Images(kind, roughness), MitsubaImages(mi, kind, roughness)
     ratios, seconds, others = [], [], []
     for turn in range(bench.repeats(8)):
         found, own = drawn(ours, 4, 10 * turn)
@@ -123,6 +199,6 @@ def beside(bench: Bench, mi: Any, kind: str, roughness: float, threads: int) -> 
         share = statistics.median(own) / statistics.median(other)
         ratios.append(noise(found) / noise(their_found) * math.sqrt(share))
     return Row(
-        f"… {kind}, roughness {roughness}: noise over Mitsuba's of as much time", statistics.median(ratios), quartiles(ratios),
+        f"… {what}: noise over Mitsuba's of as much time", statistics.median(ratios), quartiles(ratios),
         must=1.0, aim=0.5, note=f"edgegrad {milliseconds(seconds)}, Mitsuba {milliseconds(others)}, {threads} threads",
     )  # fmt: skip

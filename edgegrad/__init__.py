@@ -22,6 +22,7 @@ from .io import (
     save_scene,
     write_image,
 )
+from .light.by_material import points_by_material
 from .live import viewer
 from .plan import Plan, plan
 from .points.hits import Hits
@@ -50,7 +51,8 @@ from .scene.symmetries import Symmetries, SymmetryAxis
 
 # What the classes of scenes can do with the help of packages above them.
 provided.from_trimesh, provided.to_trimesh, provided.thumbnail = from_trimesh, to_trimesh, thumbnail
-del from_trimesh, to_trimesh, thumbnail, provided  # names of the package are those below
+provided.points_by_material = points_by_material
+del from_trimesh, to_trimesh, thumbnail, points_by_material, provided  # names of the package are those below
 
 # What torch.load(weights_only=True) may make: dataclasses of tensors, which run nothing when they are loaded.
 torch.serialization.add_safe_globals(

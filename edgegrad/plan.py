@@ -19,6 +19,7 @@ from .kernel.operators import Hits, backward_kernel, image_room, pass_size
 from .kernel.request import MOVING, SLOTS, STEPPING, Request, Work, label, make_request, required
 from .library import core
 from .light.radiance import Lighting
+from .light.resampled import how_drawn
 from .points.records import CURVE_BYTES, SURFACE_BYTES, without_colors
 from .points.shadows import ShadowLight
 from .points.surfaces import every_face
@@ -133,10 +134,9 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     where = "lit" if scene.is_lit else "seen, with mipmaps, in PyTorch"
     terms["textures"] = Term(False, f"looked up where they are {where}")
     del terms["shader"]
-    resampled = lighting.resamples(scene)
-    how = "; on glossy surfaces those of skies by what they give, of candidates by light and lobe" if resampled else ""
     terms["lights"] = Term(
-        lights > 0, f"{lights} points of lights for each point{how}; at most {AT_ONCE:,} points at a time"
+        lights > 0,
+        f"{lights} points of lights for each point{how_drawn(scene)}; at most {AT_ONCE:,} points at a time",
     )
     why = (
         f"{lights} rays for each point of the gradient, and for each face in a pixel"

@@ -2,9 +2,9 @@
 
     python examples/mirror.py [--out mirror.png]
 
-render() draws points of lights, and few of them lie where so smooth a metal looks. The shader draws the other way round: facets
-of the surface by what the eye sees of them (Heitz 2018), and looks where they mirror it. The ball is the material
-`eg.Material(0.95, metallic=1.0, roughness=0.2)` all the same.
+render() has such a material of its own, `eg.Material(0.95, metallic=1.0, roughness=0.2)`. Here the shader is one of PyTorch,
+for a metal that it defines itself: it is given points of the light where so smooth a metal looks, each with the density of its
+choice.
 """
 
 from __future__ import annotations
@@ -26,47 +26,29 @@ BASE, ALPHA = 0.95, 0.2**2
 SMOOTH = 6e-3  # how much a rough environment costs: hardly any light comes from the texels around the poles
 
 
-class Metal:
-    """The metal in the light of an environment: one facet for each point that is shaded."""
+def metal(hits: eg.Hits) -> Tensor:
+    """The metal in the light of the scene."""
+    (light,) = hits.lights
+    points = hits.light_points(light, by="material")
+    n, l = hits.shading_normal, light.incident(points, hits.position)
+    arriving = light.arriving(points, hits.position)  # over the density, which has no derivative
+    down = (n * l).sum(1, keepdim=True)
+    return torch.where(down > 0, reflected(n, hits.view, l) * down * arriving, 0.0)
 
-    def __init__(self, environment: eg.Environment) -> None:
-        self.environment = environment
 
-    def __call__(self, hits: eg.Hits) -> Tensor:
-        n, v = hits.shading_normal, hits.view
-        cosine = (n * v).sum(1, keepdim=True).clamp(min=1e-3)
-        m = visible_facets(n, v, cosine, hits.random(2).to(n))
-        towards = (v * m).sum(1, keepdim=True)
-        l = 2 * towards * m - v
-        down = (n * l).sum(1, keepdim=True)
-        # What the density of the facets leaves of the material: Fresnel's term (Schlick 1994), and the masking towards the light.
-        fresnel = BASE + (1 - BASE) * (1 - towards).clamp(0, 1) ** 5
-        back, away = slope_mask(cosine), slope_mask(down.clamp(min=1e-3))
-        masking = (1 + back) / (1 + back + away)
-        return torch.where(down > 0, fresnel * masking * self.environment.towards(l), 0.0)
+def reflected(n: Tensor, v: Tensor, l: Tensor) -> Tensor:
+    """(N, 1): the microfacets of GGX (Walter et al. 2007), masked and shadowed (Heitz 2014), with Schlick's Fresnel term."""
+    nv, nl = (n * v).sum(1, keepdim=True).clamp(min=1e-3), (n * l).sum(1, keepdim=True).clamp(min=1e-3)
+    m = normalize(v + l, dim=1)
+    sine = torch.linalg.cross(n, m).square().sum(1, keepdim=True)  # 1 − cos² would round it away
+    facets = ALPHA**2 / (math.pi * (sine + ALPHA**2 * (1 - sine)) ** 2)
+    fresnel = BASE + (1 - BASE) * (1 - (v * m).sum(1, keepdim=True)).clamp(0, 1) ** 5
+    return facets * fresnel / (4 * nv * nl * (1 + slope_mask(nv) + slope_mask(nl)))
 
 
 def slope_mask(cosine: Tensor) -> Tensor:
     """Smith's Λ of the GGX distribution (Heitz 2014, eq. 72)."""
     return ((1 + ALPHA**2 * (1 / cosine**2 - 1)).sqrt() - 1) / 2
-
-
-def visible_facets(n: Tensor, v: Tensor, cosine: Tensor, u: Tensor) -> Tensor:
-    """(N, 3) unit normals of facets, by what is seen of them from v: caps of the sphere (Dupuy and Benyoub 2023)."""
-    axis = torch.where(n[:, :1].abs() < 0.6, torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]]))
-    t = normalize(torch.linalg.cross(n, axis), dim=1)
-    b = torch.linalg.cross(n, t)
-
-    def flatter(d: Tensor) -> Tensor:
-        along = (d * n).sum(1, keepdim=True) * n
-        return normalize(ALPHA * (d - along) + along, dim=1)
-
-    stretched = flatter(v)
-    top = (stretched * n).sum(1, keepdim=True)
-    z = 1 - u[:, 1:] * (1 + top)
-    r = (1 - z * z).clamp(min=0).sqrt()
-    phi = 2 * math.pi * u[:, :1]
-    return flatter(r * phi.cos() * t + r * phi.sin() * b + z * n + stretched)
 
 
 def sky() -> Tensor:
@@ -88,12 +70,15 @@ def roughness(image: Tensor) -> Tensor:
 def fit(steps: int = 200, size: int = SIZE) -> tuple[list[Tensor], Tensor]:
     """Pictures of the ball (target, end), and the environment that was found."""
     made = trimesh.creation.icosphere(4)
-    ball = eg.Mesh(torch.tensor(made.vertices, dtype=torch.float32), torch.tensor(made.faces))
+    material = eg.Material(torch.full((3,), BASE), metallic=1.0, roughness=ALPHA**0.5)  # by which points are drawn
+    verts, faces = torch.tensor(made.vertices, dtype=torch.float32), torch.tensor(made.faces)
+    ball = eg.Mesh(verts, faces, normals=eg.vertex_normals(verts, faces), material=material)
     places = [(3.3, 1.2, 1.1), (-1.9, -1.0, 2.9), (-1.5, 1.0, -3.1), (2.0, -1.2, -2.9)]
     cameras = [eg.Camera.look_at(place, (0.0, 0.0, 0.0), fov_y=34.0, size=(size, size)) for place in places]
 
     def picture(radiance: Tensor, k: int, spp: int, seed: int) -> Tensor:
-        return eg.render(ball, cameras[k], spp, seed, shader=Metal(eg.Environment(radiance)))
+        scene = eg.Scene([ball], lights=[eg.Environment(radiance, visible=False)])
+        return eg.render(scene, cameras[k], spp, seed, shader=metal)
 
     def mean(radiance: Tensor, k: int, seed: int) -> Tensor:
         with torch.no_grad():

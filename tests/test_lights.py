@@ -284,6 +284,15 @@ def test_random_numbers_of_points():
     assert not torch.equal(hits.random(3, 1), u)
 
 
+def test_points_of_lights_are_well_spread_between_pixels():
+    """What a pixel misses of the light its neighbours find: blocks of 2 × 2 have less than the half of its noise that independent
+    points would leave."""
+    scene = eg.Scene([plane(material=WHITE)], lights=[eg.Environment(torch.ones(16, 32, 1, dtype=F64))])
+    images = torch.stack([eg.render(scene, from_above(32), spp=1, seed=seed) for seed in range(4)])[..., 0]
+    of_pixels, of_blocks = (float(torch.nn.functional.avg_pool2d(images - images.mean(), k).std()) for k in (1, 2))
+    assert of_pixels > 0.1 and of_blocks < 0.45 * of_pixels
+
+
 def test_forced_shadows():
     scene = eg.Scene([plane(material=WHITE)], lights=[eg.PointLight([0.0, 0, 1]), eg.Environment([1.0])])
     hits = hits_of(scene, 4)

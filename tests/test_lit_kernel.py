@@ -44,6 +44,7 @@ SCENES = [
     "colors harmonics",
     "area",
     "area one_sided normals microfacets",
+    "bulb microfacets",
     "base emission point",
     "nearest texture normal_map base point directional",
     "texture normal_map normals microfacets base emission point directional spot harmonics environment area",
@@ -84,6 +85,7 @@ def numbers_of(words: str) -> Leaves:
         "harmonics": lambda: {"harmonics": rand(9, 3), "harmonics_turn": torch.linalg.qr(rand(3, 3))[0]},
         "environment": lambda: {"environment": rand(8, 16, 3), "environment_turn": torch.linalg.qr(rand(3, 3))[0]},
         "sky": lambda: {"sky": rand(3)},
+        "bulb": lambda: {"lamp": number([1.0, 2.0, 1.0]), "lamp_radiance": number([5.0, 4.0, 3.0])},
         "area": lambda: {"lamp": number([1.0, 3.0, 0.0]), "lamp_radiance": number([5.0, 4.0, 3.0])},
     }  # fmt: skip
     ground = number([[-3, -1.2, -3], [3, -1.2, -3], [3, -1.2, 3], [-3, -1.2, 3]])
@@ -130,8 +132,14 @@ def scene_of(words: str, n: Leaves) -> eg.Scene:
     if "sky" in n:
         lights.append(eg.Environment(n["sky"]))
     if "lamp" in n:
-        u, v = number([0.5, 0.0, 0.0]), number([0.0, 0.1, 0.5])
-        lights.append(eg.AreaLight.rectangle(n["lamp"], u, v, n["lamp_radiance"], two_sided="one_sided" not in words))
+        if "bulb" in words:
+            bulb = icosphere(1)
+            bulb = eg.Mesh(0.7 * bulb.verts.double() + n["lamp"], bulb.faces)
+            lights.append(eg.AreaLight.of(bulb, n["lamp_radiance"]))
+        else:
+            u, v = number([0.5, 0.0, 0.0]), number([0.0, 0.1, 0.5])
+            sides = "one_sided" not in words
+            lights.append(eg.AreaLight.rectangle(n["lamp"], u, v, n["lamp_radiance"], two_sided=sides))
     return eg.Scene([mesh, ground], lights=lights)
 
 

@@ -36,7 +36,7 @@ inline uint64_t z_order(uint32_t x, uint32_t y) { return spread_bits(x) | spread
 
 class ScrambledSobol {
    public:
-    explicit ScrambledSobol(uint64_t random) : x_(random), y_(mix(random)) {}
+    explicit ScrambledSobol(uint64_t random) : x_(random), y_(mix(random)), random_(random) {}
 
     // Points first … first + n − 1. They repeat after 2³².
     void fill(uint64_t first, int n, double* x, double* y) const {
@@ -44,6 +44,13 @@ class ScrambledSobol {
             const uint32_t i = uint32_t(first) + k;
             x[k] = unit(x_(i)), y[k] = unit(y_(pascal(i)));
         }
+    }
+
+    // Point i in another order, in which runs that begin at a multiple of their length 2^m stay together (Burley 2020,
+    // "Practical hash-based Owen scrambling"): so that several sequences of the same i know nothing of each other.
+    Vec2 shuffled(uint32_t i) const {
+        i = reversed_bits(Scramble(mix(random_ + 1))(reversed_bits(i)));
+        return {unit(x_(i)), unit(y_(pascal(i)))};
     }
 
    private:
@@ -75,6 +82,7 @@ class ScrambledSobol {
     static double unit(uint32_t x) { return to_unit(uint64_t(reversed_bits(x)) << 32 | 1u << 31); }
 
     Scramble x_, y_;
+    uint64_t random_;
 };
 
 }  // namespace edgegrad

@@ -4,6 +4,7 @@
 #include <atomic>
 #include <memory>
 
+#include "core/sobol.h"
 #include "forward/image_borders.h"
 #include "forward/pixel_hits.h"
 
@@ -59,7 +60,8 @@ class LitRow : public RowVisitor {
             const PixelHit& hit = hits[i];
             among_ = i > 0 && hits[i - 1].pixel == hit.pixel ? among_ + 1 : 0;
             face_.push_back(hit.face), b_.insert(b_.end(), {1 - (hit.b.u + hit.b.v), hit.b.u, hit.b.v});
-            seed_.push_back(int64_t(in_.seed + uint64_t(in_.points) * uint64_t(hit.pixel) + among_));
+            const uint64_t place = z_order(uint32_t(hit.pixel % in_.width), uint32_t(hit.pixel / in_.width));
+            seed_.push_back(int64_t(in_.seed + uint64_t(in_.points) * place + among_));
         }
         shade_some(in_.lit, in_.scene, in_.caster, {int64_t(n), face_.data(), b_.data(), seed_.data(), {}}, in_.options,
                    *buffers_, radiance_.data(), seen_.data());

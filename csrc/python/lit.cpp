@@ -188,6 +188,23 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
     return shaped(std::move(out), {size_t(view.size), size_t(moving.channels)});
 }
 
+// Index, uv and density, (N, samples) of each.
+nb::tuple drawn_light_points(const LitArrays& lit, const PointArrays& points, const LitOptions& options, int lamp,
+                             int threads) {
+    const LitPoints view = points.view(lit.scene, faces_of(lit));
+    if (lamp < 0 || size_t(lamp) >= lit.scene.lamps.size() || options.samples < 1)
+        refuse("lamp: expected one of the scene");
+    const size_t n = size_t(view.size), k = size_t(options.samples);
+    std::vector<LightPoint> found(n * k);
+    unlocked(threads, [&](Team& team) { draw_light_points(lit.scene, view, options, lamp, found.data(), team); });
+    std::vector<int64_t> index;
+    std::vector<double> uv, density;
+    for (const LightPoint& p : found)
+        index.push_back(p.index), uv.insert(uv.end(), {p.u, p.v}), density.push_back(p.density);
+    return nb::make_tuple(shaped(std::move(index), {n, k}), shaped(std::move(uv), {n, k, 2}),
+                          shaped(std::move(density), {n, k}));
+}
+
 }  // namespace
 
 template <class T>
@@ -205,6 +222,7 @@ void bind_lit(nb::module_& m) {
     bind_lit_arrays(m);
     m.def("shade_vjp", &shade_points_vjp, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "seen"_a.noconvert(),
           "bar"_a.noconvert(), "wanted"_a, "threads"_a);
+    m.def("light_points", &drawn_light_points, "lit"_a, "points"_a, "options"_a, "lamp"_a, "threads"_a);
     m.def("light_on_faces", &light_on_faces, "verts"_a.noconvert(), "faces"_a.noconvert(), "eye"_a.noconvert(),
           "perspective"_a, "place"_a.noconvert(), "infinite"_a, "power"_a, "threads"_a);
     m.def("shade_jvp", &shade_points_jvp, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "seen"_a.noconvert(),

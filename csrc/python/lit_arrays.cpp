@@ -1,12 +1,18 @@
 #include "python/lit_arrays.h"
 
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/shared_ptr.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
+#include <array>
+#include <memory>
 #include <string>
 #include <utility>
+
+#include "python/shaped.h"
 
 using namespace nanobind::literals;
 
@@ -52,7 +58,7 @@ LampArrays make_lamp(const std::string& kind, int position, int direction, int i
                      int outer_angle, int rotation, int radiance, int mesh, int64_t height, int64_t width,
                      bool is_image, std::optional<In<double, 1>> running, std::optional<In<double, 1>> density,
                      std::optional<In<double, 1>> brightness, std::optional<In<double, 1>> cosines,
-                     const std::vector<uint64_t>& stream, double eps) {
+                     std::shared_ptr<LampTree> tree, bool hides, const std::vector<uint64_t>& stream, double eps) {
     Lamp lamp;
     lamp.kind = kind_of<Lamp::Kind>("kind", kind,
                                     {"directional", "point", "spot", "mesh", "environment", "spherical harmonics"});
@@ -70,19 +76,51 @@ LampArrays make_lamp(const std::string& kind, int position, int direction, int i
         if (!cosines || int64_t(cosines->size()) != height + 1) refuse("cosines: expected one more than rows");
         lamp.brightness = brightness->data(), lamp.cosines = cosines->data();
     }
-    if (stream.size() != std::size(lamp.stream)) refuse("stream: expected six numbers");
+    lamp.tree = tree.get(), lamp.hides = hides;
+    if (lamp.kind == Lamp::Kind::mesh) {
+        if (!brightness || brightness->size() != 1) refuse("brightness: expected one number");
+        lamp.brightness = brightness->data();
+    }
+    if (stream.size() != std::size(lamp.stream)) refuse("stream: expected three numbers");
     std::copy(stream.begin(), stream.end(), lamp.stream);
-    return {lamp, {running, density, brightness, cosines}};
+    return {lamp, {running, density, brightness, cosines}, tree};
+}
+
+std::shared_ptr<LampTree> make_tree(In<double, 2> verts, Rows faces) {
+    if (verts.shape(1) != 3 || faces.shape(1) != 3 || faces.shape(0) == 0)
+        refuse("verts, faces: expected three columns, and a face");
+    check_indices("faces", faces.data(), faces.size(), verts.shape(0), "verts", 1);
+    return std::make_shared<LampTree>(verts.data(), int64_t(verts.shape(0)), faces.data(), int64_t(faces.shape(0)));
+}
+
+// What rays (N, 3) cross between `start` and `end` (N,), in lengths of their directions: ray and face (M, 2), and
+// barycentrics and distance (M, 3), ray after ray.
+nb::tuple crossings(const LampTree& tree, In<double, 2> origins, In<double, 2> directions, In<double, 1> start,
+                    In<double, 1> end) {
+    const size_t n = origins.shape(0);
+    if (origins.shape(1) != 3 || directions.shape(1) != 3 || directions.shape(0) != n || start.size() != n ||
+        end.size() != n)
+        refuse("origins, directions, start, end: expected a row a ray");
+    std::vector<int64_t> which;
+    std::vector<double> where;
+    for (size_t i = 0; i < n; ++i) {
+        const double *o = origins.data() + 3 * i, *d = directions.data() + 3 * i;
+        tree.each_crossing({o[0], o[1], o[2]}, {d[0], d[1], d[2]}, start(i), end(i), [&](const LampTree::Crossing& c) {
+            which.insert(which.end(), {int64_t(i), c.face}), where.insert(where.end(), {c.u, c.v, c.t});
+            return true;
+        });
+    }
+    const size_t m = which.size() / 2;
+    return nb::make_tuple(shaped(std::move(which), {m, 2}), shaped(std::move(where), {m, 3}));
 }
 
 }  // namespace
 
 LitArrays::LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshes, std::vector<LampArrays> lamps,
-                     Rows faces, int verts, int eye, bool perspective, int channels, const std::vector<double>& ball,
-                     const std::vector<uint64_t>& step)
+                     Rows faces, int verts, int eye, bool perspective, int channels, const std::vector<double>& ball)
     : tables_(std::move(tables)), meshes_(std::move(meshes)), lamps_(std::move(lamps)), faces_(faces) {
     if (channels < 1 || channels > most_lit_channels) refuse("channels: expected 1 to 16");
-    if (ball.size() != 4 || step.size() != 3) refuse("ball, step: expected 4 and 3 numbers");
+    if (ball.size() != 4) refuse("ball: expected 4 numbers");
     for (const AnyTable& t : tables_) {
         const bool wide = t.dtype() == nb::dtype<double>();
         if (!wide && t.dtype() != nb::dtype<float>()) refuse("tables: expected floats or doubles");
@@ -90,7 +128,6 @@ LitArrays::LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshe
     }
     scene.faces = faces_.data(), scene.verts = verts, scene.eye = eye, scene.perspective = perspective;
     scene.channels = channels, scene.center = {ball[0], ball[1], ball[2]}, scene.radius = ball[3];
-    std::copy(step.begin(), step.end(), scene.step);
     check_table("verts", verts, 1, 3), check_table("eye", eye, 1, 3);
     if (faces.shape(1) != 3) refuse("faces: expected three columns");
     check_indices("faces", faces.data(), faces.size(), size_t(table(verts).rows), "verts", 1);
@@ -179,6 +216,7 @@ void LitArrays::check_lamp(const Lamp& lamp) const {
     if (lamp.mesh < 0 || size_t(lamp.mesh) >= scene.meshes.size()) refuse("mesh: expected one of the scene");
     if (lamp.size != scene.meshes[size_t(lamp.mesh)].faces || !scene.meshes[size_t(lamp.mesh)].emission.exists())
         refuse("mesh: expected one that emits, and a density for each of its faces");
+    if (lamp.tree && lamp.tree->n_faces() != lamp.size) refuse("tree: expected that of the mesh");
 }
 
 LitPoints PointArrays::view(const LitScene& scene, int64_t faces) const {
@@ -200,6 +238,7 @@ LitPoints PointArrays::view(const LitScene& scene, int64_t faces) const {
 
 void bind_lit_arrays(nb::module_& m) {
     m.attr("MOST_LIT_CHANNELS") = most_lit_channels;
+    m.attr("MOST_LAMP_FACES") = LampTree::most_faces;
     nb::class_<SourceArrays>(m, "LitSource")
         .def(nb::new_(&make_source), "kind"_a, "value"_a = no_table, "factor"_a = no_table, "uvs"_a = no_table,
              "uv_faces"_a.noconvert() = nb::none(), "height"_a = 0, "width"_a = 0,
@@ -213,12 +252,13 @@ void bind_lit_arrays(nb::module_& m) {
         "intensity"_a = no_table, "color"_a = no_table, "inner_angle"_a = no_table, "outer_angle"_a = no_table,
         "rotation"_a = no_table, "radiance"_a = no_table, "mesh"_a = -1, "height"_a = 1, "width"_a = 1,
         "is_image"_a = false, "running"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(),
-        "brightness"_a.noconvert() = nb::none(), "cosines"_a.noconvert() = nb::none(), "stream"_a, "eps"_a);
+        "brightness"_a.noconvert() = nb::none(), "cosines"_a.noconvert() = nb::none(), "tree"_a = nb::none(),
+        "hides"_a = true, "stream"_a, "eps"_a);
     nb::class_<LitArrays>(m, "Lit").def(
         nb::init<std::vector<AnyTable>, std::vector<MeshArrays>, std::vector<LampArrays>, Rows, int, int, bool, int,
-                 const std::vector<double>&, const std::vector<uint64_t>&>(),
+                 const std::vector<double>&>(),
         nb::kw_only(), "tables"_a, "meshes"_a, "lamps"_a, "faces"_a.noconvert(), "verts"_a, "eye"_a, "perspective"_a,
-        "channels"_a, "ball"_a, "step"_a);
+        "channels"_a, "ball"_a);
     nb::class_<PointArrays>(m, "LitPoints")
         .def(nb::new_([](In<int64_t, 1> face, In<double, 2> b, In<int64_t, 1> seed, int forced_lamp,
                          std::optional<In<int64_t, 1>> index, std::optional<In<double, 2>> uv,
@@ -228,6 +268,16 @@ void bind_lit_arrays(nb::module_& m) {
              nb::kw_only(), "face"_a.noconvert(), "b"_a.noconvert(), "seed"_a.noconvert(), "forced_lamp"_a = -1,
              "index"_a.noconvert() = nb::none(), "uv"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(),
              "lit"_a.noconvert() = nb::none());
+    nb::class_<LampTree>(m, "LampTree")
+        .def(nb::new_(&make_tree), "verts"_a.noconvert(), "faces"_a.noconvert())
+        .def_prop_ro("is_flat", &LampTree::is_flat)
+        .def_prop_ro("is_convex", &LampTree::is_convex)
+        .def_prop_ro("ball",
+                     [](const LampTree& t) {
+                         return std::array<double, 5>{t.center().x, t.center().y, t.center().z, t.radius(), t.size()};
+                     })
+        .def("crossings", &crossings, "origins"_a.noconvert(), "directions"_a.noconvert(), "start"_a.noconvert(),
+             "end"_a.noconvert());
     nb::class_<LitOptions>(m, "LitOptions")
         .def(nb::new_([](bool shadows, int samples, int only, double dark) {
                  return LitOptions{shadows, samples, only, dark};

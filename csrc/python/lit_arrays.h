@@ -3,10 +3,12 @@
 #pragma once
 
 #include <cstdint>
+#include <memory>
 #include <optional>
 #include <vector>
 
 #include "python/checks.h"
+#include "shading/lit/lamp_tree.h"
 #include "shading/lit/lit_scene.h"
 
 namespace edgegrad {
@@ -28,14 +30,14 @@ struct MeshArrays {
 struct LampArrays {
     Lamp view;
     std::vector<std::optional<In<double, 1>>> arrays;  // that it refers to
+    std::shared_ptr<LampTree> tree;
 };
 
 // All of it, checked: what indexes what exists.
 class LitArrays {
    public:
     LitArrays(std::vector<AnyTable> tables, std::vector<MeshArrays> meshes, std::vector<LampArrays> lamps, Rows faces,
-              int verts, int eye, bool perspective, int channels, const std::vector<double>& ball,
-              const std::vector<uint64_t>& step);
+              int verts, int eye, bool perspective, int channels, const std::vector<double>& ball);
 
     LitScene scene;
 

@@ -3,6 +3,7 @@ forward mode; radiance.py computes the same in PyTorch."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -17,14 +18,15 @@ from ..library import core
 from ..points.frame import Frame
 from ..points.hits import Hits
 from ..points.records import values_of
-from ..points.seeds import STEPS, mixed_bits
+from ..points.seeds import mixed_bits
 from ..points.surfaces import Surfaces, View
 from ..scene.environment import Environment
-from ..scene.lights import DirectionalLight, Light, PointLight, SphericalHarmonics, SpotLight
+from ..scene.lights import DirectionalLight, Light, LightPoints, PointLight, SphericalHarmonics, SpotLight
 from ..scene.material import WRAPS, Parameter, Texture
 from ..scene.mesh import FILTERS, Mesh
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
+from .lamp_trees import hides, least_brightness, tree_of
 from .resampled import DARK
 
 _64_BITS = 2**64 - 1
@@ -115,6 +117,27 @@ def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
     return frame.here(found)
 
 
+def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
+    """`samples` points of a light for each of the hits, as radiance() draws them; where nothing arrives their density is
+    infinite."""
+    surfaces, view = hits._surfaces, hits._view
+    assert isinstance(view, View)
+    layout, tables = _layout(surfaces, view)
+
+    def compute(b: Tensor, face: Tensor, seed: Tensor, *tables_: Tensor) -> Sequence[Tensor]:
+        tables, faces = tables_[:-1], tables_[-1]
+        points = core.LitPoints(face=array(face), b=array(b), seed=array(seed))
+        options = core.LitOptions(shadows=False, samples=samples, only=-1, dark=DARK)
+        lit = layout.kernel(tables, faces)
+        found = core.light_points(lit, points, options, hits._index(light), torch.get_num_threads())
+        return [torch.from_numpy(x) for x in found]
+
+    given = [hits._exact.cpu(), hits._face.cpu(), hits._seed.cpu(), *tables, surfaces.bare.faces]
+    index, uv, density = (x.to(hits._face.device) for x in without_derivatives(compute, *given))
+    density = torch.where(density > 0, density, math.inf)
+    return [LightPoints(index[:, k], uv[:, k], density[:, k]) for k in range(samples)]
+
+
 def light_on_faces(
     verts: Tensor, faces: Tensor, view: View, infinite: list[bool], place: Tensor, power: Tensor
 ) -> Tensor:
@@ -196,9 +219,7 @@ class _Layout(NamedTuple):
 
     def kernel(self, tables: Sequence[Tensor], faces: Tensor) -> Any:
         parts = self._asdict()
-        return core.Lit(
-            tables=[array(t) for t in tables], faces=array(faces), step=[s & _64_BITS for s in STEPS], **parts
-        )
+        return core.Lit(tables=[array(t) for t in tables], faces=array(faces), **parts)
 
 
 def _layout(surfaces: Surfaces, view: View) -> tuple[_Layout, list[Tensor]]:
@@ -276,7 +297,7 @@ def _texture(mesh: Mesh, texture: Texture, tables: _Tables) -> Any:
 
 
 def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) -> Any:
-    stream = [mixed_bits(number * 0x10001 + k) for k in range(6)]
+    stream = [mixed_bits(number * 0x10001 + k) for k in range(3)]
 
     def lamp(kind: str, **fields: Any) -> Any:
         return core.Lamp(kind, stream=stream, **{"eps": eps, **fields})
@@ -284,8 +305,18 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
     if isinstance(light, MeshLight):
         mesh = next(i for i, mesh in enumerate(scene.meshes) if mesh is light.mesh)
         running, density = values_of(*light._table)
+        glossy = any(m.material is not None and m.material.is_glossy for m in scene.meshes)
         # Where a ray meets a thin face, its rounding error is many times the spacing of doubles: a lamp must not hide itself.
-        return lamp("mesh", mesh=mesh, running=running, density=density, eps=max(eps, 2.0**-40))
+        return lamp(
+            "mesh",
+            mesh=mesh,
+            running=running,
+            density=density,
+            brightness=np.array([least_brightness(light)]),
+            tree=tree_of(light) if glossy else None,
+            hides=hides(light),
+            eps=max(eps, 2.0**-40),
+        )
     if isinstance(light, Environment):
         running, density, brightness, cosines = values_of(*light._table, light._brightness, light._cosines)
         height, width = light._size

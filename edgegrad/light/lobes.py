@@ -45,11 +45,23 @@ class Lobes(NamedTuple):
         """Each so many times."""
         return Lobes(*(part.repeat_interleave(times, 0) for part in self))
 
+    def mirrored(self) -> Tensor:
+        """(N, 3) where flat mirrors would look."""
+        return normalize(2 * dot(self.n, self.v).clamp(min=0) * self.n - self.v, dim=-1)
+
+    def solid_angle(self) -> Tensor:
+        """(N, 1): one over the density there; of wide lobes all above the surface."""
+        own = (2 * math.pi * self.alpha * self.alpha * self._spread()).clamp(max=2 * math.pi)
+        return torch.where(self.narrow[:, None], own, 2 * math.pi)
+
+    def _spread(self) -> Tensor:
+        a2, nv = self.alpha * self.alpha, dot(self.n, self.v).clamp(min=0)
+        return self.bound * nv + (a2 + (1 - a2) * nv * nv).sqrt()
+
     def density(self, l: Tensor) -> Tensor:
         """(N,) by solid angle, of unit directions (N, 3): D(h) / 2 (k n·v + √(α² + (1 − α²) (n·v)²)), k the bound."""
-        a2, nv = self.alpha * self.alpha, dot(self.n, self.v).clamp(min=0)
-        D = ggx(self.n, normalize(self.v + l, dim=-1), a2)
-        return (D / (2 * (self.bound * nv + (a2 + (1 - a2) * nv * nv).sqrt())))[:, 0]
+        D = ggx(self.n, normalize(self.v + l, dim=-1), self.alpha * self.alpha)
+        return (D / (2 * self._spread()))[:, 0]
 
     def draw(self, u: Tensor) -> Tensor:
         """(N, 3) unit directions from numbers (N, 2) in [0, 1)."""

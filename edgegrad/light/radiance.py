@@ -38,6 +38,7 @@ from . import in_kernel
 from .bsdf import Scattering, dot, terminator
 from .creases import note_jumps
 from .in_kernel import is_fused, nearest_textures
+from .lamp_trees import MeshTowards, tree_of
 from .resampled import Glossy, resampled
 
 FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
@@ -101,11 +102,11 @@ class Lighting(NamedTuple):
     def resamples(scene: Scene) -> bool:
         """Whether points of lights are drawn by how surfaces scatter as well."""
         glossy = any(mesh.material is not None and mesh.material.is_glossy for mesh in scene.meshes)
-        return glossy and any(isinstance(light, Environment) for light in scene.casting)
+        return glossy and any(not light.punctual for light in scene.casting)
 
     def _in_image(self, scene: Scene, points: int, spp: int) -> tuple[Lighting, int]:
-        """How an image is lit without derivatives, and how many points of a face in a pixel are shaded. On glossy surfaces under
-        skies, more points with fewer light samples each: what is mirrored changes within a pixel as well."""
+        """How an image is lit without derivatives, and how many points of a face in a pixel are shaded. On glossy surfaces
+        more points with fewer light samples each: what is mirrored changes within a pixel as well."""
         if not self.resamples(scene):
             return self, points
         more = max(points, min(spp, points * self.samples))
@@ -252,13 +253,24 @@ def _where_seen(hits: Hits, material: Material, total: Tensor) -> Tensor:
 
 def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> Iterator[LightPoints]:
     """`count` points of a light for each point of a surface."""
-    if hits._knows_light(light) or not isinstance(light, Environment):
+    lambertian = surface.scattering.roughness is None
+    if hits._knows_light(light) or light.punctual or (lambertian and isinstance(light, MeshLight)):
         yield from (hits.light_points(light, sample, count) for sample in range(count))
-    elif surface.scattering.roughness is None:
+    elif lambertian and isinstance(light, Environment):
         yield from (light.above(hits.light_points(light, k, count), surface.g) for k in range(count))
+    elif isinstance(light, MeshLight) and tree_of(light) is None:
+        yield from (hits.light_points(light, sample, count) for sample in range(count))
     else:
         glossy = Glossy.of(surface.v, surface.n, surface.g, surface.scattering, hits._seed)
-        yield from resampled(light, hits._index(light), glossy, count)
+        meets = None
+        if isinstance(light, MeshLight):
+            first = next(
+                first
+                for first, mesh in zip(hits._surfaces.first_faces, hits._surfaces.scene.meshes, strict=True)
+                if mesh is light.mesh
+            )
+            meets = MeshTowards.of(light, surface.position.detach().double(), hits._face - first)
+        yield from resampled(light, hits._index(light), glossy, count, meets)
 
 
 def _light_sample(hits: Hits, light: Light, points: LightPoints, surface: _Surface, shadows: bool) -> Tensor:

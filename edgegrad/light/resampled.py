@@ -1,6 +1,6 @@
-"""Points of environments, drawn by what they give to glossy surfaces where nothing lies between, the target: of candidates that
-the light and the lobe have drawn some are kept in proportion to target / density (resampled importance sampling, Talbot et al.
-2005). csrc/shading/lit/light_sample.h does the same in the kernel."""
+"""Points of lights with an extent, drawn by what they give to glossy surfaces where nothing lies between, the target: of
+candidates that the light and the lobe have drawn some are kept in proportion to target / density (resampled importance sampling,
+Talbot et al. 2005). csrc/shading/lit/light_sample.h does the same in the kernel."""
 
 from __future__ import annotations
 
@@ -9,17 +9,40 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from ..points.seeds import uniform
+from ..points.sobol import key_of, sobol, sobol_parts
 from ..scene.environment import Environment
-from ..scene.lights import LightPoints
+from ..scene.lights import Light, LightPoints
+from ..scene.mesh_light import MeshLight
+from ..scene.scene import Scene
 from .bsdf import DIELECTRIC, LEAST_ALPHA, Scattering, dot, ggx, masking
-from .lobes import Lobes
+from .lamp_trees import MeshTowards, tree_of
+from .lobes import WIDEST_LOBE, Lobes
 
 EACH = 8  # candidates for one point that is kept, half of them by the lobe if it is narrow
 # Where radiance has derivatives, points are drawn as if no surface were darker, for what is black has derivatives too.
 DARK = 0.05
 AT_ONCE = 1 << 19  # candidates
+
+
+def how_drawn(scene: Scene) -> str:
+    """What plan() says of points of lights: by what they are drawn, and why."""
+    skies = sum(isinstance(light, Environment) for light in scene.casting)
+    lamps = [light for light in scene.casting if isinstance(light, MeshLight)]
+    if not (skies or lamps):
+        return ""
+    materials = [mesh.material for mesh in scene.meshes if mesh.material is not None]
+    if not any(material.is_glossy for material in materials):
+        return ", drawn by the light, for no surface is glossy"
+    of = ["skies"] * (skies > 0) + ["meshes that emit"] * (len(lamps) > 0)
+    said = f"; on glossy surfaces of {EACH} candidates for each, by light and, up to roughness {WIDEST_LOBE}, by lobe"
+    said += f", one is kept by what it gives ({', '.join(of)})"
+    if lamps:
+        said += "; a lamp well within the lobe by the light alone"
+    if any(tree_of(lamp) is None for lamp in lamps):
+        said += "; lamps of too many faces by the light alone"
+    return said
 
 
 class Glossy(NamedTuple):
@@ -54,7 +77,7 @@ class Glossy(NamedTuple):
     def scattered(self, l: Tensor) -> Tensor:
         """(N,) about f max(0, n·l), of unit directions (N, 3); zero only where nothing is scattered."""
         a2 = (self.roughness * self.roughness).clamp(min=LEAST_ALPHA) ** 2
-        h = torch.nn.functional.normalize(self.v + l, dim=-1)
+        h = normalize(self.v + l, dim=-1)
         nl = dot(self.n, l)
         specular = ggx(self.n, h, a2) * masking(dot(self.n, self.v).clamp(min=0), nl, a2)
         fresnel = self.head_on + (1 - self.head_on) * (1 - dot(self.v, h)).clamp(0, 1) ** 5
@@ -62,19 +85,85 @@ class Glossy(NamedTuple):
         return torch.where((nl > 0) & (dot(self.g, l) > 0), nl * f, 0.0)[:, 0]
 
 
-def resampled(light: Environment, stream: int, surfaces: Glossy, count: int) -> list[LightPoints]:
-    """`count` points for each surface, from random numbers of a stream. Where nothing arrives their density is infinite."""
+def resampled(
+    light: Light, stream: int, surfaces: Glossy, count: int, meets: MeshTowards | None = None
+) -> list[LightPoints]:
+    """`count` points for each surface, from random numbers of a stream. Where nothing arrives their density is infinite.
+    Surfaces `meets` a mesh that emits; an environment is everywhere the same."""
     with torch.no_grad():
         lobes = Lobes.of(surfaces.v, surfaces.n, surfaces.roughness)
         N, every = len(surfaces.n), torch.arange(len(surfaces.n), device=surfaces.n.device)
         index = torch.zeros((N, count), dtype=torch.int64, device=surfaces.n.device)
         uv, density = surfaces.n.new_zeros((N, count, 2)), surfaces.n.new_zeros((N, count))
         at_once = max(1, AT_ONCE // (EACH * count))
-        for some, by_lobe in ((every[lobes.narrow], EACH * count // 2), (every[~lobes.narrow], 0)):
-            for rows in some.split(at_once):
-                pool = _Candidates.of(light, stream, surfaces.select(rows), lobes.select(rows), EACH * count, by_lobe)
-                index[rows], uv[rows], density[rows] = pool.kept(stream, surfaces.seed[rows], count)
+        asked = lobes.narrow if meets is None else meets.is_drawn_by(lobes)
+        small = torch.zeros_like(asked) if meets is None else meets.is_small(lobes)
+        for all in (EACH * count, count):
+            for ask_lobe in (True, False):
+                rows_ = every[(small == (all < EACH * count)) & (asked == ask_lobe)]
+                for rows in rows_.split(at_once) if len(rows_) else ():
+                    some = None if meets is None else meets.select(rows)
+                    drawn = _Drawn(light, stream, surfaces.select(rows), lobes.select(rows), some)
+                    pool = drawn.candidates(all, all // 2 if ask_lobe else 0)
+                    index[rows], uv[rows], density[rows] = pool.kept(stream, surfaces.seed[rows], count)
         return [LightPoints(index[:, k], uv[:, k], density[:, k]) for k in range(count)]
+
+
+class _Drawn(NamedTuple):
+    """What candidates for N points are drawn by."""
+
+    light: Light
+    stream: int
+    surfaces: Glossy
+    lobes: Lobes
+    meets: MeshTowards | None
+
+    def candidates(self, all: int, by_lobe: int) -> _Candidates:
+        N, by_light = len(self.surfaces.n), all - by_lobe
+        seed = self.surfaces.seed
+        every = torch.arange(N, device=seed.device)
+        drawn = self.light.draw(sobol_parts(seed, key_of(self.stream, 0), by_light))
+        kinds = [self._weighted(every.repeat_interleave(by_light), drawn, by_light, by_lobe, False)]
+        if by_lobe:
+            l = self.lobes.repeated(by_lobe).draw(sobol_parts(seed, key_of(self.stream, 1), by_lobe))
+            if self.meets is None:
+                assert isinstance(self.light, Environment)
+                rows, points = every.repeat_interleave(by_lobe), self.light.points_at(l)
+            else:
+                l, (ray, points) = None, self.meets.repeated(by_lobe).towards(l)
+                rows = ray // by_lobe
+            kinds.append(self._weighted(rows, points, by_light, by_lobe, True, l))
+        parts = [torch.cat(part, 1) for part in zip(*kinds, strict=True)]
+        index, uv, target, weight = parts
+        return _Candidates(index, uv, target, weight.cumsum(1))
+
+    def _weighted(
+        self, rows: Tensor, points: LightPoints, by_light: int, by_lobe: int, of_lobe: bool, l: Tensor | None = None
+    ) -> list[Tensor]:
+        """Index, uv, target and weight of points of the surfaces `rows`, ascending, in rows as long as the longest."""
+        surfaces = self.surfaces.select(rows)
+        if self.meets is None:
+            assert isinstance(self.light, Environment)
+            l = self.light.place(points) if l is None else l
+            brightness, solid = self.light.brightness_at(points), torch.ones_like(points.density)
+        else:
+            meets = self.meets.select(rows)
+            l = normalize(self.light.place(points).detach() - meets.position, dim=1)
+            brightness, solid = meets.brightness(points), meets.solid_angles(points)
+        target = torch.where(solid > 0, surfaces.scattered(l) * brightness * solid, 0.0)
+        # The power heuristic (Veach and Guibas 1995).
+        light = by_light * points.density
+        lobe = by_lobe * self.lobes.select(rows).density(l) * solid if by_lobe else torch.zeros_like(light)
+        weight = torch.where(target > 0, target * (lobe if of_lobe else light) / (light**2 + lobe**2), 0.0)
+        N = len(self.surfaces.n)
+        many = torch.bincount(rows, minlength=N)
+        place = torch.arange(len(rows), device=rows.device) - (many.cumsum(0) - many)[rows]
+        J = int(many.max()) if len(rows) else 0
+
+        def padded(part: Tensor) -> Tensor:
+            return part.new_zeros((N, J, *part.shape[1:])).index_put((rows, place), part)
+
+        return [padded(part) for part in (points.index, points.uv, target, weight)]
 
 
 class _Candidates(NamedTuple):
@@ -85,35 +174,11 @@ class _Candidates(NamedTuple):
     target: Tensor  # (N, J)
     running: Tensor  # (N, J) the running sum of their weights, target / density
 
-    @classmethod
-    def of(cls, light: Environment, stream: int, surfaces: Glossy, lobes: Lobes, all: int, by_lobe: int) -> _Candidates:
-        N, by_light = len(surfaces.n), all - by_lobe
-        drawn = light.draw(uniform(_parts(surfaces.seed, by_light), 3, stream))
-        kinds = [(drawn, light.place(drawn), by_light)]
-        if by_lobe:
-            l = lobes.repeated(by_lobe).draw(uniform(_parts(surfaces.seed, by_lobe), 5, stream)[:, 3:])
-            kinds.append((light.points_at(l), l, by_lobe))
-        parts = []
-        for k, (points, l, times) in enumerate(kinds):
-            target = surfaces.repeated(times).scattered(l) * light.brightness_at(points)
-            densities = by_light * points.density, by_lobe * lobes.repeated(times).density(l)
-            # The power heuristic (Veach and Guibas 1995).
-            weight = target * densities[k] / (densities[0] ** 2 + densities[1] ** 2)
-            numbers = points.index, points.uv, target, torch.where(target > 0, weight, 0.0)
-            parts.append([part.reshape(N, times, *part.shape[1:]) for part in numbers])
-        index, uv, target, weight = (torch.cat(part, 1) for part in zip(*parts, strict=True))
-        return cls(index, uv, target, weight.cumsum(1))
-
     def kept(self, stream: int, seed: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
         """Of `count` points the index, uv and density, drawn with one random number each (systematic resampling)."""
         total = self.running[:, -1:]
-        u = uniform(seed, 6, stream)[:, 5:]
+        u = sobol(seed, key_of(stream, 2))[:, :1]
         at = (torch.arange(count, device=u.device) + u) / count * total
         j = torch.searchsorted(self.running, at, right=True).clamp(max=self.running.shape[1] - 1)
         density = torch.where(total > 0, self.target.gather(1, j) / total, math.inf)
         return self.index.gather(1, j), self.uv.gather(1, j[..., None].expand(-1, -1, 2)), density
-
-
-def _parts(seed: Tensor, parts: int) -> Tensor:
-    """(N · parts,): see Hits.random."""
-    return (seed[:, None] * parts + torch.arange(parts, device=seed.device)).reshape(-1)

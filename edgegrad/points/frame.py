@@ -16,6 +16,7 @@ from .hits import Hits
 from .records import RayRecords, Sampler, SurfaceRecords, barycentrics, without_colors
 from .seeds import sample_seeds
 from .shadow_rays import Forced
+from .sobol import z_order
 from .splat import Term, attached
 from .steps import Steps
 from .surfaces import Surfaces, View
@@ -59,7 +60,8 @@ class Frame:
         begins = torch.ones(len(pixel), dtype=torch.bool)
         begins[1:] = pixel[1:] != pixel[:-1]
         among = row - torch.where(begins, row, 0).cummax(0).values if len(pixel) else row
-        return self.seeds(kind, 1) + self.here(each * pixel + among)
+        place = z_order(pixel.long() % self.width, pixel.long() // self.width)
+        return self.seeds(kind, 1) + self.here(each * place + among)
 
     def fixed_hits(
         self,

@@ -34,8 +34,8 @@ STEPS = tuple(signed(int(_golden(3) ** -k * 2**64) | 1) for k in (1, 2, 3))
 
 
 def sample_seeds(seed: int, stream: int, first: int, count: int) -> Tensor:
-    """(count,) int64: the seeds of a stream's samples from `first` on."""
-    start = mixed_bits(mixed_bits(seed) ^ mixed_bits(-1 - stream)) >> 1
+    """(count,) int64: the seeds of a stream's samples from `first` on. The upper half is the stream's, the lower counts."""
+    start = mixed_bits(mixed_bits(seed) ^ mixed_bits(-1 - stream)) & ~0xFFFFFFFF
     return torch.arange(first, first + count) + signed(start)
 
 

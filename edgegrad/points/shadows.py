@@ -46,7 +46,7 @@ class ShadowLight(NamedTuple):
     @staticmethod
     def moves(light: Light) -> bool:
         """Whether the place of one of its points may be differentiated."""
-        return moves(light.place(light.draw(torch.zeros((1, 3), dtype=torch.float64))))
+        return moves(light.place(light.draw(torch.zeros((1, 2), dtype=torch.float64))))
 
     def points(self, part: Tensor, uv: Tensor) -> tuple[LightPoints, Tensor]:
         """Those at the last two barycentrics uv (N, 2) of parts (N,), and (N,) the light's own density of points over that by
@@ -56,7 +56,7 @@ class ShadowLight(NamedTuple):
             face = self.faces.to(part.device)[part]
             return LightPoints(face, uv, self.light.density[face]), one
         if not isinstance(self.light, Environment):
-            return self.light.draw(torch.zeros((len(uv), 3), dtype=torch.float64, device=uv.device)), one
+            return self.light.draw(torch.zeros((len(uv), 2), dtype=torch.float64, device=uv.device)), one
         corner = self.parts.corner.to(uv.device)
         direction = (barycentrics(uv)[:, :, None] * corner[part]).sum(1)
         points = self.light.points_at(torch.nn.functional.normalize(direction, dim=1))
@@ -70,7 +70,7 @@ def _of_mesh(light: MeshLight, first_face: int, seed: int) -> tuple[LightParts, 
     assert mesh.material is not None
     faces = (chance > 0).nonzero()[:, 0]
     if len(faces) > MOST_FACES:
-        faces = pick(chance.cumsum(0), _even(MOST_FACES, seed)[:, 0].to(chance))
+        faces, _ = pick(chance.cumsum(0), _even(MOST_FACES, seed)[:, 0].to(chance))
         chance = torch.full_like(chance, 1 / MOST_FACES)
     corner = mesh.verts.detach()[mesh.faces[faces].long()].double().cpu()
     # In an order that keeps neighbours together, for the kernel tests edges against blocks of parts.

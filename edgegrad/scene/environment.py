@@ -108,8 +108,10 @@ class Environment(Light):
 
     def draw(self, u: Tensor) -> LightPoints:
         running, density = self._table
-        index = pick(running, u[:, 0])
-        return LightPoints(index, u[:, 1:3].detach().double(), density[index])
+        w = self._size[1]
+        row, v = pick(running[w - 1 :: w].contiguous(), u[:, 0])
+        index, x = pick(running, u[:, 1], row * w, w)
+        return LightPoints(index, torch.stack([x, v], 1), density[index])
 
     def _own_directions(self, points: LightPoints) -> Tensor:
         """(N, 3) float64, in the frame of the image."""
@@ -197,7 +199,18 @@ class Environment(Light):
         return torch.lerp(top, torch.lerp(texel(1, 0), texel(1, 1), fc), fr)
 
 
-def pick(running: Tensor, u: Tensor) -> Tensor:
-    """(N,) int64: rows by their probabilities, of which `running` (M,) is the running sum, from numbers u (N,) in [0, 1)."""
-    last = running[-1]
-    return torch.searchsorted(running, (u.double() * last).contiguous(), right=True).clamp(max=len(running) - 1)
+def pick(running: Tensor, u: Tensor, first: Tensor | int = 0, count: int | None = None) -> tuple[Tensor, Tensor]:
+    """Which parts (N,) of the `count` from `first` on numbers u (N,) in [0, 1) pick by their probabilities, of which `running`
+    (M,) is the running sum; and how far within these: (N,) in [0, 1], uniform as well."""
+    u, count = u.detach().double(), len(running) if count is None else count
+    first = torch.zeros_like(u, dtype=torch.int64) + first
+
+    def before(k: Tensor) -> Tensor:
+        return torch.where(k > 0, running[(k - 1).clamp(min=0)], 0.0)
+
+    start = before(first)
+    at = start + u * (before(first + count) - start)
+    part = torch.searchsorted(running, at.contiguous(), right=True).clamp(min=first, max=first + count - 1)
+    mass = before(part + 1) - before(part)
+    within = ((at - before(part)) / torch.where(mass > 0, mass, 1.0)).clamp(0, 1)
+    return part, torch.where(mass > 0, within, 0.5)

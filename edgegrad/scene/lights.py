@@ -61,7 +61,7 @@ class Light:
         raise NotImplementedError
 
     def draw(self, u: Tensor) -> LightPoints:
-        """Points from numbers u (N, 3), uniform in [0, 1)."""
+        """Points from numbers u (N, 2), uniform in [0, 1)."""
         count = len(u)
         one = torch.ones(count, dtype=torch.float64, device=u.device)
         return LightPoints(torch.zeros(count, dtype=torch.int64, device=u.device), one[:, None].expand(-1, 2) * 0, one)

@@ -39,8 +39,8 @@ class MeshLight(Light):
         return torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
 
     @cached_property
-    def _table(self) -> tuple[Tensor, Tensor]:
-        """(F,) float64: the running sum of the probabilities of faces, and their densities by area."""
+    def _powers(self) -> tuple[Tensor, Tensor]:
+        """(F,) float64: areas of faces, and areas times the mean magnitude of what they emit."""
         with torch.no_grad():
             face = torch.arange(len(self.mesh.faces), device=self.mesh.verts.device)
             area = self._area(face).double().norm(dim=1)
@@ -50,10 +50,21 @@ class MeshLight(Light):
                     len(face), 3
                 )
                 total = total + self._emission(face, weights / sum(b)).double().abs().mean(1)
-            power = area * total
+            return area, area * total / 4
+
+    @cached_property
+    def _table(self) -> tuple[Tensor, Tensor]:
+        """(F,) float64: the running sum of the probabilities of faces, and their densities by area."""
+        with torch.no_grad():
+            area, power = self._powers
             share = area / area.sum() if float(area.sum()) > 0 else torch.full_like(area, 1 / len(area))
             chance = (1 - EVEN) * power / power.sum() + EVEN * share if float(power.sum()) > 0 else share
             return chance.cumsum(0), torch.where(area > 0, chance / torch.where(area > 0, area, 1.0), 0.0)
+
+    @cached_property
+    def mean_emission(self) -> Tensor:
+        """() float64: the mean magnitude over the area."""
+        return self._powers[1].sum() / self._powers[0].sum().clamp(min=1e-300)
 
     @property
     def density(self) -> Tensor:
@@ -68,10 +79,10 @@ class MeshLight(Light):
 
     def draw(self, u: Tensor) -> LightPoints:
         running, density = self._table
-        face = pick(running, u[:, 0])
+        face, within = pick(running, u[:, 0])
         # Uniform in a triangle (Turk 1990).
-        root = u[:, 1].double().sqrt()
-        uv = torch.stack([root * (1 - u[:, 2]), root * u[:, 2]], 1)
+        root, v = within.sqrt(), u[:, 1].double()
+        uv = torch.stack([root * (1 - v), root * v], 1)
         return LightPoints(face, uv, density[face])
 
     def _weights(self, points: LightPoints) -> Tensor:

@@ -1,4 +1,5 @@
-"""What scenes can do with the help of packages that stand above them: each sets its function here (edgegrad/__init__.py)."""
+"""What scenes and hits can do with the help of packages that stand above them, which set their functions here
+(edgegrad/__init__.py)."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ def _missing(*args: Any) -> Any:
 
 from_trimesh: Callable[[Any], Mesh] = _missing
 to_trimesh: Callable[[Mesh], Any] = _missing
+points_by_material: Callable[[Any, Any, int], list[Any]] = _missing  # of hits and a light, so many
 thumbnail: Callable[[Scene | Mesh], bytes] = _missing
 
 

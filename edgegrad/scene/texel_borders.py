@@ -72,7 +72,7 @@ class TexelBorders(NamedTuple):
 
     def draw(self, u: Tensor) -> BorderPoints:
         """From numbers u (N, 2) in [0, 1)."""
-        k = pick(self.running, u[:, 0])
+        k, _ = pick(self.running, u[:, 0])
         b = torch.lerp(self.begin[k], self.end[k], u[:, 1:2])
         jump = self.jump[k]
         weight = self.running[-1] * jump / jump.abs().mean(1, keepdim=True)

@@ -9,6 +9,8 @@
 
 namespace edgegrad {
 
+class LampTree;
+
 struct Lamp {
     enum class Kind { directional, point, spot, mesh, environment, harmonics };
     Kind kind = Kind::point;
@@ -21,9 +23,14 @@ struct Lamp {
     // Of lights with an extent: the running sum of the probabilities of faces or texels, and their densities.
     const double *running = nullptr, *density = nullptr;
     int64_t size = 0;
-    // Of an environment: how bright texels are, but none is black, and the cosines of where rows begin and end.
+    // Of a mesh: its faces by where they lie, if glossy surfaces ask; whether none is cut out, so that near ones hide
+    // far ones.
+    const LampTree* tree = nullptr;
+    bool hides = true;
+    // Of an environment: how bright texels are, but none is black, and the cosines of where rows begin and end. Of a
+    // mesh one number, which is added to how bright it is, for the same reason.
     const double *brightness = nullptr, *cosines = nullptr;
-    uint64_t stream[6] = {};  // of its random numbers: three of the light, two of lobes, one of the choice
+    uint64_t stream[3] = {};  // of its random numbers: of the light, of lobes, and of the choice
     double eps = 0;           // relative spacing of places of its points
 
     bool is_infinite() const {
@@ -41,15 +48,36 @@ struct LightPoint {
     bool exists() const { return density > 0; }
 };
 
-// From numbers u in [0, 1).
-inline LightPoint draw(const Lamp& lamp, const double u[3]) {
+// Which of the parts first … first + n − 1 of the running sum of their probabilities, each `step` wide, a number in
+// [0, 1) picks, and how far within that: uniform as well.
+struct Picked {
+    int64_t part;
+    double within;
+};
+inline Picked pick(const double* running, int64_t first, int64_t n, int64_t step, double u) {
+    const auto before = [&](int64_t k) { return k == 0 ? 0.0 : running[k * step - 1]; };
+    const double start = before(first), at = start + u * (before(first + n) - start);
+    int64_t low = first, high = first + n - 1;  // the part is one of these
+    while (low < high) {
+        const int64_t middle = (low + high) / 2;
+        if (at < before(middle + 1)) high = middle;
+        else low = middle + 1;
+    }
+    const double mass = before(low + 1) - before(low);
+    return {low, mass > 0 ? std::clamp((at - before(low)) / mass, 0.0, 1.0) : 0.5};
+}
+
+// From numbers in [0, 1), so that near ones give near points: of an environment first the row, then the column.
+inline LightPoint draw(const Lamp& lamp, Vec2 u) {
     if (lamp.is_punctual()) return {};
-    const double* end = lamp.running + lamp.size;
-    const int64_t index =
-        std::min<int64_t>(std::upper_bound(lamp.running, end, u[0] * end[-1]) - lamp.running, lamp.size - 1);
-    if (lamp.kind == Lamp::Kind::environment) return {index, u[1], u[2], lamp.density[index]};
-    const double root = std::sqrt(u[1]);  // uniform in a triangle (Turk 1990)
-    return {index, root * (1 - u[2]), root * u[2], lamp.density[index]};
+    if (lamp.kind == Lamp::Kind::environment) {
+        const Picked row = pick(lamp.running, 0, lamp.height, lamp.width, u.x);
+        const Picked texel = pick(lamp.running, row.part * lamp.width, lamp.width, 1, u.y);
+        return {texel.part, texel.within, row.within, lamp.density[texel.part]};
+    }
+    const Picked face = pick(lamp.running, 0, lamp.size, 1, u.x);
+    const double root = std::sqrt(face.within);  // uniform in a triangle (Turk 1990)
+    return {face.part, root * (1 - u.y), root * u.y, lamp.density[face.part]};
 }
 
 // What arrives at a point of a surface: from where, and how much at normal incidence over the density of the point of

@@ -4,9 +4,11 @@
 #include <cstdint>
 #include <vector>
 
+#include "core/sobol.h"
 #include "shading/lit/environment.h"
 #include "shading/lit/lit_surface.h"
 #include "shading/lit/lobe_draw.h"
+#include "shading/lit/mesh_towards.h"
 #include "shading/lit/punctual.h"
 
 namespace edgegrad {
@@ -59,20 +61,26 @@ inline Vec3 place(const LitScene& lit, const Lamp& lamp, const LightPoint& p) {
     }
 }
 
-// Uniform numbers of one point and lamp, that fill the unit cube evenly (edgegrad/points/seeds.py): number k of part j
-// of so many.
+// Uniform numbers of one point and lamp, that fill the unit square evenly over the points of a pixel, and of blocks of
+// pixels (edgegrad/points/sobol.py). The upper half of a seed says which sequence, the lower which of its points: each
+// takes as many in a row as it has parts.
 struct Numbers {
-    const LitScene& lit;
     const Lamp& lamp;
     uint64_t seed;
 
-    double operator()(int k, int j, int count) const {
-        const uint64_t part = seed * uint64_t(count) + uint64_t(j);
-        return double((part * lit.step[k % 3] + lamp.stream[k]) >> 11) * 0x1p-53;
+    // Number j of so many.
+    Vec2 of_light(int j, int count) const { return at(0, j, count); }
+    Vec2 of_lobe(int j, int count) const { return at(1, j, count); }
+    double of_choice() const { return at(2, 0, 1).x; }
+
+   private:
+    Vec2 at(int k, int j, int count) const {
+        return ScrambledSobol(hash(seed >> 32, lamp.stream[k]))
+            .shuffled(uint32_t(seed) * uint32_t(count) + uint32_t(j));
     }
 };
 
-// Points of an environment, drawn by what they give to a glossy surface where nothing lies between, the target: of
+// Points of a light, drawn by what they give to a glossy surface where nothing lies between, the target: of
 // candidates that the light and the lobe have drawn, and that the power heuristic weights (Veach and Guibas 1995),
 // `count` are kept in proportion to target / density (resampled importance sampling, Talbot et al. 2005). Their density
 // is the target over its integral as the candidates estimate it.
@@ -83,21 +91,26 @@ class Resampled {
     template <class S>
     Resampled(const LitScene& lit, const Lamp& lamp, const Numbers& numbers, const Surface<S>& o, int count,
               double dark)
-        : lamp_(lamp), target_(o, lit.channels, dark), lobe_(o) {
-        const int all = each * count, by_lobe = lobe_.exists() ? all / 2 : 0, by_light = all - by_lobe;
-        share_light_ = by_light, share_lobe_ = by_lobe;
-        kept_.reserve(all), running_.reserve(all);
-        const Rotation<double> turn = Rotation<double>::of(lit.tables, lamp);
-        for (int j = 0; j < by_light; ++j) {
-            const double u[3] = {numbers(0, j, by_light), numbers(1, j, by_light), numbers(2, j, by_light)};
-            const LightPoint p = draw(lamp, u);
-            const Vec3 own = own_direction(lamp, p);
-            add(p, lamp.rotation == no_table ? own : unit(turn.to_world(own)), false);
+        : target_(o, lit.channels, dark), lobe_(o) {
+        if (lamp.kind == Lamp::Kind::environment) {
+            const Rotation<double> turn = Rotation<double>::of(lit.tables, lamp);
+            draw_candidates(
+                lamp, numbers, each * count, lobe_.exists(),
+                [&](const LightPoint& p) {
+                    const Vec3 own = own_direction(lamp, p);
+                    return Candidate{p, lamp.rotation == no_table ? own : unit(turn.to_world(own)),
+                                     brightness(lamp, p)};
+                },
+                [&](Vec3 l, auto add) {
+                    const LightPoint p = point_towards(lit.tables, lamp, l);
+                    add(Candidate{p, l, brightness(lamp, p)});
+                });
+            return;
         }
-        for (int j = 0; j < by_lobe; ++j) {
-            const Vec3 l = lobe_.draw(numbers(3, j, by_lobe), numbers(4, j, by_lobe));
-            add(point_towards(lit.tables, lamp, l), l, true);
-        }
+        const MeshTowards mesh(lit, lamp, plain(o.y), o.at.face + o.mesh->first_face);
+        draw_candidates(
+            lamp, numbers, mesh.is_small(lobe_) ? count : each * count, mesh.is_drawn_by(lobe_),
+            [&](const LightPoint& p) { return mesh.of(p); }, [&](Vec3 l, auto add) { mesh.each_towards(l, add); });
     }
 
     // Writes `count` points; ones that do not exist where nothing arrives.
@@ -139,17 +152,32 @@ class Resampled {
         double roughness_, diffuse_ = 0, head_on_ = 0;
     };
 
-    void add(LightPoint p, Vec3 l, bool of_lobe) {
-        const double target = target_(l) * brightness(lamp_, p);
-        if (!(target > 0)) return;
-        const double by_light = share_light_ * p.density, by_lobe = lobe_.exists() ? share_lobe_ * lobe_.density(l) : 0;
-        const double own = of_lobe ? by_lobe : by_light;
-        total_ += target * own / (by_light * by_light + by_lobe * by_lobe);
-        p.density = target;
-        kept_.push_back(p), running_.push_back(total_);
+    // So many, of which half are drawn by the lobe if it is asked: at(point) and towards(direction, add) say what they
+    // are.
+    template <class At, class Towards>
+    void draw_candidates(const Lamp& lamp, const Numbers& numbers, int all, bool ask_lobe, At at, Towards towards) {
+        const int by_lobe = ask_lobe ? all / 2 : 0, by_light = all - by_lobe;
+        share_light_ = by_light, share_lobe_ = by_lobe;
+        kept_.reserve(all), running_.reserve(all);
+        for (int j = 0; j < by_light; ++j) add(at(draw(lamp, numbers.of_light(j, by_light))), false);
+        for (int j = 0; j < by_lobe; ++j) {
+            const Vec2 u = numbers.of_lobe(j, by_lobe);
+            towards(lobe_.draw(u.x, u.y), [&](const Candidate& c) { add(c, true); });
+        }
     }
 
-    const Lamp& lamp_;
+    void add(const Candidate& c, bool of_lobe) {
+        if (!(c.solid_angle > 0)) return;
+        const double target = target_(c.l) * c.brightness * c.solid_angle;
+        if (!(target > 0)) return;
+        const double by_light = share_light_ * c.point.density,
+                     by_lobe = share_lobe_ > 0 ? share_lobe_ * lobe_.density(c.l) * c.solid_angle : 0;
+        const double own = of_lobe ? by_lobe : by_light;
+        total_ += target * own / (by_light * by_light + by_lobe * by_lobe);
+        kept_.push_back(c.point), running_.push_back(total_);
+        kept_.back().density = target;
+    }
+
     Target target_;
     DrawnLobe lobe_;
     double share_light_ = 0, share_lobe_ = 0, total_ = 0;
@@ -163,18 +191,17 @@ void light_points(const LitScene& lit, const LitPoints& points, int64_t i, int n
                   const Surface<S>& o, LightPoint* out) {
     const Lamp& lamp = lit.lamps[number];
     const ForcedLight& forced = points.forced;
-    const Numbers numbers{lit, lamp, uint64_t(points.seed[i])};
+    const Numbers numbers{lamp, uint64_t(points.seed[i])};
     if (lamp.is_punctual()) {
         out[0] = {};
     } else if (forced.lamp == number) {
         std::fill(out, out + count,
                   LightPoint{forced.index[i], forced.uv[2 * i], forced.uv[2 * i + 1], forced.density[i]});
-    } else if (lamp.kind == Lamp::Kind::environment && !o.scattering.lambertian) {
-        Resampled(lit, lamp, numbers, o, count, dark).keep(numbers(5, 0, 1), count, out);
+    } else if ((lamp.kind == Lamp::Kind::environment || lamp.tree) && !o.scattering.lambertian) {
+        Resampled(lit, lamp, numbers, o, count, dark).keep(numbers.of_choice(), count, out);
     } else {
         for (int s = 0; s < count; ++s) {
-            const double u[3] = {numbers(0, s, count), numbers(1, s, count), numbers(2, s, count)};
-            out[s] = draw(lamp, u);
+            out[s] = draw(lamp, numbers.of_light(s, count));
             if (lamp.kind == Lamp::Kind::environment) out[s] = above(lit.tables, lamp, out[s], plain(o.g));
         }
     }

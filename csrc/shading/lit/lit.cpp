@@ -38,6 +38,18 @@ void shade(const LitScene& lit, const SceneView<T>& scene, const RayCaster& cast
                    });
 }
 
+void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options, int lamp,
+                       LightPoint* out, Team& team) {
+    team.each_block(points.size, [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i) {
+            Surface<double> o;
+            set_surface<double>(lit, points.face[i], points.b + 3 * i, o);
+            if (!o.scattering.lambertian) look_up_material(lit, o);
+            light_points(lit, points, i, lamp, options.samples, options.dark, o, out + i * options.samples);
+        }
+    });
+}
+
 namespace {
 
 // Calls body(first, last, cotangents) for chunks of points, and adds these up.

@@ -29,6 +29,9 @@ std::shared_ptr<ShadeBuffers> shade_buffers(const LitScene& lit, const LitOption
 template <class T>
 void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                 const LitOptions& options, ShadeBuffers& buffers, double* radiance, int8_t* seen);
+// The points of one lamp that these are lit by, `options.samples` for each.
+void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options, int lamp,
+                       LightPoint* out, Team& team);
 // From what shade() found. Adds to the cotangents of the tables, and writes those of b (N, 3).
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
                const double* bar, const std::vector<TableBar>& to, double* b_bar, Team& team);

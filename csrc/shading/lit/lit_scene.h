@@ -33,7 +33,6 @@ struct LitScene {
     int channels = 0;
     Vec3 center;  // of a ball around all vertices
     double radius = 0;
-    uint64_t step[3] = {};  // of random numbers, from one seed to the next
 
     const LitMesh& mesh_of(int64_t face) const {
         size_t k = 0;

@@ -33,11 +33,18 @@ class DrawnLobe {
 
     bool exists() const { return alpha_ > 0; }
 
+    // Where a flat mirror would look.
+    Vec3 mirrored() const { return unit(2 * nv_ * n_ - v_); }
+    // One over the density there; of wide lobes all above the surface.
+    double solid_angle() const {
+        return exists() ? std::min(2 * M_PI * alpha_ * alpha_ * spread(), 2 * M_PI) : 2 * M_PI;
+    }
+
     // By solid angle: D(h) / 2 (k n·v + √(α² + (1 − α²) (n·v)²)), k the bound.
     double density(Vec3 l) const {
         const Vec3 h = unit(v_ + l), sine = cross(n_, h);
         const double a2 = alpha_ * alpha_, nh = dot(n_, h), d = dot(sine, sine) + a2 * nh * nh;
-        return a2 / (M_PI * d * d) / (2 * (bound_ * nv_ + std::sqrt(a2 + (1 - a2) * nv_ * nv_)));
+        return a2 / (M_PI * d * d) / (2 * spread());
     }
 
     // From numbers in [0, 1): where the hemisphere of normals is a sphere, they fill a cap of it evenly (Dupuy and
@@ -57,6 +64,11 @@ class DrawnLobe {
     static Mat3 axes_around(Vec3 n) {
         const double sign = std::copysign(1.0, n.z), a = -1 / (sign + n.z), b = n.x * n.y * a;
         return {{{1 + sign * n.x * n.x * a, sign * b, -sign * n.x}, {b, sign + n.y * n.y * a, -n.y}, n}};
+    }
+
+    double spread() const {
+        const double a2 = alpha_ * alpha_;
+        return bound_ * nv_ + std::sqrt(a2 + (1 - a2) * nv_ * nv_);
     }
 
     double alpha_ = 0, nv_ = 0, bound_ = 1;
