@@ -228,10 +228,10 @@ void bind_lit_arrays(nb::module_& m) {
              "index"_a.noconvert() = nb::none(), "uv"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(),
              "lit"_a.noconvert() = nb::none());
     nb::class_<LitOptions>(m, "LitOptions")
-        .def(nb::new_([](bool shadows, int samples, int only, double dark) {
-                 return LitOptions{shadows, samples, only, dark};
+        .def(nb::new_([](bool shadows, int samples, int only, bool in_fours, double dark) {
+                 return LitOptions{shadows, samples, only, in_fours, dark};
              }),
-             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a, "dark"_a);
+             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a, "in_fours"_a, "dark"_a);
 }
 
 }  // namespace edgegrad

@@ -8,7 +8,7 @@ with one point, or a few, of each light that has an extent. Spherical harmonics 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -96,8 +96,7 @@ class Lighting(NamedTuple):
     @staticmethod
     def resamples(scene: Scene) -> bool:
         """Whether points of lights are drawn by how surfaces scatter as well."""
-        glossy = any(mesh.material is not None and mesh.material.is_glossy for mesh in scene.meshes)
-        return glossy and any(isinstance(light, Environment) for light in scene.casting)
+        return scene.is_glossy and any(isinstance(light, Environment) for light in scene.casting)
 
     def _in_image(self, scene: Scene, points: int, spp: int) -> tuple[Lighting, int]:
         """How an image is lit without derivatives, and how many points of a face in a pixel are shaded. On glossy surfaces under
@@ -231,8 +230,9 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
         if hits._only_light and not hits._knows_light(light):
             continue
         count = 1 if light.punctual or hits._only_light else lighting.samples
-        for points in _points_of(hits, light, count, surface):
-            total = total + _light_sample(hits, light, points, surface, lighting.shadows) / count
+        drawn = _points_of(hits, light, count, surface)
+        for points in drawn:
+            total = total + _light_sample(hits, light, points, surface, lighting.shadows) / len(drawn)
     return _where_seen(hits, material, total)
 
 
@@ -242,15 +242,15 @@ def _where_seen(hits: Hits, material: Material, total: Tensor) -> Tensor:
     return total if material.two_sided else torch.where(front, total, 0.0)
 
 
-def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> Iterator[LightPoints]:
-    """`count` points of a light for each point of a surface."""
+def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> list[LightPoints]:
+    """`count` points of a light for each point of a surface; where only derivatives are wanted, so many fours of an environment
+    for a glossy one."""
     if hits._knows_light(light) or not isinstance(light, Environment):
-        yield from (hits.light_points(light, sample, count) for sample in range(count))
-    elif surface.scattering.roughness is None:
-        yield from (light.above(hits.light_points(light, k, count), surface.g) for k in range(count))
-    else:
-        glossy = Glossy.of(surface.v, surface.n, surface.g, surface.scattering, hits._seed)
-        yield from resampled(light, hits._index(light), glossy, count)
+        return [hits.light_points(light, sample, count) for sample in range(count)]
+    if surface.scattering.roughness is None:
+        return [light.above(hits.light_points(light, k, count), surface.g) for k in range(count)]
+    glossy = Glossy.of(surface.v, surface.n, surface.g, surface.scattering, hits._seed)
+    return resampled(light, hits._index(light), glossy, count, in_fours=not hits._needs_values)
 
 
 def _light_sample(hits: Hits, light: Light, points: LightPoints, surface: _Surface, shadows: bool) -> Tensor:

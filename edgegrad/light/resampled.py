@@ -14,6 +14,7 @@ from ..points.seeds import uniform
 from ..scene.environment import Environment
 from ..scene.lights import LightPoints
 from .bsdf import DIELECTRIC, LEAST_ALPHA, Scattering, dot, ggx, masking
+from .companions import COMPANIONS, companions
 from .lobes import Lobes
 
 EACH = 8  # candidates for one point that is kept, half of them by the lobe if it is narrow
@@ -62,56 +63,81 @@ class Glossy(NamedTuple):
         return torch.where((nl > 0) & (dot(self.g, l) > 0), nl * f, 0.0)[:, 0]
 
 
-def resampled(light: Environment, stream: int, surfaces: Glossy, count: int) -> list[LightPoints]:
-    """`count` points for each surface, from random numbers of a stream. Where nothing arrives their density is infinite."""
+def resampled(
+    light: Environment, stream: int, surfaces: Glossy, count: int, in_fours: bool = False
+) -> list[LightPoints]:
+    """`count` points for each surface, from random numbers of a stream. Where nothing arrives their density is infinite.
+
+    in_fours   so many directions with their companions instead (companions.py; csrc/shading/lit/derivative_points.h): what is
+               drawn, weighted and kept are all four of them
+    """
     with torch.no_grad():
         lobes = Lobes.of(surfaces.v, surfaces.n, surfaces.roughness)
-        N, every = len(surfaces.n), torch.arange(len(surfaces.n), device=surfaces.n.device)
-        index = torch.zeros((N, count), dtype=torch.int64, device=surfaces.n.device)
-        uv, density = surfaces.n.new_zeros((N, count, 2)), surfaces.n.new_zeros((N, count))
-        at_once = max(1, AT_ONCE // (EACH * count))
+        N, every, together = len(surfaces.n), torch.arange(len(surfaces.n)), COMPANIONS if in_fours else 1
+        index = torch.zeros((N, count, together), dtype=torch.int64)
+        uv, density = surfaces.n.new_zeros((N, count, together, 2)), surfaces.n.new_zeros((N, count, together))
+        at_once = max(1, AT_ONCE // (EACH * count * together))
         for some, by_lobe in ((every[lobes.narrow], EACH * count // 2), (every[~lobes.narrow], 0)):
             for rows in some.split(at_once):
-                pool = _Candidates.of(light, stream, surfaces.select(rows), lobes.select(rows), EACH * count, by_lobe)
+                pool = _Candidates.of(
+                    light, stream, surfaces.select(rows), lobes.select(rows), (EACH * count - by_lobe, by_lobe), together
+                )
                 index[rows], uv[rows], density[rows] = pool.kept(stream, surfaces.seed[rows], count)
-        return [LightPoints(index[:, k], uv[:, k], density[:, k]) for k in range(count)]
+        return [LightPoints(index[:, s, k], uv[:, s, k], density[:, s, k]) for s in range(count) for k in range(together)]
 
 
 class _Candidates(NamedTuple):
-    """J for each of N points."""
+    """J for each of N points, each of K directions."""
 
-    index: Tensor  # pyright: ignore[reportIncompatibleMethodOverride]: (N, J)
-    uv: Tensor  # (N, J, 2)
-    target: Tensor  # (N, J)
+    index: Tensor  # pyright: ignore[reportIncompatibleMethodOverride]: (N, J, K)
+    uv: Tensor  # (N, J, K, 2)
+    measure: Tensor  # (N, J, K) the solid angle that each stands for, over that of the first
+    target: Tensor  # (N, J) of all K
     running: Tensor  # (N, J) the running sum of their weights, target / density
 
     @classmethod
-    def of(cls, light: Environment, stream: int, surfaces: Glossy, lobes: Lobes, all: int, by_lobe: int) -> _Candidates:
-        N, by_light = len(surfaces.n), all - by_lobe
-        drawn = light.draw(uniform(_parts(surfaces.seed, by_light), 3, stream))
-        kinds = [(drawn, light.place(drawn), by_light)]
-        if by_lobe:
-            l = lobes.repeated(by_lobe).draw(uniform(_parts(surfaces.seed, by_lobe), 5, stream)[:, 3:])
-            kinds.append((light.points_at(l), l, by_lobe))
+    def of(
+        cls, light: Environment, stream: int, surfaces: Glossy, lobes: Lobes, shares: tuple[int, int], together: int
+    ) -> _Candidates:
+        """As many by the light and by the lobe as the shares say."""
+        N = len(surfaces.n)
+        drawn = light.draw(uniform(_parts(surfaces.seed, shares[0]), 3, stream))
+        kinds = [(drawn, light.place(drawn))]
+        if shares[1]:
+            l = lobes.repeated(shares[1]).draw(uniform(_parts(surfaces.seed, shares[1]), 5, stream)[:, 3:])
+            kinds.append((light.points_at(l), l))
         parts = []
-        for k, (points, l, times) in enumerate(kinds):
-            target = surfaces.repeated(times).scattered(l) * light.brightness_at(points)
-            densities = by_light * points.density, by_lobe * lobes.repeated(times).density(l)
+        for k, (points, l) in enumerate(kinds):
+            seen = surfaces.repeated(shares[k])
+            L, measure = l[:, None], l.new_ones((len(l), 1))
+            all = [points]
+            if together > 1:
+                alpha = (seen.roughness * seen.roughness).clamp(min=LEAST_ALPHA)
+                L, measure = companions(seen.v, seen.n, alpha, l)
+                all += [light.points_at(direction) for direction in L.unbind(1)[1:]]
+            index, uv, by_light = (torch.stack(part, 1) for part in zip(*all, strict=True))
+            bright = torch.stack([light.brightness_at(points) for points in all], 1)
+            flat, each = L.reshape(-1, 3), seen.repeated(together)
+            target = (each.scattered(flat).reshape(measure.shape) * bright * measure).sum(1)
+            by_lobe = lobes.repeated(shares[k] * together).density(flat).reshape(measure.shape)
+            densities = shares[0] * (by_light * measure).sum(1), shares[1] * (by_lobe * measure).sum(1)
             # The power heuristic (Veach and Guibas 1995).
             weight = target * densities[k] / (densities[0] ** 2 + densities[1] ** 2)
-            numbers = points.index, points.uv, target, torch.where(target > 0, weight, 0.0)
-            parts.append([part.reshape(N, times, *part.shape[1:]) for part in numbers])
-        index, uv, target, weight = (torch.cat(part, 1) for part in zip(*parts, strict=True))
-        return cls(index, uv, target, weight.cumsum(1))
+            numbers = index, uv, measure, target, torch.where(target > 0, weight, 0.0)
+            parts.append([part.reshape(N, shares[k], *part.shape[1:]) for part in numbers])
+        index, uv, measure, target, weight = (torch.cat(part, 1) for part in zip(*parts, strict=True))
+        return cls(index, uv, measure, target, weight.cumsum(1))
 
     def kept(self, stream: int, seed: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Of `count` points the index, uv and density, drawn with one random number each (systematic resampling)."""
+        """Of `count` times K points the index, uv and density, drawn with one random number (systematic resampling)."""
         total = self.running[:, -1:]
         u = uniform(seed, 6, stream)[:, 5:]
         at = (torch.arange(count, device=u.device) + u) / count * total
         j = torch.searchsorted(self.running, at, right=True).clamp(max=self.running.shape[1] - 1)
-        density = torch.where(total > 0, self.target.gather(1, j) / total, math.inf)
-        return self.index.gather(1, j), self.uv.gather(1, j[..., None].expand(-1, -1, 2)), density
+        rows = torch.arange(len(j), device=j.device)[:, None]
+        stands_for = self.measure[rows, j] * self.measure.shape[2] * total[..., None]
+        density = torch.where(stands_for > 0, self.target[rows, j][..., None] / stands_for, math.inf)
+        return self.index[rows, j], self.uv[rows, j], density
 
 
 def _parts(seed: Tensor, parts: int) -> Tensor:

@@ -72,32 +72,42 @@ struct Numbers {
     }
 };
 
+// Calls add(point, its direction, whether the lobe drew it) for so many points of an environment, half of them by the
+// lobe if it is narrow, and writes how many of both kinds there are.
+template <class Add>
+void candidates(const LitScene& lit, const Lamp& lamp, const DrawnLobe& lobe, const Numbers& numbers, int all,
+                double& share_light, double& share_lobe, Add add) {
+    const int by_lobe = lobe.exists() ? all / 2 : 0, by_light = all - by_lobe;
+    share_light = by_light, share_lobe = by_lobe;
+    const Rotation<double> turn = Rotation<double>::of(lit.tables, lamp);
+    for (int j = 0; j < by_light; ++j) {
+        const double u[3] = {numbers(0, j, by_light), numbers(1, j, by_light), numbers(2, j, by_light)};
+        const LightPoint p = draw(lamp, u);
+        const Vec3 own = own_direction(lamp, p);
+        add(p, lamp.rotation == no_table ? own : unit(turn.to_world(own)), false);
+    }
+    for (int j = 0; j < by_lobe; ++j) {
+        const Vec3 l = lobe.draw(numbers(3, j, by_lobe), numbers(4, j, by_lobe));
+        add(point_towards(lit.tables, lamp, l), l, true);
+    }
+}
+
 // Points of an environment, drawn by what they give to a glossy surface where nothing lies between, the target: of
 // candidates that the light and the lobe have drawn, and that the power heuristic weights (Veach and Guibas 1995),
 // `count` are kept in proportion to target / density (resampled importance sampling, Talbot et al. 2005). Their density
 // is the target over its integral as the candidates estimate it.
 class Resampled {
    public:
-    static constexpr int each = 8;  // candidates for one that is kept, half of them by the lobe if it is narrow
+    static constexpr int each = 8;  // candidates for one that is kept
 
     template <class S>
     Resampled(const LitScene& lit, const Lamp& lamp, const Numbers& numbers, const Surface<S>& o, int count,
               double dark)
         : lamp_(lamp), target_(o, lit.channels, dark), lobe_(o) {
-        const int all = each * count, by_lobe = lobe_.exists() ? all / 2 : 0, by_light = all - by_lobe;
-        share_light_ = by_light, share_lobe_ = by_lobe;
+        const int all = each * count;
         kept_.reserve(all), running_.reserve(all);
-        const Rotation<double> turn = Rotation<double>::of(lit.tables, lamp);
-        for (int j = 0; j < by_light; ++j) {
-            const double u[3] = {numbers(0, j, by_light), numbers(1, j, by_light), numbers(2, j, by_light)};
-            const LightPoint p = draw(lamp, u);
-            const Vec3 own = own_direction(lamp, p);
-            add(p, lamp.rotation == no_table ? own : unit(turn.to_world(own)), false);
-        }
-        for (int j = 0; j < by_lobe; ++j) {
-            const Vec3 l = lobe_.draw(numbers(3, j, by_lobe), numbers(4, j, by_lobe));
-            add(point_towards(lit.tables, lamp, l), l, true);
-        }
+        candidates(lit, lamp, lobe_, numbers, all, share_light_, share_lobe_,
+                   [&](const LightPoint& p, Vec3 l, bool of_lobe) { add(p, l, of_lobe); });
     }
 
     // Writes `count` points; ones that do not exist where nothing arrives.
@@ -111,7 +121,6 @@ class Resampled {
         }
     }
 
-   private:
     // What a surface makes of light, but for colours that are nearly black, of which there are derivatives too.
     class Target {
        public:
@@ -139,6 +148,7 @@ class Resampled {
         double roughness_, diffuse_ = 0, head_on_ = 0;
     };
 
+   private:
     void add(LightPoint p, Vec3 l, bool of_lobe) {
         const double target = target_(l) * brightness(lamp_, p);
         if (!(target > 0)) return;
@@ -178,14 +188,6 @@ void light_points(const LitScene& lit, const LitPoints& points, int64_t i, int n
             if (lamp.kind == Lamp::Kind::environment) out[s] = above(lit.tables, lamp, out[s], plain(o.g));
         }
     }
-}
-
-// Those of all samples of lights.
-template <class S>
-void light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options,
-                  const std::vector<LightSample>& lights, int64_t i, const Surface<S>& o, LightPoint* out) {
-    for (size_t k = 0; k < lights.size(); k += lights[k].count)
-        light_points(lit, points, i, lights[k].lamp, lights[k].count, options.dark, o, out + k);
 }
 
 // What one light sample adds, before it is known to be seen: f E max(0, n·l).
