@@ -62,6 +62,7 @@ class Effort(NamedTuple):
     kernel_image: Callable[[Frame], Tensor | None] | None = None
     blended: bool = False  # whether one may see through surfaces
     lit: bool = False  # whether the scene's materials and lights shade them
+    glossy: bool = False  # whether radiance has peaks, as highlights are: samples of the gradient then look where it is bright
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
@@ -95,6 +96,13 @@ def render_shaded(
     return images[0] if camera.batch is None else torch.stack(images)
 
 
+def _where_bright(image: Tensor) -> Tensor | None:
+    """(H, W), above zero: half the same for all pixels, half by how bright they are; None if all are black."""
+    size = image.detach().double().abs().mean(2)
+    mean = size.mean()
+    return size + mean if mean > 0 else None
+
+
 class _Image:
     """The image of one camera of a batch."""
 
@@ -124,6 +132,7 @@ class _Image:
             intrinsics=moves(frame.intrinsics),
             steps=cut,
             lit=frame.surfaces.scene if self._effort.lit else None,
+            looks=_where_bright(image) if self._effort.glossy else None,
         )
         terms = self._interior(SurfaceSamples(frame, surface))
         if moving or cut:

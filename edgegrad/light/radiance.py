@@ -80,6 +80,7 @@ class Lighting(NamedTuple):
             kernel_image=(lambda frame: _kernel_image(frame, *in_image)) if fused and additive else None,
             blended=scene.blends,
             lit=True,
+            glossy=scene.is_glossy,
             keeps_little=fused,
             gives_derivatives=fused and additive,
             additive=additive,
