@@ -10,6 +10,7 @@ from torch.nn.functional import normalize
 from .bsdf import dot
 
 COMPANIONS = 4  # with the direction itself
+FOURS = 2  # for one sample of a light
 LEAST_TANGENT2 = 1e-24  # below it a normal has no azimuth in doubles
 
 

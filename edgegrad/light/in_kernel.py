@@ -25,7 +25,7 @@ from ..scene.material import WRAPS, Parameter, Texture
 from ..scene.mesh import FILTERS, Mesh
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
-from .companions import COMPANIONS
+from .companions import COMPANIONS, FOURS
 from .resampled import DARK
 
 _64_BITS = 2**64 - 1
@@ -91,7 +91,7 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
             if casting.punctual:
                 hits._note_visibility(light, own)
         fours = shading.in_fours and isinstance(casting, Environment) and surfaces.scene.is_glossy
-        column += 1 if casting.punctual else samples * (COMPANIONS if fours else 1)
+        column += 1 if casting.punctual else samples * (FOURS * COMPANIONS if fours else 1)
     return found.to(surfaces.verts)
 
 

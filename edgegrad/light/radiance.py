@@ -35,6 +35,7 @@ from ..shader import Effort, render_shaded, shaded_points
 from ..warnings import warn
 from . import in_kernel
 from .bsdf import Scattering, dot, terminator
+from .companions import FOURS
 from .creases import note_jumps
 from .in_kernel import is_fused, nearest_textures
 from .resampled import Glossy, resampled
@@ -244,14 +245,16 @@ def _where_seen(hits: Hits, material: Material, total: Tensor) -> Tensor:
 
 
 def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> list[LightPoints]:
-    """`count` points of a light for each point of a surface; where only derivatives are wanted, so many fours of an environment
-    for a glossy one."""
+    """`count` points of a light for each point of a surface; where only derivatives are wanted, FOURS times as many fours of an
+    environment for a glossy one."""
     if hits._knows_light(light) or not isinstance(light, Environment):
         return [hits.light_points(light, sample, count) for sample in range(count)]
     if surface.scattering.roughness is None:
         return [light.above(hits.light_points(light, k, count), surface.g) for k in range(count)]
     glossy = Glossy.of(surface.v, surface.n, surface.g, surface.scattering, hits._seed)
-    return resampled(light, hits._index(light), glossy, count, in_fours=not hits._needs_values)
+    if hits._needs_values:
+        return resampled(light, hits._index(light), glossy, count)
+    return resampled(light, hits._index(light), glossy, FOURS * count, in_fours=True)
 
 
 def _light_sample(hits: Hits, light: Light, points: LightPoints, surface: _Surface, shadows: bool) -> Tensor:

@@ -119,7 +119,10 @@ class _Candidates(NamedTuple):
             bright = torch.stack([light.brightness_at(points) for points in all], 1)
             flat, each = L.reshape(-1, 3), seen.repeated(together)
             target = (each.scattered(flat).reshape(measure.shape) * bright * measure).sum(1)
-            by_lobe = lobes.repeated(shares[k] * together).density(flat).reshape(measure.shape)
+            # The density of lobes is known above the surface alone: what they draw below is dropped.
+            above = dot(each.n, flat)[:, 0] > 0
+            by_lobe = lobes.repeated(shares[k] * together).density(flat).where(above, 0.0).reshape(measure.shape)
+            target = target.where(above.reshape(measure.shape)[:, 0] | (k == 0), 0.0)
             densities = shares[0] * (by_light * measure).sum(1), shares[1] * (by_lobe * measure).sum(1)
             # The power heuristic (Veach and Guibas 1995).
             weight = target * densities[k] / (densities[0] ** 2 + densities[1] ** 2)

@@ -47,7 +47,9 @@ class ResampledFours {
         double target = 0, running = 0;  // the density of a point is the measure that it stands for
     };
 
+    // The density of the lobe is known above the surface alone (lobe_draw.h): what it draws below is dropped.
     void add(const LightPoint& p, Vec3 l, bool of_lobe) {
+        if (of_lobe && !(dot(n_, l) > 0)) return;
         const Companions all(v_, n_, alpha_, l);
         Four four;
         double by_light = 0, by_lobe = 0;
@@ -56,7 +58,7 @@ class ResampledFours {
             if (!(measure > 0)) continue;
             LightPoint& point = four.point[k] = k == 0 ? p : point_towards(tables_, lamp_, all.l[k]);
             by_light += measure * point.density;
-            if (lobe_.exists()) by_lobe += measure * lobe_.density(all.l[k]);
+            if (lobe_.exists() && dot(n_, all.l[k]) > 0) by_lobe += measure * lobe_.density(all.l[k]);
             const double scattered = target_(all.l[k]);
             if (scattered > 0) four.target += measure * scattered * brightness(lamp_, point);
             point.density = measure;
@@ -87,13 +89,14 @@ void light_points(const LitScene& lit, const LitPoints& points, const LitOptions
         LightPoint* own = out + k;
         if (!draws_fours(lit, options, lamp)) {
             light_points(lit, points, i, number, count, options.dark, o, own);
-        } else if (const int fours = count / Companions::most;
-                   o.scattering.lambertian || points.forced.lamp == number) {
-            // One for four.
-            light_points(lit, points, i, number, fours, options.dark, o, own);
-            for (int s = 0; s < fours; ++s) own[s].density /= Companions::most;
-            std::fill(own + fours, own + count, LightPoint{0, 0, 0, 0});
+        } else if (o.scattering.lambertian || points.forced.lamp == number) {
+            // One stands for all.
+            const int samples = options.samples;
+            light_points(lit, points, i, number, samples, options.dark, o, own);
+            for (int s = 0; s < samples; ++s) own[s].density *= double(samples) / count;
+            std::fill(own + samples, own + count, LightPoint{0, 0, 0, 0});
         } else {
+            const int fours = count / Companions::most;
             const Numbers numbers{lit, lamp, uint64_t(points.seed[i])};
             ResampledFours(lit, lamp, numbers, o, fours, options.dark).keep(numbers(5, 0, 1), fours, own);
         }
