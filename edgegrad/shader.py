@@ -97,10 +97,10 @@ def render_shaded(
 
 
 def _where_bright(image: Tensor) -> Tensor | None:
-    """(H, W), above zero: half the same for all pixels, half by how bright they are; None if all are black."""
+    """(H, W), above zero: a third the same for all pixels, the rest by how bright they are; None if all are black."""
     size = image.detach().double().abs().mean(2)
     mean = size.mean()
-    return size + mean if mean > 0 else None
+    return size + 0.5 * mean if mean > 0 else None
 
 
 class _Image:

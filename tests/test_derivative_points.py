@@ -143,10 +143,11 @@ def test_derivatives_are_unbiased(roughness: float, lamps: bool):
     error = found.std(0) / math.sqrt(seeds)
     off = (found.mean(0) - expected).abs()
     assert bool((off < 4 * error + 3e-3 * expected.abs()).all()), (found.mean(0), expected, error)
-    # Known well enough to tell them from ones 5 % off, but for what is nearly zero.
+    # Known well enough, but for what is nearly zero; of metals the diffuse share and the lobe change against one another.
     size = expected.abs()
     size[:2] = expected[:2].norm()
-    assert bool((error < 0.025 * size)[size > 0.3 * size.max()].all()), error / size
+    most = vector(0.025, 0.025, 0.025, 0.05, 0.01, 0.01)
+    assert bool((error < most * size)[size > 0.3 * size.max()].all()), error / size
 
 
 def test_what_has_both_signs_cancels():

@@ -183,12 +183,14 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
     const auto& [pixels, spp, seed, faces, share, beyond, by_importance] = samples;
     const int margin = beyond.value_or(0), stride = view.camera.width + 2 * margin;
     const Filter filter = beyond ? Filter(FilterKind::box) : view.image.filter;
-    constexpr int most_times = 16;
+    // One sample more for each quarter of the mean that a pixel counts more: what is bright varies within it as well.
+    constexpr int most_times = 64;
     const int width = view.camera.width, height = view.camera.height;
     const double usual = view.importance.mean(0, width, 0, height);
     const auto times_of = [&](int x, int y) {
         if (!by_importance || x < 0 || y < 0 || x >= width || y >= height) return 1;
-        return int(std::clamp(std::round(view.importance.mean(x, x + 1, y, y + 1) / usual), 1.0, double(most_times)));
+        const double count = view.importance.mean(x, x + 1, y, y + 1) / usual;
+        return int(std::clamp(std::ceil(4 * count - 3), 1.0, double(most_times)));
     };
     std::vector<ScrambledSobol> sobol{ScrambledSobol(seed)};
     for (uint64_t k = 1; by_importance && k < most_times; ++k) sobol.emplace_back(hash(seed, k, gradient_stream));
