@@ -58,8 +58,8 @@ def test_each_of_four_has_the_same_companions():
 
 @pytest.mark.parametrize("roughness", [0.1, 0.5])
 def test_fours_have_the_density_that_is_said(roughness: float):
-    """χ² of the one of four that has tan θ ≤ α and an azimuth in [0, π), in rings and sectors, of directions drawn by the lobe above
-    the surface."""
+    """χ² of the one of four that has tan θ ≤ α and an azimuth in [0, π), in rings and sectors, of directions that the lobe draws
+    above the surface."""
     lobe, alpha = Lobes.of(V[None], N[None], vector(roughness)[None]), roughness**2
     count, rings, sectors, fine = 40_000, 8, 8, 24
     drawn = lobe.repeated(count).draw(uniform(count, 2))
@@ -94,7 +94,7 @@ def sky(lamps: bool) -> eg.Environment:
     turn = torch.linalg.qr(uniform(3, 3))[0]
     if lamps:
         light = eg.Environment(image, rotation=turn)
-        mirror = light.points_at((2 * dot(V[None], N[None]) * N - V))
+        mirror = light.points_at(2 * dot(V[None], N[None]) * N - V)
         image.reshape(-1, 3)[mirror.index] = 40.0
         image[3:5, 20:22] = 20.0
     return eg.Environment(image, rotation=turn)
@@ -106,10 +106,11 @@ PARAMETERS = ["normal", "normal across", "roughness", "metallic", "base color", 
 def derivatives(l: Tensor, arriving: Tensor, roughness: float) -> Tensor:
     """(M, 6) of f max(0, n·l) E of directions (M, 3), by the parameters, by central differences; the last by the level of the
     sky."""
+
     def value(x: Tensor) -> Tensor:
         n = normalize(N + x[0] * AXES[0] + x[1] * AXES[1], dim=0).expand_as(l)
         scattering = Scattering(0.8 + x[4].expand(1, 1), 0.8 + x[3].expand(1, 1), roughness + x[2].expand(1, 1))
-        lit = ((l @ N > 0)).to(F64)
+        lit = (l @ N > 0).to(F64)
         return lit * (scattering.evaluate(V.expand_as(l), n, l) * dot(n, l) * arriving[:, :1])[:, 0]
 
     steps = 1e-5 * torch.eye(5, dtype=F64)
@@ -166,8 +167,17 @@ def test_kernel_and_twin_draw_the_same_points():
         mesh = ball(2)
         assert mesh.normals is not None
         image = sky(True).radiance.clone()
-        found = {"verts": mesh.verts.double(), "normals": mesh.normals.double(), "roughness": 0.2 + 0.7 * uniform(len(mesh.verts), 1)}
-        found |= {"base": uniform(len(mesh.verts), 3), "metallic": vector(0.6), "sky": image, "turn": torch.eye(3, dtype=F64)}
+        found = {
+            "verts": mesh.verts.double(),
+            "normals": mesh.normals.double(),
+            "roughness": 0.2 + 0.7 * uniform(len(mesh.verts), 1),
+        }
+        found |= {
+            "base": uniform(len(mesh.verts), 3),
+            "metallic": vector(0.6),
+            "sky": image,
+            "turn": torch.eye(3, dtype=F64),
+        }
         return {name: value.clone().requires_grad_() for name, value in found.items()}
 
     def gradients(shade: object) -> dict[str, Tensor]:
@@ -175,7 +185,7 @@ def test_kernel_and_twin_draw_the_same_points():
         material = eg.Material(of["base"], metallic=of["metallic"][0], roughness=of["roughness"])
         mesh = ball(2).replace(verts=of["verts"], normals=of["normals"], material=material)
         ground = plane(material=eg.Material()).transformed(t=vector(0, 0, -1.2))
-        lights = [eg.Environment(of["sky"], rotation=of["turn"]), eg.PointLight([2.0, 1.0, 3.0], 9.0)]
+        lights = [eg.Environment(of["sky"], rotation=of["turn"]), eg.PointLight(vector(2.0, 1.0, 3.0), 9.0)]
         scene = eg.Scene([mesh, ground], lights=lights)
         camera = eg.Camera.look_at((0.0, -2.0, 2.5), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 50.0, (16, 16))
         hits = eg.surface_samples(eg.primary_hits(scene, camera)).hits

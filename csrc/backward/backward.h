@@ -55,7 +55,8 @@ struct BackwardInput {
     HitBuffers<T> hits;         // of that image
     // (F,): faces that look as a texture says, which the scene's own colours need not; null: none.
     const uint8_t* detailed = nullptr;
-    // (H, W), above zero: how much records are to look at each pixel, for want of an adjoint; null: the same everywhere.
+    // (H, W), above zero: how much records are to look at each pixel, for want of an adjoint; null: the same
+    // everywhere.
     const T* looks = nullptr;
 };
 

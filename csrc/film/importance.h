@@ -18,8 +18,8 @@ namespace edgegrad {
 // one being the defensive floor that bounds the weight of what is small but not zero.
 class Importance {
    public:
-    // Without an adjoint all pixels count the same, and there is no table. What stands for one that is not known yet says
-    // nothing of how rough it is.
+    // Without an adjoint all pixels count the same, and there is no table. What stands for one that is not known yet
+    // says nothing of how rough it is.
     template <class T>
     Importance(const T* adjoint, int width, int height, int channels, double radius, Team& team, bool known = true)
         : width_(width), height_(height), radius_(radius), table_(adjoint ? int64_t(width + 1) * (height + 1) : 0) {

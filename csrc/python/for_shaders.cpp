@@ -82,10 +82,9 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
     const SceneView<T> scene = arrays.view();
     RecordList found;
     with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
-        found = record_samples(
-            BackwardInput<T>{scene, camera, geometry, image, nullptr, hits.view(), detailed_faces(arrays, detailed),
-                             looks ? looks->data() : nullptr},
-            options, team);
+        found = record_samples(BackwardInput<T>{scene, camera, geometry, image, nullptr, hits.view(),
+                                                detailed_faces(arrays, detailed), looks ? looks->data() : nullptr},
+                               options, team);
     });
     nb::dict surface;
     const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {

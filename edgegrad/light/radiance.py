@@ -35,7 +35,7 @@ from ..shader import Effort, render_shaded, shaded_points
 from ..warnings import warn
 from . import in_kernel
 from .bsdf import Scattering, dot, terminator
-from .companions import FOURS
+from .companions import COMPANIONS, FOURS
 from .creases import note_jumps
 from .in_kernel import is_fused, nearest_textures
 from .resampled import Glossy, resampled
@@ -99,6 +99,13 @@ class Lighting(NamedTuple):
     def resamples(scene: Scene) -> bool:
         """Whether points of lights are drawn by how surfaces scatter as well."""
         return scene.is_glossy and any(isinstance(light, Environment) for light in scene.casting)
+
+    def in_gradient(self, scene: Scene, light: Light) -> int:
+        """Points of a light for each sample of the gradient inside a glossy face."""
+        if light.punctual:
+            return 1
+        fours = scene.is_glossy and isinstance(light, Environment)
+        return self.samples * (FOURS * COMPANIONS if fours else 1)
 
     def _in_image(self, scene: Scene, points: int, spp: int) -> tuple[Lighting, int]:
         """How an image is lit without derivatives, and how many points of a face in a pixel are shaded. On glossy surfaces under

@@ -80,10 +80,17 @@ def resampled(
         for some, by_lobe in ((every[lobes.narrow], EACH * count // 2), (every[~lobes.narrow], 0)):
             for rows in some.split(at_once):
                 pool = _Candidates.of(
-                    light, stream, surfaces.select(rows), lobes.select(rows), (EACH * count - by_lobe, by_lobe), together
+                    light,
+                    stream,
+                    surfaces.select(rows),
+                    lobes.select(rows),
+                    (EACH * count - by_lobe, by_lobe),
+                    together,
                 )
                 index[rows], uv[rows], density[rows] = pool.kept(stream, surfaces.seed[rows], count)
-        return [LightPoints(index[:, s, k], uv[:, s, k], density[:, s, k]) for s in range(count) for k in range(together)]
+        return [
+            LightPoints(index[:, s, k], uv[:, s, k], density[:, s, k]) for s in range(count) for k in range(together)
+        ]
 
 
 class _Candidates(NamedTuple):
