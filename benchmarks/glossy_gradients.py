@@ -65,7 +65,9 @@ def sheet() -> tuple[Parameters, Callable[[Parameters], eg.Scene]]:
     def scene(p: Parameters) -> eg.Scene:
         map_ = eg.Texture(image, p["uvs"], faces)
         material = eg.Material(torch.tensor([0.9, 0.6, 0.3]), metallic=0.8, roughness=0.2, normal_map=map_)
-        return eg.Scene([eg.Mesh(verts, faces, material=material)], lights=[eg.PointLight(torch.tensor([1.0, 1.0, 3.0]), 30.0)])
+        return eg.Scene(
+            [eg.Mesh(verts, faces, material=material)], lights=[eg.PointLight(torch.tensor([1.0, 1.0, 3.0]), 30.0)]
+        )
 
     return {"uvs": (verts[:, :2] + 1) / 2}, scene
 

@@ -13,8 +13,8 @@ namespace edgegrad {
 //
 // The derivative of the density of normals D by n changes its sign with the half turn. That by α is negative for
 // tan θ < α and positive beyond; both parts have the same mass 1/(2α), and the same distribution of
-// u = 4 α² t / (α² + t)², t = tan² θ, for which there are two angles (pairs of signed parts: Zhang, Dong, Dong and
-// Lipson 2021; Belhe et al. 2024). Both maps are their own inverse, and they commute: so normals fall into fours, and
+// u = 4 α² t / (α² + t)², t = tan² θ, for which there are two angles (pairs of signed parts: Zhang, Dong, Doggett and
+// Zhao 2021; Belhe et al. 2024). Both maps are their own inverse, and they commute: so normals fall into fours, and
 // whichever member is drawn, its four have the density Σ p(h_k) |dh_k / dh|.
 struct Companions {
     static constexpr int most = 4;
