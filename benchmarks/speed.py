@@ -25,6 +25,7 @@ from costs import aovs, backward, bits, forward, large, small, sparse, textures,
 from defaults import deep, flat_colors, kernel_hash, noise, tangled
 from equal_error import boundary, interior, step
 from glossy import glossy
+from glossy_gradients import glossy_gradients
 from light import light
 from processes import memory, order, start
 from table import HEAD, Bench, Row, Skipped, line
@@ -56,6 +57,7 @@ ROWS: dict[str, Callable[[Bench], list[Row]]] = {
     "noise": noise,
     "light": light,
     "glossy": glossy,
+    "glossy gradients": glossy_gradients,
 }
 # What is slow or wrong in the scenes of others first: rows that a change of the default samples is measured by.
 GROUPS = {"safe": ("deep", "tangled", "flat-colors", "noise")}

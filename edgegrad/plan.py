@@ -130,20 +130,28 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     """Materials and lights are shaded in PyTorch, as by a shader."""
     terms = _shaded_terms(scene, request, creases, scene)
     lights = sum(1 if light.punctual else lighting.samples for light in scene.casting)
-    shaded = terms["interior"].samples + terms["boundary"].samples
     where = "lit" if scene.is_lit else "seen, with mipmaps, in PyTorch"
     terms["textures"] = Term(False, f"looked up where they are {where}")
     del terms["shader"]
+    inside = sum(lighting.in_gradient(scene, light) for light in scene.casting)
+    more = (
+        f"; for the gradient inside faces {inside}, in fours of which what derivatives have of both signs cancels"
+        if inside > lights
+        else ""
+    )
     terms["lights"] = Term(
         lights > 0,
-        f"{lights} points of lights for each point{how_drawn(scene)}; at most {AT_ONCE:,} points at a time",
+        f"{lights} points of lights for each point{how_drawn(scene)}{more}; at most {AT_ONCE:,} points at a time",
     )
     why = (
-        f"{lights} rays for each point of the gradient, and for each face in a pixel"
+        f"{inside} rays for each point of the gradient inside faces, {lights} for others and for each face in a pixel"
+        if inside > lights
+        else f"{lights} rays for each point of the gradient, and for each face in a pixel"
         if lighting.shadows
         else "shadows=False"
     )
-    terms["shadows"] = Term(lights > 0 and lighting.shadows, why if lights else "no lights", samples=lights * shaded)
+    rays = inside * terms["interior"].samples + lights * terms["boundary"].samples
+    terms["shadows"] = Term(lights > 0 and lighting.shadows, why if lights else "no lights", samples=rays)
     terms["shadow edges"] = _shadow_edges(scene, request, lighting)
     terms["texels of lamps"] = _texels_of_lamps(scene, lighting)
     return terms

@@ -63,6 +63,9 @@ class Effort(NamedTuple):
     kernel_image: Callable[[Frame], Tensor | None] | None = None
     blended: bool = False  # whether one may see through surfaces
     lit: bool = False  # whether the scene's materials and lights shade them
+    glossy: bool = (
+        False  # whether radiance has peaks, as highlights are: samples of the gradient then look where it is bright
+    )
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
@@ -95,6 +98,13 @@ def render_shaded(
             _Image(Frame(scene, request, k), shader, creases, check, effort).render() for k in range(request.cameras)
         ]
     return images[0] if camera.batch is None else torch.stack(images)
+
+
+def _where_bright(image: Tensor) -> Tensor | None:
+    """(H, W), above zero: a third the same for all pixels, the rest by how bright they are; None if all are black."""
+    size = image.detach().double().abs().mean(2)
+    mean = size.mean()
+    return size + 0.5 * mean if mean > 0 else None
 
 
 class _Image:
@@ -132,6 +142,7 @@ class _Image:
                 intrinsics=moves(frame.intrinsics),
                 steps=cut,
                 lit=frame.surfaces.scene if self._effort.lit else None,
+                looks=_where_bright(image) if self._effort.glossy else None,
             )
         watch.count("surface_samples", len(surface.x))
         with watch.part("surface shading"):

@@ -78,12 +78,35 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128)
     args = parser.parse_args()
     roughness, metallic, half = torch.tensor(ROUGHNESS), torch.tensor(METALLIC), torch.tensor(0.5)
-    found, made = fit(ball(), Made(GOLD, roughness, metallic), Made(half.expand(3), half, half), args.size, method="gauss-newton", spp=16, steps=60)
+    found, made = fit(
+        ball(),
+        Made(GOLD, roughness, metallic),
+        Made(half.expand(3), half, half),
+        args.size,
+        method="gauss-newton",
+        spp=16,
+        steps=60,
+    )
     print("ball", found.seconds, found.reason, made)
     stone = smooth(objects.load(args.mesh))
     assert isinstance(stone.texture, Tensor)
-    found, made = fit(stone, Made(stone.texture, roughness, metallic), Made(torch.full_like(stone.texture, 0.5), half, half), args.size, spp=4, steps=200)
-    print("scan", found.seconds, found.reason, made.roughness, made.metallic, (made.base - stone.texture).abs().mean(), (made.base - stone.texture).square().mean().sqrt())
+    found, made = fit(
+        stone,
+        Made(stone.texture, roughness, metallic),
+        Made(torch.full_like(stone.texture, 0.5), half, half),
+        args.size,
+        spp=4,
+        steps=200,
+    )
+    print(
+        "scan",
+        found.seconds,
+        found.reason,
+        made.roughness,
+        made.metallic,
+        (made.base - stone.texture).abs().mean(),
+        (made.base - stone.texture).square().mean().sqrt(),
+    )
 
 
 if __name__ == "__main__":

@@ -84,8 +84,8 @@ struct InImage {
 
     InImage(const BackwardInput<T>& input, Team& team)
         : filtered(input.adjoint, input.scene, input.image.filter, input.camera.width, input.camera.height),
-          importance(input.adjoint, input.camera.width, input.camera.height, input.scene.channels,
-                     margin_of(input.image), team),
+          importance(input.looks ? input.looks : input.adjoint, input.camera.width, input.camera.height,
+                     input.looks ? 1 : input.scene.channels, margin_of(input.image), team, !input.looks),
           occlusion(input.panes ? nullptr : input.hits.depth, input.camera.width, input.camera.height, team) {}
 
     // By which the pixel filter reaches beyond the image.
@@ -99,7 +99,7 @@ using ViewBody = std::function<void(const BackwardView<T>&)>;
 template <class T>
 void with_view(const BackwardInput<T>& input, const Camera& camera, const InImage<T>& in_image,
                const GradientOptions& o, const Terms& terms, Team& team, const ViewBody<T>& body) {
-    const auto& [scene, whole, geometry, image, adjoint, hit_buffers, detailed, panes] = input;
+    const auto& [scene, whole, geometry, image, adjoint, hit_buffers, detailed, panes, looks] = input;
     const auto& [filtered, importance, occlusion] = in_image;
     const ViewVolume volume(camera, InImage<T>::margin_of(image));
     const VertexView vertices = view_vertices(camera, volume, scene.verts, scene.n_verts, team);
@@ -306,7 +306,7 @@ void add_world(const Camera& window, const double* verts, const Array<double>& q
 template <class T>
 BackwardProfile render_backward(const BackwardInput<T>& input, const GradientOptions& o, Team& team,
                                 const Gradients& grad) {
-    const auto& [scene, camera, geometry, image, adjoint, hits, detailed, panes] = input;
+    const auto& [scene, camera, geometry, image, adjoint, hits, detailed, panes, looks] = input;
     BackwardProfile profile;
     Stopwatch watch;
     if (grad.background)

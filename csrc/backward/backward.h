@@ -57,6 +57,9 @@ struct BackwardInput {
     const uint8_t* detailed = nullptr;
     // (F,): faces that one sees through, so that they hide no curve; null: none.
     const uint8_t* panes = nullptr;
+    // (H, W), above zero: how much records are to look at each pixel, for want of an adjoint; null: the same
+    // everywhere.
+    const T* looks = nullptr;
 };
 
 // The geometry that the terms of a derivative need.

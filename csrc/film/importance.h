@@ -18,9 +18,10 @@ namespace edgegrad {
 // one being the defensive floor that bounds the weight of what is small but not zero.
 class Importance {
    public:
-    // Without an adjoint all pixels count the same, and there is no table.
+    // Without an adjoint all pixels count the same, and there is no table. What stands for one that is not known yet
+    // says nothing of how rough it is.
     template <class T>
-    Importance(const T* adjoint, int width, int height, int channels, double radius, Team& team)
+    Importance(const T* adjoint, int width, int height, int channels, double radius, Team& team, bool known = true)
         : width_(width), height_(height), radius_(radius), table_(adjoint ? int64_t(width + 1) * (height + 1) : 0) {
         if (!adjoint) return;
         const auto size = [&](int64_t pixel) {
@@ -48,7 +49,7 @@ class Importance {
         });
         const double sum = std::accumulate(row_sum.begin(), row_sum.end(), 0.0);
         const int64_t nonzero = std::accumulate(row_nonzero.begin(), row_nonzero.end(), int64_t(0));
-        roughness_ = sum > 0 ? std::accumulate(row_change.begin(), row_change.end(), 0.0) / sum : 0;
+        roughness_ = sum > 0 && known ? std::accumulate(row_change.begin(), row_change.end(), 0.0) / sum : 0;
         per_adjoint_ = sum > 0 ? 8.0 * nonzero / sum : 0;
         const double scale = unit * per_adjoint_;
         each_row([&](int j) {

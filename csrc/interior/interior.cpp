@@ -9,6 +9,7 @@
 #include "interior/interior.h"
 
 #include <algorithm>
+#include <cmath>
 #include <memory>
 #include <vector>
 
@@ -179,16 +180,26 @@ void add_surface_samples(const BackwardView<T>& view, int64_t n, const Systemati
 template <class T>
 void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Contraction& contraction,
                        Destination& to, double (&seconds)[2]) {
-    const auto& [pixels, spp, seed, faces, share, beyond] = samples;
+    const auto& [pixels, spp, seed, faces, share, beyond, by_importance] = samples;
     const int margin = beyond.value_or(0), stride = view.camera.width + 2 * margin;
     const Filter filter = beyond ? Filter(FilterKind::box) : view.image.filter;
-    const double weight = 1 / (spp * share);
-    const ScrambledSobol sobol(seed);
+    // One sample more for each quarter of the mean that a pixel counts more: what is bright varies within it as well.
+    constexpr int most_times = 64;
+    const int width = view.camera.width, height = view.camera.height;
+    const double usual = view.importance.mean(0, width, 0, height);
+    const auto times_of = [&](int x, int y) {
+        if (!by_importance || x < 0 || y < 0 || x >= width || y >= height) return 1;
+        const double count = view.importance.mean(x, x + 1, y, y + 1) / usual;
+        return int(std::clamp(std::ceil(4 * count - 3), 1.0, double(most_times)));
+    };
+    std::vector<ScrambledSobol> sobol{ScrambledSobol(seed)};
+    for (uint64_t k = 1; by_importance && k < most_times; ++k) sobol.emplace_back(hash(seed, k, gradient_stream));
     view.scatter.add(int64_t(pixels.size()), to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
         const std::unique_ptr<SurfaceContraction> chunk = contract_surfaces(view, contraction, to, grad);
         CameraRays rays(view.frame);
         struct {
             int64_t pixel;
+            double weight;
             Vec2 x;  // of the plane
         } drawn[RayBatch::size];
         const auto cast = [&] {
@@ -199,21 +210,24 @@ void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples,
             for (int i = 0; i < rays.count; ++i) {
                 const int32_t face = rays.face[i];
                 if (face < 0 || (faces && !faces[face])) continue;
-                if (drawn[i].pixel != pixel) chunk->begin_pixel(pixel = drawn[i].pixel, weight);
+                if (drawn[i].pixel != pixel) chunk->begin_pixel(pixel = drawn[i].pixel, drawn[i].weight);
                 chunk->add_in_pixel(face, rays.n(i), drawn[i].x);
             }
             rays.count = 0;
         };
         for (int64_t p = first; p < last; ++p) {
             const int64_t pixel = pixels[p];
-            if (!chunk->begin_pixel(pixel, weight)) continue;
             const int column = int(pixel % stride), row = int(pixel / stride), x = column - margin, y = row - margin;
+            const int all = times_of(x, y) * spp;
+            const double weight = 1 / (all * share);
+            if (!chunk->begin_pixel(pixel, weight)) continue;
             const uint64_t place = z_order(column, row) * spp;
-            for (int done = 0; done < spp;) {
-                const int n = std::min(spp - done, RayBatch::size - rays.count);
+            for (int done = 0; done < all;) {
+                // Each time with a sequence of its own, for neighbours that go fewer times complement one another too.
+                const int in_turn = done % spp, n = std::min(spp - in_turn, RayBatch::size - rays.count);
                 double *n_x = rays.n_x + rays.count, *n_y = rays.n_y + rays.count;
-                sobol.fill(place + done, n, n_x, n_y);
-                for (int i = 0; i < n; ++i) drawn[rays.count + i] = {pixel, {x + n_x[i], y + n_y[i]}};
+                sobol[done / spp].fill(place + in_turn, n, n_x, n_y);
+                for (int i = 0; i < n; ++i) drawn[rays.count + i] = {pixel, weight, {x + n_x[i], y + n_y[i]}};
                 place_in_pixel(view.camera, filter, x, y, n, n_x, n_y);
                 rays.count += n, done += n;
                 if (rays.count == RayBatch::size) cast();
@@ -233,7 +247,7 @@ void add_interior(const BackwardView<T>& view, SurfaceMeasure<T>& surface, int64
     if (surface.pixel_samples() > 0) {
         PixelSamples samples{surface.pixels, surface.pixel_spp, hash(o.seed, 4, gradient_stream),
                              surface.by_pixels.data(), surface.pixel_share};
-        if (view.detailed) samples.beyond = surface.beyond;
+        if (view.detailed) samples.beyond = surface.beyond, samples.by_importance = true;
         add_pixel_samples(view, samples, contraction, to, profile.surface);
     }
     if (n == 0) return;

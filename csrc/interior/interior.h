@@ -27,6 +27,7 @@ struct PixelSamples {
     // If there are some, the pixels are those of the plane, row by row, so many beyond each side of the image included,
     // and samples are uniform in them; else these are drawn in proportion to the filter of their pixel.
     std::optional<int> beyond = {};
+    bool by_importance = false;  // a pixel that counts more than the mean gets more samples
 };
 template <class T>
 void add_pixel_samples(const BackwardView<T>& view, const PixelSamples& samples, const Contraction& contraction,

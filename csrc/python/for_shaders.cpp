@@ -3,6 +3,8 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
+#include <algorithm>
+#include <cmath>
 #include <optional>
 
 #include "backward/backward.h"
@@ -70,15 +72,22 @@ nb::dict arrays_of(const std::vector<CurveRecords>& parts, double least, bool on
 template <class T>
 nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
                   const GradientOptions& options, double least, int threads, const HitArrays<T>& hits,
-                  const std::optional<In<uint8_t, 1>>& detailed, const std::optional<In<uint8_t, 1>>& panes) {
+                  const std::optional<In<uint8_t, 1>>& detailed, const std::optional<In<uint8_t, 1>>& panes,
+                  const std::optional<In<T, 2>>& looks) {
     hits.check(arrays, camera);
+    if (looks) {
+        if (int(looks->shape(0)) != camera.height || int(looks->shape(1)) != camera.width)
+            refuse("looks: expected a number a pixel");
+        if (!std::all_of(looks->data(), looks->data() + looks->size(), [](T x) { return x > 0 && std::isfinite(x); }))
+            refuse("looks: expected finite numbers above zero");
+    }
     const SceneView<T> scene = arrays.view();
     RecordList found;
     with_geometry(arrays, options.boundary, threads, [&](const Geometry& geometry, Team& team) {
-        found = record_samples(
-            BackwardInput<T>{scene, camera, geometry, image, nullptr, hits.view(),
-                             marked_faces("detailed", arrays, detailed), marked_faces("panes", arrays, panes)},
-            options, team);
+        found = record_samples(BackwardInput<T>{scene, camera, geometry, image, nullptr, hits.view(),
+                                                marked_faces("detailed", arrays, detailed),
+                                                marked_faces("panes", arrays, panes), looks ? looks->data() : nullptr},
+                               options, team);
     });
     nb::dict surface;
     const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {
@@ -251,7 +260,7 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
         .def("pixel_hits", &pixel_hits<T>, "camera"_a, "image"_a, "threads"_a, "first"_a, "end"_a, "most"_a,
              "only"_a.none(), "hits"_a)
         .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "least"_a, "threads"_a, "hits"_a,
-             "detailed"_a.none(), "panes"_a.none())
+             "detailed"_a.none(), "panes"_a.none(), "looks"_a.none())
         .def("shadow_samples", &shadow_samples<T>, "casters"_a, "camera"_a, "image"_a, "options"_a, "light"_a,
              "samples"_a, "least"_a, "one"_a, "threads"_a, "hits"_a, "panes"_a.none())
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)

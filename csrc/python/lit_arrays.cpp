@@ -279,10 +279,10 @@ void bind_lit_arrays(nb::module_& m) {
         .def("crossings", &crossings, "origins"_a.noconvert(), "directions"_a.noconvert(), "start"_a.noconvert(),
              "end"_a.noconvert());
     nb::class_<LitOptions>(m, "LitOptions")
-        .def(nb::new_([](bool shadows, int samples, int only, double dark) {
-                 return LitOptions{shadows, samples, only, dark};
+        .def(nb::new_([](bool shadows, int samples, int only, bool in_fours, double dark) {
+                 return LitOptions{shadows, samples, only, in_fours, dark};
              }),
-             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a, "dark"_a);
+             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a, "in_fours"_a, "dark"_a);
 }
 
 }  // namespace edgegrad

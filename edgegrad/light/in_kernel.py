@@ -26,6 +26,7 @@ from ..scene.material import WRAPS, Parameter, Texture
 from ..scene.mesh import FILTERS, Mesh
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
+from .companions import COMPANIONS, FOURS
 from .lamp_trees import hides, least_brightness, tree_of
 from .resampled import DARK
 
@@ -73,7 +74,8 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
     known = not shadows or len(surfaces.shadowing) == len(surfaces.scene.casting)
     values = hits._needs_values or not known
     shading = _Shading(
-        layout=layout, tables=len(tables), forced=number, shadows=shadows, samples=samples, only=only, values=values,
+        layout=layout, tables=len(tables), forced=number, shadows=shadows, samples=samples, only=only,
+        in_fours=not hits._needs_values, values=values,
         dtype=surfaces.verts.dtype, cutoffs=casters.cutoffs, spacing=casters.spacing,
     )  # fmt: skip
     arrays = (part for part in casters if isinstance(part, Tensor))
@@ -90,7 +92,8 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
             surfaces.shadowing.add(light)
             if casting.punctual:
                 hits._note_visibility(light, own)
-        column += 1 if casting.punctual else samples
+        fours = shading.in_fours and isinstance(casting, Environment) and surfaces.scene.is_glossy
+        column += 1 if casting.punctual else samples * (FOURS * COMPANIONS if fours else 1)
     return found.to(surfaces.verts)
 
 
@@ -102,7 +105,7 @@ def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
     def compute(kernel: Any, faces: Tensor, arguments: dict[str, Any], *tables: Tensor) -> Sequence[Tensor]:
         found, asked = kernel.lit_image(
             lit=layout.kernel(tables, faces),
-            options=core.LitOptions(shadows=shadows, samples=samples, only=-1, dark=0.0),
+            options=core.LitOptions(shadows=shadows, samples=samples, only=-1, in_fours=False, dark=0.0),
             points=points,
             seed=seed,
             again=again,
@@ -365,6 +368,7 @@ class _Shading(NamedTuple):
     shadows: bool
     samples: int
     only: int  # the light whose radiance alone is wanted, −1: all
+    in_fours: bool  # on glossy surfaces points of environments come in fours, for derivatives (companions.h)
     values: bool
     dtype: torch.dtype  # of the zeros
     cutoffs: list[float]  # of the flat scene, whose other fields are tensors
@@ -394,7 +398,9 @@ class _Shading(NamedTuple):
         return {
             "lit": self.layout.kernel(self._tables(tensors), self._flat(tensors).faces),
             "points": core.LitPoints(b=array(b), forced_lamp=self.forced, **arrays),
-            "options": core.LitOptions(shadows=self.shadows, samples=self.samples, only=self.only, dark=DARK),
+            "options": core.LitOptions(
+                shadows=self.shadows, samples=self.samples, only=self.only, in_fours=self.in_fours, dark=DARK
+            ),
             "threads": torch.get_num_threads(),
         }
 

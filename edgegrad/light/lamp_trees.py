@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from ..library import core
 from ..points.records import values_of
@@ -86,6 +87,10 @@ class MeshTowards(NamedTuple):
         near = torch.acos(dot(lobes.mirrored(), middle).clamp(-1, 1)) < torch.asin(sine) + FARTHEST_LOBE * half
         some = (self._solid_angle(sine) >= LEAST_LAMP * wide) & ((sine >= 1) | near)
         return some[:, 0] & lobes.narrow
+
+    def directions(self, place: Tensor) -> Tensor:
+        """(N, 3) unit directions to places on the lamp."""
+        return normalize(place.detach() - self.position, dim=1)
 
     def solid_angles(self, points: LightPoints) -> Tensor:
         """(N,): |dl/dq| of points, zero where the lamp hides them or shows nothing."""

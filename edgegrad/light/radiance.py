@@ -8,7 +8,7 @@ with one point, or a few, of each light that has an extent. Spherical harmonics 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -36,6 +36,7 @@ from ..shader import Effort, render_shaded, shaded_points
 from ..warnings import warn
 from . import in_kernel
 from .bsdf import Scattering, dot, terminator
+from .companions import COMPANIONS, FOURS
 from .creases import note_jumps
 from .in_kernel import is_fused, nearest_textures
 from .lamp_trees import MeshTowards, tree_of
@@ -84,6 +85,7 @@ class Lighting(NamedTuple):
             kernel_image=(lambda frame: _kernel_image(frame, *in_image)) if fused and additive else None,
             blended=scene.blends,
             lit=True,
+            glossy=scene.is_glossy,
             keeps_little=fused,
             gives_derivatives=fused and additive,
             additive=additive,
@@ -101,8 +103,14 @@ class Lighting(NamedTuple):
     @staticmethod
     def resamples(scene: Scene) -> bool:
         """Whether points of lights are drawn by how surfaces scatter as well."""
-        glossy = any(mesh.material is not None and mesh.material.is_glossy for mesh in scene.meshes)
-        return glossy and any(not light.punctual for light in scene.casting)
+        return scene.is_glossy and any(not light.punctual for light in scene.casting)
+
+    def in_gradient(self, scene: Scene, light: Light) -> int:
+        """Points of a light for each sample of the gradient inside a glossy face."""
+        if light.punctual:
+            return 1
+        fours = scene.is_glossy and isinstance(light, Environment)
+        return self.samples * (FOURS * COMPANIONS if fours else 1)
 
     def _in_image(self, scene: Scene, points: int, spp: int) -> tuple[Lighting, int]:
         """How an image is lit without derivatives, and how many points of a face in a pixel are shaded. On glossy surfaces
@@ -240,8 +248,9 @@ def _of_mesh(hits: Hits, index: int, lighting: Lighting) -> Tensor:
         if hits._only_light and not hits._knows_light(light):
             continue
         count = 1 if light.punctual or hits._only_light else lighting.samples
-        for points in _points_of(hits, light, count, surface):
-            total = total + _light_sample(hits, light, points, surface, lighting.shadows) / count
+        drawn = _points_of(hits, light, count, surface)
+        for points in drawn:
+            total = total + _light_sample(hits, light, points, surface, lighting.shadows) / len(drawn)
     return _where_seen(hits, material, total)
 
 
@@ -252,7 +261,8 @@ def _where_seen(hits: Hits, material: Material, total: Tensor) -> Tensor:
 
 
 def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> Iterator[LightPoints]:
-    """`count` points of a light for each point of a surface."""
+    """`count` points of a light for each point of a surface; where only derivatives are wanted, FOURS times as many fours of an
+    environment for a glossy one."""
     lambertian = surface.scattering.roughness is None
     if hits._knows_light(light) or light.punctual or (lambertian and isinstance(light, MeshLight)):
         yield from (hits.light_points(light, sample, count) for sample in range(count))
@@ -262,7 +272,7 @@ def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> Itera
         yield from (hits.light_points(light, sample, count) for sample in range(count))
     else:
         glossy = Glossy.of(surface.v, surface.n, surface.g, surface.scattering, hits._seed)
-        meets = None
+        index = hits._index(light)
         if isinstance(light, MeshLight):
             first = next(
                 first
@@ -270,7 +280,11 @@ def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> Itera
                 if mesh is light.mesh
             )
             meets = MeshTowards.of(light, surface.position.detach().double(), hits._face - first)
-        yield from resampled(light, hits._index(light), glossy, count, meets)
+            yield from resampled(light, index, glossy, count, meets)
+        elif hits._needs_values:
+            yield from resampled(light, index, glossy, count)
+        else:
+            yield from resampled(light, index, glossy, FOURS * count, in_fours=True)
 
 
 def _light_sample(hits: Hits, light: Light, points: LightPoints, surface: _Surface, shadows: bool) -> Tensor:

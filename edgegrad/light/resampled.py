@@ -17,6 +17,7 @@ from ..scene.lights import Light, LightPoints
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
 from .bsdf import DIELECTRIC, LEAST_ALPHA, Scattering, dot, ggx, masking
+from .companions import COMPANIONS, companions
 from .lamp_trees import MeshTowards, tree_of
 from .lobes import WIDEST_LOBE, Lobes
 
@@ -86,16 +87,21 @@ class Glossy(NamedTuple):
 
 
 def resampled(
-    light: Light, stream: int, surfaces: Glossy, count: int, meets: MeshTowards | None = None
+    light: Light, stream: int, surfaces: Glossy, count: int, meets: MeshTowards | None = None, in_fours: bool = False
 ) -> list[LightPoints]:
     """`count` points for each surface, from random numbers of a stream. Where nothing arrives their density is infinite.
-    Surfaces `meets` a mesh that emits; an environment is everywhere the same."""
+    Surfaces `meets` a mesh that emits; an environment is everywhere the same.
+
+    in_fours   so many directions to an environment with their companions instead (companions.py;
+               csrc/shading/lit/derivative_points.h): what is drawn, weighted and kept are all four of them
+    """
     with torch.no_grad():
         lobes = Lobes.of(surfaces.v, surfaces.n, surfaces.roughness)
         N, every = len(surfaces.n), torch.arange(len(surfaces.n), device=surfaces.n.device)
-        index = torch.zeros((N, count), dtype=torch.int64, device=surfaces.n.device)
-        uv, density = surfaces.n.new_zeros((N, count, 2)), surfaces.n.new_zeros((N, count))
-        at_once = max(1, AT_ONCE // (EACH * count))
+        together = COMPANIONS if in_fours else 1
+        index = torch.zeros((N, count, together), dtype=torch.int64, device=surfaces.n.device)
+        uv, density = surfaces.n.new_zeros((N, count, together, 2)), surfaces.n.new_zeros((N, count, together))
+        at_once = max(1, AT_ONCE // (EACH * count * together))
         asked = lobes.narrow if meets is None else meets.is_drawn_by(lobes)
         small = torch.zeros_like(asked) if meets is None else meets.is_small(lobes)
         for all in (EACH * count, count):
@@ -103,10 +109,19 @@ def resampled(
                 rows_ = every[(small == (all < EACH * count)) & (asked == ask_lobe)]
                 for rows in rows_.split(at_once) if len(rows_) else ():
                     some = None if meets is None else meets.select(rows)
-                    drawn = _Drawn(light, stream, surfaces.select(rows), lobes.select(rows), some)
+                    drawn = _Drawn(light, stream, surfaces.select(rows), lobes.select(rows), some, together)
                     pool = drawn.candidates(all, all // 2 if ask_lobe else 0)
                     index[rows], uv[rows], density[rows] = pool.kept(stream, surfaces.seed[rows], count)
-        return [LightPoints(index[:, k], uv[:, k], density[:, k]) for k in range(count)]
+        return [
+            LightPoints(index[:, s, k], uv[:, s, k], density[:, s, k]) for s in range(count) for k in range(together)
+        ]
+
+
+class _Shares(NamedTuple):
+    """How many candidates are drawn by each."""
+
+    light: int
+    lobe: int
 
 
 class _Drawn(NamedTuple):
@@ -117,44 +132,62 @@ class _Drawn(NamedTuple):
     surfaces: Glossy
     lobes: Lobes
     meets: MeshTowards | None
+    together: int  # K directions in each
 
     def candidates(self, all: int, by_lobe: int) -> _Candidates:
-        N, by_light = len(self.surfaces.n), all - by_lobe
+        N, shares = len(self.surfaces.n), _Shares(all - by_lobe, by_lobe)
         seed = self.surfaces.seed
         every = torch.arange(N, device=seed.device)
-        drawn = self.light.draw(sobol_parts(seed, key_of(self.stream, 0), by_light))
-        kinds = [self._weighted(every.repeat_interleave(by_light), drawn, by_light, by_lobe, False)]
+        drawn = self.light.draw(sobol_parts(seed, key_of(self.stream, 0), shares.light))
+        kinds = [self._weighted(every.repeat_interleave(shares.light), drawn, shares)]
         if by_lobe:
             l = self.lobes.repeated(by_lobe).draw(sobol_parts(seed, key_of(self.stream, 1), by_lobe))
             if self.meets is None:
                 assert isinstance(self.light, Environment)
                 rows, points = every.repeat_interleave(by_lobe), self.light.points_at(l)
             else:
-                l, (ray, points) = None, self.meets.repeated(by_lobe).towards(l)
-                rows = ray // by_lobe
-            kinds.append(self._weighted(rows, points, by_light, by_lobe, True, l))
-        parts = [torch.cat(part, 1) for part in zip(*kinds, strict=True)]
-        index, uv, target, weight = parts
-        return _Candidates(index, uv, target, weight.cumsum(1))
+                ray, points = self.meets.repeated(by_lobe).towards(l)
+                rows, l = ray // by_lobe, self.meets.select(ray // by_lobe).directions(self.light.place(points))
+            kinds.append(self._weighted(rows, points, shares, l))
+        index, uv, measure, target, weight = (torch.cat(part, 1) for part in zip(*kinds, strict=True))
+        return _Candidates(index, uv, measure, target, weight.cumsum(1))
 
-    def _weighted(
-        self, rows: Tensor, points: LightPoints, by_light: int, by_lobe: int, of_lobe: bool, l: Tensor | None = None
-    ) -> list[Tensor]:
-        """Index, uv, target and weight of points of the surfaces `rows`, ascending, in rows as long as the longest."""
-        surfaces = self.surfaces.select(rows)
-        if self.meets is None:
+    def _weighted(self, rows: Tensor, points: LightPoints, shares: _Shares, l: Tensor | None = None) -> list[Tensor]:
+        """Index, uv, measure, target and weight of points of the surfaces `rows`, ascending, in rows as long as the longest.
+        Directions l are those that the lobe has drawn."""
+        surfaces, of_lobe, K = self.surfaces.select(rows), l is not None, self.together
+        all = [points]
+        if self.meets is not None:
+            meets = self.meets.select(rows)
+            L = meets.directions(self.light.place(points))[:, None] if l is None else l[:, None]
+            measure, brightness = meets.solid_angles(points)[:, None], meets.brightness(points)[:, None]
+        else:
             assert isinstance(self.light, Environment)
             l = self.light.place(points) if l is None else l
-            brightness, solid = self.light.brightness_at(points), torch.ones_like(points.density)
-        else:
-            meets = self.meets.select(rows)
-            l = normalize(self.light.place(points).detach() - meets.position, dim=1)
-            brightness, solid = meets.brightness(points), meets.solid_angles(points)
-        target = torch.where(solid > 0, surfaces.scattered(l) * brightness * solid, 0.0)
+            L, measure = l[:, None], torch.ones_like(l[:, :1])
+            if K > 1:
+                alpha = (surfaces.roughness * surfaces.roughness).clamp(min=LEAST_ALPHA)
+                L, measure = companions(surfaces.v, surfaces.n, alpha, l)
+                all += [self.light.points_at(other) for other in L.unbind(1)[1:]]
+            brightness = torch.stack([self.light.brightness_at(each) for each in all], 1)
+        index, uv, density = (torch.stack(part, 1) for part in zip(*all, strict=True))
+        flat, each = L.reshape(-1, 3), surfaces.repeated(K)
+        scattered = each.scattered(flat).reshape(measure.shape)
+        target = torch.where(measure > 0, scattered * brightness * measure, 0.0).sum(1)
+        # The density of lobes is known above the surface alone: what they draw below is dropped.
+        above = (dot(each.n, flat)[:, 0] > 0).reshape(measure.shape)
+        if of_lobe:
+            target = target.where(above[:, 0], 0.0)
+        # A mesh's own density counts area already.
+        light = shares.light * (density if self.meets is not None else density * measure).sum(1)
+        lobe = torch.zeros_like(light)
+        if shares.lobe:
+            lobes = self.lobes.select(rows).repeated(K).density(flat).reshape(measure.shape)
+            lobe = shares.lobe * (lobes.where(above, 0.0) * measure).sum(1)
         # The power heuristic (Veach and Guibas 1995).
-        light = by_light * points.density
-        lobe = by_lobe * self.lobes.select(rows).density(l) * solid if by_lobe else torch.zeros_like(light)
         weight = torch.where(target > 0, target * (lobe if of_lobe else light) / (light**2 + lobe**2), 0.0)
+        if self.meets is not None:
+            measure = torch.ones_like(measure)
         N = len(self.surfaces.n)
         many = torch.bincount(rows, minlength=N)
         place = torch.arange(len(rows), device=rows.device) - (many.cumsum(0) - many)[rows]
@@ -163,22 +196,25 @@ class _Drawn(NamedTuple):
         def padded(part: Tensor) -> Tensor:
             return part.new_zeros((N, J, *part.shape[1:])).index_put((rows, place), part)
 
-        return [padded(part) for part in (points.index, points.uv, target, weight)]
+        return [padded(part) for part in (index, uv, measure, target, weight)]
 
 
 class _Candidates(NamedTuple):
-    """J for each of N points."""
+    """J for each of N points, each of K directions."""
 
-    index: Tensor  # pyright: ignore[reportIncompatibleMethodOverride]: (N, J)
-    uv: Tensor  # (N, J, 2)
-    target: Tensor  # (N, J)
+    index: Tensor  # pyright: ignore[reportIncompatibleMethodOverride]: (N, J, K)
+    uv: Tensor  # (N, J, K, 2)
+    measure: Tensor  # (N, J, K) the measure that each stands for, over that of the first
+    target: Tensor  # (N, J) of all K
     running: Tensor  # (N, J) the running sum of their weights, target / density
 
     def kept(self, stream: int, seed: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Of `count` points the index, uv and density, drawn with one random number each (systematic resampling)."""
+        """Of `count` times K points the index, uv and density, drawn with one random number each (systematic resampling)."""
         total = self.running[:, -1:]
         u = sobol(seed, key_of(stream, 2))[:, :1]
         at = (torch.arange(count, device=u.device) + u) / count * total
         j = torch.searchsorted(self.running, at, right=True).clamp(max=self.running.shape[1] - 1)
-        density = torch.where(total > 0, self.target.gather(1, j) / total, math.inf)
-        return self.index.gather(1, j), self.uv.gather(1, j[..., None].expand(-1, -1, 2)), density
+        rows = torch.arange(len(j), device=j.device)[:, None]
+        stands_for = self.measure[rows, j] * self.measure.shape[2] * total[..., None]
+        density = torch.where(stands_for > 0, self.target[rows, j][..., None] / stands_for, math.inf)
+        return self.index[rows, j], self.uv[rows, j], density

@@ -92,6 +92,7 @@ class Hits:
         forced = None if self._forced is None else self._forced.select(index)
         place = self._face[index], self._exact[index], pixel
         some = Hits(self._surfaces, view, *place, self._rays_at, steps, self._seed[index], forced)
+        some._needs_values = self._needs_values
         if self._all is None:
             rows = torch.arange(len(self), device=self._face.device)[index] if isinstance(index, slice) else index
             some._all = self, rows

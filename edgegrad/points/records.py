@@ -340,11 +340,16 @@ class Sampler:
         intrinsics: bool = False,
         steps: bool = False,
         lit: Scene | None = None,
+        looks: Tensor | None = None,
     ) -> tuple[SurfaceRecords, CurveRecords]:
         """Of the gradient, to be called after pixel_hits(). The scene of `request` has colours that differ at creases.
-        `lit`: the scene whose lights shade them."""
 
-        def compute(request: Request, camera: Any) -> Sequence[Tensor]:
+        lit     the scene whose lights shade them
+        looks   (H, W), above zero: how much they are to look at each pixel; None: the same everywhere
+        """
+        of_pixels = () if looks is None else (looks.to(self._hits.coverage.dtype),)
+
+        def compute(request: Request, camera: Any, *looks: Tensor) -> Sequence[Tensor]:
             flat, options = request.scene, request.gradient
             surface, curves = self._scene(flat).samples(
                 camera=camera,
@@ -365,10 +370,11 @@ class Sampler:
                 hits=kernel_hits(self._hits),
                 detailed=faces_with_textures(lit),
                 panes=self._panes,
+                looks=looks[0].cpu().contiguous().numpy() if looks else None,
             )
             return (*_record(SurfaceRecords, surface), *_record(CurveRecords, curves))
 
-        parts = self._compute(request, compute)
+        parts = self._compute(request, compute, *of_pixels)
         count = len(SurfaceRecords._fields)
         return SurfaceRecords(*parts[:count]), CurveRecords(*parts[count:])
 

@@ -128,6 +128,11 @@ class Scene:
         return bool(self.lights) or any(mesh.material is not None for mesh in self.meshes)
 
     @property
+    def is_glossy(self) -> bool:
+        """Whether a material scatters otherwise than evenly."""
+        return any(mesh.material is not None and mesh.material.is_glossy for mesh in self.meshes)
+
+    @property
     def is_shaded(self) -> bool:
         """Whether more than the kernel's own colours is to be seen: light, or mipmaps."""
         return self.is_lit or any(mesh.texture is not None and mesh.filter == "mipmap" for mesh in self.meshes)

@@ -80,37 +80,65 @@ struct Numbers {
     }
 };
 
+// How many candidates are drawn by each.
+struct Shares {
+    double light = 0, lobe = 0;
+};
+
+// Calls add(candidate, whether the lobe drew it) for so many points of a light, half of them drawn by the lobe if it is
+// asked, and says before how many of both kinds there are. at(point) and towards(direction, add) say what they are.
+template <class At, class Towards, class Add>
+void draw_candidates(const Lamp& lamp, const DrawnLobe& lobe, const Numbers& numbers, int all, bool ask_lobe,
+                     Shares& shares, At at, Towards towards, Add add) {
+    const int by_lobe = ask_lobe ? all / 2 : 0, by_light = all - by_lobe;
+    shares.light = by_light, shares.lobe = by_lobe;
+    for (int j = 0; j < by_light; ++j) add(at(draw(lamp, numbers.of_light(j, by_light))), false);
+    for (int j = 0; j < by_lobe; ++j) {
+        const Vec2 u = numbers.of_lobe(j, by_lobe);
+        towards(lobe.draw(u.x, u.y), [&](const Candidate& c) { add(c, true); });
+    }
+}
+// Those of an environment.
+template <class Add>
+void draw_candidates(const LitScene& lit, const Lamp& lamp, const DrawnLobe& lobe, const Numbers& numbers, int all,
+                     Shares& shares, Add add) {
+    const Rotation<double> turn = Rotation<double>::of(lit.tables, lamp);
+    draw_candidates(
+        lamp, lobe, numbers, all, lobe.exists(), shares,
+        [&](const LightPoint& p) {
+            const Vec3 own = own_direction(lamp, p);
+            return Candidate{p, lamp.rotation == no_table ? own : unit(turn.to_world(own)), brightness(lamp, p)};
+        },
+        [&](Vec3 l, auto add_one) {
+            const LightPoint p = point_towards(lit.tables, lamp, l);
+            add_one(Candidate{p, l, brightness(lamp, p)});
+        },
+        add);
+}
+
 // Points of a light, drawn by what they give to a glossy surface where nothing lies between, the target: of
 // candidates that the light and the lobe have drawn, and that the power heuristic weights (Veach and Guibas 1995),
 // `count` are kept in proportion to target / density (resampled importance sampling, Talbot et al. 2005). Their density
 // is the target over its integral as the candidates estimate it.
 class Resampled {
    public:
-    static constexpr int each = 8;  // candidates for one that is kept, half of them by the lobe if it is narrow
+    static constexpr int each = 8;  // candidates for one that is kept
 
     template <class S>
     Resampled(const LitScene& lit, const Lamp& lamp, const Numbers& numbers, const Surface<S>& o, int count,
               double dark)
         : target_(o, lit.channels, dark), lobe_(o) {
+        kept_.reserve(each * count), running_.reserve(each * count);
+        const auto add_one = [&](const Candidate& c, bool of_lobe) { add(c, of_lobe); };
         if (lamp.kind == Lamp::Kind::environment) {
-            const Rotation<double> turn = Rotation<double>::of(lit.tables, lamp);
+            draw_candidates(lit, lamp, lobe_, numbers, each * count, shares_, add_one);
+        } else {
+            const MeshTowards mesh(lit, lamp, plain(o.y), o.at.face + o.mesh->first_face);
             draw_candidates(
-                lamp, numbers, each * count, lobe_.exists(),
-                [&](const LightPoint& p) {
-                    const Vec3 own = own_direction(lamp, p);
-                    return Candidate{p, lamp.rotation == no_table ? own : unit(turn.to_world(own)),
-                                     brightness(lamp, p)};
-                },
-                [&](Vec3 l, auto add) {
-                    const LightPoint p = point_towards(lit.tables, lamp, l);
-                    add(Candidate{p, l, brightness(lamp, p)});
-                });
-            return;
+                lamp, lobe_, numbers, mesh.is_small(lobe_) ? count : each * count, mesh.is_drawn_by(lobe_), shares_,
+                [&](const LightPoint& p) { return mesh.of(p); }, [&](Vec3 l, auto add) { mesh.each_towards(l, add); },
+                add_one);
         }
-        const MeshTowards mesh(lit, lamp, plain(o.y), o.at.face + o.mesh->first_face);
-        draw_candidates(
-            lamp, numbers, mesh.is_small(lobe_) ? count : each * count, mesh.is_drawn_by(lobe_),
-            [&](const LightPoint& p) { return mesh.of(p); }, [&](Vec3 l, auto add) { mesh.each_towards(l, add); });
     }
 
     // Writes `count` points; ones that do not exist where nothing arrives.
@@ -124,7 +152,6 @@ class Resampled {
         }
     }
 
-   private:
     // What a surface makes of light, but for colours that are nearly black, of which there are derivatives too.
     class Target {
        public:
@@ -152,26 +179,13 @@ class Resampled {
         double roughness_, diffuse_ = 0, head_on_ = 0;
     };
 
-    // So many, of which half are drawn by the lobe if it is asked: at(point) and towards(direction, add) say what they
-    // are.
-    template <class At, class Towards>
-    void draw_candidates(const Lamp& lamp, const Numbers& numbers, int all, bool ask_lobe, At at, Towards towards) {
-        const int by_lobe = ask_lobe ? all / 2 : 0, by_light = all - by_lobe;
-        share_light_ = by_light, share_lobe_ = by_lobe;
-        kept_.reserve(all), running_.reserve(all);
-        for (int j = 0; j < by_light; ++j) add(at(draw(lamp, numbers.of_light(j, by_light))), false);
-        for (int j = 0; j < by_lobe; ++j) {
-            const Vec2 u = numbers.of_lobe(j, by_lobe);
-            towards(lobe_.draw(u.x, u.y), [&](const Candidate& c) { add(c, true); });
-        }
-    }
-
+   private:
     void add(const Candidate& c, bool of_lobe) {
         if (!(c.solid_angle > 0)) return;
         const double target = target_(c.l) * c.brightness * c.solid_angle;
         if (!(target > 0)) return;
-        const double by_light = share_light_ * c.point.density,
-                     by_lobe = share_lobe_ > 0 ? share_lobe_ * lobe_.density(c.l) * c.solid_angle : 0;
+        const double by_light = shares_.light * c.point.density,
+                     by_lobe = shares_.lobe > 0 ? shares_.lobe * lobe_.density(c.l) * c.solid_angle : 0;
         const double own = of_lobe ? by_lobe : by_light;
         total_ += target * own / (by_light * by_light + by_lobe * by_lobe);
         kept_.push_back(c.point), running_.push_back(total_);
@@ -180,7 +194,8 @@ class Resampled {
 
     Target target_;
     DrawnLobe lobe_;
-    double share_light_ = 0, share_lobe_ = 0, total_ = 0;
+    Shares shares_;
+    double total_ = 0;
     std::vector<LightPoint> kept_;
     std::vector<double> running_;
 };
@@ -205,14 +220,6 @@ void light_points(const LitScene& lit, const LitPoints& points, int64_t i, int n
             if (lamp.kind == Lamp::Kind::environment) out[s] = above(lit.tables, lamp, out[s], plain(o.g));
         }
     }
-}
-
-// Those of all samples of lights.
-template <class S>
-void light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options,
-                  const std::vector<LightSample>& lights, int64_t i, const Surface<S>& o, LightPoint* out) {
-    for (size_t k = 0; k < lights.size(); k += lights[k].count)
-        light_points(lit, points, i, lights[k].lamp, lights[k].count, options.dark, o, out + k);
 }
 
 // What one light sample adds, before it is known to be seen: f E max(0, n·l).

@@ -7,6 +7,7 @@
 
 #include "core/math.h"
 #include "shading/lit/area.h"
+#include "shading/lit/companions.h"
 #include "shading/lit/lamp.h"
 #include "shading/lit/normals.h"
 #include "shading/lit/source.h"
@@ -74,6 +75,8 @@ struct LitOptions {
     bool shadows = true;
     int samples = 1;  // points of each light with an extent, for each point that is shaded
     int only = -1;    // the lamp of which alone radiance is wanted; −1: of all that there is
+    // Whether only derivatives are wanted: on glossy surfaces points of environments are then drawn in fours.
+    bool in_fours = false;
     double dark = 0;  // points of lights are drawn as if no glossy surface were darker: what is black has derivatives
 };
 
@@ -84,11 +87,19 @@ constexpr int8_t not_asked = -1;
 struct LightSample {
     int lamp, sample, count;  // one of so many of a lamp
 };
+// What is cast for one sample of a light, where points come in fours: the image has many more points that are lit, and
+// derivatives have both signs (docs/tried.md).
+constexpr int fours_for_one = 2;
+inline bool draws_fours(const LitScene& lit, const LitOptions& options, const Lamp& lamp) {
+    return options.in_fours && lamp.kind == Lamp::Kind::environment &&
+           std::any_of(lit.meshes.begin(), lit.meshes.end(), [](const LitMesh& mesh) { return !mesh.lambertian; });
+}
 inline std::vector<LightSample> light_samples(const LitScene& lit, const LitOptions& options) {
     std::vector<LightSample> out;
     for (int k = 0; k < int(lit.lamps.size()); ++k) {
         if (!lit.lamps[k].casts() || !(options.only < 0 || options.only == k)) continue;
-        const int count = lit.lamps[k].is_punctual() ? 1 : options.samples;
+        const int each = draws_fours(lit, options, lit.lamps[k]) ? fours_for_one * Companions::most : 1;
+        const int count = lit.lamps[k].is_punctual() ? 1 : each * options.samples;
         for (int s = 0; s < count; ++s) out.push_back({k, s, count});
     }
     return out;

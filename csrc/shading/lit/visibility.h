@@ -10,7 +10,7 @@
 #include "rays/raycast.h"
 #include "scene/scene.h"
 #include "shading/cut_outs.h"
-#include "shading/lit/light_sample.h"
+#include "shading/lit/derivative_points.h"
 
 namespace edgegrad {
 

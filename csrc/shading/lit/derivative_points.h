@@ -1,0 +1,107 @@
+// The points of lights that surfaces are lit by; where only derivatives are wanted, on glossy surfaces in fours.
+#pragma once
+
+#include <algorithm>
+#include <vector>
+
+#include "shading/lit/companions.h"
+#include "shading/lit/light_sample.h"
+
+namespace edgegrad {
+
+// As Resampled, but what is drawn, weighted and kept are directions with their companions (companions.h): the target
+// of four is what all of them give, and each of them is lit.
+class ResampledFours {
+   public:
+    template <class S>
+    ResampledFours(const LitScene& lit, const Lamp& lamp, const Numbers& numbers, const Surface<S>& o, int count,
+                   double dark)
+        : tables_(lit.tables), lamp_(lamp), target_(o, lit.channels, dark), lobe_(o), v_(plain(o.v)), n_(plain(o.n)) {
+        const double roughness = plain(o.scattering.roughness);
+        alpha_ = std::max(roughness * roughness, least_alpha);
+        draw_candidates(lit, lamp, lobe_, numbers, each * count, shares_,
+                        [&](const Candidate& c, bool of_lobe) { add(c.point, c.l, of_lobe); });
+    }
+
+    // Writes `count` fours of points; ones that do not exist where nothing arrives.
+    void keep(double u, int count, LightPoint* out) const {
+        std::fill(out, out + Companions::most * count, LightPoint{0, 0, 0, 0});
+        if (kept_.empty()) return;
+        size_t j = 0;
+        for (int s = 0; s < count; ++s, out += Companions::most) {
+            const double at = (s + u) / count * total_;
+            while (j + 1 < kept_.size() && kept_[j].running <= at) ++j;
+            const Four& four = kept_[j];
+            for (int k = 0; k < Companions::most; ++k) {
+                out[k] = four.point[k];
+                const double measure = Companions::most * four.point[k].density * total_;
+                out[k].density = measure > 0 ? four.target / measure : 0;
+            }
+        }
+    }
+
+   private:
+    static constexpr int each = 8;  // candidates for four that are kept
+    struct Four {
+        LightPoint point[Companions::most] = {{0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}, {0, 0, 0, 0}};
+        double target = 0, running = 0;  // the density of a point is the measure that it stands for
+    };
+
+    // The density of the lobe is known above the surface alone (lobe_draw.h): what it draws below is dropped.
+    void add(const LightPoint& p, Vec3 l, bool of_lobe) {
+        if (of_lobe && !(dot(n_, l) > 0)) return;
+        const Companions all(v_, n_, alpha_, l);
+        Four four;
+        double by_light = 0, by_lobe = 0;
+        for (int k = 0; k < all.count; ++k) {
+            const double measure = all.measure[k];
+            if (!(measure > 0)) continue;
+            LightPoint& point = four.point[k] = k == 0 ? p : point_towards(tables_, lamp_, all.l[k]);
+            by_light += measure * point.density;
+            if (lobe_.exists() && dot(n_, all.l[k]) > 0) by_lobe += measure * lobe_.density(all.l[k]);
+            const double scattered = target_(all.l[k]);
+            if (scattered > 0) four.target += measure * scattered * brightness(lamp_, point);
+            point.density = measure;
+        }
+        if (!(four.target > 0)) return;
+        by_light *= shares_.light, by_lobe *= shares_.lobe;
+        total_ += four.target * (of_lobe ? by_lobe : by_light) / (by_light * by_light + by_lobe * by_lobe);
+        four.running = total_;
+        kept_.push_back(four);
+    }
+
+    const std::vector<Table>& tables_;
+    const Lamp& lamp_;
+    Resampled::Target target_;
+    DrawnLobe lobe_;
+    Vec3 v_, n_;
+    Shares shares_;
+    double alpha_ = 0, total_ = 0;
+    std::vector<Four> kept_;
+};
+
+// The points of all samples of lights.
+template <class S>
+void light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options,
+                  const std::vector<LightSample>& lights, int64_t i, const Surface<S>& o, LightPoint* out) {
+    for (size_t k = 0; k < lights.size(); k += lights[k].count) {
+        const int number = lights[k].lamp, count = lights[k].count;
+        const Lamp& lamp = lit.lamps[number];
+        LightPoint* own = out + k;
+        if (!draws_fours(lit, options, lamp)) {
+            light_points(lit, points, i, number, count, options.dark, o, own);
+        } else if (o.scattering.lambertian || points.forced.lamp == number) {
+            // One stands for all.
+            const int samples = options.samples;
+            light_points(lit, points, i, number, samples, options.dark, o, own);
+            for (int s = 0; s < samples; ++s) own[s].density *= double(samples) / count;
+            std::fill(own + samples, own + count, LightPoint{0, 0, 0, 0});
+        } else {
+            const int fours = count / Companions::most;
+            const Numbers numbers{lamp, uint64_t(points.seed[i])};
+            ResampledFours(lit, lamp, numbers, o, fours, options.dark).keep(numbers.of_choice(), fours, own);
+        }
+    }
+}
+
+}  // namespace edgegrad
