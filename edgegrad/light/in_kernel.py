@@ -130,7 +130,7 @@ def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
     def compute(b: Tensor, face: Tensor, seed: Tensor, *tables_: Tensor) -> Sequence[Tensor]:
         tables, faces = tables_[:-1], tables_[-1]
         points = core.LitPoints(face=array(face), b=array(b), seed=array(seed))
-        options = core.LitOptions(shadows=False, samples=samples, only=-1, dark=DARK)
+        options = core.LitOptions(shadows=False, samples=samples, only=-1, in_fours=False, dark=DARK)
         lit = layout.kernel(tables, faces)
         found = core.light_points(lit, points, options, hits._index(light), torch.get_num_threads())
         return [torch.from_numpy(x) for x in found]

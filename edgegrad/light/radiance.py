@@ -260,31 +260,26 @@ def _where_seen(hits: Hits, material: Material, total: Tensor) -> Tensor:
     return total if material.two_sided else torch.where(front, total, 0.0)
 
 
-def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> Iterator[LightPoints]:
+def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> list[LightPoints]:
     """`count` points of a light for each point of a surface; where only derivatives are wanted, FOURS times as many fours of an
     environment for a glossy one."""
     lambertian = surface.scattering.roughness is None
-    if hits._knows_light(light) or light.punctual or (lambertian and isinstance(light, MeshLight)):
-        yield from (hits.light_points(light, sample, count) for sample in range(count))
-    elif lambertian and isinstance(light, Environment):
-        yield from (light.above(hits.light_points(light, k, count), surface.g) for k in range(count))
-    elif isinstance(light, MeshLight) and tree_of(light) is None:
-        yield from (hits.light_points(light, sample, count) for sample in range(count))
-    else:
-        glossy = Glossy.of(surface.v, surface.n, surface.g, surface.scattering, hits._seed)
-        index = hits._index(light)
-        if isinstance(light, MeshLight):
-            first = next(
-                first
-                for first, mesh in zip(hits._surfaces.first_faces, hits._surfaces.scene.meshes, strict=True)
-                if mesh is light.mesh
-            )
-            meets = MeshTowards.of(light, surface.position.detach().double(), hits._face - first)
-            yield from resampled(light, index, glossy, count, meets)
-        elif hits._needs_values:
-            yield from resampled(light, index, glossy, count)
-        else:
-            yield from resampled(light, index, glossy, FOURS * count, in_fours=True)
+    by_light = lambertian or (isinstance(light, MeshLight) and tree_of(light) is None)
+    if hits._knows_light(light) or light.punctual or by_light:
+        drawn = [hits.light_points(light, sample, count) for sample in range(count)]
+        mirrored = lambertian and isinstance(light, Environment) and not hits._knows_light(light)
+        return [light.above(points, surface.g) for points in drawn] if mirrored else drawn
+    glossy = Glossy.of(surface.v, surface.n, surface.g, surface.scattering, hits._seed)
+    index = hits._index(light)
+    if isinstance(light, MeshLight):
+        first_faces, meshes = hits._surfaces.first_faces, hits._surfaces.scene.meshes
+        first = next(first for first, mesh in zip(first_faces, meshes, strict=True) if mesh is light.mesh)
+        return resampled(
+            light, index, glossy, count, MeshTowards.of(light, surface.position.detach().double(), hits._face - first)
+        )
+    if hits._needs_values:
+        return resampled(light, index, glossy, count)
+    return resampled(light, index, glossy, FOURS * count, in_fours=True)
 
 
 def _light_sample(hits: Hits, light: Light, points: LightPoints, surface: _Surface, shadows: bool) -> Tensor:
