@@ -241,7 +241,11 @@ def test_residuals_have_the_gradient_of_the_loss(clutter):
     "change, error, message",
     [
         ({"camera": []}, ValueError, "camera: expected at least one"),
-        ({"camera": [camera(8)] * 2}, ValueError, "target: expected 2, one for each camera, got 8"),
+        (
+            {"camera": [camera(8)] * 2},
+            ValueError,
+            "target: expected 2, one for each camera, got one of shape (8, 8, 3)",
+        ),
         (
             {"camera": [camera(8)], "target": [torch.zeros(8, 8, 3)], "mask": [torch.ones(4, 4)]},
             ValueError,
