@@ -377,7 +377,8 @@ def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, tmp_path):
     [
         (torch.ones(10, 10), ValueError, r"depth: expected shape .*96.*, got .*10.*"),
         (torch.full((96, 96), -1.0), ValueError, r"depth: expected distances along the camera's axis.*got -1"),
-        (torch.ones(96, 96, dtype=torch.int32), TypeError, r"depth: expected .*float"),
+        (torch.ones(96, 96, dtype=torch.int32), TypeError, r"depth: expected .*float.*take depth / 1000"),
+        (torch.zeros(96, 96), ValueError, r"depth: expected distances somewhere, got none"),
         ([torch.ones(96, 96)] * 2, ValueError, r"depth: expected 1, one for each camera, got 2"),
     ],
 )

@@ -251,6 +251,16 @@ def test_residuals_have_the_gradient_of_the_loss(clutter):
             ValueError,
             "mask[0]: expected",
         ),
+        (
+            {"target": "photo.png"},
+            TypeError,
+            "target: expected an image (H, W, C) of numbers, got the path 'photo.png'; read",
+        ),
+        (
+            {"target": None},
+            TypeError,
+            "target: expected an image (H, W, C) of numbers, got None; read one with read_image",
+        ),
         ({"weight": -torch.ones(8, 8)}, ValueError, "weight: expected numbers from 0 up"),
         ({"weight": torch.ones(8, 8, 3)}, ValueError, "weight: expected shape (8, 8) or (8, 8, 1)"),
     ],

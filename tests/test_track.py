@@ -94,6 +94,7 @@ def test_a_broken_frame_is_named(film, frames, spoil, words):
         ({"init": torch.eye(3)}, "init: expected"),
         ({"spp": 0}, "spp: expected"),
         ({"depth": 1.0}, "depth: expected"),
+        ({"depth": torch.ones(SIZE, SIZE)}, r"depth: expected \(T, H, W\), got"),
     ],
 )
 def test_bad_arguments_are_named_at_once(film, frames, change, words):
