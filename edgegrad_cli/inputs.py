@@ -102,9 +102,11 @@ def read_background(text: str | None, picture: Tensor) -> Tensor | None:
 
     if text is None:
         return None
-    if text.startswith("#"):
+    if text.startswith("#") or not Path(text).suffix:
         try:
-            return srgb_to_linear(torch.tensor(list(bytes.fromhex(text[1:])), dtype=torch.float32).reshape(3) / 255.0)
+            return srgb_to_linear(
+                torch.tensor(list(bytes.fromhex(text.removeprefix("#"))), dtype=torch.float32).reshape(3) / 255.0
+            )
         except (ValueError, RuntimeError):
             raise ValueError(f"--background: expected #rrggbb or an image file, got {text!r}") from None
     image = read_image(text, channels=3)

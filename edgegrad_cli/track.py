@@ -104,7 +104,9 @@ def run(args: argparse.Namespace) -> int:
         if film := write_film(args.out, written, Fraction(args.fps or fps or USUAL_FPS)):
             names.append(film)
     lost = sum(pose.lost for pose in poses)
-    print(f"{len(poses)} frames, lost in {lost}\nwrote {', '.join(names)} in {args.out}")
+    print(
+        f"{len(poses)} {'frame' if len(poses) == 1 else 'frames'}, lost in {lost}\nwrote {', '.join(names)} in {args.out}"
+    )
     return INTERRUPTED if interrupted else 0
 
 

@@ -139,6 +139,10 @@ def test_a_failed_write_still_prints_the_pose(files, capsys, monkeypatch):
         (["mesh.ply", "target.png", "--label", "2"], "--label: expected --mask with it"),
         (["mesh.ply", "target.png", "--mask", "mask.png", "--background", "#102030"], "--background: expected none"),
         (["mesh.ply", "target.png", "--background", "#1020"], "--background: expected #rrggbb"),
+        (
+            ["mesh.ply", "target.png", "--background", "blue"],
+            "--background: expected #rrggbb or an image file, got 'blue'",
+        ),
         (["mesh.ply", "target.png", "--background", "small.png"], "small.png: expected 48 × 48 pixels"),
         (["mesh.ply", "target.png", "--fov", "200"], "--fov: expected degrees between 0 and 180, got 200"),
         (["mesh.ply", "target.png", "--out", "mesh.ply/out"], "mesh.ply/out (Not a directory); choose another"),

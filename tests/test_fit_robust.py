@@ -241,11 +241,25 @@ def test_residuals_have_the_gradient_of_the_loss(clutter):
     "change, error, message",
     [
         ({"camera": []}, ValueError, "camera: expected at least one"),
-        ({"camera": [camera(8)] * 2}, ValueError, "target: expected 2, one for each camera, got 8"),
+        (
+            {"camera": [camera(8)] * 2},
+            ValueError,
+            "target: expected 2, one for each camera, got one of shape (8, 8, 3)",
+        ),
         (
             {"camera": [camera(8)], "target": [torch.zeros(8, 8, 3)], "mask": [torch.ones(4, 4)]},
             ValueError,
             "mask[0]: expected",
+        ),
+        (
+            {"target": "photo.png"},
+            TypeError,
+            "target: expected an image (H, W, C) of numbers, got the path 'photo.png'; read",
+        ),
+        (
+            {"target": None},
+            TypeError,
+            "target: expected an image (H, W, C) of numbers, got None; read one with read_image",
         ),
         ({"weight": -torch.ones(8, 8)}, ValueError, "weight: expected numbers from 0 up"),
         ({"weight": torch.ones(8, 8, 3)}, ValueError, "weight: expected shape (8, 8) or (8, 8, 1)"),

@@ -41,7 +41,7 @@ def test_a_stone_that_turns(film, frames):
 
 def test_lost_and_found_again(film):
     gone = replace(film, poses=[film.poses[0]] * 8, gone=(1, 6))
-    found = list(track(film.mesh, gone, film.camera, film.poses[0]))
+    found = list(track(film.mesh, gone, film.camera, film.poses[0], spp=2))
     assert [pose.lost for pose in found[:6]] == [False] * 4 + [True] * 2
     assert not found[-1].lost
     degrees, percent = errors(gone, 7, found[-1].R, found[-1].t)
@@ -59,7 +59,7 @@ def test_found_again_elsewhere_and_turned(film):
     gone = replace(film, poses=[film.poses[0]] * 7 + [there] * 2, gone=(1, 7))
     larger = film.mesh.replace(verts=100.0 * film.mesh.verts)
     init = film.poses[0] @ torch.diag(torch.tensor([0.01, 0.01, 0.01, 1.0]).double())
-    found = list(track(larger, gone, film.camera, init))
+    found = list(track(larger, gone, film.camera, init, spp=2))
     assert all(pose.lost for pose in found[4:7]) and not found[-1].lost
     assert found[-1].scale == pytest.approx(0.01)
     degrees, percent = errors(gone, 8, found[-1].R, found[-1].t)
@@ -94,6 +94,7 @@ def test_a_broken_frame_is_named(film, frames, spoil, words):
         ({"init": torch.eye(3)}, "init: expected"),
         ({"spp": 0}, "spp: expected"),
         ({"depth": 1.0}, "depth: expected"),
+        ({"depth": torch.ones(SIZE, SIZE)}, r"depth: expected \(T, H, W\), got"),
     ],
 )
 def test_bad_arguments_are_named_at_once(film, frames, change, words):

@@ -42,6 +42,11 @@ def slope(posterior: Tensor, alpha: Tensor) -> Tensor:
     return (1.0 - 2.0 * posterior) / likelihood(posterior, alpha)
 
 
+def told(posterior: Tensor, alpha: Tensor) -> Tensor:
+    """(h, w): how many bits more likely a pixel is than if its colour told nothing, P = ½: 1 where it is sure and right."""
+    return 1.0 + likelihood(posterior, alpha).log2()
+
+
 def around(alpha: Tensor) -> tuple[Tensor, float]:
     """What surrounds the object (h, w), and its extent, pixels; 0 where it is not seen."""
     rows, columns = torch.nonzero(alpha > 0.5, as_tuple=True)

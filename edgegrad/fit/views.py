@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from os import PathLike as OsPath
 from typing import Any
 
 import torch
@@ -192,6 +193,10 @@ def _images(name: str, value: object, cameras: list[Camera]) -> list[Tensor | No
 
 def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
     """(H, W, C) float32 on the CPU. Raises TypeError or ValueError."""
+    if value is None or isinstance(value, (str, OsPath)):
+        got = "None" if value is None else f"the path {str(value)!r}"
+        read = "read_mask" if name.startswith("mask") else "read_image"
+        raise TypeError(f"{name}: expected an image (H, W, C) of numbers, got {got}; read one with {read}(path)")
     image = as_tensor(name, value).detach().cpu()
     image = image.float() if image.dtype == torch.bool else image
     fix = "the camera must have the picture's size: camera.resized((H, W))"

@@ -267,12 +267,19 @@ def depth_images(depth: object, task: PoseTask) -> list[Tensor | None]:
     for k, (one, shot) in enumerate(zip(given, task.shots, strict=True)):
         name = f"depth[{k}]" if several else "depth"
         found.append(depth_image(name, one, shot.camera.size))
+    if not any(bool(one.isfinite().any()) for one in found):
+        raise ValueError("depth: expected distances somewhere, got none in any pixel; 0 and NaN say that there is none")
     return found
 
 
 def depth_image(name: str, given: object, size: tuple[int, int]) -> Tensor:
     """(H, W), NaN where it was not measured. Raises TypeError or ValueError."""
     value = as_tensor(name, given).detach().cpu()
+    if not value.is_floating_point():
+        raise TypeError(
+            f"{name}: expected floating-point numbers in world units, got whole ones; of millimetres, for metres, take "
+            "depth / 1000"
+        )
     check_float(name, value)
     check_shape(name, value, size, (*size, 1), fix="it needs the picture's size")
     value = value.reshape(size).float()

@@ -141,6 +141,8 @@ def track(
         raise ValueError(f"frames: expected (T, H, W, C), got {tuple(frames.shape)}; give a list of pictures")
     if depth is not None and not isinstance(depth, (Iterable, Tensor)):
         raise TypeError(f"depth: expected one for each frame or None, got {type(depth).__name__}")
+    if isinstance(depth, Tensor) and depth.dim() not in (3, 4):
+        raise ValueError(f"depth: expected (T, H, W), got {tuple(depth.shape)}; give a list of depth images")
     check_max_size(max_size)
     check_positive_int("spp", spp)
     check_int("seed", seed, 0, 2**32 - 1)

@@ -15,8 +15,8 @@ from ....aovs import render_aovs
 from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
 from ....scene.scene import Scene
-from ...region import RADIUS, Palette, Windows, around, palette, posterior, smoothed
-from ...sides import ALONE_CONTRAST, ALONE_SHOWN, CONTRAST, PURE, Sides
+from ...region import RADIUS, Palette, Windows, around, palette, posterior, smoothed, told
+from ...sides import ALONE_SHOWN, ALONE_TOLD, CONTRAST, PURE, REACH, Sides
 from ...sides import BLUR as CONTOUR_BLUR
 from ...verdict import explained
 from ..gauss_newton import Normal
@@ -183,15 +183,19 @@ class PhotoLevel:
     def explained(self, pose: Pose, seed: int, views: list[Seen] | None = None) -> float:
         """The share, 0 … 1, of the edges that the render should have in the pictures, of contours and of what is inside, that
         they have. `views`: as of equations()."""
-        pairs, contrasts, shown, length, extent = [], [], 0.0, 0.0, 0.0
-        for seen in self.see(pose, seed) if views is None else views:
+        pairs, shown, length, extent, bits, pixels = [], 0.0, 0.0, 0.0, 0.0, 0.0
+        for k, seen in enumerate(self.see(pose, seed) if views is None else views):
             picture, sides = seen.part, seen.sides()
             contour = sides.alpha
             extent = max(extent, seen.extent)
             on = ((contour > PURE) & (contour < 1.0 - PURE)).float() * picture.weight
             length += float(on.sum())
             shown += float((on * (sides.contrast > CONTRAST) * sides.band).sum())
-            contrasts.append(sides.contrast[sides.band & (picture.weight > 0.0)])
+            if not self.harmonics:
+                soft = smoothed(seen.alpha[None], REACH)[0]
+                beside = ((soft > PURE) & (soft < 1.0 - PURE)) * seen.near
+                bits += float((beside * told(self._posterior(k, seen), seen.alpha)).sum())
+                pixels += float(beside.sum())
             band = sides.band.float() * picture.weight
             if seen.lit is None or picture.mask is not None:
                 pairs.append((sides.mixed, sides.mixed, picture.outlined, band[..., None]))
@@ -207,9 +211,10 @@ class PhotoLevel:
         share = explained(pairs) * min(1.0, extent / RESOLVED)
         if self.harmonics:
             return share * min(1.0, shown / length / SHOWN)
-        along = torch.cat(contrasts)
-        middle = float(along.median()) if len(along) else 0.0
-        return share * min(1.0, shown / length / ALONE_SHOWN) * min(1.0, middle / ALONE_CONTRAST)
+        # The colours that a contour divides are alike on both sides where it is not the object's, however strong the edges are
+        # that it happens to follow.
+        sure = max(0.0, min(1.0, bits / max(pixels, 1e-30) / ALONE_TOLD))
+        return share * min(1.0, shown / length / ALONE_SHOWN) * sure
 
     @cached_property
     def labels(self) -> list[Tensor]:
