@@ -9,6 +9,7 @@
 
 #include <cstdint>
 
+#include "core/math.h"
 #include "core/sampler.h"
 
 namespace edgegrad {
@@ -36,24 +37,19 @@ inline uint64_t z_order(uint32_t x, uint32_t y) { return spread_bits(x) | spread
 
 class ScrambledSobol {
    public:
-    explicit ScrambledSobol(uint64_t random) : x_(random), y_(mix(random)), random_(random) {}
+    explicit ScrambledSobol(uint64_t random) : x_(random), y_(mix(random)) {}
 
     // Points first … first + n − 1. They repeat after 2³².
     void fill(uint64_t first, int n, double* x, double* y) const {
         for (int k = 0; k < n; ++k) {
-            const uint32_t i = uint32_t(first) + k;
-            x[k] = unit(x_(i)), y[k] = unit(y_(pascal(i)));
+            const Vec2 point = (*this)(uint32_t(first) + k);
+            x[k] = point.x, y[k] = point.y;
         }
     }
-
-    // Point i in another order, in which runs that begin at a multiple of their length 2^m stay together (Burley 2020,
-    // "Practical hash-based Owen scrambling"): so that several sequences of the same i know nothing of each other.
-    Vec2 shuffled(uint32_t i) const {
-        i = reversed_bits(Scramble(mix(random_ + 1))(reversed_bits(i)));
-        return {unit(x_(i)), unit(y_(pascal(i)))};
-    }
+    Vec2 operator()(uint32_t i) const { return {unit(x_(i)), unit(y_(pascal(i)))}; }
 
    private:
+    friend class ShuffledSobol;
     // Both coordinates are held with the first binary digit in the lowest bit, where the first is i itself.
 
     // The second coordinate: digit r is the sum of the digits c of i for which the binomial C(c, r) is odd, that is, of
@@ -82,7 +78,18 @@ class ScrambledSobol {
     static double unit(uint32_t x) { return to_unit(uint64_t(reversed_bits(x)) << 32 | 1u << 31); }
 
     Scramble x_, y_;
-    uint64_t random_;
+};
+
+// The same points in another order, in which runs that begin at a multiple of their length 2^m stay together (Burley
+// 2020, "Practical hash-based Owen scrambling"): so that several sequences of the same i know nothing of each other.
+class ShuffledSobol {
+   public:
+    explicit ShuffledSobol(uint64_t random) : points_(random), order_(mix(random + 1)) {}
+    Vec2 operator()(uint32_t i) const { return points_(reversed_bits(order_(reversed_bits(i)))); }
+
+   private:
+    ScrambledSobol points_;
+    ScrambledSobol::Scramble order_;
 };
 
 }  // namespace edgegrad

@@ -68,16 +68,21 @@ struct Numbers {
     const Lamp& lamp;
     uint64_t seed;
 
-    // Number j of so many.
-    Vec2 of_light(int j, int count) const { return at(0, j, count); }
-    Vec2 of_lobe(int j, int count) const { return at(1, j, count); }
-    double of_choice() const { return at(2, 0, 1).x; }
+    // So many numbers of one kind, by their index.
+    class Parts {
+       public:
+        Parts(const Numbers& of, int kind, int count)
+            : sobol_(hash(of.seed >> 32, of.lamp.stream[kind])), first_(uint32_t(of.seed) * uint32_t(count)) {}
+        Vec2 operator()(int j) const { return sobol_(first_ + uint32_t(j)); }
 
-   private:
-    Vec2 at(int k, int j, int count) const {
-        return ScrambledSobol(hash(seed >> 32, lamp.stream[k]))
-            .shuffled(uint32_t(seed) * uint32_t(count) + uint32_t(j));
-    }
+       private:
+        ShuffledSobol sobol_;
+        uint32_t first_;
+    };
+
+    Parts of_light(int count) const { return Parts(*this, 0, count); }
+    Parts of_lobe(int count) const { return Parts(*this, 1, count); }
+    double of_choice() const { return Parts(*this, 2, 1)(0).x; }
 };
 
 // How many candidates are drawn by each.
@@ -92,9 +97,11 @@ void draw_candidates(const Lamp& lamp, const DrawnLobe& lobe, const Numbers& num
                      Shares& shares, At at, Towards towards, Add add) {
     const int by_lobe = ask_lobe ? all / 2 : 0, by_light = all - by_lobe;
     shares.light = by_light, shares.lobe = by_lobe;
-    for (int j = 0; j < by_light; ++j) add(at(draw(lamp, numbers.of_light(j, by_light))), false);
+    const Numbers::Parts of_light = numbers.of_light(by_light);
+    for (int j = 0; j < by_light; ++j) add(at(draw(lamp, of_light(j))), false);
+    const Numbers::Parts of_lobe = numbers.of_lobe(by_lobe);
     for (int j = 0; j < by_lobe; ++j) {
-        const Vec2 u = numbers.of_lobe(j, by_lobe);
+        const Vec2 u = of_lobe(j);
         towards(lobe.draw(u.x, u.y), [&](const Candidate& c) { add(c, true); });
     }
 }
@@ -215,8 +222,9 @@ void light_points(const LitScene& lit, const LitPoints& points, int64_t i, int n
     } else if ((lamp.kind == Lamp::Kind::environment || lamp.tree) && !o.scattering.lambertian) {
         Resampled(lit, lamp, numbers, o, count, dark).keep(numbers.of_choice(), count, out);
     } else {
+        const Numbers::Parts of_light = numbers.of_light(count);
         for (int s = 0; s < count; ++s) {
-            out[s] = draw(lamp, numbers.of_light(s, count));
+            out[s] = draw(lamp, of_light(s));
             if (lamp.kind == Lamp::Kind::environment) out[s] = above(lit.tables, lamp, out[s], plain(o.g));
         }
     }
