@@ -130,7 +130,7 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     terms = _shaded_terms(scene, request, creases, scene)
     lights = sum(1 if light.punctual else lighting.samples for light in scene.casting)
     shaded = terms["interior"].samples + terms["boundary"].samples
-    where = "lit" if scene.is_lit else "seen, with mipmaps, in PyTorch"
+    where = "lit" if scene.is_lit else "seen, with mipmaps"
     terms["textures"] = Term(False, f"looked up where they are {where}")
     del terms["shader"]
     resampled = lighting.resamples(scene)
