@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..kernel.derivatives import moves
-from ..scene.textures import Pyramid
+from .pyramid import Pyramid
 from .records import RayRecords
 from .surfaces import Surfaces, View
 
@@ -31,13 +31,13 @@ class Footprints(NamedTuple):
         if moves(rays.along):
             # As functions of the intrinsics. Where a lens shows nothing, the ray of the pixel itself stands for its neighbour.
             offsets = pixel.new_tensor([[aside, 0], [-aside, 0], [0, aside], [0, -aside]])
-            found = rays_at((pixel + offsets[:, None]).flatten(0, 1)).along.unflatten(0, (4, -1))
-            along = torch.where(torch.isfinite(found), found, rays.along)
+            found = rays_at((pixel[:, None] + offsets).flatten(0, 1)).along.unflatten(0, (-1, 4))
+            along = torch.where(torch.isfinite(found), found, rays.along[:, None])
         else:
-            by_x = aside * rays.along_by_x
-            along = torch.stack([rays.along + sign * by_x[:, :, axis] for axis in (0, 1) for sign in (1, -1)])
-        b = self.view.barycentrics(self.surfaces, self.face.repeat(4), along.flatten(0, 1))[:, 1:].unflatten(0, (4, -1))
-        return torch.stack([b[0] - b[1], b[2] - b[3]], 1) / (2 * aside)
+            by_x = aside * rays.along_by_x.mT
+            along = rays.along[:, None] + torch.stack([by_x, -by_x], 2).flatten(1, 2)
+        b = self.view.barycentrics(self.surfaces, self.face, along.flatten(0, 1)).unflatten(0, (-1, 2, 2))
+        return (b[:, :, 0, 1:] - b[:, :, 1, 1:]) / (2 * aside)
 
 
 def level(texture: Tensor, corner_uvs: Tensor, spread: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ struct Source {
     const int32_t* uv_faces = nullptr;
     int64_t height = 0, width = 0;
     Sampler sampler = {};
-    int levels = 1;  // of the image's pyramid: each is half as high and wide as the one before
+    int levels = 1;  // of the image's pyramid (pyramid.h)
 
     bool exists() const { return value != no_table; }
     // Whether it is looked up by how far pixels lie apart.
@@ -31,10 +31,7 @@ struct Source {
     // The texels are rows of the table, level after level.
     TexelGrid grid(int level = 0) const {
         TexelGrid o{0, height, width, sampler};
-        for (; level > 0; --level) {
-            o.first += o.height * o.width;
-            o.height = std::max(int64_t(1), o.height / 2), o.width = std::max(int64_t(1), o.width / 2);
-        }
+        for (; level > 0; --level) o = o.halved();
         return o;
     }
 };
