@@ -335,8 +335,8 @@ def _rows(index: Tensor) -> np.ndarray:
 
 
 class _Shading(NamedTuple):
-    """csrc/shading/lit/lit.h, of the tensors (b, spread, *points, *tables, *flat). The results are radiance (N, C) float64, and which
-    light samples are seen: (N, K) int8, −1 below the surface. Without `values`, zeros with the radiance's derivatives."""
+    """csrc/shading/lit/lit.h, of the tensors (b, spread, *points, *tables, *flat). The results are radiance (N, C) float64, and
+    which light samples are seen: (N, K) int8, −1 below the surface. Without `values`, zeros with the radiance's derivatives."""
 
     layout: _Layout
     tables: int  # how many

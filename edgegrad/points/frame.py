@@ -88,9 +88,7 @@ class Frame:
         """As differentiable functions of vertices and camera, at fixed places in the image."""
         face = self.here(face)
         b = self.view.barycentrics(self.surfaces, face, self.here(self._moving(rays).along))
-        return Hits(
-            self.surfaces, self.view, face, b, self.here(x), lambda x: self._moving(self.rays_at(x)), seed=seed
-        )
+        return Hits(self.surfaces, self.view, face, b, self.here(x), lambda x: self._moving(self.rays_at(x)), seed=seed)
 
     def rays_at(self, x: Tensor) -> RayRecords:
         """The rays to places (N, 2), for moving_hits()."""
