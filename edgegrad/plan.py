@@ -130,7 +130,7 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     """Materials and lights are shaded in PyTorch, as by a shader."""
     terms = _shaded_terms(scene, request, creases, scene)
     lights = sum(1 if light.punctual else lighting.samples for light in scene.casting)
-    where = "lit" if scene.is_lit else "seen, with mipmaps, in PyTorch"
+    where = "lit" if scene.is_lit else "seen, with mipmaps"
     terms["textures"] = Term(False, f"looked up where they are {where}")
     del terms["shader"]
     inside = sum(lighting.in_gradient(scene, light) for light in scene.casting)

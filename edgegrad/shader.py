@@ -281,7 +281,7 @@ class _Image:
         frame = self._frame
         found = self._crossings()
         self._effort.watch.count("step_samples", len(found.x))
-        rays = frame.sampler.rays_at(found.x)
+        rays = frame.rays_at(found.x)
         seed = frame.seeds("steps", len(found.x))
         step = frame.here(found.step)[:, None]
         gradient = torch.cat([self._by_place(found, rays, part) for part in _parts(found)])

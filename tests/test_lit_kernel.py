@@ -47,6 +47,8 @@ SCENES = [
     "bulb microfacets",
     "base emission point",
     "nearest texture normal_map base point directional",
+    "mipmap texture point",
+    "mipmap texture normal_map normals microfacets base emission directional",
     "texture normal_map normals microfacets base emission point directional spot harmonics environment area",
 ]
 
@@ -59,6 +61,7 @@ def numbers_of(words: str) -> Leaves:
     """All tensors of a scene by their names."""
     draw = torch.Generator().manual_seed(7)
     rand = lambda *shape: torch.rand(*shape, dtype=F64, generator=draw)  # noqa: E731
+    finer = 5 if "mipmap" in words else 1
     ball = icosphere(2)
     verts = ball.verts.double()
     uvs = torch.stack([torch.atan2(verts[:, 0], verts[:, 2]) / 6.3 + 0.5, 0.5 * verts[:, 1] + 0.5], 1)
@@ -67,14 +70,14 @@ def numbers_of(words: str) -> Leaves:
         "colors": lambda: {"colors": rand(V, 3)},
         "face_colors": lambda: {"face_colors": rand(F, 3)},
         "corner_colors": lambda: {"corner_colors": rand(F, 3, 3)},
-        "texture": lambda: {"texture": rand(9, 14, 3), "uvs": uvs},
+        "texture": lambda: {"texture": rand(9 * finer, 14 * finer, 3), "uvs": uvs},
         "normals": lambda: {"normals": verts + 0.2 * (rand(V, 3) - 0.5)},
         "normal_map": lambda: {
             "uvs": uvs, "map": number([0.5, 0.5, 1.0]) + 0.2 * (rand(8, 8, 3) - 0.5), "map_factor": number([1.0, 0.9, 1.0]),
             "map_scale": number(0.7),
         },
         "microfacets": lambda: {"metallic": rand(V, 1), "roughness": number(0.4)},
-        "base": lambda: {"base": rand(8, 8, 3), "base_uvs": 2 * uvs, "base_factor": rand(3)},
+        "base": lambda: {"base": rand(8 * finer, 8 * finer, 3), "base_uvs": 2 * uvs, "base_factor": rand(3)},
         "emission": lambda: {"emission": rand(3)},
         "point": lambda: {"point": number([2.0, 3.0, 1.0]), "point_power": number(20.0), "point_color": rand(3)},
         "directional": lambda: {"sun": number([0.5, -1.0, -0.3]), "sun_power": number(2.0)},
@@ -102,7 +105,7 @@ def scene_of(words: str, n: Leaves) -> eg.Scene:
     }
     if "uvs" in own:
         own["uv_faces"] = faces
-    filter = "nearest" if "nearest" in words else "linear"
+    filter = next((kind for kind in ("nearest", "mipmap") if kind in words), "linear")
     looks: dict[str, Any] = {name: n[name] for name in ("metallic", "roughness", "emission") if name in n}
     if "map" in n:
         looks |= {
@@ -289,6 +292,7 @@ AROUND = {
         "environment",
         "base emission harmonics",
         "nearest texture point spot",
+        "mipmap texture base point",
     ],
 )
 def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -441,8 +445,8 @@ def test_which_scenes_the_kernel_shades() -> None:
     seen_through = nearest.replace(material=eg.Material(alpha_mode="BLEND"), alpha=torch.full((2, 2), 0.5, dtype=F64))
     assert not in_kernel.is_fused(scene.replace(meshes=[seen_through, ground]))
     assert mesh.texture is not None
-    levels = mesh.replace(material=eg.Material(eg.Texture(mesh.texture, filter="mipmap")))
-    assert not in_kernel.is_fused(scene.replace(meshes=[levels, ground]))
+    levels = seen_through.replace(filter="mipmap")
+    assert in_kernel.is_fused(scene.replace(meshes=[levels, ground]))
     many = mesh.replace(texture=mesh.texture[..., :1].expand(-1, -1, 17).contiguous())
     assert not in_kernel.is_fused(eg.Scene([many], lights=scene.lights[:0]))
 

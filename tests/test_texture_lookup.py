@@ -7,7 +7,8 @@ import pytest
 import torch
 from adjoints import check_vjp, pieces, random
 
-from edgegrad.scene.textures import Pyramid, bilinear
+from edgegrad.points.pyramid import Pyramid
+from edgegrad.scene.textures import bilinear
 
 
 def texels(height: int = 4, width: int = 5, channels: int = 3) -> np.ndarray:

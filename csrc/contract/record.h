@@ -134,12 +134,14 @@ inline void append_ray(const Camera& window, Vec2 n, std::vector<double>& along,
     const Mat3& turn = window.turn;
     const Vec3 direction = transposed_times(turn, {n.x, n.y, 1});
     append(along, {direction.x, direction.y, direction.z});
-    if (!along_by_k) return;
+    if (!along_by_k && !along_by_x) return;
     for (const Vec2 by_n :
          {Vec2{turn.row[0].x, turn.row[1].x}, Vec2{turn.row[0].y, turn.row[1].y}, Vec2{turn.row[0].z, turn.row[1].z}}) {
-        IntrinsicsGrad bar;
-        normalised_vjp(window, n, by_n, bar);
-        append_intrinsics(*along_by_k, window, bar);
+        if (along_by_k) {
+            IntrinsicsGrad bar;
+            normalised_vjp(window, n, by_n, bar);
+            append_intrinsics(*along_by_k, window, bar);
+        }
         if (!along_by_x) continue;
         const Vec2 by_x = pixel_vjp(window, n, by_n);
         append(*along_by_x, {by_x.x, by_x.y});

@@ -10,6 +10,7 @@ namespace edgegrad {
 
 // Beside those of Dual.
 using std::cos;
+using std::log2;
 using std::sqrt;
 
 struct Dual {
@@ -33,6 +34,7 @@ inline Dual sqrt(Dual a) {
     const double root = std::sqrt(a.value);
     return {root, a.dot / (2 * root)};
 }
+inline Dual log2(Dual a) { return {std::log2(a.value), a.dot / (M_LN2 * a.value)}; }
 inline Dual cos(Dual a) { return {std::cos(a.value), -std::sin(a.value) * a.dot}; }
 
 struct DualVec3 {

@@ -34,7 +34,8 @@ class LitRow : public RowVisitor {
         : in_(in),
           lights_(light_samples(in.lit, in.options)),
           buffers_(shade_buffers(in.lit, in.options)),
-          sums_(int64_t(in.width) * in.lit.channels) {}
+          sums_(int64_t(in.width) * in.lit.channels),
+          filtered_(in.lit.is_filtered()) {}
 
     void visit(int y, std::vector<PixelHit>& hits) override {
         std::fill(sums_.begin(), sums_.end(), 0.0);
@@ -55,16 +56,20 @@ class LitRow : public RowVisitor {
     void shade(const std::vector<PixelHit>& hits, size_t first, size_t n) {
         const int C = in_.lit.channels;
         const size_t K = lights_.size();
-        face_.clear(), b_.clear(), seed_.clear(), radiance_.resize(n * C), seen_.resize(n * K);
+        face_.clear(), b_.clear(), seed_.clear(), spread_.clear(), radiance_.resize(n * C), seen_.resize(n * K);
         for (size_t i = first; i < first + n; ++i) {
             const PixelHit& hit = hits[i];
             among_ = i > 0 && hits[i - 1].pixel == hit.pixel ? among_ + 1 : 0;
             face_.push_back(hit.face), b_.insert(b_.end(), {1 - (hit.b.u + hit.b.v), hit.b.u, hit.b.v});
+            if (filtered_)
+                for (const Barycentrics& next : {hit.spread.right, hit.spread.down})
+                    spread_.insert(spread_.end(), {next.u, next.v});
             const uint64_t place = z_order(uint32_t(hit.pixel % in_.width), uint32_t(hit.pixel / in_.width));
             seed_.push_back(int64_t(in_.seed + uint64_t(in_.points) * place + among_));
         }
-        shade_some(in_.lit, in_.scene, in_.caster, {int64_t(n), face_.data(), b_.data(), seed_.data(), {}}, in_.options,
-                   *buffers_, radiance_.data(), seen_.data());
+        const double* spread = filtered_ ? spread_.data() : nullptr;
+        shade_some(in_.lit, in_.scene, in_.caster, {int64_t(n), face_.data(), b_.data(), seed_.data(), {}, spread},
+                   in_.options, *buffers_, radiance_.data(), seen_.data());
         for (size_t i = 0; i < n; ++i) {
             const PixelHit& hit = hits[first + i];
             double* sum = &sums_[int64_t(hit.pixel % in_.width) * C];
@@ -81,9 +86,10 @@ class LitRow : public RowVisitor {
     std::vector<LightSample> lights_;
     std::shared_ptr<ShadeBuffers> buffers_;
     std::vector<double> sums_;  // of the row
-    uint64_t among_ = 0;        // the hits of one pixel, which this is
+    bool filtered_;
+    uint64_t among_ = 0;  // the hits of one pixel, which this is
     std::vector<int64_t> face_, seed_;
-    std::vector<double> b_, radiance_;
+    std::vector<double> b_, spread_, radiance_;
     std::vector<int8_t> seen_;
 };
 
@@ -104,11 +110,12 @@ LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Cam
         visit_pixel_hits(scene, camera, caster, image, choice, team, hits,
                          [&] { return std::make_unique<LitRow<T>>(rows); });
     };
-    shade_pixels({0, camera.height, sampling.points}, sampling.seed);
+    const bool spread = lit.is_filtered();
+    shade_pixels({0, camera.height, sampling.points, nullptr, spread}, sampling.seed);
     if (!borders) return out;
     std::vector<uint8_t> pixels;
     if (const int times = borders->find(pixels, team))
-        shade_pixels({0, camera.height, times * sampling.points, pixels.data()}, sampling.again);
+        shade_pixels({0, camera.height, times * sampling.points, pixels.data(), spread}, sampling.again);
     return out;
 }
 

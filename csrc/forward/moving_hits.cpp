@@ -66,13 +66,27 @@ Vec3 crossing_vjp(const Crossing<double>& c, bool perspective, const double* b_b
     return perspective ? d_bar : s_bar;
 }
 
+// A face in world and in camera coordinates.
 template <class S>
-Crossing<S> crossing(const MovingHits& hits, const Pose<S>& pose, const MovingArrays<const double>& at,
-                     const MovingArrays<const double>& tangents, int64_t i, Vector<S>* world) {
-    const int32_t* v = hits.faces + 3 * hits.face[i];
-    Vector<S> corner[3];
-    for (int k = 0; k < 3; ++k) world[k] = row<S>(at.verts, tangents.verts, v[k]), corner[k] = pose.in_camera(world[k]);
-    return {corner, row<S>(at.along, tangents.along, i), hits.perspective};
+struct Corners {
+    Vector<S> world[3], corner[3];
+
+    Corners(const MovingHits& hits, const Pose<S>& pose, const MovingArrays<const double>& at,
+            const MovingArrays<const double>& tangents, int64_t i) {
+        const int32_t* v = hits.faces + 3 * hits.face[i];
+        for (int k = 0; k < 3; ++k)
+            world[k] = row<S>(at.verts, tangents.verts, v[k]), corner[k] = pose.in_camera(world[k]);
+    }
+};
+// Calls body(number of the ray, crossing) for all rays of hits.
+template <class S, class Body>
+void each_crossing(const MovingHits& hits, const Pose<S>& pose, const MovingArrays<const double>& at,
+                   const MovingArrays<const double>& tangents, int64_t first, int64_t last, Body body) {
+    for (int64_t i = first; i < last; ++i) {
+        const Corners<S> face(hits, pose, at, tangents, i);
+        for (int64_t r = i * hits.rays; r < (i + 1) * hits.rays; ++r)
+            body(r, Crossing<S>(face.corner, row<S>(at.along, tangents.along, r), hits.perspective));
+    }
 }
 
 // What the hits of one chunk give.
@@ -86,12 +100,10 @@ struct ChunkOfHits {
 void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, Team& team) {
     const Pose<double> pose(at.world_to_camera, nullptr);
     team.each_block(hits.size, [&](int64_t, int64_t first, int64_t last) {
-        Vec3 world[3];
-        for (int64_t i = first; i < last; ++i) {
-            const Crossing<double> c = crossing<double>(hits, pose, at, {}, i, world);
+        each_crossing<double>(hits, pose, at, {}, first, last, [&](int64_t r, const Crossing<double>& c) {
             const bool there = c.exists();
-            b[3 * i] = there ? 1 - c.u - c.v : 1, b[3 * i + 1] = there ? c.u : 0, b[3 * i + 2] = there ? c.v : 0;
-        }
+            b[3 * r] = there ? 1 - c.u - c.v : 1, b[3 * r + 1] = there ? c.u : 0, b[3 * r + 2] = there ? c.v : 0;
+        });
     });
 }
 
@@ -108,17 +120,21 @@ void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at
             std::fill(chunk.pose, chunk.pose + 12, 0.0);
         },
         [&](int64_t first, int64_t last, ChunkOfHits& chunk) {
-            Vec3 world[3];
             for (int64_t i = first; i < last; ++i) {
+                const Corners<double> face(hits, pose, at, {}, i);
                 Vec3 corner_bar[3];
-                const Crossing<double> c = crossing<double>(hits, pose, at, {}, i, world);
-                if (!c.exists()) continue;
-                const Vec3 along_bar = crossing_vjp(c, hits.perspective, b_bar + 3 * i, corner_bar);
-                if (to.along)
-                    to.along[3 * i] = along_bar.x, to.along[3 * i + 1] = along_bar.y, to.along[3 * i + 2] = along_bar.z;
-                for (int k = 0; k < 3; ++k) {
+                bool met = false;
+                for (int64_t r = i * hits.rays; r < (i + 1) * hits.rays; ++r) {
+                    const Crossing<double> c(face.corner, row<double>(at.along, nullptr, r), hits.perspective);
+                    if (!c.exists()) continue;
+                    met = true;
+                    const Vec3 along = crossing_vjp(c, hits.perspective, b_bar + 3 * r, corner_bar);
+                    if (to.along)
+                        to.along[3 * r] = along.x, to.along[3 * r + 1] = along.y, to.along[3 * r + 2] = along.z;
+                }
+                for (int k = 0; met && k < 3; ++k) {
                     const double bar[3] = {corner_bar[k].x, corner_bar[k].y, corner_bar[k].z};
-                    const double p[3] = {world[k].x, world[k].y, world[k].z};
+                    const double p[3] = {face.world[k].x, face.world[k].y, face.world[k].z};
                     for (int r = 0; to.world_to_camera && r < 3; ++r) {
                         for (int s = 0; s < 3; ++s) chunk.pose[3 * r + s] += bar[r] * p[s];
                         chunk.pose[9 + r] += bar[r];
@@ -147,12 +163,10 @@ void meet_faces_jvp(const MovingHits& hits, const MovingArrays<const double>& at
                     const MovingArrays<const double>& tangents, double* b_dot, Team& team) {
     const Pose<Dual> pose(at.world_to_camera, tangents.world_to_camera);
     team.each_block(hits.size, [&](int64_t, int64_t first, int64_t last) {
-        DualVec3 world[3];
-        for (int64_t i = first; i < last; ++i) {
-            const Crossing<Dual> c = crossing<Dual>(hits, pose, at, tangents, i, world);
+        each_crossing<Dual>(hits, pose, at, tangents, first, last, [&](int64_t r, const Crossing<Dual>& c) {
             const double u = c.exists() ? c.u.dot : 0, v = c.exists() ? c.v.dot : 0;
-            b_dot[3 * i] = -u - v, b_dot[3 * i + 1] = u, b_dot[3 * i + 2] = v;
-        }
+            b_dot[3 * r] = -u - v, b_dot[3 * r + 1] = u, b_dot[3 * r + 2] = v;
+        });
     });
 }
 

@@ -12,8 +12,8 @@ template <class Number>
 struct MovingArrays {
     Number* verts = nullptr;            // (V, 3) world coordinates
     Number* world_to_camera = nullptr;  // (4, 4)
-    // (N, 3), in camera coordinates: directions of rays from the eye, or, in an orthographic view, points that rays
-    // along the axis go through.
+    // (N, rays, 3), in camera coordinates: directions of rays from the eye, or, in an orthographic view, points that
+    // rays along the axis go through.
     Number* along = nullptr;
 };
 
@@ -22,9 +22,10 @@ struct MovingHits {
     const int64_t* face;   // (N,)
     int64_t size;
     bool perspective;
+    int rays = 1;  // that meet the plane of each face
 };
 
-// Barycentrics (N, 3). Of a face without area, or seen edge-on, those of its first corner, without derivatives.
+// Barycentrics (N, rays, 3). Of a face without area, or seen edge-on, those of its first corner, without derivatives.
 void meet_faces(const MovingHits& hits, const MovingArrays<const double>& at, double* b, Team& team);
 // Adds to the cotangents of vertices and camera, and writes those of `along`.
 void meet_faces_vjp(const MovingHits& hits, const MovingArrays<const double>& at, const double* b_bar,

@@ -15,6 +15,18 @@ namespace edgegrad {
 
 namespace {
 
+// As edgegrad/points/footprints.py has it: differences over so little that texture coordinates are nearly affine there.
+Spread spread_at(const Camera& camera, const FaceMap& map, Vec2 n) {
+    constexpr double aside = 1.0 / 64;  // px
+    const auto difference = [&](Vec2 by_pixel) {
+        Barycentrics ahead, behind;
+        barycentrics(map, n + aside * by_pixel, ahead), barycentrics(map, n - aside * by_pixel, behind);
+        return Barycentrics{(ahead.u - behind.u) / (2 * aside), (ahead.v - behind.v) / (2 * aside)};
+    };
+    const Vec2 x = pixel_vjp(camera, n, {1, 0}), y = pixel_vjp(camera, n, {0, 1});  // rows of ∂n/∂x
+    return {difference({x.x, y.x}), difference({x.y, y.y})};
+}
+
 // The pixels of one row.
 template <class T>
 class HitRow {
@@ -157,7 +169,8 @@ class HitRow {
                 const Barycentrics b = barycentrics_of_hit(face.map, drawn.n);
                 const Vec2 x = bend(camera, to_pixels(camera, drawn.n)).x;
                 const double weight = double(g.count) / (double(options_.spp) * g.drawn.size());
-                to.push_back({int32_t(int64_t(y_) * camera.width + x_), g.face, b, x, weight});
+                const Spread spread = choice_.spread ? spread_at(camera, face.map, drawn.n) : Spread();
+                to.push_back({int32_t(int64_t(y_) * camera.width + x_), g.face, b, x, weight, spread});
             }
             pixel.hits += g.count;
             pixel.farthest = std::max(pixel.farthest, face.depth.farthest(middle, side_->reach));

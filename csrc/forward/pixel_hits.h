@@ -16,11 +16,17 @@
 
 namespace edgegrad {
 
+// How far barycentrics are apart one pixel to the right, and one down.
+struct Spread {
+    Barycentrics right, down;
+};
+
 struct PixelHit {
     int32_t pixel, face;
     Barycentrics b;  // where on the face
     Vec2 x;          // pixel position
     double weight;   // the share of the pixel's samples
+    Spread spread;   // where it is wanted
 };
 
 // Arrays side by side, one entry or row for each hit.
@@ -37,6 +43,7 @@ struct PixelChoice {
     int first, end;
     int most = 1;                   // of the samples of a pixel on one face that stand for all of them
     const uint8_t* only = nullptr;  // (H, W): the pixels; null: all
+    bool spread = false;            // whether it is wanted
 };
 
 // Is given the hits of rows, one row after another. Those of one pixel follow one another, but where a lens is looked

@@ -68,7 +68,7 @@ PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometr
     return out;
 }
 
-RayRecords rays_at(const Camera& camera, const Places& places, Team& team) {
+RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, Team& team) {
     const std::vector<Camera> sides = sides_of(camera);
     std::vector<RayRecords> blocks(Team::blocks(places.size));
     team.each_block(places.size, [&](int64_t block, int64_t first, int64_t last) {
@@ -79,7 +79,7 @@ RayRecords rays_at(const Camera& camera, const Places& places, Team& team) {
             for (const Camera& side : sides)
                 if (const Vec2 here = through(side, places[k]); std::isfinite(here.x + here.y))
                     window = &side, n = here;
-            append_ray(*window, n, to.along, &to.along_by_k, &to.along_by_x);
+            append_ray(*window, n, to.along, intrinsics ? &to.along_by_k : nullptr, &to.along_by_x);
         }
     });
     RayRecords all;

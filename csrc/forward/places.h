@@ -31,7 +31,7 @@ template <class T>
 PlaceHits hits_at(const SceneView<T>& scene, const Camera& camera, const Geometry& geometry, const Places& places,
                   Team& team);
 
-// Where the lens shows nothing, a ray holds NaN.
-RayRecords rays_at(const Camera& camera, const Places& places, Team& team);
+// Where the lens shows nothing, a ray holds NaN. Without `intrinsics` their derivatives are left out.
+RayRecords rays_at(const Camera& camera, const Places& places, bool intrinsics, Team& team);
 
 }  // namespace edgegrad

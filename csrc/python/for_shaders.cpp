@@ -16,6 +16,7 @@
 #include "python/arrays.h"
 #include "python/shaped.h"
 #include "python/unlocked.h"
+#include "shading/pyramid.h"
 
 using namespace nanobind::literals;
 
@@ -203,14 +204,42 @@ nb::dict seen_at(const SceneArrays<T>& arrays, const Camera& camera, In<double, 
     return out;
 }
 
-nb::dict rays_of(const Camera& camera, In<double, 2> x, int threads) {
+nb::dict rays_of(const Camera& camera, In<double, 2> x, bool intrinsics, int threads) {
     RayRecords found;
     const Places places = places_of(x);
-    unlocked(threads, [&](Team& team) { found = rays_at(camera, places, team); });
+    unlocked(threads, [&](Team& team) { found = rays_at(camera, places, intrinsics, team); });
     nb::dict out;
     out["along"] = rows(std::move(found.along), {3}), out["along_by_x"] = rows(std::move(found.along_by_x), {3, 2});
     out["along_by_k"] = rows(std::move(found.along_by_k), {3, intrinsics_width});
     return out;
+}
+
+// Of images (h, w, K): (M, K), and from its cotangent back.
+template <class T>
+void bind_pyramid(nb::module_& m) {
+    const auto shape = [](int64_t height, int64_t width, int64_t channels) {
+        if (height < 1 || width < 1 || channels < 1) refuse("image: expected texels");
+        return PyramidShape{{0, height, width}, int(channels)};
+    };
+    m.def(
+        "pyramid",
+        [shape](In<T, 3> image, int threads) {
+            const PyramidShape own = shape(image.shape(0), image.shape(1), image.shape(2));
+            Array<T> found(0);
+            unlocked(threads, [&](Team& team) { found = pyramid(own, image.data(), team); });
+            return rows(std::move(found), {image.shape(2)});
+        },
+        "image"_a.noconvert(), "threads"_a);
+    m.def(
+        "pyramid_vjp",
+        [shape](In<T, 2> bar, size_t height, size_t width, int threads) {
+            const PyramidShape own = shape(height, width, bar.shape(1));
+            if (int64_t(bar.shape(0)) != own.texels()) refuse("bar: expected a row a texel of the pyramid");
+            Array<T> found(0);
+            unlocked(threads, [&](Team& team) { found = pyramid_vjp(own, bar.data(), team); });
+            return shaped(std::move(found), {height, width, bar.shape(1)});
+        },
+        "bar"_a.noconvert(), "height"_a, "width"_a, "threads"_a);
 }
 
 void check_rows(const char* name, const In<double, 2>& array, size_t n) {
@@ -286,7 +315,8 @@ void bind_for_shaders(nb::module_& m) {
     };
     bind_vjp(&splat_vjp<float>), bind_vjp(&splat_vjp<double>);
     m.def("most_shadow_samples", &most_shadow_samples, "width"_a, "height"_a, "spp"_a);
-    m.def("rays_at", &rays_of, "camera"_a, "x"_a.noconvert(), "threads"_a);
+    m.def("rays_at", &rays_of, "camera"_a, "x"_a.noconvert(), "intrinsics"_a, "threads"_a);
+    bind_pyramid<float>(m), bind_pyramid<double>(m);
 }
 
 }  // namespace edgegrad

@@ -120,7 +120,8 @@ class Cotangent {
     Array<float> narrow_{0};
 };
 
-// Cotangents of the tables (None where they are not wanted) and of b: compute(to, b_bar, team) adds and writes them.
+// Cotangents of the tables (None where they are not wanted), of b, and of its spread, if it is known: compute(to,
+// places, team) adds and writes them.
 template <class Compute>
 nb::tuple cotangents(const LitArrays& lit, const LitPoints& points, const In<double, 2>& bar,
                      const std::vector<bool>& wanted, int threads, Compute compute) {
@@ -128,27 +129,29 @@ nb::tuple cotangents(const LitArrays& lit, const LitPoints& points, const In<dou
         refuse("bar: expected a row a point");
     if (wanted.size() != lit.scene.tables.size()) refuse("wanted: expected a number for each table");
     std::vector<Cotangent> found;
-    Array<double> b_bar(3 * points.size);
+    Array<double> b_bar(3 * points.size), spread_bar(points.spread ? spread_size * points.size : 0);
     unlocked(threads, [&](Team& team) {
         std::vector<TableBar> to;
         for (size_t i = 0; i < wanted.size(); ++i) {
             found.emplace_back(lit.scene.tables[i], wanted[i], team);
             to.push_back(found[i].bar());
         }
-        compute(to, b_bar.data(), team);
+        compute(to, {b_bar.data(), points.spread ? spread_bar.data() : nullptr}, team);
         for (Cotangent& cotangent : found) cotangent.finish(team);
     });
     nb::list out;
     for (size_t i = 0; i < found.size(); ++i) out.append(wanted[i] ? found[i].take() : nb::none());
-    return nb::make_tuple(out, shaped(std::move(b_bar), {size_t(points.size), 3}));
+    const size_t n = size_t(points.size);
+    return nb::make_tuple(out, shaped(std::move(b_bar), {n, 3}),
+                          points.spread ? shaped(std::move(spread_bar), {n, 2, 2}) : nb::none());
 }
 
 nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, const LitOptions& options,
                            In<int8_t, 2> seen, In<double, 2> bar, const std::vector<bool>& wanted, int threads) {
     const LitPoints view = points.view(lit.scene, faces_of(lit));
     check_seen(lit, view, options, seen);
-    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, double* b_bar, Team& team) {
-        shade_vjp(lit.scene, view, options, seen.data(), bar.data(), to, b_bar, team);
+    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, LitPlaces<double> places, Team& team) {
+        shade_vjp(lit.scene, view, options, seen.data(), bar.data(), to, places, team);
     });
 }
 
@@ -158,16 +161,16 @@ nb::tuple trace_and_shade_points_vjp(const SceneArrays<T>& arrays, const LitArra
                                      int threads) {
     check_faces(arrays, lit);
     const LitPoints view = points.view(lit.scene, faces_of(lit));
-    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, double* b_bar, Team& team) {
+    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, LitPlaces<double> places, Team& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
-        trace_and_shade_vjp(lit.scene, arrays.view(), geometry->caster(), view, options, bar.data(), to, b_bar, team);
+        trace_and_shade_vjp(lit.scene, arrays.view(), geometry->caster(), view, options, bar.data(), to, places, team);
     });
 }
 
 nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, const LitOptions& options,
                             In<int8_t, 2> seen, const std::vector<std::optional<In<double, 2>>>& tangents,
-                            std::optional<In<double, 2>> b_dot, int threads) {
+                            std::optional<In<double, 2>> b_dot, std::optional<In<double, 3>> spread_dot, int threads) {
     const LitPoints view = points.view(lit.scene, faces_of(lit));
     check_seen(lit, view, options, seen);
     LitScene moving = lit.scene;
@@ -181,10 +184,12 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
     }
     if (b_dot && (int64_t(b_dot->shape(0)) != view.size || b_dot->shape(1) != 3))
         refuse("b_dot: expected a row a point");
+    if (spread_dot && (!view.spread || int64_t(spread_dot->shape(0)) != view.size || spread_dot->shape(1) != 2 ||
+                       spread_dot->shape(2) != 2))
+        refuse("spread_dot: expected the shape of spread");
+    const LitPlaces<const double> dot{b_dot ? b_dot->data() : nullptr, spread_dot ? spread_dot->data() : nullptr};
     std::vector<double> out(size_t(view.size) * size_t(moving.channels));
-    unlocked(threads, [&](Team& team) {
-        shade_jvp(moving, view, options, seen.data(), b_dot ? b_dot->data() : nullptr, out.data(), team);
-    });
+    unlocked(threads, [&](Team& team) { shade_jvp(moving, view, options, seen.data(), dot, out.data(), team); });
     return shaped(std::move(out), {size_t(view.size), size_t(moving.channels)});
 }
 
@@ -226,7 +231,7 @@ void bind_lit(nb::module_& m) {
     m.def("light_on_faces", &light_on_faces, "verts"_a.noconvert(), "faces"_a.noconvert(), "eye"_a.noconvert(),
           "perspective"_a, "place"_a.noconvert(), "infinite"_a, "power"_a, "threads"_a);
     m.def("shade_jvp", &shade_points_jvp, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "seen"_a.noconvert(),
-          "tangents"_a, "b_dot"_a.none(), "threads"_a);
+          "tangents"_a, "b_dot"_a.none(), "spread_dot"_a.none(), "threads"_a);
 }
 
 }  // namespace edgegrad

@@ -31,7 +31,7 @@ Kind kind_of(const char* argument, const std::string& name, const std::vector<st
 const int32_t* data_of(const std::optional<Rows>& rows) { return rows ? rows->data() : nullptr; }
 
 SourceArrays make_source(const std::string& kind, int value, int factor, int uvs, std::optional<Rows> uv_faces,
-                         int64_t height, int64_t width, const std::vector<int>& sampler) {
+                         int64_t height, int64_t width, const std::vector<int>& sampler, int levels) {
     if (sampler.size() != 3) refuse("sampler: expected the wrap of u and of v, and the filter");
     const Source source{kind_of<Source::Kind>("kind", kind, {"constant", "vertex", "face", "corner", "texture"}),
                         value,
@@ -40,7 +40,8 @@ SourceArrays make_source(const std::string& kind, int value, int factor, int uvs
                         data_of(uv_faces),
                         height,
                         width,
-                        {Wrap(sampler[0]), Wrap(sampler[1]), TextureFilter(sampler[2])}};
+                        {Wrap(sampler[0]), Wrap(sampler[1]), TextureFilter(sampler[2])},
+                        levels};
     return {source, uv_faces};
 }
 
@@ -167,8 +168,9 @@ void LitArrays::check_source(const char* name, const SourceArrays& arrays, const
                 row < 0 || row >= table(s.value).rows)
                 refuse(std::string(name) + ": expected a row for each vertex of the mesh");
     if (s.kind != Kind::texture) return;
-    if (s.height < 1 || s.width < 1 || s.height * s.width != table(s.value).rows)
-        refuse(std::string(name) + ": expected a row for each texel");
+    const bool there = s.height >= 1 && s.width >= 1 && s.levels >= 1 && s.levels <= 64;
+    const TexelGrid behind = there ? s.grid(s.levels) : TexelGrid{-1, 0, 0};
+    if (behind.first != table(s.value).rows) refuse(std::string(name) + ": expected a row for each texel");
     check_table(name, s.uvs, 1, 2);
     if (!arrays.uv_faces || int64_t(arrays.uv_faces->shape(0)) != mesh.faces || arrays.uv_faces->shape(1) != 3)
         refuse(std::string(name) + ": expected uv_faces with a row for each face");
@@ -224,7 +226,9 @@ LitPoints PointArrays::view(const LitScene& scene, int64_t faces) const {
     if (b.shape(0) != n || b.shape(1) != 3 || seed.size() != n) refuse("b, seed: expected a row a point");
     for (size_t i = 0; i < n; ++i)
         if (face(i) < 0 || face(i) >= faces) refuse("face: expected faces of the scene");
-    LitPoints points{int64_t(n), face.data(), b.data(), seed.data(), {}};
+    if (spread && (spread->shape(0) != n || spread->shape(1) != 2 || spread->shape(2) != 2))
+        refuse("spread: expected two rows of two a point");
+    LitPoints points{int64_t(n), face.data(), b.data(), seed.data(), {}, spread ? spread->data() : nullptr};
     if (forced_lamp < 0) return points;
     if (size_t(forced_lamp) >= scene.lamps.size() || !index || !uv || !density || !lit || index->size() != n ||
         uv->shape(0) != n || uv->shape(1) != 2 || density->size() != n || lit->size() != n)
@@ -242,7 +246,7 @@ void bind_lit_arrays(nb::module_& m) {
     nb::class_<SourceArrays>(m, "LitSource")
         .def(nb::new_(&make_source), "kind"_a, "value"_a = no_table, "factor"_a = no_table, "uvs"_a = no_table,
              "uv_faces"_a.noconvert() = nb::none(), "height"_a = 0, "width"_a = 0,
-             "sampler"_a = std::vector<int>{0, 0, 0});
+             "sampler"_a = std::vector<int>{0, 0, 0}, "levels"_a = 1);
     nb::class_<MeshArrays>(m, "LitMesh")
         .def(nb::new_(&make_mesh), nb::kw_only(), "first_face"_a, "faces"_a, "first_vertex"_a, "has_material"_a,
              "two_sided"_a, "lambertian"_a, "color"_a, "base_color"_a, "metallic"_a, "roughness"_a, "emission"_a,
@@ -262,12 +266,13 @@ void bind_lit_arrays(nb::module_& m) {
     nb::class_<PointArrays>(m, "LitPoints")
         .def(nb::new_([](In<int64_t, 1> face, In<double, 2> b, In<int64_t, 1> seed, int forced_lamp,
                          std::optional<In<int64_t, 1>> index, std::optional<In<double, 2>> uv,
-                         std::optional<In<double, 1>> density, std::optional<In<uint8_t, 1>> lit) {
-                 return PointArrays{face, b, seed, forced_lamp, index, uv, density, lit};
+                         std::optional<In<double, 1>> density, std::optional<In<uint8_t, 1>> lit,
+                         std::optional<In<double, 3>> spread) {
+                 return PointArrays{face, b, seed, forced_lamp, index, uv, density, lit, spread};
              }),
              nb::kw_only(), "face"_a.noconvert(), "b"_a.noconvert(), "seed"_a.noconvert(), "forced_lamp"_a = -1,
              "index"_a.noconvert() = nb::none(), "uv"_a.noconvert() = nb::none(), "density"_a.noconvert() = nb::none(),
-             "lit"_a.noconvert() = nb::none());
+             "lit"_a.noconvert() = nb::none(), "spread"_a.noconvert() = nb::none());
     nb::class_<LampTree>(m, "LampTree")
         .def(nb::new_(&make_tree), "verts"_a.noconvert(), "faces"_a.noconvert())
         .def_prop_ro("is_flat", &LampTree::is_flat)

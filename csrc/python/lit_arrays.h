@@ -66,6 +66,7 @@ struct PointArrays {
     std::optional<In<double, 2>> uv;
     std::optional<In<double, 1>> density;
     std::optional<In<uint8_t, 1>> lit;
+    std::optional<In<double, 3>> spread;
 
     LitPoints view(const LitScene& scene, int64_t faces) const;
 };

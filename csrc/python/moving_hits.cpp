@@ -26,7 +26,11 @@ struct HitFaces {
     In<int64_t, 1> face;
     bool perspective;
 
-    MovingHits view() const { return {faces.data(), face.data(), int64_t(face.size()), perspective}; }
+    // With some rays for each, one after another.
+    MovingHits view(const Doubles& along) const {
+        const size_t n = face.size();
+        return {faces.data(), face.data(), int64_t(n), perspective, n ? int(along.shape(0) / n) : 1};
+    }
 };
 HitFaces make_hits(In<int32_t, 2> faces, In<int64_t, 1> face, bool perspective) {
     if (faces.shape(1) != 3) refuse("faces: expected three columns");
@@ -39,14 +43,15 @@ void check(const HitFaces& hits, const Doubles& verts, const Doubles& world_to_c
     if (verts.shape(1) != 3) refuse("verts: expected three columns");
     check_indices("faces", hits.faces.data(), hits.faces.size(), verts.shape(0), "verts", 1);
     if (world_to_camera.shape(0) != 4 || world_to_camera.shape(1) != 4) refuse("world_to_camera: expected (4, 4)");
-    if (along.shape(0) != hits.face.size() || along.shape(1) != 3) refuse("along: expected a row a hit");
+    if (along.shape(0) != hits.face.size() * size_t(hits.view(along).rays) || along.shape(1) != 3)
+        refuse("along: expected a row a ray, as many for each hit");
 }
 
 nb::object meet(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along, int threads) {
     check(hits, verts, world_to_camera, along);
-    std::vector<double> b(3 * hits.face.size());
+    std::vector<double> b(3 * along.shape(0));
     unlocked(threads, [&](Team& team) {
-        meet_faces(hits.view(), {verts.data(), world_to_camera.data(), along.data()}, b.data(), team);
+        meet_faces(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, b.data(), team);
     });
     return rows(std::move(b), {3});
 }
@@ -55,13 +60,13 @@ nb::object meet(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Do
 nb::tuple meet_vjp(const HitFaces& hits, Doubles verts, Doubles world_to_camera, Doubles along, Doubles bar,
                    std::array<bool, 3> wanted, int threads) {
     check(hits, verts, world_to_camera, along);
-    if (bar.shape(0) != hits.face.size() || bar.shape(1) != 3) refuse("bar: expected a row a hit");
+    if (bar.shape(0) != along.shape(0) || bar.shape(1) != 3) refuse("bar: expected a row a ray");
     const auto [of_verts, of_pose, of_along] = wanted;
     std::vector<double> verts_bar(of_verts ? verts.size() : 0), pose_bar(of_pose ? 16 : 0),
         along_bar(of_along ? along.size() : 0);
     const auto to = [](std::vector<double>& bar) { return bar.empty() ? nullptr : bar.data(); };
     unlocked(threads, [&](Team& team) {
-        meet_faces_vjp(hits.view(), {verts.data(), world_to_camera.data(), along.data()}, bar.data(),
+        meet_faces_vjp(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, bar.data(),
                        {to(verts_bar), to(pose_bar), to(along_bar)}, team);
     });
     return nb::make_tuple(rows(std::move(verts_bar), {3}), rows(std::move(pose_bar), {4}),
@@ -81,9 +86,10 @@ nb::object meet_jvp(const HitFaces& hits, Doubles verts, Doubles world_to_camera
     const MovingArrays<const double> tangents{tangent("verts_dot", verts_dot, verts),
                                               tangent("pose_dot", pose_dot, world_to_camera),
                                               tangent("along_dot", along_dot, along)};
-    std::vector<double> b_dot(3 * hits.face.size());
+    std::vector<double> b_dot(3 * along.shape(0));
     unlocked(threads, [&](Team& team) {
-        meet_faces_jvp(hits.view(), {verts.data(), world_to_camera.data(), along.data()}, tangents, b_dot.data(), team);
+        meet_faces_jvp(hits.view(along), {verts.data(), world_to_camera.data(), along.data()}, tangents, b_dot.data(),
+                       team);
     });
     return rows(std::move(b_dot), {3});
 }

@@ -18,6 +18,11 @@ struct TexelGrid {
 
     // In texels, right and down.
     Vec2 place(Vec2 uv) const { return {uv.x * width, (1 - uv.y) * height}; }
+
+    // Of the next level of a pyramid (pyramid.h), whose texels follow these.
+    TexelGrid halved() const {
+        return {first + height * width, std::max(int64_t(1), height / 2), std::max(int64_t(1), width / 2), sampler};
+    }
 };
 
 template <class T>

@@ -15,6 +15,7 @@ from ..kernel.first_order import Tensors, apply, array, doubles, without_derivat
 from ..kernel.flat import Flat
 from ..kernel.operators import kernel_scene
 from ..library import core
+from ..points.footprints import pyramid_of
 from ..points.frame import Frame
 from ..points.hits import Hits
 from ..points.records import values_of
@@ -34,14 +35,17 @@ _64_BITS = 2**64 - 1
 
 
 def is_fused(scene: Scene) -> bool:
-    """Whether the kernel can shade a scene: no texture is mipmapped; nor nearest where one sees through surfaces, for the kernel
-    declares no steps."""
+    """Whether the kernel can shade a scene: no texture is nearest where one sees through surfaces, for the kernel declares no
+    steps."""
     if scene.channels > core.MOST_LIT_CHANNELS:
         return False
+    return not scene.blends or "nearest" not in _filters(scene)
+
+
+def _filters(scene: Scene) -> set[str]:
+    """Those of all textures."""
     textures = [t for m in scene.meshes if m.material is not None for t in m.material.textures.values()]
-    own = [mesh.filter for mesh in scene.meshes if mesh.texture is not None]
-    known = {"linear"} if scene.blends else {"linear", "nearest"}
-    return known.issuperset((*own, *(t.filter for t in textures)))
+    return {*(mesh.filter for mesh in scene.meshes if mesh.texture is not None), *(t.filter for t in textures)}
 
 
 def nearest_textures(mesh: Mesh) -> list[Texture]:
@@ -79,7 +83,8 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
         dtype=surfaces.verts.dtype, cutoffs=casters.cutoffs, spacing=casters.spacing,
     )  # fmt: skip
     arrays = (part for part in casters if isinstance(part, Tensor))
-    found, *kept = apply(shading, [hits._exact.cpu(), *points, *tables, *arrays])
+    spread = hits._spread.cpu() if "mipmap" in _filters(surfaces.scene) else None
+    found, *kept = apply(shading, [hits._exact.cpu(), spread, *points, *tables, *arrays])
     if not values:
         return found.to(surfaces.verts)
     (seen,) = kept
@@ -127,15 +132,18 @@ def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
     assert isinstance(view, View)
     layout, tables = _layout(surfaces, view)
 
-    def compute(b: Tensor, face: Tensor, seed: Tensor, *tables_: Tensor) -> Sequence[Tensor]:
-        tables, faces = tables_[:-1], tables_[-1]
-        points = core.LitPoints(face=array(face), b=array(b), seed=array(seed))
+    filtered = "mipmap" in _filters(surfaces.scene)
+
+    def compute(b: Tensor, face: Tensor, seed: Tensor, faces: Tensor, *others: Tensor) -> Sequence[Tensor]:
+        spread, tables = (array(others[0]), others[1:]) if filtered else (None, others)
+        points = core.LitPoints(face=array(face), b=array(b), seed=array(seed), spread=spread)
         options = core.LitOptions(shadows=False, samples=samples, only=-1, in_fours=False, dark=DARK)
         lit = layout.kernel(tables, faces)
         found = core.light_points(lit, points, options, hits._index(light), torch.get_num_threads())
         return [torch.from_numpy(x) for x in found]
 
-    given = [hits._exact.cpu(), hits._face.cpu(), hits._seed.cpu(), *tables, surfaces.bare.faces]
+    given = [hits._exact.cpu(), hits._face.cpu(), hits._seed.cpu(), surfaces.bare.faces]
+    given += [*([hits._spread.cpu()] if filtered else ()), *tables]
     index, uv, density = (x.to(hits._face.device) for x in without_derivatives(compute, *given))
     density = torch.where(density > 0, density, math.inf)
     return [LightPoints(index[:, k], uv[:, k], density[:, k]) for k in range(samples)]
@@ -165,7 +173,7 @@ def _forced(points: Any, lit: Tensor) -> tuple[Tensor, ...]:
 
 
 class _Points(NamedTuple):
-    """Tensors of points, but for their barycentrics."""
+    """Tensors of points, but for their barycentrics and what these differ by from pixel to pixel."""
 
     face: Tensor  # (N,) int64
     seed: Tensor  # (N,) int64
@@ -241,11 +249,11 @@ def _mesh(surfaces: Surfaces, index: int, first_vertex: int, tables: _Tables) ->
     none, material = core.LitSource("constant"), mesh.material
 
     def source(parameter: Parameter | float | None) -> Any:
-        return none if parameter is None else _source(mesh, parameter, tables)
+        return none if parameter is None else _source(surfaces, mesh, parameter, tables)
 
     color = none
     if mesh.texture is not None:
-        color = _texture(mesh, Texture(mesh.texture, wrap=mesh.wrap, filter=mesh.filter), tables)
+        color = _texture(surfaces, mesh, Texture(mesh.texture, wrap=mesh.wrap, filter=mesh.filter), tables)
     elif mesh.colors is not None:
         color = core.LitSource("vertex", tables.add(mesh.colors, mesh.colors.shape[1]))
     elif mesh.face_colors is not None:
@@ -274,28 +282,33 @@ def _mesh(surfaces: Surfaces, index: int, first_vertex: int, tables: _Tables) ->
     )
 
 
-def _source(mesh: Mesh, parameter: Parameter | float, tables: _Tables) -> Any:
+def _source(surfaces: Surfaces, mesh: Mesh, parameter: Parameter | float, tables: _Tables) -> Any:
     if isinstance(parameter, Texture):
-        return _texture(mesh, parameter, tables)
+        return _texture(surfaces, mesh, parameter, tables)
     value = torch.as_tensor(parameter)
     if value.dim() == 2:
         return core.LitSource("vertex", tables.add(value, value.shape[1]))
     return core.LitSource("constant", tables.add_numbers(value))
 
 
-def _texture(mesh: Mesh, texture: Texture, tables: _Tables) -> Any:
+def _texture(surfaces: Surfaces, mesh: Mesh, texture: Texture, tables: _Tables) -> Any:
     uvs, uv_faces = (mesh.uvs, mesh.uv_faces) if texture.uvs is None else (texture.uvs, texture.uv_faces)
     assert uvs is not None and uv_faces is not None
     height, width, channels = texture.image.shape
+    texels, levels, filter = texture.image, 1, texture.filter
+    if filter == "mipmap":
+        pyramid = pyramid_of(surfaces, texture.image)
+        texels, levels, filter = pyramid.texels, len(pyramid.first), "linear"
     return core.LitSource(
         "texture",
-        tables.add(texture.image, channels),
+        tables.add(texels, channels),
         tables.add_numbers(texture.factor),
         tables.add(uvs, 2),
         _rows(uv_faces),
         height,
         width,
-        [*(WRAPS.index(wrap) for wrap in texture.wraps), FILTERS.index(texture.filter)],
+        [*(WRAPS.index(wrap) for wrap in texture.wraps), FILTERS.index(filter)],
+        levels,
     )
 
 
@@ -359,8 +372,8 @@ def _rows(index: Tensor) -> np.ndarray:
 
 
 class _Shading(NamedTuple):
-    """csrc/shading/lit/lit.h, of the tensors (b, *points, *tables, *flat). The results are radiance (N, C) float64, and which
-    light samples are seen: (N, K) int8, −1 below the surface. Without `values`, zeros with the radiance's derivatives."""
+    """csrc/shading/lit/lit.h, of the tensors (b, spread, *points, *tables, *flat). The results are radiance (N, C) float64, and
+    which light samples are seen: (N, K) int8, −1 below the surface. Without `values`, zeros with the radiance's derivatives."""
 
     layout: _Layout
     tables: int  # how many
@@ -377,11 +390,11 @@ class _Shading(NamedTuple):
     @property
     def _first(self) -> int:
         """Of the tables."""
-        return 1 + len(_Points._fields)
+        return 2 + len(_Points._fields)
 
     @property
     def moving(self) -> Sequence[int]:
-        return 0, *range(self._first, self._first + self.tables)
+        return 0, 1, *range(self._first, self._first + self.tables)
 
     def _flat(self, tensors: Tensors) -> Flat:
         arrays = tensors[self._first + self.tables :]
@@ -391,10 +404,11 @@ class _Shading(NamedTuple):
         return list(tensors[self._first : self._first + self.tables])  # pyright: ignore[reportReturnType]
 
     def _arguments(self, tensors: Tensors) -> dict[str, Any]:
-        points = _Points(*tensors[1 : self._first])  # pyright: ignore[reportArgumentType]
+        points = _Points(*tensors[2 : self._first])  # pyright: ignore[reportArgumentType]
         arrays = {name: None if t is None else array(t) for name, t in points._asdict().items()}
-        b = tensors[0]
+        b, spread = tensors[:2]
         assert b is not None
+        arrays["spread"] = None if spread is None else array(spread)
         return {
             "lit": self.layout.kernel(self._tables(tensors), self._flat(tensors).faces),
             "points": core.LitPoints(b=array(b), forced_lamp=self.forced, **arrays),
@@ -416,20 +430,22 @@ class _Shading(NamedTuple):
         return (torch.zeros((len(b), self.layout.channels), dtype=self.dtype),)
 
     def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
-        arguments = {"bar": doubles(bar), "wanted": list(wanted[1:]), **self._arguments(tensors)}
+        arguments = {"bar": doubles(bar), "wanted": list(wanted[2:]), **self._arguments(tensors)}
         if kept:
             (seen,) = kept
             assert seen is not None
-            found, b_bar = core.shade_vjp(seen=array(seen), **arguments)
+            found, *places = core.shade_vjp(seen=array(seen), **arguments)
         else:
-            found, b_bar = kernel_scene(self._flat(tensors)).trace_and_shade_vjp(**arguments)
+            found, *places = kernel_scene(self._flat(tensors)).trace_and_shade_vjp(**arguments)
         none = bar.new_zeros(0)
-        return [torch.from_numpy(b_bar), *(none if g is None else torch.from_numpy(g) for g in found)]
+        return [none if g is None else torch.from_numpy(g) for g in (*places, *found)]
 
     def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
         seen = kept[0] if kept else self._shade(tensors)[1]
         assert seen is not None
-        b_dot, *rest = (doubles(tangent) for tangent in tangents)
+        b_dot, spread_dot, *rest = (doubles(tangent) for tangent in tangents)
         return torch.from_numpy(
-            core.shade_jvp(seen=array(seen), tangents=rest, b_dot=b_dot, **self._arguments(tensors))
+            core.shade_jvp(
+                seen=array(seen), tangents=rest, b_dot=b_dot, spread_dot=spread_dot, **self._arguments(tensors)
+            )
         )

@@ -381,6 +381,6 @@ def check_unlit(function: str, scene: Scene, instead: str) -> None:
         raise ValueError(f"{function}: expected a scene without materials and lights, got one that has them; {instead}")
     if scene.is_shaded:
         raise ValueError(
-            f'{function}: expected textures with filter "linear" or "nearest", got "mipmap", of which the kernel knows nothing; '
+            f'{function}: expected textures with filter "linear" or "nearest", got "mipmap", which it does not average; '
             'replace(filter="linear")'
         )

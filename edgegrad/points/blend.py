@@ -49,7 +49,7 @@ class Blended:
             return total
         x = x[meets.cpu()]
         if hits._surfaces is frame.surfaces:
-            next_ = frame.moving_hits(face[meets], frame.sampler.rays_at(x), x, seed)
+            next_ = frame.moving_hits(face[meets], frame.rays_at(x), x, seed)
         else:
             next_ = frame.fixed_hits(face[meets], frame.here(found.b)[meets], x, seed)
         radiance = self._from(next_, left - 1)

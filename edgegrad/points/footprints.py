@@ -1,4 +1,4 @@
-"""How many texels a pixel covers, and so which level of a texture's pyramid it sees (Williams 1983)."""
+"""How far apart pixels see a surface, and so which level of a texture's pyramid they see (Williams 1983)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from ..kernel.derivatives import moves
-from ..scene.rows import interpolated
-from ..scene.textures import Pyramid
+from .pyramid import Pyramid
 from .records import RayRecords
 from .surfaces import Surfaces, View
 
@@ -24,31 +23,32 @@ class Footprints(NamedTuple):
     pixel: Tensor  # (N, 2)
     rays_at: Callable[[Tensor], RayRecords]
 
-    def level(self, texture: Tensor, corner_uvs: Tensor) -> Tensor:
-        """(N,) the level: log2 of the distance in texels of neighbouring pixels, the larger of both directions. `corner_uvs`
-        (N, 3, 2) are the texture coordinates of the faces' corners."""
-        rays_at, pixel, corners = self.rays_at, self.pixel, corner_uvs.double()
-        size = torch.tensor([texture.shape[1], texture.shape[0]], dtype=torch.float64, device=corners.device)
-        step = 1 / 64  # px, so small that texture coordinates are nearly affine in the image
+    def spread(self) -> Tensor:
+        """(N, 2, 2) float64: how far the last two barycentrics are apart one pixel to the right, and one down."""
+        rays_at, pixel = self.rays_at, self.pixel
+        aside = 1 / 64  # px, so small that texture coordinates are nearly affine in the image
         rays = rays_at(pixel)
-
-        def beside(axis: int, aside: float) -> Tensor:
-            if not moves(rays.along):
-                return rays.along + aside * rays.along_by_x[:, :, axis]
+        if moves(rays.along):
             # As functions of the intrinsics. Where a lens shows nothing, the ray of the pixel itself stands for its neighbour.
-            offset = torch.zeros(2, dtype=pixel.dtype, device=pixel.device)
-            offset[axis] = aside
-            along = rays_at(pixel + offset).along
-            return torch.where(torch.isfinite(along), along, rays.along)
+            offsets = pixel.new_tensor([[aside, 0], [-aside, 0], [0, aside], [0, -aside]])
+            found = rays_at((pixel[:, None] + offsets).flatten(0, 1)).along.unflatten(0, (-1, 4))
+            along = torch.where(torch.isfinite(found), found, rays.along[:, None])
+        else:
+            by_x = aside * rays.along_by_x.mT
+            along = rays.along[:, None] + torch.stack([by_x, -by_x], 2).flatten(1, 2)
+        b = self.view.barycentrics(self.surfaces, self.face, along.flatten(0, 1)).unflatten(0, (-1, 2, 2))
+        return (b[:, :, 0, 1:] - b[:, :, 1, 1:]) / (2 * aside)
 
-        def squared(axis: int) -> Tensor:
-            """The squared distance in texels of neighbouring pixels along an axis."""
-            b = [self.view.barycentrics(self.surfaces, self.face, beside(axis, aside)) for aside in (step, -step)]
-            texels = interpolated(b[0] - b[1], corners) * size / (2 * step)
-            return (texels * texels).sum(1)
 
-        most = torch.nan_to_num(torch.maximum(squared(0), squared(1)), nan=1.0, posinf=1e18).clamp(1, 1e18)
-        return 0.5 * most.log2()
+def level(texture: Tensor, corner_uvs: Tensor, spread: Tensor) -> Tensor:
+    """(N,) log2 of the distance in texels of neighbouring pixels, the larger of both directions. `corner_uvs` (N, 3, 2) are the
+    texture coordinates of the faces' corners. csrc/shading/lit/source.h has the same."""
+    corners = corner_uvs.double()
+    edges = (corners[:, 1:] - corners[:, :1]) * corners.new_tensor([texture.shape[1], texture.shape[0]])
+    texels = spread[:, :, :1] * edges[:, None, 0] + spread[:, :, 1:] * edges[:, None, 1]
+    right, down = (texels * texels).sum(2).unbind(1)
+    most = torch.nan_to_num(torch.maximum(right, down), nan=1.0, posinf=1e18).clamp(1, 1e18)
+    return 0.5 * most.log2()
 
 
 def pyramid_of(surfaces: Surfaces, texture: Tensor) -> Pyramid:

@@ -74,7 +74,7 @@ class Frame:
     ) -> Hits:
         """Without derivatives; b (N, 3), or the last two barycentrics."""
         place = self.here(face), self.here(b if b.shape[1] == 3 else barycentrics(b)), self.here(x)
-        return Hits(self.fixed, self.fixed_view, *place, self.sampler.rays_at, steps, seed, forced)
+        return Hits(self.fixed, self.fixed_view, *place, self._fixed_rays_at, steps, seed, forced)
 
     @property
     def no_hits(self) -> Hits:
@@ -90,9 +90,14 @@ class Frame:
         """As differentiable functions of vertices and camera, at fixed places in the image."""
         face = self.here(face)
         b = self.view.barycentrics(self.surfaces, face, self.here(self._moving(rays).along))
-        return Hits(
-            self.surfaces, self.view, face, b, self.here(x), lambda x: self._moving(self.sampler.rays_at(x)), seed=seed
-        )
+        return Hits(self.surfaces, self.view, face, b, self.here(x), lambda x: self._moving(self.rays_at(x)), seed=seed)
+
+    def rays_at(self, x: Tensor) -> RayRecords:
+        """The rays to places (N, 2), for moving_hits()."""
+        return self.sampler.rays_at(x, moves(self.intrinsics))
+
+    def _fixed_rays_at(self, x: Tensor) -> RayRecords:
+        return self.sampler.rays_at(x, intrinsics=False)
 
     def _moving(self, rays: _Rays) -> _Rays:
         """The rays as functions of the intrinsics, at fixed places in the image."""

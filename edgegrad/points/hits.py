@@ -17,7 +17,7 @@ from ..scene.material import WRAPS
 from ..scene.mesh import FILTERS
 from ..scene.rows import interpolated, rows_of
 from ..scene.textures import bilinear, in_texels, nearest
-from .footprints import Footprints, pyramid_of
+from .footprints import Footprints, level, pyramid_of
 from .records import RayRecords, visible
 from .seeds import uniform
 from .shadow_rays import Forced, seen_from
@@ -268,11 +268,15 @@ class Hits:
             return nearest(texture, self.floor(in_texels(texture, uv)), wraps)
         if filter == "linear":
             return bilinear(texture, uv, wraps)
+        assert corners is not None
+        return pyramid_of(self._surfaces, texture).look_up(level(texture, corners, self._spread), uv, wraps)
+
+    @cached_property
+    def _spread(self) -> Tensor:
+        """(N, 2, 2) float64: see Footprints."""
         if self._rays_at is None or self._pixel is None or isinstance(self._view, Rays):
             raise ValueError("mipmap: expected hits of a camera, for rays of trace() have no neighbours; leave it out")
-        assert corners is not None
-        footprints = Footprints(self._surfaces, self._view, self._face, self._pixel, self._rays_at)
-        return pyramid_of(self._surfaces, texture).look_up(footprints.level(texture, corners), uv, wraps)
+        return Footprints(self._surfaces, self._view, self._face, self._pixel, self._rays_at).spread()
 
     # -- steps ---------------------------------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ def barycentrics(
 ) -> Tensor:
     """(N, 3) float64 where rays meet the planes of faces (N,), rows of faces (F, 3) int32 of verts (V, 3). `along` (N, 3): the
     directions of rays from the eye in camera coordinates, or, in an orthographic view, points that rays along the axis go
-    through."""
+    through. With several rays for each face, one after another, the same for each of them."""
     tensors = [verts.cpu().double(), world_to_camera.cpu().double(), along.cpu().double(), faces.cpu(), face.cpu()]
     return apply(_Meeting(perspective), tensors)[0].to(verts.device)
 

@@ -106,7 +106,7 @@ class RayRecords(NamedTuple):
 
     along: Tensor  # (N, 3) float64
     along_by_x: Tensor  # (N, 3, 2) float64, by the place
-    along_by_k: Tensor  # (N, 3, 14) float64
+    along_by_k: Tensor  # (N, 3, 14) float64; empty where they are not wanted
 
 
 class TraceRecords(NamedTuple):
@@ -424,11 +424,11 @@ class Sampler:
 
         return PlaceRecords(*self._compute(self._request, compute, x))
 
-    def rays_at(self, x: Tensor) -> RayRecords:
-        """The rays to places (N, 2) in the image."""
+    def rays_at(self, x: Tensor, intrinsics: bool = True) -> RayRecords:
+        """The rays to places (N, 2) in the image, with their derivatives by the intrinsics."""
 
         def compute(request: Request, camera: Any, x: Tensor) -> RayRecords:
-            found = core.rays_at(camera=camera, x=_array(x), threads=torch.get_num_threads())
+            found = core.rays_at(camera=camera, x=_array(x), intrinsics=intrinsics, threads=torch.get_num_threads())
             return _record(RayRecords, found)
 
         return RayRecords(*(part.to(x.device) for part in self._compute(self._request, compute, x)))

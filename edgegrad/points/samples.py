@@ -51,7 +51,7 @@ class PrimaryHits:
         self.frame = frame = Frame(scene, request)
         ((_, found),) = frame.sampler.pixel_hits(ALL_AT_ONCE)
         seed = frame.seeds_of_pixels("image", found.pixel, 1)
-        self.hits = frame.moving_hits(found.face, frame.sampler.rays_at(found.x), found.x, seed)
+        self.hits = frame.moving_hits(found.face, frame.rays_at(found.x), found.x, seed)
         self.index, self.weight = frame.here(found.pixel), frame.here(found.weight).to(frame.dtype)
         self.coverage = frame.here(frame.sampler.coverage)
 

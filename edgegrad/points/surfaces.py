@@ -16,8 +16,8 @@ from ..scene.appearance import coordinates
 from ..scene.mikktspace import Fans
 from ..scene.rows import columns, dot, rows_of, scaled
 from ..scene.scene import Scene
-from ..scene.textures import Pyramid
 from .moving import barycentrics, barycentrics_by
+from .pyramid import Pyramid
 from .records import bare, values_of
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
@@ -23,10 +21,10 @@ def wrapped(cell: Tensor, count: int | Tensor, wrap: str) -> Tensor:
 
 def bilinear(texture: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
     h, w = texture.shape[:2]
-    return _bilinear(texture.reshape(h * w, -1), 0, h, w, uv, wraps)
+    return bilinear_of_rows(texture.reshape(h * w, -1), 0, h, w, uv, wraps)
 
 
-def _bilinear(
+def bilinear_of_rows(
     texels: Tensor, first: int | Tensor, h: int | Tensor, w: int | Tensor, uv: Tensor, wraps: tuple[str, ...]
 ) -> Tensor:
     """Of textures h by w, row by row from the row `first` of texels (M, K): of one, or (N,) of one for each point."""
@@ -61,35 +59,3 @@ def look_up(texture: Tensor, uv: Tensor, wraps: tuple[str, ...], filter: str) ->
     if filter == "nearest":
         return nearest(texture, in_texels(texture, uv).detach().floor(), wraps)
     return bilinear(texture, uv, wraps)
-
-
-class Pyramid(NamedTuple):
-    """A texture, and its means over squares of 2, 4, 8 … texels."""
-
-    texels: Tensor  # (M, K) of one level after the other, row by row
-    first: Tensor  # (L,) int64, the first row of a level
-    height: Tensor  # (L,) int64
-    width: Tensor  # (L,) int64
-
-    @classmethod
-    def of(cls, texture: Tensor) -> Pyramid:
-        levels = [texture]
-        while max(levels[-1].shape[:2]) > 1:
-            image = levels[-1].movedim(-1, 0)[None]
-            size = max(1, image.shape[2] // 2), max(1, image.shape[3] // 2)
-            levels.append(torch.nn.functional.adaptive_avg_pool2d(image, size)[0].movedim(0, -1))
-        height, width = (torch.tensor([n.shape[axis] for n in levels], device=texture.device) for axis in (0, 1))
-        count = height * width
-        texels = torch.cat([level.reshape(-1, texture.shape[2]) for level in levels])
-        return cls(texels, count.cumsum(0) - count, height, width)
-
-    def look_up(self, level: Tensor, uv: Tensor, wraps: tuple[str, ...]) -> Tensor:
-        """(N, K) at uv (N, 2), linear between the two levels around `level` (N,)."""
-        level = level.clamp(0, len(self.first) - 1)
-        below = level.detach().floor().long()
-        share = (level - below).to(self.texels.dtype)[:, None]
-        fine, coarse = (
-            _bilinear(self.texels, self.first[at], self.height[at], self.width[at], uv, wraps)
-            for at in (below, (below + 1).clamp(max=len(self.first) - 1))
-        )
-        return (1 - share) * fine + share * coarse

@@ -67,8 +67,9 @@ inline void from_faces_vjp(const std::vector<Table>& tables, const EmissiveFaces
     const Emitter<double> e = emitter<double>(tables, from, p, channels, y);
     if (!e.gives()) return;
     const double scale = e.scale();
-    double radiance_bar[most_lit_channels], scale_bar = 0, unused[3] = {};
+    double radiance_bar[most_lit_channels], scale_bar = 0;
     for (int c = 0; c < channels; ++c) radiance_bar[c] = bar.E[c] * scale, scale_bar += bar.E[c] * e.radiance[c];
+    FacePointBar unused;
     const FacePoint<double> at = on_emitter<double>(from, p);
     value_vjp(tables, from.emission, at, channels, radiance_bar, unused, to);
     const double facing_bar = e.sign * scale_bar / (e.squared * e.per_density);

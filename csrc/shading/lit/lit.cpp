@@ -43,7 +43,7 @@ void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOp
     team.each_block(points.size, [&](int64_t, int64_t first, int64_t last) {
         for (int64_t i = first; i < last; ++i) {
             Surface<double> o;
-            set_surface<double>(lit, points.face[i], points.b + 3 * i, o);
+            set_surface<double>(lit, points.face[i], points.b + 3 * i, points.spread_at(i), o);
             if (!o.scattering.lambertian) look_up_material(lit, o);
             light_points(lit, points, i, lamp, options.samples, options.dark, o, out + i * options.samples);
         }
@@ -51,6 +51,15 @@ void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOp
 }
 
 namespace {
+
+void clear(LitPlaces<double> places, int64_t points) {
+    std::fill(places.b, places.b + 3 * points, 0.0);
+    if (places.spread) std::fill(places.spread, places.spread + spread_size * points, 0.0);
+}
+void write(const FacePointBar& bar, LitPlaces<double> places, int64_t i) {
+    std::copy(bar.b, bar.b + 3, places.b + 3 * i);
+    if (places.spread) std::copy(bar.spread, bar.spread + spread_size, places.spread + spread_size * i);
+}
 
 // Calls body(first, last, cotangents) for chunks of points, and adds these up.
 template <class Body>
@@ -65,19 +74,21 @@ void add_cotangents(const LitScene& lit, int64_t points, const std::vector<Table
 }  // namespace
 
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               const double* bar, const std::vector<TableBar>& to, double* b_bar, Team& team) {
+               const double* bar, const std::vector<TableBar>& to, LitPlaces<double> places, Team& team) {
     const std::vector<LightSample> lights = light_samples(lit, options);
-    std::fill(b_bar, b_bar + 3 * points.size, 0.0);
+    clear(places, points.size);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
         std::vector<LightPoint> of_lights(lights.size());
         for (int64_t i = first; i < last; ++i) {
             const int8_t* sees = seen + i * lights.size();
             Surface<double> o;
-            set_surface<double>(lit, points.face[i], points.b + 3 * i, o);
+            set_surface<double>(lit, points.face[i], points.b + 3 * i, points.spread_at(i), o);
             if (o.is_black() || is_unlit(lit, *o.mesh, sees, lights.size())) continue;
             look_up_material(lit, o);
             light_points(lit, points, options, lights, i, o, of_lights.data());
-            radiance_vjp(lit, options, lights, of_lights.data(), o, sees, bar + i * lit.channels, b_bar + 3 * i, chunk);
+            FacePointBar at_bar;
+            radiance_vjp(lit, options, lights, of_lights.data(), o, sees, bar + i * lit.channels, at_bar, chunk);
+            write(at_bar, places, i);
         }
     });
 }
@@ -85,8 +96,8 @@ void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& o
 template <class T>
 void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster,
                          const LitPoints& points, const LitOptions& options, const double* bar,
-                         const std::vector<TableBar>& to, double* b_bar, Team& team) {
-    std::fill(b_bar, b_bar + 3 * points.size, 0.0);
+                         const std::vector<TableBar>& to, LitPlaces<double> places, Team& team) {
+    clear(places, points.size);
     add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
         const auto buffers = shade_buffers(lit, options);
         const size_t K = buffers->lights.size();
@@ -104,23 +115,28 @@ void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const R
                 const int8_t* sees = seen.data() + i * K;
                 if (!wanted(i) || o.is_black() || is_unlit(lit, *o.mesh, sees, K)) continue;
                 if (o.scattering.lambertian) look_up_material(lit, o);
+                FacePointBar at_bar;
                 radiance_vjp(lit, options, buffers->lights, buffers->points.data() + i * K, o, sees,
-                             bar + (first + i) * lit.channels, b_bar + 3 * (first + i), chunk);
+                             bar + (first + i) * lit.channels, at_bar, chunk);
+                write(at_bar, places, first + i);
             }
         }
     });
 }
 
 void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               const double* b_dot, double* radiance_dot, Team& team) {
+               LitPlaces<const double> dot, double* radiance_dot, Team& team) {
     const std::vector<LightSample> lights = light_samples(lit, options);
     team.each_block(points.size, [&](int64_t, int64_t first, int64_t last) {
         std::vector<LightPoint> of_lights(lights.size());
         for (int64_t i = first; i < last; ++i) {
-            Dual b[3], total[most_lit_channels];
-            for (int k = 0; k < 3; ++k) b[k] = {points.b[3 * i + k], b_dot ? b_dot[3 * i + k] : 0};
+            Dual b[3], spread[spread_size], total[most_lit_channels];
+            const auto set = [i](int n, const double* value, const double* tangent, Dual* to) {
+                for (int k = 0; value && k < n; ++k) to[k] = {value[n * i + k], tangent ? tangent[n * i + k] : 0};
+            };
+            set(3, points.b, dot.b, b), set(spread_size, points.spread, dot.spread, spread);
             Surface<Dual> o;
-            set_surface<Dual>(lit, points.face[i], b, o);
+            set_surface<Dual>(lit, points.face[i], b, points.spread ? spread : nullptr, o);
             look_up_material(lit, o);
             if (o.mesh->has_material && !o.is_black())
                 light_points(lit, points, options, lights, i, o, of_lights.data());
@@ -139,8 +155,10 @@ template void shade(const LitScene&, const SceneView<float>&, const RayCaster&, 
 template void shade(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&, const LitOptions&,
                     double*, int8_t*, Team&);
 template void trace_and_shade_vjp(const LitScene&, const SceneView<float>&, const RayCaster&, const LitPoints&,
-                                  const LitOptions&, const double*, const std::vector<TableBar>&, double*, Team&);
+                                  const LitOptions&, const double*, const std::vector<TableBar>&, LitPlaces<double>,
+                                  Team&);
 template void trace_and_shade_vjp(const LitScene&, const SceneView<double>&, const RayCaster&, const LitPoints&,
-                                  const LitOptions&, const double*, const std::vector<TableBar>&, double*, Team&);
+                                  const LitOptions&, const double*, const std::vector<TableBar>&, LitPlaces<double>,
+                                  Team&);
 
 }  // namespace edgegrad

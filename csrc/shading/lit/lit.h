@@ -32,16 +32,16 @@ void shade_some(const LitScene& lit, const SceneView<T>& scene, const RayCaster&
 // The points of one lamp that these are lit by, `options.samples` for each.
 void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options, int lamp,
                        LightPoint* out, Team& team);
-// From what shade() found. Adds to the cotangents of the tables, and writes those of b (N, 3).
+// From what shade() found. Adds to the cotangents of the tables, and writes those of the points.
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               const double* bar, const std::vector<TableBar>& to, double* b_bar, Team& team);
+               const double* bar, const std::vector<TableBar>& to, LitPlaces<double> places, Team& team);
 // The same at once, of points of which only derivatives are wanted: what each sees is found here.
 template <class T>
 void trace_and_shade_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster,
                          const LitPoints& points, const LitOptions& options, const double* bar,
-                         const std::vector<TableBar>& to, double* b_bar, Team& team);
-// For the tangents of the tables, and of b (N, 3).
+                         const std::vector<TableBar>& to, LitPlaces<double> places, Team& team);
+// For the tangents of the tables and of the points.
 void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
-               const double* b_dot, double* radiance_dot, Team& team);
+               LitPlaces<const double> dot, double* radiance_dot, Team& team);
 
 }  // namespace edgegrad

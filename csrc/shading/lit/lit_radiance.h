@@ -34,7 +34,7 @@ inline void add_unshadowed_vjp(const LitScene& lit, const Surface<double>& o, co
         for (int c = 0; c < lit.channels; ++c) bar.scattering.base[c] += total_bar[c];
         return;
     }
-    if (o.mesh->emission.exists()) value_vjp(lit.tables, o.mesh->emission, o.at, lit.channels, total_bar, bar.b, to);
+    if (o.mesh->emission.exists()) value_vjp(lit.tables, o.mesh->emission, o.at, lit.channels, total_bar, bar.at, to);
     double E[most_lit_channels], E_bar[most_lit_channels];
     for (const Lamp& lamp : lit.lamps) {
         if (lamp.casts()) continue;
@@ -64,7 +64,7 @@ inline bool is_unlit(const LitScene& lit, const LitMesh& mesh, const int8_t* see
 }
 inline void radiance_vjp(const LitScene& lit, const LitOptions& options, const std::vector<LightSample>& lights,
                          const LightPoint* points, const Surface<double>& o, const int8_t* seen,
-                         const double* total_bar, double* b_bar, Cotangents& to) {
+                         const double* total_bar, FacePointBar& at_bar, Cotangents& to) {
     SurfaceBar bar(lit.channels);
     if (options.only < 0) add_unshadowed_vjp(lit, o, total_bar, bar, to);
     for (size_t k = 0; k < lights.size(); ++k)
@@ -72,7 +72,7 @@ inline void radiance_vjp(const LitScene& lit, const LitOptions& options, const s
             add_light_vjp(lit, lit.lamps[lights[k].lamp], points[k], 1.0 / lights[k].count, o, total_bar, bar, to);
     look_up_material_vjp(lit, o, bar, to);
     surface_vjp(lit, o, bar, to);
-    std::copy(bar.b, bar.b + 3, b_bar);
+    at_bar = bar.at;
 }
 
 }  // namespace edgegrad

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cstdint>
 #include <vector>
 
@@ -21,6 +22,10 @@ struct LitMesh {
     bool has_material = false, two_sided = true, lambertian = true;
     Source color, base, metallic, roughness, emission;  // the colour of the mesh itself, and its material's
     NormalSource normal;
+
+    std::array<const Source*, 6> sources() const {
+        return {&color, &base, &metallic, &roughness, &emission, &normal.map};
+    }
 };
 
 struct LitScene {
@@ -39,6 +44,13 @@ struct LitScene {
         size_t k = 0;
         while (k + 1 < meshes.size() && face >= meshes[k + 1].first_face) ++k;
         return meshes[k];
+    }
+    // Whether a texture is looked up by how far pixels lie apart.
+    bool is_filtered() const {
+        return std::any_of(meshes.begin(), meshes.end(), [](const LitMesh& mesh) {
+            const auto all = mesh.sources();
+            return std::any_of(all.begin(), all.end(), [](const Source* s) { return s->levels > 1; });
+        });
     }
     EmissiveFaces emitter(const Lamp& lamp) const {
         const LitMesh& mesh = meshes[lamp.mesh];
@@ -60,15 +72,25 @@ struct LitPoints {
     const double* b = nullptr;      // (N, 3) barycentrics
     const int64_t* seed = nullptr;  // (N,) of random numbers
     ForcedLight forced;
+    const double* spread = nullptr;  // (N, 2, 2), see source.h; null: not known
+
+    const double* spread_at(int64_t i) const { return spread ? spread + spread_size * i : nullptr; }
 
     // So many from `first` on, or those that there are.
     LitPoints part(int64_t first, int64_t count) const {
-        LitPoints o{std::min(count, size - first), face + first, b + 3 * first, seed + first, forced};
+        LitPoints o{std::min(count, size - first), face + first, b + 3 * first, seed + first, forced, spread_at(first)};
         if (forced.lamp >= 0)
             o.forced = {forced.lamp, forced.index + first, forced.uv + 2 * first, forced.density + first,
                         forced.lit + first};
         return o;
     }
+};
+
+// Cotangents, or tangents, of places.
+template <class Number>
+struct LitPlaces {
+    Number* b = nullptr;       // (N, 3)
+    Number* spread = nullptr;  // (N, 2, 2); null: not wanted, or zero
 };
 
 struct LitOptions {

@@ -29,12 +29,12 @@ Vector<S> towards_viewer(const LitScene& lit, Vector<S> y) {
     return lit.perspective ? unit(eye - y) : eye;
 }
 
-// Written in place: it is large, and what it scatters comes later.
+// Written in place: it is large, and what it scatters comes later. It refers to `spread` (null: not known).
 template <class S>
-void set_surface(const LitScene& lit, int64_t face, const S* b, Surface<S>& o) {
+void set_surface(const LitScene& lit, int64_t face, const S* b, const S* spread, Surface<S>& o) {
     const std::vector<Table>& tables = lit.tables;
     o.mesh = &lit.mesh_of(face);
-    o.at = {face - o.mesh->first_face, lit.faces + 3 * face, o.mesh->first_vertex, {b[0], b[1], b[2]}};
+    o.at = {face - o.mesh->first_face, lit.faces + 3 * face, o.mesh->first_vertex, {b[0], b[1], b[2]}, spread};
     o.y = Vector<S>();
     for (int i = 0; i < 3; ++i) {
         o.frame.corner[i] = tables[lit.verts].vector_at<S>(o.at.vertex[i]);
@@ -72,7 +72,7 @@ struct SurfaceBar {
     Vec3 y, v, g, n;
     Scattering<double> scattering;
     FaceFrame<Vec3> frame;
-    double b[3] = {};
+    FacePointBar at;
 
     explicit SurfaceBar(int channels) {
         std::fill(scattering.base, scattering.base + channels, 0.0);
@@ -92,19 +92,19 @@ inline void look_up_material_vjp(const LitScene& lit, const Surface<double>& o, 
         else std::fill(own, own + C, 1.0);
         value(lit.tables, mesh.base, o.at, C, factor);
         for (int c = 0; c < C; ++c) factor_bar[c] = s_bar.base[c] * own[c], of_color[c] = s_bar.base[c] * factor[c];
-        value_vjp(lit.tables, mesh.base, o.at, C, factor_bar, bar.b, to);
+        value_vjp(lit.tables, mesh.base, o.at, C, factor_bar, bar.at, to);
         color_bar = of_color;
     }
-    if (mesh.color.exists()) value_vjp(lit.tables, mesh.color, o.at, C, color_bar, bar.b, to);
-    if (mesh.metallic.exists()) value_vjp(lit.tables, mesh.metallic, o.at, 1, &s_bar.metallic, bar.b, to);
-    if (mesh.roughness.exists()) value_vjp(lit.tables, mesh.roughness, o.at, 1, &s_bar.roughness, bar.b, to);
+    if (mesh.color.exists()) value_vjp(lit.tables, mesh.color, o.at, C, color_bar, bar.at, to);
+    if (mesh.metallic.exists()) value_vjp(lit.tables, mesh.metallic, o.at, 1, &s_bar.metallic, bar.at, to);
+    if (mesh.roughness.exists()) value_vjp(lit.tables, mesh.roughness, o.at, 1, &s_bar.roughness, bar.at, to);
 }
 
 // From the cotangents of place, view and normals to those of barycentrics, vertices, normals and eye.
 inline void surface_vjp(const LitScene& lit, const Surface<double>& o, SurfaceBar& bar, Cotangents& to) {
     const std::vector<Table>& tables = lit.tables;
     if (o.mesh->normal.is_flat()) bar.g += bar.n;
-    else shading_normal_vjp(tables, o.mesh->normal, o.at, o.frame, o.side * bar.n, bar.frame, bar.b, to);
+    else shading_normal_vjp(tables, o.mesh->normal, o.at, o.frame, o.side * bar.n, bar.frame, bar.at, to);
     bar.frame.g += o.side * bar.g;
     if (o.scattering.lambertian) {
         // Looks the same from everywhere.
@@ -120,7 +120,7 @@ inline void surface_vjp(const LitScene& lit, const Surface<double>& o, SurfaceBa
     cross_vjp(e1, e2, unit_vjp(cross(e1, e2), bar.frame.g), e1_bar, e2_bar);
     bar.frame.corner[0] -= e1_bar + e2_bar, bar.frame.corner[1] += e1_bar, bar.frame.corner[2] += e2_bar;
     for (int i = 0; i < 3; ++i) {
-        bar.b[i] += dot(bar.y, p[i]);
+        bar.at.b[i] += dot(bar.y, p[i]);
         to.add(lit.verts, o.at.vertex[i], bar.frame.corner[i] + o.at.b[i] * bar.y);
     }
 }

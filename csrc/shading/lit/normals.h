@@ -45,7 +45,8 @@ SmoothNormal<S> smooth_normal(const std::vector<Table>& tables, const NormalSour
     return o;
 }
 inline void smooth_normal_vjp(const std::vector<Table>& tables, const NormalSource& source, const FacePoint<double>& at,
-                              const SmoothNormal<double>& o, Vec3 n_bar, Vec3& g_bar, double* b_bar, Cotangents& to) {
+                              const SmoothNormal<double>& o, Vec3 n_bar, Vec3& g_bar, FacePointBar& at_bar,
+                              Cotangents& to) {
     if (!o.exists) {
         g_bar += n_bar;
         return;
@@ -53,7 +54,7 @@ inline void smooth_normal_vjp(const std::vector<Table>& tables, const NormalSour
     const Vec3 sum_bar = unit_vjp(o.sum, o.turned ? -n_bar : n_bar);
     const int32_t* rows = source.normal_faces + 3 * at.face;
     for (int i = 0; i < 3; ++i) {
-        b_bar[i] += dot(sum_bar, tables[source.normals].vector_at<double>(rows[i]));
+        at_bar.b[i] += dot(sum_bar, tables[source.normals].vector_at<double>(rows[i]));
         to.add(source.normals, rows[i], at.b[i] * sum_bar);
     }
 }
@@ -119,10 +120,10 @@ Vector<S> shading_normal(const std::vector<Table>& tables, const NormalSource& s
     return o.exists ? unit(o.m) : n;
 }
 
-// Adds to the cotangents of the frame and of the barycentrics.
+// Adds to the cotangents of the frame and of the point.
 inline void shading_normal_vjp(const std::vector<Table>& tables, const NormalSource& source,
                                const FacePoint<double>& at, const FaceFrame<Vec3>& frame, Vec3 bar,
-                               FaceFrame<Vec3>& frame_bar, double* b_bar, Cotangents& to) {
+                               FaceFrame<Vec3>& frame_bar, FacePointBar& at_bar, Cotangents& to) {
     const SmoothNormal<double> smooth = smooth_normal(tables, source, at, frame.g);
     const Vec3 n = smooth.n;
     Vec3 n_bar = bar;
@@ -134,7 +135,7 @@ inline void shading_normal_vjp(const std::vector<Table>& tables, const NormalSou
             to.add(source.map_scale, 0, &scale_bar);
             double map_bar[3] = {2 * o.scale * dot(m_bar, o.t), 2 * o.scale * dot(m_bar, o.bitangent),
                                  2 * dot(m_bar, n)};
-            value_vjp(tables, source.map, at, 3, map_bar, b_bar, to);
+            value_vjp(tables, source.map, at, 3, map_bar, at_bar, to);
             n_bar = o.bent[2] * m_bar;
             Vec3 t_bar = o.scale * o.bent[0] * m_bar;
             cross_vjp(n, o.t, o.hand * o.scale * o.bent[1] * m_bar, n_bar, t_bar);
@@ -145,13 +146,13 @@ inline void shading_normal_vjp(const std::vector<Table>& tables, const NormalSou
             n_bar -= dot(n, o.along) * across_bar + kept * o.along;
             if (source.tangents.exists()) {
                 const double tangent_bar[4] = {along_bar.x, along_bar.y, along_bar.z, 0};
-                value_vjp(tables, source.tangents, at, 4, tangent_bar, b_bar, to);
+                value_vjp(tables, source.tangents, at, 4, tangent_bar, at_bar, to);
             } else {
                 face_tangent_vjp(source.map, at, o, o.hand * along_bar, frame_bar, to);
             }
         }
     }
-    smooth_normal_vjp(tables, source, at, smooth, n_bar, frame_bar.g, b_bar, to);
+    smooth_normal_vjp(tables, source, at, smooth, n_bar, frame_bar.g, at_bar, to);
 }
 
 }  // namespace edgegrad

@@ -2,6 +2,8 @@
 // and beneath it the _vjp.
 #pragma once
 
+#include <algorithm>
+#include <cmath>
 #include <cstdint>
 
 #include "shading/lit/tables.h"
@@ -18,20 +20,39 @@ struct Source {
     const int32_t* uv_faces = nullptr;
     int64_t height = 0, width = 0;
     Sampler sampler = {};
+    int levels = 1;  // of the image's pyramid (pyramid.h)
 
     bool exists() const { return value != no_table; }
-    // The texels are rows of the table.
-    TexelGrid grid() const { return {0, height, width, sampler}; }
+    // Whether it is looked up by how far pixels lie apart.
+    template <class Point>
+    bool is_filtered(const Point& at) const {
+        return levels > 1 && at.spread;
+    }
+    // The texels are rows of the table, level after level.
+    TexelGrid grid(int level = 0) const {
+        TexelGrid o{0, height, width, sampler};
+        for (; level > 0; --level) o = o.halved();
+        return o;
+    }
 };
+
+// How the last two barycentrics of a point differ from one pixel to the next: (2,) to the right, and (2,) down.
+constexpr int spread_size = 4;
 
 // A point on a face of a mesh.
 template <class S>
 struct FacePoint {
-    int64_t face;           // as the mesh counts its own
-    const int32_t* vertex;  // (3,) as the scene counts them
-    int32_t first_vertex;   // of the mesh
-    S b[3];                 // barycentrics
+    int64_t face;               // as the mesh counts its own
+    const int32_t* vertex;      // (3,) as the scene counts them
+    int32_t first_vertex;       // of the mesh
+    S b[3];                     // barycentrics
+    const S* spread = nullptr;  // null: not known, and textures are looked up as they are
     int64_t row(int i) const { return vertex[i] - first_vertex; }
+};
+
+// Cotangents of a point's barycentrics and of their spread.
+struct FacePointBar {
+    double b[3] = {}, spread[spread_size] = {};
 };
 
 // The texture coordinates of a corner.
@@ -64,6 +85,68 @@ void each_texel(const Footprint& f, S a, S b, Visit visit) {
     visit(f.texel[0], (S(1) - a) * (S(1) - b)), visit(f.texel[1], a * (S(1) - b));
     visit(f.texel[2], (S(1) - a) * b), visit(f.texel[3], a * b);
 }
+template <class S, class Visit>
+void each_texel(const TexelGrid& grid, Uv<S> uv, Visit visit) {
+    const Footprint f = footprint(grid, {plain(uv.u), plain(uv.v)});
+    const bool moves = grid.sampler.filter == TextureFilter::linear;
+    const S a = fraction(f.a, uv.u, moves ? double(grid.width) : 0),
+            b = fraction(f.b, uv.v, moves ? -double(grid.height) : 0);
+    each_texel(f, a, b, visit);
+}
+
+// Where in a pyramid a point is looked up (Williams 1983): at log2 of the distance in texels of neighbouring pixels,
+// the larger of both directions; linearly between two levels. edgegrad/points/footprints.py has the same.
+template <class S>
+struct Level {
+    int fine = 0;
+    S share = 0;             // of the level above
+    int axis = -1;           // in whose direction pixels lie farther apart
+    S across = 0, down = 0;  // how far, in texels
+
+    // Else it is the finest level or the coarsest one, and has no derivative.
+    bool is_between() const { return axis >= 0; }
+};
+template <class S>
+Level<S> level_of(const std::vector<Table>& tables, const Source& source, const FacePoint<S>& at) {
+    Uv<S> corner[3];
+    for (int i = 0; i < 3; ++i) corner[i] = corner_uv<S>(tables, source, at.face, i);
+    S across[2], down[2], squared[2];
+    for (int axis = 0; axis < 2; ++axis) {
+        const S u = at.spread[2 * axis], v = at.spread[2 * axis + 1];
+        across[axis] = S(double(source.width)) * (u * (corner[1].u - corner[0].u) + v * (corner[2].u - corner[0].u));
+        down[axis] = S(double(source.height)) * (u * (corner[1].v - corner[0].v) + v * (corner[2].v - corner[0].v));
+        squared[axis] = across[axis] * across[axis] + down[axis] * down[axis];
+    }
+    // What is no number counts as the larger one, and as no distance.
+    const int axis = plain(squared[1]) > plain(squared[0]) || std::isnan(plain(squared[1])) ? 1 : 0;
+    Level<S> o;
+    if (!(plain(squared[axis]) > 1)) return o;
+    const S level = S(0.5) * log2(squared[axis]);
+    if (!(plain(level) < source.levels - 1)) {
+        o.fine = source.levels - 1;
+        return o;
+    }
+    o.fine = int(plain(level)), o.share = level - S(double(o.fine));
+    o.axis = axis, o.across = across[axis], o.down = down[axis];
+    return o;
+}
+// Of the share.
+inline void level_vjp(const std::vector<Table>& tables, const Source& source, const FacePoint<double>& at,
+                      const Level<double>& o, double bar, FacePointBar& at_bar, Cotangents& to) {
+    const double scale = bar / (M_LN2 * (o.across * o.across + o.down * o.down));
+    const double u_bar = scale * o.across * source.width, v_bar = scale * o.down * source.height;
+    const Uv<double> first = corner_uv<double>(tables, source, at.face, 0);
+    double first_bar[2] = {};
+    for (int i = 0; i < 2; ++i) {
+        const int64_t row = source.uv_faces[3 * at.face + i + 1];
+        const Uv<double> corner = corner_uv<double>(tables, source, at.face, i + 1);
+        at_bar.spread[2 * o.axis + i] += u_bar * (corner.u - first.u) + v_bar * (corner.v - first.v);
+        const double spread = at.spread[2 * o.axis + i], corner_bar[2] = {spread * u_bar, spread * v_bar};
+        to.add(source.uvs, row, corner_bar);
+        first_bar[0] -= corner_bar[0], first_bar[1] -= corner_bar[1];
+    }
+    to.add(source.uvs, source.uv_faces[3 * at.face], first_bar);
+}
 
 // Calls visit(row of the table, its weight) for the rows whose weighted sum the value is.
 template <class S, class Visit>
@@ -80,11 +163,13 @@ void each_row(const std::vector<Table>& tables, const Source& source, const Face
             return;
         case Source::Kind::texture: {
             const Uv<S> uv = interpolated_uv(tables, source, at);
-            const Footprint f = footprint(source, {plain(uv.u), plain(uv.v)});
-            const bool moves = source.sampler.filter == TextureFilter::linear;
-            const S a = fraction(f.a, uv.u, moves ? double(source.width) : 0),
-                    b = fraction(f.b, uv.v, moves ? -double(source.height) : 0);
-            each_texel(f, a, b, visit);
+            if (!source.is_filtered(at)) return each_texel(source.grid(), uv, visit);
+            const Level<S> level = level_of(tables, source, at);
+            each_texel(source.grid(level.fine), uv,
+                       [&](int64_t row, S weight) { visit(row, (S(1) - level.share) * weight); });
+            if (level.is_between())
+                each_texel(source.grid(level.fine + 1), uv,
+                           [&](int64_t row, S weight) { visit(row, level.share * weight); });
         }
     }
 }
@@ -103,9 +188,9 @@ void value(const std::vector<Table>& tables, const Source& source, const FacePoi
         for (int c = 0; c < channels; ++c) out[c] *= tables[source.factor].channel<S>(0, c);
 }
 
-// Adds the cotangent of the barycentrics to b_bar (3,).
+// Adds to the cotangents of the point.
 inline void value_vjp(const std::vector<Table>& tables, const Source& source, const FacePoint<double>& at, int channels,
-                      const double* bar, double* b_bar, Cotangents& to) {
+                      const double* bar, FacePointBar& at_bar, Cotangents& to) {
     const Table& table = tables[source.value];
     const int n = table.width == 1 ? 1 : channels;
     double own[most_lit_channels];  // that of the value before the factor
@@ -134,18 +219,34 @@ inline void value_vjp(const std::vector<Table>& tables, const Source& source, co
     if (source.kind != Source::Kind::texture) {
         each_row<double>(tables, source, at, add);
         if (source.kind == Source::Kind::vertex || source.kind == Source::Kind::corner)
-            for (int i = 0; i < 3; ++i) b_bar[i] += s[i];
+            for (int i = 0; i < 3; ++i) at_bar.b[i] += s[i];
         return;
     }
     const Uv<double> uv = interpolated_uv(tables, source, at);
-    const Footprint f = footprint(source, {uv.u, uv.v});
-    each_texel<double>(f, f.a, f.b, add);
+    double u_bar = 0, v_bar = 0;
+    // Returns bar · value of one image, of which the value takes so much.
+    const auto look_up_vjp = [&](const TexelGrid& grid, double share) {
+        const Footprint f = footprint(grid, {uv.u, uv.v});
+        k = 0;
+        each_texel<double>(f, f.a, f.b, [&](int64_t row, double weight) { add(row, share * weight); });
+        u_bar += share * (grid.width * ((1 - f.b) * (s[1] - s[0]) + f.b * (s[3] - s[2])));
+        v_bar += share * (-double(grid.height) * ((1 - f.a) * (s[2] - s[0]) + f.a * (s[3] - s[1])));
+        return (1 - f.b) * ((1 - f.a) * s[0] + f.a * s[1]) + f.b * ((1 - f.a) * s[2] + f.a * s[3]);
+    };
+    if (source.is_filtered(at)) {
+        const Level<double> level = level_of(tables, source, at);
+        const double fine = look_up_vjp(source.grid(level.fine), 1 - level.share);
+        if (level.is_between()) {
+            const double coarse = look_up_vjp(source.grid(level.fine + 1), level.share);
+            level_vjp(tables, source, at, level, coarse - fine, at_bar, to);
+        }
+    } else {
+        look_up_vjp(source.grid(), 1);
+    }
     if (source.sampler.filter != TextureFilter::linear) return;
-    const double u_bar = source.width * ((1 - f.b) * (s[1] - s[0]) + f.b * (s[3] - s[2])),
-                 v_bar = -double(source.height) * ((1 - f.a) * (s[2] - s[0]) + f.a * (s[3] - s[1]));
     for (int i = 0; i < 3; ++i) {
         const Uv<double> corner = corner_uv<double>(tables, source, at.face, i);
-        b_bar[i] += u_bar * corner.u + v_bar * corner.v;
+        at_bar.b[i] += u_bar * corner.u + v_bar * corner.v;
         const double uv_bar[2] = {at.b[i] * u_bar, at.b[i] * v_bar};
         to.add(source.uvs, source.uv_faces[3 * at.face + i], uv_bar);
     }

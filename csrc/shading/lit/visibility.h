@@ -57,7 +57,7 @@ void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayC
     for (int64_t i = 0; i < points.size; ++i)
         if (wanted(i)) {
             Surface<double>& o = buffers.surfaces[i];
-            set_surface<double>(lit, points.face[i], points.b + 3 * i, o);
+            set_surface<double>(lit, points.face[i], points.b + 3 * i, points.spread_at(i), o);
             if (!o.mesh->has_material || o.is_black()) continue;
             if (!o.scattering.lambertian) look_up_material(lit, o);
             light_points(lit, points, options, lights, i, o, buffers.points.data() + i * K);
