@@ -79,3 +79,25 @@ def test_pyramids(wraps: tuple[str, str]) -> None:
     for own, other in zip(of_found, of_expected, strict=True):
         torch.testing.assert_close(own, other, rtol=0, atol=1e-12)
         assert other.any()
+
+
+@pytest.mark.parametrize(("size", "channels"), [((8, 4), 1), ((13, 7), 3), ((1, 6), 4), ((5, 1), 5), ((1, 1), 2)])
+def test_means_of_pyramids(size: tuple[int, int], channels: int) -> None:
+    """Level after level as PyTorch's adaptive pooling has them, with its derivatives; floats as doubles."""
+    image = torch.rand((*size, channels), dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    image.requires_grad_()
+    levels = [image]
+    while max(levels[-1].shape[:2]) > 1:
+        half = [max(1, n // 2) for n in levels[-1].shape[:2]]
+        levels.append(torch.nn.functional.adaptive_avg_pool2d(levels[-1].movedim(-1, 0), half).movedim(0, -1))
+    expected = torch.cat([level.reshape(-1, channels) for level in levels])
+    pyramid = Pyramid.of(image)
+    assert pyramid.first.tolist() == [sum(a.shape[0] * a.shape[1] for a in levels[:k]) for k in range(len(levels))]
+    torch.testing.assert_close(pyramid.texels, expected, rtol=0, atol=1e-15)
+    torch.testing.assert_close(Pyramid.of(image.float()).texels, expected.float(), rtol=0, atol=1e-6)
+    weights = torch.rand(expected.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    grads = [torch.autograd.grad((weights * texels).sum(), image)[0] for texels in (pyramid.texels, expected)]
+    torch.testing.assert_close(*grads, rtol=0, atol=1e-14)
+    along = torch.randn(image.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(6))
+    moved = torch.func.jvp(lambda x: Pyramid.of(x).texels, (image.detach(),), (along,))[1]
+    assert abs(float((moved * weights).sum() - (grads[0] * along).sum())) < 1e-12
