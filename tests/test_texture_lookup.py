@@ -88,7 +88,7 @@ def test_means_of_pyramids(size: tuple[int, int], channels: int) -> None:
     image.requires_grad_()
     levels = [image]
     while max(levels[-1].shape[:2]) > 1:
-        half = [max(1, n // 2) for n in levels[-1].shape[:2]]
+        half = max(1, levels[-1].shape[0] // 2), max(1, levels[-1].shape[1] // 2)
         levels.append(torch.nn.functional.adaptive_avg_pool2d(levels[-1].movedim(-1, 0), half).movedim(0, -1))
     expected = torch.cat([level.reshape(-1, channels) for level in levels])
     pyramid = Pyramid.of(image)
