@@ -88,7 +88,7 @@ def main() -> None:
     numbers = torch.tensor(ROUGHNESS), torch.tensor(METALLIC)
     scan = scan.replace(normals=eg.vertex_normals(scan.verts, scan.faces))
     things = (
-        ("ball", ball(), Made(GOLD, *numbers), {"method": "gauss-newton", "steps": 40, "spp": 4}),
+        ("ball", ball(), Made(GOLD, *numbers), {"method": "gauss-newton", "steps": 20, "spp": 2}),
         ("scan", scan, Made(scan.texture, *numbers), {"steps": 200, "spp": 4, "views_per_step": 2}),
     )
     rows = []

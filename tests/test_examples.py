@@ -110,11 +110,22 @@ def test_a_shape_from_six_depth_maps(given: str) -> None:
     assert shape.chamfer(found.mesh, stone) < 0.3
 
 
+def test_a_material_under_a_known_sky() -> None:
+    material = example("material")
+    truth = material.Made(material.GOLD, torch.tensor(0.3), torch.tensor(0.7))
+    _, made = material.fit(
+        material.ball(), truth, 16, method="gauss-newton", steps=7, spp=4, progress=False
+    )  # from 0.2 off in both
+    assert abs(made.roughness - truth.roughness) < 0.03 and abs(made.metallic - truth.metallic) < 0.04
+    assert (made.base - truth.base).abs().max() < 0.03
+
+
 def test_there_is_no_other() -> None:
     assert sorted(path.stem for path in FOLDER.glob("*.py")) == [
         "focal",
         "harmonics",
         "many_views",
+        "material",
         "mirror",
         "network",
         "objects",
