@@ -110,6 +110,7 @@ def test_a_shape_from_six_depth_maps(given: str) -> None:
     assert shape.chamfer(found.mesh, stone) < 0.3
 
 
+@pytest.mark.slow
 def test_a_material_under_a_known_sky() -> None:
     material = example("material")
     truth = material.Made(material.GOLD, torch.tensor(0.3), torch.tensor(0.7))
