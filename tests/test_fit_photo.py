@@ -255,7 +255,7 @@ def clutter(size, seed=0):
     return torch.from_numpy(image).float()
 
 
-def photograph(view, mesh=None, seed=0, gain=(1.3, 1.0, 0.8)):
+def photograph(view, mesh=None, seed=0, gain=(1.3, 1.0, 0.8), light_samples=1):
     """The bracket in the light of a sun and a sky, before clutter, blurred, noisy, compressed."""
     mesh = (bracket() if mesh is None else mesh).replace(material=eg.Material())
     lights = [
@@ -263,7 +263,9 @@ def photograph(view, mesh=None, seed=0, gain=(1.3, 1.0, 0.8)):
         eg.Environment(torch.full((3,), 0.35), visible=False),
     ]
     with torch.no_grad():
-        image = eg.render(eg.Scene([mesh], clutter(view.size[0], seed), lights), view, spp=32, seed=1 << 40)
+        image = eg.render(
+            eg.Scene([mesh], clutter(view.size[0], seed), lights), view, 32, 1 << 40, light_samples=light_samples
+        )
     values = smoothed(linear_to_srgb((image * torch.tensor(gain)).clamp(0, 1)).movedim(-1, 0), 0.7).movedim(0, -1)
     values = values + 0.015 * torch.randn(values.shape, generator=torch.Generator().manual_seed(seed))
     file = io.BytesIO()

@@ -132,7 +132,7 @@ def test_command_line_on_a_folder(film, frames, arguments, tmp_path, capsys):
     for row in rows:
         M = torch.tensor(row["mesh_to_world"], dtype=torch.float64)
         degrees, percent = errors(film, row["frame"], M[:3, :3], M[:3, 3])
-        assert degrees < 1.5 and percent < 6.0 and not row["lost"]
+        assert degrees < 1.0 and percent < 6.0 and not row["lost"]
     assert len(rows) == 3 and (out / "frames" / "00002.png").is_file()
     assert any((out / name).is_file() for name in ("film.mp4", "film.webp"))
     # The contour is drawn on the frame and nowhere else.

@@ -131,7 +131,6 @@ def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
     surfaces, view = hits._surfaces, hits._view
     assert isinstance(view, View)
     layout, tables = _layout(surfaces, view)
-
     filtered = "mipmap" in _filters(surfaces.scene)
 
     def compute(b: Tensor, face: Tensor, seed: Tensor, faces: Tensor, *others: Tensor) -> Sequence[Tensor]:
