@@ -14,10 +14,21 @@ import edgegrad as eg
 from edgegrad.light.radiance import radiance
 
 F64 = torch.float64
+QUAD = torch.tensor([[-0.5, -0.4, 1.0], [0.6, -0.5, 1.2], [0.7, 0.5, 1.3], [-0.3, 0.6, 0.9]], dtype=F64)
 
 
 def vector(*values: float) -> Tensor:
     return torch.tensor(values, dtype=F64)
+
+
+def uniform(count: int, seed: int = 0) -> Tensor:
+    """(count, 3)"""
+    return torch.rand((count, 3), dtype=F64, generator=torch.Generator().manual_seed(seed))
+
+
+def picture(h: int = 4, w: int = 6, seed: int = 1) -> Tensor:
+    """(h, w, 3) noise, nowhere black."""
+    return 0.2 + torch.rand((h, w, 3), dtype=F64, generator=torch.Generator().manual_seed(seed))
 
 
 def plane(size: float = 4.0, **fields: Any) -> eg.Mesh:

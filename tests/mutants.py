@@ -67,9 +67,8 @@ def changes() -> list[Change]:
     return found
 
 
-def build(changes: list[Change]) -> None:
-    """The kernel of all mutants; only files that changed are compiled again."""
-    sources = BUILD / "csrc"
+def changed_sources(changes: list[Change]) -> dict[str, str]:
+    """The kernel's sources with all mutants, by their names below csrc/."""
     texts = {path.relative_to(ROOT / "csrc"): path for path in (ROOT / "csrc").rglob("*") if path.is_file()}
     new = {str(name): path.read_text() for name, path in texts.items()}
     lost = []
@@ -82,7 +81,14 @@ def build(changes: list[Change]) -> None:
             change.line, change.changed.replace('OFF("', 'off<"').replace('")', '">')
         )
     if lost:
-        sys.exit("tests/mutants.txt names what is not, or not once, in csrc/:\n" + "\n".join(lost))
+        raise ValueError("tests/mutants.txt names what is not, or not once, in csrc/:\n" + "\n".join(lost))
+    return new
+
+
+def build(changes: list[Change]) -> None:
+    """The kernel of all mutants; only files that changed are compiled again."""
+    sources = BUILD / "csrc"
+    new = changed_sources(changes)
     new["core/mutants.h"] = HEADER
     new["core/math.h"] = new["core/math.h"].replace("#pragma once\n", '#pragma once\n#include "core/mutants.h"\n', 1)
     for name, text in new.items():
