@@ -99,6 +99,7 @@ def translation(mesh: eg.Mesh, camera: eg.Camera, adjoint: Tensor, seeds: int = 
     return total
 
 
+@pytest.mark.slow
 def test_limb_of_a_fine_mesh() -> None:
     """Faces at the limb of 1.3 M faces are seen less wide than floats are apart: they were hit by rounding and hid the
     edge beside them, 2 % of the boundary term. The same sphere with coarser faces has the same gradient."""

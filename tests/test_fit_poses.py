@@ -185,7 +185,7 @@ def depth_of(view, count):
         ("colours", 2.5, 1.0),
         pytest.param("labels", 2.3, 1.3, marks=pytest.mark.slow),
         ("depth", 0.2, 0.1),
-        ("plain", 2.5, 1.4),
+        pytest.param("plain", 2.5, 1.4, marks=pytest.mark.slow),
     ],
 )
 def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):

@@ -273,7 +273,7 @@ def test_gradients_by_lights_are_finite_differences(name: str):
     check(
         name,
         exact,
-        gradient(by_light(name), 12 if name == "radiance" else 4, surface_samples=20_000, edge_samples=500, **options),
+        gradient(by_light(name), 12 if name == "radiance" else 4, surface_samples=10_000, edge_samples=500, **options),
     )
 
 

@@ -283,17 +283,19 @@ AROUND = {
 }
 
 
-@pytest.mark.parametrize("view", AROUND)
 @pytest.mark.parametrize(
-    "words",
-    [
-        "colors directional point spot",
-        "normals area point",
-        "environment",
-        "base emission harmonics",
-        "nearest texture point spot",
-        "mipmap texture base point",
-    ],
+    ("words", "view"),
+    diagonal(
+        [
+            "colors directional point spot",
+            "normals area point",
+            "environment",
+            "base emission harmonics",
+            "nearest texture point spot",
+            "mipmap texture base point",
+        ],
+        list(AROUND),
+    ),
 )
 def test_images_as_a_whole(words: str, view: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """As from hits that are shaded one by one, with the pixels that borders of shadows and texels run through shaded again."""

@@ -197,7 +197,7 @@ def test_sweep_stops_where_the_next_point_would_cost_too_much():
 
 
 @pytest.mark.parametrize(
-    "scene", [pytest.param(name, marks=pytest.mark.slow) if name == "lit-sky" else name for name in scenes.LIT]
+    "scene", [name if name == "lit-area" else pytest.param(name, marks=pytest.mark.slow) for name in scenes.LIT]
 )
 def test_lit_scenes(scene, tmp_path):
     """From a reference that is computed anew. Their terms are not timed alone."""

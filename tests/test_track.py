@@ -51,6 +51,7 @@ def test_lost_and_found_again(film):
     assert words == ["seen", *["hardly seen"] * 3, *["lost"] * 2, "seen", "seen"]
 
 
+@pytest.mark.slow
 def test_found_again_elsewhere_and_turned(film):
     """By 30°, and a quarter of the picture aside; while it is away nothing else is taken for it. The mesh is of other units."""
     there = film.poses[0].clone()

@@ -260,7 +260,7 @@ def test_area_of_a_triangle_that_reaches_around() -> None:
 )
 def test_gradient(place: str, what: str) -> None:
     case = moved(lambda dx=0.0: both(PLACES[place], dx), camera(), what)
-    check_gradient(case, spp=1024, seeds=3, step=0.01 if what[0] == "d" else 0.005)
+    check_gradient(case, spp=512, seeds=3, step=0.01 if what[0] == "d" else 0.005)
 
 
 WHAT = ["vertices", "turn", "shift", "K00", "K01", "K02", "K11", "K12", "d0", "d1", "d2", "d3"]
