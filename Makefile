@@ -43,13 +43,16 @@ mutants: $(VENV)/.ready
 # Tests with a kernel in which AddressSanitizer and UndefinedBehaviorSanitizer watch every access and sum. Python itself is
 # not built with them, so they are loaded before it; what it leaks at its end is not looked at.
 SANITIZE := build/sanitize
-# Those that reach the lines of each source of the kernel, as `make coverage` checks, and are quick.
-WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points importance topology rays pitfalls coincident steps shadows rim wide_fisheye aovs lit_kernel glossy_light forward_mode samples messages
+# Those that reach the lines of each source of the kernel, as `make coverage` checks, and are quick; without tests marked
+# `unwatched`.
+WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points importance topology rays pitfalls coincident steps shadows rim wide_fisheye aovs lit_kernel glossy_light derivative_points shadow_rims forward_mode samples messages
 WATCHED_TESTS := $(WATCHED:%=tests/test_%.py)
+CHOSEN := not slow and not unwatched
 # Of all that `make test` has, files, pictures, whole fits and long statistics call the kernel as the other tests do, only for
 # longer; tests of load measure memory and time, of which the sanitizers take more, and fork() takes minutes with them.
 WITHOUT := 3mf_files bad_files browser cli derivatives dialects distributed docs fit fit_faults late_imports mesh_files mesh_file_faults gltf_arrays gltf_files images saved_cameras load notebooks odd_files odd_scenes oracles polygons report viewer world_coordinates
 sanitize-all: WATCHED_TESTS := $(WITHOUT:%=--ignore=tests/test_%.py)
+sanitize-all: CHOSEN := not slow
 PRELOAD := $(foreach name,asan ubsan stdc++,$(shell $(CXX) -print-file-name=lib$(name).so 2>/dev/null))
 sanitize sanitize-all: $(VENV)/.ready
 ifneq ($(words $(filter /%,$(PRELOAD))),3)
@@ -63,7 +66,7 @@ else
 	EDGEGRAD_KERNEL=$(CURDIR)/$(SANITIZE)/_core.abi3.so LD_PRELOAD="$(PRELOAD)" \
 	  ASAN_OPTIONS=detect_leaks=0:allocator_may_return_null=1:detect_stack_use_after_return=1 \
 	  UBSAN_OPTIONS=print_stacktrace=1:halt_on_error=1 \
-	  $(BIN)/python -m pytest -m "not slow" -n 2 -p no:faulthandler $(WATCHED_TESTS)
+	  $(BIN)/python -m pytest -m "$(CHOSEN)" -n 2 --dist worksteal -p no:faulthandler $(WATCHED_TESTS)
 endif
 
 # What the tests of `make sanitize` reach of the kernel, by gcov.

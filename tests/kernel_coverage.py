@@ -62,7 +62,7 @@ def main() -> None:
         "pytest",
         "-q",
         "-m",
-        "not slow",
+        "not slow and not unwatched",
         "--deselect",
         "tests/test_sanitizers.py",
         *sys.argv[1:],

@@ -337,6 +337,7 @@ def test_a_batch_of_cameras_and_float32() -> None:
     assert (grad[1] == 0).all() and (grad[0] != 0).any()
 
 
+@pytest.mark.unwatched
 def test_transforms() -> None:
     """Forward mode and reverse mode give one number, and torch.vmap is a loop."""
     scene, camera = two_meshes(), front_camera(SIZE)

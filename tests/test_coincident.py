@@ -260,6 +260,7 @@ def test_closed_surfaces_in_one_place() -> None:
     assert float((three - one).norm()) < 0.02 * float(one.norm())
 
 
+@pytest.mark.unwatched
 def test_what_a_convex_surface_hides_moves_nothing() -> None:
     """At the limb, creases of the side that is turned away leave the vertices of the silhouette at angles so small that
     rays see past it: 12 vertices behind it had a gradient in these views."""

@@ -29,6 +29,7 @@ def uniform(count: int, columns: int) -> Tensor:
     return torch.rand((count, columns), dtype=F64, generator=torch.Generator().manual_seed(3))
 
 
+@pytest.mark.unwatched
 @pytest.mark.parametrize("angle", [0.0, 0.8, 1.5, 1.7], ids=["head-on", "oblique", "grazing", "behind"])
 @pytest.mark.parametrize("roughness", [0.05, 0.3, 0.6])
 def test_directions_have_the_density_that_is_said(roughness: float, angle: float):
@@ -78,6 +79,7 @@ MATERIALS = {
 }  # fmt: skip
 
 
+@pytest.mark.unwatched
 @pytest.mark.parametrize("roughness", [0.3, 0.9])
 @pytest.mark.parametrize("name", MATERIALS)
 def test_points_are_unbiased(name: str, roughness: float):

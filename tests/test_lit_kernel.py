@@ -490,6 +490,7 @@ AROUND_PYRAMID = {
 }
 
 
+@pytest.mark.unwatched
 @pytest.mark.parametrize(
     ("samples", "view", "filter"), diagonal([None, 150], list(AROUND_PYRAMID), ["box", "tent", "gaussian"])
 )

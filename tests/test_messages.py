@@ -554,6 +554,7 @@ print(json.dumps(messages))
 """
 
 
+@pytest.mark.unwatched
 def test_import_without_a_usable_embree(tmp_path):
     """Not installed; installed without the library; a file that is no library; a library that is not Embree."""
     text = tmp_path / "libembree4.so"

@@ -151,6 +151,7 @@ def test_area_in_closed_form(lens: str) -> None:
     check(gradient, truth)
 
 
+@pytest.mark.unwatched
 @pytest.mark.parametrize(
     ("lens", "filter"), [*((lens, "box") for lens in LENSES), ("fold", "gaussian"), ("all around", "gaussian")]
 )
@@ -213,6 +214,7 @@ def case(lens: str, what: str) -> Case:
     return distortion
 
 
+@pytest.mark.unwatched
 @pytest.mark.parametrize(("lens", "what"), [("fold", "d0"), ("decentred", "K02"), ("all around", "d0")])
 def test_finite_differences(lens: str, what: str) -> None:
     check_ratio(case(lens, what), 0.01, spp=512, seeds=3, surface_samples=100_000)

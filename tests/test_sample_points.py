@@ -98,6 +98,7 @@ measures = pytest.mark.parametrize("measure", MEASURES.values(), ids=MEASURES)
 SHIFTS = [2.0**-54, 0.1, 0.5, 0.77, 1 - 2.0**-53]
 
 
+@pytest.mark.unwatched
 @measures
 @pytest.mark.parametrize("n", [1, 100, 30_000])
 def test_systematic_counts_are_proportional(measure, n):

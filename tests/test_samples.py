@@ -378,6 +378,7 @@ def test_texels_get_gradients_through_mipmaps():
     assert torch.autograd.gradcheck(value, texture.requires_grad_())
 
 
+@pytest.mark.unwatched
 @pytest.mark.parametrize("view", ["perspective", "orthographic"])
 def test_levels_of_mipmaps_have_derivatives(view: str):
     """By what is seen and by the camera, at fixed places in the image; of a square that is turned away from it, so that the level

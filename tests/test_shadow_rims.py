@@ -84,6 +84,7 @@ FAST = ("one corner", "light moves", "ground rises", "alpha rises", "u moves")
 MOTIONS = [pytest.param(m, marks=[] if m in FAST else pytest.mark.slow) for m in Setting.motions]
 
 
+@pytest.mark.unwatched
 @pytest.mark.parametrize("light", LIGHTS)
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_shadow_of_a_rim(motion: str, light: str) -> None:
@@ -165,6 +166,7 @@ FD_CASES = {
 QUICK = ("alpha, point",)
 
 
+@pytest.mark.unwatched
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in FD_CASES])
 def test_curved_rims(name: str) -> None:
     """Central differences of images by a regular grid of rays."""

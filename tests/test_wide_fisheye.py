@@ -106,6 +106,7 @@ def windows(view: eg.Camera, reach: float = 0.0) -> list:
 # -- positions ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.unwatched
 @cameras
 def test_points_agree_with_the_formula(view: eg.Camera) -> None:
     """Up to 110° and beyond; through one window, and in the image as Camera.project says."""
@@ -255,6 +256,7 @@ def test_area_of_a_triangle_that_reaches_around() -> None:
 # -- gradients ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.unwatched
 @pytest.mark.parametrize(
     ("place", "what"), [("beside", "vertices"), ("behind", "d1"), pytest.param("behind", "K11", marks=pytest.mark.slow)]
 )
