@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..check import as_int, as_tensor, check_integer, check_positive_int
 from ..library import core
+from .exact import Sampling, exact_means
 from .tensors import check_image, contiguous, to_kernel, triangles
 
 
@@ -48,6 +50,11 @@ def antialias(
     tri: Tensor,
     topology_hash: TopologyHash | None = None,
     pos_gradient_boost: float = 1.0,
+    *,
+    exact: bool = False,
+    ranges: Tensor | None = None,
+    spp: int = 16,
+    seed: int = 0,
 ) -> Tensor:
     """An image whose pixels are blended across silhouettes, so that it changes continuously with the vertices.
 
@@ -57,6 +64,9 @@ def antialias(
     tri                 (F, 3) int, the triangles that were rasterized
     topology_hash       of `antialias_construct_topology_hash`; None: made here
     pos_gradient_boost  a factor of the gradient of `pos`
+    exact               means of pixels instead, see below
+    ranges              (B, 2) int, with `exact` and pos (V, 4): those that were rasterized
+    spp, seed           with `exact`: samples a pixel, and which
 
     Where two pixels side by side, or above each other, show different triangles and the nearer of these ends between their
     centres with a silhouette (an edge of one triangle, or of several on the same side in the image), the pixel that the edge cuts
@@ -65,6 +75,12 @@ def antialias(
 
     Returns (B, H, W, C). Gradients go to `color` and to x, y and w of `pos`: the exact derivatives of what is returned. They know
     silhouettes whose triangle is seen at a pixel's centre.
+
+    With `exact` a pixel becomes the mean over its area, by `spp` samples, of the colours of what they hit, and the gradient is
+    that of this mean: unbiased, also where triangles are small or seen from their edge and no centre shows them. A sample's
+    colour is that of the pixel, among the nine around it, that shows its triangle; if none does, of another one that does; if
+    none in the image does, of the one of the nine that shows the surface nearest in depth. Background has the colour of the
+    nearest pixel without a triangle. Edges between triangles of one surface count too.
 
     Raises TypeError or ValueError that names the argument.
     """
@@ -76,6 +92,18 @@ def antialias(
     if pos.dim() != 3 or pos.shape[2] != 4 or pos.shape[0] not in (1, len(rast)):
         raise ValueError(f"pos: expected shape ({len(rast)}, V, 4) or (V, 4), got {tuple(pos.shape)}")
     faces = triangles(tri, pos.shape[1], "pos")
+    boost = float(pos_gradient_boost)
+    if exact:
+        spans = _spans(ranges, pos, faces, len(rast))
+        known = pos if boost == 1 else pos.detach() + boost * (pos - pos.detach())
+        sampling = Sampling(check_positive_int("spp", spp), as_int("seed", seed))
+        images = []
+        for b, (first, count) in enumerate(spans):
+            own = faces[first : first + count]
+            counted = rast[b].clone()
+            counted[..., 3] = torch.where(counted[..., 3] > 0, counted[..., 3] - first, 0)
+            images.append(exact_means(color[b], counted, known[b if len(known) > 1 else 0], own, sampling))
+        return torch.stack(images).to(device)
     if topology_hash is None:
         topology_hash = TopologyHash(faces)
     elif not isinstance(topology_hash, TopologyHash):
@@ -87,9 +115,25 @@ def antialias(
         raise ValueError(
             f"topology_hash: expected that of {len(faces)} triangles, got one of {topology_hash.triangles}; make it of tri anew"
         )
-    return _Antialias.apply(color, pos, rast.detach(), faces, topology_hash.groups, float(pos_gradient_boost)).to(
-        device
-    )
+    return _Antialias.apply(color, pos, rast.detach(), faces, topology_hash.groups, boost).to(device)
+
+
+def _spans(ranges: Tensor | None, pos: Tensor, tri: Tensor, images: int) -> list[list[int]]:
+    """First triangle of each image and how many."""
+    if ranges is None:
+        if len(pos) != images:
+            raise ValueError(
+                "ranges: expected those that were rasterized, for positions of all images and exact=True, got None"
+            )
+        return [[0, len(tri)]] * images
+    ranges = as_tensor("ranges", ranges)
+    check_integer("ranges", ranges)
+    if len(pos) != 1 or ranges.shape != (images, 2):
+        raise ValueError(f"ranges: expected shape ({images}, 2) with positions (V, 4), got {tuple(ranges.shape)}")
+    spans = ranges.tolist()
+    if any(first < 0 or count < 0 or first + count > len(tri) for first, count in spans):
+        raise ValueError(f"ranges: expected triangles from 0 to {len(tri) - 1}, got {spans}")
+    return spans
 
 
 class _Antialias(torch.autograd.Function):
