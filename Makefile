@@ -44,7 +44,7 @@ mutants: $(VENV)/.ready
 # not built with them, so they are loaded before it; what it leaks at its end is not looked at.
 SANITIZE := build/sanitize
 # Those that reach the lines of each source of the kernel, as `make coverage` checks, and are quick.
-WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points importance topology rays pitfalls coincident steps shadows rim wide_fisheye aovs lit_kernel glossy_light forward_mode samples messages
+WATCHED := sanitizers camera_adjoints texture_lookup pixel_filters sample_points importance topology rays pitfalls coincident steps shadows rim wide_fisheye aovs lit_kernel glossy_light forward_mode samples messages raster raster_texture raster_antialias
 WATCHED_TESTS := $(WATCHED:%=tests/test_%.py)
 # Of all that `make test` has, files, pictures, whole fits and long statistics call the kernel as the other tests do, only for
 # longer; tests of load measure memory and time, of which the sanitizers take more, and fork() takes minutes with them.
