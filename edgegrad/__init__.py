@@ -38,7 +38,7 @@ from .points.samples import (
 )
 from .preview import thumbnail
 from .profile import profile
-from .render import jvp, render, screen_gradient
+from .render import jvp, render, render_batch, screen_gradient
 from .scene import provided
 from .scene.environment import Environment
 from .scene.find_symmetries import find_symmetries
@@ -101,6 +101,7 @@ __all__ = [
     "read_mask",
     "render",
     "render_aovs",
+    "render_batch",
     "save_camera",
     "save_mesh",
     "save_scene",

@@ -18,8 +18,9 @@ from .aovs import IDS, check_aovs, render_aovs
 from .camera.camera import Camera
 from .check import as_tensor, check_finite, check_float, check_not_meta, check_shape
 from .kernel.autograd import render_image
+from .kernel.batch import render_images
 from .kernel.operators import forward_kernel, screen_gradient_kernel
-from .kernel.request import make_request
+from .kernel.request import Request, make_request
 from .light.radiance import Lighting, check_unlit
 from .light.whole import lit_image
 from .scene.mesh import Mesh
@@ -111,6 +112,59 @@ def render(
         return render_shaded(as_scene(scene), camera, shader, request, creases, check_shader)
     image = render_image(request, batched=camera.batch is not None)
     return image.to(as_scene(scene).meshes[0].verts.device)
+
+
+SMALL = 1 << 22  # samples of an image, up to which one thread an image is better than all of them
+
+
+def render_batch(
+    pairs: Sequence[tuple[Scene | Mesh, Camera]], spp: int = 16, seed: int | Sequence[int] = 0, **options: Any
+) -> Tensor | list[Tensor]:
+    """The images of different scenes, each before a camera of its own: (B, H, W, C), or a list of (H, W, C) where these differ.
+
+    pairs    scenes, or meshes, with cameras, none of which is a batch
+    seed     of all, or one of each
+
+    The other arguments are those of render(). Images and gradients have the bits of render() for one pair after the other. If
+    all images are small and neither lit nor shaded, each takes one thread, and as many are rendered, and differentiated, beside
+    each other as there are threads; in reverse mode, once.
+
+    Raises what render() raises, with the number of the pair.
+    """
+    check_options("render_batch", options)
+    if isinstance(pairs, (Scene, Mesh)) or not isinstance(pairs, Sequence) or not pairs:
+        raise TypeError(f"pairs: expected a list of pairs (scene, camera), got {type(pairs).__name__}")
+    seeds = list(seed) if isinstance(seed, Sequence) else [seed] * len(pairs)
+    if len(seeds) != len(pairs):
+        raise ValueError(f"seed: expected one, or {len(pairs)}, one of each pair, got {len(seeds)}")
+    plain = not any(name in SHADING for name in options)
+    requests, images = [], []
+    for k, (pair, own) in enumerate(zip(pairs, seeds, strict=True)):
+        if not isinstance(pair, Sequence) or len(pair) != 2:
+            raise TypeError(f"pairs[{k}]: expected (scene, camera), got {type(pair).__name__}")
+        scene, camera = pair
+        try:
+            if isinstance(camera, Camera) and camera.batch is not None:
+                raise ValueError(
+                    f"camera: expected one camera, got a batch of {camera.batch}; give camera[i] one by one"
+                )
+            if plain and not as_scene(scene).is_shaded:
+                requests.append(make_request(scene, camera, spp, own, **options))
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"pairs[{k}]: {error}") from None
+    if len(requests) == len(pairs) and all(_is_small(request) for request in requests):
+        devices = [as_scene(scene).meshes[0].verts.device for scene, _ in pairs]
+        images = [image.to(device) for image, device in zip(render_images(requests), devices, strict=True)]
+    else:
+        images = [render(*pair, spp, own, **options) for pair, own in zip(pairs, seeds, strict=True)]
+    alike = all(image.shape == images[0].shape and image.dtype == images[0].dtype for image in images)
+    return torch.stack(images) if alike else images
+
+
+def _is_small(request: Request) -> bool:
+    """And without a lens that may fold, of which a warning would have to find the caller's line."""
+    samples = request.camera.height * request.camera.width * request.image.spp
+    return samples <= SMALL and not bool(request.camera.distortion.any())
 
 
 @overload

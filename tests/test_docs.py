@@ -22,6 +22,7 @@ import torch
 import edgegrad
 import edgegrad.bop
 import edgegrad.fit
+import edgegrad.raster
 
 FOLDER = Path(__file__).parents[1] / "docs"
 PAGES = ["quick-start.md", "concepts.md", *(str(p.relative_to(FOLDER)) for p in sorted(FOLDER.glob("how-to/*.md")))]
@@ -98,7 +99,7 @@ def test_equations_are_typeset() -> None:
         assert not [found for found in code if re.search("[∫∮∂∇]", found)], page.name
 
 
-@pytest.mark.parametrize("module", [edgegrad, edgegrad.bop, edgegrad.fit])
+@pytest.mark.parametrize("module", [edgegrad, edgegrad.bop, edgegrad.fit, edgegrad.raster])
 def test_reference_has_all_that_is_public(module: ModuleType) -> None:
     reference = "".join(page.read_text(encoding="utf-8") for page in (FOLDER / "api").glob("*.md"))
     listed = set(re.findall(r"^\.\. auto\w+:: (\S+)$", reference, re.MULTILINE))

@@ -137,3 +137,38 @@ def test_there_is_no_other() -> None:
         "sun",
         "texture",
     ]
+
+
+def test_a_triangle() -> None:
+    image = example("raster_triangle").picture(64)
+    covered = image.sum(2) > 0
+    assert torch.allclose(image.sum(2)[covered], torch.ones(())) and abs(covered.float().mean() - 0.32) < 0.015
+    assert image[7, 8].argmax() == 0 and image[7, 55].argmax() == 1 and image[54, 32].argmax() == 2  # y runs up
+
+
+def test_the_corners_of_a_cube_from_few_pixels() -> None:
+    before, after = example("raster_cube").fit(size=8, steps=150)
+    assert after.corners < 0.8 * before.corners and after.colors < 0.7 * before.colors
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exact", [False, True])
+def test_the_corners_of_a_cube_from_16_pixels(exact: bool) -> None:
+    before, after = example("raster_cube").fit(size=4, steps=3000, exact=exact)
+    assert before.corners > 0.5 and after.corners < 0.02 and after.colors < 0.01
+
+
+def test_a_texture_with_mipmaps_and_without() -> None:
+    earth = example("raster_earth")
+    (_, without), (_, mipmaps) = (earth.fit(mipmaps, steps=60, size=32) for mipmaps in (False, True))
+    assert mipmaps > without + 1.0
+
+
+def test_a_pose_by_trying_and_by_gradients() -> None:
+    start, _, found = example("raster_pose").fit(seed=0, steps=200, size=64)
+    assert start > 90 and found < 0.1
+
+
+def test_an_environment_and_a_highlight() -> None:
+    _, before, after = example("raster_environment_phong").fit(steps=100, size=64)
+    assert after.environment < 0.7 * before.environment and after.color < 0.9 * before.color

@@ -26,6 +26,7 @@ void bind_memory(nb::module_& m);       // memory.cpp
 void bind_for_shaders(nb::module_& m);  // for_shaders.cpp
 void bind_lit(nb::module_& m);          // lit.cpp
 void bind_moving_hits(nb::module_& m);  // moving_hits.cpp
+void bind_raster(nb::module_& m);       // raster.cpp
 template <class T>
 void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene);
 template <class T>
@@ -270,6 +271,7 @@ NB_MODULE(_core, m) {
     bind_for_shaders(m);
     bind_lit(m);
     bind_moving_hits(m);
+    bind_raster(m);
     bind_scene<float>(m, "SceneFloat", "HitsFloat");
     bind_scene<double>(m, "SceneDouble", "HitsDouble");
     bind_memory(m);

@@ -18,6 +18,7 @@ from ..warnings import warn
 from . import memory as memory
 from .flat import Flat
 from .request import PER_CAMERA, SCHEMA, SLOTS, PackedCamera, Request, Work, derived_seed, label
+from .threads import threads
 
 Profile = dict[str, float]
 
@@ -50,7 +51,7 @@ def kernel_scene(scene: Flat) -> Any:
     background = scene.background if scene.background.dim() == 3 else scene.background[None, None]
     arrays = scene._replace(background=background)._asdict()
     arrays = {name: _array(value) if isinstance(value, Tensor) else value for name, value in arrays.items()}
-    return kind(**arrays, threads=torch.get_num_threads())
+    return kind(**arrays, threads=threads())
 
 
 def kernel_camera(camera: PackedCamera, index: int = 0) -> Any:
@@ -104,7 +105,7 @@ def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
                     camera=cameras[b],
                     channels=kernel_channels(request, b),
                     options=core.ImageOptions(**options),
-                    threads=torch.get_num_threads(),
+                    threads=threads(),
                     image=image[b].numpy(),
                     hits=kernel_hits(hits, b),
                 )
@@ -139,7 +140,7 @@ def backward_kernel(
                     channels=kernel_channels(request, b),
                     image=image,
                     options=_gradient_options(request, wanted, b, dry, lit is not None),
-                    threads=torch.get_num_threads(),
+                    threads=threads(),
                     adjoint=images[b].numpy(),
                     hits=kernel_hits(hits, b),
                     # Each camera has a gradient of its own.
@@ -169,7 +170,7 @@ def jvp_kernel(hits: Hits, request: Request, tangents: Mapping[str, Tensor], dir
                 channels=kernel_channels(request, b),
                 image=image,
                 options=_gradient_options(request, tangents, b),
-                threads=torch.get_num_threads(),
+                threads=threads(),
                 adjoint=adjoint.numpy(),
                 hits=kernel_hits(hits, b),
                 tangents=[
@@ -203,7 +204,7 @@ def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Ten
                 channels=kernel_channels(request, b),
                 image=image,
                 options=_gradient_options(request, ["verts"], b),
-                threads=torch.get_num_threads(),
+                threads=threads(),
                 adjoint=adjoint[b].numpy(),
                 hits=kernel_hits(hits, b),
                 gradient=out[b],
@@ -273,7 +274,7 @@ def pass_size(request: Request) -> Any:
         number=flat.colors.element_size(),
         textured=len(flat.textures) > 0,
         jumps=jumps,
-        threads=torch.get_num_threads(),
+        threads=threads(),
         sides=_sides(camera),
     )
 
@@ -372,7 +373,7 @@ def _faces_at_centers_cpu(*args: Any) -> Tensor:
             scene.faces_at_centers(
                 camera=kernel_camera(request.camera, b),
                 channels=kernel_channels(request, b),
-                threads=torch.get_num_threads(),
+                threads=threads(),
                 face=faces[b].numpy(),
             )
         return faces

@@ -1,0 +1,160 @@
+"""Pixels blended across silhouettes, with what that says of the vertices."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from ..check import as_int, as_tensor, check_integer, check_positive_int
+from ..library import core
+from .exact import Sampling, exact_means
+from .tensors import check_image, contiguous, to_kernel, triangles
+
+
+class TopologyHash:
+    """Which triangles share edges, from `antialias_construct_topology_hash`."""
+
+    def __init__(self, tri: Tensor) -> None:
+        count = 3 * len(tri)
+        # Half-edge 3 t + i lies opposite to corner i of triangle t.
+        ends = torch.stack([tri.roll(-1, 1), tri.roll(-2, 1)], 2).reshape(-1, 2).long()
+        key = ends.amin(1) * (2**31) + ends.amax(1)
+        order = torch.argsort(key, stable=True)
+        _, of_sorted, sizes = torch.unique_consecutive(key[order], return_inverse=True, return_counts=True)
+        group = torch.empty(count, dtype=torch.int32)
+        group[order] = of_sorted.int()
+        start = torch.zeros(len(sizes) + 1, dtype=torch.int32)
+        start[1:] = sizes.cumsum(0)
+        self.triangles = len(tri)
+        self.groups = core.EdgeGroups(group.numpy(), start.numpy(), order.int().numpy())
+
+
+def antialias_construct_topology_hash(tri: Tensor) -> TopologyHash:
+    """Which triangles share edges, for `antialias`, which otherwise finds it at each call.
+
+    tri  (F, 3) int
+
+    Raises TypeError or ValueError that names the argument.
+    """
+    known = triangles(tri, 2**31 - 1, "pos")
+    return TopologyHash(known)
+
+
+def antialias(
+    color: Tensor,
+    rast: Tensor,
+    pos: Tensor,
+    tri: Tensor,
+    topology_hash: TopologyHash | None = None,
+    pos_gradient_boost: float = 1.0,
+    *,
+    exact: bool = False,
+    ranges: Tensor | None = None,
+    spp: int = 16,
+    seed: int = 0,
+) -> Tensor:
+    """An image whose pixels are blended across silhouettes, so that it changes continuously with the vertices.
+
+    color               (B, H, W, C) float
+    rast                (B, H, W, 4) float, the first result of `rasterize`
+    pos                 (B, V, 4) or (V, 4) float, the positions that were rasterized
+    tri                 (F, 3) int, the triangles that were rasterized
+    topology_hash       of `antialias_construct_topology_hash`; None: made here
+    pos_gradient_boost  a factor of the gradient of `pos`
+    exact               means of pixels instead, see below
+    ranges              (B, 2) int, with `exact` and pos (V, 4): those that were rasterized
+    spp, seed           with `exact`: samples a pixel, and which
+
+    Where two pixels side by side, or above each other, show different triangles and the nearer of these ends between their
+    centres with a silhouette (an edge of one triangle, or of several on the same side in the image), the pixel that the edge cuts
+    is blended with the other, by half a pixel less the distance of the edge from the centre. Edges that run more up than along
+    count between pixels side by side, others between those above each other (Laine et al. 2020, section 3.5).
+
+    Returns (B, H, W, C). Gradients go to `color` and to x, y and w of `pos`: the exact derivatives of what is returned. They know
+    silhouettes whose triangle is seen at a pixel's centre.
+
+    With `exact` a pixel becomes the mean over its area, by `spp` samples, of the colours of what they hit, and the gradient is
+    that of this mean: unbiased, also where triangles are small or seen from their edge and no centre shows them. A sample's
+    colour is that of the pixel, among the nine around it, that shows its triangle; if none does, of another one that does; if
+    none in the image does, of the one of the nine that shows the surface nearest in depth. Background has the colour of the
+    nearest pixel without a triangle. Edges between triangles of one surface count too.
+
+    Raises TypeError or ValueError that names the argument.
+    """
+    (color, rast, pos), device = to_kernel(color=color, rast=rast, pos=pos)
+    check_image("rast", rast, 4)
+    check_image("color", color, "C", like=rast)
+    if pos.dim() == 2:
+        pos = pos[None]
+    if pos.dim() != 3 or pos.shape[2] != 4 or pos.shape[0] not in (1, len(rast)):
+        raise ValueError(f"pos: expected shape ({len(rast)}, V, 4) or (V, 4), got {tuple(pos.shape)}")
+    faces = triangles(tri, pos.shape[1], "pos")
+    boost = float(pos_gradient_boost)
+    if exact:
+        spans = _spans(ranges, pos, faces, len(rast))
+        known = pos if boost == 1 else pos.detach() + boost * (pos - pos.detach())
+        sampling = Sampling(check_positive_int("spp", spp), as_int("seed", seed))
+        images = []
+        for b, (first, count) in enumerate(spans):
+            own = faces[first : first + count]
+            counted = rast[b].clone()
+            counted[..., 3] = torch.where(counted[..., 3] > 0, counted[..., 3] - first, 0)
+            images.append(exact_means(color[b], counted, known[b if len(known) > 1 else 0], own, sampling))
+        return torch.stack(images).to(device)
+    if topology_hash is None:
+        topology_hash = TopologyHash(faces)
+    elif not isinstance(topology_hash, TopologyHash):
+        raise TypeError(
+            "topology_hash: expected what antialias_construct_topology_hash returns, got "
+            + type(topology_hash).__name__
+        )
+    elif topology_hash.triangles != len(faces):
+        raise ValueError(
+            f"topology_hash: expected that of {len(faces)} triangles, got one of {topology_hash.triangles}; make it of tri anew"
+        )
+    return _Antialias.apply(color, pos, rast.detach(), faces, topology_hash.groups, boost).to(device)
+
+
+def _spans(ranges: Tensor | None, pos: Tensor, tri: Tensor, images: int) -> list[list[int]]:
+    """First triangle of each image and how many."""
+    if ranges is None:
+        if len(pos) != images:
+            raise ValueError(
+                "ranges: expected those that were rasterized, for positions of all images and exact=True, got None"
+            )
+        return [[0, len(tri)]] * images
+    ranges = as_tensor("ranges", ranges)
+    check_integer("ranges", ranges)
+    if len(pos) != 1 or ranges.shape != (images, 2):
+        raise ValueError(f"ranges: expected shape ({images}, 2) with positions (V, 4), got {tuple(ranges.shape)}")
+    spans = ranges.tolist()
+    if any(first < 0 or count < 0 or first + count > len(tri) for first, count in spans):
+        raise ValueError(f"ranges: expected triangles from 0 to {len(tri) - 1}, got {spans}")
+    return spans
+
+
+class _Antialias(torch.autograd.Function):
+    """csrc/raster/antialias.h"""
+
+    @staticmethod
+    def forward(ctx: Any, color: Tensor, pos: Tensor, rast: Tensor, tri: Tensor, groups: Any, boost: float) -> Tensor:
+        threads = torch.get_num_threads()
+        ctx.crossings = core.find_crossings(contiguous(pos), contiguous(tri), groups, contiguous(rast), threads)
+        ctx.save_for_backward(color, pos, tri)
+        ctx.boost = boost
+        return torch.from_numpy(core.antialias(ctx.crossings, contiguous(color), threads))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grad_outputs: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (bar,) = grad_outputs
+        color, pos, tri = map(contiguous, ctx.saved_tensors)
+        wanted = [bool(want) for want in ctx.needs_input_grad[:2]]
+        found = core.antialias_vjp(ctx.crossings, pos, tri, color, contiguous(bar), wanted, torch.get_num_threads())
+        color_bar, pos_bar = (None if grad is None else torch.from_numpy(grad) for grad in found)
+        if pos_bar is not None and ctx.boost != 1:
+            pos_bar = pos_bar * ctx.boost
+        return color_bar, pos_bar, None, None, None, None

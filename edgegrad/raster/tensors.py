@@ -1,0 +1,50 @@
+"""Tensors as the kernel takes them: on the CPU, of one floating-point type, contiguous."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..check import as_tensor, check_countable, check_indices, check_integer
+
+
+def to_kernel(**given: Any) -> tuple[list[Tensor], torch.device]:
+    """Floating-point tensors in float32, or float64 if one of them is, and the device of the first. Raises TypeError.
+
+    None stays out: ask for what is there.
+    """
+    tensors = {name: as_tensor(name, value, floating=True) for name, value in given.items()}
+    for name, tensor in tensors.items():
+        if not tensor.is_floating_point():
+            raise TypeError(f"{name}: expected a floating-point tensor, got {tensor.dtype}; use .float()")
+    double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
+    dtype = torch.float64 if double else torch.float32
+    moved = [tensor.to(device="cpu", dtype=dtype).contiguous() for tensor in tensors.values()]
+    return moved, next(iter(tensors.values())).device
+
+
+def triangles(tri: Any, vertices: int, of: str) -> Tensor:
+    """(F, 3) int32 on the CPU, indices into `vertices` rows of `of`. Raises TypeError or ValueError."""
+    tri = as_tensor("tri", tri)
+    check_integer("tri", tri)
+    if tri.dim() != 2 or tri.shape[1] != 3:
+        raise ValueError(f"tri: expected shape (F, 3), got {tuple(tri.shape)}")
+    check_countable("tri", tri, vertices, of)
+    check_indices("tri", tri, vertices, of)
+    return tri.to(device="cpu", dtype=torch.int32).contiguous()
+
+
+def check_image(name: str, tensor: Tensor, channels: int | str, like: Tensor | None = None) -> None:
+    """(B, H, W, channels), a string for any number of them, with the B, H, W of `like`. Raises ValueError."""
+    fits = tensor.dim() == 4 and (isinstance(channels, str) or tensor.shape[3] == channels)
+    fits = fits and (like is None or tensor.shape[:3] == like.shape[:3])
+    if not fits:
+        size = "B, H, W" if like is None else ", ".join(map(str, like.shape[:3]))
+        raise ValueError(f"{name}: expected shape ({size}, {channels}), got {tuple(tensor.shape)}")
+
+
+def contiguous(tensor: Tensor | None) -> Any:
+    """As an array of the kernel's; None as it is."""
+    return None if tensor is None else tensor.detach().contiguous().numpy()
