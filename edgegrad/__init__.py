@@ -44,6 +44,7 @@ from .rig.control import Control
 from .rig.joints import Joints
 from .rig.load import load_rig
 from .rig.rig import Rig
+from .rig.robot import load_robot
 from .rig.skin import Skin
 from .scene import provided
 from .scene.environment import Environment
@@ -106,6 +107,7 @@ __all__ = [
     "load_cameras",
     "load_mesh",
     "load_rig",
+    "load_robot",
     "load_scene",
     "plan",
     "primary_hits",
