@@ -39,6 +39,13 @@ from .points.samples import (
 from .preview import thumbnail
 from .profile import profile
 from .render import jvp, render, render_batch, screen_gradient
+from .rig.animation import Animation, Channel
+from .rig.control import Control
+from .rig.joints import Joints
+from .rig.load import load_rig
+from .rig.rig import Rig
+from .rig.robot import load_robot
+from .rig.skin import Skin
 from .scene import provided
 from .scene.environment import Environment
 from .scene.find_symmetries import find_symmetries
@@ -65,19 +72,25 @@ torch.serialization.add_safe_globals(
 __version__ = "0.1.0"
 
 __all__ = [
+    "Animation",
     "AreaLight",
     "Camera",
+    "Channel",
+    "Control",
     "DirectionalLight",
     "EdgeSamples",
     "Environment",
     "Hits",
+    "Joints",
     "LightPoints",
     "Material",
     "Mesh",
     "Plan",
     "PointLight",
     "PrimaryHits",
+    "Rig",
     "Scene",
+    "Skin",
     "SphericalHarmonics",
     "SpotLight",
     "SurfaceSamples",
@@ -93,6 +106,8 @@ __all__ = [
     "load_camera",
     "load_cameras",
     "load_mesh",
+    "load_rig",
+    "load_robot",
     "load_scene",
     "plan",
     "primary_hits",

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..camera.camera import Camera
 from ..scene.material import Material
-from .formats import gltf, gltf_material, obj, off, ply, stl, threemf
+from .formats import gltf, gltf_material, gltf_rig, obj, off, ply, stl, threemf
 from .formats.disguised import check_disguised
 from .formats.geometry import checked, shape, turned, typed
 from .formats.gltf_nodes import cameras, lights
@@ -46,6 +46,31 @@ def read_model(path: PathLike, wanted: Wanted) -> Model:
     model = typed(model, wanted.dtype, source)
     source.unsupported.say(path)
     return model
+
+
+def read_rig(path: PathLike, wanted: Wanted) -> tuple[gltf_rig.RigFile, Model]:
+    """What bends in a glTF or GLB file, and its parts before anything moves them: each in the coordinates of its mesh, with its
+    normals as they stand in the file. Raises Fault, FileNotFoundError, ValueError or ImportError. Warns of what nobody reads."""
+    file = check_readable(path, GLTFS)
+    data, kind, source = file.read_bytes(), file.suffix.lower()[1:], Source.of(path, wanted)
+    check_disguised(data, f"a {kind.upper()} file")
+    known: dict[object, Any] = {}
+    with _as_fault(kind):
+        given = gltf.read(data, kind)
+        with explained(given.tree):
+            note_unread(given.tree, source)
+            found = gltf_rig.read(given, source)
+            parts = []
+            for name, primitive, _ in found.parts:
+                with _naming(name, alone=len(found.parts) == 1):
+                    raw = {"vertices": primitive.positions, "faces": primitive.triangles}
+                    parts.append(checked(shape(name, raw, np.eye(4))._replace(**gltf_material.look(primitive, known))))
+            if not parts:
+                raise Fault("expected triangles, got none: the file is truncated, or was exported without faces")
+            model = Model(parts, lights(given.tree, source) if wanted.lit else [])
+    model = typed(model, wanted.dtype, source)
+    source.unsupported.say(path)
+    return found, model
 
 
 def read_cameras(path: PathLike, size: tuple[int, int]) -> dict[str, Camera]:

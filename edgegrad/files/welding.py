@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -62,10 +62,18 @@ def merge(parts: list[Part]) -> Part:
     )
 
 
-def to_mesh(part: Part, dtype: torch.dtype = torch.float32) -> Mesh:
-    """Vertices are welded in the type of the part, and then get theirs. Raises Fault."""
-    verts, faces = _weld(part.verts, part.faces)
-    verts = verts.to(dtype)
+class Welded(NamedTuple):
+    """Equal rows once."""
+
+    kept: np.ndarray  # (n,) which rows, in the order of the file
+    faces: np.ndarray  # (F, 3), indices into these
+
+
+def to_mesh(part: Part, dtype: torch.dtype = torch.float32, by: Welded | None = None) -> Mesh:
+    """Vertices are welded in the type of the part, and then get theirs; `by` says which are one, where it is not the positions
+    alone that tell. Raises Fault."""
+    by = welded(part.verts, part.faces) if by is None else by
+    verts, faces = torch.from_numpy(part.verts[by.kept]).to(dtype), torch.from_numpy(by.faces)
     images: dict[str, Any] = {**_material(part), "name": part.name or None}
     shared = part.material is not None and set(part.material.textures) - set(part.material_uvs)
     textured = part.texture is not None or part.alpha is not None or bool(shared)
@@ -113,6 +121,12 @@ def _of_vertices(corners: Tensor, faces: Tensor, count: int) -> Tensor | None:
 
 def _weld(rows: np.ndarray, index: np.ndarray) -> tuple[Tensor, Tensor]:
     """The rows that `index` (F, 3) uses, equal ones once, in the order of the file; and the index into them."""
+    found = welded(rows, index)
+    return torch.from_numpy(rows[found.kept]), torch.from_numpy(found.faces)
+
+
+def welded(rows: np.ndarray, index: np.ndarray) -> Welded:
+    """Of rows (N, K), those that `index` (F, 3) uses."""
     used, flat = compact(index)
     rows = rows[used]
     order = np.lexsort(rows.T)
@@ -120,5 +134,4 @@ def _weld(rows: np.ndarray, index: np.ndarray) -> tuple[Tensor, Tensor]:
     first = np.empty(len(rows), np.int64)
     first[order] = order[starts][np.cumsum(starts) - 1]  # the sort is stable: a group starts with its first row
     kept, renumbered = np.unique(first, return_inverse=True)
-    faces = renumbered.reshape(-1)[flat.reshape(-1)].reshape(-1, 3).astype(np.int64)
-    return torch.from_numpy(rows[kept]), torch.from_numpy(faces)
+    return Welded(used[kept], renumbered.reshape(-1)[flat.reshape(-1)].reshape(-1, 3).astype(np.int64))

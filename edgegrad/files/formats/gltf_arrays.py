@@ -15,7 +15,7 @@ from .source import WITHOUT_LOOK, Folder
 
 MOST_ZEROS = 1 << 24  # rows that a glTF may ask for without holding them
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}  # a matrix column by column
 STRIP, FAN, TRIANGLES = 5, 6, 4
 
 
@@ -39,7 +39,7 @@ class Arrays:
             count, kind = accessor["count"], accessor["type"]
             if not isinstance(count, int) or count < 1 or kind not in COLUMNS:
                 raise Fault(
-                    f"expected accessors of 1 to 4 numbers a row, got {count!r} rows of {kind!r}; export it again"
+                    f"expected accessors of 1 to 4 numbers a row, or of 4 × 4, got {count!r} rows of {kind!r}; export it again"
                 )
             component, columns = accessor["componentType"], COLUMNS[kind]
             if "bufferView" in accessor:
@@ -109,19 +109,40 @@ class Geometry:
     def attribute(self, name: str) -> np.ndarray | None:
         """(N, K) numbers, integers that the file calls normalised from −1 or 0 to 1; None without it. Raises Fault."""
         index = self.given["attributes"].get(name)
+        return None if index is None else self._numbers(name, index)
+
+    def integers(self, name: str) -> np.ndarray | None:
+        """(N, K) int64, which count something; None without it. Raises Fault."""
+        index = self.given["attributes"].get(name)
         if index is None:
             return None
+        rows = self._get(index)
+        if rows.dtype.kind != "u":
+            raise Fault(f"expected unsigned integers for {name}, got {rows.dtype}; export it again")
+        return rows.astype(np.int64)
+
+    def targets(self, name: str, shape: tuple[int, ...]) -> list[np.ndarray | None]:
+        """Of each morph target the differences of an attribute, of this shape; None where it has none. Raises Fault."""
+        found = []
+        for number, target in enumerate(self.given.get("targets", [])):
+            rows = None if name not in target else self._numbers(name, target[name])
+            if rows is not None and rows.shape != shape:
+                raise Fault(
+                    f"expected {name} of shape {shape} in morph target {number}, got {rows.shape}; export it again"
+                )
+            found.append(rows)
+        return found
+
+    def _numbers(self, name: str, index: Any) -> np.ndarray:
         rows, accessor = self._get(index), self.arrays.tree["accessors"][index]
         if rows.dtype.kind == "f":
             return rows
         tree = self.arrays.tree
         quantized = QUANTIZED in tree.get("extensionsUsed", ()) or QUANTIZED in tree.get("extensionsRequired", ())
         normalized = accessor.get("normalized", False) or name.startswith("COLOR_")  # which some writers do not say
-        if not quantized and not (normalized and name.startswith(("TEXCOORD_", "COLOR_"))):
+        if not quantized and not (normalized and name.startswith(("TEXCOORD_", "COLOR_", "WEIGHTS_"))):
             raise Fault(f"expected {name} as floats, got integers without the extension {QUANTIZED}; export it plain")
-        if not normalized:
-            return rows.astype(np.float64)
-        return np.maximum(rows / np.float64(np.iinfo(rows.dtype).max), -1.0)
+        return normalised(rows) if normalized else rows.astype(np.float64)
 
     def triangles(self) -> np.ndarray:
         """(F, 3) indices of vertices, from a list, strip or fan. Raises Fault."""
@@ -182,6 +203,11 @@ class Geometry:
                 raise Fault(f"expected triangles in {DRACO}, got points; export it again")
             found[self.given["indices"]] = np.reshape(found[self.given["indices"]], (-1, 1))
         return found
+
+
+def normalised(rows: np.ndarray) -> np.ndarray:
+    """Integers as numbers from −1 or 0 to 1, float64."""
+    return np.maximum(rows / np.float64(np.iinfo(rows.dtype).max), -1.0)
 
 
 def content(uri: str, folder: Folder, advice: str = WITHOUT_LOOK) -> bytes:

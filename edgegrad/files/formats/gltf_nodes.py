@@ -23,6 +23,8 @@ INSTEAD_OF_RANGE = "light falls off with the square of the distance, without an 
 class Placed(NamedTuple):
     """A node of the scene in its place."""
 
+    number: int  # in the file's list of nodes
+    above: int | None  # the node that it is within
     node: dict[str, Any]
     world: np.ndarray  # (4, 4), to the world
     visible: bool  # it and all nodes above it (KHR_node_visibility)
@@ -40,17 +42,17 @@ def placed(tree: dict[str, Any]) -> Iterator[Placed]:
     else:
         below = {child for node in tree.get("nodes", []) for child in node.get("children", [])}
         roots = [index for index in range(len(tree.get("nodes", []))) if index not in below]
-    waiting = [(root, np.eye(4), True) for root in reversed(roots)]
+    waiting = [(root, None, np.eye(4), True) for root in reversed(roots)]
     seen: set[int] = set()
     while waiting:
-        index, above, visible = waiting.pop()
+        index, parent, above, visible = waiting.pop()
         if index in seen:
             raise Fault("expected a tree of nodes, got some inside two others; export it again")
         seen.add(index)
         node = entry(tree, "nodes", index)
-        found = Placed(node, above @ _matrix(node), visible and _is_visible(node))
+        found = Placed(index, parent, node, above @ matrix_of(node), visible and _is_visible(node))
         yield found
-        waiting += [(child, found.world, found.visible) for child in reversed(node.get("children", []))]
+        waiting += [(child, index, found.world, found.visible) for child in reversed(node.get("children", []))]
 
 
 def _is_visible(node: dict[str, Any]) -> bool:
@@ -60,7 +62,7 @@ def _is_visible(node: dict[str, Any]) -> bool:
     return visible
 
 
-def _matrix(node: dict[str, Any]) -> np.ndarray:
+def matrix_of(node: dict[str, Any]) -> np.ndarray:
     """(4, 4) of a node within the one above it: the product of shift, rotation and scaling."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
@@ -75,7 +77,7 @@ def lights(tree: dict[str, Any], source: Source) -> list[Light]:
     """Those of KHR_lights_punctual at visible nodes, in float64. Scales of nodes change where they are, and nothing else
     of them. Raises Fault."""
     found = []
-    for node, world, visible in placed(tree):
+    for _, _, node, world, visible in placed(tree):
         reference = node.get("extensions", {}).get(PUNCTUAL)
         if reference is not None and visible:
             light = entry(tree.get("extensions", {}).get(PUNCTUAL, {}), "lights", reference["light"])
@@ -123,7 +125,7 @@ def cameras(tree: dict[str, Any], size: tuple[int, int]) -> dict[str, Camera]:
     """In float64, by the names of their nodes and in their order, (H, W) pixels, which are square: of aspectRatio, yfov and
     ymag these give the height. Raises Fault, or ValueError about the size."""
     found: dict[str, Camera] = {}
-    for node, world, _ in placed(tree):  # also where nothing else of it is visible
+    for _, _, node, world, _ in placed(tree):  # also where nothing else of it is visible
         if "camera" not in node:
             continue
         name = str(node.get("name", f"camera {len(found)}"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,14 +27,19 @@ def instances(file: File, source: Source) -> list[tuple[str, dict[str, Any], np.
             places.setdefault(at.node["mesh"], []).append(at.of_mesh)
     found = []
     for number in sorted(places):
-        mesh = entry(file.tree, "meshes", number)
-        given = [primitive for primitive in mesh["primitives"] if primitive.get("mode", 4) in (TRIANGLES, STRIP, FAN)]
-        for k, one in enumerate(given):
-            name = f"{mesh.get('name', f'mesh {number}')}{f', primitive {k}' if len(given) > 1 else ''}"
-            try:
-                primitive = Primitive.of(Geometry(arrays, one), images, source)
-            except Fault as fault:
-                raise Fault(f"part {name[:60]!r}: {fault}") from fault.__cause__
+        for name, primitive in primitives(file, number, images, source):
             raw = {"vertices": primitive.positions, "faces": primitive.triangles, "primitive": primitive}
             found += [(name, raw, world) for world in places[number]]
     return found
+
+
+def primitives(file: File, number: int, images: Images, source: Source) -> Iterator[tuple[str, Primitive]]:
+    """The triangles of a mesh, with their names. Raises Fault or FileNotFoundError."""
+    mesh = entry(file.tree, "meshes", number)
+    given = [primitive for primitive in mesh["primitives"] if primitive.get("mode", 4) in (TRIANGLES, STRIP, FAN)]
+    for k, one in enumerate(given):
+        name = f"{mesh.get('name', f'mesh {number}')}{f', primitive {k}' if len(given) > 1 else ''}"
+        try:
+            yield name, Primitive.of(Geometry(images.arrays, one), images, source)
+        except Fault as fault:
+            raise Fault(f"part {name[:60]!r}: {fault}") from fault.__cause__

@@ -33,15 +33,15 @@ def note_unread(tree: dict[str, Any], source: Source) -> None:
         if kind != "extension":
             source.unsupported.note(f"{name!r} of {kind}")
     for name, instead in {"animations": "shown at rest", "skins": "shown in the pose of their binding"}.items():
-        if tree.get(name):
-            source.unsupported.note(name, instead)
+        if tree.get(name) and not source.wanted.rigged:
+            source.unsupported.note(name, f"{instead}; load_rig() has them")
     used = {f"TEXCOORD_{number}" for number in _values(tree.get("materials", []), "texCoord")}
     primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
     attributes = {name for primitive in primitives for name in primitive["attributes"]}
     for name in sorted(name for name in attributes - used if not ATTRIBUTES.fullmatch(name)):
         source.unsupported.note(f"attribute {name}")
-    if any("targets" in primitive for primitive in primitives):
-        source.unsupported.note("morph targets", "shown without")
+    if any("targets" in primitive for primitive in primitives) and not source.wanted.rigged:
+        source.unsupported.note("morph targets", "shown without; load_rig() has them")
     if any(primitive.get("mode", 4) in (0, 1, 2, 3) for primitive in primitives):
         source.unsupported.note("points and lines")
 

@@ -55,6 +55,7 @@ class Wanted(NamedTuple):
     materials: bool = True  # textures and material colours
     lit: bool = False  # materials that scatter light, normals and lights
     split: bool = False  # the objects of an OBJ file apart
+    rigged: bool = False  # what moves the vertices of a glTF
     dtype: torch.dtype | None = None  # of the meshes; None: as precise as the file needs
 
 

@@ -1,0 +1,1 @@
+"""What bends: functions from few numbers to meshes."""

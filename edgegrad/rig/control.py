@@ -1,0 +1,101 @@
+"""The numbers that move a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..check import as_tensor, check_finite, check_shape
+from .rotations import as_matrices
+
+Values = Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """Some numbers that move a rig, under one name.
+
+    rest     their values at rest, of any shape; of rotations (J, 3) rotation vectors, radians
+    low      limits, of the same shape; None: none
+    high
+    names    of the rows: joints, morph targets
+    rotates  whether they are rotations, which posed() also takes as quaternions or matrices
+    """
+
+    rest: Tensor
+    low: Tensor | None = None
+    high: Tensor | None = None
+    names: tuple[str, ...] = ()
+    rotates: bool = False
+
+    def checked(self, name: str) -> Control:
+        """As float64. Raises TypeError or ValueError."""
+        rest = as_tensor(name, self.rest, floating=True).detach().double()
+        check_finite(name, rest)
+        if self.names and (rest.dim() == 0 or len(self.names) != len(rest)):
+            raise ValueError(f"{name}: names: expected one for each row of {tuple(rest.shape)}, got {len(self.names)}")
+        return replace(self, rest=rest).limited(name, self.low, self.high)
+
+    def limited(self, name: str, low: object, high: object) -> Control:
+        """With these limits, which broadcast. Raises ValueError."""
+        bounds = []
+        for side, bound in (("low", low), ("high", high)):
+            tensor = None if bound is None else as_tensor(f"{name}: {side}", bound, floating=True).detach().double()
+            try:
+                bounds.append(None if tensor is None else tensor.expand(self.rest.shape))
+            except RuntimeError as error:
+                raise ValueError(
+                    f"{name}: {side}: expected limits of shape {tuple(self.rest.shape)}, got {tuple(tensor.shape)}"  # type: ignore[union-attr]
+                ) from error
+        if bounds[0] is not None and bounds[1] is not None and bool((bounds[0] > bounds[1]).any()):
+            raise ValueError(f"{name}: expected limits with low ≤ high, got {low} and {high}")
+        return replace(self, low=bounds[0], high=bounds[1])
+
+    def row(self, name: str, which: object) -> int:
+        """Raises ValueError."""
+        if which not in self.names:
+            raise ValueError(f"{name}: expected names among {', '.join(self.names)}, got {which!r}")
+        return self.names.index(str(which))
+
+    def value(self, name: str, given: object) -> Tensor:
+        """As float64, with or without a batch in front; of rotations matrices (…, J, 3, 3). Raises TypeError or ValueError."""
+        if given is None:
+            value = self.rest
+        elif isinstance(given, Mapping):
+            rows = list(as_matrices(name, self.rest, len(self.rest)) if self.rotates else self.rest)
+            for key, row in given.items():
+                one = as_tensor(f"{name}[{key!r}]", row, like=self.rest).double()
+                k = self.row(name, key)
+                if self.rotates:
+                    one = as_matrices(f"{name}[{key!r}]", one[None], 1)[0]
+                check_shape(f"{name}[{key!r}]", one, tuple(rows[k].shape))
+                check_finite(f"{name}[{key!r}]", one)
+                rows[k] = one
+            return torch.stack(rows)
+        else:
+            value = as_tensor(name, given, like=self.rest).double()
+        check_finite(name, value)
+        if self.rotates:
+            return as_matrices(name, value, len(self.rest))
+        check_shape(name, value, tuple(self.rest.shape), ("B", *self.rest.shape))
+        return value
+
+    def within(self, value: Tensor) -> Tensor:
+        """Clamped to the limits."""
+        if self.low is not None:
+            value = torch.maximum(value, self.low.to(value))
+        return value if self.high is None else torch.minimum(value, self.high.to(value))
+
+
+def batch_of(values: Sequence[tuple[str, Tensor, int]]) -> int | None:
+    """The number of poses that values are given for, by their names and dimensions without a batch; None: one. Raises
+    ValueError where they differ."""
+    counts = {name: len(value) for name, value, dims in values if value.dim() > dims}
+    if len(set(counts.values())) > 1:
+        said = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise ValueError(f"expected as many poses of each value, or one for all, got {said}")
+    return next(iter(counts.values()), None)
