@@ -172,8 +172,18 @@ class PoseFit:
 
 
 def pose_from_json(text: str) -> Pose:
-    """The pose alone, from a JSON object with `mesh_to_world`, 4 × 4 by rows. Raises ValueError."""
-    return pose_from_matrix("mesh_to_world", _parsed(text, "mesh_to_world")["mesh_to_world"])
+    """The pose alone, from a JSON object with `mesh_to_world`, 4 × 4 by rows; or from one with `poses`, as `edgegrad track`
+    writes them, of which the last one that is not `lost`. Raises ValueError."""
+    data = _parsed(text)
+    if "poses" not in data:
+        return pose_from_matrix("mesh_to_world", _parsed(text, "mesh_to_world")["mesh_to_world"])
+    rows = data["poses"]
+    if not isinstance(rows, list) or not all(isinstance(row, dict) and "mesh_to_world" in row for row in rows):
+        raise ValueError("poses: expected a list of objects, each with mesh_to_world, as edgegrad track writes them")
+    seen = [row for row in rows if not row.get("lost", False)]
+    if not seen:
+        raise ValueError(f"poses: expected one that is not lost, got {len(rows)}, all lost; give a pose of fit-pose")
+    return pose_from_matrix("mesh_to_world", seen[-1]["mesh_to_world"])
 
 
 def _parsed(text: str, *keys: str) -> dict[str, Any]:
