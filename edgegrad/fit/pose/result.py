@@ -71,7 +71,7 @@ class PoseFit:
     uncertainty: Uncertainty | None = field(default=None, repr=False)
     # Of a fit of several objects, how much of this one the others leave to be seen, 0 … 1. Not kept in JSON
     visible: float = 1.0
-    conflict: str = ""  # of such a fit, in words, with which other object it cannot be; not kept in JSON
+    conflict: str = ""  # in words, which other pose or object it cannot be told from; not kept in JSON
     enough: float = ENOUGH  # of `explained`, for this mesh and picture; not kept in JSON
 
     @property
@@ -83,7 +83,7 @@ class PoseFit:
     @property
     def reason(self) -> str:
         """In words: "converged", or what kept the fit from that: "edges not explained: …", "hidden: …", "in one place: …",
-        "directions unknown: …", "steps ran out: …", "interrupted"."""
+        "looks alike: …", "directions unknown: …", "steps ran out: …", "interrupted"."""
         if not self.interrupted and not self.converged and self.visible < HIDDEN:
             return f"hidden: the other objects leave {self.visible:.0%} of it to be seen; its pose is about its start's"
         if self.conflict and not self.interrupted:
