@@ -35,7 +35,12 @@ def add(commands: Any) -> None:
     parser.add_argument("film", type=Path, metavar="VIDEO_OR_FOLDER", help="a video, or a folder of images, by name")
     add_view(parser)
     parser.add_argument(
-        "--init", type=Path, metavar="POSE.json", required=True, help="pose in the first frame, as fit-pose writes it"
+        "--init",
+        type=Path,
+        metavar="POSE.json",
+        required=True,
+        help="pose in the first frame, as fit-pose writes it; or the poses.json of a film that this one goes on from: the last "
+        "pose that is not lost",
     )
     parser.add_argument("--size", type=count, default=256, help="most pixels on the longer side (%(default)s)")
     parser.add_argument("--spp", type=count, default=8, help="samples a pixel (%(default)s)")

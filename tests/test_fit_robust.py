@@ -377,6 +377,11 @@ def test_pictures_and_masks_of_bytes_are_named():
     bytes_ = (255 * image / image.max()).round()
     with pytest.warns(UserWarning, match=r"target: expected linear radiance.*whole numbers up to 255.*srgb_to_linear"):
         fit_pose(bracket(), bytes_, view, steps=1, progress=False)
+    resized = 40.0 + 0.7 * bytes_  # no whole numbers any more
+    with pytest.warns(
+        UserWarning, match=r"target: expected linear radiance.*got numbers up to 218.*srgb_to_linear\(x / 255"
+    ):
+        fit_pose(bracket(), resized, view, steps=1, progress=False)
     with pytest.raises(
         ValueError, match=r"mask: expected numbers from 0 to 1, got 0 to 255; of 8-bit numbers take x / 255"
     ):
@@ -384,6 +389,19 @@ def test_pictures_and_masks_of_bytes_are_named():
     with pytest.raises(ValueError, match=r"masks\[0\]: expected numbers from 0 to 1"):
         masks = [255.0 * torch.eye(16)]
         fit_scene(bracket(), [view], None, {"meshes[0].verts": 0.01}, masks=masks, progress=False)
+
+
+def test_alpha_is_no_colour_of_a_picture():
+    """It would tell nothing of what surrounds the object, or more than a photograph knows."""
+    view = camera(16)
+    image = torch.cat([picture(view), silhouette(view)[..., None].reshape(16, 16, 1)], -1)
+    words = (
+        r"expected grey or colours, got 4 channels.*read_image\(path, channels=3\), or, .* x\[\.\.\., -1:\] as its mask"
+    )
+    with pytest.raises(ValueError, match="target: " + words):
+        fit_pose(bracket(plain=True), image, view, progress=False)
+    with pytest.raises(ValueError, match="images: " + words):
+        fit_scene(bracket(plain=True), view, image, {"verts": 0.01}, loss="region", progress=False)
 
 
 def test_faint_masks_are_named():

@@ -14,6 +14,7 @@ from PIL import Image
 import edgegrad as eg
 from edgegrad.camera.poses import rotation
 from edgegrad.fit import track
+from edgegrad.fit.pose.result import pose_from_json
 from edgegrad_cli import main
 
 pytest_plugins = "film_fixtures"
@@ -140,6 +141,16 @@ def test_command_line_on_a_folder(film, frames, arguments, tmp_path, capsys):
     drawn = (eg.read_image(out / "frames" / "00000.png", channels=3) - frames[0]).abs().amax(-1) > 0.02
     assert 0.01 < float(drawn.float().mean()) < 0.2
 
+    # The next part of the film goes on from what was found.
+    following = tmp_path / "following"
+    following.mkdir()
+    eg.write_image(following / "3.png", frames[3])
+    *given, _ = arguments("following")
+    again = [str(tmp_path / "again") if argument == str(out) else argument for argument in given]
+    assert main([*again, str(out / "poses.json")]) == 0
+    M = torch.tensor(json.loads((tmp_path / "again" / "poses.json").read_text())["poses"][0]["mesh_to_world"]).double()
+    assert errors(film, 3, M[:3, :3], M[:3, 3])[0] < 1.0
+
     eg.write_image(folder / "3.png", frames[3][:-4])  # of another size
     assert main(arguments("film")) == 2
     assert "frames[3]: expected" in capsys.readouterr().err
@@ -148,6 +159,17 @@ def test_command_line_on_a_folder(film, frames, arguments, tmp_path, capsys):
     with pytest.raises(SystemExit):  # before the first frame
         main([*arguments("film"), "--fps", "100000"])
     assert "--fps: expected 1 to 1000 frames a second, got '100000'" in capsys.readouterr().err
+
+
+def test_a_pose_of_a_film_is_the_last_one_that_is_not_lost():
+    rows = [{"frame": k, "mesh_to_world": torch.eye(4).tolist(), "lost": k == 2} for k in range(3)]
+    for k, row in enumerate(rows):
+        row["mesh_to_world"][0][3] = float(k)
+    assert pose_from_json(json.dumps({"poses": rows})).t[0] == 1.0
+    with pytest.raises(ValueError, match=r"poses: expected one that is not lost, got 1, all lost"):
+        pose_from_json(json.dumps({"poses": rows[2:]}))
+    with pytest.raises(ValueError, match=r"poses: expected a list of objects, each with mesh_to_world"):
+        pose_from_json(json.dumps({"poses": [{}]}))
 
 
 def test_a_hand_that_covers_more_than_half(film):

@@ -20,6 +20,9 @@ from .measured import Measurement, area_mean, measurements
 Images = Tensor | Sequence[Tensor]
 FULL = 0.98  # a mask of more covers the whole pixel
 REACH = 8  # pixels
+WITH_ALPHA = 2, 4  # channels of pictures
+BYTE_ROUNDING = 1e-2  # of 255, by what resizes a picture
+DARKEST_BYTE = 5.0  # median of a picture of 8-bit numbers that are not whole
 FAINT = 0.5  # a mask that covers no pixel by more was read by another curve, or holds labels
 
 
@@ -138,6 +141,7 @@ def outlined_views(views: Sequence[View]) -> list[View]:
             )
         if view.image is None:
             raise ValueError('images: expected a picture for each camera with loss="region", got None')
+        check_without_alpha("images", view.image)
     return [replace(view, outlined=True) for view in views]
 
 
@@ -218,12 +222,22 @@ def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
             "x / 255"
         )
     if not name.startswith("weight") and _is_of_bytes(image):
+        whole = "whole " if bool((image == image.round()).all()) else ""
         warn(
             f"bytes {name}",
-            f"{name}: expected linear radiance, as the scene's colours are, got whole numbers up to {float(image.max()):g}, "
+            f"{name}: expected linear radiance, as the scene's colours are, got {whole}numbers up to {float(image.max()):g}, "
             "as of a picture of 8 bits; take srgb_to_linear(x / 255), or read it with read_image",
         )
     return image.float()
+
+
+def check_without_alpha(name: str, image: Tensor) -> None:
+    """Of a picture (H, W, C) whose colours are all compared, and tell the object from what surrounds it. Raises ValueError."""
+    if (C := image.shape[-1]) in WITH_ALPHA:
+        raise ValueError(
+            f"{name}: expected grey or colours, got {C} channels, of which the last one would be alpha; read it with "
+            f"read_image(path, channels={C - 1}), or, if alpha is 1 on the object alone, give x[..., -1:] as its mask"
+        )
 
 
 def warn_of_faint(name: str, masks: Sequence[Tensor]) -> None:
@@ -238,8 +252,11 @@ def warn_of_faint(name: str, masks: Sequence[Tensor]) -> None:
 
 
 def _is_of_bytes(image: Tensor) -> bool:
-    """Whether it looks like 8-bit numbers that were made floats."""
-    return image.numel() > 0 and 100.0 < float(image.max()) <= 255.0 and bool((image == image.round()).all())
+    """Whether it looks like 8-bit numbers that were made floats, or resized after that. Radiance that reaches so far, as of a
+    picture with a sun in it, is hardly whole, and low in most pixels."""
+    if not image.numel() or not 100.0 < float(image.max()) <= 255.0 + BYTE_ROUNDING:
+        return False
+    return bool((image == image.round()).all()) or float(image.median()) > DARKEST_BYTE
 
 
 def before_black(image: Tensor, mask: Tensor) -> tuple[Tensor, Tensor | None]:

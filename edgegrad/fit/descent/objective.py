@@ -18,7 +18,7 @@ from ..verdict import explained
 from ..views import View, grouped
 from .building import Built, built
 from .loop import Descent
-from .regions import EVERY, Regions
+from .regions import EVERY, LAST, Regions
 from .result import Fit
 
 FINAL_SPP = 64  # samples a pixel of the renders that are judged
@@ -55,12 +55,16 @@ class Objective:
         """Whether a step begins with renew()."""
         return self.regions is not None and step % EVERY == 0
 
+    def narrows(self) -> bool:
+        """Whether the loss is one of a blur that later steps do not have."""
+        return self.regions is not None and self.regions.narrows
+
     def renew(self, tensors: Mapping[str, Tensor], step: int) -> None:
         """What the loss holds fixed between steps is what it is at these values."""
         if self.regions is None:
             return
         for i, alpha in enumerate(self._alphas(tensors, self.options.spp, self.seed(step))):
-            self.regions.renew(i, alpha)
+            self.regions.renew(i, alpha, step)
 
     def check(self, tensors: Mapping[str, Tensor]) -> None:
         """The start, and that the loss depends on all that is sought. Raises ValueError."""
@@ -138,7 +142,7 @@ def judged(objective: Objective, descent: Descent, start: Scene, coordinates: Co
     scene, cameras = built(objective.build, descent.values)
     loss, pairs = 0.0, []
     spp = max(options.spp, FINAL_SPP)
-    objective.renew(descent.values, 0)
+    objective.renew(descent.values, LAST)
     alphas: list[Tensor] = []
     with torch.no_grad():
         for i, view in enumerate(views):

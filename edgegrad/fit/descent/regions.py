@@ -1,24 +1,34 @@
-"""The region term of pictures as a loss: −log(αP + (1 − α)(1 − P)), the mean over what surrounds the object.
+"""Regions and contours of pictures as a loss, the mean over what surrounds the object.
 
-The posterior P is of the colours as a silhouette divides them (region.py). It is held fixed between renewals: with it, the loss
-is a function of the pixels' alpha, each by itself, which a descent can compare from step to step.
+The region term is −log(αP + (1 − α)(1 − P)), with the posterior P of the colours as a silhouette divides them (region.py). It has
+its least where P has its border, which is where the silhouette was: errors of P keep themselves. The contour term, half the
+robust squared difference of the picture from the mixture of the colours on both sides (sides.py), tells where between them a
+border lies. P and the colours of the sides are held fixed between renewals: with them, the loss is a function of the pixels'
+alpha, each by itself, which a descent can compare from step to step.
+
+Alpha is blurred, widely at first, that a step reaches far; the contour term joins when it is as sharp as pictures are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import torch
 from torch import Tensor
 
 from ...files.image import linear_to_srgb
 from ..region import RADIUS, Windows, around, likelihood, palette, posterior, slope, smoothed
-from ..sides import PURE, outlines_explained
+from ..sides import BLUR as SOFT
+from ..sides import PURE, Sides, outlines_explained
 from ..verdict import ENOUGH
 from ..views import View
 
+LAST = 2**20  # a step at which alpha is as sharp as pictures are
 EVERY = 3  # steps from one renewal to the next
 BLUR = 0.7  # pixels, of alpha: that of pictures, and some reach
+FIRST_BLUR, NARROWED = 3.0, 0.6  # pixels at the start, and the factor from one renewal to the next
+TOLERANCE = 12.0  # squared differences, in variances, that are far above this hardly count (Geman and McClure 1987)
 BESIDE = 2.5  # the same, where colours beside the contour are judged
 # Of right fits colours tell the sides apart by 0.70 … 0.81, of wrong ones on edges of clutter by up to 0.69.
 SURE = 0.695
@@ -36,9 +46,12 @@ class Regions:
         self.weights = [None if view.weight is None else view.weight[..., 0] for view in views]
         self.near = [torch.zeros(view.camera.size) for view in views]
         self.posteriors = [torch.full(view.camera.size, 0.5) for view in views]
+        self.sides: list[Sides | None] = [None for _ in views]
+        self.blur = BLUR
 
-    def renew(self, index: int, alpha: Tensor) -> None:
-        """By the silhouette (H, W, 1) that a view shows; without one, what was known stays."""
+    def renew(self, index: int, alpha: Tensor, step: int = LAST) -> None:
+        """By the silhouette (H, W, 1) that a view shows at a step; without one, what was known stays."""
+        self.blur = max(BLUR, FIRST_BLUR * NARROWED ** (step // EVERY))
         share = alpha[..., 0].detach().float()
         near, extent = self.around(index, share)
         if extent > 0.0 and bool((near > 0.0).any()):
@@ -46,6 +59,12 @@ class Regions:
                 (share.shape[0], share.shape[1]), self.labels[index], self.palettes[index].colours, RADIUS * extent
             )
             self.near[index], self.posteriors[index] = near, posterior(windows, share, near)
+            self.sides[index] = Sides.of(self.displays[index], smoothed(share[None], SOFT)[0], near)
+
+    @property
+    def narrows(self) -> bool:
+        """Whether alpha is blurred more than it will be."""
+        return self.blur > BLUR
 
     def around(self, index: int, alpha: Tensor) -> tuple[Tensor, float]:
         """Weights (H, W) of what surrounds the object, and its extent, pixels; 0 where it is not seen."""
@@ -56,18 +75,28 @@ class Regions:
     def loss(self, group: Sequence[int], alpha: Tensor) -> Tensor:
         """Σ of the losses of these views, of their alpha (B, H, W, 1)."""
         P, near = self._of(group)
-        f = likelihood(P, smoothed(alpha[..., 0].float(), BLUR))
-        return -(near * f.double().log()).sum()
+        soft = self.blurred(alpha)
+        found = -likelihood(P, soft).double().log()
+        if (sides := self._sides(group)) is not None:
+            squares = _squares(sides, soft)
+            found = found + 0.5 * sides.band * (squares / (1.0 + squares / TOLERANCE)).double()
+        return (near * found).sum()
 
     def curvature(self, group: Sequence[int], alpha: Tensor) -> Tensor:
-        """(B, H, W) of the same by each pixel's alpha, blurred as `blurred` does: Fisher's information."""
+        """(B, H, W) of the same by each pixel's alpha, blurred as `blurred` does: Fisher's information, and the squares of the
+        mixture's slopes."""
         P, near = self._of(group)
-        return near * slope(P, smoothed(alpha[..., 0].float(), BLUR)).square()
+        soft = self.blurred(alpha)
+        found = slope(P, soft).square()
+        if (sides := self._sides(group)) is not None:
+            robust = (1.0 + _squares(sides, soft) / TOLERANCE).pow(-2)
+            slopes = ((sides.inside - sides.outside).square() / sides.variance).sum(-1)
+            found = found + sides.band * robust * slopes
+        return near * found
 
-    @staticmethod
-    def blurred(tangents: Tensor) -> Tensor:
-        """(n, H, W) as alpha is blurred, from derivatives of alpha (n, H, W, 1)."""
-        return smoothed(tangents[..., 0].float(), BLUR)
+    def blurred(self, images: Tensor) -> Tensor:
+        """(n, H, W) as alpha is blurred, from alpha or its derivatives (n, H, W, 1)."""
+        return smoothed(images[..., 0].float(), self.blur)
 
     def explained(self, alphas: Sequence[Tensor]) -> float:
         """How much of the contour the pictures show, 0 … 1, from alphas (H, W, 1) by which they were renewed: the share of its
@@ -107,3 +136,19 @@ class Regions:
         """Posteriors (B, H, W), and weights whose sum is 1 for each view."""
         near = torch.stack([self.near[i] for i in group])
         return torch.stack([self.posteriors[i] for i in group]), near / near.sum((1, 2), keepdim=True).clamp(min=1e-30)
+
+    def _sides(self, group: Sequence[int]) -> Sides | None:
+        """Of these views, one on the other; None while alpha is blurred widely, or where no view has shown the object."""
+        found = [self.sides[i] for i in group]
+        if self.narrows or any(sides is None for sides in found):
+            return None
+        parts = {f.name: torch.stack([getattr(sides, f.name) for sides in found]) for f in fields(Sides)}
+        pictures = torch.stack([self.displays[i] for i in group])
+        # With the picture taken off, what is mixed is the difference.
+        return Sides(**{**parts, "outside": parts["outside"] - pictures, "inside": parts["inside"] - pictures})
+
+
+def _squares(sides: Sides, alpha: Tensor) -> Tensor:
+    """(B, H, W): squared differences from the mixture by alpha (B, H, W), in variances."""
+    off = sides.outside + alpha[..., None] * (sides.inside - sides.outside)
+    return (off.square() / sides.variance).sum(-1)

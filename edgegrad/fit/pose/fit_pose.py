@@ -7,6 +7,7 @@ shift in units of the object's size, and logarithms of scale and focal length, a
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -30,10 +31,10 @@ from .given import Names, check_max_size
 from .journal import Journal
 from .photo.depth import warn_of_units
 from .photo.match import matches
-from .photo.search import PhotoSearch
+from .photo.search import NEAR, PhotoSearch
 from .photo.starts import Starts, Tell, around, everywhere
 from .place import placed
-from .pose import Pose, pose_from_matrix
+from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit
 from .search import Search
 from .task import Lens, PoseTask
@@ -203,10 +204,11 @@ def search_pose(
         known = None
         if ways.curvature is not None:
             known = Uncertainty.of(task, best, ways.curvature, task.free, symmetries)
-        sure = ways.converged and not interrupted and (known is None or not known.unknown)
+        conflict = _alike(best, ways.alike, symmetries)
+        sure = ways.converged and not interrupted and not conflict and (known is None or not known.unknown)
         return PoseFit(
             best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), seconds(), sure, interrupted,
-            ways.explained, history, task, cameras, known, enough=ways.enough,
+            ways.explained, history, task, cameras, known, conflict=conflict, enough=ways.enough,
         )  # fmt: skip
 
     total = max(ways.planned, journal.steps)
@@ -238,6 +240,18 @@ def search_pose(
         bar.close()
     keep()
     return result()
+
+
+def _alike(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None) -> str:
+    """In words, that another pose may be the right one, if it is not known to be the same; else empty."""
+    same = others if symmetries is None else [other.closest(symmetries, pose) for other in others]
+    apart = max((angle(pose.R, other.R) for other in same), default=0.0)
+    if apart < NEAR:
+        return ""
+    return (
+        f"looks alike: the pictures hardly tell it from a pose that is turned by {math.degrees(apart):.0f}°; give the mesh's "
+        "colours, symmetries of the mesh, depth, or another picture"
+    )
 
 
 def check_tolerance(tolerance: object) -> None:

@@ -71,7 +71,7 @@ class PoseFit:
     uncertainty: Uncertainty | None = field(default=None, repr=False)
     # Of a fit of several objects, how much of this one the others leave to be seen, 0 … 1. Not kept in JSON
     visible: float = 1.0
-    conflict: str = ""  # of such a fit, in words, with which other object it cannot be; not kept in JSON
+    conflict: str = ""  # in words, which other pose or object it cannot be told from; not kept in JSON
     enough: float = ENOUGH  # of `explained`, for this mesh and picture; not kept in JSON
 
     @property
@@ -83,7 +83,7 @@ class PoseFit:
     @property
     def reason(self) -> str:
         """In words: "converged", or what kept the fit from that: "edges not explained: …", "hidden: …", "in one place: …",
-        "directions unknown: …", "steps ran out: …", "interrupted"."""
+        "looks alike: …", "directions unknown: …", "steps ran out: …", "interrupted"."""
         if not self.interrupted and not self.converged and self.visible < HIDDEN:
             return f"hidden: the other objects leave {self.visible:.0%} of it to be seen; its pose is about its start's"
         if self.conflict and not self.interrupted:
@@ -172,8 +172,18 @@ class PoseFit:
 
 
 def pose_from_json(text: str) -> Pose:
-    """The pose alone, from a JSON object with `mesh_to_world`, 4 × 4 by rows. Raises ValueError."""
-    return pose_from_matrix("mesh_to_world", _parsed(text, "mesh_to_world")["mesh_to_world"])
+    """The pose alone, from a JSON object with `mesh_to_world`, 4 × 4 by rows; or from one with `poses`, as `edgegrad track`
+    writes them, of which the last one that is not `lost`. Raises ValueError."""
+    data = _parsed(text)
+    if "poses" not in data:
+        return pose_from_matrix("mesh_to_world", _parsed(text, "mesh_to_world")["mesh_to_world"])
+    rows = data["poses"]
+    if not isinstance(rows, list) or not all(isinstance(row, dict) and "mesh_to_world" in row for row in rows):
+        raise ValueError("poses: expected a list of objects, each with mesh_to_world, as edgegrad track writes them")
+    seen = [row for row in rows if not row.get("lost", False)]
+    if not seen:
+        raise ValueError(f"poses: expected one that is not lost, got {len(rows)}, all lost; give a pose of fit-pose")
+    return pose_from_matrix("mesh_to_world", seen[-1]["mesh_to_world"])
 
 
 def _parsed(text: str, *keys: str) -> dict[str, Any]:

@@ -70,6 +70,7 @@ class Search:
 
     enough = ENOUGH
     curvature = None  # how exactly colours as they are show a pose is not known
+    alike = ()  # nor what looks alike
 
     def __init__(
         self, task: PoseTask, levels: list[Level], start: Pose, steps: int, tolerance: float, seed: int,

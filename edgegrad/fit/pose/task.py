@@ -18,7 +18,7 @@ from ...check import as_tensor, check_finite, check_float, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..region import VISIBLE
-from ..views import area_mean, before_black, check_image, warn_of_faint
+from ..views import area_mean, before_black, check_image, check_without_alpha, warn_of_faint
 from .given import LEAST, Names, depth_of, shots_of
 from .pose import Pose
 
@@ -112,6 +112,8 @@ class PoseTask:
                     f"{names.target}{name}: expected a picture of {LEAST} × {LEAST} pixels or more, got {view.size[1]} × "
                     f"{view.size[0]}; take a larger one"
                 )
+            if plain and mask is None:
+                check_without_alpha(f"{names.target}{name}", image)
             C = image.shape[-1] if plain else scene.channels
             if image.shape[-1] != C:
                 raise ValueError(

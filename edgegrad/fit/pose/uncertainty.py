@@ -22,7 +22,7 @@ WIDEST = 1.0  # radian and object size, the standard deviation of what the pictu
 # standard deviations of independent pixels, as measured.
 TOGETHER = 8.0
 # A direction that is known less exactly than this, in degrees or object sizes, is unknown; so is a focal length, in parts of it.
-DEGREES, SHARE, FOCAL = 5.0, 0.05, 0.05
+DEGREES, SHARE, FOCAL = 2.0, 0.05, 0.05
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,15 @@ TOLERANCE = 12.0  # squared differences, in variances, that are far above this h
 FEWEST = 20  # pixels on the contour
 
 
+def contour_loss(picture: Picture, sides: Sides) -> float:
+    """Of the contour's pixels, half the robust squares of the differences, in variances, less what noise alone leaves of them:
+    poses whose contours are longer are no less likely for that."""
+    squares = ((sides.mixed - picture.outlined).square() / sides.variance).sum(-1)
+    channels = picture.outlined.shape[-1]
+    excess = squares / (1.0 + squares / TOLERANCE) - channels / (1.0 + channels / TOLERANCE)
+    return 0.5 * float((sides.band * picture.weight * excess).sum())
+
+
 def contour_term(picture: Picture, sides: Sides, tangents: Tensor) -> Normal | None:
     """The equations of alpha's derivatives (n, h, w), blurred as alpha was; None where there is hardly any contour."""
     band = sides.band

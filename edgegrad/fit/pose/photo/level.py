@@ -15,7 +15,7 @@ from ....aovs import render_aovs
 from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
 from ....scene.scene import Scene
-from ...region import RADIUS, Palette, Windows, around, palette, posterior, smoothed, told
+from ...region import RADIUS, Palette, Windows, around, likelihood, palette, posterior, smoothed, told
 from ...sides import ALONE_SHOWN, ALONE_TOLD, CONTRAST, PURE, REACH, Sides
 from ...sides import BLUR as CONTOUR_BLUR
 from ...verdict import explained
@@ -25,7 +25,7 @@ from ..jacobian import Motion, Rendered
 from ..observed import motion
 from ..pose import Pose
 from ..task import ZOOM, Level, PoseTask, Shot
-from .contour import contour_term
+from .contour import contour_loss, contour_term
 from .depth import depth_term
 from .light import HARMONICS, Lit
 from .picture import Picture
@@ -170,6 +170,15 @@ class PhotoLevel:
                 if term is not None:
                     curvature, gradient = curvature + term.curvature, gradient + term.gradient
         return Normal(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
+
+    def unlikely(self, pose: Pose, seed: int) -> float:
+        """−log of the likelihood of the pictures by the object's outline alone, regions and contour, in nats of independent
+        pixels, up to a constant that poses of about one size share."""
+        total = 0.0
+        for k, seen in enumerate(self.see(pose, seed)):
+            total -= float((seen.near * likelihood(self._posterior(k, seen), seen.alpha).log()).sum())
+            total += contour_loss(seen.part, seen.sides())
+        return total
 
     def covered(self, pose: Pose, seed: int) -> float:
         """Pixels of the pictures that the object covers by itself."""

@@ -19,6 +19,7 @@ from ..pose import Pose, angle
 from ..result import Step
 from ..search import Search, distinct, norms_of
 from ..task import SHIFT, TURN, Level, PoseTask
+from ..uncertainty import TOGETHER
 from .cover import SIDES, WHOLE, at_one_side, covers, left, weighted
 from .level import PhotoLevel, photo_levels
 
@@ -47,6 +48,9 @@ AS_THEY_ARE = 0.05  # mean change of colours, in parts of them, by light that le
 UNCOVERED = 0.85  # of the object's pixels: with fewer, something covers it
 COVERED_ENOUGH = 0.7  # of the edges, where a way that leaves out a side of the object ends
 NEAR = 0.1  # radians: a polished pose that is farther off is another one
+# Of a contour alone: other ends may be the answer if they are within so many radians of the start. One that is less likely by a
+# smaller factor than exp(this) looks alike.
+REACH, ALIKE = 0.7, 3.0
 
 
 class _End(NamedTuple):
@@ -78,6 +82,7 @@ class PhotoSearch:
         self.history: list[Step] = []
         self.journal = journal or Journal()
         self.after_step: Callable[[], Any] = lambda: None
+        self.alike: list[Pose] = []  # others, which the pictures hardly tell from the answer
         self._answered = False  # later ways do not show until they win
 
     @property
@@ -140,12 +145,15 @@ class PhotoSearch:
             best = self._from_covers(best, begins)
         if self.further and best.explained < self.enough:
             best = self._from_aside(best, begins)
-        if best.explained < self.enough or best is start:
+        if best.explained < self.enough:
             return best
-        best = self._surrounded(best)
-        if self.further and best.explained < SURE and best.left < UNCOVERED:
-            again = self._from_covers(best, begins)
-            best = best if again is best else self._surrounded(again)
+        if best is not start:
+            best = self._surrounded(best)
+            if self.further and best.explained < SURE and best.left < UNCOVERED:
+                again = self._from_covers(best, begins)
+                best = best if again is best else self._surrounded(again)
+        if self.further and self.task.colourless and all(depth is None for depth in self.depths):
+            best = self._of_alike(best, begins)
         return best
 
     def first_end(self) -> float:
@@ -167,6 +175,37 @@ class PhotoSearch:
             if best.explained >= self.enough:
                 break
         return best
+
+    def _of_alike(self, best: _End, begins: int) -> _End:
+        """Of poses whose contours look alike, the one that makes the pictures most likely. Seen from afar, an object and what it
+        is behind a mirror have one contour, so an object that is its own mirror image has it in two poses."""
+        coarse, *finer = self.levels
+        turned = [self.task.moved(self.start, *turn) for turn in turns()]
+        before = len(self.history)
+        self._answered = True
+        here, *ends = (self._follow(coarse, pose)[0] for pose in [best.pose, *turned])
+        costs = self.journal.numbers(lambda: [coarse.unlikely(pose, self.seed) for pose in ends])
+        ends = [ends[k] for k in sorted(range(len(ends)), key=costs.__getitem__)]
+        found = [best]
+        for pose in distinct([here, *ends], 1 + FOLLOWED, APART)[1:]:
+            end = self._judge(*self._down(pose, finer))
+            if end.explained >= self.enough and angle(end.pose.R, self.start.R) < REACH:
+                found.append(end)
+        costs = self.journal.numbers(lambda: [self.levels[-1].unlikely(end.pose, self.seed) for end in found])
+        sure = ALIKE * TOGETHER**2
+        least = min(costs)
+        # One that is hardly likelier is no better an answer, but answers would then depend on the start.
+        won = costs[0] - least > sure
+        answer = found[costs.index(least)] if won else best
+        self.alike = [
+            end.pose for end, cost in zip(found, costs, strict=True) if end is not answer and cost - least < sure
+        ]
+        if not won:
+            self._forget(slice(before, None))
+            return best
+        self._forget(slice(begins, len(self.history)))
+        self._take(answer)
+        return self._surrounded(answer)
 
     def _better(self, best: _End, found: _End, earlier: slice, answered: bool) -> _End:
         """The one that explains more of the edges. Of the other one the history keeps no steps; those `earlier` than the steps to

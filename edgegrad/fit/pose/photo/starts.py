@@ -47,6 +47,7 @@ class Starts:
         self.colours_first = isinstance(one, PhotoSearch) and one.colours_first
         self.best, self.loss, self.converged, self.explained = start, math.nan, False, math.nan
         self.curvature: Tensor | None = None
+        self.alike: list[Pose] = []
         self.history: list[Step] = []
         self.after_step: Callable[[], Any] = lambda: None
         self.tell: Tell = lambda _: None  # called with what is done between steps
