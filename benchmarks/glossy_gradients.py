@@ -2,21 +2,26 @@
 
 The loss is the squared difference to the image of a scene that one parameter tells from this one, without its noise: the gradient
 is that of an image times a fixed residual. Printed is the standard deviation of the gradient over its size, as vectors, in
-percent.
+percent; and where Mitsuba is installed, with its derivatives, how much longer it takes to the same error.
 """
 
 from __future__ import annotations
 
 import math
+import statistics
+import time
 from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 import torch
 from glossy import SIZE, sky
-from table import Bench, Row
+from table import Bench, Row, milliseconds
 from torch import Tensor
 from torch.nn.functional import normalize
 
 import edgegrad as eg
+from edgegrad.report.error_time import mitsuba
 from edgegrad.report.scenes import sphere
 
 Parameters = dict[str, Tensor]
@@ -26,6 +31,7 @@ CHANGES = {
     "normals": 0.02 * torch.tensor([1.0, -0.7, 0.5]), "translation": 0.02 * torch.tensor([1.0, -0.7, 0.5]),
     "texels": 0.3 * torch.rand((8, 16, 3), generator=torch.Generator().manual_seed(1)),
 }  # fmt: skip
+SPP = (4, 16, 64, 256)  # Mitsuba's
 UVS = 0.01 * torch.tensor([1.0, 0.7])
 
 
@@ -72,16 +78,24 @@ def sheet() -> tuple[Parameters, Callable[[Parameters], eg.Scene]]:
     return {"uvs": (verts[:, :2] + 1) / 2}, scene
 
 
-def noise(
-    given: Parameters, scene: Callable[[Parameters], eg.Scene], changes: Parameters, camera: eg.Camera, seeds: int
-) -> dict[str, float]:
-    """Of the gradient by each parameter, all taken at once, in percent."""
+def residuals(
+    given: Parameters, scene: Callable[[Parameters], eg.Scene], changes: Parameters, camera: eg.Camera
+) -> dict[str, Tensor]:
+    """The derivative of each loss by the image, (H, W, 3)."""
 
     def clean(p: Parameters) -> Tensor:
         with torch.no_grad():
             return eg.render(scene(p), camera, spp=64, light_samples=4, seed=900)
 
-    residual = {name: 2 * (clean(given) - clean({**given, name: given[name] + by})) for name, by in changes.items()}
+    return {name: 2 * (clean(given) - clean({**given, name: given[name] + by})) for name, by in changes.items()}
+
+
+def noise(
+    given: Parameters, scene: Callable[[Parameters], eg.Scene], changes: Parameters, camera: eg.Camera, seeds: int
+) -> dict[str, float]:
+    """Of the gradient by each parameter, all taken at once, in percent."""
+
+    residual = residuals(given, scene, changes, camera)
     found: dict[str, list[Tensor]] = {name: [] for name in changes}
     for seed in range(seeds):
         p = {name: value.clone().requires_grad_() for name, value in given.items()}
@@ -96,6 +110,118 @@ def _relative(g: Tensor) -> float:
     """In percent; the square of the mean has its own noise in it, which is taken off."""
     variance = g.var(0).sum()
     return 100 * float((variance / (g.mean(0).square().sum() - variance / len(g)).clamp(min=1e-30)).sqrt())
+
+
+class MitsubaGradients:
+    """The same ball by Mitsuba, of its material `principled`, whose lobe and Fresnel term are glTF's but for details. Its `prb`
+    differentiates at points that are drawn by the light and by the material, and does not differentiate how these are drawn;
+    for what moves silhouettes `prb_projective`. Loss and camera are edgegrad's."""
+
+    KEYS = {
+        "roughness": "ball.bsdf.roughness.value", "metallic": "ball.bsdf.metallic.value",
+        "base color": "ball.bsdf.base_color.value", "normals": "ball.vertex_normals",
+        "translation": "ball.vertex_positions", "texels": "sky.data",
+    }  # fmt: skip
+    PRIMAL = 16  # samples a pixel of the image, edgegrad's default
+
+    def __init__(self, scene: eg.Scene, given: Parameters, residual: dict[str, Tensor]) -> None:
+        self.mi, self.dr = mi, dr = mitsuba._load()
+        dr.set_thread_count(torch.get_num_threads())
+        (mesh,), (light,) = scene.meshes, scene.lights
+        assert isinstance(light, eg.Environment) and mesh.normals is not None
+        turn = mi.ScalarTransform4f
+        sensor = {
+            "type": "perspective", "fov": 40, "fov_axis": "y",
+            "to_world": turn().look_at([0, 0.3, 3.2], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
+        }  # fmt: skip
+        props = mi.Properties()
+        color = {"type": "rgb", "value": given["base color"].tolist()}
+        factors = {name: float(given[name]) for name in ("metallic", "roughness")}
+        props["bsdf"] = mi.load_dict({"type": "principled", "base_color": color, **factors})
+        ball = mi.Mesh("ball", len(mesh.verts), len(mesh.faces), props, has_vertex_normals=True)
+        shape = mi.traverse(ball)
+        shape["vertex_positions"] = mi.Float(mesh.verts.numpy().ravel())
+        shape["vertex_normals"] = mi.Float(mesh.normals.numpy().ravel())
+        shape["faces"] = mi.UInt32(mesh.faces.numpy().astype(np.uint32).ravel())
+        shape.update()
+        radiance = mi.Bitmap(light.radiance.numpy())
+        sky_ = {"type": "envmap", "bitmap": radiance, "to_world": turn().rotate([0, 1, 0], 180)}
+        self.scene = mi.load_dict({"type": "scene", "sensor": sensor, "sky": sky_, "ball": ball})
+        self.integrators = {name: mi.load_dict({"type": name, "max_depth": 2}) for name in ("prb", "prb_projective")}
+        self.params = mi.traverse(self.scene)
+        self.values = {name: type(self.params[key])(self.params[key]) for name, key in self.KEYS.items()}
+        self.residual = {name: mi.TensorXf(r.numpy()) for name, r in residual.items()}
+
+    def __call__(self, name: str, spp: int, seed: int) -> Tensor:
+        """By one parameter."""
+        mi, dr, key = self.mi, self.dr, self.KEYS[name]
+        given = type(self.values[name])(self.values[name])
+        dr.enable_grad(given)
+        self.params[key] = given
+        self.params.update()
+        numbers: dict[str, int] = {"seed": 2 * seed, "seed_grad": 2 * seed + 1}
+        integrator = self.integrators["prb_projective" if name == "translation" else "prb"]
+        if name == "translation":  # as attributes: numbers given to mi.render would hold for both kinds of samples
+            integrator.sppc, integrator.sppp, integrator.sppi = spp, spp, 0
+            self.scene.sensors()[0].sampler().set_sample_count(self.PRIMAL)
+        else:
+            numbers |= {"spp": self.PRIMAL, "spp_grad": spp}
+        image = mi.render(self.scene, self.params, integrator=integrator, **numbers)
+        dr.backward(dr.sum(image * self.residual[name], axis=None))
+        found = torch.from_numpy(np.array(dr.grad(given))).double()
+        self.params[key] = type(given)(self.values[name])
+        if name in ("normals", "translation"):
+            return found.reshape(-1, 3).sum(0)
+        if name == "texels":  # the last column is the first one again
+            data = torch.from_numpy(np.array(self.values[name])).double()
+            shared = (found * data)[..., :3]
+            shared[:, 0] += shared[:, 128:].sum(1)
+            return shared[:, :128].reshape(8, 8, 16, 8, 3).sum((1, 3)).flatten()
+        return found.flatten()
+
+
+def beside_mitsuba(bench: Bench, kind: str, roughness: float, camera: eg.Camera) -> list[Row]:
+    """How many times longer Mitsuba takes to the error that a gradient by default samples has, in processor time. Both sides
+    are unbiased, so that errors are deviations; Mitsuba's are swept over samples and interpolated, from the last on by the
+    square root."""
+    given, scene = ball(kind, roughness)
+    residual = residuals(given, scene, CHANGES, camera)
+    theirs, seeds = MitsubaGradients(scene(given), given, residual), bench.repeats(24)
+
+    def ours(name: str, seed: int) -> Tensor:
+        p = {n: value.clone().requires_grad_(n == name) for n, value in given.items()}
+        (g,) = torch.autograd.grad((eg.render(scene(p), camera, seed=seed) * residual[name]).sum(), p[name])
+        return g.double().flatten()
+
+    rows = []
+    for name in CHANGES:
+        bench.bar.set_postfix_str(f"{kind}, {roughness}, {name}")
+        error, seconds = _measured(lambda seed, n=name: ours(n, seed), seeds)
+        swept = [_measured(lambda seed, n=name, s=spp: theirs(n, s, seed), seeds) for spp in SPP]
+        at_last = swept[-1][1] * (swept[-1][0] / error) ** 2
+        needed = float(np.exp(np.interp(-math.log(error), *np.log([(1 / e, t) for e, t in swept]).T)))
+        needed = at_last if error < swept[-1][0] else needed
+        errors = ", ".join(f"{e:.3g} % in {milliseconds([t])}" for e, t in swept)
+        rows.append(
+            Row(
+                f"… {kind} sky, roughness {roughness}, by {name}: Mitsuba's time over edgegrad's", needed / seconds,
+                unit=" ×", must=10.0, aim=30.0, more_is_better=True,
+                note=f"edgegrad {error:.3g} % in {milliseconds([seconds])}; Mitsuba at {SPP} spp {errors}",
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _measured(gradient: Callable[[int], Tensor], seeds: int) -> tuple[float, float]:
+    """Noise in percent, and seconds of the processor."""
+    gradient(10_000)  # compiled, and warm
+    found, seconds = [], []
+    for seed in range(seeds):
+        begin = time.process_time()
+        found.append(gradient(seed))
+        seconds.append(time.process_time() - begin)
+    return _relative(torch.stack(found)), statistics.median(seconds)
 
 
 def glossy_gradients(bench: Bench) -> list[Row]:
@@ -118,4 +244,7 @@ def glossy_gradients(bench: Bench) -> list[Row]:
     above = eg.Camera.look_at((0.6, -1.2, 2.6), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 45.0, (SIZE, SIZE))
     value = noise(*sheet(), {"uvs": UVS}, above, seeds)["uvs"]
     rows.append(Row("a normal-mapped sheet: gradient by texture coordinates", value, unit=" %", must=40.0, aim=20.0))
+    if mitsuba.available():
+        for kind, roughness in (("even", 0.5), ("even", 0.2), ("lamps", 0.5), ("lamps", 0.2)):
+            rows += beside_mitsuba(bench, kind, roughness, camera)
     return rows

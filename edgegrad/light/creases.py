@@ -15,6 +15,8 @@ from ..scene.lights import SphericalHarmonics
 from . import in_kernel
 from .bsdf import dot, terminator
 
+ABOVE = 0.01  # the horizon, by which a lobe reaches there
+
 
 def note_jumps(hits: Hits) -> None:
     """Notes what of the radiance of materials may jump."""
@@ -36,8 +38,10 @@ def note_jumps(hits: Hits) -> None:
             normals, rows = mesh.normals, mesh.normal_faces
             hits._note_jump(("n", index), _of_scene(surfaces, index, lambda n=normals, r=rows: n[r.long()]))
         if scene.casting:
+            seen_by = hits._view
             hits._note_jump(
-                ("lit", index), _of_scene(surfaces, index, lambda i=index: _shadow_terminators(surfaces, i))
+                ("lit", index),
+                _of_scene(surfaces, index, lambda i=index, v=seen_by: _shadow_terminators(surfaces, i, v)),
             )
 
 
@@ -95,11 +99,12 @@ def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
     return torch.where(away[:, None], -g, g) * (found != 0).any(-1, keepdim=True)
 
 
-def _shadow_terminators(surfaces: Surfaces, index: int) -> Tensor:
+def _shadow_terminators(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
     """(F, 3, K): n·l times the shadow terminator at corners, with interpolated normals n, for each light.
 
     The face's normal g enters through the terminator alone, which is 1 where g·l ≥ (g·n)(n·l). So of a fine mesh only edges near
-    the terminator are creases. An extended light has a terminator for each of its points: then g itself is compared.
+    the terminator are creases. An extended light has a terminator for each of its points: then g itself is compared, and of
+    glossy surfaces the terminator of what a mirror would show, which is where most of the jump is.
     """
     mesh, lights = surfaces.scene.meshes[index], surfaces.scene.casting
     assert mesh.normals is not None
@@ -110,6 +115,12 @@ def _shadow_terminators(surfaces: Surfaces, index: int) -> Tensor:
     n = normalize(mesh.normals.detach().to(g), dim=-1)[rows.long()].reshape(-1, 3)
     n = torch.where(dot(n, g) < 0, -n, n)
     position = mesh.verts.detach().to(g)
+    assert mesh.material is not None
+    if found and mesh.material.is_glossy and isinstance(view, View):
+        v = view.to_viewer(position).to(g)[mesh.faces.long()].reshape(-1, 3)
+        v = torch.where(dot(n, v) < 0, -v, v)
+        l = normalize(2 * dot(n, v) * n - v + ABOVE * n, dim=-1)
+        found.append(terminator(g, n, l).reshape(-1, 3, 1))
     for light in lights:
         if light.punctual:
             l = light.incident(light.draw(position), position).detach()

@@ -27,7 +27,7 @@ from ..scene.material import WRAPS, Parameter, Texture
 from ..scene.mesh import FILTERS, Mesh
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
-from .companions import COMPANIONS, FOURS
+from .companions import COMPANIONS, MOST_FOURS
 from .lamp_trees import hides, least_brightness, tree_of
 from .resampled import DARK
 
@@ -98,7 +98,7 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
             if casting.punctual:
                 hits._note_visibility(light, own)
         fours = shading.in_fours and isinstance(casting, Environment) and surfaces.scene.is_glossy
-        column += 1 if casting.punctual else samples * (FOURS * COMPANIONS if fours else 1)
+        column += 1 if casting.punctual else samples * (MOST_FOURS * COMPANIONS if fours else 1)
     return found.to(surfaces.verts)
 
 

@@ -43,6 +43,9 @@ from .lamp_trees import MeshTowards, tree_of
 from .resampled import Glossy, resampled
 
 FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
+# Where glossy surfaces end or meet, points of a light for each sample of it: these are few points, and what is wanted of them is
+# the difference of both sides.
+AT_CURVES = 4
 
 
 class Lighting(NamedTuple):
@@ -121,7 +124,8 @@ class Lighting(NamedTuple):
         return self._replace(samples=-(-points * self.samples // more)), more
 
     def __call__(self, hits: Hits) -> Tensor:
-        return radiance(hits, *self)
+        more = AT_CURVES if hits._on_curve and self.resamples(hits._surfaces.scene) else 1
+        return radiance(hits, self.shadows, more * self.samples)
 
 
 def _kernel_image(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:
@@ -261,8 +265,8 @@ def _where_seen(hits: Hits, material: Material, total: Tensor) -> Tensor:
 
 
 def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> list[LightPoints]:
-    """`count` points of a light for each point of a surface; where only derivatives are wanted, FOURS times as many fours of an
-    environment for a glossy one."""
+    """`count` points of a light for each point of a surface; where only derivatives are wanted, fours of an environment for a
+    glossy one."""
     lambertian = surface.scattering.roughness is None
     by_light = lambertian or (isinstance(light, MeshLight) and tree_of(light) is None)
     if hits._knows_light(light) or light.punctual or by_light:
@@ -279,7 +283,7 @@ def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> list[
         )
     if hits._needs_values:
         return resampled(light, index, glossy, count)
-    return resampled(light, index, glossy, FOURS * count, in_fours=True)
+    return resampled(light, index, glossy, count, in_fours=True)
 
 
 def _light_sample(hits: Hits, light: Light, points: LightPoints, surface: _Surface, shadows: bool) -> Tensor:
@@ -299,7 +303,7 @@ def _scattered(
     with torch.no_grad():
         l = light.incident(points, surface.position)
         facing = ((dot(surface.n, l) > 0) & (dot(surface.g, l) > 0))[:, 0]
-        facing &= light.shows(points)
+        facing &= light.shows(points) & points.density.isfinite()
     rows = facing.nonzero()[:, 0]
     C = hits._surfaces.scene.channels
     total = surface.position.new_zeros((len(hits), C))

@@ -4,6 +4,7 @@ Talbot et al. 2005). csrc/shading/lit/light_sample.h does the same in the kernel
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from ..scene.lights import Light, LightPoints
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
 from .bsdf import DIELECTRIC, LEAST_ALPHA, Scattering, dot, ggx, masking
-from .companions import COMPANIONS, companions
+from .companions import COMPANIONS, FOURS, MOST_FOURS, companions, seen_aside
 from .lamp_trees import MeshTowards, tree_of
 from .lobes import WIDEST_LOBE, Lobes
 
@@ -92,26 +93,31 @@ def resampled(
     """`count` points for each surface, from random numbers of a stream. Where nothing arrives their density is infinite.
     Surfaces `meets` a mesh that emits; an environment is everywhere the same.
 
-    in_fours   so many directions to an environment with their companions instead (companions.py;
-               csrc/shading/lit/derivative_points.h): what is drawn, weighted and kept are all four of them
+    in_fours   directions to an environment with their companions instead (companions.py; csrc/shading/lit/derivative_points.h):
+               what is drawn, weighted and kept are all four of them; FOURS for each point that is asked for, MOST_FOURS where
+               seen_aside()
     """
     with torch.no_grad():
         lobes = Lobes.of(surfaces.v, surfaces.n, surfaces.roughness)
         N, every = len(surfaces.n), torch.arange(len(surfaces.n), device=surfaces.n.device)
-        together = COMPANIONS if in_fours else 1
+        together, keeps = 1, torch.full_like(every, count)
+        if in_fours:
+            aside = seen_aside(surfaces.v, surfaces.n, surfaces.g)
+            together, keeps, count = COMPANIONS, count * torch.where(aside, MOST_FOURS, FOURS), count * MOST_FOURS
         index = torch.zeros((N, count, together), dtype=torch.int64, device=surfaces.n.device)
-        uv, density = surfaces.n.new_zeros((N, count, together, 2)), surfaces.n.new_zeros((N, count, together))
-        at_once = max(1, AT_ONCE // (EACH * count * together))
+        uv, density = surfaces.n.new_zeros((N, count, together, 2)), surfaces.n.new_full((N, count, together), math.inf)
         asked = lobes.narrow if meets is None else meets.is_drawn_by(lobes)
         small = torch.zeros_like(asked) if meets is None else meets.is_small(lobes)
-        for all in (EACH * count, count):
-            for ask_lobe in (True, False):
-                rows_ = every[(small == (all < EACH * count)) & (asked == ask_lobe)]
-                for rows in rows_.split(at_once) if len(rows_) else ():
-                    some = None if meets is None else meets.select(rows)
-                    drawn = _Drawn(light, stream, surfaces.select(rows), lobes.select(rows), some, together)
-                    pool = drawn.candidates(all, all // 2 if ask_lobe else 0)
-                    index[rows], uv[rows], density[rows] = pool.kept(stream, surfaces.seed[rows], count)
+        for kept, few, ask_lobe in itertools.product(keeps.unique().tolist(), (False, True), (True, False)):
+            all = kept if few else EACH * kept
+            rows_ = every[(keeps == kept) & (small == few) & (asked == ask_lobe)]
+            for rows in rows_.split(max(1, AT_ONCE // (all * together))) if len(rows_) else ():
+                some = None if meets is None else meets.select(rows)
+                drawn = _Drawn(light, stream, surfaces.select(rows), lobes.select(rows), some, together)
+                pool = drawn.candidates(all, all // 2 if ask_lobe else 0)
+                points = pool.kept(stream, surfaces.seed[rows], kept)
+                index[rows, :kept], uv[rows, :kept], density[rows, :kept] = points
+                density[rows] *= kept / count  # they stand for all
         return [
             LightPoints(index[:, s, k], uv[:, s, k], density[:, s, k]) for s in range(count) for k in range(together)
         ]

@@ -52,6 +52,7 @@ class Hits:
     ) -> None:
         self._surfaces, self._view, self._rays_at = surfaces, view, rays_at
         self._needs_values = True  # False: radiance may be zeros that have its derivatives (light/in_kernel.py)
+        self._on_curve = False  # whether it is asked how radiance jumps there
         self._seed = torch.arange(len(face), device=face.device) if seed is None else seed
         self._forced = forced
         self._face, self._exact = face, barycentrics
@@ -92,7 +93,7 @@ class Hits:
         forced = None if self._forced is None else self._forced.select(index)
         place = self._face[index], self._exact[index], pixel
         some = Hits(self._surfaces, view, *place, self._rays_at, steps, self._seed[index], forced)
-        some._needs_values = self._needs_values
+        some._needs_values, some._on_curve = self._needs_values, self._on_curve
         if self._all is None:
             rows = torch.arange(len(self), device=self._face.device)[index] if isinstance(index, slice) else index
             some._all = self, rows

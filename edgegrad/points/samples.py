@@ -145,6 +145,7 @@ class EdgeSamples:
             some = torch.ones_like(lit, dtype=torch.bool)
             forced = Forced(light.number, points.select(of_hits), lit, some, only)
         self.hits = frame.fixed_hits(records.hit_face, records.hit_b, records.hit_x, seed, forced=forced)
+        self.hits._on_curve = True
         flat = frame.request.scene if light is None else frame.surfaces.casters
         forms = [
             (Form(records.row_of, records.vertex, records.by_q), frame.view.in_camera(frame.surfaces.verts)),

@@ -80,6 +80,23 @@ class ResampledFours {
     std::vector<Four> kept_;
 };
 
+// How many fours stand for one sample of a light. Where a face is seen from aside and its normal differs from the
+// shading normal n by a part of that angle, light sets behind the face within the lobe (terminator()): all derivatives
+// are noisier there, and nearly all of the noise of how such surfaces move is theirs.
+template <class S>
+int fours_of(const Surface<S>& o) {
+    constexpr double aside = 0.2, part = 0.1;
+    const Vec3 n = plain(o.n), g = plain(o.g), apart = cross(g, n);
+    const double nv = std::max(dot(n, plain(o.v)), 0.0);
+    return nv < aside && dot(apart, apart) > part * part * nv * nv ? most_fours_for_one : fours_for_one;
+}
+
+// The first `drawn` of `count` points, as if they were all.
+inline void stand_for_all(LightPoint* points, int drawn, int count) {
+    for (int s = 0; s < drawn; ++s) points[s].density *= double(drawn) / count;
+    std::fill(points + drawn, points + count, LightPoint{0, 0, 0, 0});
+}
+
 // The points of all samples of lights.
 template <class S>
 void light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options,
@@ -91,15 +108,13 @@ void light_points(const LitScene& lit, const LitPoints& points, const LitOptions
         if (!draws_fours(lit, options, lamp)) {
             light_points(lit, points, i, number, count, options.dark, o, own);
         } else if (o.scattering.lambertian || points.forced.lamp == number) {
-            // One stands for all.
-            const int samples = options.samples;
-            light_points(lit, points, i, number, samples, options.dark, o, own);
-            for (int s = 0; s < samples; ++s) own[s].density *= double(samples) / count;
-            std::fill(own + samples, own + count, LightPoint{0, 0, 0, 0});
+            light_points(lit, points, i, number, options.samples, options.dark, o, own);
+            stand_for_all(own, options.samples, count);
         } else {
-            const int fours = count / Companions::most;
+            const int fours = options.samples * fours_of(o);
             const Numbers numbers{lamp, uint64_t(points.seed[i])};
             ResampledFours(lit, lamp, numbers, o, fours, options.dark).keep(numbers.of_choice(), fours, own);
+            stand_for_all(own, Companions::most * fours, count);
         }
     }
 }

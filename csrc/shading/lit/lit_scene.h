@@ -112,6 +112,8 @@ struct LightSample {
 // What is cast for one sample of a light, where points come in fours: the image has many more points that are lit, and
 // derivatives have both signs (docs/tried.md).
 constexpr int fours_for_one = 2;
+// The most of them (fours_of() in derivative_points.h).
+constexpr int most_fours_for_one = 8;
 inline bool draws_fours(const LitScene& lit, const LitOptions& options, const Lamp& lamp) {
     return options.in_fours && lamp.kind == Lamp::Kind::environment &&
            std::any_of(lit.meshes.begin(), lit.meshes.end(), [](const LitMesh& mesh) { return !mesh.lambertian; });
@@ -120,7 +122,7 @@ inline std::vector<LightSample> light_samples(const LitScene& lit, const LitOpti
     std::vector<LightSample> out;
     for (int k = 0; k < int(lit.lamps.size()); ++k) {
         if (!lit.lamps[k].casts() || !(options.only < 0 || options.only == k)) continue;
-        const int each = draws_fours(lit, options, lit.lamps[k]) ? fours_for_one * Companions::most : 1;
+        const int each = draws_fours(lit, options, lit.lamps[k]) ? most_fours_for_one * Companions::most : 1;
         const int count = lit.lamps[k].is_punctual() ? 1 : each * options.samples;
         for (int s = 0; s < count; ++s) out.push_back({k, s, count});
     }
