@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..check import as_tensor, check_fields, check_finite, check_float, check_indices, check_integer, check_shape
 from ..library import core
+from .rows import areas, unit
 
 WRAPS: tuple[str, ...] = core.WRAPS  # repeat, clamp, mirror
 LOOKUPS = ("linear", "nearest", "mipmap")
@@ -254,10 +255,6 @@ def vertex_normals(verts: Tensor, faces: Tensor) -> Tensor:
     check_integer("faces", faces)
     check_shape("faces", faces, ("F", 3))
     check_indices("faces", faces, len(verts), "verts")
-    corner = verts[faces.long()]
-    area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    index = faces.long().reshape(-1)
-    total = torch.zeros_like(verts).index_add(0, index, area.repeat_interleave(3, 0))
-    squared = (total * total).sum(1, keepdim=True)
-    some = squared > 0
-    return total * torch.where(some, torch.where(some, squared, 1.0).rsqrt(), 0.0)
+    area, index = areas(verts[faces.long()]), faces.long().reshape(-1)
+    total = torch.zeros_like(verts, dtype=area.dtype).index_add(0, index, area.repeat_interleave(3, 0))
+    return unit(total).to(verts.dtype)
