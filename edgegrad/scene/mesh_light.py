@@ -112,7 +112,8 @@ class MeshLight(Light):
 
     def facing(self, face: Tensor, weights: Tensor, position: Tensor) -> Tensor:
         """(N, 1) float64: cos θ / r² from places on faces, of barycentrics `weights` (N, 3), to `position` (N, 3), times how many
-        times as large as now the faces become; nothing from behind, unless the material is two-sided, nor from a face without area."""
+        times as large as now the faces become; nothing from behind, unless the material is two-sided, nor from a face without
+        area."""
         material = self.mesh.material
         assert material is not None
         normal = self._area(face)
