@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike as OsPath
@@ -20,6 +21,8 @@ from .measured import Measurement, area_mean, measurements
 Images = Tensor | Sequence[Tensor]
 FULL = 0.98  # a mask of more covers the whole pixel
 REACH = 8  # pixels
+HIGHLIGHTS = 0.01  # share of the pixels
+DARKEST = 0.05  # radiance of the brightest pixel: less is no picture of 8 bits
 FAINT = 0.5  # a mask that covers no pixel by more was read by another curve, or holds labels
 
 
@@ -281,3 +284,11 @@ def grouped(views: Sequence[View]) -> list[list[int]]:
         key = *key, view.weight is None, view.sure is None, tuple(view.measured), view.outlined
         groups.setdefault(key, []).append(i)
     return list(groups.values())
+
+
+def white_of(pixels: Tensor) -> float:
+    """Of (N, C) linear radiance: 1 of pictures as files of integers hold them, also dark ones. Of others, in any unit, what one
+    pixel in a hundred is brighter than."""
+    brightest = pixels.amax(1)
+    white = float(brightest.kthvalue(max(1, math.ceil((1.0 - HIGHLIGHTS) * len(brightest)))).values)
+    return white if white > 1.0 or (white > 0.0 and float(brightest.max()) < DARKEST) else 1.0
