@@ -89,7 +89,7 @@ MESH = {
         "verts: expected float32 or float64, got torch.float16",
     ),
     "verts in 2-D": (lambda: mesh(verts=VERTS[:, :2]), V, "verts: expected shape (V, 3), got (8, 2)"),
-    "no verts": (lambda: mesh(verts=VERTS[:0]), V, "verts: expected shape (V, 3), got (0, 3)"),
+    "no verts": (lambda: mesh(verts=VERTS[:0]), V, "verts: expected shape (V, 3), none of them 0, got (0, 3)"),
     "verts not finite": (
         lambda: mesh(verts=put(put(VERTS, (3, 1), NAN), (5, 0), INF)),
         V,
@@ -103,7 +103,7 @@ MESH = {
         ".long()",
     ),
     "quads": (lambda: mesh(faces=FACES.reshape(-1, 4)), V, "faces: expected shape (F, 3), got (9, 4); triangulate"),
-    "no faces": (lambda: mesh(faces=FACES[:0]), V, "faces: expected shape (F, 3), got (0, 3)"),
+    "no faces": (lambda: mesh(faces=FACES[:0]), V, "faces: expected shape (F, 3), none of them 0, got (0, 3)"),
     "face index too large": (
         lambda: mesh(faces=put(FACES, (4, 2), 8)),
         V,

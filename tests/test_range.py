@@ -217,3 +217,17 @@ def test_wrong_options_name_the_function_that_was_called(function):
     with pytest.raises(TypeError, match=rf"^{function.__name__}: expected only the options .*filter.*, got 'bogus'"):
         function(cube(), camera, bogus=1)
     function(cube(), camera, filter="tent")
+
+
+@pytest.mark.parametrize("brightness", [1e-37, 1e37])
+def test_skies_of_any_brightness(brightness: float):
+    """Beside images, for which no number is too large, samples of gradients go by them."""
+    radiance = torch.full((2, 4, 1), brightness, requires_grad=True)
+    ball = cube().replace(colors=None, material=eg.Material(metallic=1.0, roughness=0.5))
+    camera = eg.Camera.look_at((1.0, 1.5, 3.0), (0.0, 0.0, 0.0), size=(12, 12))
+    image = eg.render(eg.Scene([ball], lights=[eg.Environment(radiance)]), camera)
+    image.mean().backward()
+    assert radiance.grad is not None
+    # The image is linear in the sky.
+    total = float((radiance.grad.double() * radiance.detach().double()).sum()) / float(image.detach().double().mean())
+    assert total == pytest.approx(1.0, rel=0.03)

@@ -115,8 +115,8 @@ class Material:
     two_sided     False: seen from behind (vertices clockwise), faces are black and emit nothing
     alpha_mode    "MASK": the mesh's alpha, if it has one, cuts out where it is below its cutoff. "OPAQUE": it must have none.
                   "BLEND": what lies behind shows by 1 − alpha, for up to 8 such surfaces in a row, in the order of their depth;
-                  they cast shadows where alpha is at least ½. Gradients inside faces are there, by alpha too, and those of what
-                  is seen first at each place; what moves at silhouettes behind such a surface has none
+                  they cast shadows where alpha is at least ½. There are gradients inside faces, by alpha too, and
+                  of what moves before and behind such surfaces; none of borders of nearest texels of its alpha and behind it
 
     metallic and roughness both None: a Lambertian surface, f = base / π. Else the metallic-roughness model of glTF 2.0 (appendix
     B): a Lambertian base under microfacets with the GGX distribution, α = roughness² (Walter et al. 2007), Smith's masking with
