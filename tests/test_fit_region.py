@@ -173,7 +173,7 @@ def test_radiance_and_weights_of_any_unit(taken):
         regions = Regions(outlined_views(views_of(VIEW, unit * taken, None, torch.full((96, 96), weight))), 0)
         regions.renew(0, alpha)
         found.append(regions.explained([alpha]))
-    assert found[1] == pytest.approx(found[0], abs=0.05) and found[0] > 0.6
+    assert found[1] == pytest.approx(found[0], abs=0.05) and found[0] > 0.5
 
 
 @pytest.mark.parametrize("method", ["adam", "gauss-newton"])

@@ -303,7 +303,7 @@ def test_damaged_images(tmp_path, suffix):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=rf"a\.{suffix}: expected a whole image") as caught:
             read_image(path)
-        assert str(caught.value).count("ould not open file") < 2  # the library keeps the errors of all its attempts
+        assert str(caught.value).count("ould not open file") <= 2  # the library keeps the errors of all its attempts
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
