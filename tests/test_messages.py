@@ -122,7 +122,11 @@ MESH = {
     ),
     "colors of bytes": (lambda: mesh(colors=VERTS.byte()), T, "colors: expected float32 or float64, got torch.uint8"),
     "colors too few": (lambda: mesh(colors=VERTS[:7]), V, "colors: expected shape (8, C), got (7, 3)"),
-    "colors without channels": (lambda: mesh(colors=VERTS[:, :0]), V, "colors: expected shape (8, C), got (8, 0)"),
+    "colors without channels": (
+        lambda: mesh(colors=VERTS[:, :0]),
+        V,
+        "colors: expected shape (8, C), none of them 0, got (8, 0)",
+    ),
     "face_colors too few": (lambda: mesh(face_colors=VERTS), V, "face_colors: expected shape (12, C), got (8, 3)"),
     "corner_colors flat": (
         lambda: mesh(corner_colors=VERTS),
