@@ -19,6 +19,7 @@ from .kernel.request import Channels, Request, make_request
 from .light.radiance import Lighting
 from .light.whole import lit_image
 from .scene.mesh import Mesh
+from .scene.rows import areas, rows_of, unit
 from .scene.scene import Scene, as_scene
 from .scene.tree import savable
 
@@ -157,25 +158,25 @@ def with_channels(request: Request, names: Sequence[str]) -> Request:
     if "image" not in names:
         flat = flat._replace(colors=flat.colors[:, :0], texels=flat.texels[:, :0], background=flat.background[..., :0])
     faces = flat.faces.long()
-    across = _cross(flat.verts, faces) if "normal" in names or "shading_normal" in names else flat.verts
+    across = areas(rows_of(flat.verts, faces)) if "normal" in names or "shading_normal" in names else flat.verts
     of_vertices = []
     if "position" in names:
         of_vertices.append(flat.verts.expand(request.cameras, -1, -1))
     if "depth" in names:
         axis = camera.world_to_camera[:, 2]  # (B, 4)
         of_vertices.append((axis[:, :3] @ flat.verts.T + axis[:, 3:])[..., None])
-    unit = -1
+    normals = -1
     if "shading_normal" in names:
-        unit = sum(part.shape[-1] for part in of_vertices)
+        normals = sum(part.shape[-1] for part in of_vertices)
         around = flat.verts.new_zeros(flat.verts.shape)
         for corner in range(3):
             around = around.index_add(0, faces[:, corner], across)
-        of_vertices.append(_unit(around).expand(request.cameras, -1, -1))
+        of_vertices.append(unit(around).expand(request.cameras, -1, -1))
     beside = Channels(
         "alpha" in names,
         torch.cat(of_vertices, -1).contiguous() if of_vertices else request.beside.vertex_attributes,
-        unit,
-        _unit(across) if "normal" in names else request.beside.face_attributes,
+        normals,
+        unit(across) if "normal" in names else request.beside.face_attributes,
         "barycentrics" in names,
         "uv" in names,
     )
@@ -189,21 +190,6 @@ def with_channels(request: Request, names: Sequence[str]) -> Request:
         beside=beside,
         gradient=request.gradient._replace(channels_vary=vary),
     )
-
-
-def _cross(verts: Tensor, faces: Tensor) -> Tensor:
-    """(F, 3) normals of faces, as long as twice their areas."""
-    a, b, c = (verts.index_select(0, faces[:, corner]) for corner in range(3))
-    return torch.linalg.cross(b - a, c - a)
-
-
-def _unit(v: Tensor) -> Tensor:
-    """Vectors (n, 3) with the length 1; zero, without a gradient, where there is no direction."""
-    # Of areas: the squares of all that a mesh may have neither overflow nor vanish in double.
-    x, y, z = v.unbind(-1)
-    squared = x * x + y * y + z * z
-    some = squared > 0
-    return v * torch.where(some, torch.where(some, squared, 1.0).rsqrt(), 0.0)[:, None]
 
 
 def _ids(scene: Scene, face: Tensor) -> dict[str, Tensor]:

@@ -87,6 +87,8 @@ def check_shape(name: str, tensor: Tensor, *expected: Sequence[int | str], fix: 
 
     if not any(matches(shape) for shape in expected):
         want = " or ".join(shape_text(shape) for shape in expected)
+        if 0 in tensor.shape and any(len(shape) == tensor.dim() for shape in expected):
+            want += ", none of them 0"
         raise ValueError(f"{name}: expected shape {want}, got {shape_text(tensor.shape)}{fix and '; ' + fix}")
 
 

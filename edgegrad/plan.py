@@ -127,7 +127,7 @@ def _shaded_terms(scene: Scene, request: Request, creases: object, lit: Scene | 
 
 
 def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighting) -> dict[str, Term]:
-    """Materials and lights are shaded in PyTorch, as by a shader."""
+    """Materials and lights are shaded at points of surfaces and curves, as by a shader."""
     terms = _shaded_terms(scene, request, creases, scene)
     lights = sum(1 if light.punctual else lighting.samples for light in scene.casting)
     where = "lit" if scene.is_lit else "seen, with mipmaps"

@@ -89,8 +89,8 @@ def render(
                      pixel at most a quarter of its samples are, or 4 if spp is below 16; in images of glossy surfaces under an
                      Environment all are, with fewer points of lights each and no fewer in all
 
-    A scene with a light, or with a mesh that has a material, is lit: see Scene and Material. It is shaded in PyTorch, as by a
-    `shader`, and its image has the dtype of the vertices.
+    A scene with a light, or with a mesh that has a material, is lit: see Scene and Material. Its image has the dtype of the
+    vertices.
 
     Differentiable once, in reverse and in forward mode, in every floating-point tensor of the scene and the camera; torch.vmap
     and torch.func's transforms work, one element of the batch at a time, all with the same seed; tangents of one image

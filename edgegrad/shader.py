@@ -101,10 +101,10 @@ def render_shaded(
 
 
 def _where_bright(image: Tensor) -> Tensor | None:
-    """(H, W), above zero: a third the same for all pixels, the rest by how bright they are; None if all are black."""
+    """(H, W), 1.5 in the mean: a third the same for all pixels, the rest by how bright they are; None if all are black."""
     size = image.detach().double().abs().mean(2)
     mean = size.mean()
-    return size + 0.5 * mean if mean > 0 else None
+    return size / mean + 0.5 if mean > 0 else None
 
 
 class _Image:

@@ -368,7 +368,7 @@ def test_json_round_trip():
     "text, message",
     [
         ("{", "expected JSON"),
-        ("[]", "expected a JSON object, got list"),
+        ("[]", 'expected a JSON object, got list; write {"mesh_to_world": …}'),
         ("{}", "expected the entry 'mesh_to_world'"),
         ('{"mesh_to_world": [[1, 0], [0, 1]]}', "mesh_to_world: expected shape (4, 4)"),
         ('{"mesh_to_world": "here"}', "mesh_to_world: expected"),
@@ -389,6 +389,11 @@ def test_faults_of_pose_json(text, message):
         ({"mesh": "bracket.obj"}, TypeError, "mesh: expected a Mesh or a Scene, got str"),
         ({"target": torch.zeros(32, 64, 3)}, ValueError, "target: expected shape (64, 64, C), got (32, 64, 3)"),
         ({"target": torch.zeros(64, 64, 4)}, ValueError, "target: expected 3 channels"),
+        (
+            {"target": [torch.zeros(64, 64, 3)] * 2},
+            ValueError,
+            "target: expected one, for the one camera, got a list of 2",
+        ),
         (
             {"target": torch.zeros(64, 64, 3)},
             ValueError,

@@ -303,6 +303,16 @@ def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
     assert fit.explained >= search.ENOUGH and fit.reason == "converged"  # 12.3° and 8.4 % off at the start
 
 
+@pytest.mark.parametrize(("unit", "weight"), [(40.0, 1.0), (1e-3, 1.0), (1.0, 0.01), (1.0, 255.0)])
+def test_radiance_and_weights_of_any_unit(taken, unit, weight):
+    view, image = taken
+    given = {"init": START, "weight": torch.full(view.size, weight), "search": False, "progress": False}
+    fit = fit_pose(bracket(), unit * image, view, **given)
+    off = errors(fit)
+    assert off[0] < 2.5 and off[1] < 0.6 and fit.converged, (off, fit.explained)
+    assert float(fit.uncertainty.degrees) == pytest.approx(2.3, abs=0.1)
+
+
 def test_two_photographs_of_one_pose(taken):
     view, image = taken
     other = eg.Camera.look_at(

@@ -187,6 +187,16 @@ def test_weights_leave_pixels_out(taken):
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
+def test_radiance_and_weights_of_any_unit(taken):
+    alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"])["alpha"]
+    found = []
+    for unit, weight in ((1.0, 1.0), (40.0, 0.01)):
+        regions = Regions(outlined_views(views_of(VIEW, unit * taken, None, torch.full((96, 96), weight))), 0)
+        regions.renew(0, alpha)
+        found.append(regions.explained([alpha]))
+    assert found[1] == pytest.approx(found[0], abs=0.05) and found[0] > 0.5
+
+
 @pytest.mark.parametrize("method", ["adam", "gauss-newton"])
 def test_a_stopped_fit_goes_on_as_if_it_had_not(taken, method, tmp_path):
     """Also between two counts of the colours."""

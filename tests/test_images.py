@@ -301,8 +301,9 @@ def test_damaged_images(tmp_path, suffix):
     whole = path.read_bytes()
     for content in (whole[: len(whole) // 3], b"not an image at all"):
         path.write_bytes(content)
-        with pytest.raises(ValueError, match=rf"a\.{suffix}: expected a whole image"):
+        with pytest.raises(ValueError, match=rf"a\.{suffix}: expected a whole image") as caught:
             read_image(path)
+        assert str(caught.value).count("ould not open file") <= 2  # the library keeps the errors of all its attempts
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

@@ -89,7 +89,7 @@ MESH = {
         "verts: expected float32 or float64, got torch.float16",
     ),
     "verts in 2-D": (lambda: mesh(verts=VERTS[:, :2]), V, "verts: expected shape (V, 3), got (8, 2)"),
-    "no verts": (lambda: mesh(verts=VERTS[:0]), V, "verts: expected shape (V, 3), got (0, 3)"),
+    "no verts": (lambda: mesh(verts=VERTS[:0]), V, "verts: expected shape (V, 3), none of them 0, got (0, 3)"),
     "verts not finite": (
         lambda: mesh(verts=put(put(VERTS, (3, 1), NAN), (5, 0), INF)),
         V,
@@ -103,7 +103,7 @@ MESH = {
         ".long()",
     ),
     "quads": (lambda: mesh(faces=FACES.reshape(-1, 4)), V, "faces: expected shape (F, 3), got (9, 4); triangulate"),
-    "no faces": (lambda: mesh(faces=FACES[:0]), V, "faces: expected shape (F, 3), got (0, 3)"),
+    "no faces": (lambda: mesh(faces=FACES[:0]), V, "faces: expected shape (F, 3), none of them 0, got (0, 3)"),
     "face index too large": (
         lambda: mesh(faces=put(FACES, (4, 2), 8)),
         V,
@@ -122,7 +122,11 @@ MESH = {
     ),
     "colors of bytes": (lambda: mesh(colors=VERTS.byte()), T, "colors: expected float32 or float64, got torch.uint8"),
     "colors too few": (lambda: mesh(colors=VERTS[:7]), V, "colors: expected shape (8, C), got (7, 3)"),
-    "colors without channels": (lambda: mesh(colors=VERTS[:, :0]), V, "colors: expected shape (8, C), got (8, 0)"),
+    "colors without channels": (
+        lambda: mesh(colors=VERTS[:, :0]),
+        V,
+        "colors: expected shape (8, C), none of them 0, got (8, 0)",
+    ),
     "face_colors too few": (lambda: mesh(face_colors=VERTS), V, "face_colors: expected shape (12, C), got (8, 3)"),
     "corner_colors flat": (
         lambda: mesh(corner_colors=VERTS),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from scenes import cube
@@ -78,6 +80,45 @@ def test_products_of_extremes(world: float, radiance: float, adjoint: float):
     factors = {"image": radiance, "verts": both / world, "colors": adjoint, "background": adjoint}
     # Where the loss looks is kept in float, which moves samples a little.
     check_close(found, expected, {**factors, "world_to_camera": both, "K": both}, 2e-3)
+
+
+def shaded(world: float, shader: Callable[[eg.Hits], Tensor] | None) -> tuple[Tensor, Tensor]:
+    """The image of two metal faces under a lamp in other units of length, and its gradient by their vertices in these units."""
+    corners = torch.tensor([[-1.0, -0.9, 0.1], [1.0, -0.8, 0.0], [0.9, 1.0, 0.5], [-1.0, 0.8, 0.3]])
+    verts, faces = (world * corners).requires_grad_(), torch.tensor([[0, 1, 2], [0, 2, 3]])
+    above = world * (0.4 * corners + torch.tensor([1.0, 0.5, 2.0]))
+    lamp = eg.Mesh(above, faces, material=eg.Material(emission=torch.tensor([5.0, 4.0, 3.0])))
+    metal = eg.Mesh(verts, faces, material=eg.Material(metallic=1.0, roughness=0.5))
+    scene = eg.Scene([metal, lamp], lights=[eg.DirectionalLight(torch.tensor([0.2, -0.3, -1.0]), 3.0)])
+    image = eg.render(scene, eg.Camera.look_at((0, 0, 4 * world), (0, 0, 0), size=(12, 12)), shader=shader)
+    image.backward(ADJOINT.to(image.dtype))
+    assert verts.grad is not None
+    return image.detach(), world * verts.grad
+
+
+def irradiance(hits: eg.Hits) -> Tensor:
+    lamp = hits.lights[1]
+    points = hits.light_points(lamp)
+    return lamp.arriving(points, hits.position) * lamp.incident(points, hits.position)
+
+
+@pytest.mark.parametrize(
+    "shader",
+    [None, lambda hits: hits.normal, lambda hits: hits.shading_normal, lambda hits: hits.view, irradiance],
+    ids=["materials", "normal", "shading normal", "view", "irradiance"],
+)
+@pytest.mark.parametrize("power", [-17, -7, 11, 17])
+def test_units_of_length_of_what_is_shaded(shader: Callable[[eg.Hits], Tensor] | None, power: int):
+    """Areas are squares of lengths, and the lengths of normals squares of areas, which floats soon cannot hold. Where within a
+    pixel a shader is asked is a matter of rounding: up to 0.6 %."""
+    for found, expected in zip(shaded(10.0**power, shader), shaded(1.0, shader), strict=True):
+        assert float((found - expected).abs().max()) <= 1e-2 * float(expected.abs().max()) > 0.0
+
+
+@pytest.mark.parametrize("world", [1e-17, 1e17])
+def test_units_of_length_of_vertex_normals(world: float):
+    verts, faces = cube().verts.float(), cube().faces
+    assert torch.allclose(eg.vertex_normals(world * verts, faces), eg.vertex_normals(verts, faces), atol=1e-6)
 
 
 @pytest.mark.parametrize("power", [-37, 37])
@@ -176,3 +217,17 @@ def test_wrong_options_name_the_function_that_was_called(function):
     with pytest.raises(TypeError, match=rf"^{function.__name__}: expected only the options .*filter.*, got 'bogus'"):
         function(cube(), camera, bogus=1)
     function(cube(), camera, filter="tent")
+
+
+@pytest.mark.parametrize("brightness", [1e-37, 1e37])
+def test_skies_of_any_brightness(brightness: float):
+    """Beside images, for which no number is too large, samples of gradients go by them."""
+    radiance = torch.full((2, 4, 1), brightness, requires_grad=True)
+    ball = cube().replace(colors=None, material=eg.Material(metallic=1.0, roughness=0.5))
+    camera = eg.Camera.look_at((1.0, 1.5, 3.0), (0.0, 0.0, 0.0), size=(12, 12))
+    image = eg.render(eg.Scene([ball], lights=[eg.Environment(radiance)]), camera)
+    image.mean().backward()
+    assert radiance.grad is not None
+    # The image is linear in the sky.
+    total = float((radiance.grad.double() * radiance.detach().double()).sum()) / float(image.detach().double().mean())
+    assert total == pytest.approx(1.0, rel=0.03)

@@ -104,6 +104,12 @@ def test_sphere() -> None:
     assert found.error(pose, reference).degrees < 1e-6
 
 
+@pytest.mark.parametrize("scale", [1e-12, 1e12])
+def test_units_of_length(scale: float) -> None:
+    found = eg.find_symmetries(mesh_of(trimesh.creation.box((scale, 2 * scale, 3 * scale)), displaced=False))
+    assert len(found.motions) == 4
+
+
 def test_tolerance() -> None:
     """The corners of a prism of 8 sides stand out by 1 - cos(π/8) of the radius, 0.028 of the size."""
     wide = eg.find_symmetries(mesh_of(prism(8)), 0.04)

@@ -210,9 +210,10 @@ def to_bytes(values: Tensor, linear: bool = False) -> np.ndarray:
 
 
 def _reason(source: object) -> str:
-    """The last error of an OpenImageIO object, on one line."""
+    """The errors of an OpenImageIO object, each once, on one line."""
     try:
-        return " ".join(source.geterror().split()) or "it ends early"  # type: ignore[attr-defined]
+        lines = dict.fromkeys(" ".join(line.split()) for line in source.geterror().splitlines())  # type: ignore[attr-defined]
+        return " ".join(lines) or "it ends early"
     except UnicodeDecodeError:  # it quotes the damaged file
         return "damaged header"
 

@@ -6,8 +6,9 @@ All are numbers without units, so that one weight serves meshes of any scale. ve
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
+
+from ..scene.rows import areas, unit
 
 
 def edges(faces: Tensor) -> Tensor:
@@ -48,8 +49,7 @@ def edge_length(verts: Tensor, faces: Tensor) -> Tensor:
 
 def normal_consistency(verts: Tensor, faces: Tensor) -> Tensor:
     """Mean 1 − n₁·n₂ of faces that share an edge: zero where the surface is flat."""
-    a, b, c = verts[faces.long()].unbind(1)
-    normals = F.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+    normals = unit(areas(verts[faces.long()])).to(verts.dtype)
     first, second = normals[edge_pairs(faces)].unbind(1)
     return (1.0 - (first * second).sum(1)).mean()
 

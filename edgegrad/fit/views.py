@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike as OsPath
@@ -23,6 +24,8 @@ REACH = 8  # pixels
 WITH_ALPHA = 2, 4  # channels of pictures
 BYTE_ROUNDING = 1e-2  # of 255, by what resizes a picture
 DARKEST_BYTE = 5.0  # median of a picture of 8-bit numbers that are not whole
+HIGHLIGHTS = 0.01  # share of the pixels
+DARKEST = 0.05  # radiance of the brightest pixel: less is no picture of 8 bits
 FAINT = 0.5  # a mask that covers no pixel by more was read by another curve, or holds labels
 
 
@@ -298,3 +301,11 @@ def grouped(views: Sequence[View]) -> list[list[int]]:
         key = *key, view.weight is None, view.sure is None, tuple(view.measured), view.outlined
         groups.setdefault(key, []).append(i)
     return list(groups.values())
+
+
+def white_of(pixels: Tensor) -> float:
+    """Of (N, C) linear radiance: 1 of pictures as files of integers hold them, also dark ones. Of others, in any unit, what one
+    pixel in a hundred is brighter than."""
+    brightest = pixels.amax(1)
+    white = float(brightest.kthvalue(max(1, math.ceil((1.0 - HIGHLIGHTS) * len(brightest)))).values)
+    return white if white > 1.0 or (white > 0.0 and float(brightest.max()) < DARKEST) else 1.0

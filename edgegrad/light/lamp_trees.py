@@ -10,7 +10,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from ..library import core
 from ..points.records import values_of
@@ -18,6 +17,7 @@ from ..points.shadow_rays import THIN
 from ..scene.environment import EVEN
 from ..scene.lights import LightPoints
 from ..scene.mesh_light import MeshLight
+from ..scene.rows import unit
 from .bsdf import dot
 from .lobes import Lobes
 
@@ -90,7 +90,7 @@ class MeshTowards(NamedTuple):
 
     def directions(self, place: Tensor) -> Tensor:
         """(N, 3) unit directions to places on the lamp."""
-        return normalize(place.detach() - self.position, dim=1)
+        return unit(place.detach() - self.position)
 
     def solid_angles(self, points: LightPoints) -> Tensor:
         """(N,): |dl/dq| of points, zero where the lamp hides them or shows nothing."""

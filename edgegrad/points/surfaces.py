@@ -14,7 +14,7 @@ from ..kernel.derivatives import transformed
 from ..kernel.flat import Flat
 from ..scene.appearance import coordinates
 from ..scene.mikktspace import Fans
-from ..scene.rows import columns, dot, rows_of, scaled
+from ..scene.rows import areas, columns, dot, rows_of, scaled, unit
 from ..scene.scene import Scene
 from .moving import barycentrics, barycentrics_by
 from .pyramid import Pyramid
@@ -100,9 +100,9 @@ class Surfaces:
     def vertex_normals(self) -> Tensor:
         """(V, 3) unit normals: means of the normals of the faces at each index, weighted by area."""
         corner = rows_of(self.verts, self.faces)
-        area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-        index = self.faces.reshape(-1)
-        return normalize(torch.zeros_like(self.verts).index_add(0, index, area.repeat_interleave(3, 0)), dim=-1)
+        area, index = areas(corner), self.faces.reshape(-1)
+        total = torch.zeros_like(self.verts, dtype=area.dtype).index_add(0, index, area.repeat_interleave(3, 0))
+        return unit(total).to(self.verts.dtype)
 
     def tangents(self, index: int) -> Tensor | None:
         """(F, 3, 4) of a mesh whose normals are interpolated and bent by a map: see Fans."""
@@ -127,8 +127,7 @@ class Surfaces:
         return rows_of(self.verts, rows_of(self.faces, face))
 
     def face_normals(self, face: Tensor) -> Tensor:
-        corner = self.corners(face)
-        return normalize(torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=-1)
+        return unit(areas(self.corners(face))).to(self.verts.dtype)
 
     def crease_attributes(self) -> Tensor:
         """(F, 3, K): all properties that may jump and were asked for, each divided by its largest value."""
@@ -216,7 +215,7 @@ class View:
 
     def to_viewer(self, points: Tensor) -> Tensor:
         """(N, 3) unit directions, float64."""
-        return normalize(self.eye - points.double(), dim=-1) if self.perspective else self.eye.expand(len(points), 3)
+        return unit(self.eye - points.double()) if self.perspective else self.eye.expand(len(points), 3)
 
 
 class Rays(NamedTuple):
@@ -240,4 +239,4 @@ class Rays(NamedTuple):
         return dot(points.double() - self.origin, d) / dot(d, d)
 
     def to_viewer(self, points: Tensor) -> Tensor:
-        return -normalize(self.direction, dim=-1)
+        return -unit(self.direction)

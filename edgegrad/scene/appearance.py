@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 from .material import Parameter, Texture
 from .mesh import PLAIN, Mesh
 from .mikktspace import tangents
-from .rows import columns, rows_of, scaled
+from .rows import columns, rows_of, scaled, unit
 from .textures import look_up
 
 # (texture, uv, wraps, filter, uv at the corners of faces) to (N, C)
@@ -110,7 +110,7 @@ class OnMesh(NamedTuple):
         tangent, hand = self._tangent(material.normal_map)
         t = tangent - n * (n * tangent).sum(1, keepdim=True)
         there = (t.detach() * t.detach()).sum(1, keepdim=True) > 0  # else there is no frame
-        t = normalize(torch.where(there, t, 1.0), dim=-1)
+        t = unit(torch.where(there, t, 1.0))
         bitangent = hand * torch.linalg.cross(n, t)
         m = scale * (bent[:, 0:1] * t + bent[:, 1:2] * bitangent) + bent[:, 2:3] * n
         m = torch.where(there & ((m.detach() * m.detach()).sum(1, keepdim=True) > 0), m, n)
@@ -155,5 +155,5 @@ def jumps(mesh: Mesh, of_corners: Tensor | None) -> Tensor:
         # Of each face, they jump at every edge of a curved mesh.
         uvs, uv_faces = coordinates(mesh, material.normal_map)
         tangent, hand = tangents(mesh.verts[mesh.faces.long()], uvs.to(mesh.verts)[uv_faces.long()])
-        found.append((hand * normalize(tangent, dim=-1))[:, None].expand(-1, 3, -1))
+        found.append((hand * unit(tangent.double()))[:, None].expand(-1, 3, -1))
     return columns([scaled(part.detach().to(mesh.verts)) for part in found], len(mesh.faces), mesh.verts)

@@ -15,6 +15,7 @@ from ..check import check_fields, check_positive_int, check_shape, values_visibl
 from .affine import Affine, check_rotation
 from .material import Material, numbers
 from .mesh import Mesh
+from .rows import unit
 
 
 class LightPoints(NamedTuple):
@@ -81,8 +82,8 @@ class Light:
 
     def incident(self, points: LightPoints, position: Tensor) -> Tensor:
         """(N, 3) unit directions from positions (N, 3), or (1, 3) of what is the same for all. Differentiable."""
-        place = self.place(points).to(position)
-        return place if self.infinite else normalize(place - position, dim=-1)
+        place = self.place(points)
+        return place.to(position) if self.infinite else unit(place.double() - position.double()).to(position)
 
     # -- what the classes share ---------------------------------------------------------------------------------------
 
@@ -136,7 +137,7 @@ class DirectionalLight(Light):
         return self.replace(direction=affine.vectors(self.direction))
 
     def place(self, points: LightPoints) -> Tensor:
-        return -unit(self.direction).expand(len(points.index), 3)
+        return -direction_of(self.direction).expand(len(points.index), 3)
 
     def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
         return self._power(position).expand(len(position), -1)
@@ -221,15 +222,16 @@ class SpotLight(Light):
 
     def arriving(self, points: LightPoints, position: Tensor) -> Tensor:
         away = position - self.position.to(position)
-        cosine = normalize(away, dim=-1) @ unit(self.direction).to(position)
+        cosine = unit(away.double()).to(position) @ direction_of(self.direction).to(position)
         inner, outer = (torch.as_tensor(a).to(position).cos() for a in (self.inner_angle, self.outer_angle))
         scale = 1 / (inner - outer).clamp(min=1e-3)  # glTF's own limit
         ramp = ((cosine - outer) * scale).clamp(0, 1) ** 2
         return self._power(position) * ramp[:, None] * inverse_square(away)
 
 
-def unit(direction: Tensor) -> Tensor:
-    """(3,) of any length but zero: scaled first, for squares of short ones vanish and of long ones overflow."""
+def direction_of(direction: Tensor) -> Tensor:
+    """(3,) unit vector of one of any length but zero: scaled first, for squares of short ones vanish and of long ones
+    overflow."""
     return normalize(direction / direction.detach().abs().max(), dim=0)
 
 

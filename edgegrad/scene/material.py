@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..check import as_tensor, check_fields, check_finite, check_float, check_indices, check_integer, check_shape
 from ..library import core
+from .rows import areas, unit
 
 WRAPS: tuple[str, ...] = core.WRAPS  # repeat, clamp, mirror
 LOOKUPS = ("linear", "nearest", "mipmap")
@@ -114,8 +115,8 @@ class Material:
     two_sided     False: seen from behind (vertices clockwise), faces are black and emit nothing
     alpha_mode    "MASK": the mesh's alpha, if it has one, cuts out where it is below its cutoff. "OPAQUE": it must have none.
                   "BLEND": what lies behind shows by 1 − alpha, for up to 8 such surfaces in a row, in the order of their depth;
-                  they cast shadows where alpha is at least ½. Gradients inside faces are there, by alpha too, and those of what
-                  is seen first at each place; what moves at silhouettes behind such a surface has none
+                  they cast shadows where alpha is at least ½. There are gradients inside faces, by alpha too, and
+                  of what moves before and behind such surfaces; none of borders of nearest texels of its alpha and behind it
 
     metallic and roughness both None: a Lambertian surface, f = base / π. Else the metallic-roughness model of glTF 2.0 (appendix
     B): a Lambertian base under microfacets with the GGX distribution, α = roughness² (Walter et al. 2007), Smith's masking with
@@ -254,10 +255,6 @@ def vertex_normals(verts: Tensor, faces: Tensor) -> Tensor:
     check_integer("faces", faces)
     check_shape("faces", faces, ("F", 3))
     check_indices("faces", faces, len(verts), "verts")
-    corner = verts[faces.long()]
-    area = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    index = faces.long().reshape(-1)
-    total = torch.zeros_like(verts).index_add(0, index, area.repeat_interleave(3, 0))
-    squared = (total * total).sum(1, keepdim=True)
-    some = squared > 0
-    return total * torch.where(some, torch.where(some, squared, 1.0).rsqrt(), 0.0)
+    area, index = areas(verts[faces.long()]), faces.long().reshape(-1)
+    total = torch.zeros_like(verts, dtype=area.dtype).index_add(0, index, area.repeat_interleave(3, 0))
+    return unit(total).to(verts.dtype)

@@ -51,8 +51,8 @@ class Mesh:
     wrap           what lies beyond the rim of both images: "repeat", "clamp" (the texels at the rim go on) or "mirror"; or
                    a pair of these, for u and v
     filter         "linear" between the centres of texels; "nearest", the texel that the point lies in; "mipmap", for a texture
-                   finer than the pixels: its means over squares of 2, 4, 8 … texels, as of eg.Texture. Shaded in PyTorch, so
-                   slower, and not for screen_gradient(); alpha is then looked up as "linear"
+                   finer than the pixels: its means over squares of 2, 4, 8 … texels, as of eg.Texture. It takes 1.2 to
+                   1.5 times as long, and is not for screen_gradient(); alpha is then looked up as "linear"
     material       how it scatters light, and what it emits: then the colours above are base colours. None: it is not lit, and
                    colours are radiance
     normals        (N, 3) float   normals, of any length, interpolated over the faces where a material is lit; without, faces

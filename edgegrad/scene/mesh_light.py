@@ -6,13 +6,13 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from .appearance import OnMesh, coordinates
 from .environment import EVEN, pick
 from .lights import Light, LightPoints
 from .material import Texture
 from .mesh import Mesh
+from .rows import areas, dot, unit
 from .texel_borders import TexelBorders
 
 
@@ -34,16 +34,15 @@ class MeshLight(Light):
         return OnMesh(self.mesh, face, b).value(material.emission)
 
     def _area(self, face: Tensor) -> Tensor:
-        """(N, 3) normals of faces, as long as their areas."""
-        corner = self.mesh.verts[self.mesh.faces[face].long()]
-        return torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
+        """(N, 3) float64, normals of faces, as long as their areas."""
+        return areas(self.mesh.verts[self.mesh.faces[face].long()]) / 2
 
     @cached_property
     def _powers(self) -> tuple[Tensor, Tensor]:
         """(F,) float64: areas of faces, and areas times the mean magnitude of what they emit."""
         with torch.no_grad():
             face = torch.arange(len(self.mesh.faces), device=self.mesh.verts.device)
-            area = self._area(face).double().norm(dim=1)
+            area = self._area(face).norm(dim=1)
             total: Tensor = torch.zeros((), dtype=torch.float64)
             for b in ((1.0, 1.0, 1.0), (4.0, 1.0, 1.0), (1.0, 4.0, 1.0), (1.0, 1.0, 4.0)):
                 weights = torch.tensor(b, dtype=self.mesh.verts.dtype, device=self.mesh.verts.device).expand(
@@ -105,24 +104,24 @@ class MeshLight(Light):
         material = self.mesh.material
         assert material is not None
         weights = self._weights(points)
-        radiance = self._emission(points.index, weights.to(self.mesh.verts)).to(position)
-        density = points.density[:, None].to(position)
+        radiance = self._emission(points.index, weights.to(self.mesh.verts))
+        density = points.density[:, None]
         drawn = density > 0
-        return torch.where(
-            drawn, radiance * self.facing(points.index, weights, position) / torch.where(drawn, density, 1.0), 0.0
-        )
+        facing = self.facing(points.index, weights, position) / torch.where(drawn, density, 1.0)
+        return torch.where(drawn, radiance * facing, 0.0).to(position)
 
     def facing(self, face: Tensor, weights: Tensor, position: Tensor) -> Tensor:
-        """(N, 1): cos θ / r² from places on faces, of barycentrics `weights` (N, 3), to `position` (N, 3), times how many times
-        as large as now the faces become; nothing from behind, unless the material is two-sided, nor from a face without area."""
+        """(N, 1) float64: cos θ / r² from places on faces, of barycentrics `weights` (N, 3), to `position` (N, 3), times how many
+        times as large as now the faces become; nothing from behind, unless the material is two-sided, nor from a face without
+        area."""
         material = self.mesh.material
         assert material is not None
-        normal = self._area(face).to(position)
-        away = position - self._at(face, weights).to(position)
+        normal = self._area(face)
+        away = position.double() - self._at(face, weights)
         squared = (away * away).sum(1, keepdim=True)
         area = normal.detach().norm(dim=1, keepdim=True)
         some = (squared > 0) & (area > 0)
-        cosine = (normal * normalize(away, dim=1)).sum(1, keepdim=True) / torch.where(some, area, 1.0)
+        cosine = dot(normal, unit(away))[:, None] / torch.where(some, area, 1.0)
         cosine = cosine.abs() if material.two_sided else cosine.clamp(min=0)
         return torch.where(some, cosine / torch.where(some, squared, 1.0), 0.0)
 
@@ -148,5 +147,5 @@ class MeshLight(Light):
             assert self.texture is not None
             with torch.no_grad():
                 face = torch.arange(len(self.mesh.faces), device=self.mesh.verts.device)
-                self._borders = (TexelBorders.of(self.mesh, self.texture, self._area(face).double().norm(dim=1), u),)
+                self._borders = (TexelBorders.of(self.mesh, self.texture, self._area(face).norm(dim=1), u),)
         return self._borders[0]

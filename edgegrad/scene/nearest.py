@@ -35,6 +35,8 @@ class Surface:
         corners = [mesh.verts.detach().cpu().double()[mesh.faces.cpu().long()].numpy() for mesh in scene.meshes]
         self.triangles = np.concatenate(corners)  # (F, 3, 3)
         self._first = np.cumsum([0, *(len(one) for one in corners)])
+        low, high = self.triangles.min((0, 1)), self.triangles.max((0, 1))
+        self._middle, self._extent = 0.5 * (low + high), float((high - low).max()) or 1.0
         across = np.cross(self.triangles[:, 1] - self.triangles[:, 0], self.triangles[:, 2] - self.triangles[:, 0])
         length = np.linalg.norm(across, axis=1)
         self.area = 0.5 * length
@@ -68,7 +70,12 @@ class Surface:
 
         count = min(neighbours, len(self._face))
         face = self._face[self._tree.query(points, k=count)[1].reshape(len(points), count)]
-        on_faces = closest_point(self.triangles[face].reshape(-1, 3, 3), np.repeat(points, count, axis=0))
+        # closest_point() has tolerances that are meant for sizes about 1.
+        triangles, around = (
+            (one - self._middle) / self._extent
+            for one in (self.triangles[face].reshape(-1, 3, 3), np.repeat(points, count, axis=0))
+        )
+        on_faces = closest_point(triangles, around) * self._extent + self._middle
         on_faces = on_faces.reshape(len(points), count, 3)
         best = np.linalg.norm(on_faces - points[:, None], axis=2).argmin(1)[:, None]
         face = np.take_along_axis(face, best, 1)[:, 0]

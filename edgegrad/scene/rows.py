@@ -18,6 +18,21 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
 
 
+def unit(v: Tensor) -> Tensor:
+    """(…, 3) vectors with the length 1; zero, without a derivative, where there is no direction. Of areas in double, squares of
+    all that a mesh may have neither overflow nor vanish."""
+    x, y, z = v.unbind(-1)
+    squared = x * x + y * y + z * z
+    some = squared > 0
+    return v * torch.where(some, torch.where(some, squared, 1.0).rsqrt(), 0.0)[..., None]
+
+
+def areas(corners: Tensor) -> Tensor:
+    """(F, 3) float64, normals of triangles (F, 3, 3), as long as twice their areas."""
+    a, b, c = corners.double().unbind(1)
+    return torch.linalg.cross(b - a, c - a)
+
+
 def interpolated(b: Tensor, corners: Tensor) -> Tensor:
     """(N, K) from barycentrics (N, 3) and values at corners (N, 3, K). A matrix product would lose digits under autocast."""
     return b[:, :1] * corners[:, 0] + b[:, 1:2] * corners[:, 1] + b[:, 2:] * corners[:, 2]

@@ -22,7 +22,7 @@ from ..region import RADIUS, Windows, around, likelihood, palette, posterior, sl
 from ..sides import BLUR as SOFT
 from ..sides import PURE, Sides, outlines_explained
 from ..verdict import ENOUGH
-from ..views import View
+from ..views import View, white_of
 
 LAST = 2**20  # a step at which alpha is as sharp as pictures are
 EVERY = 3  # steps from one renewal to the next
@@ -40,10 +40,13 @@ class Regions:
 
     def __init__(self, views: Sequence[View], seed: int) -> None:
         pictures = [view.image for view in views if view.image is not None]
-        self.displays = [linear_to_srgb(picture.clamp(0.0, 1.0)) for picture in pictures]
+        whites = [white_of(picture.flatten(0, 1)) for picture in pictures]
+        shown = [picture / white for picture, white in zip(pictures, whites, strict=True)]
+        self.displays = [linear_to_srgb(picture.clamp(0.0, 1.0)) for picture in shown]
         self.palettes = [palette(display, seed) for display in self.displays]
         self.labels = [own.labels(display) for display, own in zip(self.displays, self.palettes, strict=True)]
-        self.weights = [None if view.weight is None else view.weight[..., 0] for view in views]
+        most = max((float(view.weight.max()) for view in views if view.weight is not None), default=1.0)
+        self.weights = [None if view.weight is None else view.weight[..., 0] / most for view in views]
         self.near = [torch.zeros(view.camera.size) for view in views]
         self.posteriors = [torch.full(view.camera.size, 0.5) for view in views]
         self.sides: list[Sides | None] = [None for _ in views]

@@ -90,7 +90,7 @@ def fit_pose(
     background  without a mask, what stands behind the object: a number, (C,) or (H, W, C); when None, the scene's own, or
                 else the median colour of the picture's border. If the border has many colours, the background counts as
                 unknown: then only what the object covers is compared
-    weight      (H, W) or (H, W, 1), from 0: how much a pixel counts
+    weight      (H, W) or (H, W, 1), from 0: how much a pixel counts, beside the one that counts most
     depth       (H, W) or (H, W, 1), as a depth camera measures it from where the picture was taken: distances along +Z of the
                 camera in world units, 0 or NaN where there is none; or a list of them
     max_size    a larger picture is reduced to so many pixels on its longer side

@@ -42,6 +42,10 @@ def shots_of(camera: Any, target: Any, mask: Any, weight: Any, names: Names) -> 
         if value is None and not needed:
             columns.append([None] * len(cameras))
         elif not several:
+            if isinstance(value, Sequence) and any(hasattr(one, "shape") for one in value):
+                raise ValueError(
+                    f"{name}: expected one, for the one camera, got a list of {len(value)}; give a list of cameras too"
+                )
             columns.append([value])
         else:
             columns.append(one_for_each(name, value, len(cameras), 2 if name in of_masks else 3))

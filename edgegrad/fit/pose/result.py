@@ -192,7 +192,8 @@ def _parsed(text: str, *keys: str) -> dict[str, Any]:
     except json.JSONDecodeError as error:
         raise ValueError(f"pose: expected JSON, got text that is not ({error})") from None
     if not isinstance(data, dict):
-        raise ValueError(f"pose: expected a JSON object, got {type(data).__name__}; write {{…}}")
+        wanted = f"{{{json.dumps(keys[0])}: …}}"
+        raise ValueError(f"pose: expected a JSON object, got {type(data).__name__}; write {wanted}")
     if missing := [key for key in keys if key not in data]:
         raise ValueError(f"pose: expected the entry {missing[0]!r}, got {', '.join(data) or 'none'}; add it")
     return data

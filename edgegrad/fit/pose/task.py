@@ -18,7 +18,7 @@ from ...check import as_tensor, check_finite, check_float, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..region import VISIBLE
-from ..views import area_mean, before_black, check_image, check_without_alpha, warn_of_faint
+from ..views import area_mean, before_black, check_image, check_without_alpha, warn_of_faint, white_of
 from .given import LEAST, Names, depth_of, shots_of
 from .pose import Pose
 
@@ -88,6 +88,7 @@ class PoseTask:
     size: float  # its diagonal at the start, world units
     free: list[int]  # entries of a step that are sought
     names: Names
+    white: float = 1.0  # radiance of the brightest that pictures show, but for highlights, where it is not about 1
 
     @staticmethod
     def of(
@@ -147,6 +148,8 @@ class PoseTask:
             scene = scene.replace(meshes=[_grey(part, shots[0].target.shape[-1]) for part in scene.meshes])
         if clutter:
             shots = [shot._replace(background=None) for shot in shots]
+        most = max((float(shot.weight.max()) for shot in shots if shot.weight is not None), default=1.0)
+        shots = [shot if shot.weight is None else shot._replace(weight=shot.weight / most) for shot in shots]
         aovs = ("image", "alpha") if clutter or (mask is not None and not plain) else ("image",)
         aovs = ("alpha",) if mask is not None and plain else aovs
 
@@ -181,7 +184,9 @@ class PoseTask:
                 f"{names.mask}: expected the object in {VISIBLE} pixels or more, got it in {most}; is it the object's mask?"
             )
         bare = scene.replace(meshes=double, background=None)
-        return PoseTask(bare, aovs, shots, clutter, colourless, extent, (low + high) / 2, size, free, names)
+        shown = seen[:, :-1] if mask is not None and not plain else seen
+        white = 1.0 if aovs == ("alpha",) else white_of(shown)
+        return PoseTask(bare, aovs, shots, clutter, colourless, extent, (low + high) / 2, size, free, names, white)
 
     def pyramid(self, start: Pose, max_size: int, spp: int) -> list[Level]:
         """From coarse to fine. Raises ValueError when the object is behind the camera."""

@@ -367,7 +367,7 @@ class Tracker:
         )
         # Whatever stands behind the object: a film shows it from more than one side.
         task = replace(task, clutter=True, shots=[task.shots[0]._replace(background=None)])
-        whole = Picture.of(task.shots[0], False, None, self.camera.size)
+        whole = Picture.of(task.shots[0], False, None, self.camera.size, task.white)
         self.palettes = [palette(whole.outlined, self.seed)]
         return task
 

@@ -265,7 +265,10 @@ def photo_levels(
     levels = []
     for k, n in enumerate(halved):
         sizes = [_reduced(shot.camera.size, f / 2**n) for shot, f in zip(shots, finest, strict=True)]
-        pictures = [Picture.of(shot, masked, depth, size) for shot, depth, size in zip(shots, cut, sizes, strict=True)]
+        pictures = [
+            Picture.of(shot, masked, depth, size, task.white)
+            for shot, depth, size in zip(shots, cut, sizes, strict=True)
+        ]
         smaller = [shot._replace(camera=picture.camera) for shot, picture in zip(shots, pictures, strict=True)]
         blur = BLURS[k] if k < len(BLURS) else 0.0
         # Perspective shows in fine detail only: on the coarsest level the focal length would run away.

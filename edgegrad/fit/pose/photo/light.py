@@ -91,13 +91,13 @@ class Lit:
         image = predicted.movedim(0, -1)
         return Lit(surface, image, light, residual, robust * whole, middle, B, scale, slopes, ridge)
 
-    @property
-    def change(self) -> float:
-        """How much the light changes the mesh's colours, in parts of them: 0 where it leaves them as they are."""
+    def change(self, white: float) -> float:
+        """How much the light changes the mesh's colours, in parts of them: 0 where it leaves them as they are. `white`: the
+        radiance that the picture has as 1."""
         inside = self.surface.inside
         colour = self.surface.channels["image"].float()[inside]
         irradiance = spherical(self.surface.normals[inside])[..., : self.coefficients.shape[1]] @ self.coefficients.T
-        return float((colour * (irradiance - 1.0)).abs().mean() / colour.abs().mean().clamp(min=1e-30))
+        return float((colour * (white * irradiance - 1.0)).abs().mean() / colour.abs().mean().clamp(min=1e-30))
 
     def difference(self, light: Tensor) -> Tensor:
         """(N,): how far the picture inside is from the surface in another light (C, n), scaled as `residual` is."""

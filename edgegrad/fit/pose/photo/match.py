@@ -106,9 +106,10 @@ class Mips:
         """`finest`: pixels across the smallest object."""
         shot = task.shots[0]
         self.masked = "alpha" in task.aovs and not task.clutter
-        target = shot.target.float().clamp(0.0, 1.0)
-        mask = target[..., -1:] if self.masked else None
-        colours = linear_to_srgb(target[..., :-1] * (mask > 0.0) if mask is not None else target)
+        target = shot.target.float()
+        mask = target[..., -1:].clamp(0.0, 1.0) if self.masked else None
+        radiance = ((target if mask is None else target[..., :-1]) / task.white).clamp(0.0, 1.0)
+        colours = linear_to_srgb(radiance if mask is None else radiance * (mask > 0.0))
         self.picture = colours if mask is None else torch.cat([colours, mask], -1)
         self.size = shot.camera.size
         self.factor = 1.0 if self.masked else min(1.0, finest / (SMALLEST * min(self.size)))

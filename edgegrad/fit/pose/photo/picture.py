@@ -20,18 +20,19 @@ class Picture:
     nearly even."""
 
     camera: Camera
-    radiance: Tensor  # (h, w, C), linear
+    radiance: Tensor  # (h, w, C), linear, of which 1 is white
     display: Tensor  # (h, w, C)
     mask: Tensor | None  # (h, w), 1 on the object
     weight: Tensor  # (h, w), how much a pixel counts
     depth: Tensor | None  # (h, w), NaN where it was not measured
 
     @staticmethod
-    def of(shot: Shot, masked: bool, depth: Tensor | None, size: tuple[int, int]) -> Picture:
-        """`masked`: the last channel of what the shot has is a mask."""
+    def of(shot: Shot, masked: bool, depth: Tensor | None, size: tuple[int, int], white: float) -> Picture:
+        """`masked`: the last channel of what the shot has is a mask. `white` becomes 1."""
         radiance, mask = area_mean(shot.target, size), None
         if masked:
             radiance, mask = radiance[..., :-1], radiance[..., -1].clamp(0.0, 1.0)
+        radiance = radiance / white
         weight = torch.ones(size) if shot.weight is None else area_mean(shot.weight, size)[..., 0]
         nearest = None if depth is None else F.interpolate(depth[None, None], size, mode="nearest-exact")[0, 0]
         return Picture(

@@ -342,7 +342,7 @@ class PhotoSearch:
     def _change(self, pose: Pose) -> float:
         """How far colours in the light are from those of the mesh, in parts of these, of all pictures the farthest."""
         seen = self.levels[-1].see(pose, self.seed)
-        return max(math.inf if one.lit is None else one.lit.change for one in seen)
+        return max(math.inf if one.lit is None else one.lit.change(self.task.white) for one in seen)
 
     def _by_colours(self, start: Pose, levels: list[Level], further: bool) -> Search:
         """The search that compares colours as they are, from a start; its steps follow in the history."""

@@ -35,7 +35,7 @@ def shown(task: PoseTask, level: Level, pose: Pose) -> list[Tensor]:
 def _lit(task: PoseTask, level: Level, pose: Pose, channels: dict[str, Tensor], k: int) -> Tensor:
     """(h, w, C) radiance times alpha."""
     shot, image = level.shots[k], channels["image"].float()
-    picture = Picture.of(shot, False, None, shot.camera.size)
+    picture = Picture.of(shot, False, None, shot.camera.size, task.white)
     surface = Surface.of(
         task.lens(shot.camera, pose), channels, motion(task, level._replace(free=task.free), shot, pose)
     )
@@ -43,4 +43,4 @@ def _lit(task: PoseTask, level: Level, pose: Pose, channels: dict[str, Tensor], 
     if lit is None:
         return image
     Y = spherical(surface.normals)[..., : lit.coefficients.shape[1]]
-    return (image * (Y @ lit.coefficients.T)).clamp(min=0.0)
+    return (image * (Y @ lit.coefficients.T) * task.white).clamp(min=0.0)
