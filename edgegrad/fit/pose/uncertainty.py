@@ -22,7 +22,7 @@ WIDEST = 1.0  # radian and object size, the standard deviation of what the pictu
 # standard deviations of independent pixels, as measured.
 TOGETHER = 8.0
 # A direction that is known less exactly than this, in degrees or object sizes, is unknown; so is a focal length, in parts of it.
-DEGREES, SHARE, FOCAL = 5.0, 0.05, 0.05
+DEGREES, SHARE, FOCAL = 5.0, 0.05, 0.03
 ALONE_DEGREES = 2.0  # of a contour alone: those known to ± 2.2 … 5° were 2 … 8° off
 
 
@@ -67,8 +67,8 @@ class Uncertainty:
 
     @property
     def unknown(self) -> str:
-        """In words, what is known less exactly than to `most` degrees, or 5 % of the object's size or of the focal length; empty
-        where all is."""
+        """In words, what is known less exactly than to `most` degrees, 5 % of the object's size, or 3 % of the focal length;
+        empty where all is."""
         parts = []
         if self.degrees > self.most:
             parts.append(f"rotation about {_named(self.axis)} known to ±{self.degrees:.0f}° only")
