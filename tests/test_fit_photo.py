@@ -299,8 +299,12 @@ def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
     given = {"mask": {"mask": silhouette(view)}, "depth": {"depth": depth_of(view)}}.get(kind, {})
     fit = fit_pose(bracket(kind == "plain"), image, view, init=START, progress=False, **given)
     off = errors(fit)
-    assert off[0] < degrees and off[1] < percent and fit.converged, (off, fit.explained)
-    assert fit.explained >= search.ENOUGH and fit.reason == "converged"  # 12.3° and 8.4 % off at the start
+    assert off[0] < degrees and off[1] < percent, (off, fit.explained)  # 12.3° and 8.4 % off at the start
+    assert fit.explained >= search.ENOUGH and fit.converged == (kind != "plain")
+    # So small a contour does not show all turns to 2°.
+    words = "directions unknown: rotation about (" if kind == "plain" else "converged"
+    assert fit.reason.startswith(words), fit.reason
+    assert fit.uncertainty is None or off[0] < 2.0 * fit.uncertainty.degrees
 
 
 @pytest.mark.parametrize(("unit", "weight"), [(40.0, 1.0), (1e-3, 1.0), (1.0, 0.01), (1.0, 255.0)])
@@ -398,3 +402,29 @@ def test_errors_of_depth(taken, depth, error, message):
     view, image = taken
     with pytest.raises(error, match=message):
         fit_pose(bracket(), image, view, init=START, depth=depth, progress=False)
+
+
+@pytest.mark.slow
+def test_what_looks_alike_is_not_converged(monkeypatch):
+    """A box before a camera without perspective has nearly one contour turned to the left and to the right."""
+    made = trimesh.creation.box((1.6, 0.9, 0.7))
+    verts = torch.tensor(made.vertices.copy())
+    box = eg.Mesh(verts, torch.tensor(made.faces.copy()))
+    view = eg.Camera.orthographic((0.0, 0.7, 4.0), (0.0, 0.0, 0.0), height=2.4, size=(96, 96))
+    R = turned(torch.tensor([0.0, 0.25, 0.0], dtype=torch.float64))
+    image = photograph(view, box.transformed(R).replace(colors=0.45 + 0.2 * torch.sin(3.0 * verts).float()), seed=4)
+    start = torch.eye(4, dtype=torch.float64)
+    start[:3, :3] = turned(torch.tensor([0.05, 0.2, 0.0], dtype=torch.float64))
+    found = []
+    for least in (
+        search.ALIKE,
+        10.0,
+    ):  # the colours of this clutter make the right one likelier, by a factor of some exp(4)
+        monkeypatch.setattr(search, "ALIKE", least)
+        found.append(fit_pose(box, image, view, init=start, progress=False))
+    for fit in found:
+        assert math.degrees(math.acos(min(1.0, (float((fit.R.T @ R).trace()) - 1.0) / 2.0))) < 3.0
+        assert fit.explained >= search.ALONE_ENOUGH
+    assert found[0].converged and not found[1].converged
+    words = "looks alike: the pictures hardly tell it from a pose that is turned by 2"
+    assert found[1].reason.startswith(words), found[1].reason

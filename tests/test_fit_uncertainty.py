@@ -16,7 +16,7 @@ from edgegrad.fit.pose.task import ZOOM, Lens, PoseTask
 from edgegrad.fit.pose.uncertainty import TOGETHER
 from edgegrad.scene.symmetries import Symmetries, SymmetryAxis
 
-SIZE = 112
+SIZE = 160
 
 
 def vase() -> eg.Mesh:

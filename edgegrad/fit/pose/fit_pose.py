@@ -121,8 +121,9 @@ def fit_pose(
     less where nothing in the picture looks like the object; where they do, but something covers the object or it is of another
     colour, nearby, in about the same time again. Another pose is the answer only if its loss is lower than that of `init` in the
     final comparison, and its edges are as well in the picture. In photographs `uncertainty` says how exactly the terms show the
-    pose, and a rotation that is known less exactly than to 5°, or a place than to 5 % of the object's size, is not `converged`:
-    `reason` names the direction, which a continuous one of the `symmetries` makes known.
+    pose, and a rotation that is known less exactly than to 5° (of a plain mesh 2°), or a place than to 5 % of the object's size,
+    is not `converged`: `reason` names the direction, which a continuous one of the `symmetries` makes known. A plain mesh has its
+    contour alone: there other starts follow in any case, and a pose is not `converged` if another one is about as likely.
     KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set.
     Works in torch.no_grad() and torch.inference_mode() too. Raises TypeError or ValueError that names the argument, also when
     the object leaves no trace in the picture at the start.

@@ -22,7 +22,8 @@ WIDEST = 1.0  # radian and object size, the standard deviation of what the pictu
 # standard deviations of independent pixels, as measured.
 TOGETHER = 8.0
 # A direction that is known less exactly than this, in degrees or object sizes, is unknown; so is a focal length, in parts of it.
-DEGREES, SHARE, FOCAL = 2.0, 0.05, 0.05
+DEGREES, SHARE, FOCAL = 5.0, 0.05, 0.03
+ALONE_DEGREES = 2.0  # of a contour alone: those known to ± 2.2 … 5° were 2 … 8° off
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,7 @@ class Uncertainty:
                 are those at the one found: distance goes with it
     size        the diagonal of the object's bounding box, world units
     focal       of the focal length, as a part of it; 0 where it was not sought
+    most        degrees of a rotation that counts as known: 5, and 2 where a contour is all that is compared
     free        directions in the world (n, 3) about which a continuous symmetry makes all turns the same: none of them is unknown
     """
 
@@ -41,6 +43,7 @@ class Uncertainty:
     size: float
     free: Tensor
     focal: float = 0.0
+    most: float = DEGREES
 
     @property
     def degrees(self) -> float:
@@ -64,10 +67,10 @@ class Uncertainty:
 
     @property
     def unknown(self) -> str:
-        """In words, what is known less exactly than to 5°, 5 % of the object's size, or 5 % of the focal length; empty where all
-        is."""
+        """In words, what is known less exactly than to `most` degrees, 5 % of the object's size, or 3 % of the focal length;
+        empty where all is."""
         parts = []
-        if self.degrees > DEGREES:
+        if self.degrees > self.most:
             parts.append(f"rotation about {_named(self.axis)} known to ±{self.degrees:.0f}° only")
         if self.shift > SHARE * self.size:
             parts.append(
@@ -101,7 +104,8 @@ class Uncertainty:
         ways = [pose.R.double() @ axis.direction for axis in ([] if symmetries is None else symmetries.continuous)]
         spun = torch.stack(ways) if ways else torch.empty(0, 3, dtype=torch.float64)
         focal = float(inverse[free.index(ZOOM), free.index(ZOOM)].sqrt()) if ZOOM in free else 0.0
-        return Uncertainty(to_world @ entries @ to_world.T, task.size, spun, focal)
+        most = ALONE_DEGREES if task.colourless else DEGREES
+        return Uncertainty(to_world @ entries @ to_world.T, task.size, spun, focal, most)
 
 
 def _widest(block: Tensor) -> tuple[Tensor, Tensor]:

@@ -138,7 +138,7 @@ class PhotoSearch:
             )
         stays = found.short and len(distinct([found.pose, self.start], 2, APART)) == 1
         start = self._judge(self.start, stays)
-        best = max(start, found, key=lambda end: end.explained)
+        best = max(found, start, key=lambda end: end.explained)
         if not self.colours_first:
             self._take(best)
         if self.further and best.explained < self.enough:
