@@ -152,10 +152,10 @@ def test_the_corners_of_a_cube_from_few_pixels() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("exact", [False, True])
-def test_the_corners_of_a_cube_from_16_pixels(exact: bool) -> None:
-    before, after = example("raster_cube").fit(size=4, steps=3000, exact=exact)
-    assert before.corners > 0.5 and after.corners < 0.02 and after.colors < 0.01
+@pytest.mark.parametrize("exact, steps, off", [(False, 3000, 0.02), (True, 500, 0.15)])
+def test_the_corners_of_a_cube_from_16_pixels(exact: bool, steps: int, off: float) -> None:
+    before, after = example("raster_cube").fit(size=4, steps=steps, exact=exact)
+    assert before.corners > 0.5 and after.corners < off and after.colors < off
 
 
 def test_a_texture_with_mipmaps_and_without() -> None:
