@@ -179,3 +179,10 @@ def test_an_environment_and_a_highlight_with_more_steps() -> None:
     _, before, after = example("raster_environment_phong").fit(steps=500, size=64)
     assert after.environment < 0.25 * before.environment and after.color < 0.5 * before.color
     assert abs(after.exponent) < 0.6 * abs(before.exponent)
+
+
+@pytest.mark.slow
+def test_a_mesh_of_few_faces_with_a_texture() -> None:
+    simplify = example("simplify", size=96)
+    mesh, off = simplify.simplify(simplify.stone(4), faces=200, steps=60)
+    assert len(mesh.faces) <= 220 and off.fitted < off.baked < 0.7 * off.simplified
