@@ -7,8 +7,10 @@ from . import image as image
 from . import io as io
 from . import lights as lights
 from .aovs import render_aovs
+from .bake import SurfacePoints, bake, bake_pictures
 from .camera.camera import Camera
 from .files.save import from_trimesh, to_trimesh
+from .fit.unwrapping import unwrapped as unwrap
 from .io import (
     View,
     load_camera,
@@ -93,12 +95,15 @@ __all__ = [
     "Skin",
     "SphericalHarmonics",
     "SpotLight",
+    "SurfacePoints",
     "SurfaceSamples",
     "Symmetries",
     "SymmetryAxis",
     "Texture",
     "View",
     "attach_boundary",
+    "bake",
+    "bake_pictures",
     "edge_samples",
     "find_symmetries",
     "fit",
@@ -123,6 +128,7 @@ __all__ = [
     "screen_gradient",
     "surface_samples",
     "trace",
+    "unwrap",
     "vertex_normals",
     "viewer",
     "write_image",

@@ -83,7 +83,7 @@ def fit(steps: int = 1000, size: int = 128, seed: int = 0) -> tuple[Look, Errors
             return Errors(float(off[0]), float(off[1]), float((found.log_exponent - true.log_exponent).exp() - 1))
 
     before = errors()
-    optimizer = torch.optim.Adam(list(found), lr=1e-2)
+    optimizer = torch.optim.Adam([{"params": [found.environment]}, {"params": [*found[1:]], "lr": 0.05}], lr=1e-2)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.02 ** (step / steps))
     for _ in tqdm(range(steps), desc="environment"):
         R = rotations(1, generator)

@@ -2,8 +2,8 @@
 
     python examples/raster_pose.py [--trials 20] [--size 256]
 
-The first quarter of the steps draws random turns around the best pose so far and keeps what comes nearer to the picture; the rest
-follows the gradient. Prints by how many degrees each pose is off.
+The first quarter of the steps draws random poses, some of them around the best so far, and keeps what comes nearest to a small
+picture; the rest follows the gradient. Prints by how many degrees each pose is off.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 import edgegrad.raster as dr
 
+SMALL, TRIED = 32, 64  # pixels of the pictures that are compared at first, and how many a step
 COLORS = torch.tensor(
     [[0.9, 0.1, 0.1], [0.1, 0.8, 0.2], [0.1, 0.3, 0.9], [0.9, 0.8, 0.1], [0.8, 0.2, 0.8], [0.1, 0.8, 0.8]]
 )
@@ -54,21 +55,21 @@ def product(p: Tensor, q: Tensor) -> Tensor:
     return torch.cat([scalar, p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + torch.linalg.cross(p[:, 1:], q[:, 1:])], 1)
 
 
-def fit(seed: int, steps: int = 400, size: int = 256, batch: int = 4) -> tuple[float, float, float]:
+def fit(seed: int, steps: int = 400, size: int = 256) -> tuple[float, float, float]:
     """Degrees that the start, the best that was tried, and the last pose are off."""
     generator = torch.Generator().manual_seed(seed)
     truth, best = (torch.randn(1, 4, generator=generator) for _ in range(2))
     start = degrees_apart(best[0], truth[0])
     with torch.no_grad():
-        target = picture(truth, size)
-        least, tries = float(difference(picture(best, size), target)), steps // 4
+        target, small = picture(truth, size), picture(truth, SMALL)
+        least, tries = float(difference(picture(best, SMALL), small)), steps // 4
         for step in range(tries):
-            # Half of them anywhere, half near the best, ever nearer.
+            # Three in four anywhere, the others near the best, ever nearer.
             spread = 0.5 ** (8 * step / tries)
-            turn = torch.nn.functional.pad(spread * torch.randn(batch, 3, generator=generator), (1, 0), value=1.0)
-            some = product(turn, best.expand(batch, -1))
-            some[: batch // 2] = torch.randn(batch // 2, 4, generator=generator)
-            found = difference(picture(some, size), target)
+            turn = torch.nn.functional.pad(spread * torch.randn(TRIED, 3, generator=generator), (1, 0), value=1.0)
+            some = product(turn, best.expand(TRIED, -1))
+            some[TRIED // 4 :] = torch.randn(TRIED - TRIED // 4, 4, generator=generator)
+            found = difference(picture(some, SMALL), small)
             if float(found.min()) < least:
                 least, best = float(found.min()), some[found.argmin()][None]
     tried = degrees_apart(best[0], truth[0])

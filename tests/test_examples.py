@@ -152,10 +152,10 @@ def test_the_corners_of_a_cube_from_few_pixels() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("exact", [False, True])
-def test_the_corners_of_a_cube_from_16_pixels(exact: bool) -> None:
-    before, after = example("raster_cube").fit(size=4, steps=3000, exact=exact)
-    assert before.corners > 0.5 and after.corners < 0.02 and after.colors < 0.01
+@pytest.mark.parametrize("exact, steps, off", [(False, 3000, 0.02), (True, 500, 0.15)])
+def test_the_corners_of_a_cube_from_16_pixels(exact: bool, steps: int, off: float) -> None:
+    before, after = example("raster_cube").fit(size=4, steps=steps, exact=exact)
+    assert before.corners > 0.5 and after.corners < off and after.colors < off
 
 
 def test_a_texture_with_mipmaps_and_without() -> None:
@@ -171,4 +171,18 @@ def test_a_pose_by_trying_and_by_gradients() -> None:
 
 def test_an_environment_and_a_highlight() -> None:
     _, before, after = example("raster_environment_phong").fit(steps=100, size=64)
-    assert after.environment < 0.7 * before.environment and after.color < 0.9 * before.color
+    assert after.environment < 0.7 * before.environment
+
+
+@pytest.mark.slow
+def test_an_environment_and_a_highlight_with_more_steps() -> None:
+    _, before, after = example("raster_environment_phong").fit(steps=500, size=64)
+    assert after.environment < 0.25 * before.environment and after.color < 0.5 * before.color
+    assert abs(after.exponent) < 0.6 * abs(before.exponent)
+
+
+@pytest.mark.slow
+def test_a_mesh_of_few_faces_with_a_texture() -> None:
+    simplify = example("simplify", size=96)
+    mesh, off = simplify.simplify(simplify.stone(4), faces=200, steps=60)
+    assert len(mesh.faces) <= 220 and off.fitted < off.baked < 0.7 * off.simplified

@@ -1,0 +1,311 @@
+"""Textures from what else is known of a surface: another mesh, a function of its points, or pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from tqdm import tqdm
+
+from . import raster
+from .camera.camera import Camera
+from .check import as_tensor, check_int, check_positive, check_shape
+from .optional import require
+from .points.rays import trace
+from .scene.mesh import Mesh
+from .scene.nearest import Places, Surface
+from .scene.scene import Scene, as_scene
+
+WHAT = ("color", "normal", "visibility")
+AT_ONCE = 1 << 20  # rays
+REACH = 0.05  # of the diagonal of a mesh's box: how far rays look for the other surface
+NEAR = 1e-4  # of a distance: what lies so close is the surface itself
+
+
+class SurfacePoints(NamedTuple):
+    """N points of a mesh, one for each texel that it uses: what a function for `bake` gets.
+
+    position      (N, 3) float64
+    normal        (N, 3) float64, of length 1: the mesh's own where it has normals, else the faces'
+    face          (N,) int64
+    barycentrics  (N, 3) float64
+    uv            (N, 2) float64
+    """
+
+    position: Tensor
+    normal: Tensor
+    face: Tensor
+    barycentrics: Tensor
+    uv: Tensor
+
+
+def bake(
+    mesh: Mesh,
+    source: Mesh | Scene | Callable[[SurfacePoints], Tensor],
+    size: int | tuple[int, int] = 512,
+    *,
+    what: str = "color",
+    by: str = "rays",
+    reach: float | None = None,
+    rays: int = 64,
+    margin: int | None = 4,
+    seed: int = 0,
+    progress: bool = True,
+) -> Tensor:
+    """A texture (h, w, C) for a mesh, of what another surface has where the two lie on each other.
+
+    mesh      with texture coordinates that do not overlap, as unwrap() makes them
+    source    the other surface, or a function of SurfacePoints of `mesh` that returns (N, C)
+    size      texels: one number, or (h, w)
+    what      "color": its colours, or base colours where it is lit; "normal": its normals (C = 3) in world coordinates, of
+              length 1; "visibility" (C = 1): the share of the sky above a point of `mesh`, weighed by the cosine, that the source
+              does not cover
+    by        "rays": along the normals of `mesh`, from outside, as far as `reach` on both sides; where these meet nothing, and
+              with "nearest" everywhere, the source's nearest point
+    reach     world units; None: a twentieth of the diagonal of the mesh's box
+    rays      for each texel, of visibility
+    margin    texels around charts that take the colour of the nearest texel within, for bilinear look-ups reach beyond seams;
+              None: all others. What is left is zero
+    seed      of the directions
+    progress  whether a bar is shown
+
+    The result is `mesh.replace(texture=…)`'s: row 0 on top. It has no gradient. Nearest points and margins need SciPy
+    (`pip install 'edgegrad[fit]'`). Raises TypeError or ValueError that names the argument, ImportError.
+    """
+    _check_mesh(mesh)
+    shape = _shape(size)
+    if what not in WHAT:
+        raise ValueError(f"what: expected one of {', '.join(WHAT)}, got {what!r}")
+    if by not in ("rays", "nearest"):
+        raise ValueError(f"by: expected 'rays' or 'nearest', got {by!r}")
+    check_int("rays", rays, 1, 1 << 16)
+    mesh = mesh.detach().to("cpu")
+    texels = _Texels.of(mesh, shape)
+    if isinstance(source, (Mesh, Scene)):
+        scene = as_scene(source).detach().to("cpu")
+        low, high = mesh.verts.double().aminmax(dim=0)
+        diagonal = float((high - low).norm())
+        reach = REACH * diagonal if reach is None else check_positive("reach", reach, least=1e-30, most=1e30)
+        if what == "visibility":
+            values = _visibility(texels.points, scene, NEAR * diagonal, rays, seed, progress)
+        else:
+            values = _of_surface(scene, _matched(texels.points, scene, by, reach), what)
+    elif callable(source):
+        if what != "color":
+            raise ValueError(f"what: expected 'color' with a function, which says itself what it gives, got {what!r}")
+        values = as_tensor("source", source(texels.points), floating=True).detach().cpu()
+        check_shape("source", values, (len(texels.points.face), "C"))
+    else:
+        raise TypeError(f"source: expected a Mesh, a Scene or a function, got {type(source).__name__}")
+    return texels.texture(values.float(), margin)
+
+
+def bake_pictures(
+    mesh: Mesh,
+    cameras: Sequence[Camera],
+    images: Sequence[Tensor],
+    size: int | tuple[int, int] = 512,
+    *,
+    masks: Sequence[Tensor] | None = None,
+) -> Tensor:
+    """A texture (h, w, C) for a mesh, from pictures of it: of each texel the mean over the pictures that see it, weighed by the
+    square of the cosine at which they do.
+
+    mesh     with texture coordinates that do not overlap, as unwrap() makes them
+    cameras  one for each picture
+    images   (H, W, C) linear radiance
+    size     texels: one number, or (h, w)
+    masks    (H, W) or (H, W, 1), 1 where a picture shows the mesh; what is below ½ does not count
+
+    A start for fit_texture(), which finds what pictures say together: `fit_texture(mesh.replace(texture=…), …)`. Texels that no
+    picture sees take the nearest colour. It has no gradient. Needs SciPy (`pip install 'edgegrad[fit]'`). Raises TypeError
+    or ValueError that names the argument, ImportError.
+    """
+    _check_mesh(mesh)
+    if len(cameras) != len(images) or not len(cameras):
+        raise ValueError(
+            f"images: expected one for each of {len(cameras)} cameras, and at least one, got {len(images)}"
+        )
+    if masks is not None and len(masks) != len(images):
+        raise ValueError(f"masks: expected one for each of {len(images)} pictures, got {len(masks)}")
+    mesh = mesh.detach().to("cpu")
+    texels = _Texels.of(mesh, _shape(size))
+    points = texels.points
+    channels = images[0].shape[-1]
+    total, weight = (
+        torch.zeros(len(points.face), channels, dtype=torch.float64),
+        torch.zeros(len(points.face), 1).double(),
+    )
+    for k, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        if camera.batch is not None:
+            raise ValueError(f"cameras[{k}]: expected one camera, got a batch of {camera.batch}; give them one by one")
+        image = as_tensor(f"images[{k}]", image, floating=True).detach().cpu().double()
+        check_shape(f"images[{k}]", image, (*camera.size, channels))
+        share = _seen(mesh, points, camera.detach().to("cpu"))
+        x = torch.nan_to_num(camera.detach().to("cpu").project(points.position).double(), nan=-1.0)
+        if masks is not None:
+            mask = as_tensor(f"masks[{k}]", masks[k], floating=True).detach().cpu().double()
+            mask = mask if mask.dim() == 3 else mask[..., None]
+            check_shape(f"masks[{k}]", mask, (*camera.size, 1))
+            share = share * (_at(mask, x) >= 0.5)
+        H, W = camera.size
+        share = share * ((x >= 0) & (x <= x.new_tensor([W, H]))).all(1, keepdim=True)
+        total, weight = total + share * _at(image, x), weight + share
+    known = weight[:, 0] > 0
+    if not bool(known.any()):
+        raise ValueError("cameras: expected some that see the mesh, got none; look at where they are with eg.viewer")
+    return texels.texture((total[known] / weight[known]).float(), None, known)
+
+
+class _Texels(NamedTuple):
+    """Those whose centres lie on a face."""
+
+    shape: tuple[int, int]
+    place: Tensor  # (N,) int64, row by row, row 0 on top
+    points: SurfacePoints
+
+    @classmethod
+    def of(cls, mesh: Mesh, shape: tuple[int, int]) -> _Texels:
+        assert mesh.uvs is not None and mesh.uv_faces is not None
+        uvs = mesh.uvs.double()
+        pos = torch.cat([2 * uvs - 1, torch.zeros(len(uvs), 1), torch.ones(len(uvs), 1)], 1).double()
+        rast, _ = raster.rasterize(raster.RasterizeContext(output_db=False), pos[None], mesh.uv_faces, shape)
+        rast = rast[0].flip(0).reshape(-1, 4)
+        place = (rast[:, 3] > 0).nonzero()[:, 0]
+        if len(place) == 0:
+            raise ValueError("mesh: expected texture coordinates in the unit square, got none there; use unwrap(mesh)")
+        u, v, _, number = rast[place].unbind(1)
+        b, face = torch.stack([u, v, 1 - u - v], 1), number.long() - 1
+        return cls(shape, place, points_of(mesh, face, b))
+
+    def texture(self, values: Tensor, margin: int | None, known: Tensor | None = None) -> Tensor:
+        """(h, w, C) of the values of those that are known."""
+        h, w = self.shape
+        place = self.place if known is None else self.place[known]
+        out = torch.zeros(h * w, values.shape[1])
+        out[place] = values
+        if margin == 0:
+            return out.view(h, w, -1)
+        empty = np.ones(h * w, bool)
+        empty[place.numpy()] = False
+        ndimage = require("scipy.ndimage", "edgegrad[fit]", "a margin around charts")
+        distance, (rows, columns) = ndimage.distance_transform_edt(empty.reshape(h, w), return_indices=True)
+        near = out.view(h, w, -1)[torch.from_numpy(rows).long(), torch.from_numpy(columns).long()]
+        if margin is None:
+            return near
+        check_int("margin", margin, 0, 1 << 14)
+        return torch.where(torch.from_numpy(distance <= margin)[..., None], near, 0.0)
+
+
+def points_of(mesh: Mesh, face: Tensor, b: Tensor) -> SurfacePoints:
+    """Of one mesh, at barycentrics (N, 3)."""
+
+    def at(rows: Tensor, index: Tensor) -> Tensor:
+        return (b[:, :, None] * rows.double()[index[face].long()]).sum(1)
+
+    corners = mesh.verts.double()[mesh.faces[face].long()]
+    flat = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if mesh.normals is not None:
+        index = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
+        smooth = at(mesh.normals, index)
+        flat = torch.where(smooth.norm(dim=1, keepdim=True) > 0, smooth, flat)
+    uv = torch.zeros(len(face), 2, dtype=torch.float64)
+    if mesh.uvs is not None and mesh.uv_faces is not None:
+        uv = at(mesh.uvs, mesh.uv_faces)
+    return SurfacePoints(at(mesh.verts, mesh.faces), F.normalize(flat, dim=1), face, b, uv)
+
+
+def _matched(points: SurfacePoints, scene: Scene, by: str, reach: float) -> Places:
+    """The source's points that belong to points of the mesh."""
+    count = len(points.face)
+    face, b = np.full(count, -1), np.zeros((count, 3))
+    if by == "rays":
+        hits = trace(scene, points.position + reach * points.normal, -2 * reach * points.normal)
+        near = hits.depth.detach() <= 1
+        rows = hits.ray[near].numpy()
+        face[rows], b[rows] = hits.face[near].numpy(), hits.barycentrics[near].detach().double().numpy()
+    lost = face < 0
+    if lost.any():
+        found = Surface(scene).nearest(points.position[torch.from_numpy(lost)].numpy())
+        face[lost], b[lost] = found.face, found.b
+    return Places(np.zeros((count, 3)), face, b)
+
+
+def _of_surface(scene: Scene, places: Places, what: str) -> Tensor:
+    if what == "color":
+        colors = Surface(scene).colors(places)
+        if colors is None:
+            raise ValueError(
+                "source: expected colours, a texture or a material, got none; give it some, or what='normal'"
+            )
+        return colors
+    out = torch.zeros(len(places.face), 3, dtype=torch.float64)
+    first = 0
+    for mesh in scene.meshes:
+        rows = torch.from_numpy((places.face >= first) & (places.face < first + len(mesh.faces)))
+        own = torch.from_numpy(places.face)[rows] - first
+        out[rows] = points_of(mesh, own, torch.from_numpy(places.b)[rows]).normal
+        first += len(mesh.faces)
+    return out
+
+
+def _visibility(points: SurfacePoints, scene: Scene, aside: float, rays: int, seed: int, progress: bool) -> Tensor:
+    """(N, 1): the share of directions, distributed as the cosine to the normal, that leave."""
+    count = len(points.face)
+    generator = torch.Generator().manual_seed(seed)
+    seen = torch.zeros(count, 1, dtype=torch.float64)
+    normal, origin = points.normal, points.position + aside * points.normal
+    # A point drawn on the unit sphere around the normal's end is a direction with this density (Shirley et al. 2019).
+    parts = max(1, -(-count * rays // AT_ONCE))
+    for k in tqdm(range(parts), desc="visibility", disable=not progress):
+        first, end = k * count // parts, (k + 1) * count // parts
+        on_sphere = F.normalize(torch.randn(end - first, rays, 3, dtype=torch.float64, generator=generator), dim=2)
+        directions = normal[first:end, None] + (1 - 1e-9) * on_sphere  # of which none is zero
+        origins = origin[first:end, None].expand(-1, rays, -1)
+        hits = trace(scene, origins.reshape(-1, 3), directions.reshape(-1, 3))
+        covered = torch.bincount(hits.ray // rays, minlength=end - first)
+        seen[first:end, 0] = 1 - covered.double() / rays
+    return seen
+
+
+def _seen(mesh: Mesh, points: SurfacePoints, camera: Camera) -> Tensor:
+    """(N, 1): the square of the cosine between the normal and the way to the camera; 0 where something lies between."""
+    pose = camera.world_to_camera.double()
+    ahead = pose[2, :3]
+    if camera.projection == "orthographic":
+        low, high = mesh.verts.double().aminmax(dim=0)
+        along = ahead.expand_as(points.position) * (2 * (high - low).norm() + 1e-30)
+    else:
+        along = points.position - camera.eye.double()
+    hits = trace(mesh, points.position - along, along)
+    first = torch.full((len(points.face),), torch.inf, dtype=torch.float64)
+    first[hits.ray] = hits.depth.detach().double()
+    visible = first >= 1 - NEAR
+    if camera.projection == "perspective":  # others see behind themselves too, or have no place
+        visible &= (points.position @ ahead + pose[2, 3]) > 0
+    cosine = -(points.normal * F.normalize(along, dim=1)).sum(1)
+    return (visible * cosine.clamp(min=0) ** 2)[:, None]
+
+
+def _at(image: Tensor, x: Tensor) -> Tensor:
+    """(N, C) bilinear at places (N, 2), px."""
+    H, W = image.shape[:2]
+    grid = (2 * x / x.new_tensor([W, H]) - 1)[None, None]
+    found = F.grid_sample(image.permute(2, 0, 1)[None], grid, padding_mode="border", align_corners=False)
+    return found[0, :, 0].T
+
+
+def _check_mesh(mesh: Mesh) -> None:
+    if not isinstance(mesh, Mesh):
+        raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; load one with load_mesh(path)")
+    if mesh.uvs is None:
+        raise ValueError("mesh: expected texture coordinates, got a mesh without; use unwrap(mesh)")
+
+
+def _shape(size: int | tuple[int, int]) -> tuple[int, int]:
+    h, w = (size, size) if isinstance(size, int) else size
+    return check_int("size", h, 1, 1 << 14), check_int("size", w, 1, 1 << 14)

@@ -1,0 +1,137 @@
+"""bake(), bake_pictures(), unwrap(): textures whose right values are known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from scenes import icosphere
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad.bake import SurfacePoints
+
+
+def square(z: float = 0.0) -> eg.Mesh:
+    """(0 … 1)², facing +z, with texture coordinates as positions."""
+    corners = torch.tensor([[0.0, 0, z], [1, 0, z], [1, 1, z], [0, 1, z]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    return eg.Mesh(corners, faces, uvs=corners[:, :2].contiguous(), uv_faces=faces)
+
+
+def centres(h: int, w: int) -> tuple[Tensor, Tensor]:
+    """x and y of texels, row 0 on top."""
+    y, x = torch.meshgrid(1 - (torch.arange(h) + 0.5) / h, (torch.arange(w) + 0.5) / w, indexing="ij")
+    return x, y
+
+
+@pytest.mark.parametrize("by", ["rays", "nearest"])
+@pytest.mark.parametrize("lift", [-0.02, 0.02])
+def test_colors_of_another_mesh(by: str, lift: float) -> None:
+    other = square(lift)
+    other = eg.Mesh(
+        other.verts, other.faces, colors=other.verts * torch.tensor([1.0, 1, 0]) + torch.tensor([0.0, 0, 0.3])
+    )
+    texture = eg.bake(square(), other, (6, 8), by=by)
+    x, y = centres(6, 8)
+    torch.testing.assert_close(texture, torch.stack([x, y, torch.full_like(x, 0.3)], 2))
+
+
+def test_rays_beyond_their_reach_give_the_nearest_point() -> None:
+    other = square(0.5)
+    other = eg.Mesh(other.verts + torch.tensor([2.0, 0, 0]), other.faces, colors=other.verts)
+    texture = eg.bake(square(), other, 4, reach=0.01)
+    assert torch.allclose(texture[..., 0], torch.zeros(()), atol=1e-6)  # its left edge
+    torch.testing.assert_close(texture[..., 1], centres(4, 4)[1])
+
+
+def test_normals_of_a_sphere() -> None:
+    ball = icosphere(3)
+    ball = eg.Mesh(ball.verts.float(), ball.faces, normals=ball.verts.float())
+    cage = eg.unwrap(eg.Mesh(icosphere(1).verts.float(), icosphere(1).faces), size=64)
+    texture = eg.bake(cage, ball, 64, what="normal", reach=0.3)
+    used = eg.bake(cage, lambda points: torch.ones(len(points.face), 1), 64, margin=0)[..., 0] > 0
+    position = eg.bake(cage, lambda points: points.position, 64)
+    cosine = (texture * torch.nn.functional.normalize(position, dim=2)).sum(2)[used]
+    assert used.float().mean() > 0.3 and cosine.min() > math.cos(math.radians(25)) and cosine.mean() > 0.995
+
+
+def test_visibility_beside_a_wall() -> None:
+    """Of a floor beside an endless wall half of the sky is covered at its foot, and (1 + cos) / 2 away from it."""
+    wall = torch.tensor([[0.0, -400, 0], [0, 400, 0], [0, 400, 0.5], [0, -400, 0.5]])
+    texture = eg.bake(
+        square(),
+        eg.Mesh(wall, torch.tensor([[0, 1, 2], [0, 2, 3]])),
+        (2, 4),
+        what="visibility",
+        rays=8192,
+        progress=False,
+    )
+    x, _ = centres(2, 4)
+    elevation = torch.atan2(torch.full_like(x, 0.5), x)
+    torch.testing.assert_close(texture[..., 0], (1 + elevation.cos()) / 2, atol=0.02, rtol=0)
+
+
+def test_a_function_and_a_margin() -> None:
+    given: list[SurfacePoints] = []
+
+    def function(points: SurfacePoints) -> Tensor:
+        given.append(points)
+        return points.uv.float()
+
+    small = square()
+    assert small.uvs is not None
+    small = small.replace(uvs=0.25 + 0.5 * small.uvs)
+    texture = eg.bake(small, function, 16, margin=2)
+    points = given[0]
+    assert len(points.face) == 64 and torch.equal(points.normal, torch.tensor([0.0, 0, 1]).double().expand(64, 3))
+    x, y = centres(16, 16)
+    inside, out = (slice(4, 12), slice(4, 12)), (slice(2, 14), slice(2, 14))
+    torch.testing.assert_close(texture[inside], torch.stack([x, y], 2)[inside])
+    near = torch.stack([x.clamp(0.25 + 1 / 32, 0.75 - 1 / 32), y.clamp(0.25 + 1 / 32, 0.75 - 1 / 32)], 2)
+    torch.testing.assert_close(texture[2, 4:12], near[2, 4:12])
+    assert not texture[0].any() and (texture[out] > 0).float().mean() > 0.9
+    assert (eg.bake(small, function, 16, margin=None) > 0).all()
+
+
+def test_pictures_give_the_texture_back() -> None:
+    """Of a ball, from all around; what one picture does not see comes from others."""
+    ball = eg.unwrap(eg.Mesh(icosphere(2).verts.float(), icosphere(2).faces), size=64)
+    truth = eg.bake(ball, lambda points: 0.5 + 0.4 * torch.sin(3 * points.position), 64, margin=None)
+    eyes = [(3.0, 0, 0), (-3.0, 0, 0), (0, 3.0, 0.1), (0, -3.0, 0.1), (0, 0, 3.0), (0, 0, -3.0)]
+    cameras = [eg.Camera.look_at(eye, (0, 0, 0), (0, 1, 0), 50.0, (96, 96)) for eye in eyes]
+    cameras[4] = eg.Camera.orthographic((0, 0, 3.0), (0, 0, 0), (0, 1, 0), 2.4, (96, 96))
+    shown = ball.replace(texture=truth)
+    images = [eg.render(shown, camera, spp=16) for camera in cameras]
+    masks = [eg.render_aovs(shown, camera, ["alpha"])["alpha"] for camera in cameras]
+    found = eg.bake_pictures(ball, cameras, images, 64, masks=masks)
+    used = eg.bake(ball, lambda points: torch.ones(len(points.face), 1), 64, margin=0)[..., 0] > 0
+    assert (found - truth)[used].abs().mean() < 0.02
+    one = eg.bake_pictures(ball, cameras[:1], images[:1], 64)
+    position = eg.bake(ball, lambda points: points.position, 64)
+    front = used & (position[..., 0] > 0.6)
+    assert (one - truth)[front].abs().mean() < 0.02 < (one - truth)[used & ~front].abs().mean()
+
+
+def test_wrong_arguments() -> None:
+    mesh = square()
+    plain = eg.Mesh(mesh.verts, mesh.faces)
+    camera = eg.Camera.look_at((0.5, 0.5, 3), (0.5, 0.5, 0), (0, 1, 0), 40.0, (8, 8))
+    away = eg.Camera.look_at((0.5, 0.5, 3), (0.5, 0.5, 6), (0, 1, 0), 40.0, (8, 8))
+    image = torch.ones(8, 8, 3)
+    for call, error, words in (
+        (lambda: eg.bake(plain, mesh), ValueError, "mesh: expected texture coordinates, .* unwrap"),
+        (lambda: eg.bake(mesh, 3), TypeError, "source: expected a Mesh"),
+        (lambda: eg.bake(mesh, plain), ValueError, "source: expected colours"),
+        (lambda: eg.bake(mesh, plain, what="gloss"), ValueError, "what: expected one of"),
+        (lambda: eg.bake(mesh, plain, by="luck"), ValueError, "by: expected"),
+        (lambda: eg.bake(mesh, plain, 0), ValueError, "size: expected"),
+        (lambda: eg.bake(mesh, lambda points: torch.ones(3)), ValueError, "source: expected shape"),
+        (lambda: eg.bake_pictures(mesh, [camera], []), ValueError, "images: expected one for each"),
+        (lambda: eg.bake_pictures(mesh, [camera], [image[1:]]), ValueError, r"images\[0\]: expected shape"),
+        (lambda: eg.bake_pictures(mesh, [camera], [image], masks=[image]), ValueError, r"masks\[0\]: expected shape"),
+        (lambda: eg.bake_pictures(mesh, [away], [image]), ValueError, "cameras: expected some that see"),
+    ):
+        with pytest.raises(error, match=words):
+            call()  # pyright: ignore[reportArgumentType]
