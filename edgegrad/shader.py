@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 from torch.utils.checkpoint import checkpoint
 
 from .camera.camera import Camera
@@ -64,7 +65,7 @@ class Effort(NamedTuple):
     blended: bool = False  # whether one may see through surfaces
     lit: bool = False  # whether the scene's materials and lights shade them
     glossy: bool = (
-        False  # whether radiance has peaks, as highlights are: samples of the gradient then look where it is bright
+        False  # whether radiance has peaks, as highlights are: samples of the gradient then look where it is bright or changes
     )
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
@@ -101,10 +102,15 @@ def render_shaded(
 
 
 def _where_bright(image: Tensor) -> Tensor | None:
-    """(H, W), above zero: a third the same for all pixels, the rest by how bright they are; None if all are black."""
+    """(H, W), above zero: how bright the pixels of an image (H, W, C) are, how much that changes from one to the next, for there
+    highlights move, and a little the same for all; None if all are black."""
     size = image.detach().double().abs().mean(2)
     mean = size.mean()
-    return size + 0.5 * mean if mean > 0 else None
+    if not mean > 0:
+        return None
+    near = pad(size[None], (1, 1, 1, 1), mode="replicate")[0]
+    across, down = near[1:-1, 2:] - near[1:-1, :-2], near[2:, 1:-1] - near[:-2, 1:-1]
+    return size + 0.5 * torch.hypot(across, down) + 0.2 * mean
 
 
 class _Image:
