@@ -11,7 +11,6 @@ import math
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import torch
@@ -112,16 +111,19 @@ def _relative(g: Tensor) -> float:
     return 100 * float((variance / (g.mean(0).square().sum() - variance / len(g)).clamp(min=1e-30)).sqrt())
 
 
+# What Mitsuba calls the parameters.
+KEYS = {
+    "roughness": "ball.bsdf.roughness.value", "metallic": "ball.bsdf.metallic.value",
+    "base color": "ball.bsdf.base_color.value", "normals": "ball.vertex_normals",
+    "translation": "ball.vertex_positions", "texels": "sky.data",
+}  # fmt: skip
+
+
 class MitsubaGradients:
     """The same ball by Mitsuba, of its material `principled`, whose lobe and Fresnel term are glTF's but for details. Its `prb`
     differentiates at points that are drawn by the light and by the material, and does not differentiate how these are drawn;
     for what moves silhouettes `prb_projective`. Loss and camera are edgegrad's."""
 
-    KEYS = {
-        "roughness": "ball.bsdf.roughness.value", "metallic": "ball.bsdf.metallic.value",
-        "base color": "ball.bsdf.base_color.value", "normals": "ball.vertex_normals",
-        "translation": "ball.vertex_positions", "texels": "sky.data",
-    }  # fmt: skip
     PRIMAL = 16  # samples a pixel of the image, edgegrad's default
 
     def __init__(self, scene: eg.Scene, given: Parameters, residual: dict[str, Tensor]) -> None:
@@ -150,12 +152,12 @@ class MitsubaGradients:
         self.scene = mi.load_dict({"type": "scene", "sensor": sensor, "sky": sky_, "ball": ball})
         self.integrators = {name: mi.load_dict({"type": name, "max_depth": 2}) for name in ("prb", "prb_projective")}
         self.params = mi.traverse(self.scene)
-        self.values = {name: type(self.params[key])(self.params[key]) for name, key in self.KEYS.items()}
+        self.values = {name: type(self.params[key])(self.params[key]) for name, key in KEYS.items()}
         self.residual = {name: mi.TensorXf(r.numpy()) for name, r in residual.items()}
 
     def __call__(self, name: str, spp: int, seed: int) -> Tensor:
         """By one parameter."""
-        mi, dr, key = self.mi, self.dr, self.KEYS[name]
+        mi, dr, key = self.mi, self.dr, KEYS[name]
         given = type(self.values[name])(self.values[name])
         dr.enable_grad(given)
         self.params[key] = given

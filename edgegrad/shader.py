@@ -64,9 +64,8 @@ class Effort(NamedTuple):
     kernel_image: Callable[[Frame], Tensor | None] | None = None
     blended: bool = False  # whether one may see through surfaces
     lit: bool = False  # whether the scene's materials and lights shade them
-    glossy: bool = (
-        False  # whether radiance has peaks, as highlights are: samples of the gradient then look where it is bright or changes
-    )
+    # Whether radiance has peaks, as highlights are: samples of the gradient then look where it is bright or changes.
+    glossy: bool = False
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
