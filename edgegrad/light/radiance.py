@@ -271,8 +271,9 @@ def _points_of(hits: Hits, light: Light, count: int, surface: _Surface) -> list[
     by_light = lambertian or (isinstance(light, MeshLight) and tree_of(light) is None)
     if hits._knows_light(light) or light.punctual or by_light:
         drawn = [hits.light_points(light, sample, count) for sample in range(count)]
-        mirrored = lambertian and isinstance(light, Environment) and not hits._knows_light(light)
-        return [light.above(points, surface.g) for points in drawn] if mirrored else drawn
+        if lambertian and isinstance(light, Environment) and not hits._knows_light(light):
+            return [light.above(points, surface.g) for points in drawn]
+        return drawn
     glossy = Glossy.of(surface.v, surface.n, surface.g, surface.scattering, hits._seed)
     index = hits._index(light)
     if isinstance(light, MeshLight):
