@@ -18,6 +18,7 @@ from .kernel.flat import Flat
 from .kernel.operators import Hits, backward_kernel, image_room, pass_size
 from .kernel.request import MOVING, SLOTS, STEPPING, Request, Work, label, make_request, required
 from .library import core
+from .light.companions import FOURS, MOST_FOURS
 from .light.radiance import Lighting
 from .light.resampled import how_drawn
 from .points.records import CURVE_BYTES, SURFACE_BYTES, without_colors
@@ -135,7 +136,8 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     del terms["shader"]
     inside = sum(lighting.in_gradient(scene, light) for light in scene.casting)
     more = (
-        f"; for the gradient inside faces {inside}, in fours of which what derivatives have of both signs cancels"
+        f"; for the gradient inside faces {inside}, in fours of which what derivatives have of both signs cancels, and up to "
+        f"{MOST_FOURS // FOURS} times as many where faces are seen from aside"
         if inside > lights
         else ""
     )

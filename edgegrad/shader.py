@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 from torch.utils.checkpoint import checkpoint
 
 from .camera.camera import Camera
@@ -63,9 +64,8 @@ class Effort(NamedTuple):
     kernel_image: Callable[[Frame], Tensor | None] | None = None
     blended: bool = False  # whether one may see through surfaces
     lit: bool = False  # whether the scene's materials and lights shade them
-    glossy: bool = (
-        False  # whether radiance has peaks, as highlights are: samples of the gradient then look where it is bright
-    )
+    # Whether radiance has peaks, as highlights are: samples of the gradient then look where it is bright or changes.
+    glossy: bool = False
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
@@ -101,10 +101,16 @@ def render_shaded(
 
 
 def _where_bright(image: Tensor) -> Tensor | None:
-    """(H, W), 1.5 in the mean: a third the same for all pixels, the rest by how bright they are; None if all are black."""
+    """(H, W), above zero: how bright the pixels of an image (H, W, C) are over the mean, how much that changes from one to the
+    next, for there highlights move, and a little the same for all; None if all are black."""
     size = image.detach().double().abs().mean(2)
     mean = size.mean()
-    return size / mean + 0.5 if mean > 0 else None
+    if not mean > 0:
+        return None
+    size = size / mean
+    near = pad(size[None], (1, 1, 1, 1), mode="replicate")[0]
+    across, down = near[1:-1, 2:] - near[1:-1, :-2], near[2:, 1:-1] - near[:-2, 1:-1]
+    return size + 0.5 * torch.hypot(across, down) + 0.2
 
 
 class _Image:
