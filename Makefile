@@ -84,7 +84,7 @@ ifeq ($(filter /%,$(shell $(CXX) -print-file-name=libtsan.so 2>/dev/null)),)
 else
 	rm -rf $(THREADS) && mkdir -p $(THREADS)
 	printf '%s\n' $(filter-out csrc/python/% csrc/checks/faults.cpp,$(filter %.cpp,$(SOURCES))) | \
-	  xargs -P 2 -I@ sh -c '$(CXX) -std=c++20 -O1 -g -pthread -fopenmp -fsanitize=thread -ffp-contract=off -w -Icsrc -c @ -o $(THREADS)/$$(echo @ | tr / _).o'
+	  xargs -P 2 -I@ sh -c '$(CXX) -std=c++20 -O1 -g1 -pthread -fopenmp -fsanitize=thread -ffp-contract=off -w -Icsrc -c @ -o $(THREADS)/$$(echo @ | tr / _).o'
 	$(CXX) -pthread -fopenmp -fsanitize=thread $(THREADS)/*.o -ldl -o $(THREADS)/threads
 	embree=$$($(BIN)/python -c "from edgegrad.library import embree_path as path; print(path())") && \
 	export TSAN_OPTIONS=ignore_noninstrumented_modules=1 && \

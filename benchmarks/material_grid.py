@@ -7,14 +7,14 @@ Run:  python benchmarks/material_grid.py [--out FILE.png] [--seeds N]          (
 from __future__ import annotations
 
 import argparse
-import importlib
+import importlib.util
 import math
 from typing import Any
 
 import numpy as np
 import torch
 from scipy.stats import t as student
-from table import Row
+from table import Bench, Row, Skipped
 from torch import Tensor
 from torch.nn.functional import normalize
 from tqdm import tqdm
@@ -178,6 +178,12 @@ def compared(seeds: int) -> tuple[Row, Tensor]:
     )
     row = Row("material grid: colours of balls that are not Mitsuba's", float(rejected.sum()), must=0.0, note=note)
     return row, torch.cat([images.mean(0).float() for images in found], 1)
+
+
+def material_grid(bench: Bench) -> list[Row]:
+    if importlib.util.find_spec("mitsuba") is None:
+        raise Skipped("Mitsuba is not installed; pip install 'edgegrad[peers]'")
+    return [compared(bench.repeats(16))[0]]
 
 
 if __name__ == "__main__":

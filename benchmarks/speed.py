@@ -27,6 +27,7 @@ from equal_error import boundary, interior, step
 from glossy import glossy
 from glossy_gradients import glossy_gradients
 from light import light
+from material_grid import material_grid
 from processes import memory, order, start
 from table import HEAD, Bench, Row, Skipped, line
 from tqdm import tqdm
@@ -58,6 +59,7 @@ ROWS: dict[str, Callable[[Bench], list[Row]]] = {
     "light": light,
     "glossy": glossy,
     "glossy gradients": glossy_gradients,
+    "materials": material_grid,
 }
 # What is slow or wrong in the scenes of others first: rows that a change of the default samples is measured by.
 GROUPS = {"safe": ("deep", "tangled", "flat-colors", "noise")}

@@ -54,6 +54,7 @@ def test_a_sun_and_a_pose() -> None:
     assert degrees_of_sun < 4 and degrees < 3 and distance < 0.15
 
 
+@pytest.mark.slow
 def test_an_environment_in_a_mirror() -> None:
     mirror = example("mirror")
     _, found = mirror.fit(steps=60, size=32)
