@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
@@ -134,6 +135,32 @@ def test_it_goes_on_where_it_stopped(tmp_path) -> None:
     rest = fit_rig(rig, cameras, checkpoint=path, resume=True, **told)
     assert torch.equal(rest.values["rotations"], whole.values["rotations"]) and len(rest.history) == len(whole.history)
     assert "pose.json" in rest.save(tmp_path / "out", figures=False)
+
+
+def test_the_command_line(tmp_path, capsys) -> None:
+    from rig_files import simple_skin
+
+    import edgegrad_cli
+
+    rig = eg.load_rig(simple_skin().write(tmp_path))
+    camera = eg.Camera.look_at((0.5, 1.0, 4.0), (0.5, 1.0, 0.0), up=(0, 1, 0), fov_y=40, size=(24, 24))
+    eg.save_camera(tmp_path / "camera.json", camera)
+    (mask,) = shown(rig.posed({"upper": [0.0, 0.0, 0.4]}), [camera])
+    eg.write_image(tmp_path / "mask.png", eg.image.srgb_to_linear(mask))
+    told = [
+        "fit-rig",
+        tmp_path / "a.gltf",
+        tmp_path / "mask.png",
+        "--camera",
+        tmp_path / "camera.json",
+        "--joints",
+        "upper",
+    ]
+    told += ["--tries", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
+    assert edgegrad_cli.main([str(word) for word in told]) == 0
+    assert "wrote pose.json, posed.glb" in capsys.readouterr().out
+    found = json.loads((tmp_path / "out" / "pose.json").read_text())["rotations"]
+    assert abs(found[-1][2] - 0.4) < 0.15 and found[0] == [0.0, 0.0, 0.0]
 
 
 def test_priors() -> None:

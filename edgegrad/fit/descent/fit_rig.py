@@ -16,6 +16,7 @@ from tqdm import tqdm
 from ...camera.camera import Camera
 from ...check import as_tensor, check_int, check_positive
 from ...files.paths import PathLike, replacing
+from ...files.save import save_scene
 from ...rig.control import Control
 from ...rig.rig import Rig
 from ...rig.skinned import Skinned
@@ -79,13 +80,15 @@ class RigFit:
         return self.fit.history
 
     def save(self, folder: PathLike, figures: bool = True) -> list[str]:
-        """What Fit.save() writes, and pose.json: all values by name, as lists. Raises OSError, or at last ImportError."""
+        """What Fit.save() writes, pose.json: all values by name, as lists, and posed.glb: the meshes in this pose. Raises
+        OSError, or at last ImportError."""
         out = Path(folder)
         out.mkdir(parents=True, exist_ok=True)
         content = {name: value.tolist() for name, value in self.values.items()}
         with replacing(out / "pose.json") as temporary:
             temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        return ["pose.json", *self.fit.save(out, figures)]
+        save_scene(out / "posed.glb", self.fit.scene.replace(background=None))
+        return ["pose.json", "posed.glb", *self.fit.save(out, figures)]
 
     def _repr_png_(self) -> bytes:
         return self.fit._repr_png_()
