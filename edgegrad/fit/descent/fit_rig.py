@@ -43,6 +43,9 @@ TRIED = 32  # pixels on the shorter side of pictures on the level where limbs ar
 TRY_STEPS = 6  # of each of these
 GROWTH = 3.0  # a prior's weight grows by this power of how much coarser the pictures are
 STEPS = 15
+ONWARD = (
+    0.5  # of the last frame's motion, that the next begins with: all of it would add up errors that no picture shows
+)
 F64 = torch.float64
 
 
@@ -159,7 +162,7 @@ def track_rig(
     smooth: float = 1e-5,
     **arguments: Any,
 ) -> Iterator[RigFit]:
-    """The pose in each picture of a sequence, one after the other: each begins where the last two lead, and stays near it.
+    """The pose in each picture of a sequence, one after the other: each begins on the way of the last two, and stays near it.
 
     frames     of each moment the arguments of fit_rig() that belong to it: {"masks": …}, or {"images": …, "keypoints": …}
     start      of the first; without one it is searched for
@@ -177,9 +180,11 @@ def track_rig(
             found = fit_rig(rig, cameras, start=start, **told)
         else:
             last = before[-1]
-            ahead = last if len(before) < 2 else {n: 2.0 * v - before[-2][n] for n, v in last.items()}
+            ahead = last if len(before) < 2 else {n: v + ONWARD * (v - before[-2][n]) for n, v in last.items()}
             ahead = {n: rig.controls[n].within(v) if n in rig.controls else v for n, v in ahead.items()}
-            whole = {"coarsest": 48, "tries": 0, **told, "priors": [near(ahead, smooth), *told.get("priors", ())]}
+            still = towards({name: control.rest for name, control in rig.controls.items()})
+            terms = [near(ahead, smooth), *(told.get("priors") or [still])]
+            whole = {"coarsest": 48, "tries": 0, **told, "priors": terms}
             found = fit_rig(rig, cameras, start=ahead, **whole)
         before = [*before[-1:], found.values]
         yield found
