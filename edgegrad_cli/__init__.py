@@ -1,4 +1,5 @@
-"""The command line: edgegrad fit-pose, fit-poses, fit-shape, fit-texture, fit-camera, track, render, bop, demo, report, doctor.
+"""The command line: edgegrad fit-pose, fit-poses, fit-shape, fit-rig, fit-texture, fit-camera, track, render, bop, demo, report,
+doctor.
 
 It lies beside the library rather than in it, for importing any part of that imports torch, which takes seconds: help and
 faults of arguments are said before. Each command imports what it uses when it runs.
@@ -13,7 +14,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from . import bop, demo, doctor, fit_camera, fit_pose, fit_poses, fit_shape, fit_texture, render, report, track
+from . import bop, demo, doctor, fit_camera, fit_pose, fit_poses, fit_rig, fit_shape, fit_texture, render, report, track
 from .arguments import Parser
 
 INTERRUPTED = 130  # exit code of a program that Ctrl-C ended, as shells have it
@@ -64,6 +65,19 @@ def parser() -> Parser:
     found = Parser(prog="edgegrad", description="Differentiable rendering of triangle meshes on the CPU.")
     found.add_argument("--version", action=doctor.Version, nargs=0, help="show the version and exit")
     commands = found.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for module in (fit_pose, fit_poses, fit_shape, fit_texture, fit_camera, track, render, bop, demo, report, doctor):
+    for module in (
+        fit_pose,
+        fit_poses,
+        fit_shape,
+        fit_rig,
+        fit_texture,
+        fit_camera,
+        track,
+        render,
+        bop,
+        demo,
+        report,
+        doctor,
+    ):
         module.add(commands)
     return found

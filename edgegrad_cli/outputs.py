@@ -6,7 +6,7 @@ import argparse
 import errno
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -79,13 +79,14 @@ def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
     return names
 
 
-def finish(fit: Fit, folder: Path) -> int:
-    """Says how a fit by descent ended and writes it all; the exit code. Raises OSError."""
+def finish(fit: Fit, folder: Path, save: Callable[..., list[str]] | None = None) -> int:
+    """Says how a fit by descent ended and writes it all, by its own save() unless another is given; the exit code. Raises
+    OSError."""
     from . import INTERRUPTED
     from .arguments import CHECKPOINT
 
     print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}", flush=True)
-    written = [*fit.save(folder, figures=_can_draw()), CHECKPOINT]
+    written = [*(save or fit.save)(folder, figures=_can_draw()), CHECKPOINT]
     print(f"wrote {', '.join(written)} in {folder}")
     return INTERRUPTED if fit.interrupted else 0
 

@@ -122,8 +122,22 @@ def test_a_material_under_a_known_sky() -> None:
     assert (made.base - truth.base).abs().max() < 0.03
 
 
+@pytest.mark.slow
+def test_a_camera_from_masks_of_a_robot(tmp_path: Path) -> None:
+    pytest.importorskip("yourdfpy")
+    pytest.importorskip("pytorch_kinematics")
+    robot = example("robot")
+    truth, start, found, _, _ = robot.trial(
+        robot.eg.load_robot(robot.arm.write(tmp_path / "arm.urdf")), 4, size=96, seed=2
+    )
+    before, after = (robot.errors(one, truth) for one in (start, found))
+    assert before[0] > 40.0 and before[1] > 2.0 and after[0] < 2.0 and after[1] < 0.1
+
+
 def test_there_is_no_other() -> None:
     assert sorted(path.stem for path in FOLDER.glob("*.py")) == [
+        "arm",
+        "figure",
         "focal",
         "harmonics",
         "many_views",
@@ -132,6 +146,7 @@ def test_there_is_no_other() -> None:
         "network",
         "objects",
         "pose",
+        "robot",
         "shadow",
         "shape",
         "step",

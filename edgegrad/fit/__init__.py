@@ -1,6 +1,7 @@
 """Fitting: what pictures say about a scene, found by following the gradients of `render`."""
 
-from . import losses, regularizers
+from . import losses, priors, regularizers
+from .descent.fit_rig import RigFit, fit_rig, track_rig
 from .descent.fit_scene import Progress, fit_scene
 from .descent.fit_shape import fit_shape
 from .descent.fit_texture import fit_texture
@@ -20,7 +21,7 @@ from .pose.uncertainty import Uncertainty
 from .unwrapping import unwrapped
 
 __all__ = [
-    "CameraFit", "Ending", "Fit", "Measured", "Options", "Parameter", "Pose", "PoseFit", "PoseParameter", "Progress", "Record",
-    "Step", "TrackedPose", "Uncertainty", "fit_camera", "fit_pose", "fit_poses", "fit_scene", "fit_shape", "fit_texture",
-    "losses", "regularizers", "track", "unwrapped", "visual_hull",
+    "CameraFit", "Ending", "Fit", "Measured", "Options", "Parameter", "Pose", "PoseFit", "PoseParameter", "Progress",
+    "Record", "RigFit", "Step", "TrackedPose", "Uncertainty", "fit_camera", "fit_pose", "fit_poses", "fit_rig", "fit_scene",
+    "fit_shape", "fit_texture", "losses", "priors", "regularizers", "track", "track_rig", "unwrapped", "visual_hull",
 ]  # fmt: skip

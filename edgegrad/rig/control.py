@@ -44,7 +44,7 @@ class Control:
         """With these limits, which broadcast. Raises ValueError."""
         bounds = []
         for side, bound in (("low", low), ("high", high)):
-            tensor = None if bound is None else as_tensor(f"{name}: {side}", bound, floating=True).detach().double()
+            tensor = None if bound is None else as_tensor(f"{name}: {side}", bound, like=self.rest).detach().double()
             try:
                 bounds.append(None if tensor is None else tensor.expand(self.rest.shape))
             except RuntimeError as error:

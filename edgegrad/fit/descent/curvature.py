@@ -62,8 +62,10 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
             "method: expected a scene and cameras that PyTorch differentiates in forward mode by what is sought, as "
             f'"gauss-newton" needs, got {error}; give method="adam"'
         ) from error
-    if objective.regularizer is not None:
-        total += _of_regularizer(objective, plain)
+    if (regularizer := objective.regularizer) is not None:
+        total += _of_term(lambda tensors: regularizer(objective.build(tensors)[0]), plain)
+    if objective.prior is not None:
+        total += _of_term(objective.prior, plain)
     return total
 
 
@@ -133,12 +135,11 @@ def check_pointwise(objective: Objective) -> None:
             )
 
 
-def _of_regularizer(objective: Objective, tensors: Mapping[str, Tensor]) -> Tensor:
-    """Its second derivative, without what curves down."""
-    assert objective.regularizer is not None
+def _of_term(term: Callable[[dict[str, Tensor]], Tensor], tensors: Mapping[str, Tensor]) -> Tensor:
+    """The second derivative of a number, without what curves down."""
     leaves = [value.clone().requires_grad_() for value in tensors.values()]
     with torch.enable_grad():
-        slope = _gradient(objective.regularizer(objective.build(dict(zip(tensors, leaves, strict=True)))[0]), leaves)
+        slope = _gradient(term(dict(zip(tensors, leaves, strict=True))), leaves)
         H = torch.stack([_gradient(part, leaves) for part in slope]).detach()
     size, axes = torch.linalg.eigh(0.5 * (H + H.T))
     return axes @ torch.diag(size.clamp(min=0.0)) @ axes.T

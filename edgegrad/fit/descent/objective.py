@@ -29,9 +29,10 @@ class Objective:
 
     def __init__(
         self, build: Callable[[Mapping[str, Tensor]], Built], views: list[View], options: Options,
-        regularizer: Callable[[Scene], Tensor] | None = None,
+        regularizer: Callable[[Scene], Tensor] | None = None, prior: Callable[[Mapping[str, Tensor]], Tensor] | None = None,
     ) -> None:  # fmt: skip
-        self.build, self.views, self.options, self.regularizer = build, views, options, regularizer
+        """`regularizer` of the scene and `prior` of the tensors are added to the loss."""
+        self.build, self.views, self.options, self.regularizer, self.prior = build, views, options, regularizer, prior
         self.losses = {"alpha": loss_of("mask_loss", options.mask_loss)}
         self.regions = Regions(views, options.seed) if options.loss == REGION else None
         if options.loss != REGION:
@@ -49,7 +50,8 @@ class Objective:
                 total = total + self.of_group(name, group, renders[name]) / len(picks)
             for name in first.measured:
                 total = total + self.of_measured(name, group, renders) / len(picks)
-        return total if self.regularizer is None else total + self.regularizer(scene)
+        total = total if self.regularizer is None else total + self.regularizer(scene)
+        return total if self.prior is None else total + self.prior(tensors)
 
     def renews(self, step: int) -> bool:
         """Whether a step begins with renew()."""

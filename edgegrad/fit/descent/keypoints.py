@@ -1,0 +1,63 @@
+"""Joints that pictures show at known pixels, as a term of a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from ...camera.camera import Camera
+from ...check import as_tensor
+from ...rig.rig import Rig
+
+OFF = 1e-9  # radians
+WIDE = 0.02  # of the picture's diagonal: distances beyond count by themselves rather than by their squares
+
+
+def keypoint_term(
+    rig: Rig, cameras: Sequence[Camera], keypoints: Mapping[str, Tensor], weight: float
+) -> Callable[[Mapping[str, Tensor]], Tensor]:
+    """weight · mean of ρ(d² / σ²) over all that are seen, of distances d in pixels, σ = WIDE of the picture's diagonal and
+    ρ(x) = 2 √(1 + x) − 2 (Charbonnier et al. 1997), which pulls from afar and no wrong one more than others; as a function of all
+    values. Raises TypeError or ValueError."""
+    names = rig.deformer.names
+    if not names:
+        raise ValueError("keypoints: expected a rig with joints, got one without; give from_function(…, joints=…)")
+    rows, where = [], []
+    for name, given in keypoints.items():
+        if name not in names:
+            raise ValueError(f"keypoints: expected joints among {', '.join(names)}, got {name!r}")
+        pixels = as_tensor(f"keypoints[{name!r}]", given, floating=True).detach().double()
+        pixels = pixels[None] if pixels.dim() == 1 else pixels
+        if pixels.shape != (len(cameras), 2):
+            raise ValueError(
+                f"keypoints[{name!r}]: expected shape ({len(cameras)}, 2), a pixel for each camera, got {tuple(pixels.shape)}"
+            )
+        rows.append(names.index(name))
+        where.append(pixels)
+    at = torch.stack(where, 1)  # (B, K, 2)
+    seen = torch.isfinite(at).all(-1)
+    if not bool(seen.any()):
+        raise ValueError("keypoints: expected numbers for one at least, got none; leave them out")
+
+    turning = {name for name, control in rig.controls.items() if control.rotates} | {"orientation"}
+
+    def term(values: Mapping[str, Tensor]) -> Tensor:
+        # The length of a rotation vector has no second derivative at 0, which Gauss-Newton asks for.
+        values = {name: value + OFF if name in turning else value for name, value in values.items()}
+        own = {name: value for name, value in values.items() if name in rig.controls}
+        place = {name: value for name, value in values.items() if name not in rig.controls}
+        joints = rig.shape(own, **place).joints
+        assert joints is not None
+        total = torch.zeros((), dtype=torch.float64)
+        for camera, pixels, there in zip(cameras, at, seen, strict=True):
+            if not bool(there.any()):
+                continue
+            shown = camera.project(joints[rows].to(camera.K.dtype)).double()[there]
+            sigma = WIDE * float(torch.tensor(camera.size, dtype=torch.float64).norm())
+            x = (shown - pixels[there]).square().sum(-1) / sigma**2
+            total = total + 2.0 * ((1.0 + x).sqrt() - 1.0).sum()
+        return weight * total / int(seen.sum())
+
+    return term

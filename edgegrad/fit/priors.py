@@ -1,0 +1,52 @@
+"""What poses are likely where the pictures do not say: terms that fit_rig() adds to its loss.
+
+Each makes a function of a rig's values, by name, rotations as rotation vectors. Weights are relative to the loss at full size, a
+mean square difference of pictures from 0 to 1; fit_rig() makes them larger on coarse levels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+Prior = Callable[[Mapping[str, Tensor]], Tensor]
+PLACE = ("translation", "orientation", "scale")
+
+
+def towards(rest: Mapping[str, Tensor], weight: float = 1e-6) -> Prior:
+    """Σ (x − rest)² over all values but those of the whole's place; rotations are in radians."""
+
+    def prior(values: Mapping[str, Tensor]) -> Tensor:
+        total = torch.zeros((), dtype=torch.float64)
+        for name, value in values.items():
+            if name not in PLACE:
+                total = total + (value - rest[name].to(value)).square().sum()
+        return weight * total
+
+    return prior
+
+
+def mirrored(
+    name: str, pairs: Sequence[tuple[int, int]], signs: Sequence[float] = (1.0, -1.0, -1.0), weight: float = 1e-6
+) -> Prior:
+    """Σ |x_left − s x_right|² over pairs of rows of a control: with these signs of rotation vectors, mirrored at x = 0 where the
+    joints' own axes are the world's."""
+
+    def prior(values: Mapping[str, Tensor]) -> Tensor:
+        value = values[name]
+        left, right = value[[a for a, _ in pairs]], value[[b for _, b in pairs]]
+        return weight * (left - right * value.new_tensor(list(signs))).square().sum()
+
+    return prior
+
+
+def near(before: Mapping[str, Tensor], weight: float = 1e-5) -> Prior:
+    """Σ (x − before)² over all values: smooth over time, where `before` is the pose of the last frame, or what it leads to."""
+
+    def prior(values: Mapping[str, Tensor]) -> Tensor:
+        parts = [(value - before[name].to(value)).square().sum() for name, value in values.items() if name in before]
+        return weight * torch.stack(parts).sum() if parts else torch.zeros((), dtype=torch.float64)
+
+    return prior

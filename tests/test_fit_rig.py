@@ -1,0 +1,191 @@
+"""Poses of rigs from masks, pictures and keypoints."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+
+import edgegrad as eg
+from edgegrad.fit import fit_rig, priors, track_rig
+
+
+def arm(bones: int = 2, colored: bool = False) -> eg.Rig:
+    """A flat bar along y of some bones of length 1."""
+    n = 4 * bones
+    y = torch.linspace(0.0, float(bones), n + 1, dtype=torch.float64)
+    ring = [(0.22, 0.1), (-0.22, 0.1), (-0.22, -0.1), (0.22, -0.1)]
+    verts = torch.stack(
+        [torch.tensor([x * (1.2 - 0.3 * float(h) / bones), float(h), z]).double() for h in y for x, z in ring]
+    )
+    faces = [[4 * k + a, 4 * k + (a + 1) % 4, 4 * k + 4 + (a + 1) % 4] for k in range(n) for a in range(4)]
+    faces += [[4 * k + a, 4 * k + 4 + (a + 1) % 4, 4 * k + 4 + a] for k in range(n) for a in range(4)]
+    faces += [[0, 2, 1], [0, 3, 2], [4 * n, 4 * n + 1, 4 * n + 2], [4 * n, 4 * n + 2, 4 * n + 3]]
+    weights = torch.zeros(len(verts), bones)
+    for k in range(bones):
+        up = (verts[:, 1] - k + 0.25).mul(2.0).clamp(0.0, 1.0) if k else torch.ones(len(verts))
+        weights[:, : k or None] *= (1.0 - up)[:, None] if k else 1.0
+        weights[:, k] = up
+    joints = eg.Joints(
+        [f"bone {k}" for k in range(bones)], list(range(-1, bones - 1)),
+        torch.tensor([[0.0, float(k > 0), 0.0] for k in range(bones)]), torch.zeros(bones, 3),
+    )  # fmt: skip
+    colors = 0.3 + 0.5 * torch.rand(len(verts), 3, generator=torch.Generator().manual_seed(0)) if colored else None
+    return eg.Rig.from_arrays(eg.Mesh(verts.float(), torch.tensor(faces), colors=colors), joints, weights)
+
+
+def views(size: int = 48, count: int = 3) -> list[eg.Camera]:
+    eyes = [(5.0 * math.sin(a), 1.8, 5.0 * math.cos(a)) for a in (0.3 + math.tau * k / count for k in range(count))]
+    return [eg.Camera.look_at(eye, (0, 1, 0), up=(0, 1, 0), fov_y=40, size=(size, size)) for eye in eyes]
+
+
+def shown(posed: eg.Mesh, cameras: list[eg.Camera], name: str = "alpha") -> list[torch.Tensor]:
+    return [eg.render_aovs(posed, camera, [name], spp=64, seed=9)[name] for camera in cameras]
+
+
+def degrees(found: torch.Tensor, truth: torch.Tensor) -> float:
+    return math.degrees(float((found - truth).norm(dim=-1).max()))
+
+
+TRUTH = torch.tensor([[0.1, 0.2, -0.3], [0.3, -0.2, 0.5]], dtype=torch.float64)
+
+
+def test_a_pose_from_masks() -> None:
+    rig, cameras = arm(), views(32)
+    masks = shown(rig.posed(TRUTH, translation=[0.05, 0.0, -0.1]), cameras)
+    found = fit_rig(rig, cameras, masks=masks, tries=0, coarsest=32, progress=False)
+    assert found.converged and degrees(found.values["rotations"], TRUTH) < 2.0
+    assert torch.allclose(found.values["translation"], torch.tensor([0.05, 0.0, -0.1]).double(), atol=0.02)
+    assert torch.allclose(found.posed().verts, found.fit.mesh.verts, atol=1e-6)
+
+
+def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:
+    rig, cameras = arm(colored=True).with_limits(rotations={"bone 1": ([-0.2] * 3, [0.2] * 3)}), views()
+    pictures = shown(rig.posed(TRUTH), cameras, "image")
+    told = {"seek": ["rotations"], "joints": ["bone 1"], "start": {"rotations": {"bone 0": TRUTH[0]}}, "tries": 0}
+    found = fit_rig(rig, cameras, pictures, progress=False, steps=5, **told)
+    assert (
+        torch.allclose(found.values["rotations"][0], TRUTH[0])
+        and found.values["rotations"][1].abs().max() <= 0.2 + 1e-12
+    )
+    assert torch.equal(found.values["translation"], torch.zeros(3, dtype=torch.float64))
+
+
+def test_keypoints_find_what_masks_do_not() -> None:
+    """A limb far from its mask, by its joints, of which one is wrong in one picture."""
+    rig, cameras = arm(3), views(count=4)
+    truth = torch.tensor([[0.0, 0.0, 1.3], [0.0, 0.0, 0.9], [0.0, 0.0, 0.3]], dtype=torch.float64)
+    joints = rig.shape({"rotations": truth}).joints
+    seen = torch.stack([camera.project(joints.float()) for camera in cameras], 1)  # (J, B, 2)
+    seen[2, 0] += 10.0
+    seen[1, 1] = math.nan
+    masks = shown(rig.posed(truth), cameras)
+    given = {f"bone {k}": seen[k] for k in range(3)}
+    found = fit_rig(
+        rig, cameras, masks=masks, keypoints=given, keypoint_weight=0.1, tries=0, coarsest=48, steps=30, progress=False
+    )
+    assert (found.rig.shape({"rotations": found.values["rotations"]}).joints - joints).norm(dim=1).max() < 0.1
+
+
+@pytest.mark.slow
+def test_a_limb_that_is_drawn_anew() -> None:
+    """From where a descent alone does not lead: the limb is bent to the other side."""
+    rig, cameras = arm(3), views(count=2)
+    truth = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.4], [0.0, 0.0, 0.6]], dtype=torch.float64)
+    masks = shown(rig.posed(truth), cameras)
+    told = {
+        "masks": masks,
+        "start": {"rotations": -truth},
+        "coarsest": 24,
+        "progress": False,
+        "seek": ["rotations"],
+        "steps": 8,
+    }
+    alone, helped = (fit_rig(rig, cameras, tries=tries, **told) for tries in (0, 6))
+    assert helped.loss < 0.3 * alone.loss and not alone.converged
+
+
+@pytest.mark.slow
+def test_a_sequence() -> None:
+    rig, cameras = arm(), views()
+    truths = [TRUTH * 0.25 * k for k in range(4)]
+    frames = [{"masks": shown(rig.posed(truth), cameras)} for truth in truths]
+    found = list(track_rig(rig, cameras, frames, start={}, tries=0, steps=8, progress=False))
+    errors = [degrees(one.values["rotations"], truth) for one, truth in zip(found, truths, strict=True)]
+    assert max(errors) < 3.0
+
+
+def test_it_goes_on_where_it_stopped(tmp_path) -> None:
+    rig, cameras = arm(), views(32, 2)
+    told = {"masks": shown(rig.posed(TRUTH), cameras), "tries": 0, "steps": 4, "progress": False, "tolerance": 0.0}
+    whole = fit_rig(rig, cameras, **told)
+    count = 0
+
+    def stop(record: object) -> None:
+        nonlocal count
+        count += 1
+        if count == 6:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "checkpoint.pt"
+    half = fit_rig(rig, cameras, checkpoint=path, callback=stop, **told)
+    assert half.fit.interrupted and half.reason == "interrupted"
+    rest = fit_rig(rig, cameras, checkpoint=path, resume=True, **told)
+    assert torch.equal(rest.values["rotations"], whole.values["rotations"]) and len(rest.history) == len(whole.history)
+    assert "pose.json" in rest.save(tmp_path / "out", figures=False)
+
+
+def test_the_command_line(tmp_path, capsys) -> None:
+    from rig_files import simple_skin
+
+    import edgegrad_cli
+
+    rig = eg.load_rig(simple_skin().write(tmp_path))
+    camera = eg.Camera.look_at((0.5, 1.0, 4.0), (0.5, 1.0, 0.0), up=(0, 1, 0), fov_y=40, size=(24, 24))
+    eg.save_camera(tmp_path / "camera.json", camera)
+    (mask,) = shown(rig.posed({"upper": [0.0, 0.0, 0.4]}), [camera])
+    eg.write_image(tmp_path / "mask.png", eg.image.srgb_to_linear(mask))
+    told = [
+        "fit-rig",
+        tmp_path / "a.gltf",
+        tmp_path / "mask.png",
+        "--camera",
+        tmp_path / "camera.json",
+        "--joints",
+        "upper",
+    ]
+    told += ["--tries", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
+    assert edgegrad_cli.main([str(word) for word in told]) == 0
+    assert "wrote pose.json, posed.glb" in capsys.readouterr().out
+    found = json.loads((tmp_path / "out" / "pose.json").read_text())["rotations"]
+    assert abs(found[-1][2] - 0.4) < 0.15 and found[0] == [0.0, 0.0, 0.0]
+
+
+def test_priors() -> None:
+    values = {"rotations": torch.tensor([[0.1, 0.2, 0.3], [0.1, -0.2, -0.3]]).double(), "scale": torch.tensor(3.0)}
+    assert priors.mirrored("rotations", [(0, 1)])(values) == 0.0
+    rest = {"rotations": torch.zeros(2, 3)}
+    assert torch.isclose(priors.towards(rest, 2.0)(values), torch.tensor(2 * 0.28).double())
+    assert torch.isclose(priors.near({"scale": torch.tensor(2.0)}, 3.0)(values).double(), torch.tensor(3.0).double())
+
+
+def test_bad_input() -> None:
+    rig, cameras = arm(), views(16, 2)
+    masks = shown(rig.posed(), cameras)
+    for error, message, told in (
+        (TypeError, "rig: expected a Rig", {"rig": rig.posed()}),
+        (ValueError, "seek: expected names among .*got 'pose'", {"seek": ["pose"]}),
+        (ValueError, "seek: expected a name or more", {"seek": []}),
+        (ValueError, "start: expected names among", {"start": {"turns": 1.0}}),
+        (ValueError, "rotations: expected names among bone 0, bone 1", {"joints": ["elbow"]}),
+        (ValueError, "keypoints: expected joints among", {"keypoints": {"elbow": torch.zeros(2, 2)}}),
+        (ValueError, "a pixel for each camera", {"keypoints": {"bone 0": torch.zeros(3, 2)}}),
+        (ValueError, "expected numbers for one at least", {"keypoints": {"bone 0": torch.full((2, 2), math.nan)}}),
+        (TypeError, "expected options among", {"step": 3}),
+        (ValueError, "images: expected pictures or masks", {"masks": None}),
+    ):
+        given = {"rig": rig, "cameras": cameras, "masks": masks, "progress": False, **told}
+        with pytest.raises(error, match=message):
+            fit_rig(**given)
