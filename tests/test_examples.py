@@ -137,3 +137,11 @@ def test_there_is_no_other() -> None:
         "sun",
         "texture",
     ]
+
+
+@pytest.mark.slow
+def test_colors_in_light_that_goes_to_and_fro() -> None:
+    corner = example("corner")
+    seen = corner.pictures(corner.TRUTH, 32, 8)
+    direct, all_light = (max(corner.errors(corner.fit(seen, bounces)).values()) for bounces in (1, 4))
+    assert direct > 0.15 and all_light < 0.02
