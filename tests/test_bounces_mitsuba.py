@@ -19,10 +19,9 @@ def test_images(lights: str, bounces: int) -> None:
     peer = MitsubaRoom(scene, camera, bounces)
     theirs = torch.stack([peer.render(512, seed) for seed in range(4)]).double()
     own = torch.stack([eg.render(scene, camera, 256, seed, bounces=bounces).detach() for seed in range(4)])
-    # Over blocks of 4 × 4 pixels, of which none but those of the lamp and the sky are without noise.
-    blocks = [images.unfold(1, 4, 4).unfold(2, 4, 4).mean((-1, -2)) for images in (theirs, own)]
-    error = sum(block.var(0) for block in blocks) / 4
-    difference = blocks[0].mean(0) - blocks[1].mean(0)
-    noise = (error + (2e-4 * blocks[1].mean(0)) ** 2).sqrt()
-    assert float((difference / noise).square().mean()) < 2.5
-    assert abs(float(own.mean() / theirs.mean()) - 1) < 3e-3
+    # Over blocks of 8 × 8 pixels, for noise has heavy tails where light is near a wall.
+    blocks = [images.unfold(1, 8, 8).unfold(2, 8, 8).mean((-1, -2)) for images in (theirs, own)]
+    error = ((blocks[0].var(0) + blocks[1].var(0)) / 4).sqrt()
+    means = [block.mean(0) for block in blocks]
+    assert bool(((means[0] - means[1]).abs() < 0.015 * means[0] + 4 * error).all())
+    assert abs(float(own.mean() / theirs.mean()) - 1) < 5e-3

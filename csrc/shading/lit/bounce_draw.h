@@ -30,8 +30,7 @@ class BounceDraw {
     // From numbers in [0, 1), the first of which chooses.
     Vec3 draw(double choice, Vec2 u) const {
         if (choice < by_lobe_) return lobe_.draw(u.x, u.y);
-        const double across = std::sqrt(u.y), phi = 2 * M_PI * u.x;
-        return transposed_times(axes_around(n_), {across * std::cos(phi), across * std::sin(phi), std::sqrt(1 - u.y)});
+        return draw_by_cosine(n_, u);
     }
 
     // By solid angle, of a direction above the normal.

@@ -18,6 +18,12 @@ inline Mat3 axes_around(Vec3 n) {
     return {{{1 + sign * n.x * n.x * a, sign * b, -sign * n.x}, {b, sign + n.y * n.y * a, -n.y}, n}};
 }
 
+// From numbers in [0, 1): a direction above n with the density n·l / π.
+inline Vec3 draw_by_cosine(Vec3 n, Vec2 u) {
+    const double across = std::sqrt(u.y), phi = 2 * M_PI * u.x;
+    return transposed_times(axes_around(n), {across * std::cos(phi), across * std::sin(phi), std::sqrt(1 - u.y)});
+}
+
 // The lobe of one point, of which directions are drawn without derivatives.
 class DrawnLobe {
    public:
