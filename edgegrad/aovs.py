@@ -44,6 +44,7 @@ def render_aovs(
     step_spacing: float = 1.0,
     shadows: bool = True,
     light_samples: int = 1,
+    bounces: int = 1,
 ) -> dict[str, Tensor]:
     """Channels of a scene by name, (H, W, c) each, or (B, H, W, c) for a batch of cameras, all from the same samples.
 
@@ -72,7 +73,7 @@ def render_aovs(
     """
     names = check_aovs(aovs)
     scene = as_scene(scene)
-    lighting = Lighting.of(shadows, light_samples)
+    lighting = Lighting.of(shadows, light_samples, bounces)
     if "uv" in names:
         _check_uvs(scene)
     options: dict[str, Any] = {

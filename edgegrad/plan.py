@@ -18,8 +18,9 @@ from .kernel.flat import Flat
 from .kernel.operators import Hits, backward_kernel, image_room, pass_size
 from .kernel.request import MOVING, SLOTS, STEPPING, Request, Work, label, make_request, required
 from .library import core
+from .light.bounces import check_bounces
 from .light.companions import FOURS, MOST_FOURS
-from .light.radiance import Lighting
+from .light.radiance import LIGHTING, Lighting
 from .light.resampled import how_drawn
 from .points.records import CURVE_BYTES, SURFACE_BYTES, without_colors
 from .points.shadows import ShadowLight
@@ -96,8 +97,10 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
     request = make_request(scene, camera, spp, seed, **options)
     if shading.get("shader") is not None:
         return Plan(_shaded_terms(scene, request, shading.get("creases", "auto")))
-    lighting = Lighting.of(shading.get("shadows", True), shading.get("light_samples", 1))
+    lighting = Lighting.of(**{name: shading[name] for name in LIGHTING if name in shading})
     if scene.is_shaded:
+        if lighting.bounces > 1:
+            check_bounces(scene, camera, request.gradient.visibility)
         return Plan(_lit_terms(scene, request, shading.get("creases", "auto"), lighting))
     wanted = required(request)
     return Plan({**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted)})
@@ -154,9 +157,22 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     )
     rays = inside * terms["interior"].samples + lights * terms["boundary"].samples
     terms["shadows"] = Term(lights > 0 and lighting.shadows, why if lights else "no lights", samples=rays)
+    terms["bounces"] = _bounces(scene, terms["interior"].samples + terms["boundary"].samples, lighting)
     terms["shadow edges"] = _shadow_edges(scene, request, lighting)
     terms["texels of lamps"] = _texels_of_lamps(scene, lighting)
     return terms
+
+
+def _bounces(scene: Scene, points: int, lighting: Lighting) -> Term:
+    if lighting.bounces == 1:
+        return Term(False, "bounces=1: light is scattered once on its way")
+    shadows = len(scene.casting) if lighting.shadows else 0
+    return Term(
+        True,
+        f"a path for each point of the gradient, and for each face in a pixel; {1 + shadows} rays for each of at most "
+        f"{lighting.bounces - 1} further points",
+        samples=(lighting.bounces - 1) * (1 + shadows) * points,
+    )
 
 
 def _texels_of_lamps(scene: Scene, lighting: Lighting) -> Term:

@@ -17,7 +17,7 @@ from .kernel import memory as memory
 from .kernel.counts import CURVES, Watch, table
 from .kernel.operators import backward_kernel, forward_kernel
 from .kernel.request import Request, make_request, required
-from .light.radiance import Lighting
+from .light.radiance import LIGHTING, Lighting
 from .render import SHADING, check_options
 from .scene.mesh import Mesh
 from .scene.scene import Scene, as_scene
@@ -150,7 +150,7 @@ def _of_shaded(
     options: Mapping[str, Any],
 ) -> Profile:
     """Of a scene of which points are shaded."""
-    lighting = Lighting.of(options.get("shadows", True), options.get("light_samples", 1))
+    lighting = Lighting.of(**{name: options[name] for name in LIGHTING if name in options})
     creases, own = options.get("creases", "auto"), {n: v for n, v in options.items() if n not in SHADING}
     scene, camera, leaves = _leaves(scene, camera)
     request = make_request(scene, camera, *spp_and_seed, **own)

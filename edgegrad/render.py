@@ -21,14 +21,14 @@ from .kernel.autograd import render_image
 from .kernel.batch import render_images
 from .kernel.operators import forward_kernel, screen_gradient_kernel
 from .kernel.request import Request, make_request
-from .light.radiance import Lighting, check_unlit
+from .light.radiance import LIGHTING, Lighting, check_unlit
 from .light.whole import lit_image
 from .scene.mesh import Mesh
 from .scene.scene import Scene, as_scene
 from .scene.tree import map_tensors, savable, tensors_in
 from .shader import Shader, render_shaded
 
-SHADING = ("shader", "creases", "check_shader", "shadows", "light_samples")  # the options of shaders and of lit scenes
+SHADING = ("shader", "creases", "check_shader", *LIGHTING)  # the options of shaders and of lit scenes
 
 
 def render(
@@ -48,6 +48,7 @@ def render(
     step_spacing: float = 1.0,
     shadows: bool = True,
     light_samples: int = 1,
+    bounces: int = 1,
 ) -> Tensor:
     """The image (H, W, C) of a scene, or (B, H, W, C) for a batch of cameras: linear radiance, row 0 on top.
 
@@ -88,6 +89,12 @@ def render(
     light_samples    of lit scenes: points drawn of each light that has an extent, for each point that is shaded. Of a face in a
                      pixel at most a quarter of its samples are, or 4 if spp is below 16; in images of glossy surfaces under an
                      Environment all are, with fewer points of lights each and no fewer in all
+    bounces          of lit scenes: how often light is scattered on its way from a light to the eye, at most; 1: direct light. A
+                     path goes on from each point that is shaded, as the material there scatters, and draws one point of
+                     each light wherever it comes to; from the third bounce on it may end early (Russian roulette). Colours
+                     of meshes without a material light nothing. So far with gradients by colours, textures, materials,
+                     normal maps and how bright lights are; what moves borders (vertices, camera, places of lights) must not
+                     require one, unless visibility=False
 
     A scene with a light, or with a mesh that has a material, is lit: see Scene and Material. Its image has the dtype of the
     vertices.
@@ -105,7 +112,7 @@ def render(
         scene, camera, spp, seed, surface_samples=surface_samples, edge_samples=edge_samples, visibility=visibility,
         filter=filter, grad_seed=grad_seed, step_spacing=step_spacing,
     )  # fmt: skip
-    lighting = Lighting.of(shadows, light_samples)
+    lighting = Lighting.of(shadows, light_samples, bounces)
     if shader is None and as_scene(scene).is_shaded:
         return lit_image(lighting, as_scene(scene), camera, request, creases)
     if shader is not None:

@@ -137,6 +137,7 @@ def test_a_camera_from_masks_of_a_robot(tmp_path: Path) -> None:
 def test_there_is_no_other() -> None:
     assert sorted(path.stem for path in FOLDER.glob("*.py")) == [
         "arm",
+        "corner",
         "figure",
         "focal",
         "harmonics",
@@ -146,9 +147,16 @@ def test_there_is_no_other() -> None:
         "network",
         "objects",
         "pose",
+        "raster_cube",
+        "raster_earth",
+        "raster_environment_phong",
+        "raster_pose",
+        "raster_triangle",
+        "raster_views",
         "robot",
         "shadow",
         "shape",
+        "simplify",
         "step",
         "sun",
         "texture",
@@ -202,3 +210,11 @@ def test_a_mesh_of_few_faces_with_a_texture() -> None:
     simplify = example("simplify", size=96)
     mesh, off = simplify.simplify(simplify.stone(4), faces=200, steps=60)
     assert len(mesh.faces) <= 220 and off.fitted < off.baked < 0.7 * off.simplified
+
+
+@pytest.mark.slow
+def test_colors_in_light_that_goes_to_and_fro() -> None:
+    corner = example("corner")
+    seen = corner.pictures(corner.TRUTH, 32, 8)
+    direct, all_light = (max(corner.errors(corner.fit(seen, bounces)).values()) for bounces in (1, 4))
+    assert direct > 0.15 and all_light < 0.02

@@ -7,6 +7,7 @@
 #include "core/sobol.h"
 #include "forward/image_borders.h"
 #include "forward/pixel_hits.h"
+#include "shading/lit/indirect.h"
 
 namespace edgegrad {
 
@@ -34,6 +35,7 @@ class LitRow : public RowVisitor {
         : in_(in),
           lights_(light_samples(in.lit, in.options)),
           buffers_(shade_buffers(in.lit, in.options)),
+          paths_(in.options.bounces > 1 ? path_buffers(in.lit, in.options) : nullptr),
           sums_(int64_t(in.width) * in.lit.channels),
           filtered_(in.lit.is_filtered()) {}
 
@@ -68,8 +70,9 @@ class LitRow : public RowVisitor {
             seed_.push_back(int64_t(in_.seed + uint64_t(in_.points) * place + among_));
         }
         const double* spread = filtered_ ? spread_.data() : nullptr;
-        shade_some(in_.lit, in_.scene, in_.caster, {int64_t(n), face_.data(), b_.data(), seed_.data(), {}, spread},
-                   in_.options, *buffers_, radiance_.data(), seen_.data());
+        const LitPoints points{int64_t(n), face_.data(), b_.data(), seed_.data(), {}, spread};
+        shade_some(in_.lit, in_.scene, in_.caster, points, in_.options, *buffers_, radiance_.data(), seen_.data());
+        if (paths_) add_indirect(in_.lit, in_.scene, in_.caster, points, *paths_, radiance_.data());
         for (size_t i = 0; i < n; ++i) {
             const PixelHit& hit = hits[first + i];
             double* sum = &sums_[int64_t(hit.pixel % in_.width) * C];
@@ -85,7 +88,8 @@ class LitRow : public RowVisitor {
     const RowInput<T>& in_;
     std::vector<LightSample> lights_;
     std::shared_ptr<ShadeBuffers> buffers_;
-    std::vector<double> sums_;  // of the row
+    std::shared_ptr<Paths> paths_;  // null: of direct light alone
+    std::vector<double> sums_;      // of the row
     bool filtered_;
     uint64_t among_ = 0;  // the hits of one pixel, which this is
     std::vector<int64_t> face_, seed_;

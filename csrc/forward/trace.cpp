@@ -20,6 +20,22 @@ void each_batch(int64_t size, Team& team, Body body) {
     });
 }
 
+template <class T>
+Vec3 point_on(const SceneView<T>& scene, int64_t face, const double* b) {
+    const double u = b[0], v = b[1];
+    return (1 - u - v) * corner(scene, face, 0) + u * corner(scene, face, 1) + v * corner(scene, face, 2);
+}
+
+// At its rim a face may be hit in float that the ray misses by a rounding: then it is hit at the rim, for its neighbour
+// may be missed as well.
+Barycentrics onto_face(const Meeting& m) {
+    double u = std::max(m.u, 0.0), v = std::max(m.v, 0.0);
+    if (u + v > 1) u /= u + v, v = 1 - u;
+    return {u, v};
+}
+
+double extent(Vec3 v) { return std::max({std::fabs(v.x), std::fabs(v.y), std::fabs(v.z)}); }
+
 }  // namespace
 
 template <class T>
@@ -30,18 +46,16 @@ RayHits trace(const SceneView<T>& scene, const RayCaster& caster, const TracedRa
         const auto ray = [&](int i) {
             return Ray{vec(rays.origins + 3 * (first + i)), vec(rays.directions + 3 * (first + i))};
         };
-        // At its rim a face may be hit in float that the ray misses by a rounding: then it is hit at the rim, for its
-        // neighbour may be missed as well. One that the ray runs along shows nothing.
+        // A face that the ray runs along shows nothing.
         std::vector<int32_t> without[RayBatch::size];
         for (int i = 0; i < n && rays.ignored; ++i)
             if (rays.ignored[first + i] >= 0) without[i] = {rays.ignored[first + i]};
         cast_each(caster, n, out.face.data() + first, without, ray, [&](int i, int32_t face) {
             const Meeting m = meet(scene, face, ray(i));
             if (!m.exists() || m.t < 0) return false;
-            double u = std::max(m.u, 0.0), v = std::max(m.v, 0.0);
-            if (u + v > 1) u /= u + v, v = 1 - u;
-            if (!shows(scene, face, {u, v})) return false;
-            out.b[2 * (first + i)] = u, out.b[2 * (first + i) + 1] = v;
+            const Barycentrics at = onto_face(m);
+            if (!shows(scene, face, at)) return false;
+            out.b[2 * (first + i)] = at.u, out.b[2 * (first + i) + 1] = at.v;
             return true;
         });
     });
@@ -56,10 +70,8 @@ void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& l
         Ray ray[RayBatch::size];
         double contact[RayBatch::size];
         for (int i = 0; i < batch.count; ++i) {
-            const int64_t k = first + i, face = lines.face[k];
-            const double u = lines.b[2 * k], v = lines.b[2 * k + 1];
-            const Vec3 from =
-                (1 - u - v) * corner(scene, face, 0) + u * corner(scene, face, 1) + v * corner(scene, face, 2);
+            const int64_t k = first + i;
+            const Vec3 from = point_on(scene, lines.face[k], lines.b + 2 * k);
             ray[i] = {from, vec(lines.to + 3 * k) - from, 1};
             contact[i] = lines.contact[k] / length(ray[i].direction);
             batch.set(i, caster.frame(), ray[i]);
@@ -87,6 +99,37 @@ std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster,
     return out;
 }
 
+template <class T>
+void depart(const SceneView<T>& scene, const RayCaster& caster, const Departures& rays, int32_t* face, double* b) {
+    std::vector<int32_t> without[RayBatch::size];
+    for (int64_t first = 0; first < rays.size; first += RayBatch::size) {
+        const int n = int(std::min<int64_t>(RayBatch::size, rays.size - first));
+        Ray ray[RayBatch::size];
+        for (int i = 0; i < n; ++i) {
+            const int64_t k = first + i, own = rays.face[k];
+            ray[i] = {point_on(scene, own, rays.b + 2 * k), vec(rays.directions + 3 * k)};
+            without[i] = {rays.face[k]};
+        }
+        cast_each(
+            caster, n, face + first, without, [&](int i) { return ray[i]; },
+            [&](int i, int32_t hit) {
+                const int64_t k = first + i;
+                const Meeting m = meet(scene, hit, ray[i]);
+                // As in see(): how faces that share a vertex lie to one another is exact.
+                const double nearest = share_vertex(scene, hit, rays.face[k])
+                                           ? Meeting::rounding * extent(ray[i].origin)
+                                           : rays.contact[k];
+                if (!m.exists() || m.t < nearest) return false;
+                const Barycentrics at = onto_face(m);
+                if (!shows(scene, hit, at)) return false;
+                b[2 * k] = at.u, b[2 * k + 1] = at.v;
+                return true;
+            });
+    }
+}
+
+template void depart(const SceneView<float>&, const RayCaster&, const Departures&, int32_t*, double*);
+template void depart(const SceneView<double>&, const RayCaster&, const Departures&, int32_t*, double*);
 template RayHits trace(const SceneView<float>&, const RayCaster&, const TracedRays&, Team&);
 template RayHits trace(const SceneView<double>&, const RayCaster&, const TracedRays&, Team&);
 template void see(const SceneView<float>&, const RayCaster&, const Sightlines&, uint8_t*);

@@ -39,4 +39,16 @@ std::vector<uint8_t> visible(const SceneView<T>& scene, const RayCaster& caster,
 template <class T>
 void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& lines, uint8_t* out);
 
+// N rays from points on faces (barycentrics (N, 2)) in unit directions (N, 3).
+struct Departures {
+    const int32_t* face;
+    const double *b, *directions;
+    const double* contact;  // (N,) world units: what is nearer than this to the point is not met
+    int64_t size;
+};
+// The nearest face that each meets, −1: none, and where on it, (N, 2); on one thread. A ray does not meet the face that
+// it leaves.
+template <class T>
+void depart(const SceneView<T>& scene, const RayCaster& caster, const Departures& rays, int32_t* face, double* b);
+
 }  // namespace edgegrad

@@ -32,6 +32,8 @@ using namespace nanobind::literals;
 
 namespace edgegrad {
 
+void bind_paths_for_tests(nb::module_& m);  // paths_for_tests.cpp
+
 namespace {
 
 using A2 = std::array<double, 2>;
@@ -143,6 +145,7 @@ void bind_for_tests(nb::module_& m) {
     nb::module_ p = m.def_submodule("for_tests", "What only tests and benchmarks call.");
     bind_scene_functions<float>(p);
     bind_scene_functions<double>(p);
+    bind_paths_for_tests(p);
 
     p.def("project", [](const Camera& c, A3 q) { return array(bend(c, project(c, vec(q))).x); });
     p.def("project_straight", [](const Camera& c, A3 q) { return array(project(c, vec(q))); });

@@ -14,6 +14,7 @@
 #include "python/shaped.h"
 #include "python/unlocked.h"
 #include "shading/lit/flat_light.h"
+#include "shading/lit/indirect.h"
 
 using namespace nanobind::literals;
 
@@ -168,12 +169,11 @@ nb::tuple trace_and_shade_points_vjp(const SceneArrays<T>& arrays, const LitArra
     });
 }
 
-nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, const LitOptions& options,
-                            In<int8_t, 2> seen, const std::vector<std::optional<In<double, 2>>>& tangents,
-                            std::optional<In<double, 2>> b_dot, std::optional<In<double, 3>> spread_dot, int threads) {
-    const LitPoints view = points.view(lit.scene, faces_of(lit));
-    check_seen(lit, view, options, seen);
-    LitScene moving = lit.scene;
+// Tangents of the tables, of b and of its spread; None: zero.
+using Tangents2 = std::optional<In<double, 2>>;
+using Tangents3 = std::optional<In<double, 3>>;
+LitScene with_tangents(const LitScene& scene, const std::vector<Tangents2>& tangents) {
+    LitScene moving = scene;
     if (tangents.size() != moving.tables.size()) refuse("tangents: expected one for each table, or None");
     for (size_t i = 0; i < tangents.size(); ++i) {
         if (!tangents[i]) continue;
@@ -182,14 +182,72 @@ nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, con
             refuse("tangents: expected the shape of the table");
         moving.tables[i].tangent = tangents[i]->data();
     }
-    if (b_dot && (int64_t(b_dot->shape(0)) != view.size || b_dot->shape(1) != 3))
+    return moving;
+}
+LitPlaces<const double> tangents_of_places(const LitPoints& points, const Tangents2& b_dot,
+                                           const Tangents3& spread_dot) {
+    if (b_dot && (int64_t(b_dot->shape(0)) != points.size || b_dot->shape(1) != 3))
         refuse("b_dot: expected a row a point");
-    if (spread_dot && (!view.spread || int64_t(spread_dot->shape(0)) != view.size || spread_dot->shape(1) != 2 ||
+    if (spread_dot && (!points.spread || int64_t(spread_dot->shape(0)) != points.size || spread_dot->shape(1) != 2 ||
                        spread_dot->shape(2) != 2))
         refuse("spread_dot: expected the shape of spread");
-    const LitPlaces<const double> dot{b_dot ? b_dot->data() : nullptr, spread_dot ? spread_dot->data() : nullptr};
+    return {b_dot ? b_dot->data() : nullptr, spread_dot ? spread_dot->data() : nullptr};
+}
+
+nb::object shade_points_jvp(const LitArrays& lit, const PointArrays& points, const LitOptions& options,
+                            In<int8_t, 2> seen, const std::vector<Tangents2>& tangents, Tangents2 b_dot,
+                            Tangents3 spread_dot, int threads) {
+    const LitPoints view = points.view(lit.scene, faces_of(lit));
+    check_seen(lit, view, options, seen);
+    const LitScene moving = with_tangents(lit.scene, tangents);
+    const LitPlaces<const double> dot = tangents_of_places(view, b_dot, spread_dot);
     std::vector<double> out(size_t(view.size) * size_t(moving.channels));
     unlocked(threads, [&](Team& team) { shade_jvp(moving, view, options, seen.data(), dot, out.data(), team); });
+    return shaped(std::move(out), {size_t(view.size), size_t(moving.channels)});
+}
+
+// (N, C): what reaches points by way of other surfaces.
+template <class T>
+nb::object indirect_points(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
+                           const LitOptions& options, int threads) {
+    check_faces(arrays, lit);
+    const LitPoints view = points.view(lit.scene, faces_of(lit));
+    std::vector<double> out(size_t(view.size) * size_t(lit.scene.channels));
+    unlocked(threads, [&](Team& team) {
+        GeometryWork work;
+        const auto geometry = arrays.geometry({}, team, work);
+        indirect(lit.scene, arrays.view(), geometry->caster(), view, options, out.data(), team);
+    });
+    return shaped(std::move(out), {size_t(view.size), size_t(lit.scene.channels)});
+}
+
+template <class T>
+nb::tuple indirect_points_vjp(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
+                              const LitOptions& options, In<double, 2> bar, const std::vector<bool>& wanted,
+                              int threads) {
+    check_faces(arrays, lit);
+    const LitPoints view = points.view(lit.scene, faces_of(lit));
+    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, LitPlaces<double> places, Team& team) {
+        GeometryWork work;
+        const auto geometry = arrays.geometry({}, team, work);
+        indirect_vjp(lit.scene, arrays.view(), geometry->caster(), view, options, bar.data(), to, places, team);
+    });
+}
+
+template <class T>
+nb::object indirect_points_jvp(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
+                               const LitOptions& options, const std::vector<Tangents2>& tangents, Tangents2 b_dot,
+                               Tangents3 spread_dot, int threads) {
+    check_faces(arrays, lit);
+    const LitPoints view = points.view(lit.scene, faces_of(lit));
+    const LitScene moving = with_tangents(lit.scene, tangents);
+    const LitPlaces<const double> dot = tangents_of_places(view, b_dot, spread_dot);
+    std::vector<double> out(size_t(view.size) * size_t(moving.channels));
+    unlocked(threads, [&](Team& team) {
+        GeometryWork work;
+        const auto geometry = arrays.geometry({}, team, work);
+        indirect_jvp(moving, arrays.view(), geometry->caster(), view, options, dot, out.data(), team);
+    });
     return shaped(std::move(out), {size_t(view.size), size_t(moving.channels)});
 }
 
@@ -217,6 +275,11 @@ void bind_scene_lit(nb::class_<SceneArrays<T>>& scene) {
     scene.def("shade", &shade_points<T>, "lit"_a, "points"_a, "options"_a, "values"_a, "threads"_a)
         .def("trace_and_shade_vjp", &trace_and_shade_points_vjp<T>, "lit"_a, "points"_a, nb::kw_only(), "options"_a,
              "bar"_a.noconvert(), "wanted"_a, "threads"_a)
+        .def("indirect", &indirect_points<T>, "lit"_a, "points"_a, "options"_a, "threads"_a)
+        .def("indirect_vjp", &indirect_points_vjp<T>, "lit"_a, "points"_a, nb::kw_only(), "options"_a,
+             "bar"_a.noconvert(), "wanted"_a, "threads"_a)
+        .def("indirect_jvp", &indirect_points_jvp<T>, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "tangents"_a,
+             "b_dot"_a.none(), "spread_dot"_a.none(), "threads"_a)
         .def("lit_image", &lit_image<T>, "lit"_a, "camera"_a, "image"_a, "options"_a, "points"_a, "seed"_a, "again"_a,
              "threads"_a, "hits"_a);
 }

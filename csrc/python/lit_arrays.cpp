@@ -242,6 +242,7 @@ LitPoints PointArrays::view(const LitScene& scene, int64_t faces) const {
 
 void bind_lit_arrays(nb::module_& m) {
     m.attr("MOST_LIT_CHANNELS") = most_lit_channels;
+    m.attr("MOST_BOUNCES") = most_bounces;
     m.attr("MOST_LAMP_FACES") = LampTree::most_faces;
     nb::class_<SourceArrays>(m, "LitSource")
         .def(nb::new_(&make_source), "kind"_a, "value"_a = no_table, "factor"_a = no_table, "uvs"_a = no_table,
@@ -284,10 +285,11 @@ void bind_lit_arrays(nb::module_& m) {
         .def("crossings", &crossings, "origins"_a.noconvert(), "directions"_a.noconvert(), "start"_a.noconvert(),
              "end"_a.noconvert());
     nb::class_<LitOptions>(m, "LitOptions")
-        .def(nb::new_([](bool shadows, int samples, int only, bool in_fours, double dark) {
-                 return LitOptions{shadows, samples, only, in_fours, dark};
+        .def(nb::new_([](bool shadows, int samples, int only, bool in_fours, double dark, int bounces) {
+                 if (bounces < 1 || bounces > most_bounces) refuse("bounces: expected 1 to MOST_BOUNCES");
+                 return LitOptions{shadows, samples, only, in_fours, dark, bounces};
              }),
-             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a, "in_fours"_a, "dark"_a);
+             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a, "in_fours"_a, "dark"_a, "bounces"_a = 1);
 }
 
 }  // namespace edgegrad

@@ -11,9 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..kernel.first_order import Tensors, apply, array, doubles, without_derivatives
-from ..kernel.flat import Flat
-from ..kernel.operators import kernel_scene
+from ..kernel.first_order import apply, array, without_derivatives
 from ..library import core
 from ..points.footprints import pyramid_of
 from ..points.frame import Frame
@@ -27,6 +25,7 @@ from ..scene.material import WRAPS, Parameter, Texture
 from ..scene.mesh import FILTERS, Mesh
 from ..scene.mesh_light import MeshLight
 from ..scene.scene import Scene
+from .at_points import AtPoints, Indirect, Options, Points, Shading
 from .companions import COMPANIONS, MOST_FOURS
 from .lamp_trees import hides, least_brightness, tree_of
 from .resampled import DARK
@@ -61,30 +60,15 @@ def nearest_textures(mesh: Mesh) -> list[Texture]:
 def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
     """(N, C) the radiance of meshes by their materials and the scene's lights; of meshes without a material their colours. Zeros
     with the same derivatives, if the hits need no values. Which lights are seen is noted in the hits."""
-    surfaces, view = hits._surfaces, hits._view
-    assert isinstance(view, View)
-    layout, tables = _layout(surfaces, view)
-    forced = hits._forced
-    points = _Points(
-        hits._face.cpu(),
-        hits._seed.cpu(),
-        *((None,) * 4 if forced is None else _forced(forced.points, forced.lit)),
-    )
-    number = -1 if forced is None else forced.light
-    only = number if hits._only_light else -1
+    surfaces = hits._surfaces
+    at, tensors = _at(hits)
+    only = at.forced if hits._only_light else -1
     samples = samples if only < 0 else 1
-    casters = surfaces.casters
     # Without values nothing is computed now; but once it must be, to note the lights whose shadows are asked for.
     known = not shadows or len(surfaces.shadowing) == len(surfaces.scene.casting)
     values = hits._needs_values or not known
-    shading = _Shading(
-        layout=layout, tables=len(tables), forced=number, shadows=shadows, samples=samples, only=only,
-        in_fours=not hits._needs_values, values=values,
-        dtype=surfaces.verts.dtype, cutoffs=casters.cutoffs, spacing=casters.spacing,
-    )  # fmt: skip
-    arrays = (part for part in casters if isinstance(part, Tensor))
-    spread = hits._spread.cpu() if "mipmap" in _filters(surfaces.scene) else None
-    found, *kept = apply(shading, [hits._exact.cpu(), spread, *points, *tables, *arrays])
+    options = Options(shadows=shadows, samples=samples, only=only, in_fours=not hits._needs_values)
+    found, *kept = apply(Shading(at, options, values), tensors)
     if not values:
         return found.to(surfaces.verts)
     (seen,) = kept
@@ -97,12 +81,34 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
             surfaces.shadowing.add(light)
             if casting.punctual:
                 hits._note_visibility(light, own)
-        fours = shading.in_fours and isinstance(casting, Environment) and surfaces.scene.is_glossy
+        fours = options.in_fours and isinstance(casting, Environment) and surfaces.scene.is_glossy
         column += 1 if casting.punctual else samples * (MOST_FOURS * COMPANIONS if fours else 1)
     return found.to(surfaces.verts)
 
 
-def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
+def indirect(hits: Hits, shadows: bool, bounces: int) -> Tensor:
+    """(N, C) what is to be added of light that is scattered more than once, `bounces` times at most. Zeros with the same
+    derivatives, if the hits need no values."""
+    at, tensors = _at(hits)
+    options = Options(shadows=shadows, samples=1, bounces=bounces)
+    return apply(Indirect(at, options, hits._needs_values), tensors)[0].to(hits._surfaces.verts)
+
+
+def _at(hits: Hits) -> tuple[AtPoints, list[Tensor | None]]:
+    surfaces, view = hits._surfaces, hits._view
+    assert isinstance(view, View)
+    layout, tables = _layout(surfaces, view)
+    forced, casters = hits._forced, surfaces.casters
+    known = (None,) * 4 if forced is None else _forced(forced.points, forced.lit)
+    points = Points(hits._face.cpu(), hits._seed.cpu(), *known)
+    spread = hits._spread.cpu() if "mipmap" in _filters(surfaces.scene) else None
+    number = -1 if forced is None else forced.light
+    at = AtPoints(layout, len(tables), number, surfaces.verts.dtype, casters.cutoffs, casters.spacing)
+    arrays = (part for part in casters if isinstance(part, Tensor))
+    return at, [hits._exact.cpu(), spread, *points, *tables, *arrays]
+
+
+def image(frame: Frame, options: Options, points: int) -> Tensor:
     """(H · W, C) the scene's surfaces before black, without derivatives, with `points` of each face in a pixel shaded."""
     layout, tables = _layout(frame.fixed, frame.fixed_view)
     seed, again = (int(frame.seeds(kind, 1)) & _64_BITS for kind in ("image", "image again"))
@@ -110,7 +116,7 @@ def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
     def compute(kernel: Any, faces: Tensor, arguments: dict[str, Any], *tables: Tensor) -> Sequence[Tensor]:
         found, asked = kernel.lit_image(
             lit=layout.kernel(tables, faces),
-            options=core.LitOptions(shadows=shadows, samples=samples, only=-1, in_fours=False, dark=0.0),
+            options=options._replace(dark=0.0).kernel,
             points=points,
             seed=seed,
             again=again,
@@ -119,7 +125,7 @@ def image(frame: Frame, shadows: bool, samples: int, points: int) -> Tensor:
         return torch.from_numpy(found), torch.from_numpy(asked)
 
     found, asked = frame.sampler.lit_image(compute, *tables)
-    if shadows:
+    if options.shadows:
         lights = range(len(frame.surfaces.scene.casting))
         frame.surfaces.shadowing.update(light for light in lights if asked[light, 0])
     return frame.here(found)
@@ -169,17 +175,6 @@ def light_on_faces(
 
 def _forced(points: Any, lit: Tensor) -> tuple[Tensor, ...]:
     return points.index.cpu(), points.uv.cpu().double(), points.density.cpu().double(), lit.cpu().to(torch.uint8)
-
-
-class _Points(NamedTuple):
-    """Tensors of points, but for their barycentrics and what these differ by from pixel to pixel."""
-
-    face: Tensor  # (N,) int64
-    seed: Tensor  # (N,) int64
-    index: Tensor | None  # pyright: ignore[reportIncompatibleMethodOverride]: points of a light whose shadow is known
-    uv: Tensor | None
-    density: Tensor | None
-    lit: Tensor | None  # (N,) uint8
 
 
 class _Tables:
@@ -368,83 +363,3 @@ def _lamp(scene: Scene, light: Light, number: int, eps: float, tables: _Tables) 
 
 def _rows(index: Tensor) -> np.ndarray:
     return values_of(index)[0].astype(np.int32)
-
-
-class _Shading(NamedTuple):
-    """csrc/shading/lit/lit.h, of the tensors (b, spread, *points, *tables, *flat). The results are radiance (N, C) float64, and
-    which light samples are seen: (N, K) int8, −1 below the surface. Without `values`, zeros with the radiance's derivatives."""
-
-    layout: _Layout
-    tables: int  # how many
-    forced: int  # the light whose visibility is given, −1: none
-    shadows: bool
-    samples: int
-    only: int  # the light whose radiance alone is wanted, −1: all
-    in_fours: bool  # on glossy surfaces points of environments come in fours, for derivatives (companions.h)
-    values: bool
-    dtype: torch.dtype  # of the zeros
-    cutoffs: list[float]  # of the flat scene, whose other fields are tensors
-    spacing: list[float]
-
-    @property
-    def _first(self) -> int:
-        """Of the tables."""
-        return 2 + len(_Points._fields)
-
-    @property
-    def moving(self) -> Sequence[int]:
-        return 0, 1, *range(self._first, self._first + self.tables)
-
-    def _flat(self, tensors: Tensors) -> Flat:
-        arrays = tensors[self._first + self.tables :]
-        return Flat(*arrays, cutoffs=self.cutoffs, spacing=self.spacing)  # pyright: ignore[reportArgumentType]
-
-    def _tables(self, tensors: Tensors) -> list[Tensor]:
-        return list(tensors[self._first : self._first + self.tables])  # pyright: ignore[reportReturnType]
-
-    def _arguments(self, tensors: Tensors) -> dict[str, Any]:
-        points = _Points(*tensors[2 : self._first])  # pyright: ignore[reportArgumentType]
-        arrays = {name: None if t is None else array(t) for name, t in points._asdict().items()}
-        b, spread = tensors[:2]
-        assert b is not None
-        arrays["spread"] = None if spread is None else array(spread)
-        return {
-            "lit": self.layout.kernel(self._tables(tensors), self._flat(tensors).faces),
-            "points": core.LitPoints(b=array(b), forced_lamp=self.forced, **arrays),
-            "options": core.LitOptions(
-                shadows=self.shadows, samples=self.samples, only=self.only, in_fours=self.in_fours, dark=DARK
-            ),
-            "threads": torch.get_num_threads(),
-        }
-
-    def _shade(self, tensors: Tensors) -> tuple[Tensor, Tensor]:
-        found, seen = kernel_scene(self._flat(tensors)).shade(values=self.values, **self._arguments(tensors))
-        return torch.from_numpy(found), torch.from_numpy(seen)
-
-    def value(self, tensors: Tensors) -> tuple[Tensor, ...]:
-        if self.values:
-            return self._shade(tensors)
-        b = tensors[0]
-        assert b is not None
-        return (torch.zeros((len(b), self.layout.channels), dtype=self.dtype),)
-
-    def vjp(self, bar: Tensor, wanted: Sequence[bool], kept: Tensors, tensors: Tensors) -> Sequence[Tensor]:
-        arguments = {"bar": doubles(bar), "wanted": list(wanted[2:]), **self._arguments(tensors)}
-        if kept:
-            (seen,) = kept
-            assert seen is not None
-            found, *places = core.shade_vjp(seen=array(seen), **arguments)
-        else:
-            found, *places = kernel_scene(self._flat(tensors)).trace_and_shade_vjp(**arguments)
-        none = bar.new_zeros(0)
-        return [none if g is None else torch.from_numpy(g) for g in (*places, *found)]
-
-    def jvp(self, tangents: Tensors, kept: Tensors, tensors: Tensors) -> Tensor:
-        seen = kept[0] if kept else self._shade(tensors)[1]
-        assert seen is not None
-        b_dot, spread_dot, *rest = (doubles(tangent) for tangent in tangents)
-        return torch.from_numpy(
-            core.shade_jvp(
-                seen=array(seen), tangents=rest, b_dot=b_dot, spread_dot=spread_dot, **self._arguments(tensors)
-            )
-        )

@@ -21,6 +21,7 @@ from ..kernel.derivatives import differentiates, moves
 from ..kernel.first_order import unreached
 from ..kernel.flat import image_dtype
 from ..kernel.request import Request
+from ..library import core
 from ..points.frame import Frame
 from ..points.hits import Hits
 from ..points.surfaces import View
@@ -35,6 +36,8 @@ from ..scene.tree import tensors_in
 from ..shader import Effort, render_shaded, shaded_points
 from ..warnings import warn
 from . import in_kernel
+from .at_points import Options
+from .bounces import check_bounces
 from .bsdf import Scattering, dot, terminator
 from .companions import COMPANIONS, FOURS
 from .creases import note_jumps
@@ -47,19 +50,26 @@ FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that
 # the difference of both sides.
 AT_CURVES = 4
 
+LIGHTING = ("shadows", "light_samples", "bounces")  # the options of render() that it is made of
+
 
 class Lighting(NamedTuple):
     """The options of render() for lit scenes."""
 
     shadows: bool
     samples: int  # points of each light with an extent, for each point that is shaded
+    bounces: int = 1  # how often light is scattered on its way, at most
 
     @classmethod
-    def of(cls, shadows: object, light_samples: object) -> Lighting:
+    def of(cls, shadows: object = True, light_samples: object = 1, bounces: object = 1) -> Lighting:
         """Raises TypeError or ValueError."""
         if not isinstance(shadows, bool):
             raise TypeError(f"shadows: expected True or False, got {type(shadows).__name__} ({shadows!r})")
-        return cls(shadows, check_positive_int("light_samples", light_samples, most=1 << 16))
+        return cls(
+            shadows,
+            check_positive_int("light_samples", light_samples, most=1 << 16),
+            check_positive_int("bounces", bounces, most=core.MOST_BOUNCES),
+        )
 
     def image(
         self,
@@ -76,10 +86,15 @@ class Lighting(NamedTuple):
                 "scene: no light falls on its materials, so they are black; give it lights=[…], such as "
                 "eg.Environment(torch.ones(3)), or leave the materials out: colours are then radiance",
             )
-        # Each shaded point draws points of its own on extended lights.
+        if self.bounces > 1:
+            check_bounces(scene, camera, request.gradient.visibility)
+        # Each shaded point draws points of its own on extended lights; and a path of its own, whose noise falls the faster the
+        # more there are in a pixel, for they are spread evenly.
         extended = any(not light.punctual for light in scene.casting)
         spp = request.image.spp
         points = max(FEWEST_IN_PENUMBRA, spp // 4) if extended else shaded_points(spp)
+        if self.bounces > 1:
+            points = max(FEWEST_IN_PENUMBRA, spp)
         in_image = self._in_image(scene, points, spp)
         fused = is_fused(scene)
         additive = not scene.blends
@@ -132,7 +147,8 @@ def _kernel_image(frame: Frame, lighting: Lighting, points: int) -> Tensor | Non
     """(H · W, C) the surfaces before black, with `points` of each face in a pixel shaded. None where it is not finite: then
     points are shaded in PyTorch, which names the first that is not."""
     note_jumps(frame.no_hits)
-    found = in_kernel.image(frame, lighting.shadows, lighting.samples, points)
+    options = Options(lighting.shadows, lighting.samples, bounces=lighting.bounces)
+    found = in_kernel.image(frame, options, points)
     return found if all_finite(found) else None
 
 
@@ -170,12 +186,14 @@ def _in_front(g: Tensor, v: Tensor) -> Tensor:
     return dot(g.detach(), v.detach()) >= 0
 
 
-def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1) -> Tensor:
+def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1, bounces: int = 1) -> Tensor:
     """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours."""
     note_jumps(hits)
     # Where steps are forced to a side PyTorch shades, for the kernel looks up the texel in which a point lies.
     fused = isinstance(hits._view, View) and is_fused(hits._surfaces.scene) and not hits._steps.forced
     L = in_kernel.radiance(hits, shadows, light_samples) if fused else reference(hits, shadows, light_samples)
+    if bounces > 1 and not hits._only_light:
+        L = L + in_kernel.indirect(hits, shadows, bounces)
     lamps = _moving_lamps(hits)
     return L + _of_moving_borders(hits, lamps, Lighting(shadows, light_samples)) if lamps else L
 

@@ -43,7 +43,8 @@ def lit_image(
     }  # fmt: skip
     recipe = to_text((scene, camera, tuple(options.items())), tensors)
     numbers = (
-        image.spp, image.seed, gradient.surface_samples, gradient.edge_samples, gradient.grad_seed, lighting.samples
+        image.spp, image.seed, gradient.surface_samples, gradient.edge_samples, gradient.grad_seed, lighting.samples,
+        lighting.bounces,
     )  # fmt: skip
     if not torch.compiler.is_compiling():
         moving = tuple(k for k, tensor in enumerate(tensors) if tensor.is_floating_point())
@@ -63,14 +64,16 @@ class _Whole(NamedTuple):
     """The operation (kernel/first_order.py) that renders `tensors`."""
 
     recipe: str  # what else the scene, the camera and the options are
-    numbers: Sequence[int]  # spp, seed, surface samples and edge samples or −1, the gradient's seed, light samples
+    numbers: Sequence[
+        int
+    ]  # spp, seed, surface samples and edge samples or −1, the gradient's seed, light samples, bounces
     moving: Sequence[int]
 
     def image(self, tensors: Sequence[Tensor]) -> Tensor:
         scene, camera, options = from_text(self.recipe, tensors, _PARTS)
-        spp, seed, surface, edge, grad_seed, samples = self.numbers
+        spp, seed, surface, edge, grad_seed, samples, bounces = self.numbers
         own = dict(options)
-        lighting, creases = Lighting(own.pop("shadows"), samples), own.pop("creases")
+        lighting, creases = Lighting(own.pop("shadows"), samples, bounces), own.pop("creases")
         counts = {"surface_samples": surface, "edge_samples": edge}
         given = {name: count for name, count in counts.items() if count >= 0}
         request = make_request(scene, camera, spp, seed, grad_seed=grad_seed, **given, **own)

@@ -97,6 +97,17 @@ inline void stand_for_all(LightPoint* points, int drawn, int count) {
     std::fill(points + drawn, points + count, LightPoint{0, 0, 0, 0});
 }
 
+// Points of a sky that is the same all around, for a surface that scatters evenly: by the cosine. Direct light alone
+// keeps its even draws.
+inline void draw_even_sky(const LitScene& lit, const Lamp& lamp, const Numbers& numbers, Vec3 n, int count,
+                          LightPoint* out) {
+    const Numbers::Parts of_light = numbers.of_light(count);
+    for (int s = 0; s < count; ++s) {
+        const Vec3 l = draw_by_cosine(n, of_light(s));
+        out[s] = point_towards(lit.tables, lamp, l), out[s].density = dot(n, l) / M_PI;
+    }
+}
+
 // The points of all samples of lights.
 template <class S>
 void light_points(const LitScene& lit, const LitPoints& points, const LitOptions& options,
@@ -105,7 +116,10 @@ void light_points(const LitScene& lit, const LitPoints& points, const LitOptions
         const int number = lights[k].lamp, count = lights[k].count;
         const Lamp& lamp = lit.lamps[number];
         LightPoint* own = out + k;
-        if (!draws_fours(lit, options, lamp)) {
+        if (options.bounces > 1 && lamp.kind == Lamp::Kind::environment && !lamp.is_image && o.scattering.lambertian &&
+            points.forced.lamp != number) {
+            draw_even_sky(lit, lamp, Numbers{lamp, uint64_t(points.seed[i])}, plain(o.n), count, own);
+        } else if (!draws_fours(lit, options, lamp)) {
             light_points(lit, points, i, number, count, options.dark, o, own);
         } else if (o.scattering.lambertian || points.forced.lamp == number) {
             light_points(lit, points, i, number, options.samples, options.dark, o, own);

@@ -3,6 +3,7 @@
 #include <algorithm>
 
 #include "shading/lit/lit_radiance.h"
+#include "shading/lit/point_cotangents.h"
 #include "shading/lit/visibility.h"
 
 namespace edgegrad {
@@ -49,29 +50,6 @@ void draw_light_points(const LitScene& lit, const LitPoints& points, const LitOp
         }
     });
 }
-
-namespace {
-
-void clear(LitPlaces<double> places, int64_t points) {
-    std::fill(places.b, places.b + 3 * points, 0.0);
-    if (places.spread) std::fill(places.spread, places.spread + spread_size * points, 0.0);
-}
-void write(const FacePointBar& bar, LitPlaces<double> places, int64_t i) {
-    std::copy(bar.b, bar.b + 3, places.b + 3 * i);
-    if (places.spread) std::copy(bar.spread, bar.spread + spread_size, places.spread + spread_size * i);
-}
-
-// Calls body(first, last, cotangents) for chunks of points, and adds these up.
-template <class Body>
-void add_cotangents(const LitScene& lit, int64_t points, const std::vector<TableBar>& to, Team& team, Body body) {
-    std::vector<Cotangents> chunks;
-    double seconds[2] = {};
-    scatter_in_waves(
-        team, points, chunks, [&](Cotangents& chunk, int owners) { chunk.prepare(lit.tables, to, owners); }, body,
-        [&](const Cotangents& chunk, int owner) { chunk.add_to(to, owner); }, [](Cotangents&) {}, seconds);
-}
-
-}  // namespace
 
 void shade_vjp(const LitScene& lit, const LitPoints& points, const LitOptions& options, const int8_t* seen,
                const double* bar, const std::vector<TableBar>& to, LitPlaces<double> places, Team& team) {
@@ -130,14 +108,9 @@ void shade_jvp(const LitScene& lit, const LitPoints& points, const LitOptions& o
     team.each_block(points.size, [&](int64_t, int64_t first, int64_t last) {
         std::vector<LightPoint> of_lights(lights.size());
         for (int64_t i = first; i < last; ++i) {
-            Dual b[3], spread[spread_size], total[most_lit_channels];
-            const auto set = [i](int n, const double* value, const double* tangent, Dual* to) {
-                for (int k = 0; value && k < n; ++k) to[k] = {value[n * i + k], tangent ? tangent[n * i + k] : 0};
-            };
-            set(3, points.b, dot.b, b), set(spread_size, points.spread, dot.spread, spread);
-            Surface<Dual> o;
-            set_surface<Dual>(lit, points.face[i], b, points.spread ? spread : nullptr, o);
-            look_up_material(lit, o);
+            Dual total[most_lit_channels];
+            const MovingPoint point(lit, points, dot, i);
+            const Surface<Dual>& o = point.surface;
             if (o.mesh->has_material && !o.is_black())
                 light_points(lit, points, options, lights, i, o, of_lights.data());
             radiance(lit, options, lights, of_lights.data(), o, seen + i * lights.size(), total);

@@ -10,31 +10,40 @@
 
 namespace edgegrad {
 
-// Everything but lights that cast shadows.
+// What a surface sends by itself: what it emits, or the colour of one without a material.
 template <class S>
-void add_unshadowed(const LitScene& lit, const Surface<S>& o, S* total) {
+void add_own(const LitScene& lit, const Surface<S>& o, S* total) {
     if (!o.mesh->has_material) {
         for (int c = 0; c < lit.channels; ++c) total[c] += o.scattering.base[c];
-        return;
-    }
-    S own[most_lit_channels];
-    if (o.mesh->emission.exists()) {
+    } else if (o.mesh->emission.exists()) {
+        S own[most_lit_channels];
         value(lit.tables, o.mesh->emission, o.at, lit.channels, own);
         for (int c = 0; c < lit.channels; ++c) total[c] += own[c];
     }
+}
+inline void add_own_vjp(const LitScene& lit, const Surface<double>& o, const double* total_bar, SurfaceBar& bar,
+                        Cotangents& to) {
+    if (!o.mesh->has_material) {
+        for (int c = 0; c < lit.channels; ++c) bar.scattering.base[c] += total_bar[c];
+    } else if (o.mesh->emission.exists()) {
+        value_vjp(lit.tables, o.mesh->emission, o.at, lit.channels, total_bar, bar.at, to);
+    }
+}
+
+// What it scatters of lights that cast no shadows.
+template <class S>
+void add_unshadowed(const LitScene& lit, const Surface<S>& o, S* total) {
+    if (!o.mesh->has_material) return;
+    S E[most_lit_channels];
     for (const Lamp& lamp : lit.lamps) {
         if (lamp.casts()) continue;
-        irradiance<S>(lit.tables, lamp, lit.channels, o.n, own);
-        for (int c = 0; c < lit.channels; ++c) total[c] += S(1 / M_PI) * o.scattering.diffuse(c) * own[c];
+        irradiance<S>(lit.tables, lamp, lit.channels, o.n, E);
+        for (int c = 0; c < lit.channels; ++c) total[c] += S(1 / M_PI) * o.scattering.diffuse(c) * E[c];
     }
 }
 inline void add_unshadowed_vjp(const LitScene& lit, const Surface<double>& o, const double* total_bar, SurfaceBar& bar,
                                Cotangents& to) {
-    if (!o.mesh->has_material) {
-        for (int c = 0; c < lit.channels; ++c) bar.scattering.base[c] += total_bar[c];
-        return;
-    }
-    if (o.mesh->emission.exists()) value_vjp(lit.tables, o.mesh->emission, o.at, lit.channels, total_bar, bar.at, to);
+    if (!o.mesh->has_material) return;
     double E[most_lit_channels], E_bar[most_lit_channels];
     for (const Lamp& lamp : lit.lamps) {
         if (lamp.casts()) continue;
@@ -47,14 +56,28 @@ inline void add_unshadowed_vjp(const LitScene& lit, const Surface<double>& o, co
     }
 }
 
+// What it scatters of the points of lights that it sees.
+template <class S>
+void add_lights(const LitScene& lit, const std::vector<LightSample>& lights, const LightPoint* points,
+                const Surface<S>& o, const int8_t* seen, S* total) {
+    for (size_t k = 0; k < lights.size(); ++k)
+        if (seen[k] > 0) add_light<S>(lit, lit.lamps[lights[k].lamp], points[k], 1.0 / lights[k].count, o, total);
+}
+inline void add_lights_vjp(const LitScene& lit, const std::vector<LightSample>& lights, const LightPoint* points,
+                           const Surface<double>& o, const int8_t* seen, const double* total_bar, SurfaceBar& bar,
+                           Cotangents& to) {
+    for (size_t k = 0; k < lights.size(); ++k)
+        if (seen[k] > 0)
+            add_light_vjp(lit, lit.lamps[lights[k].lamp], points[k], 1.0 / lights[k].count, o, total_bar, bar, to);
+}
+
 template <class S>
 void radiance(const LitScene& lit, const LitOptions& options, const std::vector<LightSample>& lights,
               const LightPoint* points, const Surface<S>& o, const int8_t* seen, S* total) {
     std::fill(total, total + lit.channels, S(0));
     if (o.is_black()) return;
-    if (options.only < 0) add_unshadowed(lit, o, total);
-    for (size_t k = 0; k < lights.size(); ++k)
-        if (seen[k] > 0) add_light<S>(lit, lit.lamps[lights[k].lamp], points[k], 1.0 / lights[k].count, o, total);
+    if (options.only < 0) add_own(lit, o, total), add_unshadowed(lit, o, total);
+    add_lights(lit, lights, points, o, seen, total);
 }
 // Whether no light that a point sees, nor anything else, gives it radiance: then it has no derivatives either.
 inline bool is_unlit(const LitScene& lit, const LitMesh& mesh, const int8_t* seen, size_t lights) {
@@ -66,10 +89,8 @@ inline void radiance_vjp(const LitScene& lit, const LitOptions& options, const s
                          const LightPoint* points, const Surface<double>& o, const int8_t* seen,
                          const double* total_bar, FacePointBar& at_bar, Cotangents& to) {
     SurfaceBar bar(lit.channels);
-    if (options.only < 0) add_unshadowed_vjp(lit, o, total_bar, bar, to);
-    for (size_t k = 0; k < lights.size(); ++k)
-        if (seen[k] > 0)
-            add_light_vjp(lit, lit.lamps[lights[k].lamp], points[k], 1.0 / lights[k].count, o, total_bar, bar, to);
+    if (options.only < 0) add_own_vjp(lit, o, total_bar, bar, to), add_unshadowed_vjp(lit, o, total_bar, bar, to);
+    add_lights_vjp(lit, lights, points, o, seen, total_bar, bar, to);
     look_up_material_vjp(lit, o, bar, to);
     surface_vjp(lit, o, bar, to);
     at_bar = bar.at;

@@ -93,6 +93,8 @@ struct LitPlaces {
     Number* spread = nullptr;  // (N, 2, 2); null: not wanted, or zero
 };
 
+constexpr int most_bounces = 64;
+
 struct LitOptions {
     bool shadows = true;
     int samples = 1;  // points of each light with an extent, for each point that is shaded
@@ -100,6 +102,7 @@ struct LitOptions {
     // Whether only derivatives are wanted: on glossy surfaces points of environments are then drawn in fours.
     bool in_fours = false;
     double dark = 0;  // points of lights are drawn as if no glossy surface were darker: what is black has derivatives
+    int bounces = 1;  // how often light is scattered on its way, at most (path.h)
 };
 
 // Whether a point sees a light sample: 1, or 0 where it is in shadow, or that it was not asked, for the surface is

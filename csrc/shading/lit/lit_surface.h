@@ -29,9 +29,10 @@ Vector<S> towards_viewer(const LitScene& lit, Vector<S> y) {
     return lit.perspective ? unit(eye - y) : eye;
 }
 
-// Written in place: it is large, and what it scatters comes later. It refers to `spread` (null: not known).
+// Where it lies. Written in place: it is large, and what it scatters comes later. It refers to `spread` (null: not
+// known).
 template <class S>
-void set_surface(const LitScene& lit, int64_t face, const S* b, const S* spread, Surface<S>& o) {
+void set_place(const LitScene& lit, int64_t face, const S* b, const S* spread, Surface<S>& o) {
     const std::vector<Table>& tables = lit.tables;
     o.mesh = &lit.mesh_of(face);
     o.at = {face - o.mesh->first_face, lit.faces + 3 * face, o.mesh->first_vertex, {b[0], b[1], b[2]}, spread};
@@ -41,11 +42,21 @@ void set_surface(const LitScene& lit, int64_t face, const S* b, const S* spread,
         o.y += o.at.b[i] * o.frame.corner[i];
     }
     o.frame.g = unit(cross(o.frame.corner[1] - o.frame.corner[0], o.frame.corner[2] - o.frame.corner[0]));
-    o.v = towards_viewer<S>(lit, o.y);
+}
+// Which side of it is seen from the unit direction v.
+template <class S>
+void set_view(const LitScene& lit, Vector<S> v, Surface<S>& o) {
+    o.v = v;
     o.side = dot(plain(o.frame.g), plain(o.v)) >= 0 ? 1 : -1;
     o.g = o.side * o.frame.g;
     o.scattering.lambertian = !o.mesh->has_material || o.mesh->lambertian;
-    o.n = o.mesh->normal.is_flat() ? o.g : o.side * shading_normal(tables, o.mesh->normal, o.at, o.frame);
+    o.n = o.mesh->normal.is_flat() ? o.g : o.side * shading_normal(lit.tables, o.mesh->normal, o.at, o.frame);
+}
+// As the viewer of the scene sees it.
+template <class S>
+void set_surface(const LitScene& lit, int64_t face, const S* b, const S* spread, Surface<S>& o) {
+    set_place(lit, face, b, spread, o);
+    set_view<S>(lit, towards_viewer<S>(lit, o.y), o);
 }
 
 // The base colour, and what else scatters.
@@ -100,20 +111,18 @@ inline void look_up_material_vjp(const LitScene& lit, const Surface<double>& o, 
     if (mesh.roughness.exists()) value_vjp(lit.tables, mesh.roughness, o.at, 1, &s_bar.roughness, bar.at, to);
 }
 
-// From the cotangents of place, view and normals to those of barycentrics, vertices, normals and eye.
-inline void surface_vjp(const LitScene& lit, const Surface<double>& o, SurfaceBar& bar, Cotangents& to) {
-    const std::vector<Table>& tables = lit.tables;
+// From the cotangent of the direction to the viewer to those of place and eye.
+inline void view_vjp(const LitScene& lit, const Surface<double>& o, SurfaceBar& bar, Cotangents& to) {
+    if (o.scattering.lambertian) return;  // looks the same from everywhere
+    if (!lit.perspective) return to.add(lit.eye, 0, bar.v);
+    const Vec3 towards_bar = unit_vjp(lit.tables[lit.eye].vector_at<double>(0) - o.y, bar.v);
+    to.add(lit.eye, 0, towards_bar), bar.y -= towards_bar;
+}
+// From the cotangents of place and normals to those of barycentrics, vertices and normals.
+inline void place_vjp(const LitScene& lit, const Surface<double>& o, SurfaceBar& bar, Cotangents& to) {
     if (o.mesh->normal.is_flat()) bar.g += bar.n;
-    else shading_normal_vjp(tables, o.mesh->normal, o.at, o.frame, o.side * bar.n, bar.frame, bar.at, to);
+    else shading_normal_vjp(lit.tables, o.mesh->normal, o.at, o.frame, o.side * bar.n, bar.frame, bar.at, to);
     bar.frame.g += o.side * bar.g;
-    if (o.scattering.lambertian) {
-        // Looks the same from everywhere.
-    } else if (lit.perspective) {
-        const Vec3 towards_bar = unit_vjp(tables[lit.eye].vector_at<double>(0) - o.y, bar.v);
-        to.add(lit.eye, 0, towards_bar), bar.y -= towards_bar;
-    } else {
-        to.add(lit.eye, 0, bar.v);
-    }
     const Vec3* p = o.frame.corner;
     const Vec3 e1 = p[1] - p[0], e2 = p[2] - p[0];
     Vec3 e1_bar, e2_bar;
@@ -123,6 +132,10 @@ inline void surface_vjp(const LitScene& lit, const Surface<double>& o, SurfaceBa
         bar.at.b[i] += dot(bar.y, p[i]);
         to.add(lit.verts, o.at.vertex[i], bar.frame.corner[i] + o.at.b[i] * bar.y);
     }
+}
+inline void surface_vjp(const LitScene& lit, const Surface<double>& o, SurfaceBar& bar, Cotangents& to) {
+    view_vjp(lit, o, bar, to);
+    place_vjp(lit, o, bar, to);
 }
 
 }  // namespace edgegrad

@@ -12,6 +12,18 @@ namespace edgegrad {
 // Above this roughness a lobe is so wide that directions drawn by it only cost (docs/performance.md).
 constexpr double widest_lobe = 0.65;
 
+// Two unit vectors across n, and n (Duff et al. 2017, "Building an orthonormal basis, revisited").
+inline Mat3 axes_around(Vec3 n) {
+    const double sign = std::copysign(1.0, n.z), a = -1 / (sign + n.z), b = n.x * n.y * a;
+    return {{{1 + sign * n.x * n.x * a, sign * b, -sign * n.x}, {b, sign + n.y * n.y * a, -n.y}, n}};
+}
+
+// From numbers in [0, 1): a direction above n with the density n·l / π.
+inline Vec3 draw_by_cosine(Vec3 n, Vec2 u) {
+    const double across = std::sqrt(u.y), phi = 2 * M_PI * u.x;
+    return transposed_times(axes_around(n), {across * std::cos(phi), across * std::sin(phi), std::sqrt(1 - u.y)});
+}
+
 // The lobe of one point, of which directions are drawn without derivatives.
 class DrawnLobe {
    public:
@@ -60,12 +72,6 @@ class DrawnLobe {
     }
 
    private:
-    // Two unit vectors across n, and n (Duff et al. 2017, "Building an orthonormal basis, revisited").
-    static Mat3 axes_around(Vec3 n) {
-        const double sign = std::copysign(1.0, n.z), a = -1 / (sign + n.z), b = n.x * n.y * a;
-        return {{{1 + sign * n.x * n.x * a, sign * b, -sign * n.x}, {b, sign + n.y * n.y * a, -n.y}, n}};
-    }
-
     double spread() const {
         const double a2 = alpha_ * alpha_;
         return bound_ * nv_ + std::sqrt(a2 + (1 - a2) * nv_ * nv_);

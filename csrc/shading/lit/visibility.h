@@ -19,6 +19,7 @@ struct ShadowRays {
     std::vector<int32_t> face;
     std::vector<double> b, to, contact;
     std::vector<int8_t*> result;
+    std::vector<uint8_t> found;
 
     void clear() { face.clear(), b.clear(), to.clear(), contact.clear(), result.clear(); }
     void add(const LitScene& lit, const Lamp& lamp, int64_t face_, const Surface<double>& o, Vec3 there, int8_t* seen) {
@@ -30,7 +31,7 @@ struct ShadowRays {
         b.insert(b.end(), {o.at.b[1], o.at.b[2]}), to.insert(to.end(), {there.x, there.y, there.z});
     }
     template <class T>
-    void cast(const SceneView<T>& scene, const RayCaster& caster, std::vector<uint8_t>& found) {
+    void cast(const SceneView<T>& scene, const RayCaster& caster) {
         found.resize(face.size());
         see(scene, caster, {face.data(), b.data(), to.data(), contact.data(), int64_t(face.size())}, found.data());
         for (size_t k = 0; k < found.size(); ++k) *result[k] = int8_t(found[k]);
@@ -44,23 +45,27 @@ struct ShadeBuffers {
     std::vector<Surface<double>> surfaces;
     std::vector<LightPoint> points;  // of lights, a row for each surface
     ShadowRays rays;
-    std::vector<uint8_t> found;
 };
 
-// Finds the surfaces at points that are `wanted`, and which lights they see.
+// Surfaces, and what is written of each, a row: the points of lights that are drawn for it, and which of them it sees.
+struct LightQuery {
+    Surface<double>* surfaces;
+    LightPoint* drawn;
+    int8_t* seen;
+};
+
+// Draws points of lights for the surfaces at the points that are `wanted`, and finds which of them these see.
 template <class T, class Wanted>
-void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
-                      const LitOptions& options, ShadeBuffers& buffers, int8_t* seen, Wanted wanted) {
-    const std::vector<LightSample>& lights = buffers.lights;
+void query_lights(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                  const LitOptions& options, const std::vector<LightSample>& lights, const LightQuery& query,
+                  ShadowRays& rays, Wanted wanted) {
     const size_t K = lights.size();
-    buffers.surfaces.resize(points.size), buffers.points.resize(points.size * K);
     for (int64_t i = 0; i < points.size; ++i)
         if (wanted(i)) {
-            Surface<double>& o = buffers.surfaces[i];
-            set_surface<double>(lit, points.face[i], points.b + 3 * i, points.spread_at(i), o);
+            Surface<double>& o = query.surfaces[i];
             if (!o.mesh->has_material || o.is_black()) continue;
             if (!o.scattering.lambertian) look_up_material(lit, o);
-            light_points(lit, points, options, lights, i, o, buffers.points.data() + i * K);
+            light_points(lit, points, options, lights, i, o, query.drawn + i * K);
         }
     // Light by light, for rays that are cast together are the faster the more alike they are.
     for (size_t k = 0; k < K; ++k) {
@@ -68,10 +73,10 @@ void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayC
         const Vec3 only_place = lamp.is_punctual() ? place(lit, lamp, {}) : Vec3();
         for (int64_t i = 0; i < points.size; ++i) {
             if (!wanted(i)) continue;
-            const Surface<double>& o = buffers.surfaces[i];
-            int8_t& found = seen[i * K + k] = not_asked;
+            const Surface<double>& o = query.surfaces[i];
+            int8_t& found = query.seen[i * K + k] = not_asked;
             if (!o.mesh->has_material || o.is_black()) continue;
-            const LightPoint& point = buffers.points[i * K + k];
+            const LightPoint& point = query.drawn[i * K + k];
             if (!point.exists()) continue;
             if (lamp.kind == Lamp::Kind::mesh &&
                 !shows(scene, lit.emitter(lamp).first + point.index, {point.u, point.v}))
@@ -82,10 +87,22 @@ void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayC
             found = 1;
             if (!options.shadows) continue;
             if (points.forced.lamp == lights[k].lamp) found = int8_t(points.forced.lit[i]);
-            else buffers.rays.add(lit, lamp, points.face[i], o, there, &found);
+            else rays.add(lit, lamp, points.face[i], o, there, &found);
         }
     }
-    buffers.rays.cast(scene, caster, buffers.found);
+    rays.cast(scene, caster);
+}
+
+// Finds the surfaces at points that are `wanted`, and which lights they see.
+template <class T, class Wanted>
+void query_visibility(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                      const LitOptions& options, ShadeBuffers& buffers, int8_t* seen, Wanted wanted) {
+    buffers.surfaces.resize(points.size), buffers.points.resize(points.size * buffers.lights.size());
+    for (int64_t i = 0; i < points.size; ++i)
+        if (wanted(i))
+            set_surface<double>(lit, points.face[i], points.b + 3 * i, points.spread_at(i), buffers.surfaces[i]);
+    query_lights(lit, scene, caster, points, options, buffers.lights,
+                 {buffers.surfaces.data(), buffers.points.data(), seen}, buffers.rays, wanted);
 }
 
 }  // namespace edgegrad

@@ -1,0 +1,104 @@
+#include "shading/lit/indirect.h"
+
+#include <algorithm>
+
+#include "shading/lit/lit.h"
+#include "shading/lit/path_radiance.h"
+#include "shading/lit/point_cotangents.h"
+
+namespace edgegrad {
+
+std::shared_ptr<Paths> path_buffers(const LitScene& lit, const LitOptions& options) {
+    return std::make_shared<Paths>(lit, options);
+}
+
+template <class T>
+void add_indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                  Paths& paths, double* out) {
+    paths.find(scene, caster, points, [](int64_t) { return true; });
+    double total[most_lit_channels];
+    for (int64_t i = 0; i < points.size; ++i) {
+        const auto at = [&](int k) -> const Surface<double>& { return paths.surface(i, k); };
+        path_radiance(lit, paths.lights(), paths.path(i), at, total);
+        for (int c = 0; c < lit.channels; ++c) out[i * lit.channels + c] += total[c];
+    }
+}
+
+template <class T>
+void indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+              const LitOptions& options, double* out, Team& team) {
+    std::fill(out, out + points.size * lit.channels, 0.0);
+    team.each_with((points.size + shaded_at_once - 1) / shaded_at_once, [&] { return path_buffers(lit, options); },
+                   [&](Paths& paths, int64_t block) {
+                       team.check();
+                       const int64_t first = block * shaded_at_once;
+                       add_indirect(lit, scene, caster, points.part(first, shaded_at_once), paths,
+                                    out + first * lit.channels);
+                   });
+}
+
+template <class T>
+void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                  const LitOptions& options, const double* bar, const std::vector<TableBar>& to,
+                  LitPlaces<double> places, Team& team) {
+    clear(places, points.size);
+    add_cotangents(lit, points.size, to, team, [&](int64_t first, int64_t last, Cotangents& chunk) {
+        Paths paths(lit, options);
+        PathBuffers buffers;
+        for (; first < last; first += shaded_at_once) {
+            team.check();
+            const LitPoints some = points.part(first, std::min(shaded_at_once, last - first));
+            const auto wanted = [&](int64_t i) {
+                const double* of_point = bar + (first + i) * lit.channels;
+                return std::any_of(of_point, of_point + lit.channels, [](double x) { return x != 0; });
+            };
+            paths.find(scene, caster, some, wanted);
+            for (int64_t i = 0; i < some.size; ++i) {
+                const Path path = paths.path(i);
+                if (path.points < 2) continue;
+                const auto at = [&](int k) -> const Surface<double>& { return paths.surface(i, k); };
+                FacePointBar at_bar;
+                path_radiance_vjp(lit, paths.lights(), path, at, bar + (first + i) * lit.channels, buffers, at_bar,
+                                  chunk);
+                write(at_bar, places, first + i);
+            }
+        }
+    });
+}
+
+template <class T>
+void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                  const LitOptions& options, LitPlaces<const double> dot, double* radiance_dot, Team& team) {
+    team.each_with((points.size + shaded_at_once - 1) / shaded_at_once, [&] { return path_buffers(lit, options); },
+                   [&](Paths& paths, int64_t block) {
+                       team.check();
+                       const int64_t first = block * shaded_at_once;
+                       const LitPoints some = points.part(first, shaded_at_once);
+                       paths.find(scene, caster, some, [](int64_t) { return true; });
+                       for (int64_t i = 0; i < some.size; ++i) {
+                           const Path path = paths.path(i);
+                           Dual total[most_lit_channels];
+                           const MovingPoint point(lit, points, dot, first + i);
+                           const std::vector<Surface<Dual>> surfaces = moving_surfaces(lit, path, point.surface);
+                           const auto at = [&](int k) -> const Surface<Dual>& { return surfaces[k]; };
+                           path_radiance(lit, paths.lights(), path, at, total);
+                           for (int c = 0; c < lit.channels; ++c)
+                               radiance_dot[(first + i) * lit.channels + c] = total[c].dot;
+                       }
+                   });
+}
+
+#define EDGEGRAD_INDIRECT(T)                                                                                      \
+    template void indirect(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,              \
+                           const LitOptions&, double*, Team&);                                                    \
+    template void add_indirect(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&, Paths&,  \
+                               double*);                                                                          \
+    template void indirect_vjp(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,          \
+                               const LitOptions&, const double*, const std::vector<TableBar>&, LitPlaces<double>, \
+                               Team&);                                                                            \
+    template void indirect_jvp(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,          \
+                               const LitOptions&, LitPlaces<const double>, double*, Team&);
+EDGEGRAD_INDIRECT(float)
+EDGEGRAD_INDIRECT(double)
+
+}  // namespace edgegrad

@@ -1,0 +1,201 @@
+// Paths along which light comes to points of surfaces that has been scattered before: light, xₙ, …, x₂, x₁, viewer.
+// They are drawn and found once, without derivatives; path_radiance.h says what they carry, as a function of what
+// moves. Each point x₂ … stays at the barycentrics of its face while faces move, and the densities of all draws are
+// constants: with paths that keep their directions instead, a moving surface would be differentiated with a bias
+// (Worchel, Finnendahl and Alexa 2025).
+//
+// What lights give a point of a path directly is found as it is of points that are seen (light_sample.h), with draws by
+// the light and by the material. So what a drawn direction meets of a light is counted there already, and is not
+// counted again here. A path ends at meshes without a material, at backs of faces that show none, and in the open.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <vector>
+
+#include "forward/trace.h"
+#include "shading/lit/bounce_draw.h"
+#include "shading/lit/visibility.h"
+
+namespace edgegrad {
+
+constexpr int steps_without_roulette = 2;
+constexpr double least_survival = 0.05;
+
+// How much solid angle the last two barycentrics of a point fill as it is seen over the distance d: |M · d| / |d|³,
+// with M the cross product of two sides of its face.
+template <class S>
+S solid_angle(const Surface<S>& o, Vector<S> d) {
+    const Vector<S> M = cross(o.frame.corner[1] - o.frame.corner[0], o.frame.corner[2] - o.frame.corner[0]);
+    const S facing = dot(M, d), squared = dot(d, d);
+    return S(plain(facing) < 0 ? -1 : 1) * facing / (squared * sqrt(squared));
+}
+
+// One path of `points` points. Arrays begin at its first point; the next one is `stride` further, or as many rows of
+// `lights`.
+struct Path {
+    int points;
+    const int64_t* face;
+    const double* b;        // (3,) barycentrics
+    const double* density;  // of the last two of them, as the point before draws them, times the chance to come so far
+    const LightPoint* drawn;
+    const int8_t* seen;
+    size_t stride, lights;
+
+    int64_t face_at(int k) const { return face[k * stride]; }
+    const double* b_at(int k) const { return b + 3 * k * stride; }
+    double density_at(int k) const { return density[k * stride]; }
+    const LightPoint* drawn_at(int k) const { return drawn + k * stride * lights; }
+    const int8_t* seen_at(int k) const { return seen + k * stride * lights; }
+};
+
+// The paths of some points, about shaded_at_once of them, point by point of all paths. It is kept from one call to the
+// next.
+class Paths {
+   public:
+    Paths(const LitScene& lit, const LitOptions& options) : lit_(lit), options_(options), C_(lit.channels) {
+        options_.samples = 1, options_.only = -1, options_.in_fours = false;
+        lights_ = light_samples(lit, options_);
+        for (const Lamp& lamp : lit.lamps) eps_ = std::max(eps_, lamp.eps);
+    }
+
+    const std::vector<LightSample>& lights() const { return lights_; }
+
+    // From points that are `wanted`; the others get paths without any points.
+    template <class T, class Wanted>
+    void find(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, Wanted wanted) {
+        n_ = from.size;
+        const int64_t all = n_ * options_.bounces;
+        surfaces_.resize(all), density_.resize(all), face_.resize(all), b_.resize(3 * all), seed_.resize(all);
+        drawn_.resize(all * lights_.size()), seen_.resize(all * lights_.size());
+        length_.assign(n_, 0), through_.assign(n_ * C_, 1.0);
+        for (int64_t i = 0; i < n_; ++i) {
+            if (!wanted(i)) continue;
+            Surface<double>& o = surfaces_[i];
+            set_surface<double>(lit_, from.face[i], from.b + 3 * i, from.spread_at(i), o);
+            face_[i] = from.face[i], std::copy(from.b + 3 * i, from.b + 3 * i + 3, &b_[3 * i]);
+            if (!scatters(o)) continue;
+            look_up_material(lit_, o), length_[i] = 1;
+        }
+        for (int k = 0; k + 1 < options_.bounces; ++k) {
+            leave(from, k);
+            if (rays_.index.empty()) break;
+            arrive(scene, caster, k);
+            light(scene, caster, from, k + 1);
+        }
+    }
+
+    Path path(int64_t i) const {
+        return {
+            length_[i], &face_[i],  &b_[3 * i], density_.data() + i, drawn_.data() + i * K(), seen_.data() + i * K(),
+            size_t(n_), size_t(K())};
+    }
+    // What they were found with.
+    const Surface<double>& surface(int64_t i, int k) const { return surfaces_[k * n_ + i]; }
+
+   private:
+    // Rays from the points that paths have come to.
+    struct Rays {
+        std::vector<int64_t> index;
+        std::vector<int32_t> face, hit;
+        std::vector<double> b, direction, contact, survival, density, hit_b;
+
+        void clear() {
+            index.clear(), face.clear(), b.clear(), direction.clear(), contact.clear(), survival.clear();
+            density.clear();
+        }
+    };
+
+    static bool scatters(const Surface<double>& o) { return o.mesh->has_material && !o.is_black(); }
+
+    int64_t K() const { return int64_t(lights_.size()); }
+
+    // Draws where the paths go on to from their points after k steps.
+    void leave(const LitPoints& from, int k) {
+        rays_.clear();
+        for (int64_t i = 0; i < n_; ++i) {
+            if (length_[i] != k + 1) continue;
+            const int64_t at = k * n_ + i;
+            const Surface<double>& o = surfaces_[at];
+            const BounceNumbers numbers(from.seed[i], k);
+            const Vec2 choice = numbers.of_choice();
+            double survival = 1;
+            if (k >= steps_without_roulette) {
+                const double* through = &through_[i * C_];
+                survival = std::clamp(*std::max_element(through, through + C_), least_survival, 1.0);
+                if (choice.y >= survival) continue;
+            }
+            const BounceDraw draw(o, C_);
+            const Vec3 l = draw.draw(choice.x, numbers.of_direction());
+            if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
+            const double size = std::max({std::fabs(o.y.x), std::fabs(o.y.y), std::fabs(o.y.z)});
+            rays_.index.push_back(i), rays_.face.push_back(int32_t(face_[at]));
+            rays_.b.insert(rays_.b.end(), {o.at.b[1], o.at.b[2]});
+            rays_.direction.insert(rays_.direction.end(), {l.x, l.y, l.z});
+            rays_.contact.push_back(16 * eps_ * size), rays_.survival.push_back(survival);
+            rays_.density.push_back(draw.density(l));
+        }
+    }
+
+    // Finds what they meet.
+    template <class T>
+    void arrive(const SceneView<T>& scene, const RayCaster& caster, int k) {
+        rays_.hit.resize(rays_.index.size()), rays_.hit_b.resize(2 * rays_.index.size());
+        depart(scene, caster,
+               {rays_.face.data(), rays_.b.data(), rays_.direction.data(), rays_.contact.data(),
+                int64_t(rays_.index.size())},
+               rays_.hit.data(), rays_.hit_b.data());
+        for (size_t r = 0; r < rays_.index.size(); ++r) {
+            if (rays_.hit[r] < 0) continue;
+            const int64_t i = rays_.index[r], at = (k + 1) * n_ + i;
+            const double u = rays_.hit_b[2 * r], v = rays_.hit_b[2 * r + 1];
+            const Surface<double>& o = surfaces_[k * n_ + i];
+            Surface<double>& next = surfaces_[at];
+            face_[at] = rays_.hit[r], b_[3 * at] = 1 - (u + v), b_[3 * at + 1] = u, b_[3 * at + 2] = v;
+            set_place<double>(lit_, face_[at], &b_[3 * at], nullptr, next);
+            const Vec3 d = next.y - o.y, l = unit(d);
+            const double measure = solid_angle(next, d);
+            set_view(lit_, -l, next);
+            if (!scatters(next) || !(measure > 0) || !(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
+            density_[at] = rays_.density[r] * rays_.survival[r] * measure;
+            length_[i] = k + 2;
+            double f[most_lit_channels];
+            scatter(o.scattering, o.v, o.n, l, C_, f);
+            const double weight = dot(o.n, l) / (rays_.density[r] * rays_.survival[r]);
+            for (int c = 0; c < C_; ++c) through_[i * C_ + c] *= std::fabs(f[c]) * weight;
+        }
+    }
+
+    // Lights the points that paths have come to after k steps.
+    template <class T>
+    void light(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, int k) {
+        const int64_t first = k * n_;
+        for (int64_t i = 0; i < n_; ++i) seed_[first + i] = BounceNumbers(from.seed[i], k).of_lights();
+        const LitPoints here{n_, &face_[first], &b_[3 * first], &seed_[first], {}, nullptr};
+        const auto came = [&](int64_t i) { return length_[i] == k + 1; };
+        query_lights(lit_, scene, caster, here, options_, lights_,
+                     {&surfaces_[first], drawn_.data() + first * K(), seen_.data() + first * K()}, shadow_rays_, came);
+        for (int64_t i = 0; i < n_; ++i)
+            if (came(i) && surfaces_[first + i].scattering.lambertian) look_up_material(lit_, surfaces_[first + i]);
+    }
+
+    const LitScene& lit_;
+    LitOptions options_;
+    const int C_;
+    double eps_ = 0;  // relative spacing of places
+    std::vector<LightSample> lights_;
+    int64_t n_ = 0;
+    // Of the points of paths after no step, one step, …, and of the points of lights for each.
+    std::vector<Surface<double>> surfaces_;
+    std::vector<double> density_, b_;
+    std::vector<int64_t> face_, seed_;
+    std::vector<LightPoint> drawn_;
+    std::vector<int8_t> seen_;
+    // Of each path how many points it has, and what its end gives to its beginning.
+    std::vector<int> length_;
+    std::vector<double> through_;
+    Rays rays_;
+    ShadowRays shadow_rays_;
+};
+
+}  // namespace edgegrad

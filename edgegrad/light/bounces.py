@@ -1,0 +1,70 @@
+"""What render() can differentiate where light is scattered more than once.
+
+Inside surfaces every tensor of a scene has its derivative (csrc/shading/lit/path_radiance.h). But what moves also moves the
+borders of what surfaces of a path see of one another and of lights; of these there are no samples yet. Without them a gradient
+would be wrong without notice, so it is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from ..camera.camera import Camera
+from ..scene.environment import Environment
+from ..scene.lights import DirectionalLight, PointLight, SpotLight
+from ..scene.scene import Scene
+from ..scene.tree import named_tensors
+from .in_kernel import is_fused, nearest_textures
+
+
+def check_bounces(scene: Scene, camera: Camera, visibility: bool) -> None:
+    """Raises ValueError for scenes whose surfaces do not light each other, and for derivatives that are not whole."""
+    if not is_fused(scene):
+        raise ValueError(
+            'bounces: expected at most 16 channels, and no texture of the filter "nearest" where meshes blend, for light that '
+            'is scattered more than once; filter="linear", or bounces=1'
+        )
+    if not visibility:
+        return
+    for name, tensor in _moving(scene, camera):
+        if _has_derivative(tensor):
+            raise ValueError(
+                f"bounces: {name} requires a gradient, and what it moves has none yet at the borders of what surfaces see of one "
+                "another by light that is scattered more than once; give bounces=1, detach it, or leave out all that moves at "
+                "borders with visibility=False. Colours, textures, roughness, normal maps, and how bright lights are, have whole "
+                "gradients"
+            )
+
+
+def _moving(scene: Scene, camera: Camera) -> Iterator[tuple[str, Tensor]]:
+    """The tensors, by name, that move borders."""
+    yield from named_tensors(camera, "camera")
+    for number, mesh in enumerate(scene.meshes):
+        name = f"meshes[{number}]"
+        yield f"{name}.verts", mesh.verts
+        if mesh.alpha is not None:
+            yield f"{name}.alpha", mesh.alpha
+        if mesh.uvs is not None and (mesh.alpha is not None or nearest_textures(mesh)):
+            yield f"{name}.uvs", mesh.uvs
+        for texture in nearest_textures(mesh):
+            if texture.uvs is not None:
+                yield f"uvs of a nearest texture of {name}", texture.uvs
+    for number, light in enumerate(scene.lights):
+        name = f"lights[{number}]"
+        if isinstance(light, DirectionalLight):
+            yield f"{name}.direction", light.direction
+        if isinstance(light, (PointLight, SpotLight)):
+            yield f"{name}.position", light.position
+        if isinstance(light, Environment) and light.rotation is not None:
+            yield f"{name}.rotation", light.rotation
+
+
+def _has_derivative(tensor: Tensor) -> bool:
+    """Of the tensor itself, while moves() says yes to all under torch.func."""
+    if torch.is_grad_enabled() and tensor.requires_grad:
+        return True
+    dual = torch.autograd.forward_ad
+    return dual._current_level >= 0 and dual.unpack_dual(tensor).tangent is not None

@@ -1,0 +1,179 @@
+"""render(bounces=n): light that is scattered more than once, against closed forms and a path tracer of the tests' own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from path_oracle import PathOracle
+from room_scenes import box_room, lamp, quad, towards_room, vector
+from scenes import icosphere
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad.kernel.request import make_request
+from edgegrad.light import in_kernel
+from edgegrad.points.frame import Frame
+
+F64 = torch.float64
+ROOMS: dict[str, dict[str, Any]] = {
+    "lamp": {},
+    "point": {"lights": "point", "metallic": 1.0, "roughness": 0.4},
+    "sky": {"lights": "sky", "floor": {"base_color": vector(0.8, 0.6, 0.4), "metallic": 0.7, "roughness": 0.5}},
+    "lamp glossy": {"floor": {"base_color": vector(0.8, 0.6, 0.4), "metallic": 0.5, "roughness": 0.5}},
+}
+
+
+def check_points(room: str, bounces: int, rows: tuple[int, ...], paths: int) -> None:
+    """Points of the image against the oracle; four standard errors of both."""
+    scene = box_room(**ROOMS[room])
+    frame = Frame(scene, make_request(scene, towards_room(8), 1, 0))
+    ((_, found),) = frame.sampler.pixel_hits(1 << 40)
+    for row in rows:
+        same = torch.full((paths,), row)
+        place = found.face[same], frame.sampler.rays_at(found.x[same]), found.x[same]
+        with torch.no_grad():
+            hits = frame.moving_hits(*place, frame.seeds("image", paths))
+            L = in_kernel.indirect(hits, True, bounces)
+            expected, error = PathOracle(scene).indirect(
+                int(found.face[row]), hits.position[0], hits.view[0], bounces, paths
+            )
+        own_error = L.std(0) / paths**0.5
+        assert bool((error < 0.06 * expected).all()) and float(expected.min()) > 0.005
+        assert bool(((L.mean(0) - expected).abs() < 4 * (error**2 + own_error**2).sqrt()).all()), (
+            row,
+            L.mean(0),
+            expected,
+        )
+
+
+@pytest.mark.parametrize("room", ["lamp", "point"])
+def test_points(room: str) -> None:
+    check_points(room, 3, (20, 55), 30_000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bounces", [2, 4])
+@pytest.mark.parametrize("room", ROOMS)
+def test_points_of_all_rooms(room: str, bounces: int) -> None:
+    check_points(room, bounces, (20, 45, 55), 300_000)
+
+
+def furnace(albedo: Tensor) -> eg.Scene:
+    """The inside of a sphere that emits 1: within it, light from all of it is the same everywhere."""
+    ball = icosphere(2)
+    return eg.Scene([eg.Mesh(ball.verts.double(), ball.faces, material=eg.Material(albedo, emission=1.0))])
+
+
+@pytest.mark.parametrize("bounces", [1, 2, 16])
+def test_white_furnace(bounces: int) -> None:
+    albedo = torch.full((3,), 0.8, dtype=F64, requires_grad=True)
+    camera = eg.Camera.look_at((0.3, 0.1, 0.2), (1.0, 0.4, 0.1), fov_y=60.0, size=(32, 32))
+    image = eg.render(furnace(albedo), camera, 16, bounces=bounces, surface_samples=20_000).mean()
+    (gradient,) = torch.autograd.grad(image, albedo)
+    expected = sum(0.8**k for k in range(bounces + 1))
+    slope = sum(k * 0.8 ** (k - 1) for k in range(1, bounces + 1))
+    assert abs(float(image.detach()) / expected - 1) < 0.01
+    assert abs(float(gradient.sum()) / slope - 1) < 0.01
+
+
+def test_gradients_of_a_room() -> None:
+    """Radiance is linear in the emission, and each colour's derivative is that of images with other colours."""
+    leaves = {"wall": vector(0.7, 0.15, 0.1), "emission": vector(6.0, 5.4, 4.2)}
+    camera, weights = towards_room(16), torch.rand(16, 16, 3, dtype=F64, generator=torch.Generator().manual_seed(1))
+
+    def loss(wall: Tensor, emission: Tensor, **options: Any) -> Tensor:
+        room = box_room()
+        red, shining = room.meshes[2], room.meshes[-1]
+        meshes = [*room.meshes[:2], red.replace(material=eg.Material(wall)), *room.meshes[3:-1]]
+        meshes.append(shining.replace(material=eg.Material(0.0, emission=emission, two_sided=False)))
+        return (weights * eg.render(eg.Scene(meshes), camera, 256, 0, bounces=3, **options)).sum()
+
+    wall, emission = (leaf.clone().requires_grad_() for leaf in leaves.values())
+    value = loss(wall, emission, surface_samples=40_000)
+    by_wall, by_emission = torch.autograd.grad(value, [wall, emission])
+    assert abs(float((by_emission * emission).sum() / value.detach()) - 1) < 0.02
+    step = torch.full((3,), 0.1, dtype=F64)
+    with torch.no_grad():
+        up, down = (loss(wall + sign * step, emission) for sign in (1, -1))
+    assert abs(float((by_wall * step).sum() / ((up - down) / 2)) - 1) < 0.02
+
+
+def test_same_bits_at_any_number_of_threads() -> None:
+    found = []
+    threads = torch.get_num_threads()
+    for count in (1, 2, 3):
+        torch.set_num_threads(count)
+        color = vector(0.6, 0.5, 0.4).requires_grad_()
+        scene = box_room("lamp", floor={"base_color": color, "roughness": 0.4})
+        image = eg.render(scene, towards_room(12), 4, bounces=4)
+        found.append((image.detach(), *torch.autograd.grad((image * image).sum(), color)))
+    torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
+
+
+def test_one_bounce_is_direct_light_and_more_add_to_it() -> None:
+    scene, camera = box_room(), towards_room(12)
+    images = [eg.render(scene, camera, 16, bounces=n) for n in (1, 2, 3)]
+    assert torch.equal(images[0], eg.render(scene, camera, 16))
+    means = [float(image.mean()) for image in images]
+    assert means[0] < 0.95 * means[1] < 0.95 * means[2]
+    alone = eg.Scene([quad((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0), base_color=0.5), lamp()])
+    flat = [eg.render(alone, towards_room(12), 16, bounces=n).mean() for n in (1, 2)]
+    assert torch.allclose(*flat, rtol=0.02)  # nothing scatters to the floor: the lamp is black
+
+
+def test_channels_batches_and_transforms() -> None:
+    color = vector(0.6, 0.5, 0.4)
+    camera = towards_room(8)
+
+    def image(color: Tensor) -> Tensor:
+        return eg.render(box_room("point", floor={"base_color": color}), camera, 4, bounces=3)
+
+    found, moved = torch.func.jvp(image, (color,), (torch.ones(3, dtype=F64),))
+    leaf = color.clone().requires_grad_()
+    assert torch.equal(found, image(leaf).detach())
+    (gradient,) = torch.autograd.grad(image(leaf).sum(), leaf)
+    assert abs(float(moved.sum()) - float(gradient.sum())) < 1e-9 * float(gradient.sum())
+    scene = box_room("point")
+    assert torch.equal(
+        eg.render(scene, camera, 4, bounces=3), eg.render_aovs(scene, camera, ["image"], 4, bounces=3)["image"]
+    )
+    pair = eg.render(scene, eg.Camera.stack([camera, camera]), 4, bounces=3)
+    assert torch.allclose(pair[0].mean(), pair[1].mean(), rtol=0.1) and torch.equal(
+        pair[0], eg.render(scene, camera, 4, bounces=3)
+    )
+
+
+def test_what_moves_borders_is_refused() -> None:
+    scene, camera = box_room("point"), towards_room(8)
+    mesh, light = scene.meshes[0], scene.lights[0]
+    moved = mesh.replace(verts=mesh.verts.clone().requires_grad_())
+    floor = scene.replace(meshes=[moved, *scene.meshes[1:]])
+    for other, seen_from, name in (
+        (floor, camera, r"meshes\[0\].verts"),
+        (
+            scene.replace(lights=[light.replace(position=vector(0, 0, 1).requires_grad_())]),
+            camera,
+            r"lights\[0\].position",
+        ),
+        (scene, camera.replace(K=camera.K.clone().requires_grad_()), "camera.K"),
+    ):
+        for function in (eg.render, eg.plan):
+            with pytest.raises(ValueError, match=f"bounces: {name} requires a gradient"):
+                function(other, seen_from, 4, bounces=2)
+    # Without borders there is nothing to leave out; and direct light has all of them.
+    assert eg.render(floor, camera, 4, bounces=2, visibility=False).requires_grad
+    assert eg.render(floor, camera, 4).requires_grad
+    with torch.no_grad():
+        eg.render(floor, camera, 4, bounces=2)
+    with pytest.raises(ValueError, match="bounces: expected an int from 1"):
+        eg.render(scene, camera, 4, bounces=0)
+
+
+def test_plan() -> None:
+    color = vector(0.6, 0.5, 0.4).requires_grad_()
+    scene = box_room("point", floor={"base_color": color})
+    off, on = (eg.plan(scene, towards_room(8), 4, bounces=n)["bounces"] for n in (1, 3))
+    assert not off.on and on.on and on.samples == 2 * 2 * eg.plan(scene, towards_room(8), 4)["interior"].samples
