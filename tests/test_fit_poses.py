@@ -306,8 +306,11 @@ def test_from_the_shell(two, tmp_path, capsys):
     for k in range(2):
         fit = PoseFit.from_json((tmp_path / str(k + 1) / "pose.json").read_text())
         off = errors(fit, MESHES[k], TRUTHS[k])
-        assert off[0] < 2.5 and off[1] < 1.4 and fit.converged, off
-    assert f"{tmp_path}/1.ply: converged" in capsys.readouterr().out
+        assert off[0] < 2.5 and off[1] < 1.4, off
+    said = capsys.readouterr().out
+    # The contour of the first tells its rotation to about 2°, and what is less exact is unknown.
+    assert f"{tmp_path}/0.ply: converged" in said or f"{tmp_path}/0.ply: directions unknown" in said
+    assert f"{tmp_path}/1.ply: converged" in said
     assert main(given[:-2]) == 2
     assert "--init: expected 2, one for each --mesh, got 1" in capsys.readouterr().err
     Image.fromarray((labels_of(view, scene_of(2)) == 1).byte().numpy()).save(tmp_path / "labels.png")

@@ -140,7 +140,7 @@ class Lighting(NamedTuple):
 
     def __call__(self, hits: Hits) -> Tensor:
         more = AT_CURVES if hits._on_curve and self.resamples(hits._surfaces.scene) else 1
-        return radiance(hits, self.shadows, more * self.samples)
+        return radiance(hits, *self._replace(samples=more * self.samples))
 
 
 def _kernel_image(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:

@@ -155,7 +155,8 @@ class PoseFit:
     @staticmethod
     def from_json(text: str) -> PoseFit:
         """From what to_json wrote; the history is not kept. Raises ValueError that names what is missing or wrong."""
-        data = _parsed(text, "mesh_to_world", "camera", "loss", "steps", "seconds", "converged", "interrupted")
+        data = _parsed(text)
+        _check_entries(data, "mesh_to_world", "camera", "loss", "steps", "seconds", "converged", "interrupted")
         pose = pose_from_matrix("mesh_to_world", data["mesh_to_world"])
         try:
             camera = data["camera"]
@@ -176,7 +177,8 @@ def pose_from_json(text: str) -> Pose:
     writes them, of which the last one that is not `lost`. Raises ValueError."""
     data = _parsed(text)
     if "poses" not in data:
-        return pose_from_matrix("mesh_to_world", _parsed(text, "mesh_to_world")["mesh_to_world"])
+        _check_entries(data, "mesh_to_world")
+        return pose_from_matrix("mesh_to_world", data["mesh_to_world"])
     rows = data["poses"]
     if not isinstance(rows, list) or not all(isinstance(row, dict) and "mesh_to_world" in row for row in rows):
         raise ValueError("poses: expected a list of objects, each with mesh_to_world, as edgegrad track writes them")
@@ -186,14 +188,16 @@ def pose_from_json(text: str) -> Pose:
     return pose_from_matrix("mesh_to_world", seen[-1]["mesh_to_world"])
 
 
-def _parsed(text: str, *keys: str) -> dict[str, Any]:
+def _parsed(text: str) -> dict[str, Any]:
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
         raise ValueError(f"pose: expected JSON, got text that is not ({error})") from None
     if not isinstance(data, dict):
-        wanted = f"{{{json.dumps(keys[0])}: …}}"
-        raise ValueError(f"pose: expected a JSON object, got {type(data).__name__}; write {wanted}")
+        raise ValueError(f'pose: expected a JSON object, got {type(data).__name__}; write {{"mesh_to_world": …}}')
+    return data
+
+
+def _check_entries(data: dict[str, Any], *keys: str) -> None:
     if missing := [key for key in keys if key not in data]:
         raise ValueError(f"pose: expected the entry {missing[0]!r}, got {', '.join(data) or 'none'}; add it")
-    return data
