@@ -16,11 +16,14 @@ from .camera.camera import Camera
 from .check import as_tensor, check_int, check_positive, check_shape
 from .optional import require
 from .points.rays import trace
+from .scene.appearance import OnMesh, coordinates
 from .scene.mesh import Mesh
+from .scene.mikktspace import Fans
 from .scene.nearest import Places, Surface
 from .scene.scene import Scene, as_scene
 
-WHAT = ("color", "normal", "visibility")
+WHAT = ("color", "normal", "normal_map", "visibility")
+FLAT = (0.5, 0.5, 1.0)  # of a normal map that bends nothing
 AT_ONCE = 1 << 20  # rays
 REACH = 0.05  # of the diagonal of a mesh's box: how far rays look for the other surface
 NEAR = 1e-4  # of a distance: what lies so close is the surface itself
@@ -62,14 +65,15 @@ def bake(
     source    the other surface, or a function of SurfacePoints of `mesh` that returns (N, C)
     size      texels: one number, or (h, w)
     what      "color": its colours, or base colours where it is lit; "normal": its normals (C = 3) in world coordinates, of
-              length 1; "visibility" (C = 1): the share of the sky above a point of `mesh`, weighed by the cosine, that the source
-              does not cover
+              length 1; "normal_map": these in the tangent frames of `mesh`, as Material(normal_map=…) and glTF take them: numbers
+              from 0 to 1, with MikkTSpace's frames where `mesh` has normals; "visibility" (C = 1): the share of the sky
+              above a point of `mesh`, weighed by the cosine, that the source does not cover
     by        "rays": along the normals of `mesh`, from outside, as far as `reach` on both sides; where these meet nothing, and
               with "nearest" everywhere, the source's nearest point
     reach     world units; None: a twentieth of the diagonal of the mesh's box
     rays      for each texel, of visibility
     margin    texels around charts that take the colour of the nearest texel within, for bilinear look-ups reach beyond seams;
-              None: all others. What is left is zero
+              None: all others. What is left is zero, of a normal map the flat (½, ½, 1)
     seed      of the directions
     progress  whether a bar is shown
 
@@ -85,6 +89,7 @@ def bake(
     check_int("rays", rays, 1, 1 << 16)
     mesh = mesh.detach().to("cpu")
     texels = _Texels.of(mesh, shape)
+    empty = FLAT if what == "normal_map" else 0.0
     if isinstance(source, (Mesh, Scene)):
         scene = as_scene(source).detach().to("cpu")
         low, high = mesh.verts.double().aminmax(dim=0)
@@ -94,6 +99,8 @@ def bake(
             values = _visibility(texels.points, scene, NEAR * diagonal, rays, seed, progress)
         else:
             values = _of_surface(scene, _matched(texels.points, scene, by, reach), what)
+            if what == "normal_map":
+                values = _in_tangent_frames(mesh, texels.points, values)
     elif callable(source):
         if what != "color":
             raise ValueError(f"what: expected 'color' with a function, which says itself what it gives, got {what!r}")
@@ -101,7 +108,7 @@ def bake(
         check_shape("source", values, (len(texels.points.face), "C"))
     else:
         raise TypeError(f"source: expected a Mesh, a Scene or a function, got {type(source).__name__}")
-    return texels.texture(values.float(), margin)
+    return texels.texture(values.float(), margin, empty=empty)
 
 
 def bake_pictures(
@@ -182,23 +189,30 @@ class _Texels(NamedTuple):
         b, face = torch.stack([u, v, 1 - u - v], 1), number.long() - 1
         return cls(shape, place, points_of(mesh, face, b))
 
-    def texture(self, values: Tensor, margin: int | None, known: Tensor | None = None) -> Tensor:
-        """(h, w, C) of the values of those that are known."""
+    def texture(
+        self,
+        values: Tensor,
+        margin: int | None,
+        known: Tensor | None = None,
+        empty: float | tuple[float, ...] = 0.0,
+    ) -> Tensor:
+        """(h, w, C) of the values of those that are known; beyond the margin `empty`."""
         h, w = self.shape
         place = self.place if known is None else self.place[known]
-        out = torch.zeros(h * w, values.shape[1])
+        left = torch.tensor(empty)
+        out = left.expand(h * w, values.shape[1]).clone()
         out[place] = values
         if margin == 0:
             return out.view(h, w, -1)
-        empty = np.ones(h * w, bool)
-        empty[place.numpy()] = False
+        unused = np.ones(h * w, bool)
+        unused[place.numpy()] = False
         ndimage = require("scipy.ndimage", "edgegrad[fit]", "a margin around charts")
-        distance, (rows, columns) = ndimage.distance_transform_edt(empty.reshape(h, w), return_indices=True)
+        distance, (rows, columns) = ndimage.distance_transform_edt(unused.reshape(h, w), return_indices=True)
         near = out.view(h, w, -1)[torch.from_numpy(rows).long(), torch.from_numpy(columns).long()]
         if margin is None:
             return near
         check_int("margin", margin, 0, 1 << 14)
-        return torch.where(torch.from_numpy(distance <= margin)[..., None], near, 0.0)
+        return torch.where(torch.from_numpy(distance <= margin)[..., None], near, left)
 
 
 def points_of(mesh: Mesh, face: Tensor, b: Tensor) -> SurfacePoints:
@@ -251,6 +265,32 @@ def _of_surface(scene: Scene, places: Places, what: str) -> Tensor:
         out[rows] = points_of(mesh, own, torch.from_numpy(places.b)[rows]).normal
         first += len(mesh.faces)
     return out
+
+
+def _in_tangent_frames(mesh: Mesh, points: SurfacePoints, normal: Tensor) -> Tensor:
+    """(N, 3): unit normals as a normal map of the mesh says them, from 0 to 1, on the outer side of its own."""
+    at = OnMesh(mesh, points.face, points.barycentrics, tangents=lambda: _tangents(mesh))
+    corners = at.corners()
+    flat = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    n = at.smooth_normal(F.normalize(flat, dim=1))
+    frame = at.tangent_frame(n, None)
+    along = torch.stack([(normal * axis).sum(1) for axis in (frame.tangent, frame.bitangent, n)], 1)
+    along[:, 2].clamp_(min=0)  # glTF has no others
+    along = torch.where(frame.there & (along.norm(dim=1, keepdim=True) > 0), along, along.new_tensor([0.0, 0, 1]))
+    return 0.5 + 0.5 * F.normalize(along, dim=1)
+
+
+def _tangents(mesh: Mesh) -> Tensor:
+    """(F, 3, 4) at the corners of a mesh with normals."""
+    assert mesh.normals is not None
+    uvs, uv_faces = coordinates(mesh, None)
+    given = (
+        (mesh.verts, mesh.faces),
+        (mesh.normals, mesh.faces if mesh.normal_faces is None else mesh.normal_faces),
+        (uvs, uv_faces),
+    )
+    fans = Fans.of(*((values.numpy(), index.numpy()) for values, index in given))
+    return fans.tangents(*(values[index.long()] for values, index in given))
 
 
 def _visibility(points: SurfacePoints, scene: Scene, aside: float, rays: int, seed: int, progress: bool) -> Tensor:

@@ -7,10 +7,10 @@ import torch
 
 from ..check import check_int
 from ..optional import require
-from ..scene.mesh import Mesh
+from .mesh import Mesh
 
 
-def unwrapped(mesh: Mesh, size: int = 512, gap: int = 4) -> Mesh:
+def unwrap(mesh: Mesh, size: int = 512, gap: int = 4) -> Mesh:
     """The mesh with texture coordinates for fit_texture(): charts of little stretch, side by side in a square, by xatlas.
     Vertices and faces stay as they are; colours and textures are left away.
 
