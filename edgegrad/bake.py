@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from . import raster
 from .camera.camera import Camera
-from .check import as_tensor, check_int, check_positive, check_shape
+from .check import as_tensor, check_finite, check_float, check_int, check_positive, check_shape
 from .optional import require
 from .points.rays import trace
 from .scene.appearance import OnMesh, coordinates
@@ -26,6 +26,7 @@ WHAT = ("color", "normal", "normal_map", "visibility")
 FLAT = (0.5, 0.5, 1.0)  # of a normal map that bends nothing
 AT_ONCE = 1 << 20  # rays
 REACH = 0.05  # of the diagonal of a mesh's box: how far rays look for the other surface
+SLACK = 1e-4  # of texture coordinates beyond the unit square, by rounding
 NEAR = 1e-4  # of a distance: what lies so close is the surface itself
 
 
@@ -105,7 +106,8 @@ def bake(
         if what != "color":
             raise ValueError(f"what: expected 'color' with a function, which says itself what it gives, got {what!r}")
         values = as_tensor("source", source(texels.points), floating=True).detach().cpu()
-        check_shape("source", values, (len(texels.points.face), "C"))
+        check_shape("source", values, (len(texels.points.face), "C"), fix="a row for each point")
+        check_finite("source", values := values.float())
     else:
         raise TypeError(f"source: expected a Mesh, a Scene or a function, got {type(source).__name__}")
     return texels.texture(values.float(), margin, empty=empty)
@@ -133,6 +135,8 @@ def bake_pictures(
     or ValueError that names the argument, ImportError.
     """
     _check_mesh(mesh)
+    if isinstance(cameras, Camera):
+        raise TypeError("cameras: expected a list of cameras, one for each picture, got a Camera; use [camera]")
     if len(cameras) != len(images) or not len(cameras):
         raise ValueError(
             f"images: expected one for each of {len(cameras)} cameras, and at least one, got {len(images)}"
@@ -142,15 +146,17 @@ def bake_pictures(
     mesh = mesh.detach().to("cpu")
     texels = _Texels.of(mesh, _shape(size))
     points = texels.points
-    channels = images[0].shape[-1]
+    pictures = [
+        _picture(f"images[{k}]", image, camera) for k, (camera, image) in enumerate(zip(cameras, images, strict=True))
+    ]
+    channels = pictures[0].shape[2]
     total, weight = (
         torch.zeros(len(points.face), channels, dtype=torch.float64),
         torch.zeros(len(points.face), 1).double(),
     )
-    for k, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+    for k, (camera, image) in enumerate(zip(cameras, pictures, strict=True)):
         if camera.batch is not None:
             raise ValueError(f"cameras[{k}]: expected one camera, got a batch of {camera.batch}; give them one by one")
-        image = as_tensor(f"images[{k}]", image, floating=True).detach().cpu().double()
         check_shape(f"images[{k}]", image, (*camera.size, channels))
         share = _seen(mesh, points, camera.detach().to("cpu"))
         x = torch.nan_to_num(camera.detach().to("cpu").project(points.position).double(), nan=-1.0)
@@ -179,12 +185,20 @@ class _Texels(NamedTuple):
     def of(cls, mesh: Mesh, shape: tuple[int, int]) -> _Texels:
         assert mesh.uvs is not None and mesh.uv_faces is not None
         uvs = mesh.uvs.double()
+        used = uvs[mesh.uv_faces.long()]
+        if bool(((used < -SLACK) | (used > 1 + SLACK)).any()):
+            low, high = (round(float(x), 3) for x in used.aminmax())
+            raise ValueError(
+                f"mesh: expected texture coordinates in the unit square, got some from {low} to {high}; use unwrap(mesh)"
+            )
         pos = torch.cat([2 * uvs - 1, torch.zeros(len(uvs), 1), torch.ones(len(uvs), 1)], 1).double()
         rast, _ = raster.rasterize(raster.RasterizeContext(output_db=False), pos[None], mesh.uv_faces, shape)
         rast = rast[0].flip(0).reshape(-1, 4)
         place = (rast[:, 3] > 0).nonzero()[:, 0]
         if len(place) == 0:
-            raise ValueError("mesh: expected texture coordinates in the unit square, got none there; use unwrap(mesh)")
+            raise ValueError(
+                f"size: expected texels whose centres lie on faces, got none of {shape}; give a larger size"
+            )
         u, v, _, number = rast[place].unbind(1)
         b, face = torch.stack([u, v, 1 - u - v], 1), number.long() - 1
         return cls(shape, place, points_of(mesh, face, b))
@@ -331,6 +345,17 @@ def _seen(mesh: Mesh, points: SurfacePoints, camera: Camera) -> Tensor:
     return (visible * cosine.clamp(min=0) ** 2)[:, None]
 
 
+def _picture(name: str, image: Tensor, camera: Camera) -> Tensor:
+    """(H, W, C) float64."""
+    if isinstance(image, str):
+        raise TypeError(f"{name}: expected a tensor, got a name; use read_image({image!r})")
+    given = as_tensor(name, image)
+    check_float(name, given)  # bytes would be neither linear nor from 0 to 1
+    check_shape(name, given, (*camera.size, "C"))
+    check_finite(name, given)
+    return given.detach().cpu().double()
+
+
 def _at(image: Tensor, x: Tensor) -> Tensor:
     """(N, C) bilinear at places (N, 2), px."""
     H, W = image.shape[:2]
@@ -347,5 +372,7 @@ def _check_mesh(mesh: Mesh) -> None:
 
 
 def _shape(size: int | tuple[int, int]) -> tuple[int, int]:
-    h, w = (size, size) if isinstance(size, int) else size
-    return check_int("size", h, 1, 1 << 14), check_int("size", w, 1, 1 << 14)
+    both = size if isinstance(size, (tuple, list)) else (size, size)
+    if len(both) != 2:
+        raise ValueError(f"size: expected an int or (h, w), got {size!r}")
+    return check_int("size", both[0], 1, 1 << 14), check_int("size", both[1], 1, 1 << 14)

@@ -170,3 +170,13 @@ def test_faults_of_unwrapping():
         eg.unwrap(3)
     with pytest.raises(ValueError, match="size: expected an int from 16"):
         eg.unwrap(ball(1), 2)
+    with pytest.raises(ValueError, match="mesh: expected faces with an area"):
+        eg.unwrap(ball(1).replace(verts=torch.zeros_like(ball(1).verts)))
+
+
+@pytest.mark.parametrize("scale", [2.0**-66, 2.0**66])
+def test_units_do_not_matter_to_unwrapping(scale: float) -> None:
+    mesh = ball(1)
+    same, other = eg.unwrap(mesh, 64), eg.unwrap(mesh.replace(verts=mesh.verts * scale), 64)
+    assert same.uvs is not None and other.uvs is not None and same.uvs.shape == other.uvs.shape
+    assert torch.equal(same.uvs, other.uvs)
