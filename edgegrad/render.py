@@ -134,7 +134,8 @@ def render_batch(
 
     The other arguments are those of render(). Images and gradients have the bits of render() for one pair after the other. If
     all images are small and neither lit nor shaded, each takes one thread, and as many are rendered, and differentiated, beside
-    each other as there are threads; in reverse mode, once.
+    each other as there are threads; in reverse mode, once. Otherwise, so with one lit scene among them, they come one after the
+    other, each with all threads.
 
     Raises what render() raises, with the number of the pair.
     """
