@@ -1,9 +1,11 @@
-"""The operators of edgegrad.raster beside render(spp=1): processor time of a step, forward and backward.
+"""The operators of edgegrad.raster beside render(spp=1), and render_batch: processor time of a step, forward and backward.
 
 python benchmarks/raster.py [--rounds 5]
 
 The scene is a textured sphere of 20,480 faces, seen by 8 cameras at 512², with gradients of vertices and texture. Both take
 turns; "share of the calling thread" is its processor time over that of all threads, which bounds what they gain.
+render_batch has 16 spheres of 1,280 faces at 64²: plain ones take one thread each, beside the calling one, lit ones come one
+by one.
 """
 
 from __future__ import annotations
@@ -60,6 +62,23 @@ class Step:
         (torch.stack(images) * self.adjoint).sum().backward()
 
 
+def batch(lit: bool) -> Callable[[], None]:
+    """A step of render_batch() over 16 meshes that share vertices."""
+    mesh = sphere(3)
+    camera = eg.Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40.0, (64, 64))
+    lights = [eg.DirectionalLight(torch.tensor([0.0, -0.3, -1.0]))] if lit else []
+    material = eg.Material() if lit else None
+
+    def step() -> None:
+        verts = mesh.verts.float().requires_grad_()
+        meshes = [eg.Mesh(verts * (1 + 0.01 * k), mesh.faces, material=material) for k in range(16)]
+        images = eg.render_batch([(eg.Scene([own], lights=lights), camera) for own in meshes])
+        assert isinstance(images, Tensor)
+        images.square().sum().backward()
+
+    return step
+
+
 def processor_time(work: Callable[[], None]) -> tuple[float, float]:
     """Seconds of all threads, and of the calling one."""
     all_threads, own = time.process_time(), time.thread_time()
@@ -82,3 +101,8 @@ if __name__ == "__main__":
     ratios = sorted(a[0] / b[0] for a, b in zip(*(times[1:] for times in found.values()), strict=True))
     middle, threads = ratios[len(ratios) // 2], torch.get_num_threads()
     print(f"operators over render: {middle:.2f} ({ratios[0]:.2f} … {ratios[-1]:.2f}); {threads} threads")
+    for lit in (False, True):
+        work = batch(lit)
+        whole, own = sorted([processor_time(work) for _ in range(rounds + 1)][1:])[rounds // 2]
+        name = "render_batch, lit" if lit else "render_batch"
+        print(f"{name:17s} {1e3 * whole / 16:5.1f} ms an image, share of the calling thread {own / whole:.2f}")

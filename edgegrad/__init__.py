@@ -10,7 +10,6 @@ from .aovs import render_aovs
 from .bake import SurfacePoints, bake, bake_pictures
 from .camera.camera import Camera
 from .files.save import from_trimesh, to_trimesh
-from .fit.unwrapping import unwrapped as unwrap
 from .io import (
     View,
     load_camera,
@@ -57,6 +56,7 @@ from .scene.mesh import Mesh
 from .scene.mesh_light import MeshLight
 from .scene.scene import Scene
 from .scene.symmetries import Symmetries, SymmetryAxis
+from .scene.unwrapping import unwrap
 
 # What the classes of scenes can do with the help of packages above them.
 provided.from_trimesh, provided.to_trimesh, provided.thumbnail = from_trimesh, to_trimesh, thumbnail

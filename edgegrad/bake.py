@@ -13,16 +13,20 @@ from tqdm import tqdm
 
 from . import raster
 from .camera.camera import Camera
-from .check import as_tensor, check_int, check_positive, check_shape
+from .check import as_tensor, check_finite, check_float, check_int, check_positive, check_shape
 from .optional import require
 from .points.rays import trace
+from .scene.appearance import OnMesh, coordinates
 from .scene.mesh import Mesh
+from .scene.mikktspace import Fans
 from .scene.nearest import Places, Surface
 from .scene.scene import Scene, as_scene
 
-WHAT = ("color", "normal", "visibility")
+WHAT = ("color", "normal", "normal_map", "visibility")
+FLAT = (0.5, 0.5, 1.0)  # of a normal map that bends nothing
 AT_ONCE = 1 << 20  # rays
 REACH = 0.05  # of the diagonal of a mesh's box: how far rays look for the other surface
+SLACK = 1e-4  # of texture coordinates beyond the unit square, by rounding
 NEAR = 1e-4  # of a distance: what lies so close is the surface itself
 
 
@@ -62,14 +66,15 @@ def bake(
     source    the other surface, or a function of SurfacePoints of `mesh` that returns (N, C)
     size      texels: one number, or (h, w)
     what      "color": its colours, or base colours where it is lit; "normal": its normals (C = 3) in world coordinates, of
-              length 1; "visibility" (C = 1): the share of the sky above a point of `mesh`, weighed by the cosine, that the source
-              does not cover
+              length 1; "normal_map": these in the tangent frames of `mesh`, as Material(normal_map=…) and glTF take them: numbers
+              from 0 to 1, with MikkTSpace's frames where `mesh` has normals; "visibility" (C = 1): the share of the sky
+              above a point of `mesh`, weighed by the cosine, that the source does not cover
     by        "rays": along the normals of `mesh`, from outside, as far as `reach` on both sides; where these meet nothing, and
               with "nearest" everywhere, the source's nearest point
     reach     world units; None: a twentieth of the diagonal of the mesh's box
     rays      for each texel, of visibility
     margin    texels around charts that take the colour of the nearest texel within, for bilinear look-ups reach beyond seams;
-              None: all others. What is left is zero
+              None: all others. What is left is zero, of a normal map the flat (½, ½, 1)
     seed      of the directions
     progress  whether a bar is shown
 
@@ -85,6 +90,7 @@ def bake(
     check_int("rays", rays, 1, 1 << 16)
     mesh = mesh.detach().to("cpu")
     texels = _Texels.of(mesh, shape)
+    empty = FLAT if what == "normal_map" else 0.0
     if isinstance(source, (Mesh, Scene)):
         scene = as_scene(source).detach().to("cpu")
         low, high = mesh.verts.double().aminmax(dim=0)
@@ -94,14 +100,17 @@ def bake(
             values = _visibility(texels.points, scene, NEAR * diagonal, rays, seed, progress)
         else:
             values = _of_surface(scene, _matched(texels.points, scene, by, reach), what)
+            if what == "normal_map":
+                values = _in_tangent_frames(mesh, texels.points, values)
     elif callable(source):
         if what != "color":
             raise ValueError(f"what: expected 'color' with a function, which says itself what it gives, got {what!r}")
         values = as_tensor("source", source(texels.points), floating=True).detach().cpu()
-        check_shape("source", values, (len(texels.points.face), "C"))
+        check_shape("source", values, (len(texels.points.face), "C"), fix="a row for each point")
+        check_finite("source", values := values.float())
     else:
         raise TypeError(f"source: expected a Mesh, a Scene or a function, got {type(source).__name__}")
-    return texels.texture(values.float(), margin)
+    return texels.texture(values.float(), margin, empty=empty)
 
 
 def bake_pictures(
@@ -126,6 +135,8 @@ def bake_pictures(
     or ValueError that names the argument, ImportError.
     """
     _check_mesh(mesh)
+    if isinstance(cameras, Camera):
+        raise TypeError("cameras: expected a list of cameras, one for each picture, got a Camera; use [camera]")
     if len(cameras) != len(images) or not len(cameras):
         raise ValueError(
             f"images: expected one for each of {len(cameras)} cameras, and at least one, got {len(images)}"
@@ -135,15 +146,17 @@ def bake_pictures(
     mesh = mesh.detach().to("cpu")
     texels = _Texels.of(mesh, _shape(size))
     points = texels.points
-    channels = images[0].shape[-1]
+    pictures = [
+        _picture(f"images[{k}]", image, camera) for k, (camera, image) in enumerate(zip(cameras, images, strict=True))
+    ]
+    channels = pictures[0].shape[2]
     total, weight = (
         torch.zeros(len(points.face), channels, dtype=torch.float64),
         torch.zeros(len(points.face), 1).double(),
     )
-    for k, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+    for k, (camera, image) in enumerate(zip(cameras, pictures, strict=True)):
         if camera.batch is not None:
             raise ValueError(f"cameras[{k}]: expected one camera, got a batch of {camera.batch}; give them one by one")
-        image = as_tensor(f"images[{k}]", image, floating=True).detach().cpu().double()
         check_shape(f"images[{k}]", image, (*camera.size, channels))
         share = _seen(mesh, points, camera.detach().to("cpu"))
         x = torch.nan_to_num(camera.detach().to("cpu").project(points.position).double(), nan=-1.0)
@@ -172,33 +185,48 @@ class _Texels(NamedTuple):
     def of(cls, mesh: Mesh, shape: tuple[int, int]) -> _Texels:
         assert mesh.uvs is not None and mesh.uv_faces is not None
         uvs = mesh.uvs.double()
+        used = uvs[mesh.uv_faces.long()]
+        if bool(((used < -SLACK) | (used > 1 + SLACK)).any()):
+            low, high = (round(float(x), 3) for x in used.aminmax())
+            raise ValueError(
+                f"mesh: expected texture coordinates in the unit square, got some from {low} to {high}; use unwrap(mesh)"
+            )
         pos = torch.cat([2 * uvs - 1, torch.zeros(len(uvs), 1), torch.ones(len(uvs), 1)], 1).double()
         rast, _ = raster.rasterize(raster.RasterizeContext(output_db=False), pos[None], mesh.uv_faces, shape)
         rast = rast[0].flip(0).reshape(-1, 4)
         place = (rast[:, 3] > 0).nonzero()[:, 0]
         if len(place) == 0:
-            raise ValueError("mesh: expected texture coordinates in the unit square, got none there; use unwrap(mesh)")
+            raise ValueError(
+                f"size: expected texels whose centres lie on faces, got none of {shape}; give a larger size"
+            )
         u, v, _, number = rast[place].unbind(1)
         b, face = torch.stack([u, v, 1 - u - v], 1), number.long() - 1
         return cls(shape, place, points_of(mesh, face, b))
 
-    def texture(self, values: Tensor, margin: int | None, known: Tensor | None = None) -> Tensor:
-        """(h, w, C) of the values of those that are known."""
+    def texture(
+        self,
+        values: Tensor,
+        margin: int | None,
+        known: Tensor | None = None,
+        empty: float | tuple[float, ...] = 0.0,
+    ) -> Tensor:
+        """(h, w, C) of the values of those that are known; beyond the margin `empty`."""
         h, w = self.shape
         place = self.place if known is None else self.place[known]
-        out = torch.zeros(h * w, values.shape[1])
+        left = torch.tensor(empty)
+        out = left.expand(h * w, values.shape[1]).clone()
         out[place] = values
         if margin == 0:
             return out.view(h, w, -1)
-        empty = np.ones(h * w, bool)
-        empty[place.numpy()] = False
+        unused = np.ones(h * w, bool)
+        unused[place.numpy()] = False
         ndimage = require("scipy.ndimage", "edgegrad[fit]", "a margin around charts")
-        distance, (rows, columns) = ndimage.distance_transform_edt(empty.reshape(h, w), return_indices=True)
+        distance, (rows, columns) = ndimage.distance_transform_edt(unused.reshape(h, w), return_indices=True)
         near = out.view(h, w, -1)[torch.from_numpy(rows).long(), torch.from_numpy(columns).long()]
         if margin is None:
             return near
         check_int("margin", margin, 0, 1 << 14)
-        return torch.where(torch.from_numpy(distance <= margin)[..., None], near, 0.0)
+        return torch.where(torch.from_numpy(distance <= margin)[..., None], near, left)
 
 
 def points_of(mesh: Mesh, face: Tensor, b: Tensor) -> SurfacePoints:
@@ -253,6 +281,32 @@ def _of_surface(scene: Scene, places: Places, what: str) -> Tensor:
     return out
 
 
+def _in_tangent_frames(mesh: Mesh, points: SurfacePoints, normal: Tensor) -> Tensor:
+    """(N, 3): unit normals as a normal map of the mesh says them, from 0 to 1, on the outer side of its own."""
+    at = OnMesh(mesh, points.face, points.barycentrics, tangents=lambda: _tangents(mesh))
+    corners = at.corners()
+    flat = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    n = at.smooth_normal(F.normalize(flat, dim=1))
+    frame = at.tangent_frame(n, None)
+    along = torch.stack([(normal * axis).sum(1) for axis in (frame.tangent, frame.bitangent, n)], 1)
+    along[:, 2].clamp_(min=0)  # glTF has no others
+    along = torch.where(frame.there & (along.norm(dim=1, keepdim=True) > 0), along, along.new_tensor([0.0, 0, 1]))
+    return 0.5 + 0.5 * F.normalize(along, dim=1)
+
+
+def _tangents(mesh: Mesh) -> Tensor:
+    """(F, 3, 4) at the corners of a mesh with normals."""
+    assert mesh.normals is not None
+    uvs, uv_faces = coordinates(mesh, None)
+    given = (
+        (mesh.verts, mesh.faces),
+        (mesh.normals, mesh.faces if mesh.normal_faces is None else mesh.normal_faces),
+        (uvs, uv_faces),
+    )
+    fans = Fans.of(*((values.numpy(), index.numpy()) for values, index in given))
+    return fans.tangents(*(values[index.long()] for values, index in given))
+
+
 def _visibility(points: SurfacePoints, scene: Scene, aside: float, rays: int, seed: int, progress: bool) -> Tensor:
     """(N, 1): the share of directions, distributed as the cosine to the normal, that leave."""
     count = len(points.face)
@@ -291,6 +345,17 @@ def _seen(mesh: Mesh, points: SurfacePoints, camera: Camera) -> Tensor:
     return (visible * cosine.clamp(min=0) ** 2)[:, None]
 
 
+def _picture(name: str, image: Tensor, camera: Camera) -> Tensor:
+    """(H, W, C) float64."""
+    if isinstance(image, str):
+        raise TypeError(f"{name}: expected a tensor, got a name; use read_image({image!r})")
+    given = as_tensor(name, image)
+    check_float(name, given)  # bytes would be neither linear nor from 0 to 1
+    check_shape(name, given, (*camera.size, "C"))
+    check_finite(name, given)
+    return given.detach().cpu().double()
+
+
 def _at(image: Tensor, x: Tensor) -> Tensor:
     """(N, C) bilinear at places (N, 2), px."""
     H, W = image.shape[:2]
@@ -307,5 +372,7 @@ def _check_mesh(mesh: Mesh) -> None:
 
 
 def _shape(size: int | tuple[int, int]) -> tuple[int, int]:
-    h, w = (size, size) if isinstance(size, int) else size
-    return check_int("size", h, 1, 1 << 14), check_int("size", w, 1, 1 << 14)
+    both = size if isinstance(size, (tuple, list)) else (size, size)
+    if len(both) != 2:
+        raise ValueError(f"size: expected an int or (h, w), got {size!r}")
+    return check_int("size", both[0], 1, 1 << 14), check_int("size", both[1], 1, 1 << 14)

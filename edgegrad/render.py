@@ -134,14 +134,18 @@ def render_batch(
 
     The other arguments are those of render(). Images and gradients have the bits of render() for one pair after the other. If
     all images are small and neither lit nor shaded, each takes one thread, and as many are rendered, and differentiated, beside
-    each other as there are threads; in reverse mode, once.
+    each other as there are threads; in reverse mode, once. Otherwise, so with one lit scene among them, they come one after the
+    other, each with all threads.
 
     Raises what render() raises, with the number of the pair.
     """
     check_options("render_batch", options)
-    if isinstance(pairs, (Scene, Mesh)) or not isinstance(pairs, Sequence) or not pairs:
-        raise TypeError(f"pairs: expected a list of pairs (scene, camera), got {type(pairs).__name__}")
-    seeds = list(seed) if isinstance(seed, Sequence) else [seed] * len(pairs)
+    if isinstance(pairs, (Scene, Mesh)) or not isinstance(pairs, Sequence):
+        raise TypeError(f"pairs: expected a list of pairs (scene, camera), got {type(pairs).__name__}; use list(pairs)")
+    if not pairs:
+        raise ValueError("pairs: expected at least one pair (scene, camera), got none")
+    each_its_own = isinstance(seed, Sequence) or (isinstance(seed, Tensor) and seed.dim() > 0)
+    seeds: list[Any] = list(seed) if each_its_own else [seed] * len(pairs)  # pyright: ignore[reportArgumentType]
     if len(seeds) != len(pairs):
         raise ValueError(f"seed: expected one, or {len(pairs)}, one of each pair, got {len(seeds)}")
     plain = not any(name in SHADING for name in options)
@@ -163,7 +167,13 @@ def render_batch(
         devices = [as_scene(scene).meshes[0].verts.device for scene, _ in pairs]
         images = [image.to(device) for image, device in zip(render_images(requests), devices, strict=True)]
     else:
-        images = [render(*pair, spp, own, **options) for pair, own in zip(pairs, seeds, strict=True)]
+        for k, (pair, own) in enumerate(zip(pairs, seeds, strict=True)):
+            try:
+                images.append(render(*pair, spp, own, **options))
+            except (TypeError, ValueError) as error:
+                if type(error) in (TypeError, ValueError):  # not of a shader's own kind
+                    raise type(error)(f"pairs[{k}]: {error}") from error
+                raise
     alike = all(image.shape == images[0].shape and image.dtype == images[0].dtype for image in images)
     return torch.stack(images) if alike else images
 

@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 import edgegrad as eg
-from edgegrad.fit import fit_pose, fit_shape, unwrapped
+from edgegrad.fit import fit_pose, fit_shape
 from edgegrad.fit.losses import ssim
 from edgegrad_cli import main
 from edgegrad_cli.doctor import gradient_error
@@ -69,7 +69,7 @@ def extras() -> None:
         "matplotlib": ("figures", fit.plot),
         "torchmetrics": ("fit", lambda: ssim(image, image)),
         "gpytoolbox": ("fit", lambda: fit_shape(mesh, [camera], [image], levels=2, steps=1, progress=False)),
-        "xatlas": ("fit", lambda: unwrapped(mesh)),
+        "xatlas": ("fit", lambda: eg.unwrap(mesh)),
     }
     for library, (extra, call) in needs.items():
         if importlib.util.find_spec(library) is None:

@@ -57,6 +57,30 @@ def test_normals_of_a_sphere() -> None:
     assert used.float().mean() > 0.3 and cosine.min() > math.cos(math.radians(25)) and cosine.mean() > 0.995
 
 
+@pytest.mark.parametrize("smooth", [True, False])
+def test_a_normal_map_shades_as_the_fine_mesh(smooth: bool) -> None:
+    """Of bumps that the coarse mesh, with interpolated normals or the faces', does not have."""
+    coarse, fine = icosphere(2).verts.double(), icosphere(4)
+    verts = fine.verts.double() * (1 + 0.03 * torch.sin(7 * fine.verts.double()).prod(1, keepdim=True))
+    normals = eg.vertex_normals(verts.float(), fine.faces)
+    wanted = eg.Mesh(verts.float(), fine.faces, normals=normals, material=eg.Material())
+    mesh = eg.Mesh(coarse.float(), icosphere(2).faces, normals=coarse.float() if smooth else None)
+    mesh = eg.unwrap(mesh, size=128)
+    camera = eg.Camera.look_at((1.5, 1, 2.5), (0, 0, 0), (0, 1, 0), 30.0, (64, 64))
+    light = eg.DirectionalLight(torch.tensor([-0.6, -0.5, -0.4]), 3.0)
+
+    def shaded(normal_map: Tensor | None) -> Tensor:
+        material = eg.Material(normal_map=None if normal_map is None else eg.Texture(normal_map))
+        return eg.render(eg.Scene([mesh.replace(material=material)], lights=[light]), camera, shadows=False)
+
+    image = eg.render(eg.Scene([wanted], lights=[light]), camera, shadows=False)
+    normal_map = eg.bake(mesh, wanted, 128, what="normal_map")
+    mirrored = torch.stack([normal_map[..., 0], 1 - normal_map[..., 1], normal_map[..., 2]], 2)
+    middle = slice(12, -12)  # silhouettes lie elsewhere
+    off = [float((shaded(m) - image)[middle, middle].abs().mean() / image.mean()) for m in (normal_map, mirrored, None)]
+    assert off[0] < 0.015 and min(off[1:]) > 0.027, off
+
+
 def test_visibility_beside_a_wall() -> None:
     """Of a floor beside an endless wall half of the sky is covered at its foot, and (1 + cos) / 2 away from it."""
     wall = torch.tensor([[0.0, -400, 0], [0, 400, 0], [0, 400, 0.5], [0, -400, 0.5]])
@@ -128,6 +152,19 @@ def test_wrong_arguments() -> None:
         (lambda: eg.bake(mesh, plain, by="luck"), ValueError, "by: expected"),
         (lambda: eg.bake(mesh, plain, 0), ValueError, "size: expected"),
         (lambda: eg.bake(mesh, lambda points: torch.ones(3)), ValueError, "source: expected shape"),
+        (lambda: eg.bake(mesh, plain, (4, 4, 3)), ValueError, "size: expected an int or"),
+        (lambda: eg.bake(mesh, plain, 4.0), TypeError, "size: expected an int"),
+        (lambda: eg.bake(mesh, lambda points: points.normal * torch.nan, 4), ValueError, "source: expected finite"),
+        (
+            lambda: eg.bake(mesh.replace(uvs=mesh.uvs + 0.5), plain, 4),
+            ValueError,
+            "unit square, got some from 0.5 to 1.5",
+        ),
+        (lambda: eg.bake(mesh.replace(uvs=mesh.uvs * 0.1), plain, 1), ValueError, "give a larger size"),
+        (lambda: eg.bake_pictures(mesh, camera, [image]), TypeError, "cameras: expected a list"),
+        (lambda: eg.bake_pictures(mesh, [camera], [image.byte()]), TypeError, r"images\[0\]: .* srgb_to_linear"),
+        (lambda: eg.bake_pictures(mesh, [camera], [image * torch.nan]), ValueError, r"images\[0\]: expected finite"),
+        (lambda: eg.bake_pictures(mesh, ["a"], ["a.png"]), TypeError, "use read_image"),
         (lambda: eg.bake_pictures(mesh, [camera], []), ValueError, "images: expected one for each"),
         (lambda: eg.bake_pictures(mesh, [camera], [image[1:]]), ValueError, r"images\[0\]: expected shape"),
         (lambda: eg.bake_pictures(mesh, [camera], [image], masks=[image]), ValueError, r"masks\[0\]: expected shape"),

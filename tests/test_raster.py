@@ -290,6 +290,14 @@ def test_same_bits_at_any_number_of_threads() -> None:
         ({"tri": torch.tensor([[0.0, 1, 2]])}, TypeError, "tri: expected an integer"),
         ({"resolution": (8,)}, ValueError, "resolution: expected \\(height, width\\)"),
         ({"resolution": (8, 0)}, ValueError, "resolution: expected a height"),
+        ({"resolution": 8}, ValueError, "resolution: expected \\(height, width\\), got 8"),
+        ({"pos": torch.ones(1, 3, 4, device="meta")}, ValueError, "pos: "),
+        (
+            {"pos": torch.full((1, 3, 4), 1e-120, dtype=torch.float64)},
+            ValueError,
+            "pos: expected numbers of which some",
+        ),
+        ({"pos": torch.zeros(3, 4), "ranges": torch.tensor([[2**32, 1]])}, ValueError, "ranges: .*4294967296"),
         ({"pos": torch.zeros(3, 4), "ranges": torch.tensor([[0, 2]])}, ValueError, "ranges: expected a first triangle"),
         ({"pos": torch.zeros(3, 4), "ranges": torch.tensor([0, 1])}, ValueError, "ranges: expected shape"),
     ],
@@ -305,6 +313,13 @@ def test_wrong_arguments(change: dict[str, object], error: type[Exception], word
         dr.rasterize(**(given | change))  # pyright: ignore[reportArgumentType]
 
 
+def test_levels_of_a_log_that_is_empty() -> None:
+    before = dr.get_log_level()
+    dr.set_log_level(2)
+    assert dr.get_log_level() == 2
+    dr.set_log_level(before)
+
+
 def test_wrong_attributes() -> None:
     pos, tri = random_triangles(13, 2)
     rast, rast_db = dr.rasterize(dr.RasterizeContext(), pos[None], tri, (4, 4))
@@ -314,10 +329,16 @@ def test_wrong_attributes() -> None:
         (torch.ones(6, 3), {"rast_db": rast_db, "diff_attrs": [3]}, "diff_attrs: expected numbers from 0 to 2"),
         (torch.ones(6, 3), {"rast_db": rast_db, "diff_attrs": "both"}, "diff_attrs: expected numbers .* or 'all'"),
         (torch.ones(6, 3), {"rast_db": rast_db[:, 1:]}, "rast_db: expected shape"),
+        (torch.ones(6, 3), {"rast_db": rast_db[..., :0], "diff_attrs": "all"}, "rast_db: .* output_db=True"),
     ):
         with pytest.raises(ValueError, match=words):
             dr.interpolate(attr, rast, tri, **more)
-    with pytest.raises(ValueError, match="rast: expected numbers of triangles"):
+    with pytest.raises(TypeError, match=r"diff_attrs: expected .* use \[1\]"):
+        dr.interpolate(torch.ones(6, 3), rast, tri, rast_db, 1)  # pyright: ignore[reportArgumentType]
+    assert dr.interpolate(torch.ones(6, 3), rast, tri, rast_db[..., :0])[1].shape == (1, 4, 4, 0)
+    with pytest.raises(
+        ValueError, match=r"rast: expected numbers of triangles from 1 to 2, or 0, .* at \[0, 0, 0, 3\]"
+    ):
         dr.interpolate(torch.ones(6, 3), rast + 7, tri)
     with pytest.raises(ValueError, match="mode: expected"):
         dr.RasterizeGLContext(mode="fast")

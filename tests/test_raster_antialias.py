@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import pickle
+
 import numpy as np
 import pytest
 import raster_twin as twin
@@ -100,6 +103,9 @@ def test_wrong_arguments() -> None:
     pos, tri = random_triangles(5, 3)
     rast, _ = dr.rasterize(dr.RasterizeContext(), pos[None], tri, (4, 4))
     color = torch.ones(1, 4, 4, 3)
+    topology = dr.antialias_construct_topology_hash(tri)
+    copied = pickle.loads(pickle.dumps(topology))
+    assert torch.equal(dr.antialias(color, rast, pos, tri, topology), dr.antialias(color, rast, pos, tri, copied))
     for given, error, words in (
         ((torch.ones(1, 4, 5, 3), rast, pos, tri), ValueError, "color: expected shape \\(1, 4, 4, C\\)"),
         ((color, rast[..., :3], pos, tri), ValueError, "rast: expected shape"),
@@ -109,8 +115,11 @@ def test_wrong_arguments() -> None:
         (
             (color, rast, pos, tri, dr.antialias_construct_topology_hash(tri[:1])),
             ValueError,
-            "topology_hash: expected that of 3",
+            "topology_hash: expected that of these 3",
         ),
+        ((color, rast, pos, tri, dr.antialias_construct_topology_hash(tri.flip(0))), ValueError, "make it of tri anew"),
+        ((color, rast, pos * torch.nan, tri), ValueError, "pos: expected finite"),
+        ((color, rast, pos, tri, None, math.nan), ValueError, "pos_gradient_boost: expected a finite"),
     ):
         with pytest.raises(error, match=words):
             dr.antialias(*given)  # pyright: ignore[reportArgumentType]

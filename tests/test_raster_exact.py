@@ -157,7 +157,8 @@ def test_batches_ranges_and_boost() -> None:
     wrong: list[tuple[dict[str, object], str]] = [
         ({}, "ranges: expected those"),
         ({"ranges": ranges[:1]}, "ranges: expected shape"),
-        ({"ranges": ranges + 1}, "ranges: expected triangles"),
+        ({"ranges": ranges + 1}, "ranges: expected a first triangle"),
+        ({"ranges": ranges.flip(0)}, "rast: expected numbers of triangles"),
         ({"ranges": ranges, "spp": 0}, "spp: expected"),
     ]
     for given, words in wrong:

@@ -171,6 +171,8 @@ def test_gradients_of_levels() -> None:
     for _ in range(2):  # no graph of its own that a first call would free
         (again,) = torch.autograd.grad((dr.texture(tex, uv, mip_level_bias=level, mip=mip) * weight).sum(), tex)
         assert torch.equal(whole, again)
+    no_levels = dr.texture(tex, uv, mip_level_bias=level, mip=[])
+    assert torch.equal(no_levels, dr.texture(tex, uv))
     own = [m.clone().requires_grad_() for m in mip.levels]
     grads = torch.autograd.grad((dr.texture(tex, uv, mip_level_bias=level, mip=own) * weight).sum(), [tex, *own])
     assert all(grad.any() for grad in grads)
@@ -202,6 +204,10 @@ def test_nearest_has_texels_gradients_alone() -> None:
         ),
         ({"mip_level_bias": torch.ones(2, 3, 3), "mip": [torch.ones(1, 2, 1, 1)]}, "mip\\[0\\]: expected shape"),
         ({"mip_level_bias": torch.ones(2, 3, 3), "max_mip_level": -1}, "max_mip_level: expected"),
+        (
+            {"mip_level_bias": torch.ones(2, 3, 3), "max_mip_level": -1, "mip": [torch.ones(1, 2, 2, 1)]},
+            "max_mip_level: expected",
+        ),
         (
             {"mip_level_bias": torch.ones(2, 3, 3), "mip": dr.texture_construct_mip(torch.ones(1, 8, 8, 1))},
             "mip: expected that of a texture",

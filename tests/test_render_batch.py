@@ -73,6 +73,18 @@ def test_lit_scenes_and_lenses_come_one_by_one() -> None:
         assert torch.equal(image, eg.render(*pair, spp=4))
 
 
+def test_errors_of_lit_scenes_name_the_pair() -> None:
+    mesh = icosphere(0)
+    lit = eg.Scene([mesh.replace(material=eg.Material())], lights=[eg.DirectionalLight(torch.tensor([0.0, 0, -1]))])
+    camera = eg.Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40.0, (4, 4))
+    with pytest.raises(ValueError, match=r"pairs\[0\]: light_samples: expected"):
+        eg.render_batch([(lit, camera)], light_samples=0)
+    with pytest.raises(TypeError, match=r"pairs\[1\]: camera: expected"):
+        eg.render_batch([(lit, camera), (lit, 3)])  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="pairs: expected at least one"):
+        eg.render_batch([])
+
+
 def test_second_derivatives_and_wrong_arguments() -> None:
     verts, shared = leaves()
     given = pairs(verts, shared)
@@ -83,7 +95,6 @@ def test_second_derivatives_and_wrong_arguments() -> None:
     batch = eg.Camera.stack([camera(0), camera(1)])
     for wrong, options, error, words in (
         (given[0][0], {}, TypeError, "pairs: expected a list"),
-        ([], {}, TypeError, "pairs: expected a list"),
         ([given[0][0]], {}, TypeError, r"pairs\[0\]: expected \(scene, camera\)"),
         ([given[0], (given[1][0], batch)], {}, ValueError, r"pairs\[1\]: camera: expected one camera"),
         ([given[0], (given[1][0], None)], {}, TypeError, r"pairs\[1\]: camera: expected a Camera"),

@@ -82,15 +82,23 @@ void check_triangles(const In<T, 4>& rast, Range range, int threads) {
     const Frames f = frames_of(rast);
     check_shape("rast", rast, f, 4);
     const int64_t pixels = f.height * f.width;
-    const bool fine = all_pass(f.pixels(), threads, [&](int64_t first, int64_t last) {
-        for (int64_t p = first; p < last; ++p) {
-            const T id = rast.data()[4 * p + 3];
-            const auto [low, high] = range(p / pixels);
-            if (!(id == 0 || (id >= T(low + 1) && id <= T(high)))) return false;
-        }
-        return true;
-    });
-    if (!fine) refuse("rast: expected numbers of triangles of its image in the last channel, from 1, or 0");
+    const auto is_wrong = [&](int64_t p) {
+        const T id = rast.data()[4 * p + 3];
+        const auto [low, high] = range(p / pixels);
+        return !(id == 0 || (id >= T(low + 1) && id <= T(high)));
+    };
+    const auto first_wrong = [&](int64_t first, int64_t last) {
+        while (first < last && !is_wrong(first)) ++first;
+        return first;
+    };
+    if (all_pass(f.pixels(), threads, [&](int64_t first, int64_t last) { return first_wrong(first, last) == last; }))
+        return;
+    const int64_t p = first_wrong(0, f.pixels());
+    const auto [low, high] = range(p / pixels);
+    refuse("rast: expected numbers of triangles from " + std::to_string(low + 1) + " to " + std::to_string(high) +
+           ", or 0, in the last channel, got " + std::to_string(rast.data()[4 * p + 3]) + " at [" +
+           std::to_string(p / pixels) + ", " + std::to_string(p % pixels / f.width) + ", " +
+           std::to_string(p % f.width) + ", 3]; give the tri that was rasterized");
 }
 
 template <class T>

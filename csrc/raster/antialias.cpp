@@ -36,12 +36,15 @@ bool is_silhouette(const Triangles<T>& mesh, const EdgeGroups& edges, int64_t it
     return true;
 }
 
-// Of one image, a bit for each side of each triangle.
+// Of images with vertices of their own, or of all of them, a bit for each side of each triangle: (images, triangles).
 template <class T>
-std::vector<uint8_t> silhouettes(const Triangles<T>& mesh, const EdgeGroups& edges, int64_t item) {
-    std::vector<uint8_t> out(mesh.triangles);
-    for (int64_t t = 0; t < mesh.triangles; ++t)
-        for (int i = 0; i < 3; ++i) out[t] |= uint8_t(is_silhouette(mesh, edges, item, 3 * t + i) << i);
+std::vector<uint8_t> silhouettes(const Triangles<T>& mesh, const EdgeGroups& edges, int64_t images, Team& team) {
+    std::vector<uint8_t> out(images * mesh.triangles);
+    team.each_block(int64_t(out.size()), [&](int64_t, int64_t first, int64_t last) {
+        for (int64_t k = first; k < last; ++k)
+            for (int i = 0; i < 3; ++i)
+                out[k] |= uint8_t(is_silhouette(mesh, edges, k / mesh.triangles, 3 * (k % mesh.triangles) + i) << i);
+    });
     return out;
 }
 
@@ -77,8 +80,7 @@ std::optional<double> share_at(const SideLine& side, const Neighbours& at, const
 template <class T>
 class PairFinder {
    public:
-    PairFinder(const Triangles<T>& mesh, const Frames& frames, const std::vector<uint8_t>& silhouette, int64_t item,
-               const T* rast)
+    PairFinder(const Triangles<T>& mesh, const Frames& frames, const uint8_t* silhouette, int64_t item, const T* rast)
         : mesh_(mesh), frames_(frames), silhouette_(silhouette), item_(item), rast_(rast) {}
 
     // Of the pixel and its neighbour to the right or above.
@@ -106,7 +108,7 @@ class PairFinder {
    private:
     const Triangles<T>& mesh_;
     const Frames& frames_;
-    const std::vector<uint8_t>& silhouette_;
+    const uint8_t* silhouette_;  // (triangles,)
     const int64_t item_;
     const T* rast_;
 };
@@ -149,17 +151,23 @@ Array<T> copy_of(const T* values, int64_t n, Team& team) {
 template <class T>
 std::vector<Crossing> find_crossings(const Triangles<T>& mesh, const Frames& frames, const EdgeGroups& edges,
                                      const T* rast, Team& team) {
-    std::vector<std::vector<Crossing>> found(frames.count);
-    std::vector<uint8_t> of_all;  // where all images have the same vertices
-    if (mesh.shared && frames.count > 0) of_all = silhouettes(mesh, edges, 0);
-    team.each(frames.count, [&](int64_t item) {
-        const std::vector<uint8_t> own = mesh.shared ? std::vector<uint8_t>() : silhouettes(mesh, edges, item);
-        const PairFinder<T> pairs(mesh, frames, mesh.shared ? of_all : own, item, rast);
-        for (int64_t y = 0; y < frames.height; ++y)
+    const std::vector<uint8_t> sides =
+        silhouettes(mesh, edges, mesh.shared ? std::min<int64_t>(1, frames.count) : frames.count, team);
+    // Of one image several bands of rows where there are fewer images than threads; crossings come in order all the
+    // same.
+    const int64_t H = frames.height;
+    const int64_t bands = std::clamp<int64_t>(2 * team.threads() / std::max<int64_t>(1, frames.count), 1, H);
+    std::vector<std::vector<Crossing>> found(frames.count * bands);
+    team.each(frames.count * bands, [&](int64_t k) {
+        const int64_t item = k / bands, band = k % bands;
+        const PairFinder<T> pairs(mesh, frames, sides.data() + (mesh.shared ? 0 : item * mesh.triangles), item, rast);
+        std::vector<Crossing> own;  // threads that write beside one another wait for each other's caches
+        for (int64_t y = band * H / bands; y < (band + 1) * H / bands; ++y)
             for (int64_t x = 0; x < frames.width; ++x) {
-                if (x + 1 < frames.width) pairs.visit(x, y, 0, found[item]);
-                if (y + 1 < frames.height) pairs.visit(x, y, 1, found[item]);
+                if (x + 1 < frames.width) pairs.visit(x, y, 0, own);
+                if (y + 1 < H) pairs.visit(x, y, 1, own);
             }
+        found[k] = std::move(own);
     });
     std::vector<Crossing> out;
     for (const auto& own : found) out.insert(out.end(), own.begin(), own.end());

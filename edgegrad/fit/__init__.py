@@ -18,10 +18,9 @@ from .pose.fit_poses import fit_poses
 from .pose.result import PoseFit, Step
 from .pose.track import TrackedPose, track
 from .pose.uncertainty import Uncertainty
-from .unwrapping import unwrapped
 
 __all__ = [
     "CameraFit", "Ending", "Fit", "Measured", "Options", "Parameter", "Pose", "PoseFit", "PoseParameter", "Progress",
     "Record", "RigFit", "Step", "TrackedPose", "Uncertainty", "fit_camera", "fit_pose", "fit_poses", "fit_rig", "fit_scene",
-    "fit_shape", "fit_texture", "losses", "priors", "regularizers", "track", "track_rig", "unwrapped", "visual_hull",
+    "fit_shape", "fit_texture", "losses", "priors", "regularizers", "track", "track_rig", "visual_hull",
 ]  # fmt: skip

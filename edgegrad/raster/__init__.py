@@ -8,10 +8,19 @@ on any device; the work is done on the CPU, with the same bits at any number of 
 
 from .antialias import TopologyHash, antialias, antialias_construct_topology_hash
 from .interpolate import interpolate
-from .rasterize import DepthPeeler, RasterizeContext, RasterizeCudaContext, RasterizeGLContext, rasterize
+from .rasterize import (
+    DepthPeeler,
+    RasterizeContext,
+    RasterizeCudaContext,
+    RasterizeGLContext,
+    get_log_level,
+    rasterize,
+    set_log_level,
+)
 from .texture import Mipmaps, texture, texture_construct_mip
 
 __all__ = [
     "DepthPeeler", "Mipmaps", "RasterizeContext", "RasterizeCudaContext", "RasterizeGLContext", "TopologyHash", "antialias",
-    "antialias_construct_topology_hash", "interpolate", "rasterize", "texture", "texture_construct_mip",
+    "antialias_construct_topology_hash", "get_log_level", "interpolate", "rasterize", "set_log_level", "texture",
+    "texture_construct_mip",
 ]  # fmt: skip

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..check import as_int, as_tensor, check_integer, check_positive_int
+from ..check import as_int, as_scalar, check_positive_int
 from ..library import core
 from .exact import Sampling, exact_means
-from .tensors import check_image, contiguous, to_kernel, triangles
+from .tensors import check_image, check_positions, contiguous, ranges_of, to_kernel, triangles
 
 
 class TopologyHash:
     """Which triangles share edges, from `antialias_construct_topology_hash`."""
 
     def __init__(self, tri: Tensor) -> None:
+        self.tri = tri
         count = 3 * len(tri)
         # Half-edge 3 t + i lies opposite to corner i of triangle t.
         ends = torch.stack([tri.roll(-1, 1), tri.roll(-2, 1)], 2).reshape(-1, 2).long()
@@ -28,8 +30,10 @@ class TopologyHash:
         group[order] = of_sorted.int()
         start = torch.zeros(len(sizes) + 1, dtype=torch.int32)
         start[1:] = sizes.cumsum(0)
-        self.triangles = len(tri)
         self.groups = core.EdgeGroups(group.numpy(), start.numpy(), order.int().numpy())
+
+    def __reduce__(self) -> tuple[type[TopologyHash], tuple[Tensor]]:
+        return TopologyHash, (self.tri,)
 
 
 def antialias_construct_topology_hash(tri: Tensor) -> TopologyHash:
@@ -39,8 +43,7 @@ def antialias_construct_topology_hash(tri: Tensor) -> TopologyHash:
 
     Raises TypeError or ValueError that names the argument.
     """
-    known = triangles(tri, 2**31 - 1, "pos")
-    return TopologyHash(known)
+    return TopologyHash(triangles(tri, 2**31 - 1, "pos").clone())
 
 
 def antialias(
@@ -92,7 +95,10 @@ def antialias(
     if pos.dim() != 3 or pos.shape[2] != 4 or pos.shape[0] not in (1, len(rast)):
         raise ValueError(f"pos: expected shape ({len(rast)}, V, 4) or (V, 4), got {tuple(pos.shape)}")
     faces = triangles(tri, pos.shape[1], "pos")
-    boost = float(pos_gradient_boost)
+    check_positions(pos)
+    boost = float(as_scalar("pos_gradient_boost", pos_gradient_boost, like=pos))
+    if not math.isfinite(boost):
+        raise ValueError(f"pos_gradient_boost: expected a finite number, got {boost}")
     if exact:
         spans = _spans(ranges, pos, faces, len(rast))
         known = pos if boost == 1 else pos.detach() + boost * (pos - pos.detach())
@@ -101,6 +107,7 @@ def antialias(
         for b, (first, count) in enumerate(spans):
             own = faces[first : first + count]
             counted = rast[b].clone()
+            _check_shown(b, rast[b, ..., 3], first, count)
             counted[..., 3] = torch.where(counted[..., 3] > 0, counted[..., 3] - first, 0)
             images.append(exact_means(color[b], counted, known[b if len(known) > 1 else 0], own, sampling))
         return torch.stack(images).to(device)
@@ -111,9 +118,10 @@ def antialias(
             "topology_hash: expected what antialias_construct_topology_hash returns, got "
             + type(topology_hash).__name__
         )
-    elif topology_hash.triangles != len(faces):
+    elif not torch.equal(topology_hash.tri, faces):
         raise ValueError(
-            f"topology_hash: expected that of {len(faces)} triangles, got one of {topology_hash.triangles}; make it of tri anew"
+            f"topology_hash: expected that of these {len(faces)} triangles, got one of {len(topology_hash.tri)} others; "
+            "make it of tri anew"
         )
     return _Antialias.apply(color, pos, rast.detach(), faces, topology_hash.groups, boost).to(device)
 
@@ -126,14 +134,21 @@ def _spans(ranges: Tensor | None, pos: Tensor, tri: Tensor, images: int) -> list
                 "ranges: expected those that were rasterized, for positions of all images and exact=True, got None"
             )
         return [[0, len(tri)]] * images
-    ranges = as_tensor("ranges", ranges)
-    check_integer("ranges", ranges)
-    if len(pos) != 1 or ranges.shape != (images, 2):
-        raise ValueError(f"ranges: expected shape ({images}, 2) with positions (V, 4), got {tuple(ranges.shape)}")
-    spans = ranges.tolist()
-    if any(first < 0 or count < 0 or first + count > len(tri) for first, count in spans):
-        raise ValueError(f"ranges: expected triangles from 0 to {len(tri) - 1}, got {spans}")
-    return spans
+    known = ranges_of(ranges, len(tri))
+    if len(pos) != 1 or len(known) != images:
+        raise ValueError(f"ranges: expected shape ({images}, 2) with positions (V, 4), got {tuple(known.shape)}")
+    return known.tolist()
+
+
+def _check_shown(image: int, number: Tensor, first: int, count: int) -> None:
+    """Of each pixel (H, W) 0, or a triangle of the image + 1. Raises ValueError."""
+    fine = (number == 0) | ((number >= first + 1) & (number <= first + count) & (number == number.round()))
+    if not bool(fine.all()):
+        y, x = (~fine).nonzero()[0].tolist()
+        raise ValueError(
+            f"rast: expected numbers of triangles from {first + 1} to {first + count}, or 0, in the last channel, "
+            f"got {number[y, x].item()} at [{image}, {y}, {x}, 3]; give the tri that was rasterized"
+        )
 
 
 class _Antialias(torch.autograd.Function):

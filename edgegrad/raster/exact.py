@@ -56,9 +56,18 @@ class Shown(NamedTuple):
         height, width = self.size
         column, row = hits.pixel.detach().floor().long().unbind(1)
         row, column = row.clamp(0, height - 1), column.clamp(0, width - 1)  # of a sample on the image's border
+        own, face = row * width + column, owner[hits.face]
+        lost = (self.rast[:, 3].long()[own] != face + 1).nonzero()[:, 0]
+        if len(lost):
+            number = 1 + int(owner.max())
+            own[lost] = self._around(row[lost], column[lost], face[lost], hits.depth.detach()[lost], number)
+        return self.color[own]
+
+    def _around(self, row: Tensor, column: Tensor, face: Tensor, depth: Tensor, triangles: int) -> Tensor:
+        """(N,) the pixels that samples take their colours of, if it need not be their own."""
+        height, width = self.size
         own = row * width + column
-        face, depth = owner[hits.face], hits.depth.detach()
-        anywhere = self._pixel_of(1 + int(owner.max()))[face]
+        anywhere = self._pixel_of(triangles)[face]
         best = torch.where(anywhere >= 0, -1.0, torch.inf)
         source = torch.where(anywhere >= 0, anywhere, own)
         for dy, dx in sorted(
@@ -71,7 +80,7 @@ class Shown(NamedTuple):
             cost = torch.where(triangle == face, -2.0, (z - depth).abs())
             better = inside & (triangle >= 0) & (cost < best)
             best, source = torch.where(better, cost, best), torch.where(better, at, source)
-        return self.color[source]
+        return source
 
     def _pixel_of(self, triangles: int) -> Tensor:
         """(F,) a pixel that shows a triangle, or −1."""

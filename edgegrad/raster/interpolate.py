@@ -34,11 +34,17 @@ def interpolate(
 
     Raises TypeError or ValueError that names the argument.
     """
+    if rast_db is not None and diff_attrs is None and tuple(rast_db.shape[3:]) == (0,):
+        rast_db = None  # of a context without derivatives
     given = {"attr": attr, "rast": rast} | ({} if rast_db is None else {"rast_db": rast_db})
     (attr, rast, *more), device = to_kernel(**given)
     rast_db = more[0] if more else None
     check_image("rast", rast, 4)
     if rast_db is not None:
+        if rast_db.dim() == 4 and rast_db.shape[3] == 0:
+            raise ValueError(
+                "rast_db: expected derivatives for diff_attrs, got none; use a context with output_db=True"
+            )
         check_image("rast_db", rast_db, 4, like=rast)
     if attr.dim() == 2:
         attr = attr[None]
@@ -60,6 +66,10 @@ def _chosen(diff_attrs: Sequence[int] | str | None, width: int) -> list[int]:
         if diff_attrs != "all":
             raise ValueError(f"diff_attrs: expected numbers of attributes or 'all', got {diff_attrs!r}")
         return list(range(width))
+    if not hasattr(diff_attrs, "__len__"):
+        raise TypeError(
+            f"diff_attrs: expected numbers of attributes or 'all', got {diff_attrs!r}; use [{diff_attrs!r}]"
+        )
     chosen = [as_int("diff_attrs", k) for k in diff_attrs]
     for k in chosen:
         if not 0 <= k < width:

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..check import as_int, as_tensor, check_integer
+from ..check import as_int, check_int
 from ..library import core
-from .tensors import contiguous, to_kernel, triangles
+from .tensors import check_positions, contiguous, ranges_of, to_kernel, triangles
 
 
 class RasterizeContext:
@@ -48,6 +48,20 @@ class RasterizeCudaContext(RasterizeContext):
         super().__init__(device=device)
 
 
+_log_level = 1
+
+
+def set_log_level(level: int) -> None:
+    """Remembers a level, 0 to 3, for scripts that set one: nothing is logged here, what is wrong raises an error."""
+    global _log_level
+    _log_level = check_int("level", level, 0, 3)
+
+
+def get_log_level() -> int:
+    """That of `set_log_level`, 1 at first."""
+    return _log_level
+
+
 def rasterize(
     ctx: RasterizeContext,
     pos: Tensor,
@@ -63,7 +77,7 @@ def rasterize(
                 the nearer. Or (V, 4) of all images, with `ranges`
     tri         (F, 3) int, vertices of the triangles
     resolution  (height, width) in pixels; row 0 is at the bottom, y = −w
-    ranges      (B, 2) int, for each image the first of its triangles and how many; with pos (V, 4)
+    ranges      (B, 2) int, for each image the first of its triangles and how many; with pos (V, 4), else ignored
     grad_db     whether gradients of the second result go to `pos`
 
     Returns two tensors of the dtype and on the device of `pos`. (B, H, W, 4): u, v, z/w and the triangle + 1; all 0 where there
@@ -134,6 +148,13 @@ class _Arguments(NamedTuple):
         (pos,), device = to_kernel(pos=pos)
         if pos.dim() not in (2, 3) or pos.shape[-1] != 4:
             raise ValueError(f"pos: expected shape (B, V, 4), or (V, 4) with ranges, got {tuple(pos.shape)}")
+        check_positions(pos)
+        if not hasattr(resolution, "__len__") or len(resolution) != 2:
+            raise ValueError(f"resolution: expected (height, width), got {resolution!r}")
+        height, width = (as_int("resolution", n) for n in resolution)
+        if not (0 < height <= 32768 and 0 < width <= 32768):
+            raise ValueError(f"resolution: expected a height and a width from 1 to 32768, got {(height, width)}")
+        faces = triangles(tri, pos.shape[-2], "pos")
         if pos.dim() == 3:
             ranges = None
         elif ranges is None:
@@ -141,17 +162,7 @@ class _Arguments(NamedTuple):
                 "ranges: expected (B, 2) with positions of shape (V, 4), got None; for one image use pos[None]"
             )
         else:
-            ranges = as_tensor("ranges", ranges)
-            check_integer("ranges", ranges)
-            if ranges.dim() != 2 or ranges.shape[1] != 2:
-                raise ValueError(f"ranges: expected shape (B, 2), got {tuple(ranges.shape)}")
-            ranges = ranges.to(device="cpu", dtype=torch.int32).contiguous()
-        if len(resolution) != 2:
-            raise ValueError(f"resolution: expected (height, width), got {tuple(resolution)}")
-        height, width = (as_int("resolution", n) for n in resolution)
-        if not (0 < height <= 32768 and 0 < width <= 32768):
-            raise ValueError(f"resolution: expected a height and a width from 1 to 32768, got {(height, width)}")
-        faces = triangles(tri, pos.shape[-2], "pos")
+            ranges = ranges_of(ranges, len(faces))
         if pos.dtype == torch.float32 and len(faces) >= 2**24:
             raise ValueError(
                 f"tri: expected fewer than 2²⁴ triangles, which a float32 can name, got {len(faces)}; use pos.double()"

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..check import as_tensor, check_countable, check_indices, check_integer
+from ..check import as_tensor, check_countable, check_finite, check_indices, check_integer, check_not_meta
 
 
 def to_kernel(**given: Any) -> tuple[list[Tensor], torch.device]:
@@ -17,6 +17,7 @@ def to_kernel(**given: Any) -> tuple[list[Tensor], torch.device]:
     """
     tensors = {name: as_tensor(name, value, floating=True) for name, value in given.items()}
     for name, tensor in tensors.items():
+        check_not_meta(name, tensor)
         if not tensor.is_floating_point():
             raise TypeError(f"{name}: expected a floating-point tensor, got {tensor.dtype}; use .float()")
     double = any(tensor.dtype == torch.float64 for tensor in tensors.values())
@@ -34,6 +35,28 @@ def triangles(tri: Any, vertices: int, of: str) -> Tensor:
     check_countable("tri", tri, vertices, of)
     check_indices("tri", tri, vertices, of)
     return tri.to(device="cpu", dtype=torch.int32).contiguous()
+
+
+def check_positions(pos: Tensor) -> None:
+    """Of clip space, finite and not so small that areas of triangles vanish. Raises ValueError."""
+    check_finite("pos", pos, smallest=1e-90)  # areas are products of three
+
+
+def ranges_of(ranges: Any, triangles: int) -> Tensor:
+    """(B, 2) int32 on the CPU: the first triangle and how many, of `triangles`. Raises TypeError or ValueError."""
+    ranges = as_tensor("ranges", ranges)
+    check_integer("ranges", ranges)
+    if ranges.dim() != 2 or ranges.shape[1] != 2:
+        raise ValueError(f"ranges: expected shape (B, 2), got {tuple(ranges.shape)}")
+    ranges = ranges.to(device="cpu", dtype=torch.int64)
+    first, count = ranges.unbind(1)
+    if bool((bad := (first < 0) | (count < 0) | (first > triangles) | (count > triangles - first)).any()):
+        k = int(bad.nonzero()[0])
+        raise ValueError(
+            f"ranges: expected a first triangle and a number of triangles among the {triangles} of tri, "
+            f"got {ranges[k].tolist()} at [{k}]"
+        )
+    return ranges.to(torch.int32).contiguous()
 
 
 def check_image(name: str, tensor: Tensor, channels: int | str, like: Tensor | None = None) -> None:

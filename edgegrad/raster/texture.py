@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ..check import as_int, as_tensor, check_finite
+from ..check import as_tensor, check_finite, check_int
 from ..library import core
 from .tensors import check_image, contiguous, to_kernel
 
@@ -37,7 +37,8 @@ def texture_construct_mip(tex: Tensor, max_mip_level: int | None = None, cube_mo
     """
     (tex,), _ = to_kernel(tex=tex)
     _check_texture(tex, cube_mode)
-    return Mipmaps(tuple(_levels_of(tex.detach(), max_mip_level)), tuple(tex.shape))
+    most = None if max_mip_level is None else check_int("max_mip_level", max_mip_level, 0, 2**31 - 1)
+    return Mipmaps(tuple(_levels_of(tex.detach(), most)), tuple(tex.shape))
 
 
 def texture(
@@ -81,7 +82,11 @@ def texture(
     by_level = "mipmap" in filter_mode
     if by_level and uv_da is None and mip_level_bias is None:
         raise ValueError(f"uv_da: expected it, or mip_level_bias, for filter_mode {filter_mode!r}, got None")
-    levels = [] if mip is None or isinstance(mip, Mipmaps) or not by_level else list(mip)
+    most = None if max_mip_level is None else check_int("max_mip_level", max_mip_level, 0, 2**31 - 1)
+    own = mip is not None and not isinstance(mip, Mipmaps)
+    if own and not isinstance(mip, Sequence):
+        raise TypeError(f"mip: expected that of texture_construct_mip, or a list of levels, got {type(mip).__name__}")
+    levels = list(mip) if mip is not None and own and by_level else []
     given = {
         "uv": uv,
         "tex": tex,
@@ -98,14 +103,12 @@ def texture(
 
     if not by_level:
         texels, count = tex.reshape(-1), 1
-    elif levels:
+    elif own:
         _check_levels(tex, levels)
-        last = len(levels) if max_mip_level is None else min(len(levels), as_int("max_mip_level", max_mip_level))
-        texels, count = torch.cat([level.reshape(-1) for level in (tex, *levels[:last])]), 1 + last
+        used = levels[:most]
+        texels, count = torch.cat([level.reshape(-1) for level in (tex, *used)]), 1 + len(used)
     else:
-        made = _made(mip, tex) if isinstance(mip, Mipmaps) else _levels_of(tex.detach(), max_mip_level)
-        if max_mip_level is not None:
-            made = made[: as_int("max_mip_level", max_mip_level)]
+        made = (_made(mip, tex) if isinstance(mip, Mipmaps) else _levels_of(tex.detach(), most))[:most]
         texels, count = _Pyramid.apply(tex, *made), 1 + len(made)
     shape = [len(tex), *tex.shape[-3:], count]
     options = core.TextureOptions(shape, boundary_mode, filter_mode)
@@ -152,8 +155,6 @@ def _check_levels(tex: Tensor, levels: list[Tensor]) -> None:
 
 def _levels_of(tex: Tensor, most: int | None) -> list[Tensor]:
     """The means over two by two texels, of these again, and so on."""
-    if most is not None and as_int("max_mip_level", most) < 0:
-        raise ValueError(f"max_mip_level: expected an int of 0 and more, got {most}")
     levels: list[Tensor] = []
     last = tex
     while max(last.shape[-3:-1]) > 1 and (most is None or len(levels) < most):

@@ -19,6 +19,14 @@ from .textures import look_up
 LookUp = Callable[[Tensor, Tensor, tuple[str, str], str, Tensor], Tensor]
 
 
+class TangentFrame(NamedTuple):
+    """Unit vectors in which normal maps are written, with the normal as the third."""
+
+    tangent: Tensor  # (N, 3), along which u grows
+    bitangent: Tensor  # (N, 3), along which v grows
+    there: Tensor  # (N, 1) bool: false where texture coordinates give no direction
+
+
 class OnMesh(NamedTuple):
     """Points of one mesh."""
 
@@ -95,28 +103,37 @@ class OnMesh(NamedTuple):
     def shading_normal(self, g: Tensor) -> Tensor:
         """(N, 3) unit normals on the side of the faces' own normals g (N, 3): interpolated if there are any, and bent by the
         material's normal map."""
-        n, mesh = g, self.mesh
-        if mesh.normals is not None:
-            index = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
-            n = self.interpolated(mesh.normals, index)
-            n = torch.where((n.detach() * n.detach()).sum(1, keepdim=True) > 0, n, g)
-            n = normalize(n, dim=-1)
-            n = torch.where((n.detach() * g.detach()).sum(1, keepdim=True) < 0, -n, n)
-        material = mesh.material
+        n = self.smooth_normal(g)
+        material = self.mesh.material
         if material is None or material.normal_map is None:
             return n
         bent = 2 * self.value(material.normal_map) - 1
         scale = torch.as_tensor(material.normal_scale).to(bent)
-        tangent, hand = self._tangent(material.normal_map)
-        t = tangent - n * (n * tangent).sum(1, keepdim=True)
-        there = (t.detach() * t.detach()).sum(1, keepdim=True) > 0  # else there is no frame
-        t = unit(torch.where(there, t, 1.0))
-        bitangent = hand * torch.linalg.cross(n, t)
-        m = scale * (bent[:, 0:1] * t + bent[:, 1:2] * bitangent) + bent[:, 2:3] * n
-        m = torch.where(there & ((m.detach() * m.detach()).sum(1, keepdim=True) > 0), m, n)
+        frame = self.tangent_frame(n, material.normal_map)
+        m = scale * (bent[:, 0:1] * frame.tangent + bent[:, 1:2] * frame.bitangent) + bent[:, 2:3] * n
+        m = torch.where(frame.there & ((m.detach() * m.detach()).sum(1, keepdim=True) > 0), m, n)
         return normalize(m, dim=-1)
 
-    def _tangent(self, texture: Texture) -> tuple[Tensor, Tensor]:
+    def smooth_normal(self, g: Tensor) -> Tensor:
+        """(N, 3) unit normals on the side of the faces' own normals g (N, 3): interpolated if there are any."""
+        mesh = self.mesh
+        if mesh.normals is None:
+            return g
+        index = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
+        n = self.interpolated(mesh.normals, index)
+        n = torch.where((n.detach() * n.detach()).sum(1, keepdim=True) > 0, n, g)
+        n = normalize(n, dim=-1)
+        return torch.where((n.detach() * g.detach()).sum(1, keepdim=True) < 0, -n, n)
+
+    def tangent_frame(self, n: Tensor, texture: Texture | None) -> TangentFrame:
+        """Of the texture's coordinates, or the mesh's, at right angles to unit normals n (N, 3)."""
+        tangent, hand = self._tangent(texture)
+        t = tangent - n * (n * tangent).sum(1, keepdim=True)
+        there = (t.detach() * t.detach()).sum(1, keepdim=True) > 0
+        t = unit(torch.where(there, t, 1.0))
+        return TangentFrame(t, hand * torch.linalg.cross(n, t), there)
+
+    def _tangent(self, texture: Texture | None) -> tuple[Tensor, Tensor]:
         """(N, 3) along which u grows, of any length, and (N, 1) 1, or −1 where the image is mirrored: of the face, or
         interpolated as normals are."""
         if self.mesh.normals is not None:

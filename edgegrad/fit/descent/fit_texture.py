@@ -37,7 +37,7 @@ def fit_texture(
 ) -> Fit:
     """Finds the texture of a mesh from pictures of it.
 
-    mesh        with texture coordinates, as unwrapped() makes them; a texture that it has is where the fit starts
+    mesh        with texture coordinates, as unwrap() makes them; a texture that it has is where the fit starts
     size        texels: one number, or (h, w)
     lr          the learning rate, radiance a step
     background  behind the mesh, (C,) or (H, W, C)
@@ -54,9 +54,7 @@ def fit_texture(
     if not isinstance(mesh, Mesh):
         raise TypeError(f"mesh: expected a Mesh, got {type(mesh).__name__}; load one with load_mesh(path)")
     if mesh.uvs is None:
-        raise ValueError(
-            "mesh: expected texture coordinates, got a mesh without; unwrap it first: edgegrad.fit.unwrapped(mesh)"
-        )
+        raise ValueError("mesh: expected texture coordinates, got a mesh without; use unwrap(mesh)")
     if not isinstance(size, int) and (not isinstance(size, (tuple, list)) or len(size) != 2):
         raise TypeError(f"size: expected an int or (h, w), got {size!r}")
     h, w = (size, size) if isinstance(size, int) else size
