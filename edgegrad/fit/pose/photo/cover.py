@@ -1,10 +1,11 @@
 """What covers a part of the object: pixels that show neither the object nor what lies behind it.
 
 Where the object lies about right, these are the pixels inside where the picture is not what the mesh is in the light of all
-others, over more than a pixel or two: edges that are a little off are thin. Where it lies wrong they cannot be told from
-differences of the pose. A cover then counts as something at one side of the object, and parts of the picture are left out on one
-side after the other: if what is left is of the object alone, the way down leads to it (Fischler and Bolles, Random Sample
-Consensus, 1981, with sets that are chosen for covers instead of drawn).
+others, as the log likelihood ratio of all pixels around has it: colours that are nearly the object's tell little one by one, and
+edges that are a little off are thin. Shadows that are cast on the object are left out with them. Where it lies wrong they cannot
+be told from differences of the pose. A cover then counts as something at one side of the object, and parts of the picture are
+left out on one side after the other: if what is left is of the object alone, the way down leads to it (Fischler and Bolles,
+Random Sample Consensus, 1981, with sets that are chosen for covers instead of drawn).
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def covered(lit: Lit, light: Tensor, most: float) -> Tensor:
 
 def uncovered(lit: Lit) -> Tensor:
     """(h, w), LEAST where something covers the surface, and 1 elsewhere, by the light that was found."""
-    inside, own = lit.surface.inside, TAILS * lit.deviation
+    inside, own = lit.surface.inside, min(TAILS * lit.deviation, FOREIGN)
     # log N(e; FOREIGN) − log N(e; own), each with the deviations of a channel; no pixel tells for all around it.
     squares = 0.5 * lit.difference(lit.coefficients).square()
     told = squares * (own**-2 - FOREIGN**-2) - len(lit.coefficients) * math.log(FOREIGN / own)
