@@ -241,15 +241,21 @@ class PhotoSearch:
         """Ways from poses around the start that the picture shows, as a whole or at all sides but one."""
         answered = self._answered
         self._answered = True
-        first, size = self.levels[1], len(self.start.numbers)
+        coarse, first, *_ = self.levels
+        size = len(self.start.numbers)
+
+        def hopeful(pose: Pose) -> bool:
+            return coarse.explained(pose, self.seed) >= HOPELESS
 
         def compared() -> list[float]:
-            found = nearby(self.task, self.start, self.seed)
-            return [number for pose, side in found for number in (*pose.numbers, float(side))]
+            if not (hopeful(self.start) or hopeful(best.pose)):
+                return []
+            found = nearby(self.task, self.start, self.seed)[:NEARBY_FOLLOWED]
+            return [number for pose, side in found if hopeful(pose) for number in (*pose.numbers, float(side))]
 
         def starts() -> Iterator[tuple[Pose, list[Tensor]]]:
             flat = self.journal.numbers(compared)
-            for at in range(0, min(len(flat), NEARBY_FOLLOWED * (size + 1)), size + 1):
+            for at in range(0, len(flat), size + 1):
                 pose, side = Pose.of(flat[at : at + size]), int(flat[at + size])
                 yield pose, [at_one_side(seen.alpha, side) for seen in first.see(pose, self.seed)]
 
