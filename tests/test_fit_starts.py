@@ -6,6 +6,7 @@ import math
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from test_fit import bracket
@@ -15,9 +16,10 @@ import edgegrad as eg
 from edgegrad.camera.poses import rotation
 from edgegrad.fit import fit_pose
 from edgegrad.fit.pose.given import Names
-from edgegrad.fit.pose.photo.match import ACROSS, ROUNDS, SIZED, Matches, Mips, _closer, _in_mask
-from edgegrad.fit.pose.photo.views import Views, all_sides, ball, pose_at, spread
-from edgegrad.fit.pose.pose import Pose, angle
+from edgegrad.fit.pose.photo.match import ACROSS, ROUNDS, SIZED, Matches, Mips, _in_mask, closer
+from edgegrad.fit.pose.photo.nearby import EVERYWHERE, comparable, nearby
+from edgegrad.fit.pose.photo.views import Views, all_sides, ball, pose_at, seen_at, spread
+from edgegrad.fit.pose.pose import Pose, angle, pose_from_matrix
 from edgegrad.fit.pose.task import Lens, PoseTask
 
 sys.path += [str(Path(__file__).parents[1] / folder) for folder in ("benchmarks", "examples")]
@@ -101,6 +103,9 @@ def test_a_pose_off_the_axis_shows_the_object_where_it_should_and_turned_alike()
     assert float(seen[2]) == pytest.approx(5.0, abs=1e-6)
     ray = (view[:3, :3] @ pose.R).T @ (seen / seen.norm())
     assert torch.allclose(ray, R.T @ torch.tensor([0.0, 0.0, 1.0]).double(), atol=1e-6)
+    again = seen_at(task, pose)
+    assert torch.allclose(again[0], R, atol=1e-6) and again[2] == pytest.approx(5.0, abs=1e-6)
+    assert torch.allclose(again[1], torch.tensor([80.0, 20.0]).double(), atol=1e-4)
 
 
 def near(pose: Pose, R: Tensor, t: Tensor, task: PoseTask, turn: float, share: float) -> bool:
@@ -119,13 +124,26 @@ def test_matches_come_closer_than_views_are_apart() -> None:
     coarse = found
     for one in ROUNDS:
         before = found
-        found = _closer(task, before, mips, one, 0.0, 0)
+        found = closer(task, before, mips, one, 0.0, 0)
         if one.across == ACROSS:  # the match itself is among those compared
             assert bool((found.scores >= before.scores - 1e-4).all())
             assert float((found.scores - before.scores).mean()) > 0.1
         found = found.distinct(12, one.turned, one.placed, SIZED)
     assert any(near(pose, R, t, task, 0.2, 0.1) for pose in found.poses(task)[:4])
     assert not any(near(pose, R, t, task, 0.2, 0.1) for pose in coarse.poses(task)[:4])
+
+
+def test_a_covered_object_is_found_near_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a quarter nothing is seen: one side has to be left out, and the right one."""
+    monkeypatch.setattr("edgegrad.fit.pose.photo.nearby.STARTS", 24)
+    case = photo_cases.rendered("pebble", pebble(), [photo_cases.clutter(k) for k in range(2)], "covered", 4)
+    task = PoseTask.of(case.mesh, case.picture, case.camera, None, None, None, Lens(), 1.0, Names())
+    start = pose_from_matrix("init", case.beside(case.truth, 15.0, 0.05 * case.size, np.random.default_rng(4)).matrix)
+    assert comparable(task, start) and not comparable(task, start._replace(scale=2.0 * start.scale))
+    R, t = case.truth.R, case.truth.t
+    pose, side = nearby(task, start, 0)[0]
+    assert near(pose, R, t, task, 0.1, 0.03) and side != EVERYWHERE
+    assert not near(start, R, t, task, 0.2, 0.03)
 
 
 def test_matches_that_are_kept_are_distinct() -> None:

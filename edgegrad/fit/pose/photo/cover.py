@@ -1,10 +1,11 @@
 """What covers a part of the object: pixels that show neither the object nor what lies behind it.
 
 Where the object lies about right, these are the pixels inside where the picture is not what the mesh is in the light of all
-others, over more than a pixel or two: edges that are a little off are thin. Where it lies wrong they cannot be told from
-differences of the pose. A cover then counts as something at one side of the object, and parts of the picture are left out on one
-side after the other: if what is left is of the object alone, the way down leads to it (Fischler and Bolles, Random Sample
-Consensus, 1981, with sets that are chosen for covers instead of drawn).
+others, as the log likelihood ratio of all pixels around has it: colours that are nearly the object's tell little one by one, and
+edges that are a little off are thin. Shadows that are cast on the object are left out with them. Where it lies wrong they cannot
+be told from differences of the pose. A cover then counts as something at one side of the object, and parts of the picture are
+left out on one side after the other: if what is left is of the object alone, the way down leads to it (Fischler and Bolles,
+Random Sample Consensus, 1981, with sets that are chosen for covers instead of drawn).
 """
 
 from __future__ import annotations
@@ -21,10 +22,13 @@ from .level import PhotoLevel, Seen
 from .light import Lit
 
 SIDES = 8  # from which something may cover the object
+EVERYWHERE = -1  # of no side is anything left out
 LEFT_OUT = 0.4  # of the object's pixels, at one side
 # A pixel that is so many deviations off is not of the object, if it is one of many in a window of so many pixels.
 OFF, ACROSS, MANY = 4.0, 1.5, 0.5
-CLEAR = 0.45  # of Lit.difference(): what shadows and highlights may make
+# In the light of one picture alone: the standard deviation of a cover's Lit.difference() and, in its deviations, of the object's,
+# with heavy tails; how much a pixel tells at most, in nats; and the pixels around it that are asked with it.
+FOREIGN, TAILS, MOST_TOLD, AROUND = 0.5, 1.5, 3.0, 4.0
 BESIDE = 2  # pixels
 SEEN_FROM = 0.05  # of a window inside the object, for which the same holds
 TURNS = 3
@@ -32,15 +36,15 @@ LEAST = 0.02  # what covered pixels count
 WHOLE = 0.65  # of the object's pixels: where fewer are left, less is explained
 
 
-def at_one_side(alpha: Tensor, side: int) -> Tensor:
-    """(h, w), 0 on one of SIDES sides of a silhouette (h, w), 1 elsewhere."""
+def at_one_side(alpha: Tensor, side: int, share: float = LEFT_OUT) -> Tensor:
+    """(h, w), 0 on one of SIDES sides of a silhouette (h, w), for such a share of it, 1 elsewhere; all 1 for EVERYWHERE."""
     h, w = alpha.shape
     angle = 2.0 * math.pi * side / SIDES
     along = torch.arange(w) * math.cos(angle) + torch.arange(h)[:, None] * math.sin(angle)
     inside = along[alpha > 0.5]
-    if not len(inside):
+    if side == EVERYWHERE or not len(inside):
         return torch.ones(h, w)
-    return (along > inside.quantile(LEFT_OUT)).float()
+    return (along > inside.quantile(share)).float()
 
 
 def covered(lit: Lit, light: Tensor, most: float) -> Tensor:
@@ -55,10 +59,16 @@ def covered(lit: Lit, light: Tensor, most: float) -> Tensor:
 
 def uncovered(lit: Lit) -> Tensor:
     """(h, w), LEAST where something covers the surface, and 1 elsewhere, by the light that was found."""
-    found = covered(lit, lit.coefficients, max(OFF * lit.deviation, CLEAR)).float()
+    inside, own = lit.surface.inside, min(TAILS * lit.deviation, FOREIGN)
+    # log N(e; FOREIGN) − log N(e; own), each with the deviations of a channel; no pixel tells for all around it.
+    squares = 0.5 * lit.difference(lit.coefficients).square()
+    told = squares * (own**-2 - FOREIGN**-2) - len(lit.coefficients) * math.log(FOREIGN / own)
+    ratio = torch.zeros_like(inside, dtype=torch.float32)
+    ratio[inside] = told.clamp(-MOST_TOLD, MOST_TOLD)
+    found = inside & (smoothed(ratio[None], AROUND)[0] > 0.0)
     # Along the silhouette beside it, contours of the object and of the cover are one in a blur.
-    beside = F.max_pool2d(found[None, None], 2 * BESIDE + 1, 1, BESIDE)[0, 0]
-    return 1.0 - (1.0 - LEAST) * torch.where(lit.surface.inside, found, beside)
+    beside = F.max_pool2d(found.float()[None, None], 2 * BESIDE + 1, 1, BESIDE)[0, 0]
+    return 1.0 - (1.0 - LEAST) * torch.where(inside, found.float(), beside)
 
 
 def weighted(level: PhotoLevel, weights: list[Tensor]) -> PhotoLevel:

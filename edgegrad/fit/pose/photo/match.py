@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 
 import torch
@@ -20,6 +20,7 @@ from ....files.image import linear_to_srgb
 from ...views import area_mean
 from ..pose import Pose
 from ..task import PoseTask
+from .cover import at_one_side
 from .templates import Templates, surprise
 from .views import Views, across, all_sides, pose_at
 
@@ -34,6 +35,7 @@ PLACES = 3  # of a view, at one size
 RANKED = 1500  # matches at most that are compared with one another
 MIP = 1.15  # between two sizes of the picture
 SHIFT = 2  # pixels to all sides that a match is moved by
+HIDDEN = 0.3  # of the object's pixels, at a side that is left out
 
 
 @dataclass(frozen=True)
@@ -44,9 +46,19 @@ class Matches:
     positions: Tensor  # (n, 2) float64 of the object's centre, pixels of the picture
     pixels: Tensor  # (n,) float64 of the picture, across the object
     scores: Tensor  # (n,)
+    sides: Tensor | None = None  # (n,), those that are left out, as at_one_side() counts them; None: all is compared
 
     def of(self, rows: Tensor) -> Matches:
-        return Matches(self.rotations[rows], self.positions[rows], self.pixels[rows], self.scores[rows])
+        sides = None if self.sides is None else self.sides[rows]
+        return Matches(self.rotations[rows], self.positions[rows], self.pixels[rows], self.scores[rows], sides)
+
+    def turned(self, turns: Tensor) -> Matches:
+        """Each of them by all rotations (k, 3, 3), not compared yet."""
+        k = len(turns)
+        positions, pixels = (x.repeat_interleave(k, 0) for x in (self.positions, self.pixels))
+        sides = None if self.sides is None else self.sides.repeat_interleave(k, 0)
+        rotations = (turns @ self.rotations[:, None]).flatten(0, 1)
+        return Matches(rotations, positions, pixels, torch.full((len(rotations),), -math.inf), sides)
 
     def distinct(self, most: int, turned: float, placed: float, sized: float) -> Matches:
         """The best ones, the best first. Of two whose angle is below `turned` radians, whose distance is below `placed` of their
@@ -160,7 +172,7 @@ def matches(task: PoseTask, seed: int, tell: Callable[[str], object]) -> list[Po
         for k, one in enumerate(ROUNDS):
             if len(found.scores):
                 tell(f"views nearby, {k + 1} of {len(ROUNDS)}")
-                found = _closer(task, found, mips, one, rare, seed)
+                found = closer(task, found, mips, one, rare, seed)
                 found = found.distinct(one.kept // fewer, one.turned, one.placed, SIZED)
         ways.append(found.poses(task))
     return [pose for pair in zip_longest(*ways) for pose in pair if pose is not None]
@@ -242,30 +254,37 @@ def _in_mask(views: Views, mips: Mips) -> Matches:
     return Matches(views.rotations, positions, pixels, scores)
 
 
-def _closer(task: PoseTask, found: Matches, mips: Mips, one: Round, rare: float, seed: int) -> Matches:
+def closer(task: PoseTask, found: Matches, mips: Mips, one: Round, rare: float, seed: int) -> Matches:
     """Each match at the best of the poses around it."""
     turns = [torch.zeros(3, dtype=torch.float64)]
     for axis in range(3):
         for sign in (one.turn, -one.turn):
             turns.append(torch.zeros(3, dtype=torch.float64).index_fill(0, torch.tensor([axis]), sign))
     n, k = len(found.scores), len(turns)
-    rotations = (torch.stack([rotation(turn) for turn in turns]) @ found.rotations[:, None]).flatten(0, 1)
-    views = Views.of(task, rotations, one.across, seed)
-    templates, T = Templates(views, rare), views.alpha.shape[-1]
-    origin, size = (x.repeat_interleave(k, 0) for x in (found.positions, found.pixels))
-    best = Matches(rotations, origin, size, torch.full((n * k,), -math.inf))
+    best = fitted(task, found.turned(torch.stack([rotation(turn) for turn in turns])), mips, one, rare, seed)
+    return best.of(torch.arange(n) * k + best.scores.reshape(n, k).argmax(1))
+
+
+def fitted(task: PoseTask, given: Matches, mips: Mips, one: Round, rare: float, seed: int) -> Matches:
+    """Each match at the best of the places and sizes around it, turned as it is."""
+    views = Views.of(task, given.rotations, one.across, seed)
+    shown = None
+    if given.sides is not None:
+        pairs = zip(views.alpha, given.sides.tolist(), strict=True)
+        shown = torch.stack([at_one_side(alpha, side, HIDDEN) for alpha, side in pairs])
+    templates, T = Templates(views, rare, shown), views.alpha.shape[-1]
+    best = given
     for factor in (1.0 - one.grow, 1.0, 1.0 + one.grow):
-        pixels = factor * size
-        scores = templates.near(mips.crops(origin, pixels, one.across, T + 2 * SHIFT), mips.masked)
+        pixels = factor * given.pixels
+        scores = templates.near(mips.crops(given.positions, pixels, one.across, T + 2 * SHIFT), mips.masked)
         values, places = scores.flatten(1).max(1)
         if not mips.masked:
             values = values * pixels.float()
         side = 2 * SHIFT + 1
         shift = torch.stack([places % side - SHIFT, places // side - SHIFT], -1) * (pixels / one.across)[:, None]
         up = values > best.scores
-        best = Matches(
-            rotations, torch.where(up[:, None], origin + shift, best.positions), torch.where(up, pixels, best.pixels),
-            torch.where(up, values, best.scores),
+        best = replace(
+            best, positions=torch.where(up[:, None], given.positions + shift, best.positions),
+            pixels=torch.where(up, pixels, best.pixels), scores=torch.where(up, values, best.scores),
         )  # fmt: skip
-    first = best.scores.reshape(n, k).argmax(1)
-    return best.of(torch.arange(n) * k + first)
+    return best

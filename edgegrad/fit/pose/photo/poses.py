@@ -17,6 +17,7 @@ from ..pose import Pose
 from ..result import HIDDEN, Step
 from ..search import distinct, norms_of
 from ..task import PoseTask
+from .nearby import turns
 from .search import (
     ALONE_ENOUGH,
     APART,
@@ -32,7 +33,6 @@ from .search import (
     SURE,
     UNCOVERED,
     most_steps,
-    turns,
 )  # fmt: skip
 from .together import Together, together_levels
 

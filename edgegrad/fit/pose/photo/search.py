@@ -8,7 +8,7 @@ colours as they are, the search that compares them as they are has the last word
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -18,10 +18,11 @@ from ..journal import Journal, Way
 from ..pose import Pose, angle
 from ..result import Step
 from ..search import Search, distinct, norms_of
-from ..task import SHIFT, TURN, Level, PoseTask
+from ..task import Level, PoseTask
 from ..uncertainty import TOGETHER
 from .cover import SIDES, WHOLE, at_one_side, covers, left, weighted
 from .level import PhotoLevel, photo_levels
+from .nearby import comparable, nearby, turns
 
 ENOUGH = 0.65  # share of the render's edges: wrong poses reach 0.57, right ones 0.83 and more
 # The same of a contour alone: wrong places in clutter reach 0.81, right ones show 0.87 and more.
@@ -38,9 +39,8 @@ COARSE_STEPS, FINE_STEPS, LAST_STEPS, USUAL = (
 )  # on a level, of the USUAL `steps`; more of these make it more
 FULL_STEPS = 8  # of full length on the last level
 GAIN = 0.1  # a step that makes the pictures more likely by a smaller factor than exp(this / 2) is short: noise moves poses as far
-# Other starts: turned about the axes of the camera by so many radians.
-ASIDE = (0.2, 0.4)
-FOLLOWED, COVERS_FOLLOWED = 3, 4  # of them, the best on the coarsest level
+FOLLOWED, COVERS_FOLLOWED = 3, 4  # of other starts, the best on the coarsest level
+NEARBY_FOLLOWED = 6  # of the poses that the picture shows around the start
 HOPELESS = 0.1  # of the edges there: noise shows none at all, clutter 0.3
 ROUNDS = 2  # of the last level, each without what covers the object in the light of the round before
 APART = 0.05  # radians between poses that are followed both
@@ -143,6 +143,8 @@ class PhotoSearch:
             self._take(best)
         if self.further and best.explained < self.enough:
             best = self._from_covers(best, begins)
+        if self.further and best.explained < self.enough and comparable(self.task, self.start):
+            best = self._from_nearby(best, begins)
         if self.further and best.explained < self.enough:
             best = self._from_aside(best, begins)
         if best.explained < self.enough:
@@ -222,7 +224,7 @@ class PhotoSearch:
         """Ways that leave out what may cover the object at one side, until the pictures show an end's edges for sure."""
         answered = self._answered
         self._answered = True
-        coarse, *finer = self.levels
+        coarse = self.levels[0]
         first = coarse.see(self.start, self.seed)
         ways = [[at_one_side(seen.alpha, side) for seen in first] for side in range(SIDES)]
         ends = [self._follow(weighted(coarse, weights), self.start)[0] for weights in ways]
@@ -232,9 +234,40 @@ class PhotoSearch:
             ]
         )
         hopeful = [k for k in range(SIDES) if scores[k] >= HOPELESS]
-        for k in sorted(hopeful, key=lambda k: -scores[k])[:COVERS_FOLLOWED]:
+        order = sorted(hopeful, key=lambda k: -scores[k])[:COVERS_FOLLOWED]
+        return self._of_covered(best, ((ends[k], ways[k]) for k in order), begins, answered)
+
+    def _from_nearby(self, best: _End, begins: int) -> _End:
+        """Ways from poses around the start that the picture shows, as a whole or at all sides but one."""
+        answered = self._answered
+        self._answered = True
+        coarse, first, *_ = self.levels
+        size = len(self.start.numbers)
+
+        def hopeful(pose: Pose) -> bool:
+            return coarse.explained(pose, self.seed) >= HOPELESS
+
+        def compared() -> list[float]:
+            if not (hopeful(self.start) or hopeful(best.pose)):
+                return []
+            found = nearby(self.task, self.start, self.seed)[:NEARBY_FOLLOWED]
+            return [number for pose, side in found if hopeful(pose) for number in (*pose.numbers, float(side))]
+
+        def starts() -> Iterator[tuple[Pose, list[Tensor]]]:
+            flat = self.journal.numbers(compared)
+            for at in range(0, len(flat), size + 1):
+                pose, side = Pose.of(flat[at : at + size]), int(flat[at + size])
+                yield pose, [at_one_side(seen.alpha, side) for seen in first.see(pose, self.seed)]
+
+        return self._of_covered(best, starts(), begins, answered)
+
+    def _of_covered(
+        self, best: _End, starts: Iterable[tuple[Pose, list[Tensor]]], begins: int, answered: bool
+    ) -> _End:  # fmt: skip
+        """The best of the ways down from poses, with weights (h, w) of the pictures at first, until one is sure."""
+        for pose, weights in starts:
             before = len(self.history)
-            found = self._uncovered(ends[k], ways[k], finer)
+            found = self._uncovered(pose, weights, self.levels[1:])
             # Of so many ways, one may end where something is alike by chance.
             if found.explained < COVERED_ENOUGH:
                 self._forget(slice(before, None))
@@ -370,13 +403,3 @@ def most_steps(steps: int, last: bool, coarsest: bool) -> int:
     help either, unless somebody asks for them."""
     usual = LAST_STEPS if last else COARSE_STEPS if coarsest else FINE_STEPS
     return min(steps, round(usual * max(1.0, steps / USUAL)))
-
-
-def turns() -> list[tuple[list[int], Tensor]]:
-    """Entries of a step and their values, for each other start."""
-    found = []
-    for size in ASIDE:
-        for axis in range(TURN, SHIFT):
-            for sign in (1.0, -1.0):
-                found.append(([axis], torch.tensor([sign * size], dtype=torch.float64)))
-    return found

@@ -30,8 +30,9 @@ COUNTED = 1500  # pixels that tell how frequent colours are
 class Templates:
     """Views as filters of pictures with the channels C, which may be none."""
 
-    def __init__(self, views: Views, rare: float) -> None:
-        """`rare`: how much the ratio to the picture's colours counts beside that to one colour."""
+    def __init__(self, views: Views, rare: float, shown: Tensor | None = None) -> None:
+        """`rare`: how much the ratio to the picture's colours counts beside that to one colour. `shown` (n, T, T): 0 where views
+        are not compared, 1 elsewhere."""
         self.rare = rare
         alpha, colours, normals = views.alpha, views.colours, views.normals
         self.C = colours.shape[-1]
@@ -39,6 +40,8 @@ class Templates:
         self.inside = torch.where(alpha > 0.5, alpha, torch.zeros_like(alpha))
         near = F.max_pool2d((alpha > 0.02).float()[:, None], 2 * views.ring + 1, 1, views.ring)[:, 0]
         self.around = near * (alpha < 0.02)
+        if shown is not None:
+            self.inside, self.around = shown * self.inside, shown * self.around
         Y = torch.cat([torch.ones_like(normals[..., :1]), normals], -1)
         basis = colours[..., None] * Y[..., None, :]  # (n, T, T, C, 4)
         weighted = basis * self.inside[..., None, None]

@@ -84,13 +84,23 @@ def pose_at(task: PoseTask, R: Tensor, position: Tensor, depth: float) -> Pose:
     center = torch.cat([ray, ray.new_tensor([depth])])
     if camera.projection != "orthographic":
         center = depth * torch.cat([ray, ray.new_ones(1)])
-        aside = ray.norm()
-        if aside > 0.0:
-            R = rotation(torch.stack([-ray[1], ray[0], ray.new_zeros(())]) / aside * torch.atan(aside)) @ R
+        R = _towards(ray) @ R
     turned = view[:3, :3].T @ R
     one = torch.ones((), dtype=torch.float64)
     t = view[:3, :3].T @ (center - view[:3, 3]) - turned @ task.center
     return Pose(turned, t, one, one)
+
+
+def seen_at(task: PoseTask, pose: Pose) -> tuple[Tensor, Tensor, float]:
+    """What pose_at() makes a pose of: rotation (3, 3) of a view, position (2,) and depth."""
+    camera = task.shots[0].camera
+    view, K = camera.world_to_camera.double(), camera.K.double()
+    center = view[:3, :3] @ (pose.R @ task.center + pose.t) + view[:3, 3]
+    R, ray = view[:3, :3] @ pose.R, center[:2]
+    if camera.projection != "orthographic":
+        ray = center[:2] / center[2]
+        R = _towards(ray).T @ R
+    return R, K[:2, :2] @ ray + K[:2, 2], float(center[2])
 
 
 def all_sides() -> Tensor:
@@ -128,6 +138,13 @@ def ball(count: int, radius: float) -> Tensor:
     # Multiples of the golden ratio, so that angles have nothing to do with axes.
     share = torch.where(k > 0, (k * 0.6180339887498949) % 1.0, torch.zeros_like(k))
     return _rotations(axes * (radius * share.pow(1.0 / 3.0))[:, None])
+
+
+def _towards(ray: Tensor) -> Tensor:
+    """(3, 3), the rotation that takes the axis (0, 0, 1) to the direction (x, y, 1) of ray (2,)."""
+    aside = ray.norm()
+    axis = torch.stack([-ray[1], ray[0], ray.new_zeros(())]) / aside.clamp(min=1e-300)
+    return rotation(axis * torch.atan(aside))
 
 
 def _rotations(vectors: Tensor) -> Tensor:
