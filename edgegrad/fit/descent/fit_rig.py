@@ -36,13 +36,13 @@ from .keypoints import keypoint_term
 from .loop import Descent, descend
 from .objective import Objective, judged
 from .result import Fit
-from .rig_search import limbs, searched
+from .rig_search import Limb, Search, limbs
 
 FEW = 200  # numbers, up to which steps are those of Gauss and Newton
-TRIED = 32  # pixels on the shorter side of pictures on the level where limbs are drawn anew
+TRIED = range(24, 97)  # pixels on the shorter side of pictures on levels where limbs are drawn anew
 TRY_STEPS = 6  # of each of these
 GROWTH = 3.0  # a prior's weight grows by this power of how much coarser the pictures are
-STEPS = 15
+STEPS, COARSE = 40, 15  # of the last level, and at most of each before
 ONWARD = (
     0.5  # of the last frame's motion, that the next begins with: all of it would add up errors that no picture shows
 )
@@ -239,11 +239,15 @@ class Sought:
         return Sought(rig, fixed, parameters, rows)
 
     def values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Of all that is sought, with the rows that are not; differentiable."""
+        """Of all that is sought, with the rows that are not; differentiable. Of one or of a batch."""
         return {
-            name: self.fixed[name].index_copy(0, self.rows[name], tensor) if name in self.rows else tensor
-            for name, tensor in tensors.items()
+            name: self._whole(name, tensor) if name in self.rows else tensor for name, tensor in tensors.items()
         }
+
+    def _whole(self, name: str, tensor: Tensor) -> Tensor:
+        fixed = self.fixed[name]
+        at = tensor.dim() - fixed.dim()
+        return fixed.expand(*tensor.shape[:at], *fixed.shape).index_copy(at, self.rows[name], tensor)
 
     def all(self, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
         """As posed() takes them."""
@@ -284,7 +288,7 @@ class _Search:
         while sizes[-1] * 1.4 < full:
             sizes.append(2 * sizes[-1])
         self.factors = [size / full for size in sizes[:-1]] + [1.0]
-        self.tried = min(range(len(sizes)), key=lambda k: abs(sizes[k] - TRIED))
+        self.tried = [k for k, size in enumerate(sizes) if size in TRIED] or [0]
 
     @torch.inference_mode(False)
     @torch.enable_grad()
@@ -318,15 +322,18 @@ class _Search:
         return RigFit(self.rig, {name: value.detach() for name, value in self.sought.all(values).items()}, fit)
 
     def build(self, views: Sequence[View]) -> Callable[[Mapping[str, Tensor]], Built]:
+        return lambda tensors: self._scene(self.rig.posed(**self.sought.all(tensors)), views)
+
+    def many(self, views: Sequence[View]) -> Callable[[Mapping[str, Tensor]], list[Built]]:
+        """The same of a batch of values."""
+        return lambda tensors: [self._scene(posed, views) for posed in self.rig.posed(**self.sought.all(tensors))]
+
+    def _scene(self, posed: Scene | Mesh, views: Sequence[View]) -> Built:
+        posed = self.look(posed)
+        scene = Scene([posed]) if isinstance(posed, Mesh) else posed
         masked = any(view.mask is not None for view in views)
-
-        def built(tensors: Mapping[str, Tensor]) -> Built:
-            posed = self.look(self.rig.posed(**self.sought.all(tensors)))
-            scene = Scene([posed]) if isinstance(posed, Mesh) else posed
-            scene = scene.replace(background=None) if masked and scene.background is not None else scene
-            return scene, [view.camera for view in views]
-
-        return built
+        scene = scene.replace(background=None) if masked and scene.background is not None else scene
+        return scene, [view.camera for view in views]
 
     def descend(
         self, values: Mapping[str, Tensor], level: int, save: Callable[[dict[str, Any]], None], saved: dict[str, Any] | None,
@@ -345,14 +352,17 @@ class _Search:
             return total if self.points is None else total + self.points(self.sought.all(tensors))
 
         build = self.build(views)
-        options = dataclasses.replace(self.options, spp=max(self.options.spp, 16) if factor < 0.3 else self.options.spp)
-        objective = Objective(build, views, options, prior=prior)
+        spp = max(self.options.spp, 16) if factor < 0.4 else self.options.spp
+        coarse = level < len(self.factors) - 1 and self.options.method == "gauss-newton" and self.options.loss != REGION
+        steps = min(self.options.steps, COARSE) if coarse else self.options.steps
+        options = dataclasses.replace(self.options, spp=spp, steps=steps)
+        objective = Objective(build, views, options, prior=prior, many=self.many(views))
         if fresh and level == 0:
             objective.check(values)
         found = self._steps(objective, values, options, save, saved, f"level {level + 1} of {len(self.factors)}")
         name = next((n for n in ("rotations", "angles") if n in values and self.rig.deformer.parents), None)
         if (
-            level == self.tried
+            level in self.tried
             and self.tries
             and name is not None
             and saved is None
@@ -364,18 +374,22 @@ class _Search:
     def _searched(
         self, objective: Objective, values: Mapping[str, Tensor], options: Options, name: str
     ) -> dict[str, Tensor]:
-        few = dataclasses.replace(options, steps=TRY_STEPS, progress=False, callback=None)
+        few = dataclasses.replace(options, steps=TRY_STEPS, tolerance=0.0, progress=False, callback=None)
+        control, rows = self.rig.controls[name], self.sought.rows.get(name, torch.arange(len(values[name])))
         if name == "rotations":
-            rows = self.sought.rows.get(name, torch.arange(len(values[name]))).tolist()
-            groups = limbs(self.rig, rows)
+            groups = limbs(self.rig, rows.tolist())
         else:
-            groups = [list(range(k, len(values[name]))) for k in range(len(values[name]))]
+            groups = [Limb(list(range(k, len(values[name])))) for k in range(len(values[name]))]
+
+        def steps(objective: Objective, parameters: Mapping[str, Parameter]) -> dict[str, Tensor]:
+            return descend(way_of(parameters, few), objective, lambda state: None).values
+
         bar = tqdm(total=self.tries, desc="limbs drawn anew", disable=not options.progress, leave=False)
         try:
-            return searched(
-                objective, dict(values), name, groups, self.tries, options.seed, self.sought.parameters[name].within,
-                lambda at: self._steps(objective, at, few, lambda state: None, None, "").values, bar.update,
-            )  # fmt: skip
+            search = Search(
+                objective, name, groups, self.sought.parameters, control.rest[rows], steps, options.seed, bar.update
+            )
+            return search.run(dict(values), self.tries)
         finally:
             bar.close()
 
