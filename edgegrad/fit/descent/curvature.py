@@ -46,15 +46,18 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
 
 
 def misfit(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
-    """How far pixels are from their pictures where each number moves them, Σ |r| |J|, of the tensors' shapes: large of what lies
-    in a wrong place, also where its slope is zero."""
+    """How far pixels are from their pictures where each number moves them, Σ |J| |r| / Σ |J|, of the tensors' shapes: large of
+    what lies in a wrong place, also where its slope is zero."""
     plain = {name: value.detach() for name, value in tensors.items()}
-    total = torch.zeros(sum(value.numel() for value in plain.values()), dtype=torch.float64)
+    n = sum(value.numel() for value in plain.values())
+    off, all = torch.zeros(n, dtype=torch.float64), torch.full((n,), 1e-30, dtype=torch.float64)
     for name, group, render, slopes in _derivatives(objective, plain, step):
         for i, image, J in zip(group, render, slopes, strict=True):
             if (wanted := objective.views[i].wanted.get(name)) is not None:
-                total += (J.abs().reshape(len(total), -1) @ (image - wanted).abs().flatten()).double()
-    parts = total.split([value.numel() for value in plain.values()])
+                rows = J.abs().reshape(n, -1)
+                off += (rows @ (image - wanted).abs().flatten()).double()
+                all += rows.sum(1).double()
+    parts = (off / all).split([value.numel() for value in plain.values()])
     return {name: part.reshape(value.shape) for (name, value), part in zip(plain.items(), parts, strict=True)}
 
 

@@ -65,6 +65,11 @@ class RigFit:
         return self.rig.posed(**self.values)
 
     @property
+    def bones(self) -> Tensor | None:
+        """See Rig.bones()."""
+        return self.rig.bones(self.values)
+
+    @property
     def converged(self) -> bool:
         """See Fit.converged."""
         return self.fit.converged
@@ -240,9 +245,7 @@ class Sought:
 
     def values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Of all that is sought, with the rows that are not; differentiable. Of one or of a batch."""
-        return {
-            name: self._whole(name, tensor) if name in self.rows else tensor for name, tensor in tensors.items()
-        }
+        return {name: self._whole(name, tensor) if name in self.rows else tensor for name, tensor in tensors.items()}
 
     def _whole(self, name: str, tensor: Tensor) -> Tensor:
         fixed = self.fixed[name]
@@ -401,5 +404,10 @@ class _Search:
             name: dataclasses.replace(p, value=p.within(values[name])) for name, p in self.sought.parameters.items()
         }
         return descend(
-            way_of(parameters, options), objective, save, saved, title, reporter(objective.build, objective.views)
-        )
+            way_of(parameters, options), objective, save, saved, title,
+            reporter(objective.build, objective.views, bones=self.bones),
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def bones(self, tensors: Mapping[str, Tensor]) -> Tensor | None:
+        return self.rig.bones(self.sought.all(tensors))

@@ -1,9 +1,9 @@
 """Poses of a rig that a descent from the start does not reach: limbs drawn anew, where that lowers the loss.
 
 Silhouettes say little of which limb they show, so that a descent ends where one of them lies in the place of another. Limbs, a
-joint and all below it, are turned at random, one after the other; the best of many turns goes down a few steps by its own numbers
-alone, which is cheap, and is kept where the loss is lower than before. All numbers go down together after each round. The search
-ends where what is left of the loss is the noise of its samples, or after rounds that found nothing.
+joint and all below it, are turned at random, most often those about which pixels are off; the best of many turns go down a few
+steps by the limb's own numbers, which is cheap, then by all, and the result is kept where the loss is lower than before. The
+search ends where what is left of the loss is the noise of its samples.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ SPREAD = 0.4  # radians, of each component
 SHARE = 0.4  # of all rows: a joint with more below it is turned alone
 EXPLAINED = 1.5  # of the loss by noise alone: less is not to be mended
 APART = 0.3  # radians of a joint at least, by which a turn is another place
-STARTS = 3  # of the turns, that go down
-ROUND = 8  # tries after which all numbers go down
+STARTS = 2  # of the turns, that go down
+WORSE = 2.0  # times the least loss, from which no way down is tried
 LEAST = 0.05  # of the largest chance of a limb to be drawn
 SEEDS = 0, 1  # by which losses are compared
 Values = dict[str, Tensor]
@@ -81,30 +81,25 @@ class Search:
     def run(self, values: Values, tries: int) -> Values:
         """The best values of so many tries."""
         self.generator = torch.Generator().manual_seed(self.seed)
-        best, least = values, self.loss(values)
-        changed, chances = False, self.chances(best)
-        for k in range(tries):
+        best, least, chances = values, self.loss(values), self.chances(values)
+        for _ in range(tries):
             if self.explained(best):
                 break
             limb = self.groups[int(torch.multinomial(chances, 1, generator=self.generator))]
-            for start in self.drawn(best, limb):
-                found = self.alone(start, limb)
+            found = min((self.alone(start, limb) for start in self.drawn(best, limb)), key=self.loss, default=None)
+            # What lies in the limb's true place must often leave it before the loss is lower.
+            if found is not None and self.loss(found) < WORSE * least:
+                found = self.steps(self.objective, self.started(found))
                 if (now := self.loss(found)) < least:
-                    best, least, changed = found, now, True
-                    break
+                    best, least, chances = found, now, self.chances(found)
             self.tell()
-            if changed and (k % ROUND == ROUND - 1 or k == tries - 1):
-                found, changed = self.steps(self.objective, self.started(best)), False
-                if (now := self.loss(found)) < least:
-                    best, least = found, now
-                chances = self.chances(best)
         return best
 
     def chances(self, values: Values) -> Tensor:
         """Of each limb, by how far pixels are from their pictures where it moves them."""
         by_row = misfit(self.objective, values, 0)[self.name]
-        by_row = by_row.reshape(len(by_row), -1).sum(1)
-        found = torch.stack([by_row[limb.rows].mean() for limb in self.groups])
+        by_row = by_row.reshape(len(by_row), -1).mean(1)
+        found = torch.stack([by_row[limb.rows].mean() for limb in self.groups]).square()
         return found + LEAST * found.max() + 1e-300
 
     def drawn(self, values: Values, limb: Limb) -> list[Values]:
