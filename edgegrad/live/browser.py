@@ -172,7 +172,9 @@ class Browser:
         points = frame.bones.detach().float().numpy()
         if self._bones is None or len(self._bones.points) != len(points):
             color = tuple(round(255 * value) for value in BONE)
-            self._bones = self.server.scene.add_line_segments("/bones", points, color, thickness=3.0, thickness_units="screen")
+            self._bones = self.server.scene.add_line_segments(
+                "/bones", points, color, thickness=3.0, thickness_units="screen"
+            )
         self._bones.points = points
 
     def _draw_cameras(self, frame: Frame) -> None:
