@@ -229,10 +229,10 @@ def body(folder: Path) -> None:
     rig, truth, _, fit = body_example.trial(0, progress=False)
     print(body_example.Errors.of(rig, fit.values["rotations"], truth))
     rows = body_example.pictures(rig, truth, fit, 320)
-    figure, axes = plt.subplots(1, 6, figsize=(12, 2.6))
+    figure, axes = plt.subplots(1, 6, figsize=(12, 3.4))
     for axis, (title, image) in zip(axes, (item for row in rows for item in row.items()), strict=True):
-        picture(axis, image[:, 40:-40], title)
-    figure.tight_layout(pad=0.4)
+        picture(axis, image[30:-15, 70:-70], title)
+    figure.tight_layout(pad=0.8)
     figure.savefig(folder / "body.png", dpi=100)
 
 

@@ -75,7 +75,7 @@ def figure(fine: int = 6, colored: bool = False) -> eg.Rig:
         verts.append(v)
         faces.append(f + count)
         weights.append(own)
-        colors.append((0.25 + 0.5 * torch.rand(3, generator=g)) * (0.6 + 0.4 * torch.rand(len(v), 1, generator=g)))
+        colors.append((0.03 + 0.6 * torch.rand(3, generator=g)) * (0.5 + 0.5 * torch.rand(len(v), 1, generator=g)))
         count += len(v)
     starts = torch.tensor([bone[2] for bone in BONES])
     parents = [bone[1] for bone in BONES]
