@@ -20,6 +20,7 @@ import edgegrad as eg
 from edgegrad.image import linear_to_srgb
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
+import body as body_example
 import sun  # the fit of examples/sun.py, in a larger picture
 
 INK, BLUE, ORANGE, GREY = "#222222", "#1f6fb2", "#d9730d", "#8a8f98"
@@ -223,10 +224,22 @@ def cup(folder: Path) -> None:
     figure.savefig(folder / "cup.jpg", dpi=110, pil_kwargs={"quality": 88})
 
 
+def body(folder: Path) -> None:
+    """The fit of examples/body.py, from two sides."""
+    rig, truth, _, fit = body_example.trial(0, progress=False)
+    print(body_example.Errors.of(rig, fit.values["rotations"], truth))
+    rows = body_example.pictures(rig, truth, fit, 320)
+    figure, axes = plt.subplots(1, 6, figsize=(12, 3.4))
+    for axis, (title, image) in zip(axes, (item for row in rows for item in row.items()), strict=True):
+        picture(axis, image[30:-15, 70:-70], title)
+    figure.tight_layout(pad=0.8)
+    figure.savefig(folder / "body.png", dpi=100)
+
+
 def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
     folder.mkdir(parents=True, exist_ok=True)
-    for draw in (light, derivatives, triangle_terms, curve_source, stages, cup):
+    for draw in (light, derivatives, triangle_terms, curve_source, stages, cup, body):
         draw(folder)
 
 

@@ -33,6 +33,7 @@ for side, s in (("left", 1.0), ("right", -1.0)):
         (f"{side} foot", k + 1, (0.15 * s, 0.12, -0.02), (0.17 * s, 0.03, 0.17), 0.05, 0.03),
     ]
 BONES.append(("hat", 4, (0.0, 1.86, 0.0), (0.0, 2.0, -0.08), 0.1, 0.05))
+BONES_ALONG = [tuple(b - a for a, b in zip(bone[2], bone[3], strict=True)) for bone in BONES]  # at rest
 HEIGHT = 2.0
 
 
@@ -74,7 +75,7 @@ def figure(fine: int = 6, colored: bool = False) -> eg.Rig:
         verts.append(v)
         faces.append(f + count)
         weights.append(own)
-        colors.append((0.25 + 0.5 * torch.rand(3, generator=g)) * (0.6 + 0.4 * torch.rand(len(v), 1, generator=g)))
+        colors.append((0.03 + 0.6 * torch.rand(3, generator=g)) * (0.5 + 0.5 * torch.rand(len(v), 1, generator=g)))
         count += len(v)
     starts = torch.tensor([bone[2] for bone in BONES])
     parents = [bone[1] for bone in BONES]

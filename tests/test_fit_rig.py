@@ -73,6 +73,25 @@ def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:
     assert torch.equal(found.values["translation"], torch.zeros(3, dtype=torch.float64))
 
 
+def test_a_pose_from_photographs_without_masks() -> None:
+    """Before clutter, in colours that the rig does not know."""
+    rig, cameras, g = arm(), views(64), torch.Generator().manual_seed(5)
+    posed = rig.posed(TRUTH, translation=[0.05, 0.0, -0.1])
+    warm = torch.tensor([0.8, 0.35, 0.15]) * (0.7 + 0.3 * torch.rand(len(posed.verts), 1, generator=g))
+    photos = []
+    for camera in cameras:
+        clutter = torch.rand(1, 3, 6, 6, generator=g) * torch.tensor([0.2, 0.5, 0.9])[:, None, None]
+        behind = torch.nn.functional.interpolate(clutter, size=camera.size, mode="bilinear")[0].movedim(0, -1)
+        photos.append(eg.render(eg.Scene(posed.replace(colors=warm), background=behind), camera, 64, seed=9))
+    start = {"rotations": 0.5 * TRUTH}
+    found = fit_rig(rig, cameras, photos, loss="region", start=start, coarsest=32, progress=False)
+    assert degrees(0.5 * TRUTH, TRUTH) > 15.0 and degrees(found.values["rotations"], TRUTH) < 5.0
+    assert found.converged and all(view.outlined for view in found.fit.views)
+    far = {"translation": [50.0, 0.0, 0.0]}
+    with pytest.raises(ValueError, match="expected an object that the pictures show at the start"):
+        fit_rig(rig, cameras, photos, loss="region", start=far, progress=False)
+
+
 def test_keypoints_find_what_masks_do_not() -> None:
     """A limb far from its mask, by its joints, of which one is wrong in one picture."""
     rig, cameras = arm(3), views(count=4)

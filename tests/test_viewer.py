@@ -19,7 +19,7 @@ import edgegrad as eg
 import edgegrad_cli as cli
 from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, write_image
-from edgegrad.fit import Parameter, fit_camera, fit_pose, fit_scene, fit_shape, fit_texture
+from edgegrad.fit import Parameter, fit_camera, fit_pose, fit_rig, fit_scene, fit_shape, fit_texture
 from edgegrad.live import frame, view
 from edgegrad.live.browser import Browser
 
@@ -88,6 +88,31 @@ def test_a_camera_moves_before_a_scene_at_rest(viewer):
     )
     np.testing.assert_allclose(page(viewer)._frusta[0][1].position, fit.camera.eye, atol=1e-9)
     assert float((fit.camera.eye - at.eye).norm()) < 0.02  # of 0.1; over seeds up to 0.009
+
+
+def test_the_skeleton_of_what_bends(viewer, monkeypatch):
+    from test_fit_rig import arm, shown
+    from test_fit_rig import views as around
+
+    monkeypatch.setattr(view, "SHORTEST", 0.0)
+    rig, cameras = arm(3), around(24, 2)
+    masks = shown(rig.posed({"bone 1": [0.0, 0.0, 0.6]}), cameras)
+    seen = []
+
+    def look(progress):
+        viewer(progress)
+        seen.append(progress.bones)
+
+    fit = fit_rig(rig, cameras, masks=masks, tries=0, steps=3, coarsest=24, callback=look, **QUIET)
+    viewer.show(fit)
+    assert len(seen) == fit.history[-1].step + 1 and seen[0].shape == (2, 2, 3) and not torch.equal(seen[0], seen[-1])
+    joints = rig.shape({"rotations": fit.values["rotations"]}, translation=fit.values["translation"]).joints
+    np.testing.assert_allclose(page(viewer)._bones.points, torch.stack([joints[:2], joints[1:]], 1), atol=1e-6)
+    assert page(viewer)._meshes[0].handle.opacity < 1.0
+    _, render, _ = frame.frame_of(fit).panel(0)
+    x, y = cameras[0].project(joints.mean(0, keepdim=True).float())[0].long().tolist()
+    orange = (render == frame.as_bytes(torch.tensor(frame.BONE))).all(-1)
+    assert orange[y - 2 : y + 3, x - 2 : x + 3].any() and not orange[:, 0].any()
 
 
 def test_shapes_are_shown_as_they_move_also_after_remeshing(viewer, monkeypatch):

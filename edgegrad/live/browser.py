@@ -17,7 +17,7 @@ from ..optional import require
 from ..scene.material import Material, vertex_normals
 from ..scene.mesh import PLAIN, Mesh
 from ..scene.tree import named_tensors
-from .frame import CONTRAST, Frame, as_bytes, displayed
+from .frame import BONE, CONTRAST, Frame, as_bytes, displayed
 
 WIDTH = 480  # pixels of the panel beside the scene
 THUMBNAIL = 128  # pixels on the longer side of a picture in a frustum
@@ -26,6 +26,7 @@ WIDEST = 2.0  # radians of a frustum; a camera that has no field of view gets
 NOMINAL = 0.6
 AMBIENT = 1.5
 FOV, ASIDE = 0.8, 0.9  # radians of the page's own camera, and between it and the cameras shown
+SEE_THROUGH = 0.6  # opacity of a mesh about its bones
 MOST_POINTS = 500  # of the curve
 GREY = (round(255 * (1.055 * PLAIN ** (1 / 2.4) - 0.055)),) * 3  # sRGB
 PANEL_TITLE = f"target | render | difference × {CONTRAST}"
@@ -56,6 +57,7 @@ class Browser:
         self._rotation = viser.transforms.SO3.from_matrix
         self._meshes: dict[int, _Shown] = {}
         self._frusta: list[tuple[Tensor | None, Any]] = []
+        self._bones: Any = None
         # Colours that are radiance have their light in them: an even light beside the page's own shows them, and the shape.
         self.server.scene.configure_default_lights(cast_shadow=False)
         self.server.scene.add_light_ambient("/light", intensity=AMBIENT)
@@ -80,6 +82,7 @@ class Browser:
             self._look_from_aside(frame)
         with self.server.atomic():
             self._draw_meshes(frame)
+            self._draw_bones(frame)
             self._draw_cameras(frame)
         self.draw_panel(frame, index)
         self.say(state)
@@ -145,6 +148,8 @@ class Browser:
                     handle.vertices = _floats(mesh.verts)
                 else:
                     handle = self._added(f"/meshes/{i}", mesh)
+                    if simple is not None and frame.bones is not None:
+                        handle.opacity = SEE_THROUGH
                 self._meshes[i] = _Shown(mesh, handle)
             for name, value in place.items():
                 setattr(self._meshes[i].handle, name, value)
@@ -160,6 +165,17 @@ class Browser:
         if mesh.material is None:  # matt and smooth
             mesh = mesh.replace(material=Material(), normals=vertex_normals(mesh.verts, mesh.faces), normal_faces=None)
         return self.server.scene.add_glb(name, to_glb(mesh)[0])
+
+    def _draw_bones(self, frame: Frame) -> None:
+        if frame.bones is None:
+            return
+        points = frame.bones.detach().float().numpy()
+        if self._bones is None or len(self._bones.points) != len(points):
+            color = tuple(round(255 * value) for value in BONE)
+            self._bones = self.server.scene.add_line_segments(
+                "/bones", points, color, thickness=3.0, thickness_units="screen"
+            )
+        self._bones.points = points
 
     def _draw_cameras(self, frame: Frame) -> None:
         if len(frame.cameras) != len(self._frusta):

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..aovs import render_aovs
 from ..camera.camera import Camera
 from ..files.image import linear_to_srgb
-from ..fit import CameraFit, Fit, PoseFit, Progress
+from ..fit import CameraFit, Fit, PoseFit, Progress, RigFit
 from ..fit.pose.photo.shown import shown
 from ..fit.pose.result import Step
 from ..fit.pose.task import PoseTask
@@ -26,6 +26,7 @@ from ..scene.tree import map_tensors
 LARGEST = 256  # pixels on the longer side of a picture
 SPP = 8
 CONTRAST = 4  # of the difference
+BONE = (1.0, 0.55, 0.1)  # colour, sRGB
 
 
 class Frame(NamedTuple):
@@ -34,19 +35,21 @@ class Frame(NamedTuple):
     cameras: list[Camera]
     targets: list[Tensor | None]  # (H, W, C) linear, one for each camera
     render: Callable[[int], Tensor]  # (h, w, C) as that camera sees it, of up to LARGEST pixels
+    bones: Tensor | None = None  # (K, 2, 3) ends of the bones of what bends
 
     def panel(self, index: int) -> list[np.ndarray]:
         """target, render and difference (h, w, 3) of a camera, uint8; without a target the render alone."""
         with torch.no_grad():
             render = displayed(self.render(index))
-            target = self.targets[index]
+            size, target = (render.shape[0], render.shape[1]), self.targets[index]
+            shown = render if self.bones is None else with_bones(render, self.cameras[index].resized(size), self.bones)
             if target is None:
-                return [as_bytes(render)]
-            target = displayed(area_mean(target.float(), (render.shape[0], render.shape[1])))
-            return [as_bytes(picture) for picture in (target, render, CONTRAST * (render - target).abs())]
+                return [as_bytes(shown)]
+            target = displayed(area_mean(target.float(), size))
+            return [as_bytes(picture) for picture in (target, shown, CONTRAST * (render - target).abs())]
 
 
-Shown = PoseFit | CameraFit | Progress | Fit
+Shown = PoseFit | CameraFit | RigFit | Progress | Fit
 
 
 def frame_of(fit: Shown) -> Frame:
@@ -55,7 +58,11 @@ def frame_of(fit: Shown) -> Frame:
         return frame_of(fit.search)._replace(matrix=None, cameras=[camera.detach() for camera in fit.cameras])
     if isinstance(fit, PoseFit) and fit.task is not None and fit.history:
         return _frame_of_pose(fit.task, next(step for step in reversed(fit.history) if step.best))
-    if isinstance(fit, Progress | Fit):
+    if isinstance(fit, RigFit):
+        return frame_of(fit.fit)._replace(bones=fit.bones)
+    if isinstance(fit, Progress):
+        return _frame(fit.scene, fit.cameras, fit.views)._replace(bones=fit.bones)
+    if isinstance(fit, Fit):
         return _frame(fit.scene, fit.cameras, fit.views)
     raise TypeError(f"fit: expected what a fit gives its callback, or returns, got {type(fit).__name__}")
 
@@ -104,6 +111,20 @@ def _frame_of_pose(task: PoseTask, step: Step) -> Frame:
 
     cameras = [task.lens(shot.camera, step.pose) for shot in task.shots]
     return Frame(task.scene, step.pose.matrix, cameras, [shot.target for shot in task.shots], render)
+
+
+def with_bones(image: Tensor, camera: Camera, bones: Tensor) -> Tensor:
+    """A picture (h, w, 3) with bones (K, 2, 3) drawn into it, as curves where the lens bends them."""
+    t = torch.linspace(0.0, 1.0, 2 * max(camera.size), dtype=bones.dtype)[:, None]
+    points = (bones[:, None, 0] + t * (bones[:, None, 1] - bones[:, None, 0])).reshape(-1, 3)
+    pixels = camera.detach().project(points.to(camera.K.dtype))
+    inside = (
+        torch.isfinite(pixels).all(-1) & (pixels >= 0).all(-1) & (pixels < pixels.new_tensor(camera.size[::-1])).all(-1)
+    )
+    x, y = pixels[inside].long().unbind(-1)
+    drawn = image.clone()
+    drawn[y, x] = image.new_tensor(BONE)
+    return drawn
 
 
 def displayed(image: Tensor) -> Tensor:

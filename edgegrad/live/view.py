@@ -21,7 +21,7 @@ from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 
 if TYPE_CHECKING:
-    from ..fit import CameraFit, Fit, PoseFit
+    from ..fit import CameraFit, Fit, PoseFit, RigFit
     from .browser import Browser
     from .figure import Notebook
     from .frame import Frame, Shown
@@ -32,7 +32,7 @@ BEAT = 0.1  # seconds in which a pause notices Ctrl-C
 
 def viewer(port: int = 8080, host: str = "127.0.0.1", *, server: bool | None = None, share: float = 0.03) -> Viewer:
     """A live view: the meshes as they move, cameras with their pictures, target | render | difference, the loss, and buttons
-    that pause and stop.
+    that pause and stop. Of fit_rig() also the skeleton.
 
         with eg.viewer() as view:
             print(view.url)
@@ -129,7 +129,7 @@ class Viewer:
         number = None if loss is None else float(loss)
         return self._step(number, lambda: frame_of_scene(scene, cameras, images, masks))
 
-    def show(self, fit: Fit | PoseFit | CameraFit) -> None:
+    def show(self, fit: Fit | PoseFit | CameraFit | RigFit) -> None:
         """Draws at once: what a fit returns, for its last step may not be drawn."""
         from .frame import frame_of
 

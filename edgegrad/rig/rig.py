@@ -193,6 +193,14 @@ class Rig:
             )
         return self.controls[name]
 
+    def bones(self, values: Mapping[str, Any]) -> Tensor | None:
+        """(K, 2, 3) float64: from the parent of each joint that has one to the joint, of all values that posed() takes. None
+        where nothing says."""
+        own = {name: value for name, value in values.items() if name in self.controls}
+        joints = self.shape(own, **{name: value for name, value in values.items() if name not in own}).joints
+        pairs = [(parent, k) for k, parent in enumerate(self.deformer.parents) if parent >= 0]
+        return joints[torch.tensor(pairs)] if joints is not None and pairs else None
+
     # -- limits -------------------------------------------------------------------------------------------------------------
 
     def with_limits(self, **limits: Any) -> Rig:

@@ -7,7 +7,7 @@ squared loss the exact one (Gauss-Newton).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import torch
@@ -20,6 +20,7 @@ from .building import Built
 from .objective import Objective
 
 MOST = 400  # numbers, each of which is a direction
+CHUNK = 32  # of them at a time, where scenes are made in batches
 FAINT = 1e-3  # of the range of the pictures: differences below count as these, for some losses have no weight at 0
 
 
@@ -27,11 +28,48 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
     """(n, n) float64 by all numbers of the tensors, one after the other. Raises TypeError where something has no forward mode."""
     plain = {name: value.detach() for name, value in tensors.items()}
     n = sum(value.numel() for value in plain.values())
+    total = torch.zeros(n, n, dtype=torch.float64)
+    for name, group, render, slopes in _derivatives(objective, plain, step):
+        if objective.regions is None:
+            weight = weights_of(objective, name, group, render)
+        else:
+            weight = objective.regions.curvature(group, render)
+            slopes = [objective.regions.blurred(J) for J in slopes]
+        for w, J in zip(weight / len(objective.picks(step)), slopes, strict=True):
+            rows = J.reshape(n, -1) * w.sqrt().flatten()
+            total += (rows @ rows.T).double()
+    if (regularizer := objective.regularizer) is not None:
+        total += _of_term(lambda tensors: regularizer(objective.build(tensors)[0]), plain)
+    if objective.prior is not None:
+        total += _of_term(objective.prior, plain)
+    return total
+
+
+def misfit(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
+    """How far pixels are from their pictures where each number moves them, Σ |J| |r| / Σ |J|, of the tensors' shapes: large of
+    what lies in a wrong place, also where its slope is zero."""
+    plain = {name: value.detach() for name, value in tensors.items()}
+    n = sum(value.numel() for value in plain.values())
+    off, all = torch.zeros(n, dtype=torch.float64), torch.full((n,), 1e-30, dtype=torch.float64)
+    for name, group, render, slopes in _derivatives(objective, plain, step):
+        for i, image, J in zip(group, render, slopes, strict=True):
+            if (wanted := objective.views[i].wanted.get(name)) is not None:
+                rows = J.abs().reshape(n, -1)
+                off += (rows @ (image - wanted).abs().flatten()).double()
+                all += rows.sum(1).double()
+    parts = (off / all).split([value.numel() for value in plain.values()])
+    return {name: part.reshape(value.shape) for (name, value), part in zip(plain.items(), parts, strict=True)}
+
+
+def _derivatives(
+    objective: Objective, plain: Mapping[str, Tensor], step: int
+) -> Iterator[tuple[str, list[int], Tensor, list[Tensor]]]:
+    """Of views of one kind, a channel's name, their places, it (B, H, W, c), and its derivatives (n, H, W, c) by all numbers.
+    Raises TypeError where something has no forward mode."""
+    options = objective.options
     try:
         (scene, cameras), tangents = _tangents(objective, plain)
-        total = torch.zeros(n, n, dtype=torch.float64)
-        picks, options = objective.picks(step), objective.options
-        for group in objective.groups(picks):
+        for group in objective.groups(objective.picks(step)):
             aovs = objective.views[group[0]].aovs
             images: dict[str, list[Tensor]] = {name: [] for name in aovs}
             slopes: dict[str, list[Tensor]] = {name: [] for name in aovs}
@@ -46,15 +84,7 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
                     images[name].append(found[0][name])
                     slopes[name].append(found[1][name])
             for name in aovs if images[aovs[0]] else ():
-                render, tangents_of = torch.stack(images[name]), slopes[name]
-                if objective.regions is None:
-                    weight = weights_of(objective, name, group, render) / len(picks)
-                else:
-                    weight = objective.regions.curvature(group, render) / len(picks)
-                    tangents_of = [objective.regions.blurred(J) for J in tangents_of]
-                for w, J in zip(weight, tangents_of, strict=True):
-                    rows = J.reshape(n, -1) * w.sqrt().flatten()
-                    total += (rows @ rows.T).double()
+                yield name, group, torch.stack(images[name]), slopes[name]
     except (NotImplementedError, RuntimeError) as error:
         if "forward" not in str(error):
             raise
@@ -62,34 +92,40 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
             "method: expected a scene and cameras that PyTorch differentiates in forward mode by what is sought, as "
             f'"gauss-newton" needs, got {error}; give method="adam"'
         ) from error
-    if (regularizer := objective.regularizer) is not None:
-        total += _of_term(lambda tensors: regularizer(objective.build(tensors)[0]), plain)
-    if objective.prior is not None:
-        total += _of_term(objective.prior, plain)
-    return total
 
 
 def _tangents(objective: Objective, tensors: Mapping[str, Tensor]) -> tuple[Built, list[tuple[Tensor, Tensor]]]:
     """Scene and cameras, and the derivative (n, *shape) of each of their tensors that depends on the numbers."""
     rows: list[list[Tensor | None]] = []
-    for name, value in tensors.items():
-        for k in range(value.numel()):
-            with forward_ad.dual_level():
-                unit = torch.zeros_like(value)
-                unit.view(-1)[k] = 1.0
-                # Copies, for a dual number is made in place of what it is made of.
-                moved = {n: v.clone() for n, v in tensors.items()}
-                moved[name] = forward_ad.make_dual(moved[name], unit)
-                rows.append([forward_ad.unpack_dual(tensor).tangent for tensor in _floating(objective.build(moved))])
+    for moved in _moved(tensors, CHUNK if objective.many is not None else 1):
+        with forward_ad.dual_level():
+            duals = {name: forward_ad.make_dual(value, unit) for name, (value, unit) in moved.items()}
+            if objective.many is None:
+                found = [objective.build({name: dual[0] for name, dual in duals.items()})]
+            else:
+                found = objective.many(duals)
+            rows += [[forward_ad.unpack_dual(tensor).tangent for tensor in _floating(one)] for one in found]
     with torch.no_grad():
         scene, cameras = objective.build(tensors)
         scene, cameras = map_tensors(scene, torch.Tensor.detach), [map_tensors(c, torch.Tensor.detach) for c in cameras]
-    found = []
+    columns = []
     for tensor, column in zip(_floating((scene, cameras)), zip(*rows, strict=True), strict=True):
         if any(tangent is not None for tangent in column):
             zero = torch.zeros_like(tensor)
-            found.append((tensor, torch.stack([zero if tangent is None else tangent.detach() for tangent in column])))
-    return (scene, cameras), found
+            columns.append((tensor, torch.stack([zero if tangent is None else tangent.detach() for tangent in column])))
+    return (scene, cameras), columns
+
+
+def _moved(tensors: Mapping[str, Tensor], count: int) -> Iterator[dict[str, tuple[Tensor, Tensor]]]:
+    """For each of all numbers the values and their derivatives by it, so many numbers at a time, (count, *shape). Copies, for a
+    dual number is made in place of what it is made of."""
+    units = torch.eye(sum(value.numel() for value in tensors.values()), dtype=torch.float64)
+    for chunk in units.split(count):
+        parts = chunk.split([value.numel() for value in tensors.values()], 1)
+        yield {
+            name: (value.expand(len(chunk), *value.shape).clone(), part.reshape(-1, *value.shape).to(value))
+            for (name, value), part in zip(tensors.items(), parts, strict=True)
+        }
 
 
 def _floating(thing: Any) -> list[Tensor]:

@@ -14,12 +14,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from ...camera.camera import Camera
-from ...check import as_tensor, check_int, check_positive
+from ...check import check_int, check_positive
 from ...files.paths import PathLike, replacing
 from ...files.save import save_scene
-from ...rig.control import Control
 from ...rig.rig import Rig
-from ...rig.skinned import Skinned
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..checkpoints import Checkpoint
@@ -32,17 +30,22 @@ from ..priors import Prior, towards
 from ..views import Images, View, outlined_views, views_of
 from .building import Built
 from .fit_scene import options_of, reporter, way_of
+from .gauss_newton import GaussNewtonSteps
 from .keypoints import keypoint_term
 from .loop import Descent, descend
 from .objective import Objective, judged
 from .result import Fit
-from .rig_search import limbs, searched
+from .rig_search import Limb, Search, limbs
+from .rig_values import Sought
 
 FEW = 200  # numbers, up to which steps are those of Gauss and Newton
-TRIED = 32  # pixels on the shorter side of pictures on the level where limbs are drawn anew
+TRIED = range(24, 97)  # pixels on the shorter side of pictures on levels where limbs are drawn anew
 TRY_STEPS = 6  # of each of these
+FINER = 4  # times as many samples on the last level, where twists of limbs are told by little
+NEAR = 10.0  # what is left of the loss, in units of its noise, from which steps go far where pictures show little:
+HARDLY_SEEN = 1e-6  # of the largest curvature, beside what damps a step
 GROWTH = 3.0  # a prior's weight grows by this power of how much coarser the pictures are
-STEPS = 15
+STEPS, COARSE = 40, 15  # of the last level, and at most of each before
 ONWARD = (
     0.5  # of the last frame's motion, that the next begins with: all of it would add up errors that no picture shows
 )
@@ -63,6 +66,11 @@ class RigFit:
 
     def posed(self) -> Scene | Mesh:
         return self.rig.posed(**self.values)
+
+    @property
+    def bones(self) -> Tensor | None:
+        """See Rig.bones()."""
+        return self.rig.bones(self.values)
 
     @property
     def converged(self) -> bool:
@@ -126,10 +134,12 @@ def fit_rig(
     keypoints  by the name of a joint, where each camera sees it: (B, 2) pixels, NaN where it does not. Robust: some may be wrong
     keypoint_weight  of the mean over all of them, of squared distances in units of 2 % of the picture
     coarsest   pixels on the shorter side of the pictures of the first level; each further one has twice as many
-    tries      how often a limb is drawn anew, on the second level, to leave places where a descent ends; 0 for a start nearby
+    tries      how often at most a limb is drawn anew, on each level of some 32 to 64 pixels, to leave places where a descent
+               ends; it ends where pictures are explained. 0 for a start nearby
     look       makes of what is posed what is rendered: with lights, a background
-    options    see edgegrad.fit.Options; `steps` are those of each level. Up to 200 numbers are sought by "gauss-newton", more by
-               "adam", unless `method` says. With loss="region" photographs need no masks
+    options    see edgegrad.fit.Options; `steps` are those of the last level, at most 15 on those before, and the last has four
+               times `spp`. Up to 200 numbers are sought by "gauss-newton", more by "adam", unless `method` says. With
+               loss="region" photographs need no masks, and limbs are not drawn anew: the start must overlap what is shown
 
     The other arguments are those of fit_scene(). Raises TypeError or ValueError that names the argument.
     """
@@ -190,86 +200,6 @@ def track_rig(
         yield found
 
 
-@dataclass(frozen=True, eq=False)
-class Sought:
-    """The numbers that are sought, and all others."""
-
-    rig: Rig
-    fixed: dict[str, Tensor]  # all values at the start
-    parameters: dict[str, Parameter]
-    rows: dict[str, Tensor]  # of which rows a parameter is, where not of all
-
-    @staticmethod
-    def of(rig: Rig, seek: Sequence[str] | None, joints: Sequence[str] | None, start: Mapping[str, Any]) -> Sought:
-        """Raises TypeError or ValueError."""
-        place = {
-            "translation": torch.zeros(3, dtype=F64),
-            "orientation": torch.zeros(3, dtype=F64),
-            "scale": torch.ones((), dtype=F64),
-        }
-        known = {**{name: control.rest for name, control in rig.controls.items()}, **place}
-        skinned = isinstance(rig.deformer, Skinned)
-        if seek is None:
-            seek = [name for name in rig.controls if not skinned or name not in ("joint_translations", "joint_scales")]
-            seek += ["translation"] if skinned else [] if "angles" in rig.controls else ["translation", "orientation"]
-        for kind, names in (("seek", seek), ("start", start)):
-            for name in names:
-                if name not in known:
-                    raise ValueError(f"{kind}: expected names among {', '.join(known)}, got {name!r}")
-        fixed = {}
-        for name, rest in known.items():
-            given = start.get(name)
-            if given is None:
-                fixed[name] = rest.clone()
-            elif name in rig.controls:
-                fixed[name] = rig.clamped(**{name: given})[name].detach()
-            else:
-                fixed[name] = as_tensor(f"start[{name!r}]", given, like=rest).detach().double().reshape(rest.shape)
-        parameters, rows = {}, {}
-        for name in seek:
-            value, control = fixed[name], rig.controls.get(name, Control(known[name]))
-            low, high = control.low, control.high
-            if control.rotates and (chosen := _free(rig, name, control, joints)) is not None:
-                rows[name] = torch.tensor(chosen)
-                value, low, high = (None if x is None else x[chosen] for x in (value, low, high))
-            assert value is not None
-            parameters[name] = Parameter(_rate(rig, name, control), value.clone(), low, high).checked(name)
-        if not parameters:
-            raise ValueError("seek: expected a name or more of what is sought, got none")
-        return Sought(rig, fixed, parameters, rows)
-
-    def values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Of all that is sought, with the rows that are not; differentiable."""
-        return {
-            name: self.fixed[name].index_copy(0, self.rows[name], tensor) if name in self.rows else tensor
-            for name, tensor in tensors.items()
-        }
-
-    def all(self, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-        """As posed() takes them."""
-        return {**self.fixed, **self.values(tensors)}
-
-
-def _free(rig: Rig, name: str, control: Control, joints: Sequence[str] | None) -> list[int] | None:
-    if joints is not None:
-        return sorted(control.row(name, joint) for joint in joints)
-    if isinstance(rig.deformer, Skinned):
-        return sorted({int(j) for skin in rig.deformer.skins for j in skin.joints})
-    return None
-
-
-def _rate(rig: Rig, name: str, control: Control) -> float:
-    """Of a step, in the value's own units."""
-    if control.rotates or name in ("orientation", "angles"):
-        return 0.03
-    if name in ("translation", "joint_translations"):
-        return 0.01 * rig.size
-    if control.low is not None and control.high is not None:
-        span = float((control.high - control.low).max())
-        return 0.05 * span if 0.0 < span < float("inf") else 0.05
-    return 0.05
-
-
 class _Search:
     """The levels of one fit."""
 
@@ -284,7 +214,7 @@ class _Search:
         while sizes[-1] * 1.4 < full:
             sizes.append(2 * sizes[-1])
         self.factors = [size / full for size in sizes[:-1]] + [1.0]
-        self.tried = min(range(len(sizes)), key=lambda k: abs(sizes[k] - TRIED))
+        self.tried = [k for k, size in enumerate(sizes) if size in TRIED] or [0]
 
     @torch.inference_mode(False)
     @torch.enable_grad()
@@ -318,15 +248,18 @@ class _Search:
         return RigFit(self.rig, {name: value.detach() for name, value in self.sought.all(values).items()}, fit)
 
     def build(self, views: Sequence[View]) -> Callable[[Mapping[str, Tensor]], Built]:
+        return lambda tensors: self._scene(self.rig.posed(**self.sought.all(tensors)), views)
+
+    def many(self, views: Sequence[View]) -> Callable[[Mapping[str, Tensor]], list[Built]]:
+        """The same of a batch of values."""
+        return lambda tensors: [self._scene(posed, views) for posed in self.rig.posed(**self.sought.all(tensors))]
+
+    def _scene(self, posed: Scene | Mesh, views: Sequence[View]) -> Built:
+        posed = self.look(posed)
+        scene = Scene([posed]) if isinstance(posed, Mesh) else posed
         masked = any(view.mask is not None for view in views)
-
-        def built(tensors: Mapping[str, Tensor]) -> Built:
-            posed = self.look(self.rig.posed(**self.sought.all(tensors)))
-            scene = Scene([posed]) if isinstance(posed, Mesh) else posed
-            scene = scene.replace(background=None) if masked and scene.background is not None else scene
-            return scene, [view.camera for view in views]
-
-        return built
+        scene = scene.replace(background=None) if masked and scene.background is not None else scene
+        return scene, [view.camera for view in views]
 
     def descend(
         self, values: Mapping[str, Tensor], level: int, save: Callable[[dict[str, Any]], None], saved: dict[str, Any] | None,
@@ -345,14 +278,19 @@ class _Search:
             return total if self.points is None else total + self.points(self.sought.all(tensors))
 
         build = self.build(views)
-        options = dataclasses.replace(self.options, spp=max(self.options.spp, 16) if factor < 0.3 else self.options.spp)
-        objective = Objective(build, views, options, prior=prior)
+        spp = max(self.options.spp, 16) if factor < 0.4 else self.options.spp
+        coarse = level < len(self.factors) - 1 and self.options.method == "gauss-newton" and self.options.loss != REGION
+        steps = min(self.options.steps, COARSE) if coarse else self.options.steps
+        fine = level == len(self.factors) - 1
+        spp = FINER * spp if fine else spp
+        options = dataclasses.replace(self.options, spp=spp, steps=steps)
+        objective = Objective(build, views, options, prior=prior, many=self.many(views))
         if fresh and level == 0:
             objective.check(values)
-        found = self._steps(objective, values, options, save, saved, f"level {level + 1} of {len(self.factors)}")
+        found = self._steps(objective, values, options, save, saved, f"level {level + 1} of {len(self.factors)}", fine)
         name = next((n for n in ("rotations", "angles") if n in values and self.rig.deformer.parents), None)
         if (
-            level == self.tried
+            level in self.tried
             and self.tries
             and name is not None
             and saved is None
@@ -364,28 +302,41 @@ class _Search:
     def _searched(
         self, objective: Objective, values: Mapping[str, Tensor], options: Options, name: str
     ) -> dict[str, Tensor]:
-        few = dataclasses.replace(options, steps=TRY_STEPS, progress=False, callback=None)
+        few = dataclasses.replace(options, steps=TRY_STEPS, tolerance=0.0, progress=False, callback=None)
+        control, rows = self.rig.controls[name], self.sought.rows.get(name, torch.arange(len(values[name])))
         if name == "rotations":
-            rows = self.sought.rows.get(name, torch.arange(len(values[name]))).tolist()
-            groups = limbs(self.rig, rows)
+            groups = limbs(self.rig, rows.tolist())
         else:
-            groups = [list(range(k, len(values[name]))) for k in range(len(values[name]))]
+            groups = [Limb(list(range(k, len(values[name])))) for k in range(len(values[name]))]
+
+        def steps(objective: Objective, parameters: Mapping[str, Parameter]) -> dict[str, Tensor]:
+            return descend(way_of(parameters, few), objective, lambda state: None).values
+
         bar = tqdm(total=self.tries, desc="limbs drawn anew", disable=not options.progress, leave=False)
         try:
-            return searched(
-                objective, dict(values), name, groups, self.tries, options.seed, self.sought.parameters[name].within,
-                lambda at: self._steps(objective, at, few, lambda state: None, None, "").values, bar.update,
-            )  # fmt: skip
+            search = Search(
+                objective, name, groups, self.sought.parameters, control.rest[rows], steps, options.seed, bar.update
+            )
+            return search.run(dict(values), self.tries)
         finally:
             bar.close()
 
     def _steps(
         self, objective: Objective, values: Mapping[str, Tensor], options: Options, save: Callable[[dict[str, Any]], None],
-        saved: dict[str, Any] | None, title: str,
+        saved: dict[str, Any] | None, title: str, fine: bool,
     ) -> Descent:  # fmt: skip
         parameters = {
             name: dataclasses.replace(p, value=p.within(values[name])) for name, p in self.sought.parameters.items()
         }
+        way = way_of(parameters, options)
+        near = objective.regions is None and fine and objective.left(values) < NEAR
+        if isinstance(way, GaussNewtonSteps) and near:
+            way.unseen = HARDLY_SEEN
         return descend(
-            way_of(parameters, options), objective, save, saved, title, reporter(objective.build, objective.views)
-        )
+            way, objective, save, saved, title,
+            reporter(objective.build, objective.views, bones=self.bones),
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def bones(self, tensors: Mapping[str, Tensor]) -> Tensor | None:
+        return self.rig.bones(self.sought.all(tensors))

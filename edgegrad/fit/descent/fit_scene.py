@@ -34,6 +34,12 @@ class Progress(Record):
     views: list[View]  # what is compared; on coarse levels of fit_shape at fewer pixels
     _values: Values
     _build: Build
+    _bones: Callable[[Values], Tensor | None] | None
+
+    @property
+    def bones(self) -> Tensor | None:
+        """(K, 2, 3) ends of the bones of what bends, of the moment as the scene; None of other fits."""
+        return None if self._bones is None else self._bones(self._values)
 
     @property
     def scene(self) -> Scene:
@@ -50,13 +56,14 @@ class Progress(Record):
 
 
 def reporter(
-    build: Build, views: list[View], coordinates: Coordinates | None = None
-) -> Callable[[Record, Values], Progress]:
+    build: Build, views: list[View], coordinates: Coordinates | None = None,
+    bones: Callable[[Values], Tensor | None] | None = None,
+) -> Callable[[Record, Values], Progress]:  # fmt: skip
     """What makes a Progress of a step."""
 
     def progress(record: Record, values: Values) -> Progress:
         made = Progress(*(record if coordinates is None else coordinates.recorded(record)))
-        made.views, made._values, made._build = views, values, build
+        made.views, made._values, made._build, made._bones = views, values, build, bones
         return made
 
     return progress

@@ -58,6 +58,7 @@ class GaussNewtonSteps(Way):
                 for name, value in self.values.items()
             ]
         )
+        self.unseen = UNSEEN
         self.losses: list[float] = []  # of the last accepted point, as they are compared
         self.noise = 0.0  # variance of their mean difference
         self.damping, self.raised = FAR_DAMPING if options.loss == REGION else FIRST_DAMPING, RAISED
@@ -149,7 +150,7 @@ class GaussNewtonSteps(Way):
     def _solved(self, free: Tensor) -> Tensor:
         """With the others at rest."""
         diagonal = self.H.diagonal()
-        A = self.H + torch.diag(self.damping * diagonal + UNSEEN * diagonal.max() + 1e-300)
+        A = self.H + torch.diag(self.damping * diagonal + self.unseen * diagonal.max() + 1e-300)
         step = torch.zeros_like(self.slope)
         step[free] = -torch.linalg.solve(A[free][:, free], self.slope[free])
         return step * min(1.0, LONGEST / max(float(step.abs().max()), 1e-300)) * self.rates

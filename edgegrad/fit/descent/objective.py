@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import torch
@@ -30,8 +31,11 @@ class Objective:
     def __init__(
         self, build: Callable[[Mapping[str, Tensor]], Built], views: list[View], options: Options,
         regularizer: Callable[[Scene], Tensor] | None = None, prior: Callable[[Mapping[str, Tensor]], Tensor] | None = None,
+        many: Callable[[Mapping[str, Tensor]], Sequence[Built]] | None = None,
     ) -> None:  # fmt: skip
-        """`regularizer` of the scene and `prior` of the tensors are added to the loss."""
+        """`regularizer` of the scene and `prior` of the tensors are added to the loss. `many` is `build` for a batch of values,
+        where that is faster."""
+        self.many = many
         self.build, self.views, self.options, self.regularizer, self.prior = build, views, options, regularizer, prior
         self.losses = {"alpha": loss_of("mask_loss", options.mask_loss)}
         self.regions = Regions(views, options.seed) if options.loss == REGION else None
@@ -40,6 +44,12 @@ class Objective:
 
     def __call__(self, tensors: Mapping[str, Tensor], step: int) -> Tensor:
         scene, cameras = self.build(tensors)
+        total = self.of_pictures(scene, cameras, step)
+        total = total if self.regularizer is None else total + self.regularizer(scene)
+        return total if self.prior is None else total + self.prior(tensors)
+
+    def of_pictures(self, scene: Scene, cameras: list[Camera], step: int) -> Tensor:
+        """The loss without what is added."""
         picks = self.picks(step)
         total = torch.zeros((), dtype=torch.float64)
         for group, renders in self.renders(scene, cameras, picks, self.options.spp, self.seed(step)):
@@ -50,8 +60,29 @@ class Objective:
                 total = total + self.of_group(name, group, renders[name]) / len(picks)
             for name in first.measured:
                 total = total + self.of_measured(name, group, renders) / len(picks)
-        total = total if self.regularizer is None else total + self.regularizer(scene)
-        return total if self.prior is None else total + self.prior(tensors)
+        return total
+
+    def left(self, tensors: Mapping[str, Tensor]) -> float:
+        """The loss of pictures and masks, in units of what it is by the noise of the render's samples alone."""
+        (scene, cameras), every = self.build(tensors), list(range(len(self.views)))
+        loss = noise = 0.0
+        pairs = zip(*(self.renders(scene, cameras, every, self.options.spp, self.seed(k)) for k in (0, 1)), strict=True)
+        for (group, first), (_, second) in pairs:
+            for name in self.views[group[0]].wanted:
+                weights = [self.views[i].weights[name] for i in group]
+                weight = None if weights[0] is None else _stacked(weights)
+                noise += 0.5 * len(group) * float(self.losses[name](first[name], second[name], weight))
+                loss += 0.5 * sum(float(self.of_group(name, group, one[name])) for one in (first, second))
+        return loss / max(noise, 1e-30)
+
+    def of(self, whole: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]) -> Objective:
+        """As a function of fewer tensors, of which `whole` makes all."""
+        build, prior, many = self.build, self.prior, self.many
+        found = copy.copy(self)
+        found.build = lambda tensors: build(whole(tensors))
+        found.prior = None if prior is None else lambda tensors: prior(whole(tensors))
+        found.many = None if many is None else lambda tensors: many(whole(tensors))
+        return found
 
     def renews(self, step: int) -> bool:
         """Whether a step begins with renew()."""

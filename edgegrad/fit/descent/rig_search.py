@@ -1,30 +1,49 @@
 """Poses of a rig that a descent from the start does not reach: limbs drawn anew, where that lowers the loss.
 
-Silhouettes say little of which limb they show, so that a descent ends where one of them lies in the place of another. Some limb,
-a joint and all below it, is turned at random, so often that one of the turns is not far off; the best of them is the start of a
-few steps, and the result is kept if its loss is lower.
+Silhouettes say little of which limb they show, so that a descent ends where one of them lies in the place of another. Limbs, a
+joint and all below it, are turned at random, most often those about which pixels are off; the best of many turns go down a few
+steps by the limb's own numbers, which is cheap, then by all, and the result is kept where the loss is lower than before. The
+search ends where what is left of the loss is the noise of its samples.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ...rig.rig import Rig
+from ..options import Parameter
+from .curvature import misfit
 from .objective import Objective
 
-DRAWS = 12  # turns of a limb that are looked at
+DRAWS = 32  # turns of a limb that are looked at
 SPREAD = 0.4  # radians, of each component
 SHARE = 0.4  # of all rows: a joint with more below it is turned alone
+EXPLAINED = 1.5  # of the loss by noise alone: less is not to be mended
+APART = 0.3  # radians of a joint at least, by which a turn is another place
+STARTS = 2  # of the turns, that go down
+WORSE = 2.0  # times the least loss, from which no way down is tried
+LEAST = 0.05  # of the largest chance of a limb to be drawn
+SEEDS = 0, 1  # by which losses are compared
 Values = dict[str, Tensor]
 
 
-def limbs(rig: Rig, rows: Sequence[int]) -> list[list[int]]:
-    """Of the joints `rows`, each with those below it, as places in `rows`."""
-    parents, found = rig.deformer.parents, []
+@dataclass(frozen=True)
+class Limb:
+    """Rows that are drawn together."""
+
+    rows: list[int]
+    twins: tuple[list[int], list[int]] | None = None  # where they are two limbs of one build: their rows
+
+
+def limbs(rig: Rig, rows: Sequence[int]) -> list[Limb]:
+    """Of the joints `rows`, each with those below it, as places in `rows`; and pairs that hang on one joint, as two legs do."""
+    parents, whole, found = rig.deformer.parents, {}, []
     for row in rows:
         group = []
         for place, other in enumerate(rows):
@@ -33,31 +52,96 @@ def limbs(rig: Rig, rows: Sequence[int]) -> list[list[int]]:
                 at = parents[at]
             if at == row:
                 group.append(place)
-        found.append(group if len(group) <= max(1.0, SHARE * len(rows)) else [list(rows).index(row)])
+        if len(group) <= max(1.0, SHARE * len(rows)):
+            whole[row] = group
+        found.append(Limb(whole.get(row, [list(rows).index(row)])))
+    for a, b in itertools.combinations(whole, 2):
+        if parents[a] == parents[b] and len(whole[a]) == len(whole[b]) > 1:
+            found.append(Limb([*whole[a], *whole[b]], (whole[a], whole[b])))
     return found
 
 
-def searched(
-    objective: Objective, values: Values, name: str, groups: Sequence[Sequence[int]], tries: int, seed: int,
-    within: Callable[[Tensor], Tensor], steps: Callable[[Values], Values], tell: Callable[[], Any],
-) -> Values:  # fmt: skip
-    """The best values of so many tries at groups of rows of one of them; `steps` goes down from a start."""
-    generator = torch.Generator().manual_seed(seed)
+@dataclass
+class Search:
+    """At groups of rows of one of the values.
 
-    def loss(at: Values, seeds: Sequence[int]) -> float:
+    steps  goes down from the values of parameters, of an objective
+    """
+
+    objective: Objective
+    name: str
+    groups: Sequence[Limb]
+    parameters: Mapping[str, Parameter]
+    rest: Tensor
+    steps: Callable[[Objective, Mapping[str, Parameter]], Values]
+    seed: int
+    tell: Callable[[], Any] = lambda: None
+    generator: torch.Generator = field(init=False)
+
+    def run(self, values: Values, tries: int) -> Values:
+        """The best values of so many tries."""
+        self.generator = torch.Generator().manual_seed(self.seed)
+        best, least, chances = values, self.loss(values), self.chances(values)
+        for _ in range(tries):
+            if self.explained(best):
+                break
+            limb = self.groups[int(torch.multinomial(chances, 1, generator=self.generator))]
+            found = min((self.alone(start, limb) for start in self.drawn(best, limb)), key=self.loss, default=None)
+            # What lies in the limb's true place must often leave it before the loss is lower.
+            if found is not None and self.loss(found) < WORSE * least:
+                found = self.steps(self.objective, self.started(found))
+                if (now := self.loss(found)) < least:
+                    best, least, chances = found, now, self.chances(found)
+            self.tell()
+        return best
+
+    def chances(self, values: Values) -> Tensor:
+        """Of each limb, by how far pixels are from their pictures where it moves them."""
+        by_row = misfit(self.objective, values, 0)[self.name]
+        by_row = by_row.reshape(len(by_row), -1).mean(1)
+        found = torch.stack([by_row[limb.rows].mean() for limb in self.groups]).square()
+        return found + LEAST * found.max() + 1e-300
+
+    def drawn(self, values: Values, limb: Limb) -> list[Values]:
+        """With a limb turned at random: the best of many turns that are not about where it is."""
+        now, low = values[self.name], []
+        for k in range(DRAWS):
+            turned = now.clone()
+            if limb.twins is not None and k % 2:
+                one, other = limb.twins
+                turned[[*one, *other]] = turned[[*other, *one]]
+            # Half of them from rest, half from where it is; some turn the first joint alone.
+            chosen = limb.rows[: 1 if k % 4 > 1 else None]
+            middle = turned[chosen] if k % 8 < 4 else self.rest[chosen].to(turned)
+            turned[chosen] = middle + SPREAD * torch.randn(middle.shape, generator=self.generator, dtype=turned.dtype)
+            start = {**values, self.name: self.parameters[self.name].within(turned)}
+            if float((start[self.name] - now)[limb.rows].reshape(len(limb.rows), -1).norm(dim=1).max()) > APART:
+                low.append((self.loss(start, SEEDS[:1]), k, start))
+        return [start for _, _, start in sorted(low)[:STARTS]]
+
+    def alone(self, start: Values, limb: Limb) -> Values:
+        """A limb's way down from there, by its own numbers."""
+        place, parameter = torch.tensor(limb.rows), self.parameters[self.name]
+
+        def whole(own: Mapping[str, Tensor]) -> Values:
+            value, part = start[self.name], own[self.name]
+            at = part.dim() - value.dim()
+            return {
+                **start,
+                self.name: value.expand(*part.shape[:at], *value.shape).index_copy(at, place, part),
+            }
+
+        low, high = (None if b is None else torch.as_tensor(b)[place] for b in (parameter.low, parameter.high))
+        own = Parameter(parameter.lr, start[self.name][place], low, high)
+        return whole(self.steps(self.objective.of(whole), {self.name: own}))
+
+    def loss(self, values: Values, seeds: Sequence[int] = SEEDS) -> float:
         with torch.no_grad():
-            return sum(float(objective(at, k)) for k in seeds) / len(seeds)
+            return sum(float(self.objective(values, k)) for k in seeds) / len(seeds)
 
-    best, least = values, loss(values, (0, 1))
-    for _ in range(tries):
-        rows = list(groups[int(torch.randint(len(groups), (), generator=generator))])
-        drawn = []
-        for _draw in range(DRAWS):
-            turned = best[name].clone()
-            turned[rows] = SPREAD * torch.randn(turned[rows].shape, generator=generator, dtype=turned.dtype)
-            drawn.append({**best, name: within(turned)})
-        found = steps(min(drawn, key=lambda one: loss(one, (0,))))
-        if (now := loss(found, (0, 1))) < least:
-            best, least = found, now
-        tell()
-    return best
+    def explained(self, values: Values) -> bool:
+        with torch.no_grad():
+            return self.objective.left(values) < EXPLAINED
+
+    def started(self, values: Values) -> dict[str, Parameter]:
+        return {n: Parameter(p.lr, p.within(values[n]), p.low, p.high) for n, p in self.parameters.items()}

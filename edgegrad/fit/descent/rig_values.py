@@ -1,0 +1,100 @@
+"""The numbers that a fit of a rig seeks, of all that the rig has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ...check import as_tensor
+from ...rig.control import Control
+from ...rig.rig import Rig
+from ...rig.skinned import Skinned
+from ..options import Parameter
+
+F64 = torch.float64
+
+
+@dataclass(frozen=True, eq=False)
+class Sought:
+    """The numbers that are sought, and all others."""
+
+    rig: Rig
+    fixed: dict[str, Tensor]  # all values at the start
+    parameters: dict[str, Parameter]
+    rows: dict[str, Tensor]  # of which rows a parameter is, where not of all
+
+    @staticmethod
+    def of(rig: Rig, seek: Sequence[str] | None, joints: Sequence[str] | None, start: Mapping[str, Any]) -> Sought:
+        """Raises TypeError or ValueError."""
+        place = {
+            "translation": torch.zeros(3, dtype=F64),
+            "orientation": torch.zeros(3, dtype=F64),
+            "scale": torch.ones((), dtype=F64),
+        }
+        known = {**{name: control.rest for name, control in rig.controls.items()}, **place}
+        skinned = isinstance(rig.deformer, Skinned)
+        if seek is None:
+            seek = [name for name in rig.controls if not skinned or name not in ("joint_translations", "joint_scales")]
+            seek += ["translation"] if skinned else [] if "angles" in rig.controls else ["translation", "orientation"]
+        for kind, names in (("seek", seek), ("start", start)):
+            for name in names:
+                if name not in known:
+                    raise ValueError(f"{kind}: expected names among {', '.join(known)}, got {name!r}")
+        fixed = {}
+        for name, rest in known.items():
+            given = start.get(name)
+            if given is None:
+                fixed[name] = rest.clone()
+            elif name in rig.controls:
+                fixed[name] = rig.clamped(**{name: given})[name].detach()
+            else:
+                fixed[name] = as_tensor(f"start[{name!r}]", given, like=rest).detach().double().reshape(rest.shape)
+        parameters, rows = {}, {}
+        for name in seek:
+            value, control = fixed[name], rig.controls.get(name, Control(known[name]))
+            low, high = control.low, control.high
+            if control.rotates and (chosen := _free(rig, name, control, joints)) is not None:
+                rows[name] = torch.tensor(chosen)
+                value, low, high = (None if x is None else x[chosen] for x in (value, low, high))
+            assert value is not None
+            parameters[name] = Parameter(_rate(rig, name, control), value.clone(), low, high).checked(name)
+        if not parameters:
+            raise ValueError("seek: expected a name or more of what is sought, got none")
+        return Sought(rig, fixed, parameters, rows)
+
+    def values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Of all that is sought, with the rows that are not; differentiable. Of one or of a batch."""
+        return {name: self._whole(name, tensor) if name in self.rows else tensor for name, tensor in tensors.items()}
+
+    def _whole(self, name: str, tensor: Tensor) -> Tensor:
+        fixed = self.fixed[name]
+        at = tensor.dim() - fixed.dim()
+        return fixed.expand(*tensor.shape[:at], *fixed.shape).index_copy(at, self.rows[name], tensor)
+
+    def all(self, tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+        """As posed() takes them."""
+        return {**self.fixed, **self.values(tensors)}
+
+
+def _free(rig: Rig, name: str, control: Control, joints: Sequence[str] | None) -> list[int] | None:
+    if joints is not None:
+        return sorted(control.row(name, joint) for joint in joints)
+    if isinstance(rig.deformer, Skinned):
+        return sorted({int(j) for skin in rig.deformer.skins for j in skin.joints})
+    return None
+
+
+def _rate(rig: Rig, name: str, control: Control) -> float:
+    """Of a step, in the value's own units."""
+    if control.rotates or name in ("orientation", "angles"):
+        return 0.03
+    if name in ("translation", "joint_translations"):
+        return 0.01 * rig.size
+    if control.low is not None and control.high is not None:
+        span = float((control.high - control.low).max())
+        return 0.05 * span if 0.0 < span < float("inf") else 0.05
+    return 0.05
