@@ -123,7 +123,6 @@ def test_a_material_under_a_known_sky() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_a_pose_of_a_body_from_masks() -> None:
     """From where a descent alone ends with a leg in the other's place."""
     body = example("body")
@@ -133,6 +132,7 @@ def test_a_pose_of_a_body_from_masks() -> None:
     assert direction.median() < 0.3 and direction.quantile(0.9) < 1.0
 
 
+@pytest.mark.slow
 def test_a_camera_from_masks_of_a_robot(tmp_path: Path) -> None:
     pytest.importorskip("yourdfpy")
     pytest.importorskip("pytorch_kinematics")
