@@ -123,6 +123,16 @@ def test_a_material_under_a_known_sky() -> None:
 
 
 @pytest.mark.slow
+def test_a_pose_of_a_body_from_masks() -> None:
+    """From where a descent alone ends with a leg in the other's place."""
+    body = example("body")
+    rig, truth, _, fit = body.trial(0, progress=False)
+    rotation, direction = body.Errors.of(rig, fit.values["rotations"], truth)
+    assert fit.converged and rotation.median() < 1.0 and rotation.quantile(0.9) < 3.0
+    assert direction.median() < 0.3 and direction.quantile(0.9) < 1.0
+
+
+@pytest.mark.slow
 def test_a_camera_from_masks_of_a_robot(tmp_path: Path) -> None:
     pytest.importorskip("yourdfpy")
     pytest.importorskip("pytorch_kinematics")

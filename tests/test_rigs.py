@@ -300,3 +300,54 @@ def test_bad_arguments() -> None:
     ):  # fmt: skip
         with pytest.raises(error, match=message):
             call()
+
+
+# -- several bodies ---------------------------------------------------------------------------------------------------
+
+
+def two_bars() -> eg.Rig:
+    """One rig of two bodies: coloured bars on joints of their own, the second across the first."""
+    from test_fit_rig import arm
+
+    one, skin = arm(), arm().deformer.skins[0]
+    meshes = [
+        one.scene.replace(colors=torch.tensor(c).expand(len(one.scene.verts), 3))
+        for c in ([0.9, 0.2, 0.1], [0.1, 0.6, 0.9])
+    ]
+    joints = eg.Joints(
+        ["a0", "a1", "b0", "b1"], [-1, 0, -1, 2],
+        torch.tensor([[0.0, 0, 0], [0, 1, 0], [0.75, 0.3, 0.35], [0, 1, 0]]),
+        torch.tensor([[0.0, 0, 0], [0, 0, 0], [0, 0, 0.9], [0, 0, 0]]),
+    )  # fmt: skip
+    inverse = torch.linalg.inv(one.joints.world())
+    skins = [eg.Skin(torch.tensor(rows), inverse, skin.weights) for rows in ([0, 1], [2, 3])]
+    return eg.Rig.from_arrays(eg.Scene(meshes), joints, skins)
+
+
+@pytest.mark.parametrize("depth", [0.0, -0.35], ids=["in front", "through"])
+def test_gradients_of_bodies_that_occlude_each_other(depth: float) -> None:
+    """Of an image's loss by the joints of both, by finite differences; depth 0: one is before the other, −0.35: within it."""
+    rig = two_bars()
+    camera = eg.Camera.look_at((0.8, 1.0, 5.0), (0, 1, 0), up=(0, 1, 0), fov_y=30, size=(32, 32))
+    at = rig.joints.translations.clone()
+    at[2, 2] += depth
+    coarse = torch.rand(1, 3, 4, 4, generator=torch.Generator().manual_seed(4))
+    # Smooth, so that differences over part of a pixel are derivatives.
+    weight = torch.nn.functional.interpolate(coarse, size=(32, 32), mode="bicubic")[0].movedim(0, -1)
+
+    def loss(angles: torch.Tensor, spp: int, seed: int, **samples: int) -> torch.Tensor:
+        rotations = torch.nn.functional.pad(angles[:, None], (2, 0)) + torch.nn.functional.pad(
+            0.4 * angles[:, None], (0, 2)
+        )
+        scene = rig.posed(rotations, joint_translations=at)
+        return (eg.render(scene, camera, spp=spp, seed=seed, **samples) * weight).sum().double()
+
+    angles = torch.tensor([0.1, -0.3, 0.15, 0.2], dtype=torch.float64, requires_grad=True)
+    samples = {"surface_samples": 400_000, "edge_samples": 400_000}
+    (found,) = torch.autograd.grad(loss(angles, 4, 1, **samples), angles)
+    h = 0.02
+    with torch.no_grad():
+        steps = torch.eye(4, dtype=torch.float64) * h
+        expected = torch.stack([(loss(angles + s, 2048, 2) - loss(angles - s, 2048, 2)) / (2 * h) for s in steps])
+    assert (found - expected).norm() < 0.02 * expected.norm()
+    assert not (1.05 * found - expected).norm() < 0.02 * expected.norm()
