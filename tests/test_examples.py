@@ -147,6 +147,7 @@ def test_a_camera_from_masks_of_a_robot(tmp_path: Path) -> None:
 def test_there_is_no_other() -> None:
     assert sorted(path.stem for path in FOLDER.glob("*.py")) == [
         "arm",
+        "body",
         "corner",
         "figure",
         "focal",

@@ -39,8 +39,8 @@ def committed(name: str) -> NotebookNode:
     return nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
 
 
-def test_there_are_ten_pairs() -> None:
-    assert sorted(int(name.partition("_")[0]) for name in NAMES) == list(range(1, 11))
+def test_there_are_eleven_pairs() -> None:
+    assert sorted(int(name.partition("_")[0]) for name in NAMES) == list(range(1, 12))
     assert sorted(path.stem for path in FOLDER.glob("*.ipynb")) == NAMES
 
 
