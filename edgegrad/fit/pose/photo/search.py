@@ -25,6 +25,7 @@ from .level import PhotoLevel, photo_levels
 from .nearby import comparable, nearby, turns
 
 ENOUGH = 0.65  # share of the render's edges: wrong poses reach 0.57, right ones 0.83 and more
+DOUBTFUL = 0.75  # the same, of objects with colours: of twenty poses a wrong one reached 0.73, right ones 0.79 and more
 # The same of a contour alone: wrong places in clutter reach 0.81, right ones show 0.87 and more.
 ALONE_ENOUGH = 0.85
 SURE = 0.85  # the same, where a picture before an even background shows less than enough of the edges of colours as they are
@@ -143,7 +144,7 @@ class PhotoSearch:
             self._take(best)
         if self.further and best.explained < self.enough:
             best = self._from_covers(best, begins)
-        if self.further and best.explained < self.enough and comparable(self.task, self.start):
+        if self.further and best.explained < max(self.enough, DOUBTFUL) and comparable(self.task, self.start):
             best = self._from_nearby(best, begins)
         if self.further and best.explained < self.enough:
             best = self._from_aside(best, begins)
