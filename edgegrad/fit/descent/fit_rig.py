@@ -17,7 +17,9 @@ from ...camera.camera import Camera
 from ...check import check_int, check_positive
 from ...files.paths import PathLike, replacing
 from ...files.save import save_scene
+from ...rig.function import OfFunction
 from ...rig.rig import Rig
+from ...rig.rotations import roma
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..checkpoints import Checkpoint
@@ -251,8 +253,16 @@ class _Search:
         return lambda tensors: self._scene(self.rig.posed(**self.sought.all(tensors)), views)
 
     def many(self, views: Sequence[View]) -> Callable[[Mapping[str, Tensor]], list[Built]]:
-        """The same of a batch of values."""
-        return lambda tensors: [self._scene(posed, views) for posed in self.rig.posed(**self.sought.all(tensors))]
+        """The same of a batch of values. Rotations become matrices first, for a batch of three rotation vectors of three joints
+        has the shape of three matrices."""
+
+        def built(tensors: Mapping[str, Tensor]) -> list[Built]:
+            values = dict(self.sought.all(tensors))
+            if "rotations" in values and not isinstance(self.rig.deformer, OfFunction):
+                values["rotations"] = roma().rotvec_to_rotmat(values["rotations"])
+            return [self._scene(posed, views) for posed in self.rig.posed(**values)]
+
+        return built
 
     def _scene(self, posed: Scene | Mesh, views: Sequence[View]) -> Built:
         posed = self.look(posed)
