@@ -108,7 +108,6 @@ def test_keypoints_find_what_masks_do_not() -> None:
     assert (found.rig.shape({"rotations": found.values["rotations"]}).joints - joints).norm(dim=1).max() < 0.1
 
 
-@pytest.mark.slow
 def test_a_limb_that_is_drawn_anew() -> None:
     """From where a descent alone does not lead: the limb is bent to the other side."""
     rig, cameras = arm(3), views(count=2)
