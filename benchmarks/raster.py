@@ -6,18 +6,20 @@ The scene is a textured sphere of 20,480 faces, seen by 8 cameras at 512², with
 turns. render_batch has 32 spheres of 1,280 faces at 64²: plain ones take one thread each, beside the calling one, lit ones come
 one by one.
 
-Two threads against one, also by turns: by the clock, as the least of all rounds, which on a machine with other work says more
-about that than about threads; and by processor time, that of one thread over what the busier of two has, which does not count
-the time that threads wait for a processor, or for each other.
+Two threads against one, also by turns: by the clock, as the least of all rounds, to be compared on a machine with other work
+with what hashing gains there, which shares perfectly; and by processor time, that of one thread over what the busier of two
+has, which does not count the time that threads wait for a processor, or for each other.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
 import statistics
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import torch
@@ -87,6 +89,18 @@ def batch(lit: bool) -> Callable[[], None]:
     return step
 
 
+def hashing(blocks: int = 300) -> None:
+    """Work that threads share perfectly."""
+    block, threads = bytes(1 << 20), torch.get_num_threads()
+
+    def part(_: int) -> None:
+        for _ in range(blocks // threads):
+            hashlib.sha256(block).digest()  # without the interpreter's lock
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(part, range(threads)))
+
+
 class Times(NamedTuple):
     """Seconds."""
 
@@ -130,14 +144,15 @@ if __name__ == "__main__":
             "render(spp=1)": step.rendered,
             "render_batch": batch(lit=False),
             "render_batch, lit": batch(lit=True),
+            "hashing": hashing,
         },
         rounds,
     )
     for name, (one, two) in ((name, times.values()) for name, times in found.items()):
         clock = min(t.wall for t in one) / min(t.wall for t in two)
-        # In a plain batch two threads beside the calling one work while it reads scenes.
-        workers = 2 if name == "render_batch" else 1
-        busier = [max(t.own, (t.whole - t.own) / workers) for t in two]
+        # Beside a calling thread that reads scenes, or waits, work two others: three share two processors.
+        three = name in ("render_batch", "hashing")
+        busier = [max(t.own, t.whole / 2 if three else t.whole - t.own) for t in two]
         gain = middle(t.whole / longest for t, longest in zip(one, busier, strict=True))
         print(
             f"{name:17s} {1e3 * middle(t.whole for t in one):5.0f} ms of processor time with 1 thread, "
