@@ -242,6 +242,7 @@ LitPoints PointArrays::view(const LitScene& scene, int64_t faces) const {
 
 void bind_lit_arrays(nb::module_& m) {
     m.attr("MOST_LIT_CHANNELS") = most_lit_channels;
+    m.attr("FAINTEST_NORMAL") = faintest_normal;
     m.attr("MOST_BOUNCES") = most_bounces;
     m.attr("MOST_LAMP_FACES") = LampTree::most_faces;
     nb::class_<SourceArrays>(m, "LitSource")
