@@ -39,7 +39,7 @@ def squirrel(folder: Path) -> Case:
 def gelatin_box(folder: Path, with_depth: bool) -> Case:
     place = folder / "gelatin_box"
     known = _json(place / "reference.json")["009_gelatin_box"]
-    mesh = _textured(place / "009_gelatin_box_textured.gltf", place / "009_gelatin_box_tex1024.png")
+    mesh = textured(place / "009_gelatin_box_textured.gltf", place / "009_gelatin_box_tex1024.png")
     truth = _placed(known["cam_R_mesh"], known["cam_t_mesh_m"])
     depth = _integers(place / "000001-depth.png") / 10000.0 if with_depth else None
     return _case("gelatin box", mesh, place / "000001-color.png", known["K"], truth, depth)
@@ -49,7 +49,7 @@ def cracker_box(folder: Path) -> Case:
     """`truth` is the start that comes with it."""
     place = folder / "cracker_box"
     known = _json(place / "reference.json")
-    mesh = _textured(place / "003_cracker_box_textured.gltf", place / "003_cracker_box_tex1024.png")
+    mesh = textured(place / "003_cracker_box_textured.gltf", place / "003_cracker_box_tex1024.png")
     R, t = torch.tensor(known["cam_R_bop"]).double(), torch.tensor(known["cam_t_bop_m"]).double()
     inner, shift = torch.tensor(known["gltf_to_bop_R"]).double(), torch.tensor(known["gltf_to_bop_t_m"]).double()
     return _case("cracker box", mesh, place / "image_rgb.png", known["K"], Placed(R @ inner, R @ shift + t))
@@ -105,7 +105,8 @@ def _case(name: str, mesh: eg.Mesh, picture: Path, K: Any, truth: Placed, depth:
     return Case(name, mesh, image, camera, truth, depth, real=True)
 
 
-def _textured(mesh: Path, texture: Path) -> eg.Mesh:
+def textured(mesh: Path, texture: Path) -> eg.Mesh:
+    """With the texture that its file names otherwise, or not at all."""
     return eg.load_mesh(mesh, materials=False).replace(texture=eg.read_image(texture, channels=3))
 
 

@@ -1,9 +1,11 @@
 """fit_pose and fit_camera in photographs: how often they find the pose, how exactly, and whether they know.
 
-    python benchmarks/photos.py [FOLDER] [--parts lit squirrel …] [--starts 20] [--pictures out/photos] [--json out/photos.json]
+    python benchmarks/photos.py [FOLDER] [--parts lit squirrel …] [--starts 20] [--first 0] [--meshes FILE …]
+        [--pictures out/photos] [--json out/photos.json]
 
-Without FOLDER, in pictures made here (photo_cases.py): of the stone of the examples, or of --meshes, before --backgrounds, the
-photographs of FOLDER, or a clutter of boards. With it, in real photographs, whose cameras are OpenCV's (x right, y down, z
+Without FOLDER, in pictures made here (photo_cases.py), numbered from --first on, of which each has a seed, a mesh and a start of
+its own: of the stone of the examples, or of --meshes by turns, before --backgrounds, the photographs of FOLDER, or a clutter of
+boards. With it, in real photographs, whose cameras are OpenCV's (x right, y down, z
 forward, pixels, X_cam = R X + t):
 
     squirrel/frame.png, squirrel_demo_low.obj (mm, without colours), camera_and_init.json: K, cam_R_model_init,
@@ -49,10 +51,12 @@ import edgegrad as eg
 from edgegrad.fit import PoseFit, fit_camera, fit_pose, fit_poses
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
+from objects import pebble
 
 FAR_OFF = 3.0  # limits: beyond, a fit must not say that it has converged
 FOCAL = 1.06  # by this factor or its inverse
 NEAR = 6.0  # pixels around a contour where edges of a real photograph are looked for
+STONE = "stone"  # the mesh of the examples
 RIM = 0.3  # share of a pixel by which a neighbour's alpha is higher on a contour
 
 
@@ -108,7 +112,7 @@ class Trial:
     def line(self) -> str:
         verdict = "falsely converged" if self.falsely else "" if self.right else "missed"
         return (
-            f"  {self.case:14s} {self.start_degrees:5.1f}° {self.start_shift:5.1%} → {self.degrees:6.2f}° {self.shift:6.2%} "
+            f"  {self.case:28s} {self.start_degrees:5.1f}° {self.start_shift:5.1%} → {self.degrees:6.2f}° {self.shift:6.2%} "
             f"({self.length:.3g})  explained {self.explained:.2f}  {'converged' if self.converged else '-':9s} "
             f"{self.steps:3d} steps {self.seconds:5.1f} s, {self.work:.1f} of work  "
             f"{''.join(f'{value:.2f} px ' for value in self.edges)} {verdict}"
@@ -158,9 +162,18 @@ class Run:
     """What all parts are given."""
 
     starts: int
+    first: int  # number of the first picture that is made here
     pictures: Path | None
-    meshes: Sequence[eg.Mesh]
+    meshes: Sequence[tuple[str, eg.Mesh]]
     backgrounds: Sequence[Tensor]
+
+    def made(self, kind: Kind, seeds: int) -> Iterator[tuple[int, Case]]:
+        """Pictures of a kind, of the meshes by turns, with their numbers, to which `seeds` is added."""
+        for k in range(self.starts):
+            name, mesh = self.meshes[k % len(self.meshes)]
+            number = self.first + k
+            seed = 0 if kind == "easy" else seeds + number
+            yield number, rendered(f"{kind} {name} {seed}", mesh, self.backgrounds, kind, seed)
 
     def fitted(
         self, part: Part, case: Case, start: Placed | None, truth: Placed, label: str,
@@ -212,6 +225,8 @@ class Run:
             trial.edges = photo_edges.across(case.picture, case.alpha(found), NEAR).quantiles()
         part.trials.append(trial)
         print(trial.line(), flush=True)
+        if not trial.right or not trial.converged:
+            print(f"    {fit.reason}", flush=True)
         return trial
 
 
@@ -234,11 +249,7 @@ def _scenes(kind: Kind, degrees: float, shift: float, limits: Limits) -> Callabl
 
     def run(run: Run, name: str) -> Part:
         part = Part(name, limits)
-        for k in range(run.starts):
-            number = k % len(run.meshes)
-            case = rendered(
-                f"{kind} {number}", run.meshes[number], run.backgrounds, kind, 0 if kind == "easy" else 100 + k
-            )
+        for k, case in run.made(kind, 100):
             rng = np.random.default_rng([k, round(degrees)])
             share = (rng.uniform(1 / 3, 1.0), rng.uniform()) if kind == "easy" else (1.0, 1.0)
             start = case.beside(case.truth, degrees * share[0], shift * case.size * share[1], rng)
@@ -253,8 +264,8 @@ def _several(count: int, limits: Limits) -> Callable[[Run, str], Part]:
 
     def run(run: Run, name: str) -> Part:
         part = Part(name, limits)
-        for k in range(run.starts):
-            meshes = [run.meshes[(k + n) % len(run.meshes)] for n in range(count)]
+        for k in range(run.first, run.first + run.starts):
+            meshes = [run.meshes[(k + n) % len(run.meshes)][1] for n in range(count)]
             cases = several(meshes, run.backgrounds, 300 + k)
             rng = np.random.default_rng([k, count])
             starts = [case.beside(case.truth, 15.0, 0.05 * case.size, rng) for case in cases]
@@ -269,9 +280,7 @@ def _cameras(focal: bool, limits: Limits) -> Callable[[Run, str], Part]:
 
     def run(run: Run, name: str) -> Part:
         part = Part(name, limits)
-        for k in range(run.starts):
-            number = k % len(run.meshes)
-            case = rendered(f"lit {number}", run.meshes[number], run.backgrounds, "lit", 100 + k)
+        for k, case in run.made("lit", 100):
             rng = np.random.default_rng([k, 10])
             start = case.beside(case.truth, 10.0, 0.05 * case.size, rng)
             # The camera that sees the object at rest as the case's camera sees it at the start.
@@ -302,9 +311,7 @@ def _anywhere(masked: bool) -> Callable[[Run, str], Part]:
 
     def run(run: Run, name: str) -> Part:
         part = Part(name, Limits(1.0, 0.01, 0.90))
-        for k in range(run.starts):
-            number = k % len(run.meshes)
-            case = rendered(f"lit {number}", run.meshes[number], run.backgrounds, "lit", 200 + k)
+        for k, case in run.made("lit", 200):
             placed, mask = case.mesh.transformed(case.truth.R, case.truth.t), None
             if masked:
                 mask = (eg.render_aovs(placed, case.camera, ["alpha"], 16)["alpha"] >= 0.5).float()
@@ -379,12 +386,14 @@ REAL: dict[str, Callable[[Run, Path], Iterator[Part]]] = {
 }  # fmt: skip
 
 
-def _meshes(paths: Sequence[str]) -> list[eg.Mesh]:
-    if paths:
-        return [eg.load_mesh(path) for path in paths]
-    from objects import pebble
-
-    return [pebble()]
+def _mesh(given: str) -> tuple[str, eg.Mesh]:
+    """By its name: of a file, or of a file and that of its texture, with a comma between."""
+    if given == STONE:
+        return STONE, pebble()
+    file, _, texture = given.partition(",")
+    if texture:
+        return Path(file).stem, photo_folder.textured(Path(file), Path(texture))
+    return Path(file).stem, eg.load_mesh(file)
 
 
 def main() -> None:
@@ -392,7 +401,11 @@ def main() -> None:
     parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="real photographs")
     parser.add_argument("--parts", nargs="+", choices=[*MADE, *REAL], metavar="PART", help=", ".join([*MADE, *REAL]))
     parser.add_argument("--starts", type=int, default=20, metavar="N", help="of each part")
-    parser.add_argument("--meshes", nargs="+", default=[], metavar="FILE", help="textured, for pictures made here")
+    parser.add_argument("--first", type=int, default=0, metavar="N", help="number of the first picture made here")
+    parser.add_argument(
+        "--meshes", nargs="+", default=[STONE], metavar="FILE",
+        help=f"for pictures made here; with a texture FILE,IMAGE; {STONE}: that of the examples",
+    )  # fmt: skip
     parser.add_argument("--backgrounds", nargs="+", default=[], metavar="FILE", help="photographs behind them")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="contours over the photographs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="every fit")
@@ -404,7 +417,7 @@ def main() -> None:
     if not backgrounds and given.folder is not None:
         backgrounds = photo_folder.photographs(given.folder)
     backgrounds = backgrounds or [clutter(seed) for seed in range(4)]
-    run = Run(given.starts, given.pictures, _meshes(given.meshes), backgrounds)
+    run = Run(given.starts, given.first, given.pictures, [_mesh(one) for one in given.meshes], backgrounds)
     done: list[Part] = []
     for name in parts:
         print(name, flush=True)

@@ -242,6 +242,7 @@ FIRST = {"pose": PoseParameter()}
         (MESH, {"mask_loss": "region"}, ValueError, r"mask_loss: expected one of l1, l2, huber, robust, iou, ssim, or"),
         (MESH, {"loss": "regions"}, ValueError, r"loss: expected one of l1, .*ssim, region, or a function, got 'regions'"),
         (MESH.transformed(t=torch.tensor([0.0, 0.0, -90.0])), {}, ValueError, r"scene: expected an object that the pict"),
+        (MESH, {"images": torch.zeros(96, 96, 3)}, ValueError, r"images: expected the object before .*one colour alone"),
         (MESH.transformed(scale=9.0), {}, ValueError, r"scene: .* that fills picture 0 at the start; leave out ground and walls"),
     ],
 )  # fmt: skip

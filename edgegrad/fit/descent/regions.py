@@ -31,6 +31,7 @@ TOLERANCE = 12.0  # squared differences, in variances, that are far above this h
 BESIDE = 2.5  # the same, where colours beside the contour are judged
 # Of right fits colours tell the sides apart by 0.70 … 0.81, of wrong ones on edges of clutter by up to 0.69.
 SURE = 0.695
+EVEN = 1.5 / 255.0  # sRGB values: pixels that differ by no more are of one colour in eight bits
 LEAST_AROUND = 0.02  # of what lies near the object: less tells no colours of a background
 
 
@@ -117,12 +118,15 @@ class Regions:
         return max(0.0, min(ENOUGH / SURE * told / max(length, 1e-30), outlines_explained(parts)))
 
     def check(self, alphas: Sequence[Tensor]) -> None:
-        """That the silhouettes of the start leave something of the pictures around them. Raises ValueError."""
-        seen = 0
+        """That the silhouettes of the start leave something of the pictures around them, of more than one colour. Raises
+        ValueError."""
+        seen = coloured = 0
         for k, alpha in enumerate(alphas):
             share = alpha[..., 0].float()
             near, extent = self.around(k, share)
             seen += extent > 0.0
+            colours = self.displays[k][near > 0.0]
+            coloured += len(colours) > 0 and float((colours.amax(0) - colours.amin(0)).max()) > EVEN
             if extent > 0.0 and float((near * (1.0 - share)).sum()) <= LEAST_AROUND * float(near.sum()):
                 raise ValueError(
                     f'scene: expected meshes with some of the picture around them, as loss="region" needs, got a scene that '
@@ -132,6 +136,11 @@ class Regions:
             raise ValueError(
                 'scene: expected an object that the pictures show at the start, as loss="region" needs, got one out of view of '
                 "all cameras; start nearer"
+            )
+        if not coloured:
+            raise ValueError(
+                'images: expected the object before something of another colour, as loss="region" needs, got one colour alone '
+                "where it is at the start and around it; start nearer, or look for what made the pictures black or white"
             )
 
     def _of(self, group: Sequence[int]) -> tuple[Tensor, Tensor]:
