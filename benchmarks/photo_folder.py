@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,7 @@ def bottle(folder: Path, frame: int, with_depth: bool) -> Case:
     if not with_depth:
         return case
     metres, pose, K = _depth_camera(place / "_sequence", frame)
-    return Case(case.name, case.mesh, case.picture, case.camera, truth, reprojected(metres, K, pose, case.camera))
+    return replace(case, depth=reprojected(metres, K, pose, case.camera))
 
 
 def reprojected(depth: Tensor, K: Tensor, to_world: Tensor, camera: eg.Camera) -> Tensor:
@@ -101,7 +102,7 @@ def _case(name: str, mesh: eg.Mesh, picture: Path, K: Any, truth: Placed, depth:
     image = eg.read_image(picture, channels=3)
     H, W = image.shape[:2]
     camera = eg.Camera.from_opencv(torch.eye(3), torch.zeros(3), torch.tensor(K), (H, W))
-    return Case(name, mesh, image, camera, truth, depth)
+    return Case(name, mesh, image, camera, truth, depth, real=True)
 
 
 def textured(mesh: Path, texture: Path) -> eg.Mesh:

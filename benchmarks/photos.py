@@ -21,8 +21,9 @@ In the parts `camera` and `focal` the object stays, and fit_camera looks for the
 others; in `focal` also for a focal length that is off by FOCAL.
 
 Errors are the angle, and how far the object's centre is off, as a part of the object's size, the diagonal of its bounding box, or
-in its mesh's units. `falsely` counts fits that say `converged` and are more than three times the limits off. Seconds are the
-processor's, of all threads.
+in its mesh's units; of real photographs also how far the contour is from their edges, in the middle (photo_edges.py). `falsely`
+counts fits that say `converged` and are more than three times the limits off. `work` is processor time of all threads, `first`
+that of the first, about what a fit takes where nothing else runs.
 """
 
 from __future__ import annotations
@@ -36,8 +37,10 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import photo_edges
 import photo_folder
 import torch
 import torch.nn.functional as F
@@ -52,6 +55,7 @@ from objects import pebble
 
 FAR_OFF = 3.0  # limits: beyond, a fit must not say that it has converged
 FOCAL = 1.06  # by this factor or its inverse
+NEAR = 6.0  # pixels around a contour where edges of a real photograph are looked for
 STONE = "stone"  # the mesh of the examples
 RIM = 0.3  # share of a pixel by which a neighbour's alpha is higher on a contour
 
@@ -64,6 +68,22 @@ class Limits:
     shift: float  # of the object's size
     share: float = 0.0  # of the fits; 0 where that is not asked
     apart: float = 0.0  # degrees to the fits' own middle; 0 where that is not asked
+
+
+class Work(NamedTuple):
+    """Seconds of processor time."""
+
+    every: float  # of all threads
+    first: float  # of the first one, about what a fit takes where nothing else runs
+
+    @staticmethod
+    def now() -> Work:
+        return Work(time.process_time(), time.thread_time())
+
+    @staticmethod
+    def since(began: Work) -> Work:
+        now = Work.now()
+        return Work(now.every - began.every, now.first - began.first)
 
 
 @dataclass
@@ -80,15 +100,22 @@ class Trial:
     converged: bool
     steps: int
     seconds: float
+    work: float  # as Work.every
+    first: float
     right: bool
     falsely: bool
+    matrix: list[list[float]]
+    edges: list[float] = field(
+        default_factory=list
+    )  # of real ones: middle, 90 % of the contour's distances to edges, pixels
 
     def line(self) -> str:
         verdict = "falsely converged" if self.falsely else "" if self.right else "missed"
         return (
             f"  {self.case:28s} {self.start_degrees:5.1f}° {self.start_shift:5.1%} → {self.degrees:6.2f}° {self.shift:6.2%} "
             f"({self.length:.3g})  explained {self.explained:.2f}  {'converged' if self.converged else '-':9s} "
-            f"{self.steps:3d} steps {self.seconds:5.1f} s  {verdict}"
+            f"{self.steps:3d} steps {self.seconds:5.1f} s, {self.work:.1f} of work  "
+            f"{''.join(f'{value:.2f} px ' for value in self.edges)} {verdict}"
         )
 
 
@@ -118,12 +145,16 @@ class Part:
             self.name, f"{right} of {count}", f"{known}", f"{falsely}", f"{middle[0]:.2f}°", f"{middle[1]:.2%}",
             "" if self.spread is None else f"{self.spread:.2f}°",
             f"{statistics.fmean(t.steps for t in self.trials):.0f}",
-            f"{statistics.fmean(t.seconds for t in self.trials):.1f}", must, met,
+            *(f"{statistics.fmean(getattr(t, name) for t in self.trials):.1f}" for name in ("work", "first")),
+            "" if not self.trials[0].edges else f"{statistics.median(t.edges[0] for t in self.trials):.2f}", must, met,
         )  # fmt: skip
 
 
-TABLE = ("part", "right", "of them converged", "falsely", "angle", "shift", "apart", "steps", "seconds", "must", "")
-WIDTHS = (22, 10, 17, 7, 7, 7, 7, 5, 7, 34, 6)
+TABLE = (
+    "part", "right", "of them converged", "falsely", "angle", "shift", "apart", "steps", "work/s", "first/s", "edges/px",
+    "must", "",
+)  # fmt: skip
+WIDTHS = (22, 10, 17, 7, 7, 7, 7, 5, 6, 7, 8, 34, 6)
 
 
 @dataclass(frozen=True)
@@ -149,13 +180,13 @@ class Run:
         mask: Tensor | None = None, search: bool = True,
     ) -> tuple[Trial, PoseFit]:  # fmt: skip
         """Without a start, it is looked for."""
-        began = time.process_time()
+        began = Work.now()
         fit = fit_pose(
             case.mesh, case.picture, case.camera, mask, None if start is None else start.matrix, depth=case.depth,
             search=search, starts="global" if start is None else 1, progress=False,
         )  # fmt: skip
         found = Placed(fit.R, fit.t)
-        trial = self.noted(part, case, start, found, truth, fit, time.process_time() - began)
+        trial = self.noted(part, case, start, found, truth, fit, Work.since(began))
         self.drawn(label, outlined(case, start, found))
         return trial, fit
 
@@ -163,13 +194,13 @@ class Run:
         """Several objects of one picture in one fit."""
         first = cases[0]
         init = [start.matrix for start in starts]
-        began = time.process_time()
+        began = Work.now()
         fits = fit_poses([case.mesh for case in cases], first.picture, first.camera, init=init, progress=False)
-        seconds = (time.process_time() - began) / len(cases)
+        work = Work.since(began)
         image = first.picture
         for case, start, fit in zip(cases, starts, fits, strict=True):
             found = Placed(fit.R, fit.t)
-            self.noted(part, case, start, found, case.truth, fit, seconds)
+            self.noted(part, case, start, found, case.truth, fit, work)
             image = outlined(replace(case, picture=image), start, found)
         self.drawn(label, image)
 
@@ -179,7 +210,7 @@ class Run:
             eg.write_image(self.pictures / f"{label}.png", image)
 
     def noted(
-        self, part: Part, case: Case, start: Placed | None, found: Placed, truth: Placed, fit: PoseFit, seconds: float
+        self, part: Part, case: Case, start: Placed | None, found: Placed, truth: Placed, fit: PoseFit, work: Work
     ) -> Trial:  # fmt: skip
         limits = part.limits
         before = (math.nan, math.nan) if start is None else case.apart(start, truth)
@@ -187,8 +218,11 @@ class Run:
         off = max(after[0] / limits.degrees, after[1] / case.size / limits.shift)
         trial = Trial(
             case.name, before[0], before[1] / case.size, after[0], after[1] / case.size, after[1], fit.explained,
-            fit.converged, fit.steps, seconds, off <= 1.0, fit.converged and off > FAR_OFF,
+            fit.converged, fit.steps, fit.seconds, *work, off <= 1.0, fit.converged and off > FAR_OFF,
+            found.matrix.tolist(),
         )  # fmt: skip
+        if case.real:
+            trial.edges = photo_edges.across(case.picture, case.alpha(found), NEAR).quantiles()
         part.trials.append(trial)
         print(trial.line(), flush=True)
         if not trial.right or not trial.converged:
@@ -204,7 +238,7 @@ def outlined(case: Case, start: Placed | None, found: Placed, camera: eg.Camera 
     ):  # fmt: skip
         if pose is None:
             continue
-        alpha = eg.render_aovs(case.mesh.transformed(pose.R, pose.t), seen, ["alpha"], 16)["alpha"]
+        alpha = case.alpha(pose, seen)[..., None]
         highest = F.max_pool2d(alpha.movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
         image = torch.where(highest - alpha > RIM, torch.tensor(colour), image)
     return image
@@ -256,12 +290,13 @@ def _cameras(focal: bool, limits: Limits) -> Callable[[Run, str], Part]:
                 K[[0, 1], [0, 1]] *= FOCAL if k % 2 else 1.0 / FOCAL
             given = case.camera.replace(world_to_camera=(W @ moved).float(), K=K)
             still = case.mesh.transformed(case.truth.R.float(), case.truth.t.float())
-            began = time.process_time()
+            began = Work.now()
             fit = fit_camera(still, case.picture, given, focal=focal, progress=False)
+            work = Work.since(began)
             # As a pose of the object before the case's camera.
             back = torch.linalg.inv(W) @ fit.camera.world_to_camera.double() @ case.truth.matrix
             found, seen = Placed(back[:3, :3], back[:3, 3]), case.camera.replace(K=fit.camera.K)
-            run.noted(part, case, start, found, case.truth, fit.search, time.process_time() - began)
+            run.noted(part, case, start, found, case.truth, fit.search, work)
             run.drawn(f"{name}-{k:02d}", outlined(case, start, found, seen))
             if focal:
                 ratio = [float(one.K[0, 0] / case.camera.K[0, 0]) for one in (given, fit.camera)]

@@ -189,9 +189,13 @@ def test_a_step_of_the_light_term_undoes_a_small_motion(harmonics, most):
 # The contour term
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.5])
-def test_a_contour_is_found_to_a_fiftieth_of_a_pixel(angle):
-    """A straight blurred edge between two textures, from half a pixel off."""
+@pytest.mark.parametrize(
+    ("angle", "front", "behind"),
+    [(0.0, (0.7, 0.4, 0.2), (0.3, 0.45, 0.5)), (0.5, (0.9, 0.6, 0.1), (0.1, 0.15, 0.2))],
+)
+def test_a_contour_is_found_to_a_fiftieth_of_a_pixel(angle, front, behind):
+    """A straight blurred edge between two textures, from half a pixel off: radiances are mixed, not the values of a display, by
+    which a bright contour before something dark would be found 0.2 pixels too far out."""
     view, n, shift = camera(48), 48, 0.5
     x, y = torch.meshgrid(torch.arange(n) + 0.0, torch.arange(n) + 0.0, indexing="xy")
     along = x * math.cos(angle) + y * math.sin(angle)
@@ -202,7 +206,8 @@ def test_a_contour_is_found_to_a_fiftieth_of_a_pixel(angle):
 
     middle = 24.3 * math.cos(angle) + 23.7 * math.sin(angle)
     a = alpha(middle + shift)[..., None]
-    display = a * torch.tensor([0.7, 0.4, 0.2]) + (1 - a) * torch.tensor([0.3, 0.45, 0.5]) + noise
+    front, behind = (srgb_to_linear(torch.tensor(colour)) for colour in (front, behind))
+    display = linear_to_srgb(a * front + (1 - a) * behind) + noise
     picture = shown(view, srgb_to_linear(display))
     near, at = torch.ones(n, n), 0.0
     for _ in range(4):
@@ -256,7 +261,7 @@ def clutter(size, seed=0):
 
 
 def photograph(view, mesh=None, seed=0, gain=(1.3, 1.0, 0.8), light_samples=1):
-    """The bracket in the light of a sun and a sky, before clutter, blurred, noisy, compressed."""
+    """The bracket in the light of a sun and a sky, before clutter, blurred as a lens does, noisy, compressed."""
     mesh = (bracket() if mesh is None else mesh).replace(material=eg.Material())
     lights = [
         eg.DirectionalLight(torch.tensor([-0.5, -1.0, -0.8]).double(), 2.0),
@@ -266,7 +271,8 @@ def photograph(view, mesh=None, seed=0, gain=(1.3, 1.0, 0.8), light_samples=1):
         image = eg.render(
             eg.Scene([mesh], clutter(view.size[0], seed), lights), view, 32, 1 << 40, light_samples=light_samples
         )
-    values = smoothed(linear_to_srgb((image * torch.tensor(gain)).clamp(0, 1)).movedim(-1, 0), 0.7).movedim(0, -1)
+    seen = smoothed((image * torch.tensor(gain)).clamp(0, 1).movedim(-1, 0), 0.7).movedim(0, -1)
+    values = linear_to_srgb(seen)
     values = values + 0.015 * torch.randn(values.shape, generator=torch.Generator().manual_seed(seed))
     file = io.BytesIO()
     Image.fromarray((255 * values.clamp(0, 1)).round().byte().numpy()).save(file, "JPEG", quality=85)

@@ -12,7 +12,6 @@ Alpha is blurred, widely at first, that a step reaches far; the contour term joi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 
 import torch
 from torch import Tensor
@@ -82,7 +81,7 @@ class Regions:
         soft = self.blurred(alpha)
         found = -likelihood(P, soft).double().log()
         if (sides := self._sides(group)) is not None:
-            squares = _squares(sides, soft)
+            squares = self._squares(group, sides, soft)
             found = found + 0.5 * sides.band * (squares / (1.0 + squares / TOLERANCE)).double()
         return (near * found).sum()
 
@@ -93,8 +92,8 @@ class Regions:
         soft = self.blurred(alpha)
         found = slope(P, soft).square()
         if (sides := self._sides(group)) is not None:
-            robust = (1.0 + _squares(sides, soft) / TOLERANCE).pow(-2)
-            slopes = ((sides.inside - sides.outside).square() / sides.variance).sum(-1)
+            robust = (1.0 + self._squares(group, sides, soft) / TOLERANCE).pow(-2)
+            slopes = (sides.slope_by(soft).square() / sides.variance).sum(-1)
             found = found + sides.band * robust * slopes
         return near * found
 
@@ -154,13 +153,15 @@ class Regions:
         found = [self.sides[i] for i in group]
         if self.narrows or any(sides is None for sides in found):
             return None
-        parts = {f.name: torch.stack([getattr(sides, f.name) for sides in found]) for f in fields(Sides)}
-        pictures = torch.stack([self.displays[i] for i in group])
-        # With the picture taken off, what is mixed is the difference.
-        return Sides(**{**parts, "outside": parts["outside"] - pictures, "inside": parts["inside"] - pictures})
+        columns = zip(*(_tensors(sides) for sides in found if sides), strict=True)
+        alpha, inside, outside, variance, band = (torch.stack(list(column)) for column in columns)
+        return Sides(alpha, inside, outside, variance, band)
+
+    def _squares(self, group: Sequence[int], sides: Sides, alpha: Tensor) -> Tensor:
+        """(B, H, W): squared differences of the pictures from the mixture by alpha (B, H, W), in variances."""
+        off = sides.mixed_by(alpha) - torch.stack([self.displays[i] for i in group])
+        return (off.square() / sides.variance).sum(-1)
 
 
-def _squares(sides: Sides, alpha: Tensor) -> Tensor:
-    """(B, H, W): squared differences from the mixture by alpha (B, H, W), in variances."""
-    off = sides.outside + alpha[..., None] * (sides.inside - sides.outside)
-    return (off.square() / sides.variance).sum(-1)
+def _tensors(sides: Sides) -> tuple[Tensor, ...]:
+    return sides.alpha, sides.inside, sides.outside, sides.variance, sides.band

@@ -95,7 +95,8 @@ class Seen:
 
     def sides(self) -> Sides:
         """Of the contour, in the box."""
-        return Sides.of(self.part.outlined, smoothed(self.alpha[self.box][None], CONTOUR_BLUR)[0], self.near[self.box])
+        contour = smoothed(self.alpha[self.box][None], CONTOUR_BLUR)[0]
+        return Sides.of(self.part.outlined, contour, self.near[self.box], self.part.mask is None)
 
 
 @dataclass(frozen=True)
