@@ -58,7 +58,7 @@ def camera() -> eg.Camera:
 
 
 def ours(seed: int) -> Tensor:
-    shape = sphere(4)
+    shape = sphere(5)  # Mitsuba's balls are round; ours of a quarter as many faces are 0.18 % darker
     verts = normalize(shape.verts.float(), dim=1)
     meshes = [
         eg.Mesh(
