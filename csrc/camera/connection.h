@@ -14,6 +14,7 @@ namespace edgegrad {
 struct CameraConnection {
     Vec2 x;             // the pixel position
     double area_scale;  // px² of the image that an area of the surface fills, per unit
+    double spread[4];   // how barycentrics along the two sides change from a pixel to the next, to the right and down
 };
 
 class CameraConnections {
@@ -23,23 +24,21 @@ class CameraConnections {
         for (const Camera& window : windows_of(camera, reach)) windows_.push_back({window, {window, reach}});
     }
 
-    // Calls body(CameraConnection) for each place of the image at which the point y of a surface lies, that two vectors
-    // span, in world coordinates.
-    //
-    // Along the ray dq/dz = r of the camera, the area A of a surface with the normal g fills A |g · r| / u² of the
-    // plane of normalised coordinates, u world units of which fill one of n.
+    // Calls body(CameraConnection) for each place of the image at which the point y of a face with the sides e1 and e2
+    // lies, world coordinates.
     template <class Body>
     void each(Vec3 y, Vec3 e1, Vec3 e2, Body body) const {
         for (const Window& window : windows_) {
             const Camera& c = window.camera;
             const Vec3 q = c.to_camera(y);
-            const double w = c.depth_weight(q);
-            if (!(w > 0) || window.volume.outcode(q) != 0) continue;
+            if (!(c.depth_weight(q) > 0) || window.volume.outcode(q) != 0) continue;
             const Bent bent = bend(c, project(c, q));
             if (!(bent.area_scale != 0)) continue;
-            const Vec3 g = (1 / length(cross(e1, e2))) * cross(c.R * e1, c.R * e2);
-            const double u = c.unit_at_depth(q.z), filled = std::fabs(c.along_ray(g, {q.x / w, q.y / w})) / (u * u);
-            body(CameraConnection{bent.x, filled * std::fabs(c.k_det * bent.area_scale)});
+            const Vec2 u = project_jvp(c, q, c.R * e1, {}), v = project_jvp(c, q, c.R * e2, {});
+            const double area = u.x * v.y - u.y * v.x;
+            if (!(std::fabs(area) > 0)) continue;  // seen edge-on
+            body(CameraConnection{
+                bent.x, std::fabs(area) / length(cross(e1, e2)), {v.y / area, -u.y / area, -v.x / area, u.x / area}});
         }
     }
 

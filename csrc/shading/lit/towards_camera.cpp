@@ -21,6 +21,7 @@ class LightPaths {
     LightPaths(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const CameraConnections& camera)
         : lit_(lit), scene_(scene), caster_(caster), camera_(camera), C_(lit.channels) {
         for (const Lamp& lamp : lit.lamps) eps_ = std::max(eps_, lamp.eps);
+        filtered_ = lit.is_filtered();
     }
 
     void follow(const Arrivals& arrivals, int64_t first_arrival, StepRange steps, Connections& out) {
@@ -69,10 +70,10 @@ class LightPaths {
         return true;
     }
 
-    // What an end scatters into the unit direction w; false if nothing.
-    bool scatters(const End& end, Vec3 w, double* f) const {
-        if (!(dot(end.o.n, w) > 0 && dot(end.o.g, w) > 0)) return false;
-        scatter(end.o.scattering, w, end.o.n, end.in, C_, f);
+    // What a point scatters from one unit direction into another; false if nothing.
+    bool scatters(const Surface<double>& o, Vec3 into, Vec3 from, double* f) const {
+        if (!(dot(o.n, into) > 0 && dot(o.g, into) > 0)) return false;
+        scatter(o.scattering, into, o.n, from, C_, f);
         return true;
     }
 
@@ -84,7 +85,7 @@ class LightPaths {
             const Surface<double>& o = end.o;
             const Vec3 v = lit_.perspective ? unit(eye - o.y) : eye;
             double f[most_lit_channels];
-            if (!scatters(end, v, f)) continue;
+            if (!scatters(end.o, v, end.in, f)) continue;
             const Vec3* corner = o.frame.corner;
             camera_.each(o.y, corner[1] - corner[0], corner[2] - corner[0], [&](CameraConnection there) {
                 const Vec3 to = lit_.perspective ? eye : o.y + (length(o.y - lit_.center) + 1.01 * lit_.radius) * v;
@@ -93,6 +94,12 @@ class LightPaths {
                 lines_.to.insert(lines_.to.end(), {to.x, to.y, to.z});
                 lines_.contact.push_back(16 * eps_ * std::max(size_of(o.y), size_of(to)));
                 lines_.arrival.push_back(end.arrival), lines_.x.push_back(there.x);
+                if (filtered_) {
+                    Surface<double> seen = o;
+                    seen.at.spread = there.spread;
+                    look_up_material(lit_, seen);
+                    scatters(seen, v, end.in, f);
+                }
                 for (int c = 0; c < C_; ++c) lines_.radiance.push_back(f[c] * end.carried[c] * there.area_scale);
             });
         }
@@ -124,7 +131,7 @@ class LightPaths {
             const BounceDraw draw(o, C_);
             const Vec3 w = draw.draw(choice.x, numbers.of_direction());
             double f[most_lit_channels];
-            if (!scatters(end, w, f)) continue;
+            if (!scatters(o, w, end.in, f)) continue;
             const double weight = dot(o.g, w) / (draw.density(w) * survival);
             if (!std::isfinite(weight)) continue;
             End& next = leaving_.emplace_back(end);
@@ -154,6 +161,7 @@ class LightPaths {
     const CameraConnections& camera_;
     const int C_;
     double eps_ = 0;  // relative spacing of places
+    bool filtered_ = false;
     std::vector<End> ends_, leaving_;
     struct {
         std::vector<int32_t> face, hit;
