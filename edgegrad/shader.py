@@ -26,12 +26,13 @@ from .check import all_finite, values_visible
 from .kernel.counts import Watch
 from .kernel.derivatives import differentiates, moves, transformed
 from .kernel.request import Request, derived_seed
+from .library import core
 from .points.background import environments
 from .points.blend import Blended, let_through, panes
 from .points.borders import Borders
 from .points.frame import Frame
 from .points.hits import Hits
-from .points.records import PixelRecords, RayRecords, shaded_room, without_colors
+from .points.records import CurveRecords, PixelRecords, RayRecords, shaded_room, without_colors
 from .points.samples import EdgeSamples, SurfaceSamples
 from .points.shadows import ShadowLight
 from .points.splat import Term, boundary
@@ -70,6 +71,8 @@ class Effort(NamedTuple):
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
+    # What samples on borders of a light's shadows on surfaces give to the image, by light that these surfaces pass on.
+    passed_on: Callable[[Frame, ShadowLight, CurveRecords], list[Term]] | None = None
     watch: Watch = Watch()  # is told what it takes
 
     @property
@@ -163,6 +166,9 @@ class _Image:
         if visibility:
             with watch.part("shadows"):
                 terms += self._shadows()
+            if self._effort.passed_on is not None:
+                with watch.part("unseen shadows"):
+                    terms += self._unseen_shadows(self._effort.passed_on)
         return frame.attached(image, terms)
 
     # -- the image -----------------------------------------------------------------------------------------------------
@@ -264,6 +270,24 @@ class _Image:
                 self._effort.watch.count("shadow_samples", len(records.x))
                 if len(records.x):
                     terms += self._boundary(EdgeSamples(frame, records, light, one))
+        return terms
+
+    def _unseen_shadows(self, passed_on: Callable[[Frame, ShadowLight, CurveRecords], list[Term]]) -> list[Term]:
+        """The same of borders of shadows, seen or not, by the light that surfaces pass on. They stay as the camera moves."""
+        frame = self._frame
+        terms: list[Term] = []
+        request, flat = frame.request, frame.surfaces.casters
+        count = request.gradient.edge_samples
+        if count < 0:
+            count = core.most_shadow_samples(frame.width, frame.height, request.image.spp)
+        moving = moves(frame.surfaces.verts) or (bool(len(flat.cut_outs)) and moves(flat.alphas, flat.uvs))
+        for index, casting in enumerate(frame.surfaces.scene.casting):
+            if moving or ShadowLight.moves(casting):
+                seed = derived_seed(frame.sampler.grad_seed, index + 2)
+                light = ShadowLight.of(frame.surfaces, index, seed)
+                records = frame.sampler.shadow_samples(light.parts, seed, count, False, one=True, seen=False)
+                self._effort.watch.count("unseen_shadow_samples", len(records.x))
+                terms += passed_on(frame, light, records)
         return terms
 
     def _boundary(self, samples: EdgeSamples) -> list[Term]:

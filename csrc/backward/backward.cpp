@@ -14,6 +14,7 @@
 #include "boundary/curve_measure.h"
 #include "boundary/shadows.h"
 #include "boundary/steps.h"
+#include "boundary/unseen_shadows.h"
 #include "camera/windows.h"
 #include "interior/interior.h"
 #include "interior/surface_measure.h"
@@ -395,15 +396,31 @@ std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const Sc
     return std::move(records.curves);
 }
 
-#define EDGEGRAD_INSTANTIATE(T)                                                                                  \
-    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,             \
-                                             const Gradients&);                                                  \
-    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&, \
-                                  double*);                                                                      \
-    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);              \
-    template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                         \
-    template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,              \
-                                                      const GradientOptions&, const LightParts&, int64_t, Team&);
+template <class T>
+std::vector<CurveRecords> record_unseen_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                                const GradientOptions& o, const LightParts& light, int64_t samples,
+                                                Team& team) {
+    RecordList records;
+    Destination to;
+    to.records = &records;
+    // No window shows more of them than another.
+    const Camera window = windows_of(input.camera, InImage<T>::margin_of(input.image)).front();
+    with_view<T>(input, window, InImage<T>(input, team), o, Terms{}, team,
+                 [&](const BackwardView<T>& view) { add_unseen_shadows(view, casters, light, samples, to); });
+    return std::move(records.curves);
+}
+
+#define EDGEGRAD_INSTANTIATE(T)                                                                                   \
+    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,              \
+                                             const Gradients&);                                                   \
+    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&,  \
+                                  double*);                                                                       \
+    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);               \
+    template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                          \
+    template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,               \
+                                                      const GradientOptions&, const LightParts&, int64_t, Team&); \
+    template std::vector<CurveRecords> record_unseen_shadows(                                                     \
+        const BackwardInput<T>&, const SceneView<T>&, const GradientOptions&, const LightParts&, int64_t, Team&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)
 #undef EDGEGRAD_INSTANTIATE

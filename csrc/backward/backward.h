@@ -92,6 +92,11 @@ template <class T>
 std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
                                          const GradientOptions& options, const LightParts& light, int64_t samples,
                                          Team& team);
+// So many on those that lie on surfaces, seen or not (boundary/unseen_shadows.h).
+template <class T>
+std::vector<CurveRecords> record_unseen_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                                const GradientOptions& options, const LightParts& light,
+                                                int64_t samples, Team& team);
 
 // q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a window.
 void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,

@@ -131,6 +131,30 @@ def image(frame: Frame, options: Options, points: int) -> Tensor:
     return frame.here(found)
 
 
+def towards_camera(frame: Frame, arrivals: Sequence[Tensor], steps: tuple[int, int]) -> list[Tensor]:
+    """What comes to the image of light that has come to points, without derivatives: which point it is of (M,) int64, the places
+    in the image (M, 2), and the radiance times px² (M, C). See csrc/shading/lit/towards_camera.h.
+
+    arrivals  faces (N,), barycentrics (N, 3), seeds (N,), unit directions (N, 3) where the light came from, and how much (N, C)
+    steps     the first and the last after which it goes to the camera
+    """
+    layout, tables = _layout(frame.fixed, frame.fixed_view)
+
+    def compute(kernel: Any, faces: Tensor, arguments: dict[str, Any], *tensors: Tensor) -> Sequence[Tensor]:
+        names, given = ("face", "b", "seed", "origin", "carried"), len(tensors) - len(tables)
+        del arguments["hits"]
+        found = kernel.towards_camera(
+            layout.kernel(tensors[given:], faces),
+            first=steps[0],
+            last=steps[1],
+            **{name: array(t) for name, t in zip(names, tensors, strict=False)},
+            **arguments,
+        )
+        return [torch.from_numpy(part) for part in found]
+
+    return list(frame.sampler.lit_image(compute, *(t.cpu() for t in arrivals), *tables))
+
+
 def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:
     """`samples` points of a light for each of the hits, as radiance() draws them; where nothing arrives their density is
     infinite."""

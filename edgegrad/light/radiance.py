@@ -24,6 +24,9 @@ from ..kernel.request import Request
 from ..library import core
 from ..points.frame import Frame
 from ..points.hits import Hits
+from ..points.records import CurveRecords
+from ..points.shadows import ShadowLight
+from ..points.splat import Term
 from ..points.surfaces import View
 from ..scene.appearance import OnMesh, coordinates
 from ..scene.environment import Environment
@@ -44,6 +47,7 @@ from .creases import note_jumps
 from .in_kernel import is_fused, nearest_textures
 from .lamp_trees import MeshTowards, tree_of
 from .resampled import Glossy, resampled
+from .unseen_shadows import unseen_shadows
 
 FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
 # Where glossy surfaces end or meet, points of a light for each sample of it: these are few points, and what is wanted of them is
@@ -108,6 +112,7 @@ class Lighting(NamedTuple):
             gives_derivatives=fused and additive,
             additive=additive,
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
+            passed_on=self._passed_on if self.bounces > 1 and self.shadows else None,
             watch=watch,
         )
         image = render_shaded(scene, camera, self, request, creases, False, effort)
@@ -117,6 +122,9 @@ class Lighting(NamedTuple):
         for tensor in unreached(image, tensors_in((scene, camera))):
             image = image + tensor.reshape(-1)[:0].sum().to(image)
         return image
+
+    def _passed_on(self, frame: Frame, light: ShadowLight, records: CurveRecords) -> list[Term]:
+        return unseen_shadows(frame, light, records, self.bounces)
 
     @staticmethod
     def resamples(scene: Scene) -> bool:

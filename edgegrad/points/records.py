@@ -386,9 +386,11 @@ class Sampler:
         intrinsics: bool,
         one: bool = False,
         casters: Flat | None = None,
+        seen: bool = True,
     ) -> CurveRecords:
         """On the borders of a light's shadows, to be called after pixel_hits(). `samples`: how many, −1: the default. `one`: with
-        only the point in the light. `casters`: the faces that shadow rays meet, where they differ from what the camera sees."""
+        only the point in the light. `casters`: the faces that shadow rays meet, where they differ from what the camera sees.
+        `seen`: by the camera; else so many on surfaces, seen or not, with velocities by world coordinates and no places x."""
         parts, count = [part for part in casters or () if isinstance(part, Tensor)], len(light[:3])
 
         def with_values(values: Iterator[Tensor]) -> Any:
@@ -407,6 +409,7 @@ class Sampler:
                 samples=samples,
                 least=self._least,
                 one=one,
+                seen=seen,
                 threads=torch.get_num_threads(),
                 hits=kernel_hits(self._hits),
                 panes=self._panes,
