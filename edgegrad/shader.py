@@ -31,7 +31,7 @@ from .points.blend import Blended, let_through, panes
 from .points.borders import Borders
 from .points.frame import Frame
 from .points.hits import Hits
-from .points.records import PixelRecords, RayRecords, shaded_room, without_colors
+from .points.records import CurveRecords, PixelRecords, RayRecords, shaded_room, without_colors
 from .points.samples import EdgeSamples, SurfaceSamples
 from .points.shadows import ShadowLight
 from .points.splat import Term, boundary
@@ -70,6 +70,9 @@ class Effort(NamedTuple):
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
+    # Samples on the borders of what surfaces of paths of light see of one another, and how the image jumps there; None: there
+    # are no paths.
+    bounce_samples: Callable[[Frame], tuple[CurveRecords, Tensor]] | None = None
     watch: Watch = Watch()  # is told what it takes
 
     @property
@@ -163,6 +166,9 @@ class _Image:
         if visibility:
             with watch.part("shadows"):
                 terms += self._shadows()
+        if moving and self._effort.bounce_samples is not None:
+            with watch.part("bounces"):
+                terms += self._bounces(self._effort.bounce_samples)
         return frame.attached(image, terms)
 
     # -- the image -----------------------------------------------------------------------------------------------------
@@ -265,6 +271,19 @@ class _Image:
                 if len(records.x):
                     terms += self._boundary(EdgeSamples(frame, records, light, one))
         return terms
+
+    def _bounces(self, sample: Callable[[Frame], tuple[CurveRecords, Tensor]]) -> list[Term]:
+        """The same over samples on the borders of what surfaces of paths see of one another."""
+        records, jump = sample(self._frame)
+        self._effort.watch.count("bounce_samples", len(records.x))
+        if not len(records.x):
+            return []
+        samples = EdgeSamples(self._frame, records)
+        jump = self._frame.here(jump).to(self._frame.dtype)
+        if self._effort.blended:
+            with torch.no_grad():
+                jump = let_through(self._frame, records)[:, None].to(jump) * jump
+        return boundary(samples.x, samples.velocity, jump, None, None)
 
     def _boundary(self, samples: EdgeSamples) -> list[Term]:
         """Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""

@@ -9,6 +9,7 @@
 
 #include "backward/budget.h"
 #include "backward/vertex_image.h"
+#include "boundary/bounces.h"
 #include "boundary/boundary.h"
 #include "boundary/curve.h"
 #include "boundary/curve_measure.h"
@@ -395,15 +396,31 @@ std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const Sc
     return std::move(records.curves);
 }
 
-#define EDGEGRAD_INSTANTIATE(T)                                                                                  \
-    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,             \
-                                             const Gradients&);                                                  \
-    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&, \
-                                  double*);                                                                      \
-    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);              \
-    template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                         \
-    template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,              \
-                                                      const GradientOptions&, const LightParts&, int64_t, Team&);
+template <class T>
+std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                         const GradientOptions& o, const LitPaths& paths, int64_t samples, Team& team,
+                                         std::vector<std::vector<double>>& jumps) {
+    RecordList records;
+    Destination to;
+    to.records = &records;
+    each_view(input, o, Terms{}, team, [&](const BackwardView<T>& view) {
+        add_bounces(view, casters, paths, samples, Record{o.intrinsics}, to, jumps);
+    });
+    return std::move(records.curves);
+}
+
+#define EDGEGRAD_INSTANTIATE(T)                                                                                   \
+    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,              \
+                                             const Gradients&);                                                   \
+    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&,  \
+                                  double*);                                                                       \
+    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);               \
+    template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                          \
+    template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,               \
+                                                      const GradientOptions&, const LightParts&, int64_t, Team&); \
+    template std::vector<CurveRecords> record_bounces(const BackwardInput<T>&, const SceneView<T>&,               \
+                                                      const GradientOptions&, const LitPaths&, int64_t, Team&,    \
+                                                      std::vector<std::vector<double>>&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)
 #undef EDGEGRAD_INSTANTIATE

@@ -24,6 +24,7 @@ from ..kernel.request import Request
 from ..library import core
 from ..points.frame import Frame
 from ..points.hits import Hits
+from ..points.records import CurveRecords
 from ..points.surfaces import View
 from ..scene.appearance import OnMesh, coordinates
 from ..scene.environment import Environment
@@ -108,6 +109,7 @@ class Lighting(NamedTuple):
             gives_derivatives=fused and additive,
             additive=additive,
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
+            bounce_samples=self._bounce_samples if self.bounces > 1 else None,
             watch=watch,
         )
         image = render_shaded(scene, camera, self, request, creases, False, effort)
@@ -117,6 +119,10 @@ class Lighting(NamedTuple):
         for tensor in unreached(image, tensors_in((scene, camera))):
             image = image + tensor.reshape(-1)[:0].sum().to(image)
         return image
+
+    def _bounce_samples(self, frame: Frame) -> tuple[CurveRecords, Tensor]:
+        options = Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces)
+        return in_kernel.bounce_samples(frame, options)
 
     @staticmethod
     def resamples(scene: Scene) -> bool:
