@@ -27,13 +27,6 @@ void bind_lit_arrays(nb::module_& m);  // lit_arrays.cpp
 namespace {
 
 template <class T>
-void check_faces(const SceneArrays<T>& arrays, const LitArrays& lit) {
-    if (arrays.faces.shape(0) == 0 ||
-        size_t(lit.scene.meshes.back().first_face + lit.scene.meshes.back().faces) != arrays.faces.shape(0))
-        refuse("lit: expected the faces of the scene");
-}
-
-template <class T>
 nb::tuple shade_points(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
                        const LitOptions& options, bool values, int threads) {
     check_faces(arrays, lit);
