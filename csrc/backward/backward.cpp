@@ -9,6 +9,7 @@
 
 #include "backward/budget.h"
 #include "backward/vertex_image.h"
+#include "boundary/bounces.h"
 #include "boundary/boundary.h"
 #include "boundary/curve.h"
 #include "boundary/curve_measure.h"
@@ -410,6 +411,19 @@ std::vector<CurveRecords> record_unseen_shadows(const BackwardInput<T>& input, c
     return std::move(records.curves);
 }
 
+template <class T>
+std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                         const GradientOptions& o, const LitPaths& paths, int64_t samples, Team& team,
+                                         std::vector<std::vector<double>>& jumps) {
+    RecordList records;
+    Destination to;
+    to.records = &records;
+    each_view(input, o, Terms{}, team, [&](const BackwardView<T>& view) {
+        add_bounces(view, casters, paths, samples, Record{o.intrinsics}, to, jumps);
+    });
+    return std::move(records.curves);
+}
+
 #define EDGEGRAD_INSTANTIATE(T)                                                                                   \
     template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,              \
                                              const Gradients&);                                                   \
@@ -421,6 +435,8 @@ std::vector<CurveRecords> record_unseen_shadows(const BackwardInput<T>& input, c
                                                       const GradientOptions&, const LightParts&, int64_t, Team&); \
     template std::vector<CurveRecords> record_unseen_shadows(                                                     \
         const BackwardInput<T>&, const SceneView<T>&, const GradientOptions&, const LightParts&, int64_t, Team&);
+template std::vector<CurveRecords> record_bounces(const BackwardInput<T>&, const SceneView<T>&, const GradientOptions&,
+                                                  const LitPaths&, int64_t, Team&, std::vector<std::vector<double>>&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)
 #undef EDGEGRAD_INSTANTIATE

@@ -9,11 +9,11 @@
 
 #include "backward/backward.h"
 #include "boundary/shadows.h"
-#include "contract/curve_hits.h"
 #include "forward/pixel_hits.h"
 #include "forward/places.h"
 #include "forward/trace.h"
 #include "python/arrays.h"
+#include "python/curve_arrays.h"
 #include "python/shaped.h"
 #include "python/unlocked.h"
 #include "shading/pyramid.h"
@@ -46,29 +46,6 @@ nb::dict pixel_hits(const SceneArrays<T>& arrays, const Camera& camera, const Im
     return out;
 }
 
-nb::dict arrays_of(const std::vector<CurveRecords>& parts, double least, bool one, int threads) {
-    nb::dict curves;
-    CurveHits hits = unlocked(threads, [&](Team& team) { return curve_hits(parts, least, one, team); });
-    curves["hit_sample"] = rows(std::move(hits.sample)), curves["hit_face"] = rows(std::move(hits.face));
-    curves["hit_side"] = rows(std::move(hits.side)), curves["hit_b"] = rows(std::move(hits.b), {3});
-    curves["hit_x"] = rows(std::move(hits.x), {2}), curves["hit_factor"] = rows(std::move(hits.factor));
-    curves["to_background"] = rows(std::move(hits.to_background));
-    const auto add = [&](const char* name, auto field, std::vector<size_t> row = {}) {
-        curves[name] = rows(unlocked(threads, [&](Team& team) { return joined(parts, field, team); }), std::move(row));
-    };
-    const auto add_rows = [&](const char* name, auto field) {
-        curves[name] = rows(unlocked(threads, [&](Team& team) { return joined_rows(parts, field, team); }));
-    };
-    using C = CurveRecords;
-    add("x", &C::x, {2}), add("by_k", &C::by_k, {intrinsics_width});
-    add_rows("row_of", &C::row_of), add("vertex", &C::vertex), add("by_q", &C::by_q, {3});
-    add_rows("uv_row_of", &C::uv_row_of), add("uv", &C::uv), add("by_uv", &C::by_uv, {2});
-    add_rows("alpha_row_of", &C::alpha_row_of), add("alpha", &C::alpha), add("by_alpha", &C::by_alpha);
-    add_rows("pane_row_of", &C::pane_row_of), add("pane", &C::pane), add("pane_b", &C::pane_b, {2});
-    add("light", &C::light), add("light_uv", &C::light_uv, {2}), add("by_light", &C::by_light, {3});
-    return curves;
-}
-
 // The samples of the terms inside faces and on curves, as records of arrays.
 template <class T>
 nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const ImageOptions& image,
@@ -98,7 +75,7 @@ nb::tuple samples(const SceneArrays<T>& arrays, const Camera& camera, const Imag
     using S = SurfaceRecords;
     add("face", &S::face), add("x", &S::x, {2}), add("along", &S::along, {3}), add("weight", &S::weight);
     add("along_by_k", &S::along_by_k, {3, intrinsics_width});
-    return nb::make_tuple(surface, arrays_of(found.curves, least, false, threads));
+    return nb::make_tuple(surface, curve_arrays(found.curves, least, false, threads));
 }
 
 // A light as edges cast shadows of it.
@@ -143,7 +120,7 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& cast
         found = seen ? record_shadows(input, casting, options, light.view(), samples, team)
                      : record_unseen_shadows(input, casting, options, light.view(), samples, team);
     });
-    return arrays_of(found, least, one, threads);
+    return curve_arrays(found, least, one, threads);
 }
 
 Places places_of(const In<double, 2>& x) {

@@ -7,6 +7,7 @@
 #include <optional>
 #include <vector>
 
+#include "python/arrays.h"
 #include "python/checks.h"
 #include "shading/lit/lamp_tree.h"
 #include "shading/lit/lit_scene.h"
@@ -55,6 +56,14 @@ class LitArrays {
     std::vector<LampArrays> lamps_;
     Rows faces_;
 };
+
+// Refuses what is not made of the faces of a scene.
+template <class T>
+void check_faces(const SceneArrays<T>& arrays, const LitArrays& lit) {
+    if (arrays.faces.shape(0) == 0 ||
+        size_t(lit.scene.meshes.back().first_face + lit.scene.meshes.back().faces) != arrays.faces.shape(0))
+        refuse("lit: expected the faces of the scene");
+}
 
 // Points, and what is forced of one light at them.
 struct PointArrays {

@@ -25,12 +25,15 @@ namespace edgegrad {
 void bind_memory(nb::module_& m);       // memory.cpp
 void bind_for_shaders(nb::module_& m);  // for_shaders.cpp
 void bind_lit(nb::module_& m);          // lit.cpp
+void bind_bounces(nb::module_& m);      // bounces.cpp
 void bind_moving_hits(nb::module_& m);  // moving_hits.cpp
 void bind_raster(nb::module_& m);       // raster.cpp
 template <class T>
 void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene);
 template <class T>
 void bind_scene_lit(nb::class_<SceneArrays<T>>& scene);
+template <class T>
+void bind_scene_bounces(nb::class_<SceneArrays<T>>& scene);
 void bind_for_tests(nb::module_& m);  // for_tests.cpp
 
 namespace {
@@ -208,6 +211,7 @@ void bind_scene(nb::module_& m, const char* scene_name, const char* hits_name) {
              "adjoint"_a.noconvert(), "hits"_a, "gradient"_a.noconvert());
     bind_scene_for_shaders(scene);
     bind_scene_lit(scene);
+    bind_scene_bounces(scene);
 }
 
 }  // namespace
@@ -270,6 +274,7 @@ NB_MODULE(_core, m) {
     m.attr("GRADIENT_SLOTS") = nb::tuple(nb::cast(slots));
     bind_for_shaders(m);
     bind_lit(m);
+    bind_bounces(m);
     bind_moving_hits(m);
     bind_raster(m);
     bind_scene<float>(m, "SceneFloat", "HitsFloat");

@@ -11,12 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..kernel.derivatives import moves
 from ..kernel.first_order import apply, array, without_derivatives
+from ..kernel.request import derived_seed
 from ..library import core
 from ..points.footprints import pyramid_of
 from ..points.frame import Frame
 from ..points.hits import Hits
-from ..points.records import values_of
+from ..points.records import CurveRecords, values_of
 from ..points.seeds import mixed_bits
 from ..points.surfaces import Surfaces, View
 from ..scene.environment import Environment
@@ -153,6 +155,21 @@ def towards_camera(frame: Frame, arrivals: Sequence[Tensor], steps: tuple[int, i
         return [torch.from_numpy(part) for part in found]
 
     return list(frame.sampler.lit_image(compute, *(t.cpu() for t in arrivals), *tables))
+
+
+def bounce_samples(frame: Frame, options: Options) -> tuple[CurveRecords, Tensor]:
+    """Samples on the borders of what surfaces of paths see of one another, and (S, C) float64 by how much the image jumps there,
+    times what a sample stands for (csrc/boundary/bounces.h)."""
+    layout, tables = _layout(frame.fixed, frame.fixed_view)
+
+    def compute(
+        kernel: Any, casters: Any, faces: Tensor, arguments: dict[str, Any], *tables: Tensor
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        return kernel.bounce_samples(casters, layout.kernel(tables, faces), options.kernel, **arguments)
+
+    count, seed = frame.request.gradient.edge_samples, derived_seed(frame.sampler.grad_seed, 0)
+    casters = frame.fixed.casters if frame.surfaces.scene.blends else None
+    return frame.sampler.bounce_samples(compute, tables, seed, count, moves(frame.intrinsics), casters)
 
 
 def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:

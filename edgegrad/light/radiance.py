@@ -113,6 +113,7 @@ class Lighting(NamedTuple):
             additive=additive,
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
             passed_on=self._passed_on if self.bounces > 1 and self.shadows else None,
+            bounce_samples=self._bounce_samples if self.bounces > 1 else None,
             watch=watch,
         )
         image = render_shaded(scene, camera, self, request, creases, False, effort)
@@ -125,6 +126,10 @@ class Lighting(NamedTuple):
 
     def _passed_on(self, frame: Frame, light: ShadowLight, records: CurveRecords) -> list[Term]:
         return unseen_shadows(frame, light, records, self.bounces)
+
+    def _bounce_samples(self, frame: Frame) -> tuple[CurveRecords, Tensor]:
+        options = Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces)
+        return in_kernel.bounce_samples(frame, options)
 
     @staticmethod
     def resamples(scene: Scene) -> bool:

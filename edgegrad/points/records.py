@@ -171,6 +171,17 @@ def _of_values(packed: Sequence[Any], compute: Callable[..., Sequence[Tensor]], 
     return without_derivatives(with_values, *(packed[i] for i in places), *more)
 
 
+def _tensors_of(flat: Flat | None) -> list[Tensor]:
+    return [part for part in flat or () if isinstance(part, Tensor)]
+
+
+def _with_tensors(flat: Flat, tensors: Sequence[Tensor]) -> Flat:
+    """With these in place of its own."""
+    values = iter(tensors)
+    found: list[Any] = [next(values) if isinstance(part, Tensor) else part for part in flat]
+    return Flat(*found)
+
+
 def _array(tensor: Tensor) -> np.ndarray:
     return tensor.cpu().double().contiguous().numpy()
 
@@ -391,32 +402,58 @@ class Sampler:
         """On the borders of a light's shadows, to be called after pixel_hits(). `samples`: how many, −1: the default. `one`: with
         only the point in the light. `casters`: the faces that shadow rays meet, where they differ from what the camera sees.
         `seen`: by the camera; else so many on surfaces, seen or not, with velocities by world coordinates and no places x."""
-        parts, count = [part for part in casters or () if isinstance(part, Tensor)], len(light[:3])
-
-        def with_values(values: Iterator[Tensor]) -> Any:
-            found: list[Any] = [next(values) if isinstance(part, Tensor) else part for part in casters or ()]
-            return kernel_scene(Flat(*found))
+        parts, count = _tensors_of(casters), len(light[:3])
 
         def compute(request: Request, camera: Any, *tensors: Tensor) -> CurveRecords:
             arrays = (tensor.cpu().contiguous().numpy() for tensor in tensors[:count])
             scene = self._scene(request.scene)
             found = scene.shadow_samples(
-                casters=scene if casters is None else with_values(iter(tensors[count:])),
-                camera=camera,
-                image=core.ImageOptions(**request.image._asdict()),
-                options=core.GradientOptions(seed=seed, intrinsics=intrinsics),
+                casters=scene if casters is None else kernel_scene(_with_tensors(casters, tensors[count:])),
                 light=core.LightParts(*arrays, *light[3:]),
-                samples=samples,
-                least=self._least,
                 one=one,
                 seen=seen,
-                threads=torch.get_num_threads(),
-                hits=kernel_hits(self._hits),
-                panes=self._panes,
+                **self._of_curves(request, camera, seed, samples, intrinsics),
             )
             return _record(CurveRecords, found)
 
         return CurveRecords(*self._compute(self._request, compute, *light[:3], *parts))
+
+    def bounce_samples(
+        self,
+        compute: Callable[..., tuple[dict[str, np.ndarray], np.ndarray]],
+        tables: Sequence[Tensor],
+        seed: int,
+        samples: int,
+        intrinsics: bool,
+        casters: Flat | None = None,
+    ) -> tuple[CurveRecords, Tensor]:
+        """On the borders of what surfaces see of one another, each with its point that is seen in the image alone, and (S, C)
+        float64 by how much the image jumps there, times what a sample stands for: of compute(the kernel's scene, that of
+        `casters`, the faces, its arguments for curves, *tables). See shadow_samples()."""
+        parts, count = _tensors_of(casters), len(tables)
+
+        def with_request(request: Request, camera: Any, *tensors: Tensor) -> Sequence[Tensor]:
+            scene = self._scene(request.scene)
+            casting = scene if casters is None else kernel_scene(_with_tensors(casters, tensors[count:]))
+            arguments = self._of_curves(request, camera, seed, samples, intrinsics)
+            found, jump = compute(scene, casting, request.scene.faces, arguments, *tensors[:count])
+            return *_record(CurveRecords, found), torch.from_numpy(jump)
+
+        *fields, jump = self._compute(self._request, with_request, *tables, *parts)
+        return CurveRecords(*fields), jump
+
+    def _of_curves(self, request: Request, camera: Any, seed: int, samples: int, intrinsics: bool) -> dict[str, Any]:
+        """The kernel's arguments for samples on curves."""
+        return {
+            "camera": camera,
+            "image": core.ImageOptions(**request.image._asdict()),
+            "options": core.GradientOptions(seed=seed, intrinsics=intrinsics),
+            "samples": samples,
+            "least": self._least,
+            "threads": torch.get_num_threads(),
+            "hits": kernel_hits(self._hits),
+            "panes": self._panes,
+        }
 
     def hits_at(self, x: Tensor) -> PlaceRecords:
         """What is seen at places (N, 2) in the image."""

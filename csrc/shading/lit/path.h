@@ -64,26 +64,23 @@ class Paths {
     // From points that are `wanted`; the others get paths without any points.
     template <class T, class Wanted>
     void find(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, Wanted wanted) {
-        n_ = from.size;
-        const int64_t all = n_ * options_.bounces;
-        surfaces_.resize(all), density_.resize(all), face_.resize(all), b_.resize(3 * all), seed_.resize(all);
-        drawn_.resize(all * lights_.size()), seen_.resize(all * lights_.size());
-        length_.assign(n_, 0), through_.assign(n_ * C_, 1.0);
-        for (int64_t i = 0; i < n_; ++i) {
-            if (!wanted(i)) continue;
-            Surface<double>& o = surfaces_[i];
+        begin(from, [&](int64_t i, Surface<double>& o) {
+            if (!wanted(i)) return false;
             set_surface<double>(lit_, from.face[i], from.b + 3 * i, from.spread_at(i), o);
-            face_[i] = from.face[i], std::copy(from.b + 3 * i, from.b + 3 * i + 3, &b_[3 * i]);
-            if (!scatters(o)) continue;
-            look_up_material(lit_, o), length_[i] = 1;
-        }
-        for (int k = 0; k + 1 < options_.bounces; ++k) {
-            leave(from, k);
-            if (rays_.index.empty()) break;
-            arrive(scene, caster, k);
-            light(scene, caster, from, k + 1);
-        }
+            return true;
+        });
+        go_on(scene, caster, from);
     }
+    // From points that `place(i, surface)` sets, if it returns true, seen from where it says; lights are asked for
+    // them, too.
+    template <class T, class Place>
+    void find_lit(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, Place place) {
+        begin(from, place);
+        light(scene, caster, from, 0);
+        go_on(scene, caster, from);
+    }
+
+    static bool scatters(const Surface<double>& o) { return o.mesh->has_material && !o.is_black(); }
 
     Path path(int64_t i) const {
         return {
@@ -106,7 +103,30 @@ class Paths {
         }
     };
 
-    static bool scatters(const Surface<double>& o) { return o.mesh->has_material && !o.is_black(); }
+    template <class Place>
+    void begin(const LitPoints& from, Place place) {
+        n_ = from.size;
+        const int64_t all = n_ * options_.bounces;
+        surfaces_.resize(all), density_.resize(all), face_.resize(all), b_.resize(3 * all), seed_.resize(all);
+        drawn_.resize(all * lights_.size()), seen_.resize(all * lights_.size());
+        length_.assign(n_, 0), through_.assign(n_ * C_, 1.0);
+        for (int64_t i = 0; i < n_; ++i) {
+            Surface<double>& o = surfaces_[i];
+            if (!place(i, o)) continue;
+            face_[i] = from.face[i], std::copy(from.b + 3 * i, from.b + 3 * i + 3, &b_[3 * i]);
+            if (!scatters(o)) continue;
+            look_up_material(lit_, o), length_[i] = 1;
+        }
+    }
+    template <class T>
+    void go_on(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from) {
+        for (int k = 0; k + 1 < options_.bounces; ++k) {
+            leave(from, k);
+            if (rays_.index.empty()) break;
+            arrive(scene, caster, k);
+            light(scene, caster, from, k + 1);
+        }
+    }
 
     int64_t K() const { return int64_t(lights_.size()); }
 

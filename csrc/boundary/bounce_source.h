@@ -1,0 +1,145 @@
+// Borders of what surfaces see of one another, as a source of curves: an edge (a, b) on the line between two points of
+// a path of light, y₁ that is seen in the image and y₂ that sends light to it.
+//
+// In place of a light there is a surface of the scene, so that one border in the image has no one place: for each point
+// of the edge and each line past it there is another. Lines are drawn by the point p = (1 − t) a + t b and the unit
+// direction w, in the wedge on which the faces of the edge lie where N · (y − p) < 0, N = (b − a) × w. A line that is
+// moved by h along N / |N| passes the faces if h > 0, and |N| dh dt dω is the measure of lines, cos θ₁ cos θ₂ / r² dA₁
+// dA₂ at its ends: so the border's share of ∂loss/∂Φ is
+//
+//     ∫∫ Ã |dx/dA₁| V f₁ L₂ δF dt dω,    F = N · (λ y₁ + (1 − λ) y₂ − p),    λ = |y₂ − p| / (|y₁ − p| + |y₂ − p|)
+//
+// with f₁ L₂ what y₁ scatters to the viewer of what y₂ sends, and V whether the viewer sees y₁. The place of y₁ in the
+// image is fixed, y₂ and p stay at their places on face and edge: along the ray r = dq/dz of the camera, with the
+// normal m of the face of y₁, c = N·r / m·r, and barycentrics β and γ of y₁ and y₂,
+//
+//     δF = λ c m · Σ β_i δv_i + (1 − λ) N · Σ γ_i δv_i − N · ((1 − t) δa + t δb) + λ (N − c m) · δq(x),
+//
+// δq(x) at a fixed depth, as for borders of shadows (shadow_source.h).
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+#include "backward/view.h"
+#include "boundary/curve_source.h"
+
+namespace edgegrad {
+
+// A line past an edge, of which both ends lie on faces.
+struct BounceLine {
+    int32_t vertex[2] = {};              // of the edge
+    double t = 0;                        // on it
+    Vec3 w = {};                         // unit, world coordinates
+    int64_t segment = 0;                 // of the sampler (bounces.cpp)
+    int32_t receiver = -1, sender = -1;  // the faces of y₁ and y₂
+    Barycentrics at = {}, from = {};     // y₁ and y₂ on them
+    Barycentrics asked = {};  // where the sender's radiance is asked: beside y₂, if the edge lies on that face
+    double share = 0;         // λ
+    double facing = 0;        // on which side of the receiver's plane the sender is
+};
+
+template <class T>
+class BounceSource {
+   public:
+    using Curve = BounceLine;
+
+    struct Sample : CurveSample {
+        BounceLine line;
+        int32_t own;  // the receiver, which the ray ignores
+        CurveFaces faces;
+        Vec3 N, m;     // the latter times λ c
+        Vec2 by_n;     // ∂F/∂n
+        double scale;  // px² of the straight image for each unit of the receiver's area
+    };
+
+    explicit BounceSource(const BackwardView<T>& view) : view_(view) {}
+
+    Vec2 position(const Curve& line, double) const { return project(view_.camera, place_of(line)); }
+
+    // In camera coordinates.
+    Vec3 place_of(const Curve& line) const {
+        const auto v = corners_of(view_, line.receiver);
+        return line.at[0] * v[0] + line.at[1] * v[1] + line.at[2] * v[2];
+    }
+
+    bool place(const Curve& line, double, Sample& sample) const {
+        const Camera& camera = view_.camera;
+        const auto v = corners_of(view_, line.receiver);
+        const Array<Vec3>& q = view_.vertices.q;
+        const Vec3 m = cross(v[1] - v[0], v[2] - v[0]), y = place_of(line);
+        // What the viewer sees from behind is dark on both sides of the border.
+        if (!(line.facing * dot(m, camera.to_viewer(y)) > 0)) return false;
+
+        sample.line = line, sample.own = line.receiver;
+        sample.point = y, sample.behind = {};
+        const Vec3 N = cross(q[line.vertex[1]] - q[line.vertex[0]], camera.R * line.w);
+        const double along = camera.along_ray(m, sample.n), unit_there = camera.unit_at_depth(y.z);
+        sample.N = N, sample.m = (line.share * camera.along_ray(N, sample.n) / along) * m;
+        const Vec3 slope = unit_there * (line.share * N - sample.m);
+        sample.by_n = {slope.x, slope.y};
+        sample.scale = std::fabs(camera.k_det * along) / (length(m) * unit_there * unit_there);
+        if (!std::isfinite(sample.scale) || !std::isfinite(dot(sample.m, sample.m))) return false;
+
+        sample.ignored = {&sample.own, 1};
+        const int32_t* vertex = view_.scene.faces + 3 * int64_t(line.receiver);
+        sample.faces = {sample.ignored, 0, view_.scene.spacing->of(vertex[0])};
+        for (int i = 0; i < 3; ++i)
+            for (int axis = 0; axis < 3; ++axis)
+                sample.faces.coordinate =
+                    std::max(sample.faces.coordinate, std::fabs(view_.scene.verts[3 * int64_t(vertex[i]) + axis]));
+        return true;
+    }
+
+    const CurveFaces& faces_of(const Sample& sample) const { return sample.faces; }
+
+    // The receiver, and, of which no radiance is wanted, the sender.
+    SampleSurfaces surfaces(const Sample& sample) const {
+        const BounceLine& line = sample.line;
+        return {{{line.receiver, line.at, sample.point.z}, {line.sender, line.asked, sample.point.z}}};
+    }
+
+    // Light passes where F > 0.
+    CurveJumps jumps(const Sample& sample, const double* radiance) const { return {sample.weight * radiance[0], 0}; }
+
+    Vec2 normal(const Sample& sample) const {
+        return (-sample.scale * sample.area_scale) * pixel_vjp(view_.camera, sample.n, sample.by_n);
+    }
+
+    CurveJumps velocities(const Sample& sample, const Direction& direction) const {
+        if (!direction.moves()) return {};
+        const BounceLine& line = sample.line;
+        const auto moved = [&](int32_t face, Barycentrics b) {
+            const int32_t* vertex = view_.scene.faces + 3 * int64_t(face);
+            return b[0] * direction.q[vertex[0]] + b[1] * direction.q[vertex[1]] + b[2] * direction.q[vertex[2]];
+        };
+        const Vec3 edge = (1 - line.t) * direction.q[line.vertex[0]] + line.t * direction.q[line.vertex[1]];
+        const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
+        const double F_dot = dot(sample.m, moved(line.receiver, line.at)) +
+                             dot(sample.N, (1 - line.share) * moved(line.sender, line.from) - edge) +
+                             sample.by_n.x * n_dot.x + sample.by_n.y * n_dot.y;
+        return {sample.scale * sample.area_scale * F_dot, 0};
+    }
+
+    void add_motion(const Sample& sample, CurveJumps jumps, ChunkGrad& grad) const {
+        const BounceLine& line = sample.line;
+        const double F_bar = sample.scale * sample.area_scale * jumps.first;
+        const auto add = [&](int32_t vertex, Vec3 bar) { grad.q.add<3>(vertex, &bar.x); };
+        for (int i = 0; i < 3; ++i) {
+            add(view_.scene.faces[3 * int64_t(line.receiver) + i], (F_bar * line.at[i]) * sample.m);
+            add(view_.scene.faces[3 * int64_t(line.sender) + i], (F_bar * (1 - line.share) * line.from[i]) * sample.N);
+        }
+        add(line.vertex[0], (-F_bar * (1 - line.t)) * sample.N);
+        add(line.vertex[1], (-F_bar * line.t) * sample.N);
+        normalised_vjp(view_.camera, sample.n, F_bar * sample.by_n, grad.k);
+    }
+
+    void cast() {}
+    void finish(ChunkGrad&) {}
+
+   private:
+    const BackwardView<T>& view_;
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,149 @@
+// How densely lines past edges are drawn: by how much light passes along them, as far as it is known.
+//
+// Edges of one connected part of a scene see alike along parallel lines, and each of many has few lines of its own. So
+// what is found of some lines is pooled: by their parts, and by cells of directions.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <utility>
+#include <vector>
+
+#include "backward/view.h"
+#include "boundary/lune.h"
+#include "rays/meeting.h"
+
+namespace edgegrad {
+
+// Cells of directions of lines, whichever way these run: where they pass through three sides of a cube around the
+// origin.
+struct DirectionCells {
+    static constexpr int across = 6, count = 3 * across * across;
+
+    static int of(Vec3 w) {
+        const double x = std::fabs(w.x), y = std::fabs(w.y), z = std::fabs(w.z);
+        if (x >= y && x >= z) return in_side(0, w.y / w.x, w.z / w.x);
+        return y >= z ? in_side(1, w.z / w.y, w.x / w.y) : in_side(2, w.x / w.z, w.y / w.z);
+    }
+
+   private:
+    static int in_side(int side, double a, double b) {
+        const auto index = [](double c) { return std::clamp(int((c + 1) / 2 * across), 0, across - 1); };
+        return (side * across + index(a)) * across + index(b);
+    }
+};
+
+// Root mean squares of what lines gave, by part and direction.
+class PooledLines {
+   public:
+    explicit PooledLines(const Parts& parts)
+        : parts_(parts),
+          tables_(std::min<int64_t>(parts.size(), most_tables)),
+          squares_(tables_ * DirectionCells::count, 0.0),
+          lines_(squares_.size(), 0) {}
+
+    // That of a line along w past an edge at a vertex.
+    int64_t cell(int32_t vertex, Vec3 w) const {
+        return parts_.of(vertex) * tables_ / parts_.size() * DirectionCells::count + DirectionCells::of(w);
+    }
+    void add_line(int64_t cell) { ++lines_[cell]; }
+    void add(int64_t cell, double value) {
+        if (std::isfinite(value)) squares_[cell] += value * value;
+    }
+    // Once all are there: the root mean squares, each raised by a share of that of all.
+    std::vector<double> means() const {
+        double squares = 0, lines = 0;
+        for (size_t k = 0; k < squares_.size(); ++k) squares += squares_[k], lines += double(lines_[k]);
+        if (!(squares > 0)) return {};
+        std::vector<double> out(squares_.size(), unguided * std::sqrt(squares / lines));
+        for (size_t k = 0; k < out.size(); ++k)
+            if (lines_[k]) out[k] += std::sqrt(squares_[k] / double(lines_[k]));
+        return out;
+    }
+
+   private:
+    static constexpr int64_t most_tables = 1 << 12;
+    static constexpr double unguided = 0.15;
+
+    const Parts& parts_;
+    int64_t tables_;
+    std::vector<double> squares_;
+    std::vector<int64_t> lines_;
+};
+
+// The lines past one edge after another, cut into cells of even density.
+template <class T>
+class EdgeLines {
+   public:
+    // `means`: of the cells of `pooled`; empty: all are alike.
+    EdgeLines(const SceneView<T>& scene, const Topology& topology, const PooledLines& pooled,
+              const std::vector<double>& means)
+        : scene_(scene), topology_(topology), pooled_(pooled), means_(means) {}
+
+    // How many lines of the edge are drawn, relative to others.
+    double set(int64_t edge) {
+        const auto halves = topology_.half_edges(edge);
+        opposite_.clear();
+        for (const HalfEdge& h : halves) opposite_.push_back(corner(scene_, h.face, (h.corner + 2) % 3));
+        const HalfEdge& h = halves[0];
+        vertex_ = scene_.faces[3 * int64_t(h.face) + h.first()];
+        lune_ = {corner(scene_, h.face, h.first()), corner(scene_, h.face, h.second()), opposite_};
+        across_ = means_.empty() ? 1 : int(std::clamp(std::ceil(lune_.width() / widest), 1.0, most_across));
+        sum_.clear();
+        if (means_.empty() || lune_.empty()) return lune_.measure();
+        double sum = 0;
+        for (int j = 0; j < along; ++j)
+            for (int k = 0; k < across_; ++k) {
+                const Vec3 w = lune_.at(angle_at_middle(j), (k + 0.5) / across_);
+                sum_.push_back(sum += means_[pooled_.cell(vertex_, w)]);
+            }
+        return lune_.measure() * sum / double(sum_.size());
+    }
+
+    struct Line {
+        double t;     // on the edge
+        Vec3 w;       // unit
+        double area;  // ∫ dt dω over what it stands for, were one line drawn of this edge
+    };
+    // For numbers in [0, 1).
+    Line at(double along_edge, Vec2 u) const {
+        if (sum_.empty()) return line(along_edge, u, 1);
+        const double total = sum_.back(), s = along_edge * total;
+        const int64_t k =
+            std::min<int64_t>(std::upper_bound(sum_.begin(), sum_.end(), s) - sum_.begin(), int64_t(sum_.size()) - 1);
+        const double begin = k ? sum_[k - 1] : 0, own = sum_[k] - begin;
+        const Vec2 cell{double(k / across_), double(k % across_)};
+        const Vec2 there{(cell.x + u.x) / along, (cell.y + u.y) / across_};
+        return line(std::clamp((s - begin) / own, 0.0, 1.0), there, total / (own * double(sum_.size())));
+    }
+    int64_t cell(Vec3 w) const { return pooled_.cell(vertex_, w); }
+
+   private:
+    static constexpr int along = 8;
+    static constexpr double widest = M_PI / 8, most_across = 8;  // azimuths of a cell
+
+    static double angle_at_middle(int j) {
+        static const std::vector<double> angles = [] {
+            std::vector<double> out;
+            for (int k = 0; k < along; ++k) out.push_back(Lune::polar_angle((k + 0.5) / along));
+            return out;
+        }();
+        return angles[j];
+    }
+    Line line(double t, Vec2 u, double share) const {
+        const Vec3 w = lune_.direction(u.x, u.y);
+        return {t, w, share * lune_.weight(w)};
+    }
+
+    const SceneView<T>& scene_;
+    const Topology& topology_;
+    const PooledLines& pooled_;
+    const std::vector<double>& means_;
+    std::vector<Vec3> opposite_;
+    int32_t vertex_ = 0;
+    Lune lune_;
+    int across_ = 1;
+    std::vector<double> sum_;  // of the means of its cells
+};
+
+}  // namespace edgegrad

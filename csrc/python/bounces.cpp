@@ -1,0 +1,63 @@
+// Borders of what surfaces of paths of light see of one another, for images that are made in PyTorch.
+
+#include "boundary/bounces.h"
+
+#include <nanobind/stl/optional.h>
+
+#include <optional>
+#include <vector>
+
+#include "backward/backward.h"
+#include "python/arrays.h"
+#include "python/curve_arrays.h"
+#include "python/lit_arrays.h"
+#include "python/shaped.h"
+#include "python/unlocked.h"
+
+using namespace nanobind::literals;
+
+namespace edgegrad {
+
+namespace {
+
+// The samples, as records of arrays with their first point alone; and (S, channels) by how much the image jumps there,
+// times what a sample stands for. `casters`: the same faces as light meets them.
+template <class T>
+nb::tuple bounce_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const LitArrays& lit,
+                         const LitOptions& lit_options, const Camera& camera, const ImageOptions& image,
+                         const GradientOptions& options, int64_t samples, double least, int threads,
+                         const HitArrays<T>& hits, const std::optional<In<uint8_t, 1>>& panes) {
+    hits.check(arrays, camera), check_faces(arrays, lit);
+    if (casters.faces.shape(0) != arrays.faces.shape(0)) refuse("casters: expected the faces of the scene");
+    if (lit_options.bounces < 2) refuse("bounces: expected at least 2");
+    const SceneView<T> scene = arrays.view(), casting = casters.view();
+    std::vector<CurveRecords> found;
+    std::vector<std::vector<double>> jumps;
+    std::vector<double> jump;
+    unlocked(threads, [&](Team& team) {
+        GeometryWork done;
+        const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
+        found = record_bounces(BackwardInput<T>{scene, camera, *geometry, image, nullptr, hits.view(), nullptr,
+                                                marked_faces("panes", arrays, panes)},
+                               casting, options, {lit.scene, lit_options}, samples, team, jumps);
+        for (const std::vector<double>& part : jumps) jump.insert(jump.end(), part.begin(), part.end());
+    });
+    return nb::make_tuple(curve_arrays(found, least, true, threads),
+                          rows(std::move(jump), {size_t(lit.scene.channels)}));
+}
+
+}  // namespace
+
+template <class T>
+void bind_scene_bounces(nb::class_<SceneArrays<T>>& scene) {
+    scene.def("bounce_samples", &bounce_samples<T>, "casters"_a, "lit"_a, "lit_options"_a, nb::kw_only(), "camera"_a,
+              "image"_a, "options"_a, "samples"_a, "least"_a, "threads"_a, "hits"_a, "panes"_a.none());
+}
+template void bind_scene_bounces(nb::class_<SceneArrays<float>>&);
+template void bind_scene_bounces(nb::class_<SceneArrays<double>>&);
+
+void bind_bounces(nb::module_& m) {
+    m.def("most_bounce_samples", &most_bounce_samples, "width"_a, "height"_a, "spp"_a);
+}
+
+}  // namespace edgegrad

@@ -1,0 +1,123 @@
+"""Borders of what surfaces of a path see of one another, in render(bounces=n)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from strip_oracle import Strip, border
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad import shader
+
+F64 = torch.float64
+LOOKS: dict[str, dict[str, Any]] = {
+    "lambert": {"base_color": torch.tensor([0.8, 0.6, 0.4], dtype=F64)},
+    "glossy": {"base_color": torch.tensor([0.8, 0.6, 0.4], dtype=F64), "metallic": 0.3, "roughness": 0.5},
+    "mirror-like": {"base_color": torch.tensor([0.8, 0.7, 0.6], dtype=F64), "metallic": 1.0, "roughness": 0.2},
+}
+
+
+@pytest.fixture
+def accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """render() refuses what moves borders of paths, for those of shadows on what is not seen are not there yet."""
+    monkeypatch.setattr("edgegrad.light.radiance.check_bounces", lambda *_: None)
+
+
+@pytest.fixture
+def alone(accepted: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gradients are those of these borders alone."""
+    for term in ("_interior", "_boundary", "_shadows"):
+        monkeypatch.setattr(shader._Image, term, lambda *_: [])
+
+
+def leaves_of(strip: Strip) -> Strip:
+    """With tensors that require gradients."""
+    receiver, sender, own = (x.clone().requires_grad_() for x in (strip.receiver, strip.sender, strip.strip))
+    pose, K = (x.clone().requires_grad_() for x in (strip.camera.world_to_camera, strip.camera.K))
+    return Strip(receiver, sender, own, strip.camera.replace(world_to_camera=pose, K=K), strip.light)
+
+
+# How far off gradients may be, along the exact ones; of the receiver and what it slides with, few samples make up much.
+MOST = {"strip": 0.02, "sender": 0.02, "pose": 0.03, "K": 0.03, "receiver": 0.05}
+
+
+def gradients(strip: Strip, looks: tuple[str, str], weights: Tensor, samples: int, **options: Any) -> dict[str, Tensor]:
+    own = leaves_of(strip)
+    scene = own.scene(*(LOOKS[look] for look in looks))
+    counts = {"edge_samples": samples, "surface_samples": 1}
+    given: dict[str, Any] = {"bounces": 2, **counts, **options}
+    image = eg.render(scene, own.camera, 1, 0, shadows=False, **given)
+    found = torch.autograd.grad((weights.to(image) * image).sum(), list(own.tensors.values()))
+    return dict(zip(own.tensors, found, strict=True))
+
+
+def weights_of(strip: Strip) -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return 0.5 + torch.rand(*strip.camera.size, 3, dtype=F64, generator=generator)
+
+
+def check_strip(strip: Strip, looks: tuple[str, str], samples: int, finer: int = 1) -> None:
+    """Gradients of all that moves the border, against the oracle."""
+    exact, weights = leaves_of(strip), weights_of(strip)
+    value = border(exact, LOOKS[looks[0]], LOOKS[looks[1]], weights, finer)
+    expected = torch.autograd.grad(value, list(exact.tensors.values()))
+    found = gradients(strip, looks, weights, samples)
+    for name, b in zip(exact.tensors, expected, strict=True):
+        a = found[name]
+        if name == "K":  # of which the upper rows count
+            a, b = a[:2], b[:2]
+        ratio, error = float((a * b).sum() / (b * b).sum()), float((a - b).norm() / b.norm())
+        assert abs(ratio - 1) < MOST[name] and error < 2 * MOST[name], (name, ratio, error)
+
+
+@pytest.mark.usefixtures("alone")
+@pytest.mark.parametrize("looks", [("lambert", "lambert"), ("glossy", "lambert"), ("lambert", "glossy")], ids="-".join)
+def test_strip_between_two_faces(looks: tuple[str, str]) -> None:
+    check_strip(Strip.standard(), looks, 1_600_000)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("alone")
+@pytest.mark.parametrize("looks", [("mirror-like", "lambert"), ("lambert", "mirror-like")], ids="-".join)
+def test_strip_between_mirrors(looks: tuple[str, str]) -> None:
+    check_strip(Strip.standard(), looks, 60_000_000, finer=3)
+
+
+@pytest.mark.usefixtures("alone")
+def test_lines_of_floats() -> None:
+    """In float32 lines are the same, but for rounding."""
+    weights = weights_of(Strip.standard())
+    fine, coarse = (gradients(Strip.standard(t), ("lambert", "lambert"), weights, 40_000) for t in (F64, torch.float32))
+    for name, exact in fine.items():
+        assert float((coarse[name] - exact).norm() / exact.norm()) < 1e-3
+
+
+@pytest.mark.usefixtures("alone")
+def test_same_bits_at_any_number_of_threads() -> None:
+    threads, found = torch.get_num_threads(), []
+    for count in (1, 2, 3):
+        torch.set_num_threads(count)
+        found.append(
+            gradients(Strip.standard(), ("glossy", "lambert"), weights_of(Strip.standard()), 20_000, bounces=3)
+        )
+    torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0].values(), other.values(), strict=True))
+
+
+@pytest.mark.usefixtures("alone")
+def test_forward_mode_is_the_adjoint_of_reverse_mode() -> None:
+    strip, weights = Strip.standard(), weights_of(Strip.standard())
+    found = gradients(strip, ("lambert", "glossy"), weights, 5_000)
+    tangents = {k: torch.rand(x.shape, dtype=F64, generator=torch.Generator().manual_seed(3)) for k, x in found.items()}
+
+    def image(receiver: Tensor, sender: Tensor, own: Tensor, pose: Tensor, K: Tensor) -> Tensor:
+        moved = Strip(receiver, sender, own, strip.camera.replace(world_to_camera=pose, K=K), strip.light)
+        scene = moved.scene(LOOKS["lambert"], LOOKS["glossy"])
+        return eg.render(scene, moved.camera, 1, bounces=2, shadows=False, edge_samples=5_000, surface_samples=1)
+
+    moved: Tensor = torch.func.jvp(image, tuple(strip.tensors.values()), tuple(tangents.values()))[1]
+    expected = sum(float((found[name] * tangent).sum()) for name, tangent in tangents.items())
+    assert abs(float((weights * moved).sum()) - expected) < 1e-9 * abs(expected)
