@@ -434,9 +434,10 @@ std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const Sc
     template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,               \
                                                       const GradientOptions&, const LightParts&, int64_t, Team&); \
     template std::vector<CurveRecords> record_unseen_shadows(                                                     \
-        const BackwardInput<T>&, const SceneView<T>&, const GradientOptions&, const LightParts&, int64_t, Team&);
-template std::vector<CurveRecords> record_bounces(const BackwardInput<T>&, const SceneView<T>&, const GradientOptions&,
-                                                  const LitPaths&, int64_t, Team&, std::vector<std::vector<double>>&);
+        const BackwardInput<T>&, const SceneView<T>&, const GradientOptions&, const LightParts&, int64_t, Team&); \
+    template std::vector<CurveRecords> record_bounces(const BackwardInput<T>&, const SceneView<T>&,               \
+                                                      const GradientOptions&, const LitPaths&, int64_t, Team&,    \
+                                                      std::vector<std::vector<double>>&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)
 #undef EDGEGRAD_INSTANTIATE
