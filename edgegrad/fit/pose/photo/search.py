@@ -265,6 +265,7 @@ class PhotoSearch(Ways):
         """The end, once more with what surrounds the object where it is now, and without what covers it: it does not depend
         on the start any more."""
         last = photo_levels(self.task, best.pose, self.depths, self.max_size, self.spp, self.seed)[-1]
+        last = last.focused(best.pose, self.seed)
         before = len(self.history)
         found = self._uncovered(best.pose, [torch.ones(picture.size) for picture in last.pictures], [last] * ROUNDS)
         if found.explained < self.enough:
