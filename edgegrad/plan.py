@@ -26,6 +26,7 @@ from .points.records import CURVE_BYTES, SURFACE_BYTES, without_colors
 from .points.shadows import ShadowLight
 from .points.surfaces import every_face
 from .render import SHADING, check_options
+from .scene.lights import Light
 from .scene.mesh import Mesh
 from .scene.mesh_light import MeshLight
 from .scene.scene import Scene, as_scene
@@ -159,6 +160,8 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     terms["shadows"] = Term(lights > 0 and lighting.shadows, why if lights else "no lights", samples=rays)
     terms["bounces"] = _bounces(scene, terms["interior"].samples + terms["boundary"].samples, lighting)
     terms["shadow edges"] = _shadow_edges(scene, request, lighting)
+    terms["unseen shadow edges"] = _unseen_shadow_edges(scene, request, lighting)
+    terms["bounce edges"] = _bounce_edges(scene, request, lighting)
     terms["texels of lamps"] = _texels_of_lamps(scene, lighting)
     return terms
 
@@ -184,25 +187,70 @@ def _texels_of_lamps(scene: Scene, lighting: Lighting) -> Term:
     return Term(True, f"{count} point{'s' * (count > 1)} of their borders for each point of the interior")
 
 
-def _shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
+def _lights_with_borders(
+    scene: Scene, request: Request, lighting: Lighting, names: Collection[str]
+) -> tuple[list[Light], str]:
+    """Those whose shadows have borders that move, as they do with slots of these names; else why none."""
     if not scene.casting or not lighting.shadows:
-        return Term(False, "shadows=False" if scene.casting else "no lights")
+        return [], "shadows=False" if scene.casting else "no lights"
     if not request.gradient.visibility:
-        return Term(False, "visibility=False")
-    cuts = any(mesh.alpha is not None for mesh in scene.meshes)
-    moving = [name for name in required(request) if name in (STEPPING if cuts else MOVING)]
-    lights = [light for light in scene.casting if moving or ShadowLight.moves(light)]
+        return [], "visibility=False"
+    moving = any(name in names for name in required(request))
+    return [light for light in scene.casting if moving or ShadowLight.moves(light)], ""
+
+
+def _shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
+    lights, why = _lights_with_borders(scene, request, lighting, STEPPING if _cuts(scene) else MOVING)
     if not lights:
-        return Term(False, "nothing that casts, receives or gives light moves, nor the camera")
+        return Term(False, why or "nothing that casts, receives or gives light moves, nor the camera")
     many = sum(not light.punctual for light in lights)
-    samples = (
-        request.cameras
-        * many
-        * core.most_shadow_samples(request.camera.width, request.camera.height, request.image.spp)
-    )
+    samples = request.cameras * many * _most_shadow_samples(request)
     why = f"of {len(lights)} light{'s' * (len(lights) > 1)}: 24 samples a pixel of border"
     why += ", not counted here" + "; of those with an extent by the rays of the image" * (many > 0)
     return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
+
+
+def _unseen_shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
+    if lighting.bounces == 1:
+        return Term(False, "bounces=1: no surface lights another")
+    # How borders lie on surfaces does not depend on the camera.
+    names = ("verts", *(("uvs", "alphas") if _cuts(scene) else ()))
+    lights, why = _lights_with_borders(scene, request, lighting, names)
+    if not lights:
+        return Term(False, why or "nothing that casts, receives or gives light moves")
+    each = request.gradient.edge_samples
+    samples = request.cameras * len(lights) * (each if each >= 0 else _most_shadow_samples(request))
+    why = (
+        f"of {len(lights)} light{'s' * (len(lights) > 1)}, on surfaces that light others: a ray of the light for each sample, "
+        f"and one to go on and one to the camera for each of {lighting.bounces - 1} further bounces"
+    )
+    return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
+
+
+def _bounce_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
+    if lighting.bounces == 1:
+        return Term(False, "bounces=1: no surface lights another")
+    if not request.gradient.visibility:
+        return Term(False, "visibility=False")
+    moving = [name for name in required(request) if name in MOVING]
+    if not moving:
+        return Term(False, "neither surfaces nor the camera move")
+    # What only the camera moves are borders that it sees.
+    kinds = lighting.bounces - 1 if "verts" in moving else 1
+    each, size = request.gradient.edge_samples, (request.camera.width, request.camera.height)
+    samples = request.cameras * kinds * (each if each >= 0 else core.most_bounce_samples(*size, request.image.spp))
+    why = "what surfaces see of one another: lines past edges, each two rays, one to the camera and a path at its other end"
+    if kinds > 1:
+        why += f"; as many whose light goes on to the camera after each of {kinds - 1} further bounces"
+    return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
+
+
+def _cuts(scene: Scene) -> bool:
+    return any(mesh.alpha is not None for mesh in scene.meshes)
+
+
+def _most_shadow_samples(request: Request) -> int:
+    return core.most_shadow_samples(request.camera.width, request.camera.height, request.image.spp)
 
 
 def _image_terms(scene: Scene, request: Request, any_gradient: bool) -> dict[str, Term]:

@@ -93,8 +93,8 @@ def render(
                      path goes on from each point that is shaded, as the material there scatters, and draws one point of
                      each light wherever it comes to; from the third bounce on it may end early (Russian roulette). Colours
                      of meshes without a material light nothing. So far with gradients by colours, textures, materials,
-                     normal maps and how bright lights are; what moves borders (vertices, camera, places of lights) must not
-                     require one, unless visibility=False
+                     normal maps, how bright lights are, and where, if they are no meshes; what else moves borders (vertices,
+                     camera) must not require one, unless visibility=False
 
     A scene with a light, or with a mesh that has a material, is lit: see Scene and Material. Its image has the dtype of the
     vertices.

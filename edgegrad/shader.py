@@ -26,6 +26,7 @@ from .check import all_finite, values_visible
 from .kernel.counts import Watch
 from .kernel.derivatives import differentiates, moves, transformed
 from .kernel.request import Request, derived_seed
+from .library import core
 from .points.background import environments
 from .points.blend import Blended, let_through, panes
 from .points.borders import Borders
@@ -70,9 +71,10 @@ class Effort(NamedTuple):
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
-    # Samples on the borders of what surfaces of paths of light see of one another, and how the image jumps there; None: there
-    # are no paths.
-    bounce_samples: Callable[[Frame], tuple[CurveRecords, Tensor]] | None = None
+    # What samples on the borders of what surfaces see of one another give to the image, by light that is scattered between them.
+    bounce_edges: Callable[[Frame], list[Term]] | None = None
+    # What samples on borders of a light's shadows on surfaces give to the image, by light that these surfaces pass on.
+    passed_on: Callable[[Frame, ShadowLight, CurveRecords], list[Term]] | None = None
     watch: Watch = Watch()  # is told what it takes
 
     @property
@@ -166,9 +168,12 @@ class _Image:
         if visibility:
             with watch.part("shadows"):
                 terms += self._shadows()
-        if moving and self._effort.bounce_samples is not None:
-            with watch.part("bounces"):
-                terms += self._bounces(self._effort.bounce_samples)
+            if self._effort.passed_on is not None:
+                with watch.part("unseen shadows"):
+                    terms += self._unseen_shadows(self._effort.passed_on)
+        if moving and self._effort.bounce_edges is not None:
+            with watch.part("bounce edges"):
+                terms += self._effort.bounce_edges(frame)
         return frame.attached(image, terms)
 
     # -- the image -----------------------------------------------------------------------------------------------------
@@ -272,18 +277,23 @@ class _Image:
                     terms += self._boundary(EdgeSamples(frame, records, light, one))
         return terms
 
-    def _bounces(self, sample: Callable[[Frame], tuple[CurveRecords, Tensor]]) -> list[Term]:
-        """The same over samples on the borders of what surfaces of paths see of one another."""
-        records, jump = sample(self._frame)
-        self._effort.watch.count("bounce_samples", len(records.x))
-        if not len(records.x):
-            return []
-        samples = EdgeSamples(self._frame, records)
-        jump = self._frame.here(jump).to(self._frame.dtype)
-        if self._effort.blended:
-            with torch.no_grad():
-                jump = let_through(self._frame, records)[:, None].to(jump) * jump
-        return boundary(samples.x, samples.velocity, jump, None, None)
+    def _unseen_shadows(self, passed_on: Callable[[Frame, ShadowLight, CurveRecords], list[Term]]) -> list[Term]:
+        """The same of borders of shadows, seen or not, by the light that surfaces pass on. They stay as the camera moves."""
+        frame = self._frame
+        terms: list[Term] = []
+        request, flat = frame.request, frame.surfaces.casters
+        count = request.gradient.edge_samples
+        if count < 0:
+            count = core.most_shadow_samples(frame.width, frame.height, request.image.spp)
+        moving = moves(frame.surfaces.verts) or (bool(len(flat.cut_outs)) and moves(flat.alphas, flat.uvs))
+        for index, casting in enumerate(frame.surfaces.scene.casting):
+            if moving or ShadowLight.moves(casting):
+                seed = derived_seed(frame.sampler.grad_seed, index + 2)
+                light = ShadowLight.of(frame.surfaces, index, seed)
+                records = frame.sampler.shadow_samples(light.parts, seed, count, False, one=True, seen=False)
+                self._effort.watch.count("unseen_shadow_samples", len(records.x))
+                terms += passed_on(frame, light, records)
+        return terms
 
     def _boundary(self, samples: EdgeSamples) -> list[Term]:
         """Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""

@@ -151,13 +151,13 @@ def test_what_moves_borders_is_refused() -> None:
     mesh, light = scene.meshes[0], scene.lights[0]
     moved = mesh.replace(verts=mesh.verts.clone().requires_grad_())
     floor = scene.replace(meshes=[moved, *scene.meshes[1:]])
+    moved_light = scene.replace(lights=[light.replace(position=vector(0, 0, 1).requires_grad_())])
+    half = torch.full((2, 2), 0.5, dtype=F64)
+    uvs = {"uvs": mesh.verts[:, :2], "uv_faces": mesh.faces}
+    pane = mesh.replace(**uvs, alpha=half, material=eg.Material(0.5, alpha_mode="BLEND"))
     for other, seen_from, name in (
         (floor, camera, r"meshes\[0\].verts"),
-        (
-            scene.replace(lights=[light.replace(position=vector(0, 0, 1).requires_grad_())]),
-            camera,
-            r"lights\[0\].position",
-        ),
+        (moved_light.replace(meshes=[pane, *scene.meshes[1:]]), camera, r"lights\[0\].position"),
         (scene, camera.replace(K=camera.K.clone().requires_grad_()), "camera.K"),
     ):
         for function in (eg.render, eg.plan):
@@ -166,6 +166,8 @@ def test_what_moves_borders_is_refused() -> None:
     # Without borders there is nothing to leave out; and direct light has all of them.
     assert eg.render(floor, camera, 4, bounces=2, visibility=False).requires_grad
     assert eg.render(floor, camera, 4).requires_grad
+    # A light moves the borders of its shadows alone.
+    assert eg.render(moved_light, camera, 4, bounces=2).requires_grad
     with torch.no_grad():
         eg.render(floor, camera, 4, bounces=2)
     with pytest.raises(ValueError, match="bounces: expected an int from 1"):

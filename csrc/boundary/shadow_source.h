@@ -66,6 +66,36 @@ struct ShadowPoint {
     double along = 0;     // y = l + along · d, or p + along · d from a light at infinity
 };
 
+// How F depends on what the border is made of, in whichever coordinates vertices and the light are given.
+struct ShadowBorder {
+    Vec3 N, d;
+    double S;
+    double by_caster[3] = {}, by_light;  // by its vertices, and by the light
+    double by_rim = 0;                   // ∂F/∂f
+
+    // at(i): a vertex; `light`: the point, or the direction towards it.
+    template <class At>
+    static ShadowBorder of(const ShadowPoint& point, bool infinite, Vec3 light, At at) {
+        const ShadowCaster& caster = point.caster;
+        const Vec3 p = caster.sum(caster.weight, at), along = caster.sum(caster.tangent, at);
+        ShadowBorder o;
+        o.d = infinite ? -light : p - light, o.N = cross(along, o.d), o.S = infinite ? 1 : point.along;
+        for (int i = 0; i < caster.count; ++i) o.by_caster[i] = o.S * caster.weight[i];
+        o.by_light = infinite ? -point.along : 1 - point.along;
+        if (caster.is_rim()) {
+            const Vec3 a = at(caster.vertex[0]);
+            o.by_rim = o.S * caster.kappa * dot(o.d, cross(at(caster.vertex[1]) - a, at(caster.vertex[2]) - a));
+        }
+        return o;
+    }
+    // What is swept where F may change by `most` times the length of how what casts the border moves along N.
+    double swept(double most, const ShadowCaster& caster) const {
+        double sum = by_caster[0] + by_caster[1];
+        if (caster.is_rim()) sum += by_caster[2];
+        return most * sum * length(N);
+    }
+};
+
 template <class T>
 class ShadowSource {
    public:
@@ -75,10 +105,8 @@ class ShadowSource {
         ShadowPoint shadow;
         int32_t receiver;  // which the ray ignores
         CurveFaces faces;
-        Vec3 N, m;            // the latter times c
-        double by_caster[3];  // by its vertices, and by the light
-        double by_light;
-        double by_rim;   // ∂F/∂f
+        ShadowBorder border;
+        Vec3 m;          // times c
         Vec2 by_n;       // ∂F/∂n
         double speed;    // |du/dt|, px of the straight image
         double scale;    // that over |∇F|
@@ -102,30 +130,18 @@ class ShadowSource {
     bool place(const Curve& curve, double, Sample& sample) const {
         const Camera& camera = view_.camera;
         const auto v = corners_of(view_, curve.face);
-        const Array<Vec3>& q = view_.vertices.q;
-        const auto of_vertex = [&](int32_t i) { return q[i]; };
-        const ShadowCaster& caster = curve.caster;
-        const Vec3 p = caster.sum(caster.weight, of_vertex), along = caster.sum(caster.tangent, of_vertex);
-        const Vec3 light = light_of(curve);
-        const Vec3 d = infinite_ ? -light : p - light, m = cross(v[1] - v[0], v[2] - v[0]);
-        const Vec3 N = cross(along, d), y = place_of(curve);
+        const ShadowBorder border =
+            ShadowBorder::of(curve, infinite_, light_of(curve), [&](int32_t i) { return view_.vertices.q[i]; });
+        const Vec3 m = cross(v[1] - v[0], v[2] - v[0]), y = place_of(curve), d = border.d, N = border.N;
         // What is lit from behind is dark on both sides of the border.
         if (!(dot(m, d) * dot(m, camera.view_direction(y)) > 0)) return false;
 
         sample.shadow = curve, sample.receiver = curve.face;
         sample.point = y, sample.behind = {};
-        const double S = infinite_ ? 1 : curve.along;
-        for (int i = 0; i < 3; ++i) sample.by_caster[i] = S * caster.weight[i];
-        sample.by_rim = 0;
-        if (caster.is_rim()) {
-            const Vec3 a = q[caster.vertex[0]];
-            sample.by_rim = S * caster.kappa * dot(d, cross(q[caster.vertex[1]] - a, q[caster.vertex[2]] - a));
-        }
-        sample.by_light = infinite_ ? -curve.along : 1 - curve.along;
-        sample.N = N, sample.m = (camera.along_ray(N, sample.n) / camera.along_ray(m, sample.n)) * m;
+        sample.border = border, sample.m = (camera.along_ray(N, sample.n) / camera.along_ray(m, sample.n)) * m;
         const Vec3 slope = camera.unit_at_depth(y.z) * (N - sample.m);
         sample.by_n = {slope.x, slope.y};
-        const Vec3 moved = (S / dot(m, d)) * cross(m, N);
+        const Vec3 moved = (border.S / dot(m, d)) * cross(m, N);
         const double w = 1 / camera.depth_weight(y),
                      w_dot = camera.projection([&](auto c) { return c.weight_jvp(moved); });
         sample.speed =
@@ -167,17 +183,18 @@ class ShadowSource {
         Vec3 receiver;
         for (int i = 0; i < 3; ++i) receiver += sample.shadow.on[i] * direction.q[vertex[i]];
         const ShadowCaster& edge = sample.shadow.caster;
-        const Vec3 caster = edge.sum(sample.by_caster, [&](int32_t i) { return direction.q[i]; });
+        const Vec3 caster = edge.sum(sample.border.by_caster, [&](int32_t i) { return direction.q[i]; });
         const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
         double F_dot =
-            dot(sample.m, receiver) - dot(sample.N, caster) + sample.by_n.x * n_dot.x + sample.by_n.y * n_dot.y;
+            dot(sample.m, receiver) - dot(sample.border.N, caster) + sample.by_n.x * n_dot.x + sample.by_n.y * n_dot.y;
         if (const double* uvs = direction.tangents.uvs; uvs && edge.is_rim())
             for (int i = 0; i < 3; ++i) {
                 const double* uv_dot = uvs + 2 * int64_t(edge.uv_row[i]);
-                F_dot += sample.by_rim * edge.weight[i] * (edge.by_uv.x * uv_dot[0] + edge.by_uv.y * uv_dot[1]);
+                F_dot += sample.border.by_rim * edge.weight[i] * (edge.by_uv.x * uv_dot[0] + edge.by_uv.y * uv_dot[1]);
             }
         if (const double* alphas = direction.tangents.alphas; alphas && edge.of_alpha)
-            for (int k = 0; k < 4; ++k) F_dot += sample.by_rim * edge.alpha.weight(k) * alphas[edge.alpha.texel[k]];
+            for (int k = 0; k < 4; ++k)
+                F_dot += sample.border.by_rim * edge.alpha.weight(k) * alphas[edge.alpha.texel[k]];
         return {sample.scale * sample.area_scale * F_dot, 0};
     }
 
@@ -190,10 +207,10 @@ class ShadowSource {
         }
         const ShadowCaster& caster = sample.shadow.caster;
         for (int i = 0; i < caster.count; ++i) {
-            const Vec3 bar = (-F_bar * sample.by_caster[i]) * sample.N;
+            const Vec3 bar = (-F_bar * sample.border.by_caster[i]) * sample.border.N;
             grad.q.add<3>(caster.vertex[i], &bar.x);
         }
-        const double rim_bar = F_bar * sample.by_rim;
+        const double rim_bar = F_bar * sample.border.by_rim;
         if (caster.is_rim() && grad.uvs.is_wanted())
             for (int i = 0; i < 3; ++i) {
                 const Vec2 uv_bar = (rim_bar * caster.weight[i]) * caster.by_uv;
@@ -204,7 +221,7 @@ class ShadowSource {
                 const double alpha_bar = rim_bar * caster.alpha.weight(k);
                 grad.alphas.add<1>(caster.alpha.texel[k], &alpha_bar);
             }
-        grad.light = {sample.shadow.part, sample.shadow.uv, (-F_bar * sample.by_light) * sample.N};
+        grad.light = {sample.shadow.part, sample.shadow.uv, (-F_bar * sample.border.by_light) * sample.border.N};
         normalised_vjp(view_.camera, sample.n, F_bar * sample.by_n, grad.k);
     }
 

@@ -101,11 +101,12 @@ struct LightArrays {
     }
 };
 
-// The samples on the borders of shadows of `casters`: the same faces as light meets them.
+// The samples on the borders of shadows of `casters`: the same faces as light meets them. `seen`: by the camera; else
+// on surfaces, whether it sees them or not.
 template <class T>
 nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const Camera& camera,
                         const ImageOptions& image, const GradientOptions& options, const LightArrays& light,
-                        int64_t samples, double least, bool one, int threads, const HitArrays<T>& hits,
+                        int64_t samples, double least, bool one, bool seen, int threads, const HitArrays<T>& hits,
                         const std::optional<In<uint8_t, 1>>& panes) {
     hits.check(arrays, camera), light.check(int64_t(arrays.faces.shape(0)));
     if (casters.faces.shape(0) != arrays.faces.shape(0)) refuse("casters: expected the faces of the scene");
@@ -114,9 +115,10 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& cast
     unlocked(threads, [&](Team& team) {
         GeometryWork done;
         const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
-        found = record_shadows(BackwardInput<T>{scene, camera, *geometry, image, nullptr, hits.view(), nullptr,
-                                                marked_faces("panes", arrays, panes)},
-                               casting, options, light.view(), samples, team);
+        const BackwardInput<T> input{scene,   camera,      *geometry, image,
+                                     nullptr, hits.view(), nullptr,   marked_faces("panes", arrays, panes)};
+        found = seen ? record_shadows(input, casting, options, light.view(), samples, team)
+                     : record_unseen_shadows(input, casting, options, light.view(), samples, team);
     });
     return curve_arrays(found, least, one, threads);
 }
@@ -268,7 +270,7 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
         .def("samples", &samples<T>, "camera"_a, "image"_a, "options"_a, "least"_a, "threads"_a, "hits"_a,
              "detailed"_a.none(), "panes"_a.none(), "looks"_a.none())
         .def("shadow_samples", &shadow_samples<T>, "casters"_a, "camera"_a, "image"_a, "options"_a, "light"_a,
-             "samples"_a, "least"_a, "one"_a, "threads"_a, "hits"_a, "panes"_a.none())
+             "samples"_a, "least"_a, "one"_a, "seen"_a, "threads"_a, "hits"_a, "panes"_a.none())
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)
         .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(),
              "ignored"_a.noconvert().none(), "threads"_a)

@@ -8,6 +8,7 @@
 #include <optional>
 #include <vector>
 
+#include "contract/record.h"
 #include "forward/lit_image.h"
 #include "python/arrays.h"
 #include "python/lit_arrays.h"
@@ -15,6 +16,7 @@
 #include "python/unlocked.h"
 #include "shading/lit/flat_light.h"
 #include "shading/lit/indirect.h"
+#include "shading/lit/towards_camera.h"
 
 using namespace nanobind::literals;
 
@@ -244,6 +246,37 @@ nb::object indirect_points_jvp(const SceneArrays<T>& arrays, const LitArrays& li
     return shaped(std::move(out), {size_t(view.size), size_t(moving.channels)});
 }
 
+// What comes to the image of light that has come to points, after `first`, …, `last` further steps: which point it is
+// of (M,), where (M, 2), and its radiance times px² (M, C).
+template <class T>
+nb::tuple points_towards_camera(const SceneArrays<T>& arrays, const LitArrays& lit, const Camera& camera,
+                                const ImageOptions& image, In<int64_t, 1> face, In<double, 2> b, In<int64_t, 1> seed,
+                                In<double, 2> origin, In<double, 2> carried, int first, int last, int threads) {
+    check_faces(arrays, lit);
+    const size_t n = face.size(), C = size_t(lit.scene.channels);
+    if (b.shape(0) != n || b.shape(1) != 3 || seed.size() != n || origin.shape(0) != n || origin.shape(1) != 3 ||
+        carried.shape(0) != n || carried.shape(1) != C)
+        refuse("b, seed, origin, carried: expected a row for each point");
+    if (first < 0 || last < first || last > most_bounces) refuse("steps: expected some in ascending order");
+    for (size_t i = 0; i < n; ++i)
+        if (face(i) < 0 || face(i) >= faces_of(lit)) refuse("face: expected faces of the scene");
+    const Arrivals arrivals{int64_t(n), face.data(), b.data(), origin.data(), carried.data(), seed.data()};
+    Array<int64_t> arrival(0);
+    Array<double> x(0), radiance(0);
+    unlocked(threads, [&](Team& team) {
+        GeometryWork work;
+        const auto geometry = arrays.geometry({}, team, work);
+        const CameraConnections connections(camera, image.filter.radius() - 0.5);
+        const std::vector<Connections> found = towards_camera(lit.scene, arrays.view(), geometry->caster(), connections,
+                                                              arrivals, StepRange{first, last}, team);
+        arrival = joined(found, &Connections::arrival, team), x = joined(found, &Connections::x, team);
+        radiance = joined(found, &Connections::radiance, team);
+    });
+    const size_t m = size_t(arrival.size());
+    return nb::make_tuple(shaped(std::move(arrival), {m}), shaped(std::move(x), {m, 2}),
+                          shaped(std::move(radiance), {m, C}));
+}
+
 // Index, uv and density, (N, samples) of each.
 nb::tuple drawn_light_points(const LitArrays& lit, const PointArrays& points, const LitOptions& options, int lamp,
                              int threads) {
@@ -273,6 +306,8 @@ void bind_scene_lit(nb::class_<SceneArrays<T>>& scene) {
              "bar"_a.noconvert(), "wanted"_a, "threads"_a)
         .def("indirect_jvp", &indirect_points_jvp<T>, "lit"_a, "points"_a, nb::kw_only(), "options"_a, "tangents"_a,
              "b_dot"_a.none(), "spread_dot"_a.none(), "threads"_a)
+        .def("towards_camera", &points_towards_camera<T>, "lit"_a, nb::kw_only(), "camera"_a, "image"_a, "face"_a,
+             "b"_a, "seed"_a, "origin"_a, "carried"_a, "first"_a, "last"_a, "threads"_a)
         .def("lit_image", &lit_image<T>, "lit"_a, "camera"_a, "image"_a, "options"_a, "points"_a, "seed"_a, "again"_a,
              "threads"_a, "hits"_a);
 }

@@ -1,8 +1,9 @@
 """What render() can differentiate where light is scattered more than once.
 
-Inside surfaces every tensor of a scene has its derivative (csrc/shading/lit/path_radiance.h). But what moves also moves the
-borders of what surfaces of a path see of one another and of lights; of these there are no samples yet. Without them a gradient
-would be wrong without notice, so it is refused.
+Inside surfaces every tensor of a scene has its derivative (csrc/shading/lit/path_radiance.h), and the borders of lights' shadows
+have theirs (unseen_shadows.py). But what moves also moves the borders of what surfaces of a path see of one another; of these
+there are no samples yet. Without them a gradient would be wrong without notice, so it is refused: of all that moves but lights
+that are no meshes, for these move borders of shadows alone.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ def check_bounces(scene: Scene, camera: Camera, visibility: bool) -> None:
             raise ValueError(
                 f"bounces: {name} requires a gradient, and what it moves has none yet at the borders of what surfaces see of one "
                 "another by light that is scattered more than once; give bounces=1, detach it, or leave out all that moves at "
-                "borders with visibility=False. Colours, textures, roughness, normal maps, and how bright lights are, have whole "
-                "gradients"
+                "borders with visibility=False. Colours, textures, roughness, normal maps, and how bright lights are and where, "
+                "if they are no meshes, have whole gradients"
             )
 
 
@@ -52,6 +53,9 @@ def _moving(scene: Scene, camera: Camera) -> Iterator[tuple[str, Tensor]]:
         for texture in nearest_textures(mesh):
             if texture.uvs is not None:
                 yield f"uvs of a nearest texture of {name}", texture.uvs
+    if not scene.blends:
+        return
+    # Light is not followed to the camera through what one sees through.
     for number, light in enumerate(scene.lights):
         name = f"lights[{number}]"
         if isinstance(light, DirectionalLight):

@@ -25,6 +25,8 @@ from ..library import core
 from ..points.frame import Frame
 from ..points.hits import Hits
 from ..points.records import CurveRecords
+from ..points.shadows import ShadowLight
+from ..points.splat import Term
 from ..points.surfaces import View
 from ..scene.appearance import OnMesh, coordinates
 from ..scene.environment import Environment
@@ -38,6 +40,7 @@ from ..shader import Effort, render_shaded, shaded_points
 from ..warnings import warn
 from . import in_kernel
 from .at_points import Options
+from .bounce_edges import bounce_edges
 from .bounces import check_bounces
 from .bsdf import Scattering, dot, terminator
 from .companions import COMPANIONS, FOURS
@@ -45,6 +48,7 @@ from .creases import note_jumps
 from .in_kernel import is_fused, nearest_textures
 from .lamp_trees import MeshTowards, tree_of
 from .resampled import Glossy, resampled
+from .unseen_shadows import unseen_shadows
 
 FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
 # Where glossy surfaces end or meet, points of a light for each sample of it: these are few points, and what is wanted of them is
@@ -109,7 +113,8 @@ class Lighting(NamedTuple):
             gives_derivatives=fused and additive,
             additive=additive,
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
-            bounce_samples=self._bounce_samples if self.bounces > 1 else None,
+            bounce_edges=self._bounce_edges if self.bounces > 1 else None,
+            passed_on=self._passed_on if self.bounces > 1 and self.shadows else None,
             watch=watch,
         )
         image = render_shaded(scene, camera, self, request, creases, False, effort)
@@ -120,9 +125,11 @@ class Lighting(NamedTuple):
             image = image + tensor.reshape(-1)[:0].sum().to(image)
         return image
 
-    def _bounce_samples(self, frame: Frame) -> tuple[CurveRecords, Tensor]:
-        options = Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces)
-        return in_kernel.bounce_samples(frame, options)
+    def _bounce_edges(self, frame: Frame) -> list[Term]:
+        return bounce_edges(frame, Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces))
+
+    def _passed_on(self, frame: Frame, light: ShadowLight, records: CurveRecords) -> list[Term]:
+        return unseen_shadows(frame, light, records, self.bounces)
 
     @staticmethod
     def resamples(scene: Scene) -> bool:

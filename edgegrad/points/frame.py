@@ -22,7 +22,8 @@ from .steps import Steps
 from .surfaces import Surfaces, View
 
 _Rays = TypeVar("_Rays", bound=RayRecords | SurfaceRecords)
-SAMPLES = ("image", "inside", "edges", "steps", "shadows", "image again")  # each kind has its own random numbers
+# Each kind has its own random numbers.
+SAMPLES = ("image", "inside", "edges", "steps", "shadows", "image again", "unseen shadows", "bounce edges")
 
 
 class Frame:

@@ -1,0 +1,53 @@
+// Where a camera has points of surfaces in its image, as far as nothing hides them: how light that is followed from its
+// source comes to pixels.
+#pragma once
+
+#include <cmath>
+#include <vector>
+
+#include "camera/camera.h"
+#include "camera/view_volume.h"
+#include "camera/windows.h"
+
+namespace edgegrad {
+
+struct CameraConnection {
+    Vec2 x;             // the pixel position
+    double area_scale;  // px² of the image that an area of the surface fills, per unit
+    double spread[4];   // how barycentrics along the two sides change from a pixel to the next, to the right and down
+};
+
+class CameraConnections {
+   public:
+    // reach  how far beyond its borders, px, the image shows something: the pixel filter's
+    CameraConnections(const Camera& camera, double reach) {
+        for (const Camera& window : windows_of(camera, reach)) windows_.push_back({window, {window, reach}});
+    }
+
+    // Calls body(CameraConnection) for each place of the image at which the point y of a face with the sides e1 and e2
+    // lies, world coordinates.
+    template <class Body>
+    void each(Vec3 y, Vec3 e1, Vec3 e2, Body body) const {
+        for (const Window& window : windows_) {
+            const Camera& c = window.camera;
+            const Vec3 q = c.to_camera(y);
+            if (!(c.depth_weight(q) > 0) || window.volume.outcode(q) != 0) continue;
+            const Bent bent = bend(c, project(c, q));
+            if (!(bent.area_scale != 0)) continue;
+            const Vec2 u = project_jvp(c, q, c.R * e1, {}), v = project_jvp(c, q, c.R * e2, {});
+            const double area = u.x * v.y - u.y * v.x;
+            if (!(std::fabs(area) > 0)) continue;  // seen edge-on
+            body(CameraConnection{
+                bent.x, std::fabs(area) / length(cross(e1, e2)), {v.y / area, -u.y / area, -v.x / area, u.x / area}});
+        }
+    }
+
+   private:
+    struct Window {
+        Camera camera;
+        ViewVolume volume;
+    };
+    std::vector<Window> windows_;
+};
+
+}  // namespace edgegrad

@@ -1,0 +1,70 @@
+"""Borders of lights' shadows on surfaces that light others, whether the camera sees these borders or not: how much light comes
+by way of such surfaces changes as the borders move on them.
+
+    δI = Σ_k k(x_k − c) B_k δF        over samples
+
+of a border F = 0 (csrc/boundary/unseen_shadows.cpp), with the light B_k that comes from the surface there to the place x_k of the
+image, by so many steps more (csrc/shading/lit/towards_camera.h).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..points.frame import Frame
+from ..points.moving import Form, velocity
+from ..points.records import CurveRecords
+from ..points.shadows import ShadowLight
+from ..points.splat import Term
+from . import in_kernel
+from .bsdf import dot
+
+AT_ONCE = 1 << 17  # samples whose light is followed together
+
+
+def unseen_shadows(frame: Frame, light: ShadowLight, records: CurveRecords, bounces: int) -> list[Term]:
+    """What samples on the borders of a light's shadows give to the image, by light that is scattered `bounces` times at most."""
+    moved = _velocity(frame, light, records)
+    terms: list[Term] = []
+    for first in range(0, len(records.x), AT_ONCE):
+        with torch.no_grad():
+            sample, x, radiance = _towards_camera(frame, light, records, slice(first, first + AT_ONCE), bounces)
+        terms.append(Term(x, moved.index_select(0, sample).to(radiance.dtype)[:, None] * radiance))
+    return terms
+
+
+def _towards_camera(
+    frame: Frame, light: ShadowLight, records: CurveRecords, some: slice, bounces: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Which samples send light to the camera (M,), to which places of the image (M, 2), and how much (M, C)."""
+    face, b = frame.here(records.hit_face[some]), frame.here(records.hit_b[some])
+    seed = frame.seeds("unseen shadows", len(records.x))[some]
+    hits = frame.fixed_hits(face, b, frame.here(records.hit_x[some]), seed)
+    points, share = light.points(frame.here(records.light[some]), frame.here(records.light_uv[some]))
+    drawn = light.light.shows(points) & points.density.isfinite()
+    position = hits.position
+    origin = light.light.incident(points, position).expand(len(position), 3)
+    # The light that falls on the surface, over the cosine by which the border's measure has been divided.
+    cosine = dot(frame.fixed.face_normals(face), origin).abs()
+    weight = torch.where(drawn, frame.here(records.hit_factor[some]) * share * cosine[:, 0].double(), 0.0)
+    arriving = light.light.arriving(points, position).expand(len(position), frame.fixed.scene.channels)
+    carried = torch.where(drawn[:, None], arriving.double() * weight[:, None], 0.0)
+    found = in_kernel.towards_camera(frame, (face, b, seed, origin.double(), carried), (1, bounces - 1))
+    sample, x, radiance = (frame.here(part) for part in found)
+    return sample + some.start, x, radiance.to(frame.dtype)
+
+
+def _velocity(frame: Frame, light: ShadowLight, records: CurveRecords) -> Tensor:
+    """(S,): zeros with the derivatives of F."""
+    count, flat = len(records.x), frame.surfaces.casters
+    forms = [
+        (Form(records.row_of, records.vertex, records.by_q), frame.surfaces.verts),
+        (Form(records.uv_row_of, records.uv, records.by_uv), flat.uvs),
+        (Form(records.alpha_row_of, records.alpha, records.by_alpha[:, None]), flat.alphas[:, :1]),
+    ]
+    if light.moves(light.light):
+        points, _ = light.points(frame.here(records.light), frame.here(records.light_uv))
+        every = torch.arange(count)
+        forms.append((Form(every, every, records.by_light), light.light.place(points).double()))
+    return frame.here(velocity(count, forms))

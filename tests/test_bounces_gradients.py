@@ -1,0 +1,39 @@
+"""Gradients of light that is scattered more than once, by what moves, against finite differences of images of it alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from bounce_scenes import case_of, indirect_change, indirect_gradient
+from finite_differences import right_ratio
+
+from edgegrad.light import radiance
+
+
+@pytest.fixture
+def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets render() differentiate what moves borders, of which one kind is not there yet: those between two points of a path."""
+    monkeypatch.setattr(radiance, "check_bounces", lambda *_: None)
+
+
+def check(scene: str, motion: str, spp: int, seeds: int, h: float = 0.1, bounces: int = 2, **samples: Any) -> None:
+    case = case_of(scene, motion)
+    change = indirect_change(case, h, spp, seeds, bounces)
+    print(right_ratio(change, indirect_gradient(case, h, seeds, bounces, **samples)))
+
+
+OPEN = {"surface_samples": 60_000, "edge_samples": 10_000}
+
+
+@pytest.mark.usefixtures("allowed")
+def test_paths_that_no_border_crosses() -> None:
+    check("open plates", "left y", 512, 4, **OPEN)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("allowed")
+@pytest.mark.parametrize("bounces", [2, 3])
+@pytest.mark.parametrize("motion", ["right vertex", "left y", "lamp y"])
+def test_all_motions_of_paths_that_no_border_crosses(motion: str, bounces: int) -> None:
+    check("open plates", motion, 4096, 8, bounces=bounces, **{name: 8 * n for name, n in OPEN.items()})
