@@ -127,7 +127,7 @@ class MitsubaGradients:
     PRIMAL = 16  # samples a pixel of the image, edgegrad's default
 
     def __init__(self, scene: eg.Scene, given: Parameters, residual: dict[str, Tensor]) -> None:
-        self.mi, self.dr = mi, dr = mitsuba._load()
+        self.mi, self.dr = mi, dr = mitsuba.load()
         dr.set_thread_count(torch.get_num_threads())
         (mesh,), (light,) = scene.meshes, scene.lights
         assert isinstance(light, eg.Environment) and mesh.normals is not None

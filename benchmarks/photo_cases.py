@@ -54,6 +54,7 @@ class Case:
     truth: Placed
     depth: Tensor | None = None  # (H, W)
     symmetries: eg.Symmetries | None = None  # up to which poses look alike
+    real: bool = False  # a photograph, of which `truth` may be off
 
     @property
     def center(self) -> Tensor:
@@ -66,6 +67,13 @@ class Case:
         """The diagonal of the bounding box."""
         low, high = self.mesh.verts.double().aminmax(dim=0)
         return float((high - low).norm())
+
+    def alpha(self, pose: Placed, camera: eg.Camera | None = None) -> Tensor:
+        """(H, W), the silhouette at a pose, as the camera sees it, or another one."""
+        placed = self.mesh.transformed(pose.R.float(), pose.t.float())
+        return eg.render_aovs(eg.Mesh(placed.verts, placed.faces), camera or self.camera, ["alpha"], 16)["alpha"][
+            ..., 0
+        ]
 
     def beside(self, pose: Placed, degrees: float, shift: float, rng: np.random.Generator) -> Placed:
         """The pose turned by an angle and shifted by a length, both in random directions."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ def squirrel(folder: Path) -> Case:
 def gelatin_box(folder: Path, with_depth: bool) -> Case:
     place = folder / "gelatin_box"
     known = _json(place / "reference.json")["009_gelatin_box"]
-    mesh = _textured(place / "009_gelatin_box_textured.gltf", place / "009_gelatin_box_tex1024.png")
+    mesh = textured(place / "009_gelatin_box_textured.gltf", place / "009_gelatin_box_tex1024.png")
     truth = _placed(known["cam_R_mesh"], known["cam_t_mesh_m"])
     depth = _integers(place / "000001-depth.png") / 10000.0 if with_depth else None
     return _case("gelatin box", mesh, place / "000001-color.png", known["K"], truth, depth)
@@ -48,7 +49,7 @@ def cracker_box(folder: Path) -> Case:
     """`truth` is the start that comes with it."""
     place = folder / "cracker_box"
     known = _json(place / "reference.json")
-    mesh = _textured(place / "003_cracker_box_textured.gltf", place / "003_cracker_box_tex1024.png")
+    mesh = textured(place / "003_cracker_box_textured.gltf", place / "003_cracker_box_tex1024.png")
     R, t = torch.tensor(known["cam_R_bop"]).double(), torch.tensor(known["cam_t_bop_m"]).double()
     inner, shift = torch.tensor(known["gltf_to_bop_R"]).double(), torch.tensor(known["gltf_to_bop_t_m"]).double()
     return _case("cracker box", mesh, place / "image_rgb.png", known["K"], Placed(R @ inner, R @ shift + t))
@@ -64,7 +65,7 @@ def bottle(folder: Path, frame: int, with_depth: bool) -> Case:
     if not with_depth:
         return case
     metres, pose, K = _depth_camera(place / "_sequence", frame)
-    return Case(case.name, case.mesh, case.picture, case.camera, truth, reprojected(metres, K, pose, case.camera))
+    return replace(case, depth=reprojected(metres, K, pose, case.camera))
 
 
 def reprojected(depth: Tensor, K: Tensor, to_world: Tensor, camera: eg.Camera) -> Tensor:
@@ -101,10 +102,11 @@ def _case(name: str, mesh: eg.Mesh, picture: Path, K: Any, truth: Placed, depth:
     image = eg.read_image(picture, channels=3)
     H, W = image.shape[:2]
     camera = eg.Camera.from_opencv(torch.eye(3), torch.zeros(3), torch.tensor(K), (H, W))
-    return Case(name, mesh, image, camera, truth, depth)
+    return Case(name, mesh, image, camera, truth, depth, real=True)
 
 
-def _textured(mesh: Path, texture: Path) -> eg.Mesh:
+def textured(mesh: Path, texture: Path) -> eg.Mesh:
+    """With the texture that its file names otherwise, or not at all."""
     return eg.load_mesh(mesh, materials=False).replace(texture=eg.read_image(texture, channels=3))
 
 

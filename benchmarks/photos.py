@@ -1,9 +1,11 @@
 """fit_pose and fit_camera in photographs: how often they find the pose, how exactly, and whether they know.
 
-    python benchmarks/photos.py [FOLDER] [--parts lit squirrel …] [--starts 20] [--pictures out/photos] [--json out/photos.json]
+    python benchmarks/photos.py [FOLDER] [--parts lit squirrel …] [--starts 20] [--first 0] [--meshes FILE …]
+        [--pictures out/photos] [--json out/photos.json]
 
-Without FOLDER, in pictures made here (photo_cases.py): of the stone of the examples, or of --meshes, before --backgrounds, the
-photographs of FOLDER, or a clutter of boards. With it, in real photographs, whose cameras are OpenCV's (x right, y down, z
+Without FOLDER, in pictures made here (photo_cases.py), numbered from --first on, of which each has a seed, a mesh and a start of
+its own: of the stone of the examples, or of --meshes by turns, before --backgrounds, the photographs of FOLDER, or a clutter of
+boards. With it, in real photographs, whose cameras are OpenCV's (x right, y down, z
 forward, pixels, X_cam = R X + t):
 
     squirrel/frame.png, squirrel_demo_low.obj (mm, without colours), camera_and_init.json: K, cam_R_model_init,
@@ -19,7 +21,9 @@ In the parts `camera` and `focal` the object stays, and fit_camera looks for the
 others; in `focal` also for a focal length that is off by FOCAL.
 
 Errors are the angle, and how far the object's centre is off, as a part of the object's size, the diagonal of its bounding box, or
-in its mesh's units. `falsely` counts fits that say `converged` and are more than three times the limits off.
+in its mesh's units; of real photographs also how far the contour is from their edges, in the middle (photo_edges.py). `falsely`
+counts fits that say `converged` and are more than three times the limits off. `work` is processor time of all threads, `first`
+that of the first, about what a fit takes where nothing else runs.
 """
 
 from __future__ import annotations
@@ -29,11 +33,14 @@ import json
 import math
 import statistics
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import photo_edges
 import photo_folder
 import torch
 import torch.nn.functional as F
@@ -44,9 +51,12 @@ import edgegrad as eg
 from edgegrad.fit import PoseFit, fit_camera, fit_pose, fit_poses
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
+from objects import pebble
 
 FAR_OFF = 3.0  # limits: beyond, a fit must not say that it has converged
 FOCAL = 1.06  # by this factor or its inverse
+NEAR = 6.0  # pixels around a contour where edges of a real photograph are looked for
+STONE = "stone"  # the mesh of the examples
 RIM = 0.3  # share of a pixel by which a neighbour's alpha is higher on a contour
 
 
@@ -58,6 +68,22 @@ class Limits:
     shift: float  # of the object's size
     share: float = 0.0  # of the fits; 0 where that is not asked
     apart: float = 0.0  # degrees to the fits' own middle; 0 where that is not asked
+
+
+class Work(NamedTuple):
+    """Seconds of processor time."""
+
+    every: float  # of all threads
+    first: float  # of the first one, about what a fit takes where nothing else runs
+
+    @staticmethod
+    def now() -> Work:
+        return Work(time.process_time(), time.thread_time())
+
+    @staticmethod
+    def since(began: Work) -> Work:
+        now = Work.now()
+        return Work(now.every - began.every, now.first - began.first)
 
 
 @dataclass
@@ -74,15 +100,22 @@ class Trial:
     converged: bool
     steps: int
     seconds: float
+    work: float  # as Work.every
+    first: float
     right: bool
     falsely: bool
+    matrix: list[list[float]]
+    edges: list[float] = field(
+        default_factory=list
+    )  # of real ones: middle, 90 % of the contour's distances to edges, pixels
 
     def line(self) -> str:
         verdict = "falsely converged" if self.falsely else "" if self.right else "missed"
         return (
-            f"  {self.case:14s} {self.start_degrees:5.1f}° {self.start_shift:5.1%} → {self.degrees:6.2f}° {self.shift:6.2%} "
+            f"  {self.case:28s} {self.start_degrees:5.1f}° {self.start_shift:5.1%} → {self.degrees:6.2f}° {self.shift:6.2%} "
             f"({self.length:.3g})  explained {self.explained:.2f}  {'converged' if self.converged else '-':9s} "
-            f"{self.steps:3d} steps {self.seconds:5.1f} s  {verdict}"
+            f"{self.steps:3d} steps {self.seconds:5.1f} s, {self.work:.1f} of work  "
+            f"{''.join(f'{value:.2f} px ' for value in self.edges)} {verdict}"
         )
 
 
@@ -112,12 +145,16 @@ class Part:
             self.name, f"{right} of {count}", f"{known}", f"{falsely}", f"{middle[0]:.2f}°", f"{middle[1]:.2%}",
             "" if self.spread is None else f"{self.spread:.2f}°",
             f"{statistics.fmean(t.steps for t in self.trials):.0f}",
-            f"{statistics.fmean(t.seconds for t in self.trials):.1f}", must, met,
+            *(f"{statistics.fmean(getattr(t, name) for t in self.trials):.1f}" for name in ("work", "first")),
+            "" if not self.trials[0].edges else f"{statistics.median(t.edges[0] for t in self.trials):.2f}", must, met,
         )  # fmt: skip
 
 
-TABLE = ("part", "right", "of them converged", "falsely", "angle", "shift", "apart", "steps", "seconds", "must", "")
-WIDTHS = (22, 10, 17, 7, 7, 7, 7, 5, 7, 34, 6)
+TABLE = (
+    "part", "right", "of them converged", "falsely", "angle", "shift", "apart", "steps", "work/s", "first/s", "edges/px",
+    "must", "",
+)  # fmt: skip
+WIDTHS = (22, 10, 17, 7, 7, 7, 7, 5, 6, 7, 8, 34, 6)
 
 
 @dataclass(frozen=True)
@@ -125,21 +162,31 @@ class Run:
     """What all parts are given."""
 
     starts: int
+    first: int  # number of the first picture that is made here
     pictures: Path | None
-    meshes: Sequence[eg.Mesh]
+    meshes: Sequence[tuple[str, eg.Mesh]]
     backgrounds: Sequence[Tensor]
+
+    def made(self, kind: Kind, seeds: int) -> Iterator[tuple[int, Case]]:
+        """Pictures of a kind, of the meshes by turns, with their numbers, to which `seeds` is added."""
+        for k in range(self.starts):
+            name, mesh = self.meshes[k % len(self.meshes)]
+            number = self.first + k
+            seed = 0 if kind == "easy" else seeds + number
+            yield number, rendered(f"{kind} {name} {seed}", mesh, self.backgrounds, kind, seed)
 
     def fitted(
         self, part: Part, case: Case, start: Placed | None, truth: Placed, label: str,
         mask: Tensor | None = None, search: bool = True,
     ) -> tuple[Trial, PoseFit]:  # fmt: skip
         """Without a start, it is looked for."""
+        began = Work.now()
         fit = fit_pose(
             case.mesh, case.picture, case.camera, mask, None if start is None else start.matrix, depth=case.depth,
             search=search, starts="global" if start is None else 1, progress=False,
         )  # fmt: skip
         found = Placed(fit.R, fit.t)
-        trial = self.noted(part, case, start, found, truth, fit)
+        trial = self.noted(part, case, start, found, truth, fit, Work.since(began))
         self.drawn(label, outlined(case, start, found))
         return trial, fit
 
@@ -147,11 +194,13 @@ class Run:
         """Several objects of one picture in one fit."""
         first = cases[0]
         init = [start.matrix for start in starts]
+        began = Work.now()
         fits = fit_poses([case.mesh for case in cases], first.picture, first.camera, init=init, progress=False)
+        work = Work.since(began)
         image = first.picture
         for case, start, fit in zip(cases, starts, fits, strict=True):
             found = Placed(fit.R, fit.t)
-            self.noted(part, case, start, found, case.truth, fit)
+            self.noted(part, case, start, found, case.truth, fit, work)
             image = outlined(replace(case, picture=image), start, found)
         self.drawn(label, image)
 
@@ -160,17 +209,24 @@ class Run:
             self.pictures.mkdir(parents=True, exist_ok=True)
             eg.write_image(self.pictures / f"{label}.png", image)
 
-    def noted(self, part: Part, case: Case, start: Placed | None, found: Placed, truth: Placed, fit: PoseFit) -> Trial:
+    def noted(
+        self, part: Part, case: Case, start: Placed | None, found: Placed, truth: Placed, fit: PoseFit, work: Work
+    ) -> Trial:  # fmt: skip
         limits = part.limits
         before = (math.nan, math.nan) if start is None else case.apart(start, truth)
         after = case.apart(found, truth)
         off = max(after[0] / limits.degrees, after[1] / case.size / limits.shift)
         trial = Trial(
             case.name, before[0], before[1] / case.size, after[0], after[1] / case.size, after[1], fit.explained,
-            fit.converged, fit.steps, fit.seconds, off <= 1.0, fit.converged and off > FAR_OFF,
+            fit.converged, fit.steps, fit.seconds, *work, off <= 1.0, fit.converged and off > FAR_OFF,
+            found.matrix.tolist(),
         )  # fmt: skip
+        if case.real:
+            trial.edges = photo_edges.across(case.picture, case.alpha(found), NEAR).quantiles()
         part.trials.append(trial)
         print(trial.line(), flush=True)
+        if not trial.right or not trial.converged:
+            print(f"    {fit.reason}", flush=True)
         return trial
 
 
@@ -182,7 +238,7 @@ def outlined(case: Case, start: Placed | None, found: Placed, camera: eg.Camera 
     ):  # fmt: skip
         if pose is None:
             continue
-        alpha = eg.render_aovs(case.mesh.transformed(pose.R, pose.t), seen, ["alpha"], 16)["alpha"]
+        alpha = case.alpha(pose, seen)[..., None]
         highest = F.max_pool2d(alpha.movedim(-1, 0)[None], 3, 1, 1)[0].movedim(0, -1)
         image = torch.where(highest - alpha > RIM, torch.tensor(colour), image)
     return image
@@ -193,11 +249,7 @@ def _scenes(kind: Kind, degrees: float, shift: float, limits: Limits) -> Callabl
 
     def run(run: Run, name: str) -> Part:
         part = Part(name, limits)
-        for k in range(run.starts):
-            number = k % len(run.meshes)
-            case = rendered(
-                f"{kind} {number}", run.meshes[number], run.backgrounds, kind, 0 if kind == "easy" else 100 + k
-            )
+        for k, case in run.made(kind, 100):
             rng = np.random.default_rng([k, round(degrees)])
             share = (rng.uniform(1 / 3, 1.0), rng.uniform()) if kind == "easy" else (1.0, 1.0)
             start = case.beside(case.truth, degrees * share[0], shift * case.size * share[1], rng)
@@ -212,8 +264,8 @@ def _several(count: int, limits: Limits) -> Callable[[Run, str], Part]:
 
     def run(run: Run, name: str) -> Part:
         part = Part(name, limits)
-        for k in range(run.starts):
-            meshes = [run.meshes[(k + n) % len(run.meshes)] for n in range(count)]
+        for k in range(run.first, run.first + run.starts):
+            meshes = [run.meshes[(k + n) % len(run.meshes)][1] for n in range(count)]
             cases = several(meshes, run.backgrounds, 300 + k)
             rng = np.random.default_rng([k, count])
             starts = [case.beside(case.truth, 15.0, 0.05 * case.size, rng) for case in cases]
@@ -228,9 +280,7 @@ def _cameras(focal: bool, limits: Limits) -> Callable[[Run, str], Part]:
 
     def run(run: Run, name: str) -> Part:
         part = Part(name, limits)
-        for k in range(run.starts):
-            number = k % len(run.meshes)
-            case = rendered(f"lit {number}", run.meshes[number], run.backgrounds, "lit", 100 + k)
+        for k, case in run.made("lit", 100):
             rng = np.random.default_rng([k, 10])
             start = case.beside(case.truth, 10.0, 0.05 * case.size, rng)
             # The camera that sees the object at rest as the case's camera sees it at the start.
@@ -240,11 +290,13 @@ def _cameras(focal: bool, limits: Limits) -> Callable[[Run, str], Part]:
                 K[[0, 1], [0, 1]] *= FOCAL if k % 2 else 1.0 / FOCAL
             given = case.camera.replace(world_to_camera=(W @ moved).float(), K=K)
             still = case.mesh.transformed(case.truth.R.float(), case.truth.t.float())
+            began = Work.now()
             fit = fit_camera(still, case.picture, given, focal=focal, progress=False)
+            work = Work.since(began)
             # As a pose of the object before the case's camera.
             back = torch.linalg.inv(W) @ fit.camera.world_to_camera.double() @ case.truth.matrix
             found, seen = Placed(back[:3, :3], back[:3, 3]), case.camera.replace(K=fit.camera.K)
-            run.noted(part, case, start, found, case.truth, fit.search)
+            run.noted(part, case, start, found, case.truth, fit.search, work)
             run.drawn(f"{name}-{k:02d}", outlined(case, start, found, seen))
             if focal:
                 ratio = [float(one.K[0, 0] / case.camera.K[0, 0]) for one in (given, fit.camera)]
@@ -259,9 +311,7 @@ def _anywhere(masked: bool) -> Callable[[Run, str], Part]:
 
     def run(run: Run, name: str) -> Part:
         part = Part(name, Limits(1.0, 0.01, 0.90))
-        for k in range(run.starts):
-            number = k % len(run.meshes)
-            case = rendered(f"lit {number}", run.meshes[number], run.backgrounds, "lit", 200 + k)
+        for k, case in run.made("lit", 200):
             placed, mask = case.mesh.transformed(case.truth.R, case.truth.t), None
             if masked:
                 mask = (eg.render_aovs(placed, case.camera, ["alpha"], 16)["alpha"] >= 0.5).float()
@@ -336,12 +386,14 @@ REAL: dict[str, Callable[[Run, Path], Iterator[Part]]] = {
 }  # fmt: skip
 
 
-def _meshes(paths: Sequence[str]) -> list[eg.Mesh]:
-    if paths:
-        return [eg.load_mesh(path) for path in paths]
-    from objects import pebble
-
-    return [pebble()]
+def _mesh(given: str) -> tuple[str, eg.Mesh]:
+    """By its name: of a file, or of a file and that of its texture, with a comma between."""
+    if given == STONE:
+        return STONE, pebble()
+    file, _, texture = given.partition(",")
+    if texture:
+        return Path(file).stem, photo_folder.textured(Path(file), Path(texture))
+    return Path(file).stem, eg.load_mesh(file)
 
 
 def main() -> None:
@@ -349,7 +401,11 @@ def main() -> None:
     parser.add_argument("folder", nargs="?", type=Path, metavar="FOLDER", help="real photographs")
     parser.add_argument("--parts", nargs="+", choices=[*MADE, *REAL], metavar="PART", help=", ".join([*MADE, *REAL]))
     parser.add_argument("--starts", type=int, default=20, metavar="N", help="of each part")
-    parser.add_argument("--meshes", nargs="+", default=[], metavar="FILE", help="textured, for pictures made here")
+    parser.add_argument("--first", type=int, default=0, metavar="N", help="number of the first picture made here")
+    parser.add_argument(
+        "--meshes", nargs="+", default=[STONE], metavar="FILE",
+        help=f"for pictures made here; with a texture FILE,IMAGE; {STONE}: that of the examples",
+    )  # fmt: skip
     parser.add_argument("--backgrounds", nargs="+", default=[], metavar="FILE", help="photographs behind them")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="contours over the photographs")
     parser.add_argument("--json", type=Path, metavar="FILE", help="every fit")
@@ -361,7 +417,7 @@ def main() -> None:
     if not backgrounds and given.folder is not None:
         backgrounds = photo_folder.photographs(given.folder)
     backgrounds = backgrounds or [clutter(seed) for seed in range(4)]
-    run = Run(given.starts, given.pictures, _meshes(given.meshes), backgrounds)
+    run = Run(given.starts, given.first, given.pictures, [_mesh(one) for one in given.meshes], backgrounds)
     done: list[Part] = []
     for name in parts:
         print(name, flush=True)

@@ -2,18 +2,25 @@
 
 python benchmarks/raster.py [--rounds 5]
 
-The scene is a textured sphere of 20,480 faces, seen by 8 cameras at 512², with gradients of vertices and texture. Both take
-turns; "share of the calling thread" is its processor time over that of all threads, which bounds what they gain.
-render_batch has 16 spheres of 1,280 faces at 64²: plain ones take one thread each, beside the calling one, lit ones come one
-by one.
+The scene is a textured sphere of 20,480 faces, seen by 8 cameras at 512², with gradients of vertices and texture. All take
+turns. render_batch has 32 spheres of 1,280 faces at 64²: plain ones take one thread each, beside the calling one, lit ones come
+one by one.
+
+Two threads against one, also by turns: by the clock, as the least of all rounds, to be compared on a machine with other work
+with what hashing gains there, which shares perfectly; and by processor time, that of one thread over what the busier of two
+has, which does not count the time that threads wait for a processor, or for each other.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
+import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -62,8 +69,11 @@ class Step:
         (torch.stack(images) * self.adjoint).sum().backward()
 
 
+IMAGES = 32
+
+
 def batch(lit: bool) -> Callable[[], None]:
-    """A step of render_batch() over 16 meshes that share vertices."""
+    """A step of render_batch() over meshes that share vertices."""
     mesh = sphere(3)
     camera = eg.Camera.look_at((0, 0, 3), (0, 0, 0), (0, 1, 0), 40.0, (64, 64))
     lights = [eg.DirectionalLight(torch.tensor([0.0, -0.3, -1.0]))] if lit else []
@@ -71,7 +81,7 @@ def batch(lit: bool) -> Callable[[], None]:
 
     def step() -> None:
         verts = mesh.verts.float().requires_grad_()
-        meshes = [eg.Mesh(verts * (1 + 0.01 * k), mesh.faces, material=material) for k in range(16)]
+        meshes = [eg.Mesh(verts * (1 + 0.01 * k), mesh.faces, material=material) for k in range(IMAGES)]
         images = eg.render_batch([(eg.Scene([own], lights=lights), camera) for own in meshes])
         assert isinstance(images, Tensor)
         images.square().sum().backward()
@@ -79,11 +89,48 @@ def batch(lit: bool) -> Callable[[], None]:
     return step
 
 
-def processor_time(work: Callable[[], None]) -> tuple[float, float]:
-    """Seconds of all threads, and of the calling one."""
-    all_threads, own = time.process_time(), time.thread_time()
+def hashing(blocks: int = 300) -> None:
+    """Work that threads share perfectly."""
+    block, threads = bytes(1 << 20), torch.get_num_threads()
+
+    def part(_: int) -> None:
+        for _ in range(blocks // threads):
+            hashlib.sha256(block).digest()  # without the interpreter's lock
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(part, range(threads)))
+
+
+class Times(NamedTuple):
+    """Seconds."""
+
+    whole: float  # of processors, of all threads
+    own: float  # of them that of the calling one
+    wall: float
+
+
+def measured(work: Callable[[], None]) -> Times:
+    before = time.process_time(), time.thread_time(), time.perf_counter()
     work()
-    return time.process_time() - all_threads, time.thread_time() - own
+    after = time.process_time(), time.thread_time(), time.perf_counter()
+    return Times(*(b - a for a, b in zip(before, after, strict=True)))
+
+
+def middle(numbers: Iterable[float]) -> float:
+    return statistics.median_low(list(numbers))
+
+
+def by_turns(works: dict[str, Callable[[], None]], rounds: int) -> dict[str, dict[int, list[Times]]]:
+    """Of each, with one thread and with two; a first round is left out."""
+    found: dict[str, dict[int, list[Times]]] = {name: {1: [], 2: []} for name in works}
+    for turn in range(rounds + 1):
+        for name, work in works.items():
+            for threads in (1, 2):
+                torch.set_num_threads(threads)
+                times = measured(work)
+                if turn > 0:
+                    found[name][threads].append(times)
+    return found
 
 
 if __name__ == "__main__":
@@ -91,18 +138,29 @@ if __name__ == "__main__":
     parser.add_argument("--rounds", type=int, default=5)
     rounds = parser.parse_args().rounds
     step = Step()
-    found: dict[str, list[tuple[float, float]]] = {"operators": [], "render(spp=1)": []}
-    for _ in range(rounds + 1):
-        found["operators"].append(processor_time(step.operators))
-        found["render(spp=1)"].append(processor_time(step.rendered))
-    for name, times in found.items():
-        whole, own = sorted(times[1:])[len(times[1:]) // 2]
-        print(f"{name:14s} {1e3 * whole:6.0f} ms of processor time, share of the calling thread {own / whole:.2f}")
-    ratios = sorted(a[0] / b[0] for a, b in zip(*(times[1:] for times in found.values()), strict=True))
-    middle, threads = ratios[len(ratios) // 2], torch.get_num_threads()
-    print(f"operators over render: {middle:.2f} ({ratios[0]:.2f} … {ratios[-1]:.2f}); {threads} threads")
-    for lit in (False, True):
-        work = batch(lit)
-        whole, own = sorted([processor_time(work) for _ in range(rounds + 1)][1:])[rounds // 2]
-        name = "render_batch, lit" if lit else "render_batch"
-        print(f"{name:17s} {1e3 * whole / 16:5.1f} ms an image, share of the calling thread {own / whole:.2f}")
+    found = by_turns(
+        {
+            "operators": step.operators,
+            "render(spp=1)": step.rendered,
+            "render_batch": batch(lit=False),
+            "render_batch, lit": batch(lit=True),
+            "hashing": hashing,
+        },
+        rounds,
+    )
+    for name, (one, two) in ((name, times.values()) for name, times in found.items()):
+        clock = min(t.wall for t in one) / min(t.wall for t in two)
+        # Beside a calling thread that reads scenes, or waits, work two others: three share two processors.
+        three = name in ("render_batch", "hashing")
+        busier = [max(t.own, t.whole / 2 if three else t.whole - t.own) for t in two]
+        gain = middle(t.whole / longest for t, longest in zip(one, busier, strict=True))
+        print(
+            f"{name:17s} {1e3 * middle(t.whole for t in one):5.0f} ms of processor time with 1 thread, "
+            f"{1e3 * middle(t.whole for t in two):5.0f} with 2, of which the calling thread has "
+            f"{middle(t.own / t.whole for t in two):.2f}; 2 threads gain {clock:.2f} by the clock, {gain:.2f} by "
+            "processor time"
+        )
+    for threads in (1, 2):
+        pairs = zip(found["operators"][threads], found["render(spp=1)"][threads], strict=True)
+        ratios = [a.whole / b.whole for a, b in pairs]
+        print(f"operators over render, {threads} threads: {middle(ratios):.2f} ({min(ratios):.2f} … {max(ratios):.2f})")

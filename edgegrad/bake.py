@@ -21,6 +21,7 @@ from .scene.mesh import Mesh
 from .scene.mikktspace import Fans
 from .scene.nearest import Places, Surface
 from .scene.scene import Scene, as_scene
+from .warnings import warn
 
 WHAT = ("color", "normal", "normal_map", "visibility")
 FLAT = (0.5, 0.5, 1.0)  # of a normal map that bends nothing
@@ -62,7 +63,7 @@ def bake(
 ) -> Tensor:
     """A texture (h, w, C) for a mesh, of what another surface has where the two lie on each other.
 
-    mesh      with texture coordinates that do not overlap, as unwrap() makes them
+    mesh      with texture coordinates that do not overlap, as unwrap() makes them; where they do, a warning counts the texels
     source    the other surface, or a function of SurfacePoints of `mesh` that returns (N, C)
     size      texels: one number, or (h, w)
     what      "color": its colours, or base colours where it is lit; "normal": its normals (C = 3) in world coordinates, of
@@ -184,16 +185,20 @@ class _Texels(NamedTuple):
     @classmethod
     def of(cls, mesh: Mesh, shape: tuple[int, int]) -> _Texels:
         assert mesh.uvs is not None and mesh.uv_faces is not None
-        uvs = mesh.uvs.double()
-        used = uvs[mesh.uv_faces.long()]
+        used = mesh.uvs.double()[mesh.uv_faces.long()]
         if bool(((used < -SLACK) | (used > 1 + SLACK)).any()):
             low, high = (round(float(x), 3) for x in used.aminmax())
             raise ValueError(
                 f"mesh: expected texture coordinates in the unit square, got some from {low} to {high}; use unwrap(mesh)"
             )
-        pos = torch.cat([2 * uvs - 1, torch.zeros(len(uvs), 1), torch.ones(len(uvs), 1)], 1).double()
-        rast, _ = raster.rasterize(raster.RasterizeContext(output_db=False), pos[None], mesh.uv_faces, shape)
-        rast = rast[0].flip(0).reshape(-1, 4)
+        # Each face at a depth of its own, in their order: a second layer is where two lie on the same texel.
+        count = len(used)
+        depth = ((2 * torch.arange(count, dtype=torch.float64) + 1) / count - 1).view(-1, 1, 1).expand(-1, 3, 1)
+        pos = torch.cat([2 * used - 1, depth, torch.ones_like(depth)], 2).view(1, 3 * count, 4)
+        corners = torch.arange(3 * count).view(count, 3)
+        with raster.DepthPeeler(raster.RasterizeContext(output_db=False), pos, corners, shape) as layers:
+            rast, beneath = (layers.rasterize_next_layer()[0][0].flip(0).reshape(-1, 4) for _ in range(2))
+        _warn_of_overlaps(rast[:, 3].long(), beneath[:, 3].long())
         place = (rast[:, 3] > 0).nonzero()[:, 0]
         if len(place) == 0:
             raise ValueError(
@@ -343,6 +348,19 @@ def _seen(mesh: Mesh, points: SurfacePoints, camera: Camera) -> Tensor:
         visible &= (points.position @ ahead + pose[2, 3]) > 0
     cosine = -(points.normal * F.normalize(along, dim=1)).sum(1)
     return (visible * cosine.clamp(min=0) ** 2)[:, None]
+
+
+def _warn_of_overlaps(first: Tensor, second: Tensor) -> None:
+    """Of numbers of faces + 1 that each texel has, and of others there; 0: none."""
+    both = (second > 0) & (second != first)
+    if not bool(both.any()):
+        return
+    faces = torch.cat([first[both], second[both]]).unique()
+    warn(
+        "overlapping texture coordinates",
+        f"mesh: {int(both.sum())} of {int((first > 0).sum())} texels lie on two faces or more and take what the first has "
+        f"({len(faces)} faces overlap, the first of them {int(faces[0]) - 1}); use unwrap(mesh) for coordinates that do not",
+    )
 
 
 def _picture(name: str, image: Tensor, camera: Camera) -> Tensor:

@@ -1,6 +1,7 @@
 """Meshes, scenes, images and cameras from and to files; see edgegrad.files.load for what is read of each format."""
 
 from .files.cameras import load_camera, load_cameras, save_camera
+from .files.depth import read_depth
 from .files.formats.views import View
 from .files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
 from .files.load import load_mesh, load_scene
@@ -8,6 +9,6 @@ from .files.mask import read_mask
 from .files.save import save_mesh, save_scene
 
 __all__ = [
-    "View", "linear_to_srgb", "load_camera", "load_cameras", "load_mesh", "load_scene", "read_image", "read_mask", "save_camera",
-    "save_mesh", "save_scene", "srgb_to_linear", "write_image",
+    "View", "linear_to_srgb", "load_camera", "load_cameras", "load_mesh", "load_scene", "read_depth", "read_image", "read_mask",
+    "save_camera", "save_mesh", "save_scene", "srgb_to_linear", "write_image",
 ]  # fmt: skip

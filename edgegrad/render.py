@@ -7,7 +7,8 @@ the derivative of the expected image.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, overload
 
 import torch
@@ -16,7 +17,7 @@ from torch.utils._pytree import tree_map
 
 from .aovs import IDS, check_aovs, render_aovs
 from .camera.camera import Camera
-from .check import as_tensor, check_finite, check_float, check_not_meta, check_shape
+from .check import as_int, as_tensor, check_finite, check_float, check_not_meta, check_shape, values_visible
 from .kernel.autograd import render_image
 from .kernel.batch import render_images
 from .kernel.operators import forward_kernel, screen_gradient_kernel
@@ -134,8 +135,8 @@ def render_batch(
 
     The other arguments are those of render(). Images and gradients have the bits of render() for one pair after the other. If
     all images are small and neither lit nor shaded, each takes one thread, and as many are rendered, and differentiated, beside
-    each other as there are threads; in reverse mode, once. Otherwise, so with one lit scene among them, they come one after the
-    other, each with all threads.
+    each other as there are threads, the first while later scenes are still read; in reverse mode, once. Otherwise, so with one
+    lit scene among them, they come one after the other, each with all threads.
 
     Raises what render() raises, with the number of the pair.
     """
@@ -148,40 +149,58 @@ def render_batch(
     seeds: list[Any] = list(seed) if each_its_own else [seed] * len(pairs)  # pyright: ignore[reportArgumentType]
     if len(seeds) != len(pairs):
         raise ValueError(f"seed: expected one, or {len(pairs)}, one of each pair, got {len(seeds)}")
-    plain = not any(name in SHADING for name in options)
-    requests, images = [], []
-    for k, (pair, own) in enumerate(zip(pairs, seeds, strict=True)):
+    together = not any(name in SHADING for name in options)
+    scenes: list[tuple[Scene, Camera]] = []
+    for k, pair in enumerate(pairs):
         if not isinstance(pair, Sequence) or len(pair) != 2:
             raise TypeError(f"pairs[{k}]: expected (scene, camera), got {type(pair).__name__}")
-        scene, camera = pair
-        try:
-            if isinstance(camera, Camera) and camera.batch is not None:
+        with _of_pair(k):
+            scene, camera = as_scene(pair[0]), pair[1]
+            if not isinstance(camera, Camera):
+                raise TypeError(
+                    f"camera: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)"
+                )
+            if camera.batch is not None:
                 raise ValueError(
                     f"camera: expected one camera, got a batch of {camera.batch}; give camera[i] one by one"
                 )
-            if plain and not as_scene(scene).is_shaded:
-                requests.append(make_request(scene, camera, spp, own, **options))
-        except (TypeError, ValueError) as error:
-            raise type(error)(f"pairs[{k}]: {error}") from None
-    if len(requests) == len(pairs) and all(_is_small(request) for request in requests):
-        devices = [as_scene(scene).meshes[0].verts.device for scene, _ in pairs]
-        images = [image.to(device) for image, device in zip(render_images(requests), devices, strict=True)]
+            together = together and not scene.is_shaded and _is_small(camera, as_int("spp", spp))
+        scenes.append((scene, camera))
+
+    def requests() -> Iterator[Request]:
+        for k, (pair, own) in enumerate(zip(scenes, seeds, strict=True)):
+            with _of_pair(k):
+                request = make_request(*pair, spp, own, **options)
+            yield request
+
+    images: list[Tensor] = []
+    if together:
+        found = render_images(requests(), len(scenes))
+        images = [image.to(scene.meshes[0].verts.device) for image, (scene, _) in zip(found, scenes, strict=True)]
     else:
-        for k, (pair, own) in enumerate(zip(pairs, seeds, strict=True)):
-            try:
+        for k, (pair, own) in enumerate(zip(scenes, seeds, strict=True)):
+            with _of_pair(k):
                 images.append(render(*pair, spp, own, **options))
-            except (TypeError, ValueError) as error:
-                if type(error) in (TypeError, ValueError):  # not of a shader's own kind
-                    raise type(error)(f"pairs[{k}]: {error}") from error
-                raise
     alike = all(image.shape == images[0].shape and image.dtype == images[0].dtype for image in images)
     return torch.stack(images) if alike else images
 
 
-def _is_small(request: Request) -> bool:
+@contextmanager
+def _of_pair(k: int) -> Iterator[None]:
+    """Errors of arguments get the pair's number; a shader's own kinds stay as they are."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        if type(error) in (TypeError, ValueError):
+            raise type(error)(f"pairs[{k}]: {error}") from error
+        raise
+
+
+def _is_small(camera: Camera, spp: int) -> bool:
     """And without a lens that may fold, of which a warning would have to find the caller's line."""
-    samples = request.camera.height * request.camera.width * request.image.spp
-    return samples <= SMALL and not bool(request.camera.distortion.any())
+    height, width = camera.size
+    known = values_visible(camera.coefficients)
+    return height * width * spp <= SMALL and known and not bool(camera.coefficients.any())
 
 
 @overload

@@ -77,6 +77,18 @@ def add_label(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--label", type=number, metavar="N", help="the object's number in a mask of several labels")
 
 
+def add_depth(parser: argparse.ArgumentParser) -> None:
+    """inputs.read_depth reads it."""
+    parser.add_argument(
+        "--depth", type=Path, metavar="IMAGE",
+        help="distances along the camera's axis, as the picture's camera sees them; 0 where there is none",
+    )  # fmt: skip
+    parser.add_argument(
+        "--depth-scale", type=float, metavar="LENGTH",
+        help="of one unit of it, in those of the mesh: 0.001 for millimetres and metres; floating point needs none",
+    )  # fmt: skip
+
+
 def add_descent(parser: argparse.ArgumentParser, result: str) -> None:
     """What fits by descent have in common; inputs.descent reads it."""
     parser.add_argument("--steps", type=count, default=150, help="most steps; of fit-shape on each level (%(default)s)")

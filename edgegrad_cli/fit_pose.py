@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
-from .arguments import CHECKPOINT, add_label, add_live, add_mesh, add_resume, add_view, count, number
+from .arguments import CHECKPOINT, add_depth, add_label, add_live, add_mesh, add_resume, add_view, count, number
 from .inputs import (
     check_size,
     read_background,
     read_coverage,
+    read_depth,
     read_picture,
     read_pose,
     read_scene,
@@ -42,6 +43,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--weight", type=Path, help="image of the picture's size: how much a pixel counts, black not at all"
     )
+    add_depth(parser)
     parser.add_argument("--fit-scale", action="store_true", help="also find the scale; the distance then stays")
     parser.add_argument("--fit-focal", action="store_true", help="also find the focal length")
     parser.add_argument(
@@ -85,6 +87,7 @@ def run(args: argparse.Namespace) -> int:
         check_size(weight, picture, args.weight, args.image)
     if mask is not None and args.background is not None:
         raise ValueError("--background: expected none with a mask (or an image with alpha), got both; leave one out")
+    depth = read_depth(args, picture)
     init = None if args.init is None else read_pose(args.init)
     camera = read_view(args, scene, (picture.shape[0], picture.shape[1]), args.init)
     outputs.make_folder(args.out)
@@ -101,8 +104,8 @@ def run(args: argparse.Namespace) -> int:
         fit = fit_pose(
             scene, picture, camera, mask, None if init is None else init.matrix,
             fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=read_background(args.background, picture),
-            weight=weight, max_size=args.size, steps=args.steps, seed=args.seed, starts=args.starts, callback=after_step,
-            checkpoint=args.out / CHECKPOINT, resume=args.resume,
+            weight=weight, depth=depth, max_size=args.size, steps=args.steps, seed=args.seed, starts=args.starts,
+            callback=after_step, checkpoint=args.out / CHECKPOINT, resume=args.resume,
         )  # fmt: skip
         # Neither a full disk nor a closed terminal may lose the result: it is printed before the files are written, and they
         # are written also when printing failed.

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
-from .arguments import add_view, count, number
-from .inputs import check_size, read_labels, read_picture, read_pose, read_view
+from .arguments import add_depth, add_view, count, number
+from .inputs import check_size, read_depth, read_labels, read_picture, read_pose, read_view
 
 if TYPE_CHECKING:
     from edgegrad.fit import PoseFit
@@ -32,6 +32,7 @@ def add(commands: Any) -> None:
         help="image of labels of the picture's size: 1 where the first mesh is seen, 2 the second, …",
     )
     add_view(parser)
+    add_depth(parser)
     parser.add_argument("--size", type=count, default=256, help="most pixels on the longer side (%(default)s)")
     parser.add_argument("--steps", type=count, default=40, help="most steps on each level of resolution (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
@@ -57,12 +58,13 @@ def run(args: argparse.Namespace) -> int:
     if args.mask is not None:
         mask = read_labels(args.mask, len(scenes))
         check_size(mask[0], picture, args.mask, args.image)
+    depth = read_depth(args, picture)
     init = [read_pose(path).matrix for path in args.init] or None
     everything = Scene([mesh for scene in scenes for mesh in scene.meshes])
     camera = read_view(args, everything, (picture.shape[0], picture.shape[1]), args.init[0] if args.init else None)
     outputs.make_folder(args.out)
     fits = fit_poses(
-        scenes, picture, camera, mask, init, max_size=args.size, steps=args.steps, seed=args.seed
+        scenes, picture, camera, mask, init, depth=depth, max_size=args.size, steps=args.steps, seed=args.seed
     )  # fmt: skip
     # Neither a full disk nor a closed terminal may lose the result, as in fit-pose.
     folders = [args.out / str(k + 1) for k in range(len(fits))]

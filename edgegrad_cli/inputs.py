@@ -84,6 +84,27 @@ def read_weight(path: Path) -> Tensor:
     return read_weight(path)
 
 
+def read_depth(args: argparse.Namespace, picture: Tensor) -> Tensor | None:
+    """(H, W) of --depth and --depth-scale, for a picture (H, W, 3). Raises what edgegrad.read_depth raises, in words of the
+    command line."""
+    from edgegrad import read_depth
+
+    if args.depth is None:
+        if args.depth_scale is not None:
+            raise ValueError("--depth-scale: expected --depth with it, an image of distances, got none; name it")
+        return None
+    try:
+        depth = read_depth(args.depth, args.depth_scale)
+    except ValueError as error:
+        raise ValueError(f"--depth-{error}" if str(error).startswith("scale:") else str(error)) from error
+    check_size(depth, picture, args.depth, args.image)
+    if not bool((depth > 0.0).any()):
+        raise ValueError(
+            f"{args.depth}: expected distances somewhere, got 0 in all pixels, which says that there is none"
+        )
+    return depth
+
+
 def check_size(image: Tensor, picture: Tensor, path: Path, like: Path) -> None:
     """Raises ValueError."""
     if image.shape[:2] != picture.shape[:2]:

@@ -11,9 +11,8 @@ import argparse
 from typing import NamedTuple
 
 import torch
-from raster_views import cube, in_clip_space, perspective, rotations
+from raster_views import cube, descend, in_clip_space, perspective, rotations
 from torch import Tensor
-from tqdm import tqdm
 
 import edgegrad.raster as dr
 
@@ -50,18 +49,14 @@ def fit(size: int = 16, steps: int = 3000, exact: bool = False, seed: int = 0) -
 
     before = errors()
     optimizer = torch.optim.Adam([verts, colors], lr=1e-2)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.01 ** (step / steps))
-    bar = tqdm(range(steps), desc="cube")
-    for _ in bar:
+
+    def loss() -> Tensor:
         R = rotations(BATCH, generator)
         with torch.no_grad():
             target = pictures(truth, true_colors, R, size, exact)
-        loss = (pictures(verts, colors, R, size, exact) - target).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        bar.set_postfix(loss=f"{loss.item():.1e}", refresh=False)
+        return (pictures(verts, colors, R, size, exact) - target).square().mean()
+
+    descend(optimizer, loss, steps, 0.01, "cube")
     return before, errors()
 
 

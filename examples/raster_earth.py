@@ -12,9 +12,8 @@ import argparse
 import math
 
 import torch
-from raster_views import in_clip_space, perspective, rotations
+from raster_views import descend, in_clip_space, perspective, rotations
 from torch import Tensor
-from tqdm import tqdm
 
 import edgegrad as eg
 import edgegrad.raster as dr
@@ -78,17 +77,15 @@ def fit(mipmaps: bool, steps: int = 1000, size: int = 128, seed: int = 0) -> tup
     truth, of = world(generator), Globe()
     texture = torch.full_like(truth, 0.2).requires_grad_()
     optimizer = torch.optim.Adam([texture], lr=1e-2)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.1 ** (step / steps))
-    for _ in tqdm(range(steps), desc="with mipmaps" if mipmaps else "without"):
+
+    def loss() -> Tensor:
         R, distance = rotations(1, generator), 2.5 + 30 * torch.rand(1, generator=generator) ** 3
         with torch.no_grad():
             fine = of.picture(truth, R, distance, FINER * size, mipmaps=False).permute(0, 3, 1, 2)
             target = torch.nn.functional.avg_pool2d(fine, FINER).permute(0, 2, 3, 1)
-        loss = (of.picture(texture, R, distance, size, mipmaps) - target).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
+        return (of.picture(texture, R, distance, size, mipmaps) - target).square().mean()
+
+    descend(optimizer, loss, steps, 0.1, "with mipmaps" if mipmaps else "without")
     return texture.detach(), psnr(texture.detach(), truth)
 
 

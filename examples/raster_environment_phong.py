@@ -14,9 +14,8 @@ from typing import NamedTuple
 
 import torch
 from raster_earth import globe
-from raster_views import in_clip_space, perspective, rotations
+from raster_views import descend, in_clip_space, perspective, rotations
 from torch import Tensor
-from tqdm import tqdm
 
 import edgegrad as eg
 import edgegrad.raster as dr
@@ -84,16 +83,14 @@ def fit(steps: int = 1000, size: int = 128, seed: int = 0) -> tuple[Look, Errors
 
     before = errors()
     optimizer = torch.optim.Adam([{"params": [found.environment]}, {"params": [*found[1:]], "lr": 0.05}], lr=1e-2)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.02 ** (step / steps))
-    for _ in tqdm(range(steps), desc="environment"):
+
+    def loss() -> Tensor:
         R = rotations(1, generator)
         with torch.no_grad():
             target = of.picture(true, R, size)
-        loss = (of.picture(found, R, size) - target).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
+        return (of.picture(found, R, size) - target).square().mean()
+
+    descend(optimizer, loss, steps, 0.02, "environment")
     return Look(*(part.detach() for part in found)), before, errors()
 
 

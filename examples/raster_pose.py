@@ -12,7 +12,7 @@ import argparse
 import math
 
 import torch
-from raster_views import cube, in_clip_space, of_quaternions, perspective
+from raster_views import cube, descend, in_clip_space, of_quaternions, perspective
 from torch import Tensor
 from tqdm import tqdm
 
@@ -75,12 +75,7 @@ def fit(seed: int, steps: int = 400, size: int = 256) -> tuple[float, float, flo
     tried = degrees_apart(best[0], truth[0])
     q = (best / best.norm()).requires_grad_()
     optimizer = torch.optim.Adam([q], lr=1e-2)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 0.02 ** (step / (steps - tries)))
-    for _ in range(steps - tries):
-        optimizer.zero_grad()
-        difference(picture(q, size), target).sum().backward()
-        optimizer.step()
-        schedule.step()
+    descend(optimizer, lambda: difference(picture(q, size), target).sum(), steps - tries, 0.02)
     return start, tried, degrees_apart(q.detach()[0], truth[0])
 
 

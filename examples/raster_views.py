@@ -1,9 +1,12 @@
-"""What the examples of edgegrad.raster share: matrices to clip space, rotations, and a cube."""
+"""What the examples of edgegrad.raster share: matrices to clip space, rotations, a cube, and how they descend."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 
 def perspective(f: float = 2.0, near: float = 1.0, far: float = 20.0) -> Tensor:
@@ -42,3 +45,19 @@ def cube() -> tuple[Tensor, Tensor, Tensor]:
     sides = torch.tensor([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     triangles = torch.stack([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]], 1).reshape(-1, 3)
     return corners, triangles.int(), torch.arange(6).repeat_interleave(2)[:, None].expand(-1, 3).int()
+
+
+def descend(
+    optimizer: torch.optim.Optimizer, loss: Callable[[], Tensor], steps: int, last: float, name: str | None = None
+) -> None:
+    """Steps along the gradient of a loss that is made anew for each. Learning rates fall to the share `last` of what they were,
+    by the same factor at each step. A bar of this name is shown."""
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: last ** (step / steps))
+    bar = tqdm(range(steps), desc=name, disable=name is None)
+    for _ in bar:
+        optimizer.zero_grad()
+        value = loss()
+        value.backward()
+        optimizer.step()
+        schedule.step()
+        bar.set_postfix(loss=f"{value.item():.1e}", refresh=False)

@@ -172,3 +172,30 @@ def test_wrong_arguments() -> None:
     ):
         with pytest.raises(error, match=words):
             call()  # pyright: ignore[reportArgumentType]
+
+
+def test_faces_on_the_same_texels_are_told() -> None:
+    """Three squares: the second covers the right half of the first, the third touches both with an edge only."""
+    own = square()
+    moved = [
+        own.uvs * torch.tensor([0.5, 0.5]) + torch.tensor(shift) for shift in ([0.0, 0.0], [0.25, 0.0], [0.0, 0.5])
+    ]
+    faces = torch.cat([own.faces + 4 * k for k in range(3)])
+    verts = torch.cat([own.verts + torch.tensor([2.0 * k, 0, 0]) for k in range(3)])
+    mesh = eg.Mesh(verts, faces, uvs=torch.cat(moved), uv_faces=faces)
+    with pytest.warns(UserWarning, match=r"mesh: 8 of 40 texels lie on two faces or more") as seen:
+        texture = eg.bake(mesh, lambda points: points.face[:, None].double(), 8, margin=0)
+    assert [warning.filename for warning in seen] == [__file__]
+    assert "(4 faces overlap, the first of them 0)" in str(seen[0].message)
+    assert texture[4:, :4].max() <= 1 and texture[:4, :4].min() >= 4  # the first has them
+    twice = torch.cat([own.faces, own.faces.flip(1)])  # from both sides
+    camera = eg.Camera.look_at((0.5, 0.5, 2), (0.5, 0.5, 0), (0, 1, 0), 40.0, (8, 8))
+    with pytest.warns(UserWarning, match=r"mesh: 16 of 16 texels"):
+        eg.bake_pictures(eg.Mesh(own.verts, twice, uvs=own.uvs, uv_faces=twice), [camera], [torch.ones(8, 8, 3)], 4)
+
+
+@pytest.mark.filterwarnings("error")
+def test_charts_side_by_side_do_not_overlap() -> None:
+    cage = eg.unwrap(eg.Mesh(icosphere(2).verts.float(), icosphere(2).faces), size=128)
+    for size in (16, 128):
+        eg.bake(cage, lambda points: points.position, size, margin=0)

@@ -85,6 +85,52 @@ def test_fit_pose_with(what, files):
     assert max(errors(PoseFit.from_json((files / "out" / "pose.json").read_text()))) < 0.5
 
 
+def test_depth_reaches_the_fit(files, monkeypatch):
+    """In millimetres; of a mesh without colours, whose distance it tells."""
+    given = {}
+
+    def fit_pose(*arguments, depth, **options):
+        given["depth"] = depth
+        raise ValueError("seen")
+
+    monkeypatch.setattr("edgegrad.fit.fit_pose", fit_pose)
+    z = eg.render_aovs(bracket(), camera(48), ["depth"])["depth"][..., 0]
+    Image.fromarray((1000 * z).round().numpy().astype(np.uint16)).save(files / "depth.png")
+    more = ["--depth", files / "depth.png", "--depth-scale", 0.001, "--out", files / "out"]
+    assert fit(files, *more) == 2
+    torch.testing.assert_close(given["depth"], z, atol=5.1e-4, rtol=0.0)
+    again = {}
+
+    def fit_poses(*arguments, depth, **options):
+        again["depth"] = depth
+        raise ValueError("seen")
+
+    monkeypatch.setattr("edgegrad.fit.fit_poses", fit_poses)
+    view = ["--mesh", files / "mesh.ply", "--camera", files / "camera.json"]
+    assert run("fit-poses", files / "target.png", *view, *more) == 2
+    assert torch.equal(again["depth"], given["depth"])
+
+
+def test_depth_files(tmp_path):
+    """Whole numbers of 16 bits with their scale, floating point as it is, NaN where nothing was measured."""
+    whole = np.array([[0, 1, 65535], [1000, 2500, 40000]], np.uint16)
+    Image.fromarray(whole).save(tmp_path / "mm.png")
+    found = eg.read_depth(tmp_path / "mm.png", 0.001)
+    assert found.dtype == torch.float32
+    np.testing.assert_allclose(found.numpy(), whole / 1000, rtol=1e-7)
+    metres = torch.tensor([[0.0, 1.5], [2.25, torch.nan]])
+    Image.fromarray(metres.numpy()).save(tmp_path / "m.tif")
+    torch.testing.assert_close(eg.read_depth(tmp_path / "m.tif"), metres, equal_nan=True)
+    torch.testing.assert_close(eg.read_depth(tmp_path / "m.tif", 2.0), 2 * metres, equal_nan=True)
+    with pytest.raises(TypeError, match="scale: expected a number, got str"):
+        eg.read_depth(tmp_path / "m.tif", "1")
+    for scale in (0.0, -1.0, float("inf"), float("nan")):
+        with pytest.raises(ValueError, match="scale: expected a number above 0"):
+            eg.read_depth(tmp_path / "mm.png", scale)
+    with pytest.raises(ValueError, match=r"whole numbers up to 65535, got none; 0\.001"):
+        eg.read_depth(tmp_path / "mm.png")
+
+
 def test_an_interrupted_fit_is_written(files, capsys, monkeypatch):
     count = 0
 
@@ -144,6 +190,21 @@ def test_a_failed_write_still_prints_the_pose(files, capsys, monkeypatch):
             "--background: expected #rrggbb or an image file, got 'blue'",
         ),
         (["mesh.ply", "target.png", "--background", "small.png"], "small.png: expected 48 × 48 pixels"),
+        (
+            ["mesh.ply", "target.png", "--depth", "depth.png"],
+            "--depth-scale: expected the length of one unit of depth.png",
+        ),
+        (["mesh.ply", "target.png", "--depth-scale", "1"], "--depth-scale: expected --depth with it"),
+        (
+            ["mesh.ply", "target.png", "--depth", "depth.png", "--depth-scale", "-1"],
+            "--depth-scale: expected a number above 0, the length of one unit of the file, got -1",
+        ),
+        (["mesh.ply", "target.png", "--depth", "mask.png"], "mask.png: expected depth of 16 bits or more"),
+        (["mesh.ply", "target.png", "--depth", "target.png"], "target.png: expected depth in one channel, got 3"),
+        (
+            ["mesh.ply", "target.png", "--depth", "shallow.png", "--depth-scale", "1"],
+            "shallow.png: expected 48 × 48 pixels like",
+        ),
         (["mesh.ply", "target.png", "--fov", "200"], "--fov: expected degrees between 0 and 180, got 200"),
         (["mesh.ply", "target.png", "--out", "mesh.ply/out"], "mesh.ply/out (Not a directory); choose another"),
         (["mesh.ply", "target.png", "--steps", "0"], "argument --steps: expected a whole number from 1 up, got '0'"),
@@ -158,6 +219,8 @@ def test_errors_are_one_line(files, capsys, monkeypatch, change, message):
     labels = np.zeros((48, 48), np.uint8)
     labels[20:30, 20:30], labels[30:32] = 5, 2
     Image.fromarray(labels).save(files / "labels.png")
+    Image.fromarray(np.full((48, 48), 4000, np.uint16)).save(files / "depth.png")
+    Image.fromarray(np.full((8, 48), 4000, np.uint16)).save(files / "shallow.png")
     try:
         code = run("fit-pose", *change, *(() if "--out" in change else ("--out", "out")))
     except SystemExit as stop:  # from argparse

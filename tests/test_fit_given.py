@@ -14,7 +14,7 @@ import edgegrad as eg
 from edgegrad.fit import fit_camera, fit_pose, fit_poses, track
 from edgegrad.fit.pose.fit_poses import _masks
 from edgegrad.fit.pose.given import Names, shots_of
-from edgegrad.fit.pose.photo import search
+from edgegrad.fit.pose.photo import ways
 from edgegrad.fit.pose.photo.depth import warn_of_units
 
 SIZE = 48
@@ -154,14 +154,14 @@ def test_a_film_begins_where_the_object_is_seen(taken, along, message):
 
 
 def test_more_steps_are_taken_where_they_are_asked_for():
-    assert [search.most_steps(40, *level) for level in ((False, True), (False, False), (True, False))] == [12, 8, 20]
-    assert [search.most_steps(5, *level) for level in ((False, True), (False, False), (True, False))] == [5, 5, 5]
-    assert search.most_steps(80, True, False) == 40 and search.most_steps(80, False, True) == 24
+    assert [ways.most_steps(40, *level) for level in ((False, True), (False, False), (True, False))] == [12, 8, 20]
+    assert [ways.most_steps(5, *level) for level in ((False, True), (False, False), (True, False))] == [5, 5, 5]
+    assert ways.most_steps(80, True, False) == 40 and ways.most_steps(80, False, True) == 24
 
 
 def test_what_is_not_explained_is_not_blamed_on_steps(taken):
     """A plain mesh has to show more of its edges than one with colours."""
     view, image = taken
     fit = fit_pose(bracket(True), image, view, init=START, search=False, progress=False, steps=2)
-    assert 0.6 < fit.explained < search.ALONE_ENOUGH and not fit.converged, fit.explained
+    assert 0.6 < fit.explained < ways.ALONE_ENOUGH and not fit.converged, fit.explained
     assert fit.reason.startswith("edges not explained"), fit.reason

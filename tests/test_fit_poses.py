@@ -93,15 +93,15 @@ def scene_of(count, light=True):
 
 
 def photograph(view, meshes, seed=0):
-    """In the light of a sun and a sky, before clutter, blurred, noisy, compressed."""
+    """In the light of a sun and a sky, before clutter, blurred as a lens does, noisy, compressed."""
     lights = [
         eg.DirectionalLight(torch.tensor([-0.5, -1.0, -0.8]).double(), 2.0),
         eg.Environment(torch.full((3,), 0.35), visible=False),
     ]
     with torch.no_grad():
         image = eg.render(eg.Scene(meshes, clutter(view.size[0], seed), lights), view, spp=32, seed=1 << 40)
-    values = smoothed(linear_to_srgb((image * torch.tensor([1.3, 1.0, 0.8])).clamp(0, 1)).movedim(-1, 0), 0.7)
-    values = values.movedim(0, -1) + 0.015 * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed))
+    seen = smoothed((image * torch.tensor([1.3, 1.0, 0.8])).clamp(0, 1).movedim(-1, 0), 0.7).movedim(0, -1)
+    values = linear_to_srgb(seen) + 0.015 * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed))
     file = io.BytesIO()
     Image.fromarray((255 * values.clamp(0, 1)).round().byte().numpy()).save(file, "JPEG", quality=85)
     return srgb_to_linear(torch.from_numpy(np.array(Image.open(file))).float() / 255)

@@ -11,6 +11,7 @@ from test_fit import START, bracket, camera, errors
 from test_fit_photo import clutter, photograph
 
 import edgegrad as eg
+from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, fit_shape, fit_texture, losses
 from edgegrad.fit.descent.regions import BLUR, EVERY, Regions
 from edgegrad.fit.region import OUTLIERS, Palette, smoothed
@@ -134,7 +135,8 @@ def test_loss_and_curvature_are_those_of_the_likelihood(taken):
     assert 200 < int(sides.band.sum()) < 2000
 
     def off(soft):
-        mixed = soft[..., None] * sides.inside + (1 - soft[..., None]) * sides.outside
+        front, behind = srgb_to_linear(sides.inside), srgb_to_linear(sides.outside)
+        mixed = linear_to_srgb(soft[..., None] * front + (1 - soft[..., None]) * behind)
         return (mixed - regions.displays[0]) / sides.variance.sqrt()
 
     def of_contour(soft):
@@ -154,7 +156,8 @@ def test_loss_and_curvature_are_those_of_the_likelihood(taken):
         expected = torch.where(near > 0.0, slope.square() / near.clamp(min=1e-12), 0.0)
         if blur == BLUR:  # of the contour that of a squared difference, with a weight that is held fixed
             weight = (1 + off(soft).square().sum(-1) / 12.0).pow(-2) * near * sides.band
-            expected = expected + weight * ((sides.inside - sides.outside).square() / sides.variance).sum(-1)
+            along = (off(soft + 1e-5) - off(soft - 1e-5)) / 2e-5
+            expected = expected + weight * along.square().sum(-1)
         torch.testing.assert_close(regions.curvature([0], moving[None])[0].double(), expected, rtol=1e-4, atol=1e-9)
 
 
@@ -239,6 +242,7 @@ FIRST = {"pose": PoseParameter()}
         (MESH, {"mask_loss": "region"}, ValueError, r"mask_loss: expected one of l1, l2, huber, robust, iou, ssim, or"),
         (MESH, {"loss": "regions"}, ValueError, r"loss: expected one of l1, .*ssim, region, or a function, got 'regions'"),
         (MESH.transformed(t=torch.tensor([0.0, 0.0, -90.0])), {}, ValueError, r"scene: expected an object that the pict"),
+        (MESH, {"images": torch.zeros(96, 96, 3)}, ValueError, r"images: expected the object before .*one colour alone"),
         (MESH.transformed(scale=9.0), {}, ValueError, r"scene: .* that fills picture 0 at the start; leave out ground and walls"),
     ],
 )  # fmt: skip

@@ -183,6 +183,30 @@ def test_values_and_cotangents(words: str, view: str) -> None:
         assert float((a - b).abs().max()) <= 1e-9 * float(a.abs().max()), name
 
 
+@pytest.mark.parametrize("grey", [0.5, 128 / 255, 127 / 255], ids=["half", "128", "127"])
+@pytest.mark.parametrize("noise", [0.0, 1e-15])
+def test_a_grey_normal_map_does_not_bend(grey: float, noise: float) -> None:
+    """As without the map, by the kernel and by PyTorch, and so are derivatives, which rounding would make as large as 1e15."""
+    words, found = "normals normal_map microfacets point", []
+    draw = torch.Generator().manual_seed(5)
+    image = grey + noise * (torch.rand(8, 8, 3, dtype=F64, generator=draw) - 0.5)
+    for mapped in (True, False):
+        numbers = numbers_of(words) | ({"map": image, "map_factor": number(1.0)} if mapped else {})
+        leaves = {
+            name: value.clone().requires_grad_() for name, value in numbers.items() if mapped or "map" not in name
+        }
+        hits = [hits_of(scene_of(words, leaves), CAMERAS["perspective"]) for _ in range(2)]
+        for own, shade in zip(hits, (in_kernel.radiance, radiance.reference), strict=True):
+            L = shade(own, True, 1)
+            grads = torch.autograd.grad(L.sum(), list(leaves.values()), materialize_grads=True)
+            found.append({"": L, **dict(zip(leaves, grads, strict=True))})
+    *those_mapped, kernels, twins = found
+    for one, without in zip(those_mapped, (kernels, twins), strict=True):
+        assert all(float(one.pop(name).abs().max()) == 0 for name in ("map", "map_factor", "map_scale"))
+        assert all(torch.allclose(one[name], without[name], rtol=1e-9, atol=1e-9) for name in without)
+    assert float(kernels["normals"].abs().max()) > 0.1
+
+
 @pytest.mark.parametrize("words", SCENES)
 def test_tangents_are_cotangents(words: str) -> None:
     leaves = numbers_of(words)

@@ -18,6 +18,7 @@ def test_lines_stand_once_and_tests_exist() -> None:
         file, function = test.split("::")
         assert re.search(rf"^def {function}\(", (Path(__file__).parent / file).read_text(), re.MULTILINE), test
     for change in every:
+        assert not re.search(r"\boff\b", change.changed), f"hides off<>, which is what OFF is: {change}"
         assert all(f'OFF("{name}")' in change.changed for name in change.mutants), change
 
 

@@ -85,6 +85,19 @@ def test_errors_of_lit_scenes_name_the_pair() -> None:
         eg.render_batch([])
 
 
+def test_warnings_point_at_the_caller_and_errors_at_the_pair() -> None:
+    verts, shared = leaves()
+    given = pairs(verts, shared)
+    away = eg.Camera.look_at((0.0, 0.5, 3.0), (0.0, 0.0, 9.0), (0.0, 1.0, 0.0), 40.0, (20, 24))
+    with pytest.warns(UserWarning, match="behind") as seen:
+        eg.render_batch([given[0], (given[1][0], away)], spp=2)
+    assert [warning.filename for warning in seen] == [__file__]
+    with pytest.raises(ValueError, match=r"pairs\[0\]: filter: expected"):
+        eg.render_batch(given, filter="none")
+    with pytest.raises(ValueError, match=r"pairs\[3\]: seed: expected"):
+        eg.render_batch(given, seed=[0, 1, 2, -1, 4])  # while others are rendered already
+
+
 def test_second_derivatives_and_wrong_arguments() -> None:
     verts, shared = leaves()
     given = pairs(verts, shared)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import json
+import math
 
 import pytest
 import torch
@@ -321,6 +323,29 @@ def test_what_mitsuba_gets_is_the_same_view(open_ball):
         view.project(s.meshes[0].verts.double()) for s, view in ((scene, camera), (open_ball.scene, open_ball.camera))
     ]
     torch.testing.assert_close(*points, rtol=0, atol=1e-9)
+
+
+def test_mitsuba_gets_the_same_sky() -> None:
+    """By its rows, the first and the last of which are at the poles; as one finds by asking its `envmap`, where it is there."""
+    image = torch.rand((5, 8, 3), dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    theirs, ours = mitsuba.sky_image(image), eg.Environment(image)
+    theta = math.pi * (torch.arange(40, dtype=torch.float64) + 0.3) / 40
+    phi = 2 * math.pi * (3 + 0.5) / 8 - math.pi  # of the centres of a column
+    d = torch.stack([theta.sin() * math.sin(phi), theta.cos(), -theta.sin() * math.cos(phi)], 1)
+    row = theta / math.pi * (len(theirs) - 1)
+    above = row.floor().long()
+    found = torch.lerp(theirs[above, 3], theirs[above + 1, 3], (row - above)[:, None])
+    assert torch.allclose(found, ours.towards(d), rtol=0, atol=1e-12)
+    if importlib.util.find_spec("mitsuba") is None:
+        return
+    mi = importlib.import_module("mitsuba")
+    mi.set_variant("scalar_rgb")
+    turned = mi.ScalarTransform4f().rotate([0, 1, 0], 180)
+    sky = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(theirs.float().numpy()), "to_world": turned})
+    at = mi.SurfaceInteraction3f()
+    for direction, expected in zip(d.tolist(), found.tolist(), strict=True):
+        at.wi = [-x for x in direction]
+        assert list(sky.eval(at)) == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize("integrator", mitsuba.INTEGRATORS)

@@ -151,17 +151,28 @@ nb::tuple shade_points_vjp(const LitArrays& lit, const PointArrays& points, cons
     });
 }
 
-template <class T>
-nb::tuple trace_and_shade_points_vjp(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
-                                     const LitOptions& options, In<double, 2> bar, const std::vector<bool>& wanted,
-                                     int threads) {
+// The same of what casts rays in the scene: compute(geometry's caster, points, to, places, team).
+template <class T, class Compute>
+nb::tuple traced_cotangents(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
+                            const In<double, 2>& bar, const std::vector<bool>& wanted, int threads, Compute compute) {
     check_faces(arrays, lit);
     const LitPoints view = points.view(lit.scene, faces_of(lit));
     return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, LitPlaces<double> places, Team& team) {
         GeometryWork work;
         const auto geometry = arrays.geometry({}, team, work);
-        trace_and_shade_vjp(lit.scene, arrays.view(), geometry->caster(), view, options, bar.data(), to, places, team);
+        compute(geometry->caster(), view, to, places, team);
     });
+}
+
+template <class T>
+nb::tuple trace_and_shade_points_vjp(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
+                                     const LitOptions& options, In<double, 2> bar, const std::vector<bool>& wanted,
+                                     int threads) {
+    return traced_cotangents(arrays, lit, points, bar, wanted, threads,
+                             [&](const auto& caster, const LitPoints& view, const auto& to, auto places, Team& team) {
+                                 trace_and_shade_vjp(lit.scene, arrays.view(), caster, view, options, bar.data(), to,
+                                                     places, team);
+                             });
 }
 
 // Tangents of the tables, of b and of its spread; None: zero.
@@ -220,13 +231,11 @@ template <class T>
 nb::tuple indirect_points_vjp(const SceneArrays<T>& arrays, const LitArrays& lit, const PointArrays& points,
                               const LitOptions& options, In<double, 2> bar, const std::vector<bool>& wanted,
                               int threads) {
-    check_faces(arrays, lit);
-    const LitPoints view = points.view(lit.scene, faces_of(lit));
-    return cotangents(lit, view, bar, wanted, threads, [&](const auto& to, LitPlaces<double> places, Team& team) {
-        GeometryWork work;
-        const auto geometry = arrays.geometry({}, team, work);
-        indirect_vjp(lit.scene, arrays.view(), geometry->caster(), view, options, bar.data(), to, places, team);
-    });
+    return traced_cotangents(arrays, lit, points, bar, wanted, threads,
+                             [&](const auto& caster, const LitPoints& view, const auto& to, auto places, Team& team) {
+                                 indirect_vjp(lit.scene, arrays.view(), caster, view, options, bar.data(), to, places,
+                                              team);
+                             });
 }
 
 template <class T>

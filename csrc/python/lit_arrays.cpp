@@ -13,6 +13,7 @@
 #include <utility>
 
 #include "python/shaped.h"
+#include "shading/lit/mesh_towards.h"
 
 using namespace nanobind::literals;
 
@@ -81,6 +82,7 @@ LampArrays make_lamp(const std::string& kind, int position, int direction, int i
     if (lamp.kind == Lamp::Kind::mesh) {
         if (!brightness || brightness->size() != 1) refuse("brightness: expected one number");
         lamp.brightness = brightness->data();
+        lamp.is_round = tree && is_round(*tree, lamp.density, lamp.size);
     }
     if (stream.size() != std::size(lamp.stream)) refuse("stream: expected three numbers");
     std::copy(stream.begin(), stream.end(), lamp.stream);
@@ -108,7 +110,7 @@ nb::tuple crossings(const LampTree& tree, In<double, 2> origins, In<double, 2> d
         const double *o = origins.data() + 3 * i, *d = directions.data() + 3 * i;
         tree.each_crossing({o[0], o[1], o[2]}, {d[0], d[1], d[2]}, start(i), end(i), [&](const LampTree::Crossing& c) {
             which.insert(which.end(), {int64_t(i), c.face}), where.insert(where.end(), {c.u, c.v, c.t});
-            return true;
+            return end(i);
         });
     }
     const size_t m = which.size() / 2;
@@ -242,6 +244,7 @@ LitPoints PointArrays::view(const LitScene& scene, int64_t faces) const {
 
 void bind_lit_arrays(nb::module_& m) {
     m.attr("MOST_LIT_CHANNELS") = most_lit_channels;
+    m.attr("FAINTEST_NORMAL") = faintest_normal;
     m.attr("MOST_BOUNCES") = most_bounces;
     m.attr("MOST_LAMP_FACES") = LampTree::most_faces;
     nb::class_<SourceArrays>(m, "LitSource")
@@ -278,6 +281,12 @@ void bind_lit_arrays(nb::module_& m) {
         .def(nb::new_(&make_tree), "verts"_a.noconvert(), "faces"_a.noconvert())
         .def_prop_ro("is_flat", &LampTree::is_flat)
         .def_prop_ro("is_convex", &LampTree::is_convex)
+        .def(
+            "is_round",
+            [](const LampTree& t, In<double, 1> density) {
+                return is_round(t, density.data(), int64_t(density.size()));
+            },
+            "density"_a.noconvert())
         .def_prop_ro("ball",
                      [](const LampTree& t) {
                          return std::array<double, 5>{t.center().x, t.center().y, t.center().z, t.radius(), t.size()};

@@ -153,16 +153,15 @@ std::vector<Crossing> find_crossings(const Triangles<T>& mesh, const Frames& fra
                                      const T* rast, Team& team) {
     const std::vector<uint8_t> sides =
         silhouettes(mesh, edges, mesh.shared ? std::min<int64_t>(1, frames.count) : frames.count, team);
-    // Of one image several bands of rows where there are fewer images than threads; crossings come in order all the
-    // same.
-    const int64_t H = frames.height;
-    const int64_t bands = std::clamp<int64_t>(2 * team.threads() / std::max<int64_t>(1, frames.count), 1, H);
+    // Bands of rows, so that threads end at the same time; crossings come in order all the same.
+    constexpr int64_t rows = 32;
+    const int64_t H = frames.height, bands = (H + rows - 1) / rows;
     std::vector<std::vector<Crossing>> found(frames.count * bands);
     team.each(frames.count * bands, [&](int64_t k) {
         const int64_t item = k / bands, band = k % bands;
         const PairFinder<T> pairs(mesh, frames, sides.data() + (mesh.shared ? 0 : item * mesh.triangles), item, rast);
         std::vector<Crossing> own;  // threads that write beside one another wait for each other's caches
-        for (int64_t y = band * H / bands; y < (band + 1) * H / bands; ++y)
+        for (int64_t y = band * rows; y < std::min(H, (band + 1) * rows); ++y)
             for (int64_t x = 0; x < frames.width; ++x) {
                 if (x + 1 < frames.width) pairs.visit(x, y, 0, own);
                 if (y + 1 < H) pairs.visit(x, y, 1, own);

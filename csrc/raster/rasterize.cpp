@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <memory>
 #include <vector>
 
 #include "raster/exact_sign.h"
@@ -107,12 +108,21 @@ struct Window {
     int64_t item, row, end_row;
 };
 
-// The nearest triangle at each pixel of a window, −1 where there is none.
+// The nearest triangle at each pixel of a window, −1 where there is none, and its depth.
+struct Nearest {
+    std::vector<double> depth;
+    std::vector<int32_t> triangle;
+
+    void clear(int64_t pixels) {
+        depth.assign(pixels, std::numeric_limits<double>::infinity());
+        triangle.assign(pixels, -1);
+    }
+};
+
 template <class T>
-std::vector<int32_t> nearest(const Triangles<T>& mesh, const Frames& frames, const Window& window, const T* behind) {
-    const int64_t W = frames.width, n = (window.end_row - window.row) * W;
-    std::vector<double> nearest(n, std::numeric_limits<double>::infinity());
-    std::vector<int32_t> found(n, -1);
+void find_nearest(const Triangles<T>& mesh, const Frames& frames, const Window& window, const T* behind, Nearest& out) {
+    const int64_t W = frames.width;
+    out.clear((window.end_row - window.row) * W);
     for (int64_t t = mesh.first(window.item); t < mesh.end(window.item); ++t) {
         Facet f(mesh, window.item, t);
         Box box = box_of(f, frames);
@@ -127,27 +137,26 @@ std::vector<int32_t> nearest(const Triangles<T>& mesh, const Frames& frames, con
             for (int64_t x = box.left; x < box.right; ++x) {
                 const double px = frames.x(x);
                 double e[3];
-                bool sure = true, out = false;
+                bool sure = true, outside = false;
                 for (int i = 0; i < 3; ++i) {
                     e[i] = f.facing * (f.side[i].n.x * px + start[i]);
-                    out |= e[i]<-f.side[i].doubt, sure &= e[i]> f.side[i].doubt;
+                    outside |= e[i]<-f.side[i].doubt, sure &= e[i]> f.side[i].doubt;
                 }
-                if (out) continue;
+                if (outside) continue;
                 if (!sure) {
                     const Vec3 p = frames.exact_center(x, y);
-                    for (int i = 0; i < 3 && !out; ++i)
-                        out = side_of_line(p, f.corner[(i + 1) % 3], f.corner[(i + 2) % 3]) != f.facing;
-                    if (out) continue;
+                    for (int i = 0; i < 3 && !outside; ++i)
+                        outside = side_of_line(p, f.corner[(i + 1) % 3], f.corner[(i + 2) % 3]) != f.facing;
+                    if (outside) continue;
                 }
                 const double depth = Weights(e).depth(f);
                 const int64_t at = (y - window.row) * W + x;
-                if (!(depth < nearest[at]) || !(depth >= -1 && depth <= 1)) continue;
+                if (!(depth < out.depth[at]) || !(depth >= -1 && depth <= 1)) continue;
                 if (behind && !(T(depth) > behind[(window.item * frames.height + y) * W + x])) continue;
-                nearest[at] = depth, found[at] = int32_t(t);
+                out.depth[at] = depth, out.triangle[at] = int32_t(t);
             }
         }
     }
-    return found;
 }
 
 // u and v at a pixel and how they change a pixel to the right and up, with what they are made of.
@@ -175,13 +184,14 @@ RasterImages<T> rasterize(const Triangles<T>& mesh, const Frames& frames, const 
     const int64_t H = frames.height, W = frames.width;
     // Of one image several windows where there are fewer images than threads.
     const int64_t windows = std::clamp<int64_t>(2 * team.threads() / std::max<int64_t>(1, frames.count), 1, H);
-    team.each(frames.count * windows, [&](int64_t k) {
+    const auto scratch = [] { return std::make_unique<Nearest>(); };
+    team.each_with(frames.count * windows, scratch, [&](Nearest& found, int64_t k) {
         const int64_t item = k / windows, part = k % windows;
         const Window window{item, part * H / windows, (part + 1) * H / windows};
-        const std::vector<int32_t> found = nearest(mesh, frames, window, behind);
+        find_nearest(mesh, frames, window, behind, found);
         for (int64_t y = window.row; y < window.end_row; ++y)
             for (int64_t x = 0; x < W; ++x) {
-                const int32_t t = found[(y - window.row) * W + x];
+                const int32_t t = found.triangle[(y - window.row) * W + x];
                 const int64_t at = 4 * ((item * H + y) * W + x);
                 if (t < 0) {
                     std::fill_n(out.rast.data() + at, 4, T(0));

@@ -57,9 +57,11 @@ inline std::vector<Share> shares_of(const Frames& frames, const Targets& to) {
 // T: (count, width), or (images, count, width) where they are not shared.
 template <class T, class Body>
 Array<T> sums_over(const std::vector<Share>& shares, const Frames& frames, const Targets& to, Team& team, Body body) {
-    std::vector<std::vector<double>> found(shares.size());
+    std::vector<Array<double>> found;
+    for (size_t k = 0; k < shares.size(); ++k) found.emplace_back(0);
     team.each(int64_t(shares.size()), [&](int64_t k) {
-        found[k].assign(size_t(shares[k].targets * to.width), 0.0);
+        found[k] = Array<double>(shares[k].targets * to.width);
+        std::fill(found[k].begin(), found[k].end(), 0.0);
         body(shares[k], found[k].data());
     });
     const int64_t images = to.shared ? 1 : frames.count, stride = to.count * to.width;

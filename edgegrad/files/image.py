@@ -37,6 +37,13 @@ def linear_to_srgb(values: Tensor) -> Tensor:
     return torch.where(values <= 0.0031308, values * 12.92, curve)
 
 
+def srgb_slope(values: Tensor) -> Tensor:
+    """The derivative of linear_to_srgb(), any shape, where it gives the sRGB `values`."""
+    # The inverse of the other curve's slope.
+    curve = (2.4 / 1.055 * ((values.clamp(min=0.04045) + 0.055) / 1.055) ** 1.4).reciprocal()
+    return torch.where(values <= 0.04045, torch.full_like(values, 12.92), curve)
+
+
 class Stored(NamedTuple):
     """An image upright, with the numbers that are in its file."""
 

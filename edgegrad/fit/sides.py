@@ -1,7 +1,9 @@
 """Across the silhouette a picture changes from the object's colour to that of what lies behind.
 
-A pixel that is covered by the share α shows α F + (1 − α) B, with the colours F of the object and B of what is behind it, which
-are the means of the picture a little inside and a little outside. Both vary there by their textures.
+A pixel that is covered by the share α shows α F + (1 − α) B, with the radiances F of the object and B of what is behind it, whose
+colours are the means of the picture a little inside and a little outside. Both vary there by their textures. Lenses and sensors
+mix radiance, and the display's curve comes after: half of white and half of black is 0.73 in sRGB values, so contours that were
+found by mixing those would lie on the dark side of edges, by a tenth of a pixel or two.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..files.image import linear_to_srgb, srgb_slope, srgb_to_linear
 from .region import smoothed
 from .verdict import explained
 
@@ -41,21 +44,40 @@ class Sides:
     outside: Tensor
     variance: Tensor  # (h, w, C) of their mixture
     band: Tensor  # (h, w) bool: where it is mixed, and both sides are known
+    curved: bool = True  # colours, in sRGB values; a mask's values mix as they are
 
     @staticmethod
-    def of(image: Tensor, alpha: Tensor, near: Tensor) -> Sides:
-        """Of an image (h, w, C) in sRGB values, or a mask; `near` (h, w): what may be used of it."""
+    def of(image: Tensor, alpha: Tensor, near: Tensor, curved: bool = True) -> Sides:
+        """Of an image (h, w, C) in sRGB values, or a mask, which is not `curved`; `near` (h, w): what may be used of it."""
         front, front_spread, front_count = _local(image, (alpha > 1.0 - PURE) * near)
         behind, behind_spread, behind_count = _local(image, (alpha < PURE) * near)
         known = (front_count > SUPPORT) & (behind_count > SUPPORT) & (near > 0.0)
         a = alpha[..., None]
         variance = NOISE**2 + a.square() * front_spread + (1.0 - a).square() * behind_spread
-        return Sides(alpha, front, behind, variance, (alpha > PURE) & (alpha < 1.0 - PURE) & known)
+        return Sides(alpha, front, behind, variance, (alpha > PURE) & (alpha < 1.0 - PURE) & known, curved)
 
     @property
     def mixed(self) -> Tensor:
         """(h, w, C), what the picture shows there if the contour is right."""
-        return self.outside + self.alpha[..., None] * (self.inside - self.outside)
+        return self.mixed_by(self.alpha)
+
+    def mixed_by(self, alpha: Tensor) -> Tensor:
+        """The same of another alpha (h, w)."""
+        behind, step = self._radiances()
+        mixed = behind + alpha[..., None] * step
+        return linear_to_srgb(mixed.clamp(0.0, 1.0)) if self.curved else mixed
+
+    def slope_by(self, alpha: Tensor) -> Tensor:
+        """(h, w, C): the derivative of mixed_by() by alpha."""
+        step = self._radiances()[1]
+        return srgb_slope(self.mixed_by(alpha)) * step if self.curved else step
+
+    def _radiances(self) -> tuple[Tensor, Tensor]:
+        """Behind the contour, and the step from there to the object, both as they mix."""
+        inside, outside = (
+            (srgb_to_linear(self.inside), srgb_to_linear(self.outside)) if self.curved else (self.inside, self.outside)
+        )
+        return outside, inside - outside
 
     @property
     def contrast(self) -> Tensor:

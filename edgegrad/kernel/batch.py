@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -16,22 +16,28 @@ from .threads import beside
 WIDTH = len(IS_TENSOR)  # arguments of a packed request
 
 
-def render_images(requests: Sequence[Request]) -> list[Tensor]:
-    """The image (H, W, C) of each, as functions of the requests' tensors. The bits, also of gradients, are those of one image
-    after another."""
-    if not requests:
-        return []
+def render_images(requests: Iterable[Request], count: int) -> list[Tensor]:
+    """The image (H, W, C) of each of `count` requests, as functions of their tensors: those that are there are rendered while
+    others are made. The bits, also of gradients, are those of one image after another."""
+    made: list[Request] = []
+
+    def remembered() -> Iterator[Request]:
+        for request in requests:
+            made.append(request)
+            yield request
+
+    found = beside(forward_kernel, remembered(), count)
     # Backward passes of single images run from the last to the first, and so are sums over them of what scenes share.
-    packed = [value for request in reversed(requests) for value in request.pack()]
-    return list(reversed(_RenderBatch.apply(*packed)))  # pyright: ignore[reportArgumentType, reportCallIssue]
+    packed = [value for request in reversed(made) for value in request.pack()]
+    return list(reversed(_RenderBatch.apply(found[::-1], *packed)))  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
 class _RenderBatch(torch.autograd.Function):
+    """What forward_kernel() found of requests, as functions of these, packed one after the other."""
+
     @staticmethod
-    def forward(ctx: Any, *packed: Any) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, found: list[Any], *packed: Any) -> tuple[Tensor, ...]:
         parts = [packed[k : k + WIDTH] for k in range(0, len(packed), WIDTH)]
-        requests = [Request.unpack(part) for part in parts]
-        found = beside(forward_kernel, requests)
         kept = [[*hits, *tensors_of(part)] for (_, hits, _), part in zip(found, parts, strict=True)]
         ctx.save_for_backward(*(tensor for group in kept for tensor in group))
         ctx.sizes, ctx.others = [len(group) for group in kept], [others_of(part) for part in parts]
@@ -43,7 +49,7 @@ class _RenderBatch(torch.autograd.Function):
         if torch.is_grad_enabled():
             raise RuntimeError(FIRST_ORDER)
         groups = _split(ctx.saved_tensors, ctx.sizes)
-        needed = ctx.needs_input_grad
+        needed = ctx.needs_input_grad[1:]
         wanted = [[i for i in POSITIONS if needed[k * WIDTH + i]] for k in range(len(groups))]
 
         def gradients(k: int) -> dict[int, Tensor]:
@@ -57,10 +63,10 @@ class _RenderBatch(torch.autograd.Function):
             return {i: found[name].to(request.slot(name).dtype) for i, name in names.items()}
 
         out: list[Tensor | None] = [None] * (WIDTH * len(groups))
-        for k, found in enumerate(beside(gradients, range(len(groups)))):
+        for k, found in enumerate(beside(gradients, range(len(groups)), len(groups))):
             for i, grad in found.items():
                 out[k * WIDTH + i] = grad
-        return tuple(out)
+        return None, *out
 
 
 def _split(tensors: Sequence[Tensor], sizes: Sequence[int]) -> list[Sequence[Tensor]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
@@ -19,17 +19,18 @@ def threads() -> int:
     return 1 if getattr(_own, "beside", False) else torch.get_num_threads()
 
 
-def beside(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """work(item) of all, on as many threads as torch takes, each pass on one of them. Nothing is recorded by autograd."""
-    count = min(torch.get_num_threads(), len(items))
+def beside(work: Callable[[Item], Result], items: Iterable[Item], count: int) -> list[Result]:
+    """work(item) of all `count` items, on as many threads as torch takes, each pass on one of them. Work on an item begins once
+    it is there, while the calling thread makes the next. Nothing of the work is recorded by autograd."""
+    threads = min(torch.get_num_threads(), count)
 
     def run(item: Item) -> Result:
-        _own.beside = True
+        _own.beside = threads > 1
         with torch.no_grad():
             return work(item)
 
-    if count < 2:
-        with torch.no_grad():
-            return [work(item) for item in items]
-    with ThreadPoolExecutor(count) as pool:
-        return list(pool.map(run, items))
+    if threads < 2:
+        return [run(item) for item in items]
+    with ThreadPoolExecutor(threads) as pool:
+        started = [pool.submit(run, item) for item in items]
+        return [job.result() for job in started]

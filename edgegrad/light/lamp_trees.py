@@ -19,9 +19,10 @@ from ..scene.lights import LightPoints
 from ..scene.mesh_light import MeshLight
 from ..scene.rows import unit
 from .bsdf import dot
-from .lobes import Lobes
+from .lobes import Lobes, axes_around
 
 LEAST_LAMP = 0.25  # solid angle over that of a lobe, below which nothing is drawn by the lobe
+LEAST_ROUND = 1.0  # the same of round lamps
 FARTHEST_LOBE = 4.0  # between them, in half angles of the lobe
 SMALLEST_LAMP = 0.1  # solid angle over that of a lobe, below which points of a flat lamp are alike
 
@@ -72,12 +73,35 @@ class MeshTowards(NamedTuple):
         return torch.where(outside, radius / distance, 1.0), torch.where(outside, to / distance, 0.0)
 
     def _solid_angle(self, sine: Tensor) -> Tensor:
-        return torch.where(sine < 1, 2 * math.pi * (1 - (1 - sine * sine).sqrt()), 4 * math.pi)
+        return torch.where(sine < 1, 2 * math.pi * _one_minus_cosine(sine), 4 * math.pi)
 
-    def is_small(self, lobes: Lobes) -> Tensor:
-        """(N,) bool: whether its points are so much alike that one is as good as another."""
+    def _is_round(self) -> Tensor:
+        """(N, 1) bool: whether it is round, and seen from outside."""
+        density = np.ascontiguousarray(values_of(self.light.density)[0])
+        return (self._ball()[0] < 1) & tree_of(self.light).is_round(density)
+
+    def is_drawn_by_ball(self, lobes: Lobes) -> Tensor:
+        """(N,) bool: whether what the light draws are directions to a ball around it."""
+        return self._is_round()[:, 0] & ~self.is_drawn_by(lobes)
+
+    def draw_by_ball(self, u: Tensor) -> Tensor:
+        """(N, 3) unit directions that fill the cone around the ball evenly, from numbers (N, 2) in [0, 1)."""
+        sine, middle = self._ball()
+        z, phi = u[:, 1] * _one_minus_cosine(sine)[:, 0], 2 * math.pi * u[:, 0]
+        across = (z * (2 - z)).sqrt()
+        l = torch.stack([across * phi.cos(), across * phi.sin(), 1 - z], 1)
+        return (l[:, None] @ axes_around(middle))[:, 0]
+
+    def with_ball_density(self, points: LightPoints) -> LightPoints:
+        """Points that were drawn whatever by, with the density of draw_by_ball()."""
         sine, _ = self._ball()
-        return (self._solid_angle(sine) < SMALLEST_LAMP * lobes.solid_angle())[:, 0] & tree_of(self.light).is_flat
+        return points._replace(density=self.solid_angles(points) / self._solid_angle(sine)[:, 0])
+
+    def are_alike(self, lobes: Lobes) -> Tensor:
+        """(N,) bool: whether points that the light draws are so much alike that one is as good as another."""
+        sine, _ = self._ball()
+        small = (self._solid_angle(sine) < SMALLEST_LAMP * lobes.solid_angle())[:, 0] & tree_of(self.light).is_flat
+        return small | self.is_drawn_by_ball(lobes)
 
     def is_drawn_by(self, lobes: Lobes) -> Tensor:
         """(N,) bool: whether directions are drawn by lobes as well."""
@@ -85,7 +109,8 @@ class MeshTowards(NamedTuple):
         wide = lobes.solid_angle()
         half = torch.acos(1 - wide / (2 * math.pi))
         near = torch.acos(dot(lobes.mirrored(), middle).clamp(-1, 1)) < torch.asin(sine) + FARTHEST_LOBE * half
-        some = (self._solid_angle(sine) >= LEAST_LAMP * wide) & ((sine >= 1) | near)
+        least = torch.where(self._is_round(), LEAST_ROUND, LEAST_LAMP)
+        some = (self._solid_angle(sine) >= least * wide) & ((sine >= 1) | near)
         return some[:, 0] & lobes.narrow
 
     def directions(self, place: Tensor) -> Tensor:
@@ -141,6 +166,10 @@ class MeshTowards(NamedTuple):
         """(N,): about how bright points are, but nowhere zero."""
         emission = self.light._emission(points.index, self.light._weights(points).to(self.light.mesh.verts))
         return emission.detach().double().abs().mean(1) + least_brightness(self.light)
+
+
+def _one_minus_cosine(sine: Tensor) -> Tensor:
+    return sine * sine / (1 + (1 - sine * sine).sqrt())
 
 
 def least_brightness(light: MeshLight) -> float:

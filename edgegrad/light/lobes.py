@@ -65,7 +65,7 @@ class Lobes(NamedTuple):
 
     def draw(self, u: Tensor) -> Tensor:
         """(N, 3) unit directions from numbers (N, 2) in [0, 1)."""
-        axes = _axes_around(self.n)
+        axes = axes_around(self.n)
         own = (axes @ self.v[:, :, None])[:, :, 0]
         stretch = torch.cat([self.alpha, self.alpha, torch.ones_like(self.alpha)], 1)
         wide = normalize(torch.cat([own[:, :2], own[:, 2:].clamp(min=0)], 1) * stretch, dim=-1)
@@ -77,7 +77,7 @@ class Lobes(NamedTuple):
         return normalize(2 * dot(self.v, h) * h - self.v, dim=-1)
 
 
-def _axes_around(n: Tensor) -> Tensor:
+def axes_around(n: Tensor) -> Tensor:
     """(N, 3, 3): two unit vectors across n (N, 3), and n (Duff et al. 2017, "Building an orthonormal basis, revisited")."""
     x, y, z = n.unbind(-1)
     sign = torch.copysign(torch.ones_like(z), z)

@@ -41,7 +41,7 @@ def how_drawn(scene: Scene) -> str:
     said = f"; on glossy surfaces of {EACH} candidates for each, by light and, up to roughness {WIDEST_LOBE}, by lobe"
     said += f", one is kept by what it gives ({', '.join(of)})"
     if lamps:
-        said += "; a lamp well within the lobe by the light alone"
+        said += "; a lamp well within the lobe by the light alone, of a round one directions to a ball around it"
     if any(tree_of(lamp) is None for lamp in lamps):
         said += "; lamps of too many faces by the light alone"
     return said
@@ -107,13 +107,14 @@ def resampled(
         index = torch.zeros((N, count, together), dtype=torch.int64, device=surfaces.n.device)
         uv, density = surfaces.n.new_zeros((N, count, together, 2)), surfaces.n.new_full((N, count, together), math.inf)
         asked = lobes.narrow if meets is None else meets.is_drawn_by(lobes)
-        small = torch.zeros_like(asked) if meets is None else meets.is_small(lobes)
-        for kept, few, ask_lobe in itertools.product(keeps.unique().tolist(), (False, True), (True, False)):
+        alike = torch.zeros_like(asked) if meets is None else meets.are_alike(lobes)
+        by_ball = torch.zeros_like(asked) if meets is None else meets.is_drawn_by_ball(lobes)
+        for kept, few, ask_lobe, ball in itertools.product(keeps.unique().tolist(), *[(False, True)] * 3):
             all = kept if few else EACH * kept
-            rows_ = every[(keeps == kept) & (small == few) & (asked == ask_lobe)]
+            rows_ = every[(keeps == kept) & (alike == few) & (asked == ask_lobe) & (by_ball == ball)]
             for rows in rows_.split(max(1, AT_ONCE // (all * together))) if len(rows_) else ():
                 some = None if meets is None else meets.select(rows)
-                drawn = _Drawn(light, stream, surfaces.select(rows), lobes.select(rows), some, together)
+                drawn = _Drawn(light, stream, surfaces.select(rows), lobes.select(rows), some, ball, together)
                 pool = drawn.candidates(all, all // 2 if ask_lobe else 0)
                 points = pool.kept(stream, surfaces.seed[rows], kept)
                 index[rows, :kept], uv[rows, :kept], density[rows, :kept] = points
@@ -138,14 +139,22 @@ class _Drawn(NamedTuple):
     surfaces: Glossy
     lobes: Lobes
     meets: MeshTowards | None
+    by_ball: bool  # around the mesh
     together: int  # K directions in each
 
     def candidates(self, all: int, by_lobe: int) -> _Candidates:
         N, shares = len(self.surfaces.n), _Shares(all - by_lobe, by_lobe)
         seed = self.surfaces.seed
         every = torch.arange(N, device=seed.device)
-        drawn = self.light.draw(sobol_parts(seed, key_of(self.stream, 0), shares.light))
-        kinds = [self._weighted(every.repeat_interleave(shares.light), drawn, shares)]
+        rows, u = every.repeat_interleave(shares.light), sobol_parts(seed, key_of(self.stream, 0), shares.light)
+        if self.by_ball:
+            assert self.meets is not None
+            towards = self.meets.select(rows)
+            ray, drawn = towards.towards(towards.draw_by_ball(u))
+            rows = rows[ray]
+        else:
+            drawn = self.light.draw(u)
+        kinds = [self._weighted(rows, drawn, shares)]
         if by_lobe:
             l = self.lobes.repeated(by_lobe).draw(sobol_parts(seed, key_of(self.stream, 1), by_lobe))
             if self.meets is None:
@@ -165,6 +174,8 @@ class _Drawn(NamedTuple):
         all = [points]
         if self.meets is not None:
             meets = self.meets.select(rows)
+            if self.by_ball:
+                all = [points := meets.with_ball_density(points)]
             L = meets.directions(self.light.place(points))[:, None] if l is None else l[:, None]
             measure, brightness = meets.solid_angles(points)[:, None], meets.brightness(points)[:, None]
         else:
@@ -197,7 +208,7 @@ class _Drawn(NamedTuple):
         N = len(self.surfaces.n)
         many = torch.bincount(rows, minlength=N)
         place = torch.arange(len(rows), device=rows.device) - (many.cumsum(0) - many)[rows]
-        J = int(many.max()) if len(rows) else 0
+        J = max(1, int(many.max()))  # one that is nothing where all directions miss
 
         def padded(part: Tensor) -> Tensor:
             return part.new_zeros((N, J, *part.shape[1:])).index_put((rows, place), part)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ..library import core
 from .material import Parameter, Texture
 from .mesh import PLAIN, Mesh
 from .mikktspace import tangents
@@ -102,7 +103,7 @@ class OnMesh(NamedTuple):
 
     def shading_normal(self, g: Tensor) -> Tensor:
         """(N, 3) unit normals on the side of the faces' own normals g (N, 3): interpolated if there are any, and bent by the
-        material's normal map."""
+        material's normal map where that tells a direction."""
         n = self.smooth_normal(g)
         material = self.mesh.material
         if material is None or material.normal_map is None:
@@ -111,7 +112,8 @@ class OnMesh(NamedTuple):
         scale = torch.as_tensor(material.normal_scale).to(bent)
         frame = self.tangent_frame(n, material.normal_map)
         m = scale * (bent[:, 0:1] * frame.tangent + bent[:, 1:2] * frame.bitangent) + bent[:, 2:3] * n
-        m = torch.where(frame.there & ((m.detach() * m.detach()).sum(1, keepdim=True) > 0), m, n)
+        told = (m.detach() * m.detach()).sum(1, keepdim=True) > core.FAINTEST_NORMAL**2
+        m = torch.where(frame.there & told, m, n)
         return normalize(m, dim=-1)
 
     def smooth_normal(self, g: Tensor) -> Tensor:

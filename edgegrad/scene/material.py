@@ -110,7 +110,8 @@ class Material:
     emission      radiance of its own, W/(sr m²) or whatever unit the lights have; a mesh with emission is a light
     normal_map    Texture (h, w, 3) of linear numbers in [0, 1], of which 2 n − 1 is the normal in the tangent frame of its uvs,
                   as in glTF: red along u, green along v (upwards), blue along the normal. Of a mesh with normals, the frames at
-                  the corners of faces are MikkTSpace's
+                  the corners of faces are MikkTSpace's. Where it is grey, of a length below 1/128 after all, which 8 bits do not
+                  tell from zero, the normal is not bent and has no derivative by the map: start an optimisation at (½, ½, 1)
     normal_scale  multiplies the first two of these
     two_sided     False: seen from behind (vertices clockwise), faces are black and emit nothing
     alpha_mode    "MASK": the mesh's alpha, if it has one, cuts out where it is below its cutoff. "OPAQUE": it must have none.

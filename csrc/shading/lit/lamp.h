@@ -27,6 +27,8 @@ struct Lamp {
     // far ones.
     const LampTree* tree = nullptr;
     bool hides = true;
+    // Whether directions to a ball around it find it, and all of it emits about alike.
+    bool is_round = false;
     // Of an environment: how bright texels are, but none is black, and the cosines of where rows begin and end. Of a
     // mesh one number, which is added to how bright it is, for the same reason.
     const double *brightness = nullptr, *cosines = nullptr;

@@ -27,8 +27,10 @@ class LampTree {
             for (const Vec3 q : {q0, q1, q2}) low = least(low, q), high = most(high, q);
         }
         center_ = 0.5 * (low + high);
-        for (const Triangle& t : triangles_)
+        for (const Triangle& t : triangles_) {
             for (int i = 0; i < 3; ++i) radius_ = std::max(radius_, length(t.corner(i) - center_));
+            area_ += 0.5 * length(cross(t.e1, t.e2));
+        }
         size_ = std::max({std::fabs(low.x), std::fabs(low.y), std::fabs(low.z), std::fabs(high.x), std::fabs(high.y),
                           std::fabs(high.z)});
         find_shape(verts, n_verts, faces);
@@ -42,16 +44,20 @@ class LampTree {
     Vec3 center() const { return center_; }
     double radius() const { return radius_; }
     double size() const { return size_; }
+    double area() const { return area_; }
     // Whether all faces lie in one plane; whether they are the rim of a convex body, and look outwards.
     bool is_flat() const { return flat_; }
     bool is_convex() const { return convex_; }
+    // Whether most lines through the ball meet the faces: of lines that meet a convex body the share that meets one
+    // inside of it is that of their surfaces (Crofton).
+    bool fills_ball() const { return convex_ && area_ >= least_filled * 4 * M_PI * radius_ * radius_; }
 
     // Where origin + t direction meets a face.
     struct Crossing {
         int32_t face;
         double u, v, t;
     };
-    // Calls found(crossing) for those with t in (start, end), in any order, until it is false.
+    // Calls found(crossing) for those with t in (start, end), near ones about first. It returns a new `end`.
     template <class Found>
     void each_crossing(Vec3 origin, Vec3 direction, double start, double end, Found found) const {
         const Vec3 inverse{1 / direction.x, 1 / direction.y, 1 / direction.z};
@@ -61,18 +67,20 @@ class LampTree {
             const Node& node = nodes_[waiting[--n]];
             if (!node.meets(origin, inverse, start, end)) continue;
             if (!node.count) {
-                waiting[n++] = node.first, waiting[n++] = node.first + 1;
+                const int forwards = along(direction, node.axis) >= 0;
+                waiting[n++] = node.first + forwards, waiting[n++] = node.first + 1 - forwards;
                 continue;
             }
             for (int32_t k = node.first; k < node.first + node.count; ++k) {
                 Crossing c;
-                if (triangles_[k].meets(origin, direction, c) && c.t > start && c.t < end && !found(c)) return;
+                if (triangles_[k].meets(origin, direction, c) && c.t > start && c.t < end) end = found(c);
             }
         }
     }
 
    private:
     static constexpr int leaf = 4;
+    static constexpr double least_filled = 0.5;
     // Of the size: how far from a plane floats may put what lies in it.
     static constexpr double flatness = 1e-6;
 
@@ -103,6 +111,7 @@ class LampTree {
     struct Node {
         Vec3 low, high;
         int32_t first = 0, count = 0;  // triangles of a leaf; of others the first of two nodes, and none
+        int axis = 0;                  // along which the two follow one another
 
         // Kay and Kajiya 1986. A ray in the plane of a side gives no number.
         bool meets(Vec3 origin, Vec3 inverse, double start, double end) const {
@@ -136,7 +145,7 @@ class LampTree {
                              return x != y ? x < y : a.face < b.face;
                          });
         const int32_t child = int32_t(nodes_.size());
-        nodes_[node].first = child;
+        nodes_[node].first = child, nodes_[node].axis = axis;
         nodes_.emplace_back(), nodes_.emplace_back();
         split(child, first, half), split(child + 1, half, last);
     }
@@ -184,7 +193,7 @@ class LampTree {
     std::vector<Triangle> triangles_;
     std::vector<Node> nodes_;
     Vec3 center_;
-    double radius_ = 0, size_ = 0;
+    double radius_ = 0, size_ = 0, area_ = 0;
     bool flat_ = false, convex_ = false;
 };
 

@@ -91,16 +91,17 @@ struct Shares {
 };
 
 // Calls add(candidate, whether the lobe drew it) for so many points of a light, half of them drawn by the lobe if it is
-// asked, and says before how many of both kinds there are. at(point) and towards(direction, add) say what they are.
-template <class At, class Towards, class Add>
-void draw_candidates(const Lamp& lamp, const DrawnLobe& lobe, const Numbers& numbers, int all, bool ask_lobe,
-                     Shares& shares, At at, Towards towards, Add add) {
-    const int by_lobe = ask_lobe ? all / 2 : 0, by_light = all - by_lobe;
-    shares.light = by_light, shares.lobe = by_lobe;
-    const Numbers::Parts of_light = numbers.of_light(by_light);
-    for (int j = 0; j < by_light; ++j) add(at(draw(lamp, of_light(j))), false);
-    const Numbers::Parts of_lobe = numbers.of_lobe(by_lobe);
-    for (int j = 0; j < by_lobe; ++j) {
+// asked, and says before how many of both kinds there are. by_light(numbers, add) and towards(direction, add) say what
+// they are.
+template <class ByLight, class Towards, class Add>
+void draw_candidates(const DrawnLobe& lobe, const Numbers& numbers, int all, bool ask_lobe, Shares& shares,
+                     ByLight by_light, Towards towards, Add add) {
+    const int of_all = ask_lobe ? all / 2 : 0, others = all - of_all;
+    shares.light = others, shares.lobe = of_all;
+    const Numbers::Parts of_light = numbers.of_light(others);
+    for (int j = 0; j < others; ++j) by_light(of_light(j), [&](const Candidate& c) { add(c, false); });
+    const Numbers::Parts of_lobe = numbers.of_lobe(of_all);
+    for (int j = 0; j < of_all; ++j) {
         const Vec2 u = of_lobe(j);
         towards(lobe.draw(u.x, u.y), [&](const Candidate& c) { add(c, true); });
     }
@@ -111,10 +112,11 @@ void draw_candidates(const LitScene& lit, const Lamp& lamp, const DrawnLobe& lob
                      Shares& shares, Add add) {
     const Rotation<double> turn = Rotation<double>::of(lit.tables, lamp);
     draw_candidates(
-        lamp, lobe, numbers, all, lobe.exists(), shares,
-        [&](const LightPoint& p) {
+        lobe, numbers, all, lobe.exists(), shares,
+        [&](Vec2 u, auto add_one) {
+            const LightPoint p = draw(lamp, u);
             const Vec3 own = own_direction(lamp, p);
-            return Candidate{p, lamp.rotation == no_table ? own : unit(turn.to_world(own)), brightness(lamp, p)};
+            add_one(Candidate{p, lamp.rotation == no_table ? own : unit(turn.to_world(own)), brightness(lamp, p)});
         },
         [&](Vec3 l, auto add_one) {
             const LightPoint p = point_towards(lit.tables, lamp, l);
@@ -140,11 +142,11 @@ class Resampled {
         if (lamp.kind == Lamp::Kind::environment) {
             draw_candidates(lit, lamp, lobe_, numbers, each * count, shares_, add_one);
         } else {
-            const MeshTowards mesh(lit, lamp, plain(o.y), o.at.face + o.mesh->first_face);
+            const MeshTowards mesh(lit, lamp, lobe_, plain(o.y), o.at.face + o.mesh->first_face);
             draw_candidates(
-                lamp, lobe_, numbers, mesh.is_small(lobe_) ? count : each * count, mesh.is_drawn_by(lobe_), shares_,
-                [&](const LightPoint& p) { return mesh.of(p); }, [&](Vec3 l, auto add) { mesh.each_towards(l, add); },
-                add_one);
+                lobe_, numbers, mesh.are_alike() ? count : each * count, mesh.by_lobe(), shares_,
+                [&](Vec2 u, auto add) { mesh.draw_by_light(u, add); },
+                [&](Vec3 l, auto add) { mesh.each_towards(l, add); }, add_one);
         }
     }
 

@@ -59,6 +59,11 @@ inline void smooth_normal_vjp(const std::vector<Table>& tables, const NormalSour
     }
 }
 
+// A bent normal that is no longer than this before it is given the length 1 tells no direction, and would have
+// derivatives as large as it is short: a map of 8 bits is off by up to 1/255 in each component, √3/255 in length.
+// The normal is not bent there.
+constexpr double faintest_normal = 1.0 / 128;
+
 // The frame of texture coordinates at the point, and what the map says in it.
 template <class S>
 struct BentNormal {
@@ -94,7 +99,7 @@ BentNormal<S> bent_normal(const std::vector<Table>& tables, const NormalSource& 
     if (!(dot(plain(o.across), plain(o.across)) > 0)) return o;
     o.t = unit(o.across), o.bitangent = o.hand * cross(n, o.t);
     o.m = o.scale * (o.bent[0] * o.t + o.bent[1] * o.bitangent) + o.bent[2] * n;
-    o.exists = dot(plain(o.m), plain(o.m)) > 0;
+    o.exists = dot(plain(o.m), plain(o.m)) > faintest_normal * faintest_normal;
     return o;
 }
 

@@ -12,7 +12,6 @@ Alpha is blurred, widely at first, that a step reaches far; the contour term joi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 
 import torch
 from torch import Tensor
@@ -32,6 +31,7 @@ TOLERANCE = 12.0  # squared differences, in variances, that are far above this h
 BESIDE = 2.5  # the same, where colours beside the contour are judged
 # Of right fits colours tell the sides apart by 0.70 … 0.81, of wrong ones on edges of clutter by up to 0.69.
 SURE = 0.695
+EVEN = 1.5 / 255.0  # sRGB values: pixels that differ by no more are of one colour in eight bits
 LEAST_AROUND = 0.02  # of what lies near the object: less tells no colours of a background
 
 
@@ -81,7 +81,7 @@ class Regions:
         soft = self.blurred(alpha)
         found = -likelihood(P, soft).double().log()
         if (sides := self._sides(group)) is not None:
-            squares = _squares(sides, soft)
+            squares = self._squares(group, sides, soft)
             found = found + 0.5 * sides.band * (squares / (1.0 + squares / TOLERANCE)).double()
         return (near * found).sum()
 
@@ -92,8 +92,8 @@ class Regions:
         soft = self.blurred(alpha)
         found = slope(P, soft).square()
         if (sides := self._sides(group)) is not None:
-            robust = (1.0 + _squares(sides, soft) / TOLERANCE).pow(-2)
-            slopes = ((sides.inside - sides.outside).square() / sides.variance).sum(-1)
+            robust = (1.0 + self._squares(group, sides, soft) / TOLERANCE).pow(-2)
+            slopes = (sides.slope_by(soft).square() / sides.variance).sum(-1)
             found = found + sides.band * robust * slopes
         return near * found
 
@@ -118,12 +118,15 @@ class Regions:
         return max(0.0, min(ENOUGH / SURE * told / max(length, 1e-30), outlines_explained(parts)))
 
     def check(self, alphas: Sequence[Tensor]) -> None:
-        """That the silhouettes of the start leave something of the pictures around them. Raises ValueError."""
-        seen = 0
+        """That the silhouettes of the start leave something of the pictures around them, of more than one colour. Raises
+        ValueError."""
+        seen = coloured = 0
         for k, alpha in enumerate(alphas):
             share = alpha[..., 0].float()
             near, extent = self.around(k, share)
             seen += extent > 0.0
+            colours = self.displays[k][near > 0.0]
+            coloured += len(colours) > 0 and float((colours.amax(0) - colours.amin(0)).max()) > EVEN
             if extent > 0.0 and float((near * (1.0 - share)).sum()) <= LEAST_AROUND * float(near.sum()):
                 raise ValueError(
                     f'scene: expected meshes with some of the picture around them, as loss="region" needs, got a scene that '
@@ -133,6 +136,11 @@ class Regions:
             raise ValueError(
                 'scene: expected an object that the pictures show at the start, as loss="region" needs, got one out of view of '
                 "all cameras; start nearer"
+            )
+        if not coloured:
+            raise ValueError(
+                'images: expected the object before something of another colour, as loss="region" needs, got one colour alone '
+                "where it is at the start and around it; start nearer, or look for what made the pictures black or white"
             )
 
     def _of(self, group: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -145,13 +153,15 @@ class Regions:
         found = [self.sides[i] for i in group]
         if self.narrows or any(sides is None for sides in found):
             return None
-        parts = {f.name: torch.stack([getattr(sides, f.name) for sides in found]) for f in fields(Sides)}
-        pictures = torch.stack([self.displays[i] for i in group])
-        # With the picture taken off, what is mixed is the difference.
-        return Sides(**{**parts, "outside": parts["outside"] - pictures, "inside": parts["inside"] - pictures})
+        columns = zip(*(_tensors(sides) for sides in found if sides), strict=True)
+        alpha, inside, outside, variance, band = (torch.stack(list(column)) for column in columns)
+        return Sides(alpha, inside, outside, variance, band)
+
+    def _squares(self, group: Sequence[int], sides: Sides, alpha: Tensor) -> Tensor:
+        """(B, H, W): squared differences of the pictures from the mixture by alpha (B, H, W), in variances."""
+        off = sides.mixed_by(alpha) - torch.stack([self.displays[i] for i in group])
+        return (off.square() / sides.variance).sum(-1)
 
 
-def _squares(sides: Sides, alpha: Tensor) -> Tensor:
-    """(B, H, W): squared differences from the mixture by alpha (B, H, W), in variances."""
-    off = sides.outside + alpha[..., None] * (sides.inside - sides.outside)
-    return (off.square() / sides.variance).sum(-1)
+def _tensors(sides: Sides) -> tuple[Tensor, ...]:
+    return sides.alpha, sides.inside, sides.outside, sides.variance, sides.band

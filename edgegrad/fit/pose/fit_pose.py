@@ -123,7 +123,8 @@ def fit_pose(
     final comparison, and its edges are as well in the picture. In photographs `uncertainty` says how exactly the terms show the
     pose, and a rotation that is known less exactly than to 5° (of a plain mesh 2°), or a place than to 5 % of the object's size,
     is not `converged`: `reason` names the direction, which a continuous one of the `symmetries` makes known. A plain mesh has its
-    contour alone: there other starts follow in any case, and a pose is not `converged` if another one is about as likely.
+    contour alone: there other starts follow in any case, as they do of a mesh with colours whose rotation is known less exactly
+    than to 1°, and a pose is not `converged` if another one is about as likely.
     KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set.
     Works in torch.no_grad() and torch.inference_mode() too. Raises TypeError or ValueError that names the argument, also when
     the object leaves no trace in the picture at the start.
@@ -205,7 +206,7 @@ def search_pose(
         known = None
         if ways.curvature is not None:
             known = Uncertainty.of(task, best, ways.curvature, task.free, symmetries)
-        conflict = _alike(best, ways.alike, symmetries)
+        conflict = _alike(best, ways.alike, symmetries, task.colourless)
         sure = ways.converged and not interrupted and not conflict and (known is None or not known.unknown)
         return PoseFit(
             best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), seconds(), sure, interrupted,
@@ -243,15 +244,16 @@ def search_pose(
     return result()
 
 
-def _alike(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None) -> str:
+def _alike(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None, colourless: bool) -> str:
     """In words, that another pose may be the right one, if it is not known to be the same; else empty."""
     same = others if symmetries is None else [other.closest(symmetries, pose) for other in others]
     apart = max((angle(pose.R, other.R) for other in same), default=0.0)
     if apart < NEAR:
         return ""
+    colours = "the mesh's colours, " if colourless else ""
     return (
-        f"looks alike: the pictures hardly tell it from a pose that is turned by {math.degrees(apart):.0f}°; give the mesh's "
-        "colours, symmetries of the mesh, depth, or another picture"
+        f"looks alike: the pictures hardly tell it from a pose that is turned by {math.degrees(apart):.0f}°; give {colours}"
+        "symmetries of the mesh, depth, or another picture"
     )
 
 

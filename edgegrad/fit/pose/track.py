@@ -32,8 +32,8 @@ from .photo.level import PhotoLevel, Seen, photo_levels
 from .photo.match import ACROSS, places
 from .photo.picture import Picture
 from .photo.remembered import Remembered
-from .photo.search import ALONE_ENOUGH, DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST
 from .photo.views import Views, across, ball
+from .photo.ways import ALONE_ENOUGH, DAMPING, ENOUGH, FLOOR, LAST_DAMPING, LONGEST
 from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit
 from .task import Lens, PoseTask

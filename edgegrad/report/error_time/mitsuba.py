@@ -32,12 +32,12 @@ SPLIT = 8  # interior samples for each boundary sample: one of the latter costs 
 def available() -> str | None:
     """Mitsuba's version, or None where it is not installed or finds no LLVM."""
     try:
-        return _load()[0].__version__
+        return load()[0].__version__
     except (ImportError, RuntimeError):
         return None
 
 
-def _load() -> tuple[Any, Any]:
+def load() -> tuple[Any, Any]:
     """The modules mitsuba and drjit, in the variant that runs on the CPU with derivatives."""
     try:
         mi, dr = importlib.import_module("mitsuba"), importlib.import_module("drjit")
@@ -55,6 +55,16 @@ def _load() -> tuple[Any, Any]:
             f"mitsuba: expected LLVM {LLVM} or newer, got {version}; install one or set DRJIT_LIBLLVM_PATH"
         )
     return mi, dr
+
+
+def sky_image(radiance: Tensor) -> Tensor:
+    """(2 h + 1, w, C): an environment's image (h, w, C) as Mitsuba's `envmap` takes it. That has the first and the last row at
+    the poles and all others evenly between, where edgegrad has the centres of texels half a row off the poles: an image taken as
+    it is would be stretched by h / (h − 1). Every second row is one of the image, and both interpolate alike."""
+    between = (radiance[1:] + radiance[:-1]) / 2
+    poles_and_between = torch.cat([radiance[:1], between, radiance[-1:]])
+    rows = torch.stack([poles_and_between[:-1], radiance], 1).flatten(0, 1)
+    return torch.cat([rows, poles_and_between[-1:]])
 
 
 class Mitsuba:
@@ -95,7 +105,7 @@ class Mitsuba:
         background = torch.zeros(3) if scene.background is None else scene.background
         if background.dim() != 1:
             raise ValueError("background: expected one colour (3,), got an image; not supported by this peer")
-        self.mi, self.dr = mi, dr = _load()
+        self.mi, self.dr = mi, dr = load()
         dr.set_thread_count(torch.get_num_threads())
         self.compile_seconds = 0.0
         self._boundary = boundary

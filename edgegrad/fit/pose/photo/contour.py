@@ -32,7 +32,7 @@ def contour_term(picture: Picture, sides: Sides, tangents: Tensor) -> Normal | N
         return None
     deviation = sides.variance[band].sqrt()
     residual = (sides.mixed - picture.outlined)[band] / deviation
-    step = (sides.inside - sides.outside)[band] / deviation
+    step = sides.slope_by(sides.alpha)[band] / deviation
     robust = (1.0 + residual.square().sum(-1) / TOLERANCE).pow(-2) * picture.weight[band]
     J = tangents[:, band].double()
     curvature = (J * (robust * step.square().sum(-1))) @ J.T

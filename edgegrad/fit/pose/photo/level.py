@@ -95,7 +95,8 @@ class Seen:
 
     def sides(self) -> Sides:
         """Of the contour, in the box."""
-        return Sides.of(self.part.outlined, smoothed(self.alpha[self.box][None], CONTOUR_BLUR)[0], self.near[self.box])
+        contour = smoothed(self.alpha[self.box][None], CONTOUR_BLUR)[0]
+        return Sides.of(self.part.outlined, contour, self.near[self.box], self.part.mask is None)
 
 
 @dataclass(frozen=True)
@@ -171,14 +172,20 @@ class PhotoLevel:
                     curvature, gradient = curvature + term.curvature, gradient + term.gradient
         return Normal(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
 
-    def unlikely(self, pose: Pose, seed: int) -> float:
-        """−log of the likelihood of the pictures by the object's outline alone, regions and contour, in nats of independent
-        pixels, up to a constant that poses of about one size share."""
-        total = 0.0
-        for k, seen in enumerate(self.see(pose, seed)):
-            total -= float((seen.near * likelihood(self._posterior(k, seen), seen.alpha).log()).sum())
-            total += contour_loss(seen.part, seen.sides())
-        return total
+    def unlikely(self, poses: Sequence[Pose], seed: int) -> list[float]:
+        """Of each pose, −log of the likelihood of the pictures by all terms but depth, in nats of independent pixels, up to a
+        constant that poses of about one size share."""
+        views = [self.see(pose, seed) for pose in poses]
+        totals = []
+        for seen in views:
+            total = 0.0
+            for k, one in enumerate(seen):
+                total -= float((one.near * likelihood(self._posterior(k, one), one.alpha).log()).sum())
+                total += contour_loss(one.part, one.sides())
+                if one.lit is not None:  # one noise for all: that of the pose which leaves the least
+                    total += one.lit.loss(min(lit.deviation for other in views if (lit := other[k].lit) is not None))
+            totals.append(total)
+        return totals
 
     def covered(self, pose: Pose, seed: int) -> float:
         """Pixels of the pictures that the object covers by itself."""

@@ -32,6 +32,7 @@ FEWEST = 60  # pixels
 REWEIGHTED = 4  # times
 CLIPPED = 0.95  # linear radiance
 LEAST = 0.02  # standard deviation of a difference
+OUTLIER = 3.0  # deviations: differences that are far above this hardly count (Geman and McClure 1987)
 # Differences of neighbouring pixels are alike, for shadows and highlights have an extent: so many pixels count as one.
 TOGETHER = 8.0
 
@@ -44,7 +45,8 @@ class Lit:
     predicted: Tensor  # (h, w, C) linear radiance, blurred
     coefficients: Tensor  # (C, n), of harmonics
     residual: Tensor  # (C, N) of the pixels inside, scaled
-    robust: Tensor  # (N,) weights
+    count: Tensor  # (N,), how much a pixel counts
+    robust: Tensor  # (N,), the same of those that differ no more than noise does
     deviation: float  # of a scaled difference
     _basis: Tensor  # (C, n, N), scaled
     _scale: Tensor  # (C, N)
@@ -83,13 +85,13 @@ class Lit:
             residual = shown - seen
             e = residual.square().sum(0).sqrt()
             middle = max(_weighted_median(e, count) / _median(C), LEAST)
-            robust = count * (1.0 + (e / (3.0 * middle)).square()).pow(-2)
+            robust = count * (1.0 + (e / (OUTLIER * middle)).square()).pow(-2)
         predicted = (light[:, None] @ basis.flatten(2)).reshape(C, h, w)
         slopes = slope(0.5 * (predicted + pictured))[..., inside]
         # Beside the rim a blur reaches fewer pixels, and slopes are too low.
         whole = smoothed(inside[None].float(), BLUR)[0][inside] > WHOLE
         image = predicted.movedim(0, -1)
-        return Lit(surface, image, light, residual, robust * whole, middle, B, scale, slopes, ridge)
+        return Lit(surface, image, light, residual, count, robust * whole, middle, B, scale, slopes, ridge)
 
     def change(self, white: float) -> float:
         """How much the light changes the mesh's colours, in parts of them: 0 where it leaves them as they are. `white`: the
@@ -103,6 +105,14 @@ class Lit:
         """(N,): how far the picture inside is from the surface in another light (C, n), scaled as `residual` is."""
         off = ((light - self.coefficients)[:, None] @ self._basis)[:, 0] + self.residual
         return off.square().sum(0).sqrt()
+
+    def loss(self, deviation: float) -> float:
+        """−log of the likelihood of the picture inside, for differences of a standard deviation, in nats, less what noise alone
+        leaves: of two poses, the one that shows less of the surface is no likelier for that."""
+        channels, far = len(self.coefficients), OUTLIER * OUTLIER
+        squares = self.residual.square().sum(0) / deviation**2
+        excess = squares / (1.0 + squares / far) - channels / (1.0 + channels / far)
+        return 0.5 * float((self.count * excess).sum()) / TOGETHER
 
     def term(self) -> Normal:
         """The equations of a step of the pose, of which those of the light are eliminated."""

@@ -18,23 +18,19 @@ from ..result import HIDDEN, Step
 from ..search import distinct, norms_of
 from ..task import PoseTask
 from .nearby import turns
-from .search import (
+from .search import APART, FOLLOWED, ROUNDS, SURE, UNCOVERED
+from .together import Together, together_levels
+from .ways import (
     ALONE_ENOUGH,
-    APART,
     DAMPING,
     ENOUGH,
     FLOOR,
-    FOLLOWED,
     FULL_STEPS,
     GAIN,
     LAST_DAMPING,
     LONGEST,
-    ROUNDS,
-    SURE,
-    UNCOVERED,
     most_steps,
-)  # fmt: skip
-from .together import Together, together_levels
+)
 
 
 class PosesSearch:

@@ -8,38 +8,24 @@ colours as they are, the search that compares them as they are has the last word
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
 
 import torch
 from torch import Tensor
 
-from ..journal import Journal, Way
+from ..journal import Journal
 from ..pose import Pose, angle
 from ..result import Step
-from ..search import Search, distinct, norms_of
+from ..search import Search, distinct
 from ..task import Level, PoseTask
-from ..uncertainty import TOGETHER
-from .cover import SIDES, WHOLE, at_one_side, covers, left, weighted
+from ..uncertainty import TOGETHER, Uncertainty
+from .cover import SIDES, at_one_side, covers, weighted
 from .level import PhotoLevel, photo_levels
 from .nearby import comparable, nearby, turns
+from .ways import End, Ways
 
-ENOUGH = 0.65  # share of the render's edges: wrong poses reach 0.57, right ones 0.83 and more
-DOUBTFUL = 0.75  # the same, of objects with colours: of twenty poses a wrong one reached 0.73, right ones 0.79 and more
-# The same of a contour alone: wrong places in clutter reach 0.81, right ones show 0.87 and more.
-ALONE_ENOUGH = 0.85
+DOUBTFUL = 0.75  # share of the edges, of objects with colours: of twenty poses a wrong one reached 0.73, right ones 0.79 and more
 SURE = 0.85  # the same, where a picture before an even background shows less than enough of the edges of colours as they are
-# Of the curvature's diagonal, where colours are still counted beside the object and where it is found, and of its largest entry.
-DAMPING, LAST_DAMPING, FLOOR = 0.1, 0.01, 1e-5
-LONGEST = 0.1  # of any entry of a step
-COARSE_STEPS, FINE_STEPS, LAST_STEPS, USUAL = (
-    12,
-    8,
-    20,
-    40,
-)  # on a level, of the USUAL `steps`; more of these make it more
-FULL_STEPS = 8  # of full length on the last level
-GAIN = 0.1  # a step that makes the pictures more likely by a smaller factor than exp(this / 2) is short: noise moves poses as far
 FOLLOWED, COVERS_FOLLOWED = 3, 4  # of other starts, the best on the coarsest level
 NEARBY_FOLLOWED = 6  # of the poses that the picture shows around the start
 HOPELESS = 0.1  # of the edges there: noise shows none at all, clutter 0.3
@@ -49,21 +35,13 @@ AS_THEY_ARE = 0.05  # mean change of colours, in parts of them, by light that le
 UNCOVERED = 0.85  # of the object's pixels: with fewer, something covers it
 COVERED_ENOUGH = 0.7  # of the edges, where a way that leaves out a side of the object ends
 NEAR = 0.1  # radians: a polished pose that is farther off is another one
-# Of a contour alone: other ends may be the answer if they are within so many radians of the start. One that is less likely by a
-# smaller factor than exp(this) looks alike.
+# Other ends may be the answer if they are within so many radians of the start. One that is less likely by a smaller factor than
+# exp(this) looks alike.
 REACH, ALIKE = 0.7, 3.0
+SHARP = 1.0  # degrees: of objects with colours whose rotation is known less exactly than this, others that look alike are sought
 
 
-class _End(NamedTuple):
-    """Where a way down ended."""
-
-    explained: float
-    pose: Pose
-    short: bool  # the last step
-    left: float = 1.0  # of the object, by what covers it
-
-
-class PhotoSearch:
+class PhotoSearch(Ways):
     """The state of a search, as Search has it."""
 
     def __init__(
@@ -71,25 +49,11 @@ class PhotoSearch:
         tolerance: float, seed: int, journal: Journal | None = None, further: bool = True,
     ) -> None:  # fmt: skip
         """`further`: whether other starts follow where the way down from the given one does not end well."""
-        self.task, self.start, self.depths = task, start, depths
-        self.enough = ALONE_ENOUGH if task.colourless else ENOUGH
+        super().__init__(task, start, depths, max_size, spp, steps, tolerance, seed, journal)
         # Before an even background colours are compared as they are first.
         self.colours_first = not task.clutter and "alpha" not in task.aovs and all(depth is None for depth in depths)
-        self.levels = photo_levels(task, start, depths, max_size, spp, seed)
-        self.max_size, self.spp, self.steps, self.tolerance = max_size, spp, steps, tolerance
-        self.seed, self.further = seed, further
-        self.best, self.loss, self.converged, self.explained = start, math.nan, False, math.nan
-        self.curvature: Tensor | None = None  # JᵀJ of the terms of photographs at the answer, where it is theirs
-        self.history: list[Step] = []
-        self.journal = journal or Journal()
-        self.after_step: Callable[[], Any] = lambda: None
+        self.further = further
         self.alike: list[Pose] = []  # others, which the pictures hardly tell from the answer
-        self._answered = False  # later ways do not show until they win
-
-    @property
-    def planned(self) -> int:
-        """Steps of the first way at most."""
-        return sum(self._most(level) for level in self.levels)
 
     def run(self) -> None:
         """Raises ValueError when nothing in the pictures depends on the pose."""
@@ -111,6 +75,8 @@ class PhotoSearch:
         self._forget(lost)
         if best.explained >= SURE:
             self._take(best)
+        else:
+            self.alike = []
 
     def _photograph_first(self) -> None:
         """Colours as they are have the last word where the light leaves them so, and in a mask where its terms find nothing."""
@@ -128,7 +94,7 @@ class PhotoSearch:
         else:
             self._forget(slice(len(self.history) - len(colours.history) + 1, None))
 
-    def _photograph(self) -> _End:
+    def _photograph(self) -> End:
         """The best end by the terms of photographs."""
         begins = len(self.history)
         found = self._judge(*self._down(self.start, self.levels))
@@ -155,15 +121,12 @@ class PhotoSearch:
             if self.further and best.explained < SURE and best.left < UNCOVERED:
                 again = self._from_covers(best, begins)
                 best = best if again is best else self._surrounded(again)
-        if self.further and self.task.colourless and all(depth is None for depth in self.depths):
+        alone = self.further and all(depth is None for depth in self.depths)
+        if alone and (self.task.colourless or self._vague(best.pose)):
             best = self._of_alike(best, begins)
         return best
 
-    def first_end(self) -> float:
-        """The share of the render's edges that the pictures show where the way down from the start alone ends."""
-        return self._judge(*self._down(self.start, self.levels)).explained
-
-    def _from_aside(self, best: _End, begins: int) -> _End:
+    def _from_aside(self, best: End, begins: int) -> End:
         """Ways from other starts, until one ends where the pictures show the render's edges. Those of this search begin in the
         history at `begins`."""
         coarse, *finer = self.levels
@@ -179,29 +142,34 @@ class PhotoSearch:
                 break
         return best
 
-    def _of_alike(self, best: _End, begins: int) -> _End:
-        """Of poses whose contours look alike, the one that makes the pictures most likely. Seen from afar, an object and what it
-        is behind a mirror have one contour, so an object that is its own mirror image has it in two poses."""
+    def _of_alike(self, best: End, begins: int) -> End:
+        """Of poses that look alike, the one that makes the pictures most likely. An object that is its own mirror image has, from
+        afar, the contour that it has behind a mirror, and so one contour in two poses; a bottle that shows hardly more than its
+        bottom, a disc of one colour, looks alike in many."""
         coarse, *finer = self.levels
-        turned = [self.task.moved(self.start, *turn) for turn in turns()]
+        plain = self.task.colourless
+        turned = [self.task.moved(self.start if plain else best.pose, *turn) for turn in turns()]
         before = len(self.history)
         self._answered = True
         here, *ends = (self._follow(coarse, pose)[0] for pose in [best.pose, *turned])
-        costs = self.journal.numbers(lambda: [coarse.unlikely(pose, self.seed) for pose in ends])
-        ends = [ends[k] for k in sorted(range(len(ends)), key=costs.__getitem__)]
+        costs = self.journal.numbers(lambda: coarse.unlikely([here, *ends], self.seed))
+        sure = ALIKE * TOGETHER**2
+        order = sorted(range(len(ends)), key=lambda k: costs[1 + k])
+        if not plain:  # where colours tell the others from this one in so few pixels, they do in more
+            order = [k for k in order if costs[1 + k] - costs[0] < sure]
         found = [best]
-        for pose in distinct([here, *ends], 1 + FOLLOWED, APART)[1:]:
-            end = self._judge(*self._down(pose, finer))
+        level = self._left_of(best)
+        for pose in distinct([here, *(ends[k] for k in order)], 1 + FOLLOWED, APART)[1:]:
+            end = self._judge(*self._down(pose, finer), level)
             if end.explained >= self.enough and angle(end.pose.R, self.start.R) < REACH:
                 found.append(end)
-        costs = self.journal.numbers(lambda: [self.levels[-1].unlikely(end.pose, self.seed) for end in found])
-        sure = ALIKE * TOGETHER**2
-        least = min(costs)
+        costs = self.journal.numbers(lambda: level.unlikely([end.pose for end in found], self.seed))
+        k = min(range(len(found)), key=costs.__getitem__)
         # One that is hardly likelier is no better an answer, but answers would then depend on the start.
-        won = costs[0] - least > sure
-        answer = found[costs.index(least)] if won else best
+        won = costs[0] - costs[k] > sure and (plain or found[k].explained > best.explained)
+        answer, cost = (found[k], costs[k]) if won else (best, costs[0])
         self.alike = [
-            end.pose for end, cost in zip(found, costs, strict=True) if end is not answer and cost - least < sure
+            end.pose for end, other in zip(found, costs, strict=True) if end is not answer and other - cost < sure
         ]
         if not won:
             self._forget(slice(before, None))
@@ -210,7 +178,22 @@ class PhotoSearch:
         self._take(answer)
         return self._surrounded(answer)
 
-    def _better(self, best: _End, found: _End, earlier: slice, answered: bool) -> _End:
+    def _left_of(self, end: End) -> PhotoLevel:
+        """The last level, without what covers the object at an end, if something does."""
+        last = self.levels[-1]
+        weights = covers(last.see(end.pose, self.seed)) if end.left < UNCOVERED else None
+        return last if weights is None else weighted(last, weights)
+
+    def _vague(self, pose: Pose) -> bool:
+        """Whether the pictures show the pose's rotation so little that others may look alike."""
+        (degrees,) = self.journal.numbers(lambda: [self._degrees(pose)])
+        return degrees > SHARP
+
+    def _degrees(self, pose: Pose) -> float:
+        curvature = self.levels[-1].equations(pose, self.seed)[0].curvature
+        return Uncertainty.of(self.task, pose, curvature, self.task.free, None).degrees
+
+    def _better(self, best: End, found: End, earlier: slice, answered: bool) -> End:
         """The one that explains more of the edges. Of the other one the history keeps no steps; those `earlier` than the steps to
         the found one led to the best."""
         if found.explained <= best.explained:
@@ -221,7 +204,7 @@ class PhotoSearch:
             self._take(found)
         return found
 
-    def _from_covers(self, best: _End, begins: int) -> _End:
+    def _from_covers(self, best: End, begins: int) -> End:
         """Ways that leave out what may cover the object at one side, until the pictures show an end's edges for sure."""
         answered = self._answered
         self._answered = True
@@ -238,7 +221,7 @@ class PhotoSearch:
         order = sorted(hopeful, key=lambda k: -scores[k])[:COVERS_FOLLOWED]
         return self._of_covered(best, ((ends[k], ways[k]) for k in order), begins, answered)
 
-    def _from_nearby(self, best: _End, begins: int) -> _End:
+    def _from_nearby(self, best: End, begins: int) -> End:
         """Ways from poses around the start that the picture shows, as a whole or at all sides but one."""
         answered = self._answered
         self._answered = True
@@ -263,8 +246,8 @@ class PhotoSearch:
         return self._of_covered(best, starts(), begins, answered)
 
     def _of_covered(
-        self, best: _End, starts: Iterable[tuple[Pose, list[Tensor]]], begins: int, answered: bool
-    ) -> _End:  # fmt: skip
+        self, best: End, starts: Iterable[tuple[Pose, list[Tensor]]], begins: int, answered: bool
+    ) -> End:  # fmt: skip
         """The best of the ways down from poses, with weights (h, w) of the pictures at first, until one is sure."""
         for pose, weights in starts:
             before = len(self.history)
@@ -278,23 +261,7 @@ class PhotoSearch:
                 break
         return best
 
-    def _uncovered(self, pose: Pose, weights: list[Tensor], levels: list[PhotoLevel]) -> _End:
-        """Down from a pose, with `weights` (h, w) of each picture until the light tells what covers the object."""
-        short, last = False, levels[-1]
-        for level in levels:
-            if level.last:
-                weights = covers(weighted(level, weights).see(pose, self.seed)) or weights
-            pose, short = self._follow(last := weighted(level, weights), pose)
-        weights = covers(last.see(pose, self.seed)) or weights
-        share, kept = self.journal.numbers(
-            lambda: [
-                weighted(levels[-1], weights).explained(pose, self.seed),
-                left(levels[-1].see(pose, self.seed), weights),
-            ]
-        )
-        return _End(share * min(1.0, kept / WHOLE), pose, short, kept)
-
-    def _surrounded(self, best: _End) -> _End:
+    def _surrounded(self, best: End) -> End:
         """The end, once more with what surrounds the object where it is now, and without what covers it: it does not depend
         on the start any more."""
         last = photo_levels(self.task, best.pose, self.depths, self.max_size, self.spp, self.seed)[-1]
@@ -307,66 +274,6 @@ class PhotoSearch:
         if not self.colours_first:
             self._take(found)
         return found
-
-    def _down(self, pose: Pose, levels: list[PhotoLevel]) -> tuple[Pose, bool]:
-        """Through the levels; the pose, and whether the last step was short."""
-        short = False
-        for level in levels:
-            pose, short = self._follow(level, pose)
-        return pose, short
-
-    def _follow(self, level: PhotoLevel, origin: Pose) -> tuple[Pose, bool]:
-        """Steps on one level; the pose, and whether the last step was short."""
-        way = self.journal.entered() or Way(origin, origin, math.inf, search={})
-        for step in way.steps:
-            self._note(step)
-        while not way.done:
-            # The same samples at each step, so that steps come to rest.
-            normal, loss = level.equations(way.pose, self.seed)
-            move = normal.damped(LAST_DAMPING if level.last else DAMPING, FLOOR, LONGEST)
-            if move is None:
-                self.journal.keep(way := way._replace(done=True))
-                break
-            if level.last and len(way.steps) > FULL_STEPS:
-                move = 0.5 * move  # weights that are solved anew at each step make full ones go to and fro
-            far = float(move.abs().max()) >= self.tolerance * level.plain.coarseness
-            short = not far or float(move @ normal.curvature @ move) < GAIN
-            step = Step(level.size, loss, way.pose, True, norms_of(level.plain.free, normal.gradient))
-            steps = (*way.steps, step)
-            way = way._replace(
-                pose=self.task.moved(way.pose, level.plain.free, move), here=way.pose, lowest=loss, short=short,
-                done=short or len(steps) >= self._most(level), steps=steps,
-            )  # fmt: skip
-            self.journal.keep(way)
-            self._note(step)
-            self.after_step()
-        return way.pose, way.short
-
-    def _most(self, level: PhotoLevel) -> int:
-        return most_steps(self.steps, level.last, level.plain.coarseness == self.levels[0].plain.coarseness)
-
-    def _note(self, step: Step) -> None:
-        if not self._answered:
-            self.best, self.loss = step.pose, step.loss
-        self.history.append(step)
-
-    def _forget(self, lost: slice) -> None:
-        self.history[lost] = [step._replace(best=False) for step in self.history[lost]]
-
-    def _judge(self, pose: Pose, short: bool) -> _End:
-        (share,) = self.journal.numbers(lambda: [self.levels[-1].explained(pose, self.seed)])
-        return _End(share, pose, short)
-
-    def _take(self, end: _End) -> None:
-        self.loss, *curvature = self.journal.numbers(lambda: self._at(end.pose))
-        self.curvature = torch.tensor(curvature, dtype=torch.float64).reshape((len(self.task.free),) * 2)
-        self.explained, self.best, self._answered = end.explained, end.pose, True
-        self.converged = end.short and end.explained >= self.enough
-
-    def _at(self, pose: Pose) -> list[float]:
-        """The loss, and the curvature by rows."""
-        normal, loss = self.levels[-1].equations(pose, self.seed)
-        return [loss, *normal.curvature.flatten().tolist()]
 
     def _as_they_are(self, pose: Pose) -> bool:
         """Whether the light leaves the mesh's colours as they are."""
@@ -397,10 +304,3 @@ class PhotoSearch:
     def _adopt(self, search: Search) -> None:
         self.best, self.loss, self._answered = search.best, search.loss, True
         self.explained, self.converged, self.curvature = search.explained, search.converged, None
-
-
-def most_steps(steps: int, last: bool, coarsest: bool) -> int:
-    """On a level, of what the user allows. Few lead from one level to the next, and where they do not come to rest, more do not
-    help either, unless somebody asks for them."""
-    usual = LAST_STEPS if last else COARSE_STEPS if coarsest else FINE_STEPS
-    return min(steps, round(usual * max(1.0, steps / USUAL)))

@@ -18,8 +18,9 @@ from ..result import Step
 from ..search import Search, distinct
 from ..task import PoseTask
 from .level import photo_levels
-from .search import DAMPING, FLOOR, LONGEST, PhotoSearch
+from .search import PhotoSearch
 from .views import ball, spread
+from .ways import DAMPING, FLOOR, LONGEST
 
 Tell = Callable[[str], Any]
 

@@ -1,0 +1,145 @@
+"""How far a render's contour is from the edges of a photograph, by nothing that a fit compares.
+
+Along normals to the contour the photograph is read where its colours change most: a maximum of the Gaussian derivative (Canny
+1986), refined by a parabola. The sides of a box are lines that are fitted to such points robustly (RANSAC, Fischler and Bolles
+1981), and its corners are where lines of neighbouring sides meet, in the photograph as in the render: so it makes no difference
+that corners of a scan are round.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+from skimage import measure
+from torch import Tensor
+
+from edgegrad.files.image import linear_to_srgb
+
+SIGMA = 1.0  # pixels, of the derivative
+STEP = 0.1  # pixels along a normal
+STRONG = 0.03  # sRGB values a pixel: weaker edges are not counted
+CORNER = 4.0  # pixels that a polygon of the contour may leave out
+ENDS = 0.12  # of a side, at each end, where corners are round
+ON_LINE = 0.75  # pixels
+LINES = 500  # that are tried for a side
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The photograph across a contour."""
+
+    points: np.ndarray  # (n, 2), x and y in pixels, on the contour
+    normals: np.ndarray  # (n, 2), outwards
+    along: np.ndarray  # (m,) pixels
+    change: np.ndarray  # (n, m), sRGB values a pixel, of all channels together
+
+    def maxima(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Strong edges: rows of points, pixels along their normals, and strengths."""
+        left, middle, right = self.change[:, :-2], self.change[:, 1:-1], self.change[:, 2:]
+        rows, columns = np.nonzero((middle > STRONG) & (middle >= left) & (middle > right))
+        a, b, c = (part[rows, columns] for part in (left, middle, right))
+        return rows, self.along[columns + 1] + STEP * 0.5 * (a - c) / (a - 2.0 * b + c), b
+
+    def quantiles(self) -> list[float]:
+        """Half and 90 % of the distances are as short, pixels."""
+        return np.quantile(self.distances(), [0.5, 0.9]).tolist()
+
+    def distances(self) -> np.ndarray:
+        """(k,) pixels, from points to the strongest edges near them; of those that have one."""
+        rows, offsets, strengths = self.maxima()
+        best: dict[int, tuple[float, float]] = {}
+        for row, offset, strength in zip(rows.tolist(), offsets.tolist(), strengths.tolist(), strict=True):
+            best[row] = max(best.get(row, (0.0, 0.0)), (strength, abs(offset)))
+        return np.array([offset for _, offset in best.values()])
+
+
+def across(picture: Tensor, alpha: Tensor, reach: float) -> Profile:
+    """Of a photograph (H, W, 3), linear, across the contour of alpha (H, W), as far as `reach` pixels to both sides."""
+    points, normals = _outline(alpha.double().numpy())
+    along = np.arange(-reach, reach + 0.5 * STEP, STEP)
+    y, x = (points[:, None, k] + along * normals[:, None, k] - 0.5 for k in (1, 0))
+    image = linear_to_srgb(picture.clamp(0.0, 1.0)).double().numpy()
+    squares = np.zeros_like(x)
+    for channel in np.moveaxis(image, -1, 0):
+        slopes = [ndimage.gaussian_filter(channel, SIGMA, order=order) for order in ((0, 1), (1, 0))]
+        read = [ndimage.map_coordinates(slope, [y, x], order=1, mode="nearest") for slope in slopes]
+        squares += (read[0] * normals[:, None, 0] + read[1] * normals[:, None, 1]) ** 2
+    return Profile(points, normals, along, np.sqrt(squares))
+
+
+def _outline(alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 2), x and y, of the longest contour of alpha (H, W), a pixel apart, and normals."""
+    ring = max(measure.find_contours(np.pad(alpha, 1), 0.5), key=len)[:, ::-1] - 0.5  # of the first pixel's centre: 0.5
+    lengths = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))]
+    places = np.arange(0.0, lengths[-1], 1.0)
+    points = np.stack([np.interp(places, lengths, ring[:, k]) for k in (0, 1)], -1)
+    smooth = ndimage.gaussian_filter1d(points, 1.5, axis=0, mode="wrap")
+    tangents = np.roll(smooth, -1, 0) - np.roll(smooth, 1, 0)
+    normals = np.stack([tangents[:, 1], -tangents[:, 0]], -1) / np.linalg.norm(tangents, axis=1, keepdims=True)
+    # find_contours() keeps what is higher on one side, which side that is the sign of the area tells.
+    x, y = points.T
+    area = float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
+    return points, normals if area > 0.0 else -normals
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Where the sides of a box's silhouette meet, (n, 2), pixels."""
+
+    render: np.ndarray
+    photograph: np.ndarray  # NaN where a side is not found
+    shown: np.ndarray  # (n,) of each side, the share of its points that are on a line of the photograph
+
+    @property
+    def apart(self) -> np.ndarray:
+        """(n,) pixels."""
+        return np.linalg.norm(self.render - self.photograph, axis=1)
+
+
+def corners(picture: Tensor, alpha: Tensor, reach: float) -> Corners:
+    """Of a box whose silhouette is alpha (H, W), in a photograph (H, W, 3), linear."""
+    profile = across(picture, alpha, reach)
+    rows, offsets, _ = profile.maxima()
+    candidates = profile.points[rows] + offsets[:, None] * profile.normals[rows]
+    polygon = measure.approximate_polygon(np.r_[profile.points, profile.points[:1]], CORNER)[:-1]
+    at = [int(np.linalg.norm(profile.points - corner, axis=1).argmin()) for corner in polygon]
+    own, seen, shown = [], [], []
+    for first, last in zip(at, [*at[1:], at[0] + len(profile.points)], strict=True):
+        inset = round(ENDS * (last - first))
+        side = np.arange(first + inset, last - inset) % len(profile.points)
+        own.append(_line(profile.points[side]))
+        line, share = _ransac(candidates[np.isin(rows, side)], len(side))
+        seen.append(line)
+        shown.append(share)
+    return Corners(_met(own), _met(seen), np.array(shown))
+
+
+def _line(points: np.ndarray) -> np.ndarray:
+    """(3,): a normal, and its distance from the origin."""
+    middle = points.mean(0)
+    normal = np.linalg.svd(points - middle)[2][1]
+    return np.r_[normal, -normal @ middle]
+
+
+def _ransac(points: np.ndarray, count: int) -> tuple[np.ndarray, float]:
+    """The line that most of the points are on, and how many they are, of `count`."""
+    rng = np.random.default_rng(0)
+    best = np.zeros(len(points), bool)
+    for _ in range(LINES if len(points) > 1 else 0):
+        line = _line(points[rng.choice(len(points), 2, replace=False)])
+        on = np.abs(points @ line[:2] + line[2]) < ON_LINE
+        best = on if on.sum() > best.sum() else best
+    if best.sum() < 5:
+        return np.full(3, np.nan), 0.0
+    for _ in range(5):
+        line = _line(points[best])
+        best = np.abs(points @ line[:2] + line[2]) < ON_LINE
+    return line, float(best.sum()) / count
+
+
+def _met(lines: list[np.ndarray]) -> np.ndarray:
+    """(n, 2), each line with the one before it."""
+    pairs = [np.cross(line, before) for line, before in zip(lines, [lines[-1], *lines[:-1]], strict=True)]
+    return np.array([pair[:2] / pair[2] for pair in pairs])
