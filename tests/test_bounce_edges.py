@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 import torch
-from bounce_scenes import QUAD, SCENES, case_of, indirect_change, indirect_gradient, mesh, plates, seen_from
-from finite_differences import Case, right_ratio
+from bounce_scenes import BOX, GAUSS, QUAD, SCENES, case_of, indirect_change, indirect_gradient, mesh, plates, seen_from
+from finite_differences import Case, estimate, right_ratio
 from strip_oracle import Strip, border
 from torch import Tensor
 
@@ -182,3 +182,39 @@ def test_motions(scene: str, motion: str) -> None:
 @pytest.mark.parametrize("scene", ["cornell", "plates", "lamp upwards", "ball"])
 def test_more_bounces(scene: str, bounces: int) -> None:
     check(case_of(scene, next(iter(SCENES[scene][1]))), 8192, 16, bounces, 4_000_000, 1_000_000)
+
+
+def block_on_sender(theta: Tensor, dtype: torch.dtype) -> tuple[eg.Scene, eg.Camera]:
+    """A black block stands on the face that sends light, and slides on it; the camera sees the receiver alone."""
+    strip, gray = Strip.standard(), torch.full((3,), 0.7, dtype=F64)
+    sender = torch.tensor([[-1.0, -5.0, -5.2], [-1.0, -5.4, 6.6], [-1.0, 5.8, 0.6]], dtype=dtype)
+    turn = torch.tensor([[1, 0, 0], [0, 0.92, -0.39], [0, 0.39, 0.92]], dtype=F64)
+    ends = [(x, y, z) for z in (-0.3, 0.3) for y in (-0.25, 0.25) for x in (-1.0, -0.4)]
+    block = torch.tensor(ends, dtype=F64) @ turn.T + theta * torch.tensor([0.0, 1.0, 0.3], dtype=F64)
+    looks = (strip.receiver, QUAD[:1], gray), (sender, QUAD[:1], gray), (block, BOX, torch.zeros(3, dtype=F64))
+    meshes = [eg.Mesh(v.to(dtype), torch.tensor(f), material=eg.Material(color)) for v, f, color in looks]
+    lights = [eg.PointLight(torch.tensor([0.0, 0.5, 0.2], dtype=F64), 4.0)]
+    return eg.Scene(meshes, lights=lights), strip.camera
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("accepted")
+@pytest.mark.parametrize("dtype", [F64, torch.float32])
+def test_what_stands_on_the_sender(dtype: torch.dtype) -> None:
+    weights, h = weights_of(Strip.standard()), 0.1
+
+    def loss(theta: Tensor, spp: int, seed: int, **counts: Any) -> Tensor:
+        image = eg.render(*block_on_sender(theta, dtype), spp, seed, bounces=2, shadows=False, **counts)
+        return (weights * image).sum()
+
+    changes, slopes = [], []
+    for seed in range(8):
+        with torch.no_grad():
+            high, low = (float(loss(torch.tensor(x, dtype=F64), 1 << 15, seed)) for x in (h, -h))
+        changes.append((high - low) / (2 * h))
+        slopes.append(0.0)
+        for at, share in GAUSS:
+            theta = torch.tensor(at * h, dtype=F64, requires_grad=True)
+            value = loss(theta, 1, 50 + seed, edge_samples=1_500_000, surface_samples=1)
+            slopes[-1] += share * float(torch.autograd.grad(value, theta)[0])
+    print(right_ratio(estimate(changes), estimate(slopes)))
