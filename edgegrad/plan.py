@@ -161,6 +161,7 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     terms["bounces"] = _bounces(scene, terms["interior"].samples + terms["boundary"].samples, lighting)
     terms["shadow edges"] = _shadow_edges(scene, request, lighting)
     terms["unseen shadow edges"] = _unseen_shadow_edges(scene, request, lighting)
+    terms["bounce edges"] = _bounce_edges(scene, request, lighting)
     terms["texels of lamps"] = _texels_of_lamps(scene, lighting)
     return terms
 
@@ -223,6 +224,24 @@ def _unseen_shadow_edges(scene: Scene, request: Request, lighting: Lighting) -> 
         f"of {len(lights)} light{'s' * (len(lights) > 1)}, on surfaces that light others: a ray of the light for each sample, "
         f"and one to go on and one to the camera for each of {lighting.bounces - 1} further bounces"
     )
+    return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
+
+
+def _bounce_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
+    if lighting.bounces == 1:
+        return Term(False, "bounces=1: no surface lights another")
+    if not request.gradient.visibility:
+        return Term(False, "visibility=False")
+    moving = [name for name in required(request) if name in MOVING]
+    if not moving:
+        return Term(False, "neither surfaces nor the camera move")
+    # What only the camera moves are borders that it sees.
+    kinds = lighting.bounces - 1 if "verts" in moving else 1
+    each, size = request.gradient.edge_samples, (request.camera.width, request.camera.height)
+    samples = request.cameras * kinds * (each if each >= 0 else core.most_bounce_samples(*size, request.image.spp))
+    why = "what surfaces see of one another: lines past edges, each two rays, one to the camera and a path at its other end"
+    if kinds > 1:
+        why += f"; as many whose light goes on to the camera after each of {kinds - 1} further bounces"
     return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
 
 

@@ -71,11 +71,10 @@ class Effort(NamedTuple):
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
+    # What samples on the borders of what surfaces see of one another give to the image, by light that is scattered between them.
+    bounce_edges: Callable[[Frame], list[Term]] | None = None
     # What samples on borders of a light's shadows on surfaces give to the image, by light that these surfaces pass on.
     passed_on: Callable[[Frame, ShadowLight, CurveRecords], list[Term]] | None = None
-    # Samples on the borders of what surfaces of paths of light see of one another, and how the image jumps there; None: there
-    # are no paths.
-    bounce_samples: Callable[[Frame], tuple[CurveRecords, Tensor]] | None = None
     watch: Watch = Watch()  # is told what it takes
 
     @property
@@ -172,9 +171,9 @@ class _Image:
             if self._effort.passed_on is not None:
                 with watch.part("unseen shadows"):
                     terms += self._unseen_shadows(self._effort.passed_on)
-        if moving and self._effort.bounce_samples is not None:
-            with watch.part("bounces"):
-                terms += self._bounces(self._effort.bounce_samples)
+        if moving and self._effort.bounce_edges is not None:
+            with watch.part("bounce edges"):
+                terms += self._effort.bounce_edges(frame)
         return frame.attached(image, terms)
 
     # -- the image -----------------------------------------------------------------------------------------------------
@@ -295,19 +294,6 @@ class _Image:
                 self._effort.watch.count("unseen_shadow_samples", len(records.x))
                 terms += passed_on(frame, light, records)
         return terms
-
-    def _bounces(self, sample: Callable[[Frame], tuple[CurveRecords, Tensor]]) -> list[Term]:
-        """The same over samples on the borders of what surfaces of paths see of one another."""
-        records, jump = sample(self._frame)
-        self._effort.watch.count("bounce_samples", len(records.x))
-        if not len(records.x):
-            return []
-        samples = EdgeSamples(self._frame, records)
-        jump = self._frame.here(jump).to(self._frame.dtype)
-        if self._effort.blended:
-            with torch.no_grad():
-                jump = let_through(self._frame, records)[:, None].to(jump) * jump
-        return boundary(samples.x, samples.velocity, jump, None, None)
 
     def _boundary(self, samples: EdgeSamples) -> list[Term]:
         """Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""

@@ -248,6 +248,14 @@ void each_view(const BackwardInput<T>& input, const GradientOptions& o, const Te
     for (size_t k = 0; k < windows.size(); ++k) with_view(input, windows[k], in_image, options[k], terms, team, body);
 }
 
+// The same for one window, where none shows more of what is looked for than another.
+template <class T>
+void with_any_window(const BackwardInput<T>& input, const GradientOptions& o, Team& team,
+                     const std::type_identity_t<ViewBody<T>>& body) {
+    const Camera window = windows_of(input.camera, InImage<T>::margin_of(input.image)).front();
+    with_view<T>(input, window, InImage<T>(input, team), o, Terms{}, team, body);
+}
+
 // δI = (1 − coverage) δbackground of direction d, for pixels (H, W, D, C).
 template <class T>
 void add_background_tangent(const BackwardInput<T>& input, const std::vector<Tangents>& directions, Team& team,
@@ -398,29 +406,29 @@ std::vector<CurveRecords> record_shadows(const BackwardInput<T>& input, const Sc
 }
 
 template <class T>
+std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                         const GradientOptions& o, const LitPaths& paths, int64_t samples, Team& team,
+                                         BounceSamples& out) {
+    RecordList records;
+    Destination to;
+    to.records = &records;
+    const auto add = [&](const BackwardView<T>& view) {
+        add_bounces(view, casters, paths, samples, Record{o.intrinsics}, to, out);
+    };
+    if (paths.further == 0) each_view(input, o, Terms{}, team, add);
+    else with_any_window<T>(input, o, team, add);
+    return std::move(records.curves);
+}
+
+template <class T>
 std::vector<CurveRecords> record_unseen_shadows(const BackwardInput<T>& input, const SceneView<T>& casters,
                                                 const GradientOptions& o, const LightParts& light, int64_t samples,
                                                 Team& team) {
     RecordList records;
     Destination to;
     to.records = &records;
-    // No window shows more of them than another.
-    const Camera window = windows_of(input.camera, InImage<T>::margin_of(input.image)).front();
-    with_view<T>(input, window, InImage<T>(input, team), o, Terms{}, team,
-                 [&](const BackwardView<T>& view) { add_unseen_shadows(view, casters, light, samples, to); });
-    return std::move(records.curves);
-}
-
-template <class T>
-std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const SceneView<T>& casters,
-                                         const GradientOptions& o, const LitPaths& paths, int64_t samples, Team& team,
-                                         std::vector<std::vector<double>>& jumps) {
-    RecordList records;
-    Destination to;
-    to.records = &records;
-    each_view(input, o, Terms{}, team, [&](const BackwardView<T>& view) {
-        add_bounces(view, casters, paths, samples, Record{o.intrinsics}, to, jumps);
-    });
+    with_any_window<T>(input, o, team,
+                       [&](const BackwardView<T>& view) { add_unseen_shadows(view, casters, light, samples, to); });
     return std::move(records.curves);
 }
 
@@ -433,11 +441,11 @@ std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const Sc
     template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                          \
     template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,               \
                                                       const GradientOptions&, const LightParts&, int64_t, Team&); \
-    template std::vector<CurveRecords> record_unseen_shadows(                                                     \
-        const BackwardInput<T>&, const SceneView<T>&, const GradientOptions&, const LightParts&, int64_t, Team&); \
     template std::vector<CurveRecords> record_bounces(const BackwardInput<T>&, const SceneView<T>&,               \
                                                       const GradientOptions&, const LitPaths&, int64_t, Team&,    \
-                                                      std::vector<std::vector<double>>&);
+                                                      BounceSamples&);                                            \
+    template std::vector<CurveRecords> record_unseen_shadows(                                                     \
+        const BackwardInput<T>&, const SceneView<T>&, const GradientOptions&, const LightParts&, int64_t, Team&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)
 #undef EDGEGRAD_INSTANTIATE

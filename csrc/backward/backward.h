@@ -13,6 +13,7 @@
 namespace edgegrad {
 
 struct LitPaths;  // boundary/bounces.h
+struct BounceSamples;
 
 struct GradientOptions {
     int64_t surface_samples = -1;  // in all; −1: the default (surface_measure.cpp)
@@ -100,12 +101,11 @@ std::vector<CurveRecords> record_unseen_shadows(const BackwardInput<T>& input, c
                                                 const GradientOptions& options, const LightParts& light,
                                                 int64_t samples, Team& team);
 
-// The samples on the borders of what surfaces of paths of light see of one another; and by how much the image jumps
-// there, an array for each chunk (bounces.h).
+// The samples on the borders of what surfaces of paths of light see of one another (boundary/bounces.h).
 template <class T>
 std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const SceneView<T>& casters,
                                          const GradientOptions& options, const LitPaths& paths, int64_t samples,
-                                         Team& team, std::vector<std::vector<double>>& jumps);
+                                         Team& team, BounceSamples& out);
 
 // q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a window.
 void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,

@@ -40,14 +40,15 @@ struct LineScene {
     const BackwardView<T>& view;
     const SceneView<T>& casters;
     const LitPaths& lit;
-    LitOptions at_sender;  // that light is scattered once less there than in all
+    LitOptions at_sender;  // how often light may be scattered up to there
     PooledLines& pooled;
     std::vector<double> means = {};  // of its cells; empty: not known yet
 
     LineScene(const BackwardView<T>& view_, const SceneView<T>& casters_, const LitPaths& lit_, PooledLines& pooled_)
         : view(view_), casters(casters_), lit(lit_), at_sender(lit_.options), pooled(pooled_) {
-        --at_sender.bounces;
+        at_sender.bounces -= 1 + lit.further;
     }
+    bool is_seen() const { return lit.further == 0; }  // whether the viewer sees the ends to which light comes
     EdgeLines<T> lines() const { return {view.scene, view.geometry.topology(), pooled, means}; }
 
     // What is drawn of each edge, relative to others.
@@ -85,55 +86,71 @@ class Ends {
                                 &b_[0][3 * i],
                                 &b_[1][3 * i],
                                 &seed[i]};
-            send_between(scene.lit.lit, scene.casters, scene.view.geometry.caster(), some, paths, &out[i * C]);
+            send_between(scene.lit.lit, scene.casters, scene.view.geometry.caster(), some,
+                         scene.is_seen() ? Received::by_viewer : Received::there, paths, &out[i * C]);
+        }
+        return out;
+    }
+
+    // (N, 3) unit directions from receivers to senders.
+    template <class T>
+    std::vector<double> directions(const LineScene<T>& scene) const {
+        std::vector<double> out;
+        for (int64_t i = 0; i < size(); ++i) {
+            const Vec3 l = unit(place(scene, 1, i) - place(scene, 0, i));
+            append(out, {l.x, l.y, l.z});
         }
         return out;
     }
 
    private:
+    template <class T>
+    Vec3 place(const LineScene<T>& scene, int end, int64_t i) const {
+        Vec3 out;
+        for (int k = 0; k < 3; ++k) out += b_[end][3 * i + k] * corner(scene.view.scene, face_[end][i], k);
+        return out;
+    }
+
     std::vector<int64_t> face_[2];
     std::vector<double> b_[2];
 };
 
-// The contraction of pilots: which of them are seen, and how much the border of each moves.
-template <class T>
-class Pilots {
-   public:
-    explicit Pilots(const BackwardView<T>& view) : view_(view) {}
-
-    bool wants(int, Vec2) const { return true; }
-
-    void add(int, BounceSource<T>&, typename BounceSource<T>::Sample& sample) {
-        const BounceLine& line = sample.line;
-        // As its edge moves, or the receiver.
-        const double moved = length(sample.N) + length(sample.m);
-        const double look = view_.importance.mean(sample.x, sample.x);
-        const double size = sample.weight * sample.scale * sample.area_scale * moved * look;
-        if (!(size > 0)) return;
-        cell.push_back(line.segment), value.push_back(size);
-        ends.add(0, line.receiver, line.at.u, line.at.v), ends.add(1, line.sender, line.asked.u, line.asked.v);
-    }
-
+// What pilots find.
+struct Pilots {
     std::vector<int64_t> cell;  // of PooledLines
     std::vector<double> value;
     Ends ends;
 
-   private:
-    const BackwardView<T>& view_;
+    void add(const BounceLine& line, double size) {
+        if (!(size > 0)) return;
+        cell.push_back(line.segment), value.push_back(size);
+        ends.add(0, line.receiver, line.at.u, line.at.v), ends.add(1, line.sender, line.asked.u, line.asked.v);
+    }
 };
 
-// Casts a chunk of lines past edges, and from the camera what they are seen to meet.
-template <class T, class Contraction>
-class BounceChunk {
+// Their contraction: which of them are seen, and how much the border of each moves, with its edge or the receiver.
+template <class T>
+class SeenPilots {
    public:
-    BounceChunk(const LineScene<T>& scene, const Systematic& edges, uint64_t seed, Contraction& contraction)
-        : scene_(scene),
-          edges_(edges),
-          sequence_(seed),
-          edge_lines_(scene.lines()),
-          source_(scene.view),
-          lines_(scene.view, scene.casters),
-          samples_(scene.view, source_, contraction) {}
+    SeenPilots(const BackwardView<T>& view, Pilots& found) : view_(view), found_(found) {}
+
+    bool wants(int, Vec2) const { return true; }
+    void add(int, BounceSource<T>&, typename BounceSource<T>::Sample& sample) {
+        const double moved = length(sample.N) + length(sample.m), look = view_.importance.mean(sample.x, sample.x);
+        found_.add(sample.line, sample.weight * sample.scale * sample.area_scale * moved * look);
+    }
+
+   private:
+    const BackwardView<T>& view_;
+    Pilots& found_;
+};
+
+// Calls body(line, weight) for both ways along the lines of a chunk.
+template <class T, class Body>
+class LineChunk {
+   public:
+    LineChunk(const LineScene<T>& scene, const Systematic& edges, uint64_t seed, Body body)
+        : edges_(edges), sequence_(seed), body_(body), edge_lines_(scene.lines()), lines_(scene.view, scene.casters) {}
 
     // The i-th line, at a position along the edges; these ascend. The cell that it is pooled in.
     int64_t add(int64_t i, double position) {
@@ -146,27 +163,55 @@ class BounceChunk {
         if (lines_.is_full()) cast();
         return cell;
     }
-    void finish(ChunkGrad& grad) {
-        cast();
-        samples_.finish(grad);
-    }
+    void cast() { lines_.cast(body_); }
 
    private:
-    void cast() {
-        lines_.cast([&](const BounceLine& line, double weight) {
-            if (is_in_view(scene_.view, source_.place_of(line))) samples_.add(line, 0, weight);
-        });
-    }
-
-    const LineScene<T>& scene_;
     const Systematic& edges_;
     const ShiftedSequence sequence_;
+    const Body body_;
     int64_t edge_ = -1;
     EdgeLines<T> edge_lines_;
-    BounceSource<T> source_;
     BounceLines<T> lines_;
-    CurveSamples<Contraction, T, BounceSource<T>> samples_;
 };
+
+// Calls lines(body) with a body that gives the contraction those of which the camera sees an end.
+template <class T, class Contraction, class Lines>
+void each_seen(const BackwardView<T>& view, Contraction& contraction, ChunkGrad& grad, Lines lines) {
+    BounceSource<T> source(view);
+    CurveSamples samples(view, source, contraction);
+    lines([&](const BounceLine& line, double weight) {
+        if (is_in_view(view, source.place_of(line))) samples.add(line, 0, weight);
+    });
+    samples.finish(grad);
+}
+
+template <class T>
+Vec3 normal_of(const BackwardView<T>& view, const BounceLine& line) {
+    const auto at = [&](int i) { return vec(view.scene.verts + 3 * int64_t(line.vertex[i])); };
+    return cross(at(1) - at(0), line.w);
+}
+
+// A line of which no end need be seen: F by places in the world, y₁ stays at its barycentrics (bounce_source.h).
+template <class T>
+void append_unseen(const BackwardView<T>& view, const BounceLine& line, double weight, CurveRecords& records) {
+    const int64_t sample = records.size();
+    const Vec3 N = normal_of(view, line);
+    append(records.x, {0.0, 0.0});
+    for (int k = 0; k < CurveRecords::surfaces; ++k) {
+        const Barycentrics b = k == 0 ? line.at : line.asked;
+        records.face.push_back(k == 0 ? line.receiver : k == 1 ? line.sender : -2);
+        records.factor.push_back(k == 0 ? weight : 0), append(records.b, {b.u, b.v});
+    }
+    const auto add = [&](int32_t vertex, double by) {
+        records.row_of.push_back(sample), records.vertex.push_back(vertex);
+        append(records.by_q, {by * N.x, by * N.y, by * N.z});
+    };
+    for (int i = 0; i < 3; ++i) {
+        add(view.scene.faces[3 * int64_t(line.receiver) + i], line.share * line.at[i]);
+        add(view.scene.faces[3 * int64_t(line.sender) + i], (1 - line.share) * line.from[i]);
+    }
+    add(line.vertex[0], line.t - 1), add(line.vertex[1], -line.t);
+}
 
 // Fills what is pooled.
 template <class T>
@@ -186,13 +231,23 @@ void cast_pilots(LineScene<T>& scene, int64_t n) {
         int64_t(found.size()), [&] { return path_buffers(scene.lit.lit, scene.at_sender); },
         [&](Paths& paths, int64_t block) {
             view.team.check();
-            Pilots<T> pilots(view);
-            BounceChunk chunk(scene, edges, hash(view.options.seed, 18, gradient_stream), pilots);
+            Pilots pilots;
             Found& own = found[block];
             const int64_t first = block * pilots_of_block, last = std::min(first + pilots_of_block, n);
-            for (int64_t i = first; i < last; ++i) own.lines.push_back(chunk.add(i, edges.position(i)));
-            ChunkGrad unused;
-            chunk.finish(unused);
+            const auto lines = [&](auto body) {
+                LineChunk chunk(scene, edges, hash(view.options.seed, 18, gradient_stream), body);
+                for (int64_t i = first; i < last; ++i) own.lines.push_back(chunk.add(i, edges.position(i)));
+                chunk.cast();
+            };
+            if (scene.is_seen()) {
+                ChunkGrad unused;
+                SeenPilots seen(view, pilots);
+                each_seen(view, seen, unused, lines);
+            } else {
+                lines([&](const BounceLine& line, double weight) {
+                    pilots.add(line, weight * length(normal_of(view, line)));
+                });
+            }
             const std::vector<double> sent = pilots.ends.sent(scene, 19, 2 * first, paths);
             own.cell = std::move(pilots.cell), own.value = std::move(pilots.value);
             for (size_t i = 0; i < own.value.size(); ++i) {
@@ -208,9 +263,10 @@ void cast_pilots(LineScene<T>& scene, int64_t n) {
     scene.means = scene.pooled.means();
 }
 
-// (S, channels): by how much the image jumps at the samples of a record, of which the first is number `first`.
+// Of the samples of a record, of which the first is number `first`.
 template <class T>
-std::vector<double> jumps_of(const LineScene<T>& scene, const CurveRecords& record, int64_t first, Paths& paths) {
+void add_jumps(const LineScene<T>& scene, const CurveRecords& record, int64_t first, Paths& paths,
+               std::vector<double>& jump, std::vector<double>& origin) {
     constexpr int surfaces = CurveRecords::surfaces;
     Ends ends;
     for (int64_t i = 0; i < record.size(); ++i)
@@ -218,11 +274,11 @@ std::vector<double> jumps_of(const LineScene<T>& scene, const CurveRecords& reco
             const int64_t at = surfaces * i + k;
             ends.add(k, record.face[at], record.b[2 * at], record.b[2 * at + 1]);
         }
-    std::vector<double> out = ends.sent(scene, 15, first, paths);
+    jump = ends.sent(scene, 15, first, paths);
     const int C = scene.lit.lit.channels;
     for (int64_t i = 0; i < record.size(); ++i)
-        for (int c = 0; c < C; ++c) out[i * C + c] *= record.factor[surfaces * i];
-    return out;
+        for (int c = 0; c < C; ++c) jump[i * C + c] *= record.factor[surfaces * i];
+    if (!scene.is_seen()) origin = ends.directions(scene);
 }
 
 }  // namespace
@@ -233,7 +289,7 @@ int64_t most_bounce_samples(int64_t width, int64_t height, int spp) {
 
 template <class T>
 void add_bounces(const BackwardView<T>& view, const SceneView<T>& casters, const LitPaths& lit, int64_t samples,
-                 const Record& record, Destination& to, std::vector<std::vector<double>>& jumps) {
+                 const Record& record, Destination& to, BounceSamples& out) {
     const int64_t n =
         samples >= 0 ? samples : most_bounce_samples(view.camera.width, view.camera.height, view.image.spp);
     if (n == 0) return;
@@ -247,27 +303,34 @@ void add_bounces(const BackwardView<T>& view, const SceneView<T>& casters, const
     double seconds[2] = {};
     const size_t before = to.records->curves.size();
     view.scatter.add(n, to, seconds, [&](int64_t first, int64_t last, ChunkGrad& grad) {
-        const std::unique_ptr<CurveContraction> to_chunk = contract_curves(view, record, grad);
-        BounceChunk chunk(scene, edges, hash(view.options.seed, 16, gradient_stream), *to_chunk);
-        for (int64_t i = first; i < last; ++i) chunk.add(i, edges.position(i));
-        chunk.finish(grad);
+        const auto lines = [&](auto body) {
+            LineChunk chunk(scene, edges, hash(view.options.seed, 16, gradient_stream), body);
+            for (int64_t i = first; i < last; ++i) chunk.add(i, edges.position(i));
+            chunk.cast();
+        };
+        if (scene.is_seen()) {
+            each_seen(view, *contract_curves(view, record, grad), grad, lines);
+        } else {
+            lines(
+                [&](const BounceLine& line, double weight) { append_unseen(view, line, weight, grad.records.curves); });
+        }
     });
     const std::vector<CurveRecords>& found = to.records->curves;
     std::vector<int64_t> first(found.size() + 1, 0);
     for (size_t k = before; k < found.size(); ++k) first[k + 1] = first[k] + found[k].size();
-    jumps.resize(found.size());
+    out.jump.resize(found.size()), out.origin.resize(found.size());
     view.team.each_with(
         int64_t(found.size() - before), [&] { return path_buffers(lit.lit, scene.at_sender); },
         [&](Paths& paths, int64_t i) {
             view.team.check();
             const size_t k = before + size_t(i);
-            jumps[k] = jumps_of(scene, found[k], first[k], paths);
+            add_jumps(scene, found[k], first[k], paths, out.jump[k], out.origin[k]);
         });
 }
 
 template void add_bounces(const BackwardView<float>&, const SceneView<float>&, const LitPaths&, int64_t, const Record&,
-                          Destination&, std::vector<std::vector<double>>&);
+                          Destination&, BounceSamples&);
 template void add_bounces(const BackwardView<double>&, const SceneView<double>&, const LitPaths&, int64_t,
-                          const Record&, Destination&, std::vector<std::vector<double>>&);
+                          const Record&, Destination&, BounceSamples&);
 
 }  // namespace edgegrad

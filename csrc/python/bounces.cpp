@@ -20,38 +20,43 @@ namespace edgegrad {
 
 namespace {
 
-// The samples, as records of arrays with their first point alone; and (S, channels) by how much the image jumps there,
-// times what a sample stands for. `casters`: the same faces as light meets them.
+nb::object joined_rows(const std::vector<std::vector<double>>& parts, size_t width) {
+    std::vector<double> out;
+    for (const std::vector<double>& part : parts) out.insert(out.end(), part.begin(), part.end());
+    return rows(std::move(out), {width});
+}
+
+// The samples, as records of arrays with their first point alone; and of BounceSamples the jumps (S, channels) and
+// origins (S, 3), of which there are none where light does not go further. `casters`: the same faces as light meets
+// them.
 template <class T>
 nb::tuple bounce_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& casters, const LitArrays& lit,
-                         const LitOptions& lit_options, const Camera& camera, const ImageOptions& image,
+                         const LitOptions& lit_options, int further, const Camera& camera, const ImageOptions& image,
                          const GradientOptions& options, int64_t samples, double least, int threads,
                          const HitArrays<T>& hits, const std::optional<In<uint8_t, 1>>& panes) {
     hits.check(arrays, camera), check_faces(arrays, lit);
     if (casters.faces.shape(0) != arrays.faces.shape(0)) refuse("casters: expected the faces of the scene");
-    if (lit_options.bounces < 2) refuse("bounces: expected at least 2");
+    if (further < 0 || lit_options.bounces < 2 + further) refuse("bounces: expected at least 2 + further");
     const SceneView<T> scene = arrays.view(), casting = casters.view();
     std::vector<CurveRecords> found;
-    std::vector<std::vector<double>> jumps;
-    std::vector<double> jump;
+    BounceSamples of_chunks;
     unlocked(threads, [&](Team& team) {
         GeometryWork done;
         const auto geometry = arrays.geometry({.topology = true, .parts = true}, team, done);
         found = record_bounces(BackwardInput<T>{scene, camera, *geometry, image, nullptr, hits.view(), nullptr,
                                                 marked_faces("panes", arrays, panes)},
-                               casting, options, {lit.scene, lit_options}, samples, team, jumps);
-        for (const std::vector<double>& part : jumps) jump.insert(jump.end(), part.begin(), part.end());
+                               casting, options, {lit.scene, lit_options, further}, samples, team, of_chunks);
     });
     return nb::make_tuple(curve_arrays(found, least, true, threads),
-                          rows(std::move(jump), {size_t(lit.scene.channels)}));
+                          joined_rows(of_chunks.jump, size_t(lit.scene.channels)), joined_rows(of_chunks.origin, 3));
 }
 
 }  // namespace
 
 template <class T>
 void bind_scene_bounces(nb::class_<SceneArrays<T>>& scene) {
-    scene.def("bounce_samples", &bounce_samples<T>, "casters"_a, "lit"_a, "lit_options"_a, nb::kw_only(), "camera"_a,
-              "image"_a, "options"_a, "samples"_a, "least"_a, "threads"_a, "hits"_a, "panes"_a.none());
+    scene.def("bounce_samples", &bounce_samples<T>, "casters"_a, "lit"_a, "lit_options"_a, nb::kw_only(), "further"_a,
+              "camera"_a, "image"_a, "options"_a, "samples"_a, "least"_a, "threads"_a, "hits"_a, "panes"_a.none());
 }
 template void bind_scene_bounces(nb::class_<SceneArrays<float>>&);
 template void bind_scene_bounces(nb::class_<SceneArrays<double>>&);

@@ -133,6 +133,24 @@ def image(frame: Frame, options: Options, points: int) -> Tensor:
     return frame.here(found)
 
 
+def bounce_samples(frame: Frame, options: Options, further: int) -> tuple[CurveRecords, Tensor, Tensor]:
+    """Samples on the borders of what surfaces of paths see of one another, and (S, C) float64 by how much the image jumps there,
+    times what a sample stands for. Where light goes `further` steps after that: what has come to the first point of each, and
+    (S, 3) from which unit directions (csrc/boundary/bounces.h)."""
+    layout, tables = _layout(frame.fixed, frame.fixed_view)
+
+    def compute(
+        kernel: Any, casters: Any, faces: Tensor, arguments: dict[str, Any], *tables: Tensor
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+        return kernel.bounce_samples(
+            casters, layout.kernel(tables, faces), options.kernel, further=further, **arguments
+        )
+
+    count, seed = frame.request.gradient.edge_samples, derived_seed(frame.sampler.grad_seed, -further)
+    casters = frame.fixed.casters if frame.surfaces.scene.blends else None
+    return frame.sampler.bounce_samples(compute, tables, seed, count, moves(frame.intrinsics), casters)
+
+
 def towards_camera(frame: Frame, arrivals: Sequence[Tensor], steps: tuple[int, int]) -> list[Tensor]:
     """What comes to the image of light that has come to points, without derivatives: which point it is of (M,) int64, the places
     in the image (M, 2), and the radiance times px² (M, C). See csrc/shading/lit/towards_camera.h.
@@ -155,21 +173,6 @@ def towards_camera(frame: Frame, arrivals: Sequence[Tensor], steps: tuple[int, i
         return [torch.from_numpy(part) for part in found]
 
     return list(frame.sampler.lit_image(compute, *(t.cpu() for t in arrivals), *tables))
-
-
-def bounce_samples(frame: Frame, options: Options) -> tuple[CurveRecords, Tensor]:
-    """Samples on the borders of what surfaces of paths see of one another, and (S, C) float64 by how much the image jumps there,
-    times what a sample stands for (csrc/boundary/bounces.h)."""
-    layout, tables = _layout(frame.fixed, frame.fixed_view)
-
-    def compute(
-        kernel: Any, casters: Any, faces: Tensor, arguments: dict[str, Any], *tables: Tensor
-    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        return kernel.bounce_samples(casters, layout.kernel(tables, faces), options.kernel, **arguments)
-
-    count, seed = frame.request.gradient.edge_samples, derived_seed(frame.sampler.grad_seed, 0)
-    casters = frame.fixed.casters if frame.surfaces.scene.blends else None
-    return frame.sampler.bounce_samples(compute, tables, seed, count, moves(frame.intrinsics), casters)
 
 
 def light_points(hits: Hits, light: Light, samples: int) -> list[LightPoints]:

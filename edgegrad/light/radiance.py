@@ -40,6 +40,7 @@ from ..shader import Effort, render_shaded, shaded_points
 from ..warnings import warn
 from . import in_kernel
 from .at_points import Options
+from .bounce_edges import bounce_edges
 from .bounces import check_bounces
 from .bsdf import Scattering, dot, terminator
 from .companions import COMPANIONS, FOURS
@@ -112,8 +113,8 @@ class Lighting(NamedTuple):
             gives_derivatives=fused and additive,
             additive=additive,
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
+            bounce_edges=self._bounce_edges if self.bounces > 1 else None,
             passed_on=self._passed_on if self.bounces > 1 and self.shadows else None,
-            bounce_samples=self._bounce_samples if self.bounces > 1 else None,
             watch=watch,
         )
         image = render_shaded(scene, camera, self, request, creases, False, effort)
@@ -124,12 +125,11 @@ class Lighting(NamedTuple):
             image = image + tensor.reshape(-1)[:0].sum().to(image)
         return image
 
+    def _bounce_edges(self, frame: Frame) -> list[Term]:
+        return bounce_edges(frame, Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces))
+
     def _passed_on(self, frame: Frame, light: ShadowLight, records: CurveRecords) -> list[Term]:
         return unseen_shadows(frame, light, records, self.bounces)
-
-    def _bounce_samples(self, frame: Frame) -> tuple[CurveRecords, Tensor]:
-        options = Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces)
-        return in_kernel.bounce_samples(frame, options)
 
     @staticmethod
     def resamples(scene: Scene) -> bool:

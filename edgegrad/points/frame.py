@@ -23,7 +23,7 @@ from .surfaces import Surfaces, View
 
 _Rays = TypeVar("_Rays", bound=RayRecords | SurfaceRecords)
 # Each kind has its own random numbers.
-SAMPLES = ("image", "inside", "edges", "steps", "shadows", "image again", "unseen shadows")
+SAMPLES = ("image", "inside", "edges", "steps", "shadows", "image again", "unseen shadows", "bounce edges")
 
 
 class Frame:

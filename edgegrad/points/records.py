@@ -420,27 +420,27 @@ class Sampler:
 
     def bounce_samples(
         self,
-        compute: Callable[..., tuple[dict[str, np.ndarray], np.ndarray]],
+        compute: Callable[..., tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]],
         tables: Sequence[Tensor],
         seed: int,
         samples: int,
         intrinsics: bool,
         casters: Flat | None = None,
-    ) -> tuple[CurveRecords, Tensor]:
-        """On the borders of what surfaces see of one another, each with its point that is seen in the image alone, and (S, C)
-        float64 by how much the image jumps there, times what a sample stands for: of compute(the kernel's scene, that of
-        `casters`, the faces, its arguments for curves, *tables). See shadow_samples()."""
+    ) -> tuple[CurveRecords, Tensor, Tensor]:
+        """On the borders of what surfaces see of one another, each with its point that receives light alone, and what else there
+        is of compute(the kernel's scene, that of `casters`, the faces, its arguments for curves, *tables). See
+        shadow_samples()."""
         parts, count = _tensors_of(casters), len(tables)
 
         def with_request(request: Request, camera: Any, *tensors: Tensor) -> Sequence[Tensor]:
             scene = self._scene(request.scene)
             casting = scene if casters is None else kernel_scene(_with_tensors(casters, tensors[count:]))
             arguments = self._of_curves(request, camera, seed, samples, intrinsics)
-            found, jump = compute(scene, casting, request.scene.faces, arguments, *tensors[:count])
-            return *_record(CurveRecords, found), torch.from_numpy(jump)
+            found, *more = compute(scene, casting, request.scene.faces, arguments, *tensors[:count])
+            return *_record(CurveRecords, found), *map(torch.from_numpy, more)
 
-        *fields, jump = self._compute(self._request, with_request, *tables, *parts)
-        return CurveRecords(*fields), jump
+        *fields, jump, origin = self._compute(self._request, with_request, *tables, *parts)
+        return CurveRecords(*fields), jump, origin
 
     def _of_curves(self, request: Request, camera: Any, seed: int, samples: int, intrinsics: bool) -> dict[str, Any]:
         """The kernel's arguments for samples on curves."""

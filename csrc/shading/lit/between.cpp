@@ -9,15 +9,16 @@ namespace edgegrad {
 
 template <class T>
 void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitLines& lines,
-                  Paths& paths, double* out) {
+                  Received received, Paths& paths, double* out) {
     const int C = lit.channels;
     std::fill(out, out + lines.size * C, 0.0);
     std::vector<Surface<double>> receivers(lines.size);
     const auto place = [&](int64_t i, Surface<double>& sender) {
         Surface<double>& receiver = receivers[i];
-        set_surface<double>(lit, lines.receiver[i], lines.receiver_b + 3 * i, nullptr, receiver);
+        set_place<double>(lit, lines.receiver[i], lines.receiver_b + 3 * i, nullptr, receiver);
         set_place<double>(lit, lines.sender[i], lines.sender_b + 3 * i, nullptr, sender);
         const Vec3 l = unit(sender.y - receiver.y);
+        set_view<double>(lit, received == Received::by_viewer ? towards_viewer<double>(lit, receiver.y) : l, receiver);
         set_view<double>(lit, -l, sender);
         return Paths::scatters(receiver) && dot(receiver.n, l) > 0 && dot(receiver.g, l) > 0;
     };
@@ -29,6 +30,10 @@ void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaste
         const auto at = [&](int k) -> const Surface<double>& { return paths.surface(i, k); };
         path_radiance(lit, paths.lights(), path, at, sent);
         add_direct(lit, paths.lights(), path, 0, at(0), sent);
+        if (received == Received::there) {
+            std::copy(sent, sent + C, out + i * C);
+            continue;
+        }
         Surface<double>& o = receivers[i];
         look_up_material(lit, o);
         const Vec3 l = -at(0).v;
@@ -39,9 +44,9 @@ void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaste
     }
 }
 
-template void send_between(const LitScene&, const SceneView<float>&, const RayCaster&, const LitLines&, Paths&,
-                           double*);
-template void send_between(const LitScene&, const SceneView<double>&, const RayCaster&, const LitLines&, Paths&,
-                           double*);
+template void send_between(const LitScene&, const SceneView<float>&, const RayCaster&, const LitLines&, Received,
+                           Paths&, double*);
+template void send_between(const LitScene&, const SceneView<double>&, const RayCaster&, const LitLines&, Received,
+                           Paths&, double*);
 
 }  // namespace edgegrad

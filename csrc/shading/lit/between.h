@@ -1,10 +1,9 @@
-// What the viewer sees of light that goes from one point of a surface to another, were nothing between them: the sender
-// gets it from lights, or by way of further surfaces, and the receiver scatters it. With the sender's radiance L
-// towards the receiver, without what it emits itself, that is
+// Light that goes from one point of a surface to another, were nothing between them: the sender gets it from lights, or
+// by way of further surfaces. With its radiance L towards the receiver, without what it emits itself, the viewer sees
 //
 //     f(v, l) L (n · l) / |g · l|
 //
-// by the measure of lines, in which the cosine of the receiver's face is (g is its normal, n that for shading).
+// of it by the measure of lines, in which the cosine of the receiver's face is (g is its normal, n that for shading).
 #pragma once
 
 #include <cstdint>
@@ -24,9 +23,11 @@ struct LitLines {
     const int64_t* seed = nullptr;
 };
 
-// (N, channels), of few lines on one thread. `paths`: of points that scatter the light once less than it is in all.
+// (N, channels), of few lines on one thread: what the viewer sees, or L, that comes to the receiver from wherever it is
+// seen. `paths`: from senders, by which light is scattered so often at most as it may be up to there.
+enum class Received { by_viewer, there };
 template <class T>
 void send_between(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitLines& lines,
-                  Paths& paths, double* radiance);
+                  Received received, Paths& paths, double* radiance);
 
 }  // namespace edgegrad
