@@ -12,12 +12,13 @@ from typing import Literal
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image, ImageFilter
+from PIL import Image
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.camera.poses import rotation
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
+from edgegrad.fit.region import smoothed
 
 Kind = Literal["easy", "lit", "shadow", "covered", "plain"]
 SIZE = 256  # pixels
@@ -231,9 +232,8 @@ def _covered(image: Tensor, alpha: Tensor, cover: Tensor, rng: np.random.Generat
 
 
 def _worn(image: Tensor, blur: float, noise: float, quality: int, rng: np.random.Generator) -> Tensor:
-    """Through a lens, a sensor and a file."""
-    pixels = (255.0 * linear_to_srgb(image.clamp(0.0, 1.0))).round().byte().numpy()
-    seen = np.asarray(Image.fromarray(pixels).filter(ImageFilter.GaussianBlur(blur)), np.float32) / 255.0
+    """Through a lens, which blurs radiance, a sensor and a file."""
+    seen = linear_to_srgb(smoothed(image.clamp(0.0, 1.0).movedim(-1, 0), blur).movedim(0, -1)).numpy()
     seen = seen + noise * rng.normal(size=seen.shape)
     file = io.BytesIO()
     Image.fromarray((255.0 * seen.clip(0.0, 1.0)).round().astype(np.uint8)).save(file, "JPEG", quality=quality)

@@ -17,7 +17,7 @@ from edgegrad.fit import fit_camera, fit_pose
 from edgegrad.fit.pose.given import Names
 from edgegrad.fit.pose.jacobian import Motion, Rendered
 from edgegrad.fit.pose.photo import light, search, ways
-from edgegrad.fit.pose.photo.contour import contour_term
+from edgegrad.fit.pose.photo.contour import CONTOUR_BLURS, blur_losses, contour_term
 from edgegrad.fit.pose.photo.depth import depth_term
 from edgegrad.fit.pose.photo.level import photo_levels
 from edgegrad.fit.pose.photo.light import Lit, _blurred_inside, spherical
@@ -217,6 +217,21 @@ def test_a_contour_is_found_to_a_fiftieth_of_a_pixel(angle, front, behind):
         at -= float(normal.gradient / normal.curvature)
     assert at == pytest.approx(shift, abs=0.02)
     assert contour_term(picture, Sides.of(picture.display, alpha(1e3), near), tangents[None]) is None
+
+
+@pytest.mark.parametrize("blur", CONTOUR_BLURS)
+def test_how_sharp_a_contour_is(blur):
+    """A disc before something dark, noisy: the blur that it was taken with leaves the least."""
+    view, n = camera(64), 64
+    y, x = torch.meshgrid(torch.arange(n) + 0.5, torch.arange(n) + 0.5, indexing="ij")
+    alpha = (17.3 - ((x - 31.6).square() + (y - 32.2).square()).sqrt()).add(0.5).clamp(0.0, 1.0)
+    front, behind = (srgb_to_linear(torch.tensor(colour)) for colour in ((0.9, 0.6, 0.1), (0.1, 0.15, 0.2)))
+    mixed = smoothed(alpha[None], blur)[0][..., None]
+    noise = 0.02 * torch.randn(n, n, 3, generator=torch.Generator().manual_seed(0))
+    picture = shown(view, srgb_to_linear(linear_to_srgb(mixed * front + (1 - mixed) * behind) + noise))
+    sides = Sides.of(picture.display, smoothed(alpha[None], max(CONTOUR_BLURS))[0], torch.ones(n, n))
+    losses = blur_losses(picture, sides, alpha)
+    assert CONTOUR_BLURS[losses.index(min(losses))] == blur, losses
 
 
 # The depth term

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from ..jacobian import Motion, Rendered
 from ..observed import motion
 from ..pose import Pose
 from ..task import ZOOM, Level, PoseTask, Shot
-from .contour import contour_loss, contour_term
+from .contour import CONTOUR_BLURS, blur_losses, contour_loss, contour_term
 from .depth import depth_term
 from .light import HARMONICS, Lit
 from .picture import Picture
@@ -93,9 +93,9 @@ class Seen:
     surface: Surface | None  # in the box
     lit: Lit | None
 
-    def sides(self) -> Sides:
-        """Of the contour, in the box."""
-        contour = smoothed(self.alpha[self.box][None], CONTOUR_BLUR)[0]
+    def sides(self, blur: float = CONTOUR_BLUR) -> Sides:
+        """Of the contour, in the box, when alpha is blurred by so many pixels."""
+        contour = smoothed(self.alpha[self.box][None], blur)[0]
         return Sides.of(self.part.outlined, contour, self.near[self.box], self.part.mask is None)
 
 
@@ -110,6 +110,7 @@ class PhotoLevel:
     blur: float
     harmonics: int  # 0: the mesh has no colours
     last: bool
+    blur_of_contours: float = CONTOUR_BLUR  # pixels
 
     @property
     def size(self) -> tuple[int, int]:
@@ -163,14 +164,22 @@ class PhotoLevel:
                 terms.append(seen.lit.term())
             if self.last:
                 rows, columns = seen.box
-                blurred = smoothed(seen.tangents[:, rows, columns], CONTOUR_BLUR)
-                terms.append(contour_term(seen.part, seen.sides(), blurred))
+                blurred = smoothed(seen.tangents[:, rows, columns], self.blur_of_contours)
+                terms.append(contour_term(seen.part, seen.sides(self.blur_of_contours), blurred))
             if seen.surface is not None and seen.part.depth is not None:
                 terms.append(depth_term(seen.surface, seen.part.depth, seen.part.weight, self.task.size))
             for term in terms:
                 if term is not None:
                     curvature, gradient = curvature + term.curvature, gradient + term.gradient
         return Normal(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
+
+    def focused(self, pose: Pose, seed: int) -> PhotoLevel:
+        """With contours as sharp as the pictures show them where the object is: one blur for all, of CONTOUR_BLURS."""
+        losses = [0.0] * len(CONTOUR_BLURS)
+        for seen in self.see(pose, seed):
+            for k, found in enumerate(blur_losses(seen.part, seen.sides(max(CONTOUR_BLURS)), seen.alpha[seen.box])):
+                losses[k] += found
+        return replace(self, blur_of_contours=CONTOUR_BLURS[losses.index(min(losses))])
 
     def unlikely(self, poses: Sequence[Pose], seed: int) -> list[float]:
         """Of each pose, −log of the likelihood of the pictures by all terms but depth, in nats of independent pixels, up to a

@@ -64,16 +64,18 @@ class PhotoSearch(Ways):
         self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
 
     def _colours_first(self) -> None:
-        """The terms of photographs decide where colours do not fit as they are, if they are sure."""
+        """The terms of photographs decide where colours do not fit as they are."""
         colours = self._by_colours(self.start, self.task.pyramid(self.start, self.max_size, self.spp), self.further)
         self._adopt(colours)
         if colours.explained >= colours.enough or not self.further:
             return
         begins = len(self.history)
         best = self._photograph()
-        lost = slice(0, begins) if best.explained >= SURE else slice(begins, None)
-        self._forget(lost)
-        if best.explained >= SURE:
+        won = best.explained >= self.enough
+        self._forget(slice(0, begins) if won else slice(begins, None))
+        if won:
+            # To have converged: the terms of photographs explain much that is no photograph.
+            self.enough = SURE
             self._take(best)
         else:
             self.alike = []
@@ -160,7 +162,9 @@ class PhotoSearch(Ways):
         found = [best]
         level = self._left_of(best)
         for pose in distinct([here, *(ends[k] for k in order)], 1 + FOLLOWED, APART)[1:]:
-            end = self._judge(*self._down(pose, finer), level)
+            if (way := self._apart(pose, finer, None if plain else best.pose)) is None:
+                continue
+            end = self._judge(*way, level)
             if end.explained >= self.enough and angle(end.pose.R, self.start.R) < REACH:
                 found.append(end)
         costs = self.journal.numbers(lambda: level.unlikely([end.pose for end in found], self.seed))
@@ -175,8 +179,18 @@ class PhotoSearch(Ways):
             self._forget(slice(before, None))
             return best
         self._forget(slice(begins, len(self.history)))
-        self._take(answer)
+        if not self.colours_first:
+            self._take(answer)
         return self._surrounded(answer)
+
+    def _apart(self, pose: Pose, levels: list[PhotoLevel], other: Pose | None) -> tuple[Pose, bool] | None:
+        """As _down(), but None as soon as the way comes to the other pose."""
+        short = False
+        for level in levels:
+            pose, short = self._follow(level, pose)
+            if other is not None and angle(pose.R, other.R) < APART:
+                return None
+        return pose, short
 
     def _left_of(self, end: End) -> PhotoLevel:
         """The last level, without what covers the object at an end, if something does."""
@@ -264,9 +278,14 @@ class PhotoSearch(Ways):
     def _surrounded(self, best: End) -> End:
         """The end, once more with what surrounds the object where it is now, and without what covers it: it does not depend
         on the start any more."""
-        last = photo_levels(self.task, best.pose, self.depths, self.max_size, self.spp, self.seed)[-1]
+        *_, coarser, last = photo_levels(self.task, best.pose, self.depths, self.max_size, self.spp, self.seed)
+        last = last.focused(best.pose, self.seed)
         before = len(self.history)
-        found = self._uncovered(best.pose, [torch.ones(picture.size) for picture in last.pictures], [last] * ROUNDS)
+        weights = covers(last.see(best.pose, self.seed)) or [torch.ones(picture.size) for picture in last.pictures]
+        # On the last level steps are small, and may come to rest on the way; from nearer, those of the one before, which compares
+        # colours inside, lead on.
+        levels = [last] * ROUNDS if self.task.colourless else [coarser, *[last] * ROUNDS]
+        found = self._uncovered(best.pose, weights, levels)
         if found.explained < self.enough:
             self._forget(slice(before, None))
             return best
