@@ -93,9 +93,10 @@ def render(
     bounces          of lit scenes: how often light is scattered on its way from a light to the eye, at most; 1: direct light. A
                      path goes on from each point that is shaded, as the material there scatters, and draws one point of
                      each light wherever it comes to; from the third bounce on it may end early (Russian roulette). Colours
-                     of meshes without a material light nothing. So far with gradients by colours, textures, materials,
-                     normal maps, how bright lights are, and where, if they are no meshes; what else moves borders (vertices,
-                     camera) must not require one, unless visibility=False
+                     of meshes without a material light nothing. With 2, everything has its gradient, but for scenes
+                     of which one mesh blends, is cut out by alpha or has a nearest texture, and for vertices of meshes that
+                     pass through each other; there, and by vertices and camera with 3 or more, it is refused, unless
+                     visibility=False. Lights that are no meshes may always move
 
     A scene with a light, or with a mesh that has a material, is lit: see Scene and Material. Its image has the dtype of the
     vertices.

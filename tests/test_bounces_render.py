@@ -13,7 +13,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
-from edgegrad.light import in_kernel
+from edgegrad.light import in_kernel, radiance
 from edgegrad.points.frame import Frame
 
 F64 = torch.float64
@@ -146,32 +146,66 @@ def test_channels_batches_and_transforms() -> None:
     )
 
 
-def test_what_moves_borders_is_refused() -> None:
+def test_borders_without_samples_are_refused() -> None:
     scene, camera = box_room("point"), towards_room(8)
-    mesh, light = scene.meshes[0], scene.lights[0]
-    moved = mesh.replace(verts=mesh.verts.clone().requires_grad_())
-    floor = scene.replace(meshes=[moved, *scene.meshes[1:]])
-    moved_light = scene.replace(lights=[light.replace(position=vector(0, 0, 1).requires_grad_())])
-    half = torch.full((2, 2), 0.5, dtype=F64)
+    mesh, *others = scene.meshes
+    leaf = mesh.verts.clone().requires_grad_()
     uvs = {"uvs": mesh.verts[:, :2], "uv_faces": mesh.faces}
-    pane = mesh.replace(**uvs, alpha=half, material=eg.Material(0.5, alpha_mode="BLEND"))
-    for other, seen_from, name in (
-        (floor, camera, r"meshes\[0\].verts"),
-        (moved_light.replace(meshes=[pane, *scene.meshes[1:]]), camera, r"lights\[0\].position"),
-        (scene, camera.replace(K=camera.K.clone().requires_grad_()), "camera.K"),
+    half = torch.full((2, 2), 0.5, dtype=F64)
+
+    def room(verts: Tensor, light: Tensor | None = None, **fields: Any) -> eg.Scene:
+        lights = [scene.lights[0].replace(position=vector(0.5, -0.3, 1.7) if light is None else light)]
+        return scene.replace(meshes=[mesh.replace(verts=verts, **fields), *others], lights=lights)
+
+    pane = {**uvs, "alpha": half, "material": eg.Material(0.5, alpha_mode="BLEND")}
+    nearest = eg.Texture(torch.rand(2, 2, 3, dtype=F64), filter="nearest", uvs=mesh.verts[:, :2], uv_faces=mesh.faces)
+    moved_camera = camera.replace(K=camera.K.clone().requires_grad_())
+    moved_light = room(mesh.verts, vector(0, 0, 1).requires_grad_(), **pane)
+    verts = r"meshes\[0\].verts"
+    for other, seen_from, bounces, name, why in (
+        (room(leaf), camera, 3, verts, "more than two bounces"),
+        (scene, moved_camera, 3, "camera.K", "more than two bounces"),
+        (room(leaf, **pane), camera, 2, verts, "sees through"),
+        (moved_light, camera, 2, r"lights\[0\].position", "sees through"),
+        (room(leaf, **uvs, alpha=half), camera, 2, verts, "alpha cuts out"),
+        (room(leaf, material=eg.Material(nearest)), camera, 2, verts, "nearest texels"),
+        (room(leaf + vector(0, 0, 0.5)), camera, 2, verts, "pass through each other"),
     ):
         for function in (eg.render, eg.plan):
-            with pytest.raises(ValueError, match=f"bounces: {name} requires a gradient"):
-                function(other, seen_from, 4, bounces=2)
+            with pytest.raises(ValueError, match=f"bounces: {name} requires a gradient.*{why}"):
+                function(other, seen_from, 4, bounces=bounces)
     # Without borders there is nothing to leave out; and direct light has all of them.
-    assert eg.render(floor, camera, 4, bounces=2, visibility=False).requires_grad
-    assert eg.render(floor, camera, 4).requires_grad
-    # A light moves the borders of its shadows alone.
-    assert eg.render(moved_light, camera, 4, bounces=2).requires_grad
+    assert eg.render(room(leaf), camera, 4, bounces=3, visibility=False).requires_grad
+    assert eg.render(room(leaf), camera, 4).requires_grad
     with torch.no_grad():
-        eg.render(floor, camera, 4, bounces=2)
+        eg.render(room(leaf), camera, 4, bounces=3)
     with pytest.raises(ValueError, match="bounces: expected an int from 1"):
         eg.render(scene, camera, 4, bounces=0)
+
+
+def test_creases_that_no_light_reaches_directly() -> None:
+    """The front and the top of the block, both turned away from a point light, show different light of the walls."""
+    scene = box_room("point")
+    scene = scene.replace(lights=[scene.lights[0].replace(position=vector(0.0, 0.9, 0.1))])
+    frame = Frame(scene, make_request(scene, towards_room(8), 1, 0))
+    first = frame.fixed.first_faces[4]
+    differ = []
+    for bounces in (1, 2):
+        frame.fixed.jumping.clear()
+        radiance.note_jumps(frame.no_hits, bounces > 1)
+        attributes = frame.fixed.crease_attributes()[first : first + 12]
+        differ.append(bool((attributes[2] != attributes[5]).any()))
+    assert differ == [False, True]
+
+
+def test_what_moves_by_two_bounces() -> None:
+    scene, camera = box_room("lamp"), towards_room(8)
+    leaves = [mesh.verts.clone().requires_grad_() for mesh in scene.meshes]
+    moved = scene.replace(meshes=[mesh.replace(verts=v) for mesh, v in zip(scene.meshes, leaves, strict=True)])
+    pose = camera.world_to_camera.clone().requires_grad_()
+    image = eg.render(moved, camera.replace(world_to_camera=pose), 4, bounces=2)
+    gradients = torch.autograd.grad(image.sum(), [*leaves, pose])
+    assert all(bool(gradient.isfinite().all()) and float(gradient.abs().sum()) > 0 for gradient in gradients)
 
 
 def test_plan() -> None:

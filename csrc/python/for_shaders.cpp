@@ -123,6 +123,17 @@ nb::dict shadow_samples(const SceneArrays<T>& arrays, const SceneArrays<T>& cast
     return curve_arrays(found, least, one, threads);
 }
 
+// Whether faces pass through each other anywhere.
+template <class T>
+bool has_intersections(const SceneArrays<T>& arrays, int threads) {
+    bool found = false;
+    with_geometry(arrays, true, threads, [&](const Geometry& geometry, Team&) {
+        const Intersections& all = geometry.intersections();
+        found = all.are_drawn() || !all.all().empty();
+    });
+    return found;
+}
+
 Places places_of(const In<double, 2>& x) {
     if (x.shape(1) != 2) refuse("x: expected rows of two numbers");
     return {x.data(), int64_t(x.shape(0))};
@@ -271,6 +282,7 @@ void bind_scene_for_shaders(nb::class_<SceneArrays<T>>& scene) {
              "detailed"_a.none(), "panes"_a.none(), "looks"_a.none())
         .def("shadow_samples", &shadow_samples<T>, "casters"_a, "camera"_a, "image"_a, "options"_a, "light"_a,
              "samples"_a, "least"_a, "one"_a, "seen"_a, "threads"_a, "hits"_a, "panes"_a.none())
+        .def("has_intersections", &has_intersections<T>, "threads"_a)
         .def("hits_at", &seen_at<T>, "camera"_a, "x"_a.noconvert(), "threads"_a)
         .def("trace", &trace_rays<T>, "origins"_a.noconvert(), "directions"_a.noconvert(),
              "ignored"_a.noconvert().none(), "threads"_a)

@@ -1,9 +1,8 @@
 """What render() can differentiate where light is scattered more than once.
 
-Inside surfaces every tensor of a scene has its derivative (csrc/shading/lit/path_radiance.h), and the borders of lights' shadows
-have theirs (unseen_shadows.py). But what moves also moves the borders of what surfaces of a path see of one another; of these
-there are no samples yet. Without them a gradient would be wrong without notice, so it is refused: of all that moves but lights
-that are no meshes, for these move borders of shadows alone.
+Inside surfaces every tensor of a scene has its derivative (csrc/shading/lit/path_radiance.h), the borders of lights' shadows have
+theirs (unseen_shadows.py), and so have edges on the way of light from one surface to another (csrc/boundary/bounces.h). Of some
+borders there are no samples. Without them a gradient would be wrong without notice, so it is refused.
 """
 
 from __future__ import annotations
@@ -14,6 +13,8 @@ import torch
 from torch import Tensor
 
 from ..camera.camera import Camera
+from ..kernel.request import Request
+from ..points.records import has_intersections
 from ..scene.environment import Environment
 from ..scene.lights import DirectionalLight, PointLight, SpotLight
 from ..scene.scene import Scene
@@ -21,27 +22,45 @@ from ..scene.tree import named_tensors
 from .in_kernel import is_fused, nearest_textures
 
 
-def check_bounces(scene: Scene, camera: Camera, visibility: bool) -> None:
+def check_bounces(scene: Scene, camera: Camera, request: Request, bounces: int) -> None:
     """Raises ValueError for scenes whose surfaces do not light each other, and for derivatives that are not whole."""
     if not is_fused(scene):
         raise ValueError(
             'bounces: expected at most 16 channels, and no texture of the filter "nearest" where meshes blend, for light that '
             'is scattered more than once; filter="linear", or bounces=1'
         )
-    if not visibility:
+    if not request.gradient.visibility:
         return
-    for name, tensor in _moving(scene, camera):
-        if _has_derivative(tensor):
-            raise ValueError(
-                f"bounces: {name} requires a gradient, and what it moves has none yet at the borders of what surfaces see of one "
-                "another by light that is scattered more than once; give bounces=1, detach it, or leave out all that moves at "
-                "borders with visibility=False. Colours, textures, roughness, normal maps, and how bright lights are and where, "
-                "if they are no meshes, have whole gradients"
-            )
+    if missing := _missing(scene, bounces):
+        for name, tensor in (*_moving(scene, camera), *(_lights(scene) if scene.blends else ())):
+            if _has_derivative(tensor):
+                raise _refused(name, missing)
+    for number, mesh in enumerate(scene.meshes):
+        if _has_derivative(mesh.verts) and has_intersections(request.scene):
+            raise _refused(f"meshes[{number}].verts", "where meshes pass through each other")
+
+
+def _refused(name: str, where: str) -> ValueError:
+    return ValueError(
+        f"bounces: {name} requires a gradient, and where light is scattered more than once it has none {where}; give bounces=1, "
+        "detach it, or leave out all that moves at borders with visibility=False. Colours, textures, roughness, normal maps, and "
+        "how bright lights are and where, if they are no meshes, have whole gradients"
+    )
+
+
+def _missing(scene: Scene, bounces: int) -> str | None:
+    """Where borders that may move have no samples."""
+    if scene.blends:
+        return "where one sees through surfaces"
+    if any(mesh.alpha is not None for mesh in scene.meshes):
+        return "at the rims of what alpha cuts out"
+    if any(nearest_textures(mesh) for mesh in scene.meshes):
+        return "at the borders of nearest texels"
+    return "with more than two bounces yet" if bounces > 2 else None
 
 
 def _moving(scene: Scene, camera: Camera) -> Iterator[tuple[str, Tensor]]:
-    """The tensors, by name, that move borders."""
+    """The tensors of the camera and of meshes, by name, that move borders."""
     yield from named_tensors(camera, "camera")
     for number, mesh in enumerate(scene.meshes):
         name = f"meshes[{number}]"
@@ -53,9 +72,10 @@ def _moving(scene: Scene, camera: Camera) -> Iterator[tuple[str, Tensor]]:
         for texture in nearest_textures(mesh):
             if texture.uvs is not None:
                 yield f"uvs of a nearest texture of {name}", texture.uvs
-    if not scene.blends:
-        return
-    # Light is not followed to the camera through what one sees through.
+
+
+def _lights(scene: Scene) -> Iterator[tuple[str, Tensor]]:
+    """The same of lights. They move the borders of their shadows alone."""
     for number, light in enumerate(scene.lights):
         name = f"lights[{number}]"
         if isinstance(light, DirectionalLight):

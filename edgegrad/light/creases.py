@@ -18,8 +18,8 @@ from .bsdf import dot, terminator
 ABOVE = 0.01  # the horizon, by which a lobe reaches there
 
 
-def note_jumps(hits: Hits) -> None:
-    """Notes what of the radiance of materials may jump."""
+def note_jumps(hits: Hits, indirect: bool = False) -> None:
+    """Notes what of the radiance of materials may jump. `indirect`: light also comes by way of other surfaces."""
     surfaces = hits._surfaces
     scene = surfaces.scene
     if len(scene.meshes) > 1:
@@ -31,7 +31,8 @@ def note_jumps(hits: Hits) -> None:
         if mesh.normals is None:
             seen_by = hits._view
             hits._note_jump(
-                ("g", index), _of_scene(surfaces, index, lambda i=index, v=seen_by: _flat_radiance(surfaces, i, v))
+                ("g", index),
+                _of_scene(surfaces, index, lambda i=index, v=seen_by: _flat_radiance(surfaces, i, v, indirect)),
             )
             continue
         if mesh.normal_faces is not None:
@@ -41,7 +42,7 @@ def note_jumps(hits: Hits) -> None:
             seen_by = hits._view
             hits._note_jump(
                 ("lit", index),
-                _of_scene(surfaces, index, lambda i=index, v=seen_by: _shadow_terminators(surfaces, i, v)),
+                _of_scene(surfaces, index, lambda i=index, v=seen_by: _shadow_terminators(surfaces, i, v, indirect)),
             )
 
 
@@ -73,18 +74,19 @@ def _face_normals(surfaces: Surfaces, index: int) -> Tensor:
     return surfaces.face_normals(_faces_of(surfaces, index))[:, None].expand(-1, 3, -1)
 
 
-def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
+def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays, indirect: bool) -> Tensor:
     """(F, 3, K) of a mesh without shading normals: what may jump at its edges, besides colours.
 
-    That is the face's normal on the viewer's side; if all lights are punctual, only of faces that one of them lights. Of
-    Lambertian faces it is E max(0, n·l) of each light: if both faces agree at the ends of an edge, they agree all along it, for
-    n·l |l| is the light's distance from the face's plane. The cone of a spot light may end between the ends, and is left out.
+    That is the face's normal on the viewer's side; if all light is that of punctual lights, only of faces that one of them
+    lights. Of Lambertian faces it is then E max(0, n·l) of each light: if both faces agree at the ends of an edge, they agree
+    all along it, for n·l |l| is the light's distance from the face's plane. The cone of a spot light may end between the ends,
+    and is left out.
     """
     scene, mesh = surfaces.scene, surfaces.scene.meshes[index]
     material = mesh.material
     assert material is not None
     harmonics = any(isinstance(light, SphericalHarmonics) for light in scene.lights)
-    points_alone = not harmonics and all(light.punctual for light in scene.casting)
+    points_alone = not harmonics and not indirect and all(light.punctual for light in scene.casting)
     if not points_alone or material.normal_map is not None or not isinstance(view, View):
         return _face_normals(surfaces, index)
     verts = mesh.verts.detach().double()
@@ -99,17 +101,17 @@ def _flat_radiance(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
     return torch.where(away[:, None], -g, g) * (found != 0).any(-1, keepdim=True)
 
 
-def _shadow_terminators(surfaces: Surfaces, index: int, view: View | Rays) -> Tensor:
+def _shadow_terminators(surfaces: Surfaces, index: int, view: View | Rays, indirect: bool) -> Tensor:
     """(F, 3, K): n·l times the shadow terminator at corners, with interpolated normals n, for each light.
 
     The face's normal g enters through the terminator alone, which is 1 where g·l ≥ (g·n)(n·l). So of a fine mesh only edges near
-    the terminator are creases. An extended light has a terminator for each of its points: then g itself is compared, and of
-    glossy surfaces the terminator of what a mirror would show, which is where most of the jump is.
+    the terminator are creases. An extended light, or another surface, has a terminator for each of its points: then g itself is
+    compared, and of glossy surfaces the terminator of what a mirror would show, which is where most of the jump is.
     """
     mesh, lights = surfaces.scene.meshes[index], surfaces.scene.casting
     assert mesh.normals is not None
     of_faces = _face_normals(surfaces, index)
-    found = [] if all(light.punctual for light in lights) else [of_faces]
+    found = [] if all(light.punctual for light in lights) and not indirect else [of_faces]
     g = of_faces.reshape(-1, 3)
     rows = mesh.faces if mesh.normal_faces is None else mesh.normal_faces
     n = normalize(mesh.normals.detach().to(g), dim=-1)[rows.long()].reshape(-1, 3)

@@ -92,7 +92,7 @@ class Lighting(NamedTuple):
                 "eg.Environment(torch.ones(3)), or leave the materials out: colours are then radiance",
             )
         if self.bounces > 1:
-            check_bounces(scene, camera, request.gradient.visibility)
+            check_bounces(scene, camera, request, self.bounces)
         # Each shaded point draws points of its own on extended lights; and a path of its own, whose noise falls the faster the
         # more there are in a pixel, for they are spread evenly.
         extended = any(not light.punctual for light in scene.casting)
@@ -159,7 +159,7 @@ class Lighting(NamedTuple):
 def _kernel_image(frame: Frame, lighting: Lighting, points: int) -> Tensor | None:
     """(H · W, C) the surfaces before black, with `points` of each face in a pixel shaded. None where it is not finite: then
     points are shaded in PyTorch, which names the first that is not."""
-    note_jumps(frame.no_hits)
+    note_jumps(frame.no_hits, lighting.bounces > 1)
     options = Options(lighting.shadows, lighting.samples, bounces=lighting.bounces)
     found = in_kernel.image(frame, options, points)
     return found if all_finite(found) else None
@@ -201,7 +201,7 @@ def _in_front(g: Tensor, v: Tensor) -> Tensor:
 
 def radiance(hits: Hits, shadows: bool = True, light_samples: int = 1, bounces: int = 1) -> Tensor:
     """(N, C) of the scene's meshes by their materials and its lights; of meshes without a material their colours."""
-    note_jumps(hits)
+    note_jumps(hits, bounces > 1)
     # Where steps are forced to a side PyTorch shades, for the kernel looks up the texel in which a point lies.
     fused = isinstance(hits._view, View) and is_fused(hits._surfaces.scene) and not hits._steps.forced
     L = in_kernel.radiance(hits, shadows, light_samples) if fused else reference(hits, shadows, light_samples)

@@ -245,6 +245,18 @@ def visible(flat: Flat, face: Tensor, b: Tensor, to: Tensor, contact: Tensor) ->
     return _of_values(flat, compute, face, b, to, contact)[0].to(face.device)
 
 
+def has_intersections(flat: Flat) -> bool:
+    """Whether faces pass through each other anywhere."""
+    found: list[bool] = []
+
+    def compute(values: list[Any]) -> Sequence[Tensor]:
+        found.append(kernel_scene(Flat(*values)).has_intersections(torch.get_num_threads()))
+        return (torch.zeros(0),)
+
+    _of_values(flat, compute)
+    return found[0]
+
+
 # -- of a camera --------------------------------------------------------------------------------------------------------
 
 
