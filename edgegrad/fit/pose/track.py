@@ -243,6 +243,9 @@ class Tracker:
                     best = again
                 if best.share >= ENOUGH and best.covered < MOSTLY:
                     break
+        if self.first and best.share < ENOUGH:  # the coarsest level leads aside from some starts that are near
+            again = self._down(self._levels(task, depth, predicted)[-2:], predicted, MORE_STEPS)
+            best = max(best, again, key=lambda end: end.shown)
         if best.share >= LEARNT and best.covered < MOSTLY:
             self.remembered.learn(best.views)
         return best if best.share >= POOR else best._replace(pose=predicted)
@@ -278,8 +281,10 @@ class Tracker:
         way ends well. `offset` (n,): how far the steps have led from the prediction, which they add to; the object is taken to
         be near that, as far as the picture shows little of it."""
         views: list[Seen] = []
-        for _ in range(most):
+        for step in range(most):
             views = level.see(pose, self.seed)
+            if level.last and step == 0:
+                level = level.focused(views)
             normal, _loss = level.equations(pose, self.seed, views)
             if not float(normal.curvature.trace()) > 0.0:
                 break  # the prior below would hide that

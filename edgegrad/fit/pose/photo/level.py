@@ -173,11 +173,11 @@ class PhotoLevel:
                     curvature, gradient = curvature + term.curvature, gradient + term.gradient
         return Normal(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
 
-    def focused(self, pose: Pose, seed: int) -> PhotoLevel:
+    def focused(self, seen: Sequence[Seen]) -> PhotoLevel:
         """With contours as sharp as the pictures show them where the object is: one blur for all, of CONTOUR_BLURS."""
         losses = [0.0] * len(CONTOUR_BLURS)
-        for seen in self.see(pose, seed):
-            for k, found in enumerate(blur_losses(seen.part, seen.sides(max(CONTOUR_BLURS)), seen.alpha[seen.box])):
+        for one in seen:
+            for k, found in enumerate(blur_losses(one.part, one.sides(max(CONTOUR_BLURS)), one.alpha[one.box])):
                 losses[k] += found
         return replace(self, blur_of_contours=CONTOUR_BLURS[losses.index(min(losses))])
 

@@ -279,7 +279,7 @@ class PhotoSearch(Ways):
         """The end, once more with what surrounds the object where it is now, and without what covers it: it does not depend
         on the start any more."""
         *_, coarser, last = photo_levels(self.task, best.pose, self.depths, self.max_size, self.spp, self.seed)
-        last = last.focused(best.pose, self.seed)
+        last = last.focused(last.see(best.pose, self.seed))
         before = len(self.history)
         weights = covers(last.see(best.pose, self.seed)) or [torch.ones(picture.size) for picture in last.pictures]
         # On the last level steps are small, and may come to rest on the way; from nearer, those of the one before, which compares
