@@ -176,9 +176,11 @@ def test_the_command_line(tmp_path, capsys) -> None:
     ]
     told += ["--tries", "0", "--steps", "12", "--coarsest", "24", "--out", tmp_path / "out"]
     assert edgegrad_cli.main([str(word) for word in told]) == 0
-    assert "wrote pose.json, posed.glb" in capsys.readouterr().out
+    assert "wrote pose.json, joints.json, posed.glb" in capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "pose.json").read_text())["rotations"]
     assert abs(found[-1][2] - 0.4) < 0.15 and found[0] == [0.0, 0.0, 0.0]
+    told = json.loads((tmp_path / "out" / "joints.json").read_text())
+    assert list(told) == ["upper"] and told["upper"]["explained"] > 0.6 and told["upper"]["degrees"] > 0.0
 
 
 def test_priors() -> None:
