@@ -19,7 +19,7 @@ from edgegrad.fit.pose.fit_pose import looks_alike
 from edgegrad.fit.pose.given import Names
 from edgegrad.fit.pose.jacobian import Motion, Rendered
 from edgegrad.fit.pose.photo import light, search, ways
-from edgegrad.fit.pose.photo.contour import CONTOUR_BLURS, blur_losses, contour_term
+from edgegrad.fit.pose.photo.contour import contour_term
 from edgegrad.fit.pose.photo.depth import depth_term
 from edgegrad.fit.pose.photo.level import photo_levels
 from edgegrad.fit.pose.photo.light import Lit, _blurred_inside, spherical
@@ -29,7 +29,7 @@ from edgegrad.fit.pose.photo.surface import AOVS, Surface
 from edgegrad.fit.pose.pose import pose_from_matrix
 from edgegrad.fit.pose.task import Lens, PoseTask, is_clutter
 from edgegrad.fit.region import OUTLIERS, Windows, palette, posterior, smoothed
-from edgegrad.fit.sides import NOISE, Sides, noise_of_mask
+from edgegrad.fit.sides import BLURS, NOISE, Sides, blur_losses, noise_of_mask
 from edgegrad.fit.views import area_mean
 
 CENTER = torch.tensor([1.0, 0.75, 0.4]).double()
@@ -246,7 +246,7 @@ def test_a_pose_that_looks_alike_may_be_elsewhere(taken):
         assert words in said and bool(said) == bool(words)
 
 
-@pytest.mark.parametrize("blur", CONTOUR_BLURS)
+@pytest.mark.parametrize("blur", BLURS)
 def test_how_sharp_a_contour_is(blur):
     """A disc before something dark, noisy: the blur that it was taken with leaves the least."""
     view, n = camera(64), 64
@@ -256,9 +256,9 @@ def test_how_sharp_a_contour_is(blur):
     mixed = smoothed(alpha[None], blur)[0][..., None]
     noise = 0.02 * torch.randn(n, n, 3, generator=torch.Generator().manual_seed(0))
     picture = shown(view, srgb_to_linear(linear_to_srgb(mixed * front + (1 - mixed) * behind) + noise))
-    sides = Sides.of(picture.display, smoothed(alpha[None], max(CONTOUR_BLURS))[0], torch.ones(n, n))
-    losses = blur_losses(picture, sides, alpha)
-    assert CONTOUR_BLURS[losses.index(min(losses))] == blur, losses
+    sides = Sides.of(picture.display, smoothed(alpha[None], max(BLURS))[0], torch.ones(n, n))
+    losses = blur_losses(sides, picture.display, picture.weight, alpha)
+    assert BLURS[int(losses.argmin())] == blur, losses
 
 
 # The depth term

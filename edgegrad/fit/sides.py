@@ -26,6 +26,8 @@ PURE = 0.03  # share of the other side in a pixel of one side alone
 SUPPORT = 0.03  # of a window
 CONTRAST = 2.0  # of both sides of a contour that shows, in standard deviations
 BLUR = 0.9  # pixels, of alpha: about that of photographs at full size
+BLURS = 0.3, 0.5, 0.7, BLUR  # that of one picture; softer ones are not told from contours that are off
+TOLERANCE = 12.0  # squared differences, in variances, that are far above this hardly count (Geman and McClure 1987)
 # Share of the contour that has to show, where the contour is all that is compared; with less, less is explained. Wrong places
 # show 0.5 … 0.7 of it in clutter, right ones 0.85 and more.
 ALONE_SHOWN = 0.85
@@ -100,6 +102,18 @@ def outlines_explained(parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> float:
         shown += float((on * (sides.contrast > CONTRAST) * sides.band).sum())
         pairs.append((sides.mixed, sides.mixed, image, (sides.band * near)[..., None]))
     return explained(pairs) * min(1.0, shown / length / ALONE_SHOWN) if length > 0.0 else 0.0
+
+
+def blur_losses(sides: Sides, image: Tensor, weight: Tensor, alpha: Tensor) -> Tensor:
+    """(n,): half the robust squares of the differences of an image (h, w, C) from what `sides` mix, weighted (h, w), with alpha
+    (h, w) blurred by each of BLURS: the tails of a blur show far in the values of a display, and one that is too wide puts bright
+    contours too far out."""
+    found = []
+    for blur in BLURS:
+        off = (sides.mixed_by(smoothed(alpha[None], blur)[0]) - image).square() / sides.variance
+        squares = off.sum(-1)
+        found.append(0.5 * (sides.band * weight * squares / (1.0 + squares / TOLERANCE)).sum())
+    return torch.stack(found)
 
 
 def noise_of_mask(mask: Tensor, factor: float) -> float:

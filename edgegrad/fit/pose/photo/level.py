@@ -16,8 +16,9 @@ from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
 from ....scene.scene import Scene
 from ...region import RADIUS, Palette, Windows, around, likelihood, palette, posterior, smoothed, told
-from ...sides import ALONE_SHOWN, ALONE_TOLD, CONTRAST, PURE, REACH, Sides
+from ...sides import ALONE_SHOWN, ALONE_TOLD, CONTRAST, PURE, REACH, Sides, blur_losses
 from ...sides import BLUR as CONTOUR_BLUR
+from ...sides import BLURS as CONTOUR_BLURS
 from ...verdict import explained
 from ..gauss_newton import Normal
 from ..given import bare
@@ -25,7 +26,7 @@ from ..jacobian import Motion, Rendered
 from ..observed import motion
 from ..pose import Pose
 from ..task import ZOOM, Level, PoseTask, Shot
-from .contour import CONTOUR_BLURS, blur_losses, contour_loss, contour_term
+from .contour import contour_loss, contour_term
 from .depth import depth_term
 from .light import HARMONICS, Lit
 from .picture import Picture
@@ -256,11 +257,11 @@ class PhotoLevel:
 
 def sharpest(seen: Sequence[Seen]) -> float:
     """The one of CONTOUR_BLURS, pixels, with which the pictures' contours are likeliest."""
-    losses = [0.0] * len(CONTOUR_BLURS)
+    losses = torch.zeros(len(CONTOUR_BLURS))
     for one in seen:
-        for k, found in enumerate(blur_losses(one.part, one.sides(max(CONTOUR_BLURS)), one.alpha[one.box])):
-            losses[k] += found
-    return CONTOUR_BLURS[losses.index(min(losses))]
+        part = one.part
+        losses += blur_losses(one.sides(max(CONTOUR_BLURS)), part.outlined, part.weight, one.alpha[one.box])
+    return CONTOUR_BLURS[int(losses.argmin())]
 
 
 def photo_levels(
