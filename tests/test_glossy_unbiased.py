@@ -28,8 +28,8 @@ from edgegrad.shader import Effort, render_shaded
 F64 = torch.float64
 ALPHA = 0.01 / len(GLOSSY)
 SUMS = 16  # random, of pixels
-SEEDS, ORACLES, DIFFERENCES = 256, 64, 8
-FEW: dict[str, Any] = {"spp": 16, "surface_samples": 2_000, "edge_samples": 2_000}
+SEEDS, ORACLES, DIFFERENCES = 256, 32, 8
+FEW: dict[str, Any] = {"spp": 16, "surface_samples": 1_000, "edge_samples": 1_000}
 MANY: dict[str, Any] = {"spp": 64, "surface_samples": 4_000, "edge_samples": 100}
 STILL = ("brightness", "base colour", "roughness", "metallic", "normals", "alpha")  # what moves nothing
 
@@ -76,7 +76,7 @@ def components(problem: Problem) -> list[Component]:
         found.add(sums_and_gradients(problem, still + moving, few, seed))
     for seed in range(ORACLES):
         oracle.add(sums_and_gradients(problem, still, by_oracle, 10_000 + seed))
-    seeds, adjoint = Seeds(difference_seeds=(DIFFERENCES,)), problem.cotangent(torch.empty(0))
+    seeds, adjoint = Seeds(difference_seeds=(DIFFERENCES,), difference_spp=512), problem.cotangent(torch.empty(0))
     runs = [oracle, *(differences(problem, adjoint, name, 1.0, seeds) for name in moving)]
     counts = torch.cat([torch.full_like(run.mean, run.count) for run in runs])
     wanted = torch.cat([run.mean for run in runs])
