@@ -7,19 +7,20 @@ or less a run of all scenes without bias has a rejection.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
 import torch
-from light_oracle import Oracle, around
+from light_oracle import Ball, Oracle, around
 from scipy.stats import t as student
 from torch import Tensor
 
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
 from edgegrad.report.stability.cases.case import Parts, Problem
-from edgegrad.report.stability.cases.glossy import GLOSSY
+from edgegrad.report.stability.cases.glossy import GLOSSY, LAMPS
 from edgegrad.report.stability.cases.measure import Effort as Seeds
 from edgegrad.report.stability.cases.measure import Running, differences
 from edgegrad.report.stability.statistics import holm
@@ -28,8 +29,8 @@ from edgegrad.shader import Effort, render_shaded
 F64 = torch.float64
 ALPHA = 0.01 / len(GLOSSY)
 SUMS = 16  # random, of pixels
-SEEDS, ORACLES, DIFFERENCES = 256, 64, 8
-FEW: dict[str, Any] = {"spp": 16, "surface_samples": 2_000, "edge_samples": 2_000}
+SEEDS, ORACLES, DIFFERENCES = 256, 32, 8
+FEW: dict[str, Any] = {"spp": 16, "surface_samples": 1_000, "edge_samples": 1_000}
 MANY: dict[str, Any] = {"spp": 64, "surface_samples": 4_000, "edge_samples": 100}
 STILL = ("brightness", "base colour", "roughness", "metallic", "normals", "alpha")  # what moves nothing
 
@@ -41,9 +42,21 @@ def few(scene: eg.Scene, camera: eg.Camera, seed: int) -> Tensor:
     return eg.render(scene, camera, seed=seed, light_samples=1, **FEW)
 
 
+def sky_lamps() -> list[Ball]:
+    """Far away, around the middles of the lamps of a sky."""
+    found = []
+    for row, column, _ in LAMPS:
+        polar, turn = math.pi * (row + 1) / 16, math.pi * (column + 1) / 16 - math.pi
+        across = math.sin(polar)
+        d = torch.tensor([across * math.sin(turn), math.cos(polar), -across * math.cos(turn)], dtype=F64)
+        found.append(Ball(1e4 * d, 1e4 * math.sin(math.radians(20))))
+    return found
+
+
 def by_oracle(scene: eg.Scene, camera: eg.Camera, seed: int) -> Tensor:
     shining = [m for m in scene.meshes if m.material is not None and m.material.emission is not None]
-    oracle = Oracle([around(mesh) for mesh in shining], seed)
+    skies = any(isinstance(light, eg.Environment) for light in scene.lights)
+    oracle = Oracle([around(mesh) for mesh in shining] + sky_lamps() * skies, seed)
     effort = Effort(points=16, blended=scene.blends, glossy=True)
     return render_shaded(scene, camera, oracle, make_request(scene, camera, seed=seed, **MANY), "auto", False, effort)
 
@@ -76,7 +89,7 @@ def components(problem: Problem) -> list[Component]:
         found.add(sums_and_gradients(problem, still + moving, few, seed))
     for seed in range(ORACLES):
         oracle.add(sums_and_gradients(problem, still, by_oracle, 10_000 + seed))
-    seeds, adjoint = Seeds(difference_seeds=(DIFFERENCES,)), problem.cotangent(torch.empty(0))
+    seeds, adjoint = Seeds(difference_seeds=(DIFFERENCES,), difference_spp=512), problem.cotangent(torch.empty(0))
     runs = [oracle, *(differences(problem, adjoint, name, 1.0, seeds) for name in moving)]
     counts = torch.cat([torch.full_like(run.mean, run.count) for run in runs])
     wanted = torch.cat([run.mean for run in runs])
