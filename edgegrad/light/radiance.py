@@ -90,7 +90,7 @@ class Lighting(NamedTuple):
                 "eg.Environment(torch.ones(3)), or leave the materials out: colours are then radiance",
             )
         if self.bounces > 1:
-            check_bounces(scene, camera, request, self.bounces)
+            check_bounces(scene, camera, request)
         # Each shaded point draws points of its own on extended lights; and a path of its own, whose noise falls the faster the
         # more there are in a pixel, for they are spread evenly.
         extended = any(not light.punctual for light in scene.casting)
