@@ -84,7 +84,10 @@ def sun_and_sky(seed: int) -> list[Any]:
     x, z = torch.randn(2, generator=g).tolist()
     sky = torch.zeros(9, 3)
     sky[0], sky[1] = 3.0, 0.8
-    return [eg.DirectionalLight(torch.tensor([x, -1.2, z]), torch.tensor([1.6, 1.5, 1.3])), eg.SphericalHarmonics(sky)]
+    return [
+        eg.DirectionalLight(torch.tensor([x, -1.2, z]), 1.6, color=torch.tensor([1.0, 0.95, 0.85])),
+        eg.SphericalHarmonics(sky),
+    ]
 
 
 def visible(rig: eg.Rig, posed: eg.Mesh, camera: eg.Camera) -> Tensor:

@@ -11,7 +11,7 @@ from test_fit_rig import arm, shown, views
 import edgegrad as eg
 from edgegrad.fit import Options, Parameter, fit_rig
 from edgegrad.fit.descent.objective import Objective
-from edgegrad.fit.rig.shown import explained_by_joint
+from edgegrad.fit.rig.shown import explained_by_joint, left_out
 from edgegrad.fit.rig.uncertainty import uncertainty_of
 from edgegrad.fit.views import views_of
 
@@ -35,6 +35,17 @@ def test_a_hand_in_a_wrong_place_is_told() -> None:
     right, off = (explained_by_joint(judged, {"rotations": pose}, names) for pose in (TRUTH, wrong))
     assert min(right.values()) > 0.95
     assert off["bone 2"] < 0.5 < 0.6 < off["bone 0"] and off["bone 2"] < off["bone 1"] < off["bone 0"]
+
+
+def test_a_hand_that_hides_is_told() -> None:
+    """Folded back onto its arm it has hardly edges of its own, and the masks show what nothing covers."""
+    rig, cameras = arm(3), views(48, 2)
+    hidden = TRUTH.clone()
+    hidden[2, 2] = math.pi
+    seen = views_of(cameras, None, shown(rig.posed(TRUTH), cameras), None)
+    right, off = (left_out(seen, shown(rig.posed(pose), cameras)) for pose in (TRUTH, hidden))
+    assert right == 0.0 and off > 0.1
+    assert left_out(seen, shown(rig.posed(TRUTH + 0.02), cameras)) == 0.0
 
 
 def test_uncertainty_is_that_of_noise() -> None:

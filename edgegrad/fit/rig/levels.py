@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from ...aovs import render_aovs
 from ...rig.function import OfFunction
 from ...rig.rig import Rig
 from ...rig.rotations import roma
@@ -32,7 +33,7 @@ from ..priors import Prior
 from ..views import View
 from .limbs import ByContour, ByLoss, Limb, Search, limbs
 from .result import RigFit
-from .shown import explained_by_joint
+from .shown import explained_by_joint, left_out
 from .sought import Sought
 from .uncertainty import JointUncertainty, uncertainty_of
 
@@ -41,7 +42,8 @@ TRY_STEPS = 6  # of each of these
 BY_REGIONS = 4  # a try by regions takes so many times as long, and there are so many times fewer
 FINER = 4  # times as many samples on the last level, where twists of limbs are told by little
 NEAR = 10.0  # what is left of the loss, in units of its noise, from which steps go far where pictures show little:
-HARDLY_SEEN = 1e-6  # of the largest curvature, beside what damps a step
+HARDLY_SEEN = 1e-6  # of the largest curvature, beside what damps a step,
+NEAR_DAMPING = 1e-4  # and that: shared twists go all the way before the loss, which hardly tells, seems at rest
 GROWTH = 3.0  # a prior's weight grows by this power of how much coarser the pictures are
 COARSE = 15  # steps at most of each level before the last
 F64 = torch.float64
@@ -96,7 +98,9 @@ class Levels:
             start, _ = objective.build(first)
         fit = judged(objective, Descent(values, history, seconds, found.ending), start, Coordinates({}))
         found_values = {name: value.detach() for name, value in self.sought.all(values).items()}
-        return RigFit(self.rig, found_values, fit, *self._told(objective, values))
+        with torch.no_grad():
+            alphas = [render_aovs(fit.scene, view.camera, ["alpha"], spp=16)["alpha"] for view in self.views]
+        return RigFit(self.rig, found_values, fit, *self._told(objective, values), left_out(self.views, alphas))
 
     def _told(
         self, objective: Objective, values: Mapping[str, Tensor]
@@ -213,7 +217,7 @@ class Levels:
         way = way_of(parameters, options)
         near = objective.regions is None and fine and objective.left(values) < NEAR
         if isinstance(way, GaussNewtonSteps) and near:
-            way.unseen = HARDLY_SEEN
+            way.unseen, way.damping = HARDLY_SEEN, NEAR_DAMPING
         return descend(
             way, objective, save, saved, title,
             reporter(objective.build, objective.views, bones=self.bones),

@@ -19,6 +19,8 @@ from ..history import Record
 from ..verdict import ENOUGH
 from .uncertainty import JointUncertainty
 
+REGION = 0.01  # of a mask's area: a region of it is a limb that is missed
+
 
 @dataclass(frozen=True, eq=False)
 class RigFit:
@@ -27,6 +29,7 @@ class RigFit:
     values       all that posed() takes, by name: rig.posed(**values); rotations as rotation vectors
     fit          the numbers that were sought, loss, views and history
     explained    by the name of each joint that was sought and that pictures can show, the share of its edges that they do, 0 … 1
+    left_out     the largest share of a mask's area that lies in regions which the fit does not cover, or has too much
     uncertainty  how exactly the pictures show each joint; None where nothing tells: of a rig without joints, or one that PyTorch
                  does not differentiate in forward mode
     """
@@ -36,6 +39,7 @@ class RigFit:
     fit: Fit = field(repr=False)
     explained: dict[str, float] = field(default_factory=dict, repr=False)
     uncertainty: JointUncertainty | None = field(default=None, repr=False)
+    left_out: float = field(default=0.0, repr=False)
 
     def posed(self) -> Scene | Mesh:
         return self.rig.posed(**self.values)
@@ -48,13 +52,20 @@ class RigFit:
     @property
     def converged(self) -> bool:
         """Further steps lead no further, and the pictures show what the fit has found, each joint of it; see Fit.converged."""
-        return self.fit.converged and not self._missing
+        return self.fit.converged and not self._missing and self.left_out < REGION
 
     @property
     def reason(self) -> str:
         """In words: "converged", or what kept the fit from that; see Fit.reason."""
-        if not self.fit.converged or not self._missing:
+        if not self.fit.converged:
             return self.fit.reason
+        if not self._missing:
+            if self.left_out < REGION:
+                return self.fit.reason
+            return (
+                f"masks not explained: a region of {self.left_out:.0%} of one is without the fit, or of the fit beside it; give "
+                "more tries or keypoints, or look for what else the masks show"
+            )
         worst = sorted(self._missing, key=lambda name: self.explained[name])[:3]
         said = ", ".join(f"{self.explained[name]:.0%} at {name}" for name in worst)
         return (

@@ -1,7 +1,8 @@
 """Which limbs the pictures show: whether there are edges in them where the fit has those of each joint.
 
 A hand in a wrong place hardly changes how much of a whole body is explained. Each joint is judged by the pixels that change as it
-turns, so that the last one of a limb is judged by itself.
+turns, so that the last one of a limb is judged by itself. A limb that hides where it should not has no edges of its own: what of
+the masks is left out tells of it.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from torch import Tensor
 from ..descent.curvature import derivatives
 from ..descent.objective import Objective
 from ..verdict import edges_of, explained
+from ..views import View
 
 MOVED = 0.05  # of the largest derivative by a joint: pixels that it moves
 BESIDE = 2  # pixels around these
@@ -86,3 +88,20 @@ def _areas(moved: Mapping[tuple[str, int], Tensor]) -> dict[tuple[str, int], Ten
         key: F.max_pool2d((size > MOVED * most).float()[None], wide, 1, BESIDE)[0][..., None]
         for key, size in moved.items()
     }
+
+
+def left_out(views: Sequence[View], renders: Sequence[Tensor]) -> float:
+    """The largest share, over all views with a mask, of what it shows that lies in a region where the fit covers nothing, or that
+    the fit covers beside it; of regions three pixels wide or more. `renders` are the fit's alphas (H, W, 1)."""
+    most = 0.0
+    for view, alpha in zip(views, renders, strict=True):
+        if view.mask is None:
+            continue
+        known = 1.0 if view.weight is None else (view.weight > 0.0).float()
+        off = (view.mask - alpha) * known
+        for side in (off, -off):
+            wrong = (side > 0.5).float().movedim(-1, 0)[None]
+            wide = -F.max_pool2d(-F.pad(wrong, (1, 1, 1, 1)), 3, 1)  # what an erosion leaves
+            inside = F.max_pool2d(wide, 3, 1, 1)
+            most = max(most, float(inside.sum()) / max(float(view.mask.sum()), 1.0))
+    return most
