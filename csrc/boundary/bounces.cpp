@@ -28,12 +28,6 @@ namespace {
 constexpr int64_t fewest_samples = 256, most_samples = 1 << 18;
 constexpr int64_t fewest_pilots = 1 << 10, most_pilots = 1 << 14, samples_of_pilot = 4, pilots_of_block = 1 << 8;
 
-// Whether the filter of a pixel reaches x, and what is there belongs to this window.
-template <class T>
-bool is_in_view(const BackwardView<T>& view, Vec3 y) {
-    return view.camera.depth_weight(y) > 0 && view.volume.outcode(y) == 0;
-}
-
 // What chunks of lines share.
 template <class T>
 struct LineScene {
