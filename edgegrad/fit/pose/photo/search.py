@@ -132,11 +132,11 @@ class PhotoSearch(Ways):
     def _from_aside(self, best: End, begins: int) -> End:
         """Ways from other starts, until one ends where the pictures show the render's edges. Those of this search begin in the
         history at `begins`."""
-        coarse, *finer = self.levels
+        first, *finer = self._of_turned()
         answered = self._answered
         self._answered = True
-        ends = [self._follow(coarse, self.task.moved(self.start, *turn))[0] for turn in turns()]
-        scores = self.journal.numbers(lambda: [coarse.explained(pose, self.seed) for pose in ends])
+        ends = [self._follow(first, self.task.moved(self.start, *turn))[0] for turn in turns()]
+        scores = self.journal.numbers(lambda: [first.explained(pose, self.seed) for pose in ends])
         order = sorted((k for k in range(len(ends)) if scores[k] >= HOPELESS), key=lambda k: -scores[k])
         for pose in distinct([ends[k] for k in order], FOLLOWED, APART):
             before = len(self.history)
@@ -144,6 +144,11 @@ class PhotoSearch(Ways):
             if best.explained >= self.enough:
                 break
         return best
+
+    def _of_turned(self) -> list[PhotoLevel]:
+        """The levels that ways from poses turned aside go through. Those of an object with colours begin on the coarsest one,
+        which tells the light. Of a contour it shows so little that ways which begin apart end in one place there."""
+        return self.levels[1:] if self.task.colourless else self.levels
 
     def likeliest(self, pose: Pose, short: bool) -> tuple[End | None, list[Pose]]:
         """Of poses that look like one that was found otherwise, whose last step was `short` or not, the one that makes the
@@ -160,12 +165,9 @@ class PhotoSearch(Ways):
     def _of_alike(self, best: End, begins: int) -> End:
         """Of poses that look alike, the one that makes the pictures most likely. An object that is its own mirror image has, from
         afar, the contour that it has behind a mirror, and so one contour in two poses; a bottle that shows hardly more than its
-        bottom, a disc of one colour, looks alike in many.
-
-        Ways of an object with colours begin on the coarsest level, which tells the light. Of a contour it shows so little that
-        ways which begin apart end in one place there, and it ranks them by chance."""
+        bottom, a disc of one colour, looks alike in many."""
         plain = self.task.colourless
-        first, *finer = self.levels[plain:]
+        first, *finer = self._of_turned()
         turned = [self.task.moved(self.start if plain else best.pose, *turn) for turn in turns()]
         before = len(self.history)
         self._answered = True
