@@ -39,6 +39,9 @@ NEAR = 0.1  # radians: a polished pose that is farther off is another one
 # Other ends may be the answer if they are within so many radians of the start. One that is less likely by a smaller factor than
 # exp(this) looks alike.
 REACH, ALIKE = 0.7, 3.0
+# The same of contours alone, where the other one has come to rest: ends that were wrong were up to exp(19) times less likely than
+# the right pose, which no way had come to, and exp(5) times likelier than the next; beside right ones, others were exp(10) less.
+ALONE_ALIKE = 8.0
 SHARP = 1.0  # degrees: of objects with colours whose rotation is known less exactly than this, others that look alike are sought
 
 
@@ -173,7 +176,7 @@ class PhotoSearch(Ways):
         self._answered = True
         here, *ends = (self._follow(first, pose)[0] for pose in [best.pose, *turned])
         costs = self.journal.numbers(lambda: first.unlikely([here, *ends], self.seed))
-        sure = ALIKE * TOGETHER**2
+        sure, doubt = ALIKE * TOGETHER**2, (ALONE_ALIKE if plain else ALIKE) * TOGETHER**2
         order = sorted(range(len(ends)), key=lambda k: costs[1 + k])
         if not plain:  # where colours tell the others from this one in so few pixels, they do in more
             order = [k for k in order if costs[1 + k] - costs[0] < sure]
@@ -191,7 +194,7 @@ class PhotoSearch(Ways):
         won = costs[0] - costs[k] > sure and (plain or found[k].explained > best.explained)
         answer, cost = (found[k], costs[k]) if won else (best, costs[0])
         self.alike = [
-            end.pose for end, other in zip(found, costs, strict=True) if end is not answer and other - cost < sure
+            end.pose for end, other in zip(found, costs, strict=True) if end is not answer and other - cost < doubt
         ]
         if not won:
             self._forget(slice(before, None))
