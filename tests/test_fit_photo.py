@@ -485,6 +485,7 @@ def test_what_looks_alike_is_not_converged(monkeypatch):
         search.ALIKE,
     ):  # the colours of this clutter make the right one likelier, by a factor of some exp(2.6)
         monkeypatch.setattr(search, "ALIKE", least)
+        monkeypatch.setattr(search, "ALONE_ALIKE", least)
         found.append(fit_pose(box, image, view, init=start, progress=False))
     for fit in found:
         assert math.degrees(math.acos(min(1.0, (float((fit.R.T @ R).trace()) - 1.0) / 2.0))) < 3.0

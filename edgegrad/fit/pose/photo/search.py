@@ -39,6 +39,9 @@ NEAR = 0.1  # radians: a polished pose that is farther off is another one
 # Other ends may be the answer if they are within so many radians of the start. One that is less likely by a smaller factor than
 # exp(this) looks alike.
 REACH, ALIKE = 0.7, 3.0
+# The same of contours alone, where the other one has come to rest: ends that were wrong were up to exp(19) times less likely than
+# the right pose, which no way had come to, and exp(5) times likelier than the next; beside right ones, others were exp(10) less.
+ALONE_ALIKE = 8.0
 SHARP = 1.0  # degrees: of objects with colours whose rotation is known less exactly than this, others that look alike are sought
 
 
@@ -132,11 +135,11 @@ class PhotoSearch(Ways):
     def _from_aside(self, best: End, begins: int) -> End:
         """Ways from other starts, until one ends where the pictures show the render's edges. Those of this search begin in the
         history at `begins`."""
-        coarse, *finer = self.levels
+        first, *finer = self._of_turned()
         answered = self._answered
         self._answered = True
-        ends = [self._follow(coarse, self.task.moved(self.start, *turn))[0] for turn in turns()]
-        scores = self.journal.numbers(lambda: [coarse.explained(pose, self.seed) for pose in ends])
+        ends = [self._follow(first, self.task.moved(self.start, *turn))[0] for turn in turns()]
+        scores = self.journal.numbers(lambda: [first.explained(pose, self.seed) for pose in ends])
         order = sorted((k for k in range(len(ends)) if scores[k] >= HOPELESS), key=lambda k: -scores[k])
         for pose in distinct([ends[k] for k in order], FOLLOWED, APART):
             before = len(self.history)
@@ -144,6 +147,11 @@ class PhotoSearch(Ways):
             if best.explained >= self.enough:
                 break
         return best
+
+    def _of_turned(self) -> list[PhotoLevel]:
+        """The levels that ways from poses turned aside go through. Those of an object with colours begin on the coarsest one,
+        which tells the light. Of a contour it shows so little that ways which begin apart end in one place there."""
+        return self.levels[1:] if self.task.colourless else self.levels
 
     def likeliest(self, pose: Pose, short: bool) -> tuple[End | None, list[Pose]]:
         """Of poses that look like one that was found otherwise, whose last step was `short` or not, the one that makes the
@@ -160,18 +168,15 @@ class PhotoSearch(Ways):
     def _of_alike(self, best: End, begins: int) -> End:
         """Of poses that look alike, the one that makes the pictures most likely. An object that is its own mirror image has, from
         afar, the contour that it has behind a mirror, and so one contour in two poses; a bottle that shows hardly more than its
-        bottom, a disc of one colour, looks alike in many.
-
-        Ways of an object with colours begin on the coarsest level, which tells the light. Of a contour it shows so little that
-        ways which begin apart end in one place there, and it ranks them by chance."""
+        bottom, a disc of one colour, looks alike in many."""
         plain = self.task.colourless
-        first, *finer = self.levels[plain:]
+        first, *finer = self._of_turned()
         turned = [self.task.moved(self.start if plain else best.pose, *turn) for turn in turns()]
         before = len(self.history)
         self._answered = True
         here, *ends = (self._follow(first, pose)[0] for pose in [best.pose, *turned])
         costs = self.journal.numbers(lambda: first.unlikely([here, *ends], self.seed))
-        sure = ALIKE * TOGETHER**2
+        sure, doubt = ALIKE * TOGETHER**2, (ALONE_ALIKE if plain else ALIKE) * TOGETHER**2
         order = sorted(range(len(ends)), key=lambda k: costs[1 + k])
         if not plain:  # where colours tell the others from this one in so few pixels, they do in more
             order = [k for k in order if costs[1 + k] - costs[0] < sure]
@@ -189,7 +194,7 @@ class PhotoSearch(Ways):
         won = costs[0] - costs[k] > sure and (plain or found[k].explained > best.explained)
         answer, cost = (found[k], costs[k]) if won else (best, costs[0])
         self.alike = [
-            end.pose for end, other in zip(found, costs, strict=True) if end is not answer and other - cost < sure
+            end.pose for end, other in zip(found, costs, strict=True) if end is not answer and other - cost < doubt
         ]
         if not won:
             self._forget(slice(before, None))
