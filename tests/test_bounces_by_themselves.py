@@ -3,6 +3,8 @@ that is nearly a mirror, by two bounces. Samplers that look for borders of shado
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from bounce_scenes import GAUSS, SIZE, Y, adjoint, panel, under_sky
@@ -13,7 +15,7 @@ from torch import Tensor
 import edgegrad as eg
 
 STEP, SEEDS = 0.05, 6
-SAMPLES = {"surface_samples": 150_000, "edge_samples": 50_000}
+SAMPLES: dict[str, Any] = {"surface_samples": 150_000, "edge_samples": 50_000}
 
 
 def moved(theta: Tensor, floor: str) -> tuple[eg.Scene, eg.Camera]:
@@ -28,7 +30,7 @@ def moved(theta: Tensor, floor: str) -> tuple[eg.Scene, eg.Camera]:
     return eg.Scene([block, ground.replace(face_colors=None, material=metal), lamp]), scene.camera
 
 
-def loss(theta: Tensor, floor: str, spp: int, seed: int, **samples: int) -> Tensor:
+def loss(theta: Tensor, floor: str, spp: int, seed: int, **samples: Any) -> Tensor:
     image = eg.render(*moved(theta, floor), spp, seed, bounces=2, **samples)
     return (adjoint()[:, :, None] * image).sum() / SIZE**2
 
