@@ -113,6 +113,59 @@ def light(folder: Path) -> None:
     figure.savefig(folder / "light.png", dpi=100)
 
 
+def bounces(folder: Path) -> None:
+    """A room by how often light is scattered, and how its image changes as the block moves to the right."""
+    room, size = corner_room(), 160
+    camera = eg.Camera.look_at((0.0, -3.4, 1.0), (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), 38.0, (size, size))
+    figure, axes = plt.subplots(1, 7, figsize=(16, 2.7))
+    for axis, count in zip(axes, (1, 2, 4, 8), strict=False):
+        picture(axis, eg.render(room, camera, 64, bounces=count), f"bounces={count}")
+    *others, block = room.meshes
+    right = torch.tensor([1.0, 0.0, 0.0]).expand(1, len(block.verts), 3)
+    samples = {"surface_samples": 600_000, "edge_samples": 300_000}
+
+    def derivative(count: int, visibility: bool = True) -> Tensor:
+        scene = eg.Scene([*others, block])
+        _, dot = eg.jvp(scene, camera, {block.verts: right}, 4, bounces=count, visibility=visibility, **samples)
+        return dot[0].mean(-1)
+
+    whole, inside, direct = derivative(2), derivative(2, False), derivative(1)
+    terms = {
+        "the block moves right": whole,
+        "inside of faces, × 4": 4 * inside,
+        "by the second bounce, × 4": 4 * (whole - direct),
+    }
+    for axis, (title, term) in zip(axes[4:], terms.items(), strict=True):
+        signed(axis, term, title, 3.0)
+    figure.tight_layout(pad=0.6)
+    figure.savefig(folder / "bounces.png", dpi=100)
+
+
+def corner_room() -> eg.Scene:
+    """Open to the front, with walls in colours and a lamp; the last mesh is a block."""
+
+    def quad(*corners: tuple[float, float, float], **material: object) -> eg.Mesh:
+        faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+        return eg.Mesh(torch.tensor(corners), faces, material=eg.Material(**material))  # type: ignore[arg-type]
+
+    white, red, green = torch.full((3,), 0.75), torch.tensor([0.7, 0.15, 0.1]), torch.tensor([0.15, 0.6, 0.2])
+    a, b, c, d = (-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)
+    walls = [
+        quad(*((x, y, 0.0) for x, y in (a, b, c, d)), base_color=white),
+        quad(*((x, y, 2.0) for x, y in (d, c, b, a)), base_color=white),
+        quad((*d, 0.0), (*c, 0.0), (*c, 2.0), (*d, 2.0), base_color=white),
+        quad((*a, 0.0), (*d, 0.0), (*d, 2.0), (*a, 2.0), base_color=red),
+        quad((*b, 0.0), (*b, 2.0), (*c, 2.0), (*c, 0.0), base_color=green),
+    ]
+    lamp = eg.AreaLight.rectangle(
+        torch.tensor([0.0, 0.0, 1.98]), torch.tensor([0.4, 0.0, 0.0]), torch.tensor([0.0, -0.4, 0.0]), 7.0,
+        two_sided=False,
+    )  # fmt: skip
+    box = trimesh.creation.box((0.6, 0.7, 0.7), trimesh.transformations.rotation_matrix(0.4, (0, 0, 1), (0, 0, 0)))
+    verts = torch.tensor(box.vertices, dtype=torch.float32) + torch.tensor([-0.2, 0.15, 0.5])
+    return eg.Scene([*walls, lamp, eg.Mesh(verts, torch.tensor(box.faces), material=eg.Material(white))])
+
+
 def triangle_terms(folder: Path) -> None:
     """The two terms of the derivative of a triangle that moves right, its red channel, and finite differences."""
     verts = torch.tensor([[-0.9, -0.7, 0.0], [0.9, -0.5, 0.0], [-0.1, 0.9, 0.0]], dtype=torch.float64)
@@ -239,7 +292,7 @@ def body(folder: Path) -> None:
 def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
     folder.mkdir(parents=True, exist_ok=True)
-    for draw in (light, derivatives, triangle_terms, curve_source, stages, cup, body):
+    for draw in (light, bounces, derivatives, triangle_terms, curve_source, stages, cup, body):
         draw(folder)
 
 
