@@ -40,6 +40,8 @@ def run(args: argparse.Namespace) -> int:
     told = {"joints": args.joints, "tries": args.tries, "coarsest": args.coarsest, **descent(args)}
     with live(args) as view:
         found = fit_rig(rig, cameras, masks=masks, callback=view, **told)
-        code = finish(found.fit, args.out, found.save)
+        code = finish(found.fit, args.out, found.save, found.reason)
+        if found.uncertainty is not None and found.uncertainty.unknown:
+            print(f"not determined by the masks: {found.uncertainty.unknown}", flush=True)
         linger(view, found.fit)
     return code

@@ -79,13 +79,13 @@ def write_outputs(folder: Path, fit: PoseFit) -> list[str]:
     return names
 
 
-def finish(fit: Fit, folder: Path, save: Callable[..., list[str]] | None = None) -> int:
-    """Says how a fit by descent ended and writes it all, by its own save() unless another is given; the exit code. Raises
-    OSError."""
+def finish(fit: Fit, folder: Path, save: Callable[..., list[str]] | None = None, reason: str | None = None) -> int:
+    """Says how a fit by descent ended and writes it all, by its own reason and save() unless others are given; the exit code.
+    Raises OSError."""
     from . import INTERRUPTED
     from .arguments import CHECKPOINT
 
-    print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}", flush=True)
+    print(f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {reason or fit.reason}", flush=True)
     written = [*(save or fit.save)(folder, figures=_can_draw()), CHECKPOINT]
     print(f"wrote {', '.join(written)} in {folder}")
     return INTERRUPTED if fit.interrupted else 0

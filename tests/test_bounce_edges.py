@@ -25,7 +25,7 @@ LOOKS: dict[str, dict[str, Any]] = {
 @pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Gradients are those of these borders alone."""
-    for term in ("_interior", "_boundary", "_shadows", "_unseen_shadows"):
+    for term in ("_interior", "_boundary", "_shadows"):
         monkeypatch.setattr(shader._Image, term, lambda *_: [])
 
 

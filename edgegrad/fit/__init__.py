@@ -1,7 +1,6 @@
 """Fitting: what pictures say about a scene, found by following the gradients of `render`."""
 
 from . import losses, priors, regularizers
-from .descent.fit_rig import RigFit, fit_rig, track_rig
 from .descent.fit_scene import Progress, fit_scene
 from .descent.fit_shape import fit_shape
 from .descent.fit_texture import fit_texture
@@ -18,9 +17,14 @@ from .pose.fit_poses import fit_poses
 from .pose.result import PoseFit, Step
 from .pose.track import TrackedPose, track
 from .pose.uncertainty import Uncertainty
+from .rig.fit_rig import fit_rig
+from .rig.result import RigFit
+from .rig.track_rig import track_rig
+from .rig.uncertainty import JointUncertainty
 
 __all__ = [
-    "CameraFit", "Ending", "Fit", "Measured", "Options", "Parameter", "Pose", "PoseFit", "PoseParameter", "Progress",
-    "Record", "RigFit", "Step", "TrackedPose", "Uncertainty", "fit_camera", "fit_pose", "fit_poses", "fit_rig", "fit_scene",
-    "fit_shape", "fit_texture", "losses", "priors", "regularizers", "track", "track_rig", "visual_hull",
+    "CameraFit", "Ending", "Fit", "JointUncertainty", "Measured", "Options", "Parameter", "Pose", "PoseFit",
+    "PoseParameter", "Progress", "Record", "RigFit", "Step", "TrackedPose", "Uncertainty", "fit_camera", "fit_pose",
+    "fit_poses", "fit_rig", "fit_scene", "fit_shape", "fit_texture", "losses", "priors", "regularizers", "track",
+    "track_rig", "visual_hull",
 ]  # fmt: skip

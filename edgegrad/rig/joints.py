@@ -31,6 +31,7 @@ class Joints:
     rotations: Tensor
     stretches: Tensor | None = None
     _order: list[Tensor] = field(init=False, repr=False)  # joints of one depth, by depth
+    _above: list[Tensor] = field(init=False, repr=False)  # the place of each one's parent among those of its depth
     _back: Tensor = field(init=False, repr=False)  # places in the concatenation of these
 
     def __post_init__(self) -> None:
@@ -52,7 +53,7 @@ class Joints:
         order = _by_depth(names, parents)
         values = {
             "names": names, "parents": parents, "translations": translations, "rotations": rotations, "stretches": stretches,
-            "_order": order, "_back": torch.argsort(torch.cat(order)),
+            "_order": order, "_above": _above(order, parents), "_back": torch.argsort(torch.cat(order)),
         }  # fmt: skip
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -81,22 +82,13 @@ class Joints:
         last = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
         local = torch.cat([top, last], -2)
         found, above = [], None
-        for level in self._order:
+        for level, places in zip(self._order, self._above, strict=True):
             own = local.index_select(-3, level)
             if above is not None:
-                places = self._places[level]
                 own = above.index_select(-3, places) @ own
             found.append(own)
             above = own
         return torch.cat(found, -3).index_select(-3, self._back)
-
-    @property
-    def _places(self) -> Tensor:
-        """Of each joint's parent among those of its depth."""
-        places = torch.zeros(len(self), dtype=torch.long)
-        for level in self._order:
-            places[level] = torch.arange(len(level))
-        return places[torch.tensor(self.parents)]
 
 
 def _by_depth(names: tuple[str, ...], parents: tuple[int, ...]) -> list[Tensor]:
@@ -116,3 +108,10 @@ def _by_depth(names: tuple[str, ...], parents: tuple[int, ...]) -> list[Tensor]:
         for steps, j in enumerate(reversed(way)):
             depth[j] = first + 1 + steps
     return [torch.tensor([j for j, own in enumerate(depth) if own == d]) for d in range(max(depth) + 1)]
+
+
+def _above(order: list[Tensor], parents: tuple[int, ...]) -> list[Tensor]:
+    places = torch.zeros(len(parents), dtype=torch.long)
+    for level in order:
+        places[level] = torch.arange(len(level))
+    return [places[torch.tensor(parents)[level]] for level in order]

@@ -29,7 +29,7 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
     plain = {name: value.detach() for name, value in tensors.items()}
     n = sum(value.numel() for value in plain.values())
     total = torch.zeros(n, n, dtype=torch.float64)
-    for name, group, render, slopes in _derivatives(objective, plain, step):
+    for name, group, render, slopes in derivatives(objective, plain, step):
         if objective.regions is None:
             weight = weights_of(objective, name, group, render)
         else:
@@ -45,13 +45,37 @@ def curvature(objective: Objective, tensors: Mapping[str, Tensor], step: int) ->
     return total
 
 
+def scores(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> tuple[Tensor, Tensor]:
+    """The curvature (n, n) of the pictures alone, and Σ s sᵀ (n, n) over the scores of all pixels, s = w r J."""
+    plain = {name: value.detach() for name, value in tensors.items()}
+    n, count = sum(value.numel() for value in plain.values()), len(objective.picks(step))
+    H, S = (torch.zeros(n, n, dtype=torch.float64) for _ in range(2))
+    for name, group, render, slopes in derivatives(objective, plain, step):
+        regions = objective.regions
+        if regions is None:
+            weight = weights_of(objective, name, group, render)
+            off = (render - torch.stack([objective.views[i].wanted[name] for i in group])) * weight
+        else:
+            weight = regions.curvature(group, render)
+            slopes = [regions.blurred(J) for J in slopes]
+            off = (
+                weight * regions.shares(group)
+            ).sqrt()  # a log likelihood's squared score is its curvature on average
+        for w, s, J in zip(weight / count, off / count, slopes, strict=True):
+            rows = J.reshape(n, -1)
+            H += ((rows * w.flatten()) @ rows.T).double()
+            rows = rows * s.flatten()
+            S += (rows @ rows.T).double()
+    return H, S
+
+
 def misfit(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
     """How far pixels are from their pictures where each number moves them, Σ |J| |r| / Σ |J|, of the tensors' shapes: large of
     what lies in a wrong place, also where its slope is zero."""
     plain = {name: value.detach() for name, value in tensors.items()}
     n = sum(value.numel() for value in plain.values())
     off, all = torch.zeros(n, dtype=torch.float64), torch.full((n,), 1e-30, dtype=torch.float64)
-    for name, group, render, slopes in _derivatives(objective, plain, step):
+    for name, group, render, slopes in derivatives(objective, plain, step):
         for i, image, J in zip(group, render, slopes, strict=True):
             if (wanted := objective.views[i].wanted.get(name)) is not None:
                 rows = J.abs().reshape(n, -1)
@@ -61,7 +85,7 @@ def misfit(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> di
     return {name: part.reshape(value.shape) for (name, value), part in zip(plain.items(), parts, strict=True)}
 
 
-def _derivatives(
+def derivatives(
     objective: Objective, plain: Mapping[str, Tensor], step: int
 ) -> Iterator[tuple[str, list[int], Tensor, list[Tensor]]]:
     """Of views of one kind, a channel's name, their places, it (B, H, W, c), and its derivatives (n, H, W, c) by all numbers.

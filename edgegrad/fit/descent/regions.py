@@ -101,14 +101,19 @@ class Regions:
         """(n, H, W) as alpha is blurred, from alpha or its derivatives (n, H, W, 1)."""
         return smoothed(images[..., 0].float(), self.blur)
 
-    def explained(self, alphas: Sequence[Tensor]) -> float:
+    def shares(self, group: Sequence[int]) -> Tensor:
+        """(B, H, W): by how much each pixel counts of the loss of its view, 1 in sum."""
+        return self._of(group)[1]
+
+    def explained(self, alphas: Sequence[Tensor], within: Sequence[Tensor] | None = None) -> float:
         """How much of the contour the pictures show, 0 … 1, from alphas (H, W, 1) by which they were renewed: the share of its
         edges, or, where that is less, how surely colours tell its two sides apart: the mean of 2P − 1 inside, 1 − 2P outside, in
-        such units that SURE is just enough."""
+        such units that SURE is just enough. Where `within` (H, W) is 1."""
         parts, told, length = [], 0.0, 0.0
         for k, alpha in enumerate(alphas):
             share = alpha[..., 0].float()
             near = self.around(k, share)[0]
+            near = near if within is None else near * within[k]
             parts.append((self.displays[k], share, near))
             soft = smoothed(share[None], BESIDE)[0]
             band = ((soft > PURE) & (soft < 1.0 - PURE)) * near

@@ -26,9 +26,16 @@ class Sought:
     fixed: dict[str, Tensor]  # all values at the start
     parameters: dict[str, Parameter]
     rows: dict[str, Tensor]  # of which rows a parameter is, where not of all
+    looks: tuple[str, ...] = ()  # parameters that are none of the rig, but of how it looks
 
     @staticmethod
-    def of(rig: Rig, seek: Sequence[str] | None, joints: Sequence[str] | None, start: Mapping[str, Any]) -> Sought:
+    def of(
+        rig: Rig,
+        seek: Sequence[str] | None,
+        joints: Sequence[str] | None,
+        start: Mapping[str, Any],
+        looks: Mapping[str, Parameter],
+    ) -> Sought:
         """Raises TypeError or ValueError."""
         place = {
             "translation": torch.zeros(3, dtype=F64),
@@ -62,13 +69,45 @@ class Sought:
                 value, low, high = (None if x is None else x[chosen] for x in (value, low, high))
             assert value is not None
             parameters[name] = Parameter(_rate(rig, name, control), value.clone(), low, high).checked(name)
+        for name, parameter in looks.items():
+            if name in known:
+                raise ValueError(
+                    f"parameters: expected names that the rig does not have, got {name!r}; seek=[{name!r}]"
+                )
+            if not isinstance(parameter, Parameter):
+                raise TypeError(f"parameters[{name!r}]: expected a Parameter, got {type(parameter).__name__}")
+            parameters[name] = parameter.checked(name)
         if not parameters:
             raise ValueError("seek: expected a name or more of what is sought, got none")
-        return Sought(rig, fixed, parameters, rows)
+        return Sought(rig, fixed, parameters, rows, tuple(looks))
+
+    @property
+    def joints(self) -> dict[str, tuple[str, ...]]:
+        """Of the sought values that are turns of joints, their names."""
+        found = {}
+        for name in self.parameters:
+            control = self.rig.controls.get(name)
+            if control is not None and control.names and (control.rotates or name == "angles"):
+                rows = self.rows.get(name)
+                found[name] = control.names if rows is None else tuple(control.names[k] for k in rows.tolist())
+        return found
 
     def values(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Of all that is sought, with the rows that are not; differentiable. Of one or of a batch."""
-        return {name: self._whole(name, tensor) if name in self.rows else tensor for name, tensor in tensors.items()}
+        """Of all of the rig that is sought, with the rows that are not; differentiable. Of one or of a batch."""
+        return {
+            name: self._whole(name, tensor) if name in self.rows else tensor
+            for name, tensor in tensors.items()
+            if name not in self.looks
+        }
+
+    def look(self, tensors: Mapping[str, Tensor], index: int | None = None) -> dict[str, Tensor]:
+        """What it looks like, of one or of that place in a batch."""
+        found = {}
+        for name in self.looks:
+            value, own = tensors[name], self.parameters[name].value
+            assert own is not None
+            found[name] = value[index] if index is not None and value.dim() > own.dim() else value
+        return found
 
     def _whole(self, name: str, tensor: Tensor) -> Tensor:
         fixed = self.fixed[name]

@@ -9,25 +9,28 @@ search ends where what is left of the loss is the noise of its samples.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from ...rig.rig import Rig
+from ..descent.curvature import misfit
+from ..descent.objective import Objective
+from ..descent.regions import LAST
 from ..options import Parameter
-from .curvature import misfit
-from .objective import Objective
+from ..verdict import ENOUGH
+from .shown import explained_by_joint
 
-DRAWS = 32  # turns of a limb that are looked at
-SPREAD = 0.4  # radians, of each component
+DRAWS = 64  # turns of a limb that are looked at
+SPREADS = 0.2, 0.4  # radians, of each component, by turns
 SHARE = 0.4  # of all rows: a joint with more below it is turned alone
 EXPLAINED = 1.5  # of the loss by noise alone: less is not to be mended
 APART = 0.3  # radians of a joint at least, by which a turn is another place
 STARTS = 2  # of the turns, that go down
-WORSE = 2.0  # times the least loss, from which no way down is tried
 LEAST = 0.05  # of the largest chance of a limb to be drawn
 SEEDS = 0, 1  # by which losses are compared
 Values = dict[str, Tensor]
@@ -61,6 +64,86 @@ def limbs(rig: Rig, rows: Sequence[int]) -> list[Limb]:
     return found
 
 
+class Judge(Protocol):
+    """Which of two poses is better, and whether one is good."""
+
+    @property
+    def worse(self) -> float:
+        """Factor of the least cost, from which no way down is tried."""
+        ...
+
+    @property
+    def gain(self) -> float:
+        """By how much the cost must fall."""
+        ...
+
+    def cost(self, values: Values) -> float: ...
+
+    def explained(self, values: Values) -> bool: ...
+
+    def off(self, values: Values) -> Tensor:
+        """(rows, …): how wrong the pictures are where each row of the value that is searched moves them."""
+        ...
+
+    def renew(self, values: Values) -> None:
+        """What losses of poses that are compared hold fixed is what it is at these values."""
+        ...
+
+
+@dataclass(frozen=True)
+class ByLoss:
+    """Poses by their loss: pictures and masks that the rig explains but for noise."""
+
+    objective: Objective
+    name: str
+    worse: float = 2.0
+    gain: float = 0.0
+
+    def cost(self, values: Values) -> float:
+        return loss_of(self.objective, values)
+
+    def explained(self, values: Values) -> bool:
+        with torch.no_grad():
+            return self.objective.left(values) < EXPLAINED
+
+    def off(self, values: Values) -> Tensor:
+        return misfit(self.objective, values, 0)[self.name]
+
+    def renew(self, values: Values) -> None:
+        pass
+
+
+@dataclass(frozen=True)
+class ByContour:
+    """Poses by how much of the contours of their limbs the pictures show: by regions, whose losses of different silhouettes are
+    none of the same colours."""
+
+    objective: Objective
+    name: str
+    joints: Sequence[str]
+    worse: float = math.inf
+    gain: float = 0.05
+
+    def cost(self, values: Values) -> float:
+        return float(self.off(values).mean())
+
+    def explained(self, values: Values) -> bool:
+        return float(self.off(values).max()) < 1.0 - ENOUGH
+
+    def off(self, values: Values) -> Tensor:
+        self.renew(values)
+        found = explained_by_joint(self.objective, values, {self.name: self.joints})
+        return torch.tensor([1.0 - found.get(joint, 1.0) for joint in self.joints], dtype=torch.float64)
+
+    def renew(self, values: Values) -> None:
+        self.objective.renew(values, LAST)
+
+
+def loss_of(objective: Objective, values: Values, seeds: Sequence[int] = SEEDS) -> float:
+    with torch.no_grad():
+        return sum(float(objective(values, k)) for k in seeds) / len(seeds)
+
+
 @dataclass
 class Search:
     """At groups of rows of one of the values.
@@ -69,6 +152,7 @@ class Search:
     """
 
     objective: Objective
+    judge: Judge
     name: str
     groups: Sequence[Limb]
     parameters: Mapping[str, Parameter]
@@ -80,24 +164,31 @@ class Search:
 
     def run(self, values: Values, tries: int) -> Values:
         """The best values of so many tries."""
+        if self.judge.explained(values):
+            return values
         self.generator = torch.Generator().manual_seed(self.seed)
-        best, least, chances = values, self.loss(values), self.chances(values)
+        best, least, chances = values, self.judge.cost(values), self.chances(values)
         for _ in range(tries):
-            if self.explained(best):
-                break
             limb = self.groups[int(torch.multinomial(chances, 1, generator=self.generator))]
-            found = min((self.alone(start, limb) for start in self.drawn(best, limb)), key=self.loss, default=None)
+            self.judge.renew(best)
+            found = min(
+                (self.alone(start, limb) for start in self.drawn(best, limb)), key=self.judge.cost, default=None
+            )
             # What lies in the limb's true place must often leave it before the loss is lower.
-            if found is not None and self.loss(found) < WORSE * least:
+            if found is not None and self.judge.cost(found) < self.judge.worse * least:
                 found = self.steps(self.objective, self.started(found))
-                if (now := self.loss(found)) < least:
-                    best, least, chances = found, now, self.chances(found)
+                if (now := self.judge.cost(found)) < least - self.judge.gain:
+                    best, least = found, now
+                    if self.judge.explained(best):
+                        break
+                    chances = self.chances(best)
             self.tell()
+        self.judge.renew(best)
         return best
 
     def chances(self, values: Values) -> Tensor:
         """Of each limb, by how far pixels are from their pictures where it moves them."""
-        by_row = misfit(self.objective, values, 0)[self.name]
+        by_row = self.judge.off(values)
         by_row = by_row.reshape(len(by_row), -1).mean(1)
         found = torch.stack([by_row[limb.rows].mean() for limb in self.groups]).square()
         return found + LEAST * found.max() + 1e-300
@@ -113,10 +204,12 @@ class Search:
             # Half of them from rest, half from where it is; some turn the first joint alone.
             chosen = limb.rows[: 1 if k % 4 > 1 else None]
             middle = turned[chosen] if k % 8 < 4 else self.rest[chosen].to(turned)
-            turned[chosen] = middle + SPREAD * torch.randn(middle.shape, generator=self.generator, dtype=turned.dtype)
+            turned[chosen] = middle + SPREADS[k % 3 % 2] * torch.randn(
+                middle.shape, generator=self.generator, dtype=turned.dtype
+            )
             start = {**values, self.name: self.parameters[self.name].within(turned)}
             if float((start[self.name] - now)[limb.rows].reshape(len(limb.rows), -1).norm(dim=1).max()) > APART:
-                low.append((self.loss(start, SEEDS[:1]), k, start))
+                low.append((loss_of(self.objective, start, SEEDS[:1]), k, start))
         return [start for _, _, start in sorted(low)[:STARTS]]
 
     def alone(self, start: Values, limb: Limb) -> Values:
@@ -134,14 +227,6 @@ class Search:
         low, high = (None if b is None else torch.as_tensor(b)[place] for b in (parameter.low, parameter.high))
         own = Parameter(parameter.lr, start[self.name][place], low, high)
         return whole(self.steps(self.objective.of(whole), {self.name: own}))
-
-    def loss(self, values: Values, seeds: Sequence[int] = SEEDS) -> float:
-        with torch.no_grad():
-            return sum(float(self.objective(values, k)) for k in seeds) / len(seeds)
-
-    def explained(self, values: Values) -> bool:
-        with torch.no_grad():
-            return self.objective.left(values) < EXPLAINED
 
     def started(self, values: Values) -> dict[str, Parameter]:
         return {n: Parameter(p.lr, p.within(values[n]), p.low, p.high) for n, p in self.parameters.items()}

@@ -1,0 +1,1 @@
+"""Poses and shapes of what bends."""

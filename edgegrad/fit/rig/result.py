@@ -1,0 +1,97 @@
+"""What a fit of a rig returns."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from ...files.paths import PathLike, replacing
+from ...files.save import save_scene
+from ...rig.rig import Rig
+from ...scene.mesh import Mesh
+from ...scene.scene import Scene
+from ..descent.result import Fit
+from ..history import Record
+from ..verdict import ENOUGH
+from .uncertainty import JointUncertainty
+
+
+@dataclass(frozen=True, eq=False)
+class RigFit:
+    """What fit_rig() found.
+
+    values       all that posed() takes, by name: rig.posed(**values); rotations as rotation vectors
+    fit          the numbers that were sought, loss, views and history
+    explained    by the name of each joint that was sought and that pictures can show, the share of its edges that they do, 0 … 1
+    uncertainty  how exactly the pictures show each joint; None where nothing tells: of a rig without joints, or one that PyTorch
+                 does not differentiate in forward mode
+    """
+
+    rig: Rig
+    values: dict[str, Any]
+    fit: Fit = field(repr=False)
+    explained: dict[str, float] = field(default_factory=dict, repr=False)
+    uncertainty: JointUncertainty | None = field(default=None, repr=False)
+
+    def posed(self) -> Scene | Mesh:
+        return self.rig.posed(**self.values)
+
+    @property
+    def bones(self) -> Tensor | None:
+        """See Rig.bones()."""
+        return self.rig.bones(self.values)
+
+    @property
+    def converged(self) -> bool:
+        """Further steps lead no further, and the pictures show what the fit has found, each joint of it; see Fit.converged."""
+        return self.fit.converged and not self._missing
+
+    @property
+    def reason(self) -> str:
+        """In words: "converged", or what kept the fit from that; see Fit.reason."""
+        if not self.fit.converged or not self._missing:
+            return self.fit.reason
+        worst = sorted(self._missing, key=lambda name: self.explained[name])[:3]
+        said = ", ".join(f"{self.explained[name]:.0%} at {name}" for name in worst)
+        return (
+            f"edges not explained: the pictures show too few of the edges of {len(self._missing)} joints ({said}); start nearer, "
+            "give more tries or keypoints, or look for what covers them"
+        )
+
+    @property
+    def _missing(self) -> list[str]:
+        return [name for name, share in self.explained.items() if share < ENOUGH]
+
+    @property
+    def loss(self) -> float:
+        return self.fit.loss
+
+    @property
+    def history(self) -> list[Record]:
+        return self.fit.history
+
+    def save(self, folder: PathLike, figures: bool = True) -> list[str]:
+        """What Fit.save() writes, pose.json: all values by name, as lists, posed.glb: the meshes so posed, and joints.json: of
+        each joint how much of its edges the pictures show, and to how many degrees it is known. Raises OSError, or at last
+        ImportError."""
+        out = Path(folder)
+        out.mkdir(parents=True, exist_ok=True)
+        content = {name: value.tolist() for name, value in self.values.items()}
+        with replacing(out / "pose.json") as temporary:
+            temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        known = {} if self.uncertainty is None else self.uncertainty.degrees
+        joints = {
+            name: {"explained": self.explained.get(name), "degrees": known.get(name)}
+            for name in {**known, **self.explained}
+        }
+        with replacing(out / "joints.json") as temporary:
+            temporary.write_text(json.dumps(joints, indent=2) + "\n", encoding="utf-8")
+        save_scene(out / "posed.glb", self.fit.scene.replace(background=None))
+        return ["pose.json", "joints.json", "posed.glb", *self.fit.save(out, figures)]
+
+    def _repr_png_(self) -> bytes:
+        return self.fit._repr_png_()

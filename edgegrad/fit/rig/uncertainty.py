@@ -1,0 +1,80 @@
+"""How exactly pictures show what a fit of a rig sought, joint by joint.
+
+With the loss L = Σ ρ(r_p) over pixels p, its curvature H = Σ w_p J_p J_pᵀ and the score s_p = w_p r_p J_p of each, the numbers
+have the covariance H⁻¹ (Σ s_p s_pᵀ) H⁻¹ (Huber, The Behavior of Maximum Likelihood Estimates under Nonstandard Conditions, 1967;
+White, A Heteroskedasticity-Consistent Covariance Matrix Estimator, 1980). It asks for no noise level: pixels at contours, which
+differ by more than those inside, tell theirs. It speaks of the place where the fit is: of another pose that looks alike it knows
+nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..descent.curvature import scores
+from ..descent.objective import Objective
+from .shown import places_of
+
+WIDEST = 1.0  # radian, or as many learning rates as make one: the deviation of what the pictures do not show at all
+DEGREES = 5.0  # a joint that is known less exactly is unknown
+STEP = 2**22  # a step that no fit comes to: its samples are those of no loss that was made small
+
+
+@dataclass(frozen=True, eq=False)
+class JointUncertainty:
+    """Standard deviations of what was sought, where the pictures' pixels are off by chance and the rig is right.
+
+    covariance  (n, n) float64, of all numbers that were sought, in the order of the fit's values
+    degrees     by the joint's name, of its rotation about the axis about which it is known least; of a robot of its angle
+    axes        by the joint's name, this axis (3,), among its own, of length 1; none of a robot
+    """
+
+    covariance: Tensor
+    degrees: dict[str, float]
+    axes: dict[str, Tensor]
+
+    @property
+    def unknown(self) -> str:
+        """In words, the joints that are known less exactly than to 5°, the worst first; empty where there are none."""
+        worst = sorted((name for name, d in self.degrees.items() if d > DEGREES), key=lambda name: -self.degrees[name])
+        return ", ".join(f"{name} known to ±{self.degrees[name]:.0f}°{self._about(name)} only" for name in worst)
+
+    def _about(self, name: str) -> str:
+        return (
+            f" about ({', '.join(f'{x:.1f}' for x in (self.axes[name] + 0.0).tolist())})" if name in self.axes else ""
+        )
+
+
+def uncertainty_of(
+    objective: Objective,
+    tensors: Mapping[str, Tensor],
+    rates: Mapping[str, float],
+    joints: Mapping[str, tuple[str, ...]],
+) -> JointUncertainty:
+    """At these values.
+
+    rates   of each, of which 1 / 0.03 make as much as a radian does
+    joints  of the values that are turns of joints, their names
+    """
+    H, S = scores(objective, tensors, STEP)
+    unit = torch.cat([torch.full((v.numel(),), rates[name] / 0.03, dtype=torch.float64) for name, v in tensors.items()])
+    H, S = H * unit * unit[:, None], S * unit * unit[:, None]
+    # What the pictures do not show: as if one more picture, of the pixels' own noise, had told it to WIDEST.
+    noise = float(S.diagonal().sum() / H.diagonal().sum().clamp(min=1e-300))
+    inverse = torch.linalg.pinv(H + noise / WIDEST**2 * torch.eye(len(H), dtype=torch.float64), hermitian=True)
+    known = S + noise**2 / WIDEST**2 * torch.eye(len(H), dtype=torch.float64)
+    covariance = inverse @ known @ inverse
+    covariance = covariance * unit * unit[:, None]
+    degrees: dict[str, float] = {}
+    axes: dict[str, Tensor] = {}
+    for joint, place in places_of(tensors, joints).items():
+        size, ways = torch.linalg.eigh(covariance[place, place])
+        degrees[joint] = math.degrees(math.sqrt(max(float(size[-1]), 0.0)))
+        if len(size) == 3:
+            axes[joint] = ways[:, -1] * float(ways[ways[:, -1].abs().argmax(), -1].sign())
+    return JointUncertainty(covariance, degrees, axes)

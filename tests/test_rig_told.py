@@ -1,0 +1,102 @@
+"""What a fit of a rig says of its joints: which the pictures show, and how exactly; and light that is sought with a pose."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from test_fit_rig import arm, shown, views
+
+import edgegrad as eg
+from edgegrad.fit import Options, Parameter, fit_rig
+from edgegrad.fit.descent.objective import Objective
+from edgegrad.fit.rig.shown import explained_by_joint
+from edgegrad.fit.rig.uncertainty import uncertainty_of
+from edgegrad.fit.views import views_of
+
+F64 = torch.float64
+TRUTH = torch.tensor([[0.0, 0.0, 0.2], [0.2, 0.0, 0.4], [0.0, 0.0, 0.3]], dtype=F64)
+
+
+def objective(rig: eg.Rig, cameras: list[eg.Camera], **pictures: list[torch.Tensor]) -> Objective:
+    def build(values: dict[str, torch.Tensor]) -> tuple[eg.Scene, list[eg.Camera]]:
+        return eg.Scene([rig.posed(values["rotations"])]), cameras
+
+    return Objective(build, views_of(cameras, pictures.get("images"), pictures.get("masks"), None), Options(spp=64))
+
+
+def test_a_hand_in_a_wrong_place_is_told() -> None:
+    rig, cameras = arm(3), views(48, 2)
+    judged = objective(rig, cameras, masks=shown(rig.posed(TRUTH), cameras))
+    names = {"rotations": rig.joints.names}
+    wrong = TRUTH.clone()
+    wrong[2, 2] = -1.0
+    right, off = (explained_by_joint(judged, {"rotations": pose}, names) for pose in (TRUTH, wrong))
+    assert min(right.values()) > 0.95
+    assert off["bone 2"] < 0.5 < 0.6 < off["bone 0"] and off["bone 2"] < off["bone 1"] < off["bone 0"]
+
+
+def test_uncertainty_is_that_of_noise() -> None:
+    """Of pictures with noise of a known deviation σ, the covariance is σ² (JᵀJ)⁻¹, with J of a derivative of its own."""
+    rig, cameras, sigma = arm(2, colored=True), views(32, 2), 0.1
+    truth = TRUTH[:2]
+    g = torch.Generator().manual_seed(2)
+    clean = shown(rig.posed(truth), cameras, "image")
+    judged = objective(rig, cameras, images=[p + sigma * torch.randn(p.shape, generator=g) for p in clean])
+    found = uncertainty_of(judged, {"rotations": truth}, {"rotations": 0.03}, {"rotations": rig.joints.names})
+    JTJ = torch.zeros(6, 6, dtype=F64)
+    mesh = rig.posed(truth)
+    tangents = (
+        torch.autograd.functional.jacobian(lambda x: rig.posed(x).verts, truth).movedim((2, 3), (0, 1)).flatten(0, 1)
+    )
+    for camera in cameras:
+        _, J = eg.jvp(mesh, camera, {mesh.verts: tangents.float()}, 64, 77, aovs=["image"])
+        rows = J["image"].reshape(6, -1).double()
+        JTJ += rows @ rows.T
+    expected = (sigma**2 * torch.linalg.inv(JTJ)).diagonal().sqrt()
+    ratio = found.covariance.diagonal().sqrt() / expected
+    assert float(ratio.min()) > 0.8 and float(ratio.max()) < 1.25
+
+
+def test_what_no_picture_shows_is_unknown() -> None:
+    """A joint of a limb that lies out of sight."""
+    rig, cameras = arm(2), views(32, 1)
+    camera = cameras[0].replace(world_to_camera=cameras[0].world_to_camera.clone())
+    camera.world_to_camera[1, 3] += 2.2  # of the upper limb hardly anything is seen
+    fit = fit_rig(
+        rig,
+        camera,
+        masks=shown(rig.posed(), [camera]),
+        seek=["rotations"],
+        tries=0,
+        coarsest=32,
+        steps=3,
+        progress=False,
+    )
+    assert fit.uncertainty is not None and fit.uncertainty.degrees["bone 1"] > 5.0
+    assert "bone 1 known to ±" in fit.uncertainty.unknown
+
+
+def test_light_is_sought_with_the_pose() -> None:
+    rig, cameras = arm(2, colored=True), views(32, 2)
+
+    def lit(posed: eg.Mesh, light: torch.Tensor) -> eg.Scene:
+        normals = eg.vertex_normals(posed.verts, posed.faces)
+        mesh = posed.replace(colors=None, normals=normals, material=eg.Material(base_color=posed.colors))
+        return eg.Scene(mesh, lights=[eg.SphericalHarmonics(light.to(posed.verts))])
+
+    light = torch.zeros(9, 1, dtype=F64)
+    light[:4, 0] = torch.tensor([4.0, 0.8, -0.5, 0.6])
+    truth = TRUTH[:2]
+    pictures = [eg.render(lit(rig.posed(truth), light), camera, 64, 9) for camera in cameras]
+    start = torch.zeros_like(light)
+    start[0] = 2.0
+    told = {"look": lit, "seek": ["rotations"], "tries": 0, "coarsest": 32, "steps": 12, "progress": False}
+    found = fit_rig(rig, cameras, pictures, parameters={"light": Parameter(0.2, start)}, **told)
+    assert math.degrees(float((found.values["rotations"] - truth).norm(dim=1).max())) < 5.0
+    assert torch.allclose(found.fit.values["light"][:4], light[:4], atol=0.3) and "light" not in found.values
+    with pytest.raises(ValueError, match="parameters: expected names that the rig does not have, got 'rotations'"):
+        fit_rig(rig, cameras, pictures, parameters={"rotations": Parameter(0.2, start)}, **told)
+    with pytest.raises(TypeError, match=r"parameters\['light'\]: expected a Parameter, got float"):
+        fit_rig(rig, cameras, pictures, parameters={"light": 0.2}, **told)
