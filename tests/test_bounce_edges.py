@@ -13,6 +13,7 @@ from torch import Tensor
 
 import edgegrad as eg
 from edgegrad import shader
+from edgegrad.light import bounce_edges, in_kernel
 
 F64 = torch.float64
 LOOKS: dict[str, dict[str, Any]] = {
@@ -25,7 +26,7 @@ LOOKS: dict[str, dict[str, Any]] = {
 @pytest.fixture
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Gradients are those of these borders alone."""
-    for term in ("_interior", "_boundary", "_shadows", "_unseen_shadows"):
+    for term in ("_interior", "_boundary", "_shadows"):
         monkeypatch.setattr(shader._Image, term, lambda *_: [])
 
 
@@ -84,6 +85,25 @@ def test_strip_between_two_faces(looks: tuple[str, str]) -> None:
 )
 def test_strip_between_mirrors(looks: tuple[str, str]) -> None:
     check_strip(Strip.standard(), looks, 4_000_000, finer=(4, 3))
+
+
+@pytest.mark.usefixtures("alone")
+@pytest.mark.parametrize("looks", [("lambert", "lambert"), ("glossy", "lambert")], ids="-".join)
+def test_light_that_is_followed_to_the_camera(looks: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """From ends of lines that could be out of sight, light goes on to the camera; without any step in between, the same border is
+    found that the camera sees."""
+    follow, passed_on = in_kernel.towards_camera, bounce_edges._passed_on
+    monkeypatch.setattr(in_kernel, "towards_camera", lambda frame, arrivals, _: follow(frame, arrivals, (0, 0)))
+    monkeypatch.setattr(
+        bounce_edges, "_seen", lambda frame, options: passed_on(frame, options._replace(bounces=3), further=1)
+    )
+    exact, weights = leaves_of(Strip.standard()), weights_of(Strip.standard())
+    value = border(exact, LOOKS[looks[0]], LOOKS[looks[1]], weights)
+    found = gradients(Strip.standard(), looks, weights, 400_000)
+    for name, tensor in {"strip": exact.strip, "sender": exact.sender}.items():
+        (b,) = torch.autograd.grad(value, tensor, retain_graph=True)
+        ratio = float((found[name] * b).sum() / (b * b).sum())
+        assert abs(ratio - 1) < MOST[name], (name, ratio)
 
 
 @pytest.mark.usefixtures("alone")
