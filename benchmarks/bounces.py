@@ -17,57 +17,63 @@ import edgegrad as eg
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 
 from mitsuba_rooms import MitsubaRoom
-from room_scenes import box_room, towards_room, vector
+from room_scenes import ROOMS, box_room, towards_room, vector, without_alpha
 
 SIZE, SPP = 64, 64
-MUST: dict[tuple[str, int], float] = {("lamp", 2): 1.0, ("point", 2): 1.0, ("sky", 2): 1.0}
+SAMPLERS = {"independent": {"must": 1.0, "aim": 0.5}, "multijitter": {}}  # Mitsuba's default, and its best one
 
 
 def bounces(bench: Bench) -> list[Row]:
-    return [*gradients(bench), *(row for lights in ("lamp", "point", "sky") for row in images(bench, lights))]
+    return [*gradients(bench), *(row for room in ROOMS for row in images(bench, room))]
 
 
 def gradients(bench: Bench) -> list[Row]:
-    """By the colour of a wall, at default samples."""
-    color = vector(0.7, 0.15, 0.1).requires_grad_()
-    room = box_room()
-    wall = room.meshes[2].replace(material=eg.Material(color))
-    scene = room.replace(meshes=[*room.meshes[:2], wall, *room.meshes[3:]])
-    ratios = []
-    for seed in range(bench.repeats(8)):
-        begin = time.process_time()
-        image = eg.render(scene, towards_room(2 * SIZE), seed=seed, bounces=2)
-        middle = time.process_time()
-        image.mean().backward()
-        ratios.append((time.process_time() - middle) / (middle - begin))
-    return [median_row("2 bounces: backward pass over image, by the colour of a wall", ratios, must=1.5, aim=1.0)]
-
-
-def images(bench: Bench, lights: str) -> list[Row]:
-    scene, camera = box_room(lights), towards_room(SIZE)
+    """By the colour of a wall and by all vertices, at default samples."""
     rows = []
-    seeds = iter(range(1 << 20))
-    for count in (2, 4):
-        try:
-            peer = MitsubaRoom(scene, camera, count)
-        except ImportError as error:
-            raise Skipped(f"{error}; pip install mitsuba") from error
-
-        def own(count: int = count) -> Tensor:
+    for what in ("the colour of a wall", "the block's vertices"):
+        room = box_room()
+        leaf = vector(0.7, 0.15, 0.1) if what.startswith("the colour") else room.meshes[4].verts.clone()
+        leaf.requires_grad_()
+        meshes = list(room.meshes)
+        if what.startswith("the colour"):
+            meshes[2] = meshes[2].replace(material=eg.Material(leaf))
+        else:
+            meshes[4] = meshes[4].replace(verts=leaf)
+        scene, ratios = room.replace(meshes=meshes), []
+        for seed in range(bench.repeats(8)):
+            begin = time.process_time()
             with torch.no_grad():
-                return eg.render(scene, camera, SPP, next(seeds), bounces=count)
+                eg.render(scene, towards_room(2 * SIZE), seed=seed, bounces=2)
+            middle = time.process_time()
+            eg.render(scene, towards_room(2 * SIZE), seed=seed, bounces=2).mean().backward()
+            # What a gradient adds, in the forward pass as well.
+            ratios.append((time.process_time() - middle) / (middle - begin) - 1)
+        rows.append(median_row(f"2 bounces: gradient over image, by {what}", ratios, must=1.5, aim=1.0))
+    return rows
 
-        def theirs(peer: MitsubaRoom = peer) -> Tensor:
-            return peer.render(SPP, next(seeds))
 
-        found = bench.interleaved(8, _timed(own), _timed(theirs))
-        noise = [float(torch.stack([image for image, _ in side]).double().var(0).mean()) ** 0.5 for side in found]
-        seconds = [statistics.median(taken for _, taken in side) for side in found]
-        at_equal_time = noise[0] / noise[1] * (seconds[0] / seconds[1]) ** 0.5
-        note = f"noise {noise[0]:.4f} and {noise[1]:.4f}, processor time {seconds[0]:.3f} s and {seconds[1]:.3f} s"
-        what = f"room, {lights}, {count} bounces: noise at equal time over Mitsuba's"
-        aim = 0.5 if (lights, count) in MUST else None
-        rows.append(Row(what, at_equal_time, must=MUST.get((lights, count)), aim=aim, note=note))
+def images(bench: Bench, room: str) -> list[Row]:
+    scene, camera, seeds = ROOMS[room](), towards_room(SIZE), iter(range(1 << 20))
+    try:
+        peers = [MitsubaRoom(without_alpha(room), camera, 2, sampler) for sampler in SAMPLERS]
+    except (ImportError, RuntimeError) as error:
+        raise Skipped(f"{error}") from error
+
+    def own() -> Tensor:
+        with torch.no_grad():
+            return eg.render(scene, camera, SPP, next(seeds), bounces=2)
+
+    for warm in (own, *(lambda peer=peer: peer.render(SPP, 0) for peer in peers)):
+        warm()
+    found = bench.interleaved(8, _timed(own), *(_timed(lambda p=peer: p.render(SPP, next(seeds))) for peer in peers))
+    noise = [float(torch.stack([image for image, _ in side]).double().var(0).mean()) ** 0.5 for side in found]
+    seconds = [statistics.median(taken for _, taken in side) for side in found]
+    rows = []
+    for k, (sampler, wanted) in enumerate(SAMPLERS.items(), 1):
+        at_equal_time = noise[0] / noise[k] * (seconds[0] / seconds[k]) ** 0.5
+        note = f"noise {noise[0]:.4f} and {noise[k]:.4f}, processor time {seconds[0]:.3f} s and {seconds[k]:.3f} s"
+        what = f"{room}, 2 bounces: noise at equal time over Mitsuba's with {sampler}"
+        rows.append(Row(what, at_equal_time, note=note, **wanted))
     return rows
 
 

@@ -15,6 +15,7 @@ from table import Bench, Row, milliseconds, quartiles, seconds_of
 from torch import Tensor
 
 import edgegrad as eg
+from edgegrad.report.error_time import mitsuba
 from edgegrad.report.scenes import sphere
 
 SIZE = 96
@@ -53,7 +54,8 @@ class MitsubaImages:
         to_world = turn().look_at([0, 0.3, 3.2], [0, 0, 0], [0, 1, 0])
         film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
         metal = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": roughness**2}
-        sky_ = {"type": "envmap", "bitmap": mi.Bitmap(sky(kind).numpy()), "to_world": turn().rotate([0, 1, 0], 180)}
+        image = mi.Bitmap(mitsuba.sky_image(sky(kind)).numpy())
+        sky_ = {"type": "envmap", "bitmap": image, "to_world": turn().rotate([0, 1, 0], 180)}
         sensor = {"type": "perspective", "fov": 40, "fov_axis": "y", "to_world": to_world, "film": film}
         parts = {
             "integrator": {"type": "direct"},

@@ -147,8 +147,9 @@ class MitsubaGradients:
         shape["vertex_normals"] = mi.Float(mesh.normals.numpy().ravel())
         shape["faces"] = mi.UInt32(mesh.faces.numpy().astype(np.uint32).ravel())
         shape.update()
-        radiance = mi.Bitmap(light.radiance.numpy())
-        sky_ = {"type": "envmap", "bitmap": radiance, "to_world": turn().rotate([0, 1, 0], 180)}
+        self.radiance = light.radiance
+        bitmap = mi.Bitmap(mitsuba.sky_image(light.radiance).numpy())
+        sky_ = {"type": "envmap", "bitmap": bitmap, "to_world": turn().rotate([0, 1, 0], 180)}
         self.scene = mi.load_dict({"type": "scene", "sensor": sensor, "sky": sky_, "ball": ball})
         self.integrators = {name: mi.load_dict({"type": name, "max_depth": 2}) for name in ("prb", "prb_projective")}
         self.params = mi.traverse(self.scene)
@@ -175,12 +176,14 @@ class MitsubaGradients:
         self.params[key] = type(given)(self.values[name])
         if name in ("normals", "translation"):
             return found.reshape(-1, 3).sum(0)
-        if name == "texels":  # the last column is the first one again
-            data = torch.from_numpy(np.array(self.values[name])).double()
-            shared = (found * data)[..., :3]
-            shared[:, 0] += shared[:, 128:].sum(1)
-            return shared[:, :128].reshape(8, 8, 16, 8, 3).sum((1, 3)).flatten()
-        return found.flatten()
+        return self.by_blocks(found[..., :3]) if name == "texels" else found.flatten()
+
+    def by_blocks(self, by_data: Tensor) -> Tensor:
+        """What is by texels of Mitsuba's image of the sky, whose last column is the first one again, by factors of ours."""
+        factor = torch.ones((8, 16, 3), dtype=torch.float64, requires_grad=True)
+        image = mitsuba.sky_image(self.radiance * factor.repeat_interleave(8, 0).repeat_interleave(8, 1))
+        data = torch.cat([image, image[:, : by_data.shape[1] - image.shape[1]]], 1)
+        return torch.autograd.grad((data * by_data).sum(), factor)[0].flatten()
 
 
 def beside_mitsuba(bench: Bench, kind: str, roughness: float, camera: eg.Camera) -> list[Row]:

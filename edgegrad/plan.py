@@ -101,7 +101,7 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
     lighting = Lighting.of(**{name: shading[name] for name in LIGHTING if name in shading})
     if scene.is_shaded:
         if lighting.bounces > 1:
-            check_bounces(scene, camera, request, lighting.bounces)
+            check_bounces(scene, camera, request)
         return Plan(_lit_terms(scene, request, shading.get("creases", "auto"), lighting))
     wanted = required(request)
     return Plan({**_image_terms(scene, request, bool(wanted)), **_gradient_terms(request, wanted)})

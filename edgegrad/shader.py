@@ -26,17 +26,17 @@ from .check import all_finite, values_visible
 from .kernel.counts import Watch
 from .kernel.derivatives import differentiates, moves, transformed
 from .kernel.request import Request, derived_seed
-from .library import core
 from .points.background import environments
 from .points.blend import Blended, let_through, panes
 from .points.borders import Borders
 from .points.frame import Frame
 from .points.hits import Hits
-from .points.records import CurveRecords, PixelRecords, RayRecords, shaded_room, without_colors
+from .points.records import PixelRecords, shaded_room, without_colors
 from .points.samples import EdgeSamples, SurfaceSamples
 from .points.shadows import ShadowLight
 from .points.splat import Term, boundary
-from .points.steps import UNEQUAL, Crossings, Points, Steps, find_crossings
+from .points.step_terms import StepTerms
+from .points.steps import UNEQUAL
 from .points.surfaces import every_face
 from .scene.mesh_light import MeshLight
 from .scene.scene import Scene
@@ -71,10 +71,8 @@ class Effort(NamedTuple):
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
-    # What samples on the borders of what surfaces see of one another give to the image, by light that is scattered between them.
-    bounce_edges: Callable[[Frame], list[Term]] | None = None
-    # What samples on borders of a light's shadows on surfaces give to the image, by light that these surfaces pass on.
-    passed_on: Callable[[Frame, ShadowLight, CurveRecords], list[Term]] | None = None
+    # What samples on the borders of light that surfaces scatter to one another give to the image.
+    indirect: Callable[[Frame, Watch], list[Term]] | None = None
     watch: Watch = Watch()  # is told what it takes
 
     @property
@@ -164,16 +162,13 @@ class _Image:
                 terms += self._boundary(EdgeSamples(frame, curves))
         if visibility and self._kinds:
             with watch.part("steps"):
-                terms += self._steps()
+                declare = self._effort.steps or self._shade
+                terms += StepTerms(frame, self._kinds, self._shade, declare, AT_ONCE).found(watch)
         if visibility:
             with watch.part("shadows"):
                 terms += self._shadows()
-            if self._effort.passed_on is not None:
-                with watch.part("unseen shadows"):
-                    terms += self._unseen_shadows(self._effort.passed_on)
-        if moving and self._effort.bounce_edges is not None:
-            with watch.part("bounce edges"):
-                terms += self._effort.bounce_edges(frame)
+            if self._effort.indirect is not None:
+                terms += self._effort.indirect(frame, watch)
         return frame.attached(image, terms)
 
     # -- the image -----------------------------------------------------------------------------------------------------
@@ -277,24 +272,6 @@ class _Image:
                     terms += self._boundary(EdgeSamples(frame, records, light, one))
         return terms
 
-    def _unseen_shadows(self, passed_on: Callable[[Frame, ShadowLight, CurveRecords], list[Term]]) -> list[Term]:
-        """The same of borders of shadows, seen or not, by the light that surfaces pass on. They stay as the camera moves."""
-        frame = self._frame
-        terms: list[Term] = []
-        request, flat = frame.request, frame.surfaces.casters
-        count = request.gradient.edge_samples
-        if count < 0:
-            count = core.most_shadow_samples(frame.width, frame.height, request.image.spp)
-        moving = moves(frame.surfaces.verts) or (bool(len(flat.cut_outs)) and moves(flat.alphas, flat.uvs))
-        for index, casting in enumerate(frame.surfaces.scene.casting):
-            if moving or ShadowLight.moves(casting):
-                seed = derived_seed(frame.sampler.grad_seed, index + 2)
-                light = ShadowLight.of(frame.surfaces, index, seed)
-                records = frame.sampler.shadow_samples(light.parts, seed, count, False, one=True, seen=False)
-                self._effort.watch.count("unseen_shadow_samples", len(records.x))
-                terms += passed_on(frame, light, records)
-        return terms
-
     def _boundary(self, samples: EdgeSamples) -> list[Term]:
         """Σ k(x − c) ΔL v over samples on curves, with the curve's velocity v, whose value is zero."""
         at_once = self._effort.at_once
@@ -310,97 +287,6 @@ class _Image:
                 through = let_through(self._frame, samples._records)
                 jump, to_background = through[:, None].to(jump) * jump, through * to_background
         return boundary(samples.x, samples.velocity, jump, to_background, self._background)
-
-    def _steps(self) -> list[Term]:
-        """Σ k(x − c) [L₊ − L₋] δs / |∇ₓs| · weight over where lines cross steps s = 0 of the shader."""
-        frame = self._frame
-        found = self._crossings()
-        self._effort.watch.count("step_samples", len(found.x))
-        rays = frame.rays_at(found.x)
-        seed = frame.seeds("steps", len(found.x))
-        step = frame.here(found.step)[:, None]
-        gradient = torch.cat([self._by_place(found, rays, part) for part in _parts(found)])
-        with torch.no_grad():
-            jumps = []
-            for part in _parts(found):
-                sides = [
-                    self._shade(
-                        frame.fixed_hits(
-                            found.face[part], found.b[part], found.x[part], seed[part], Steps(states[part])
-                        )
-                    )
-                    for states in (found.before, found.after)
-                ]
-                jumps.append((sides[1] - sides[0]).detach())
-            jump = torch.cat(jumps) * torch.where(frame.here(found.rises), 1.0, -1.0).to(frame.dtype)[:, None]
-            # |n_x| / |∇s|, and none where s has no direction.
-            length = gradient.norm(dim=1)
-            across = gradient.gather(1, frame.here(found.axis)[:, None])[:, 0].abs()
-            weight = frame.here(found.weight) * torch.where(length > 0, across / length**2, 0.0)
-            weight = torch.nan_to_num(weight, nan=0.0, posinf=0.0)
-        values = []
-        for part in _parts(found):
-
-            def of_scene(part: slice = part) -> Tensor:
-                here = RayRecords(*(field[part] for field in rays))
-                hits = frame.moving_hits(found.face[part], here, found.x[part])
-                return self._step_values(hits).gather(1, step[part])[:, 0]
-
-            many = len(found.x) > AT_ONCE and not transformed()
-            s = checkpoint(of_scene, use_reentrant=False) if many else of_scene()
-            assert isinstance(s, Tensor)
-            values.append(s)
-        s = torch.cat(values)
-        return boundary(found.x, weight * (s - s.detach()), jump, None, None)
-
-    def _crossings(self) -> Crossings:
-        frame, options = self._frame, self._frame.request.gradient
-        kinds = self._kinds or []
-
-        def at(x: Tensor) -> Points:
-            places = [frame.sampler.hits_at(x[k : k + AT_ONCE]) for k in range(0, max(len(x), 1), AT_ONCE)]
-            face, part, b = (torch.cat(field) for field in zip(*places, strict=True))
-            values = torch.full((len(x), len(kinds)), torch.nan, dtype=torch.float64)
-            there = (face >= 0).nonzero()[:, 0]
-            for some in there.split(AT_ONCE):
-                found = self._step_values(frame.fixed_hits(face[some], b[some], x[some])).detach()
-                if not values_visible(found):
-                    raise RuntimeError(
-                        "torch.vmap: expected declared steps that are the same for all of a batch, for where they lie is "
-                        "looked for once; render one by one where s of hits.where() or t of hits.floor() differs"
-                    )
-                values[some] = found.cpu()
-            return Points(x, face, part, b, values)
-
-        with torch.no_grad():
-            margin = {"box": 0.0, "tent": 0.5, "gaussian": 1.0}[frame.request.image.filter]
-            size = frame.height, frame.width
-            return find_crossings(at, kinds, size, margin, options.step_spacing, frame.sampler.grad_seed)
-
-    def _by_place(self, found: Crossings, rays: RayRecords, part: slice) -> Tensor:
-        """(M, 2): ∇ₓs of each crossing's step, without derivatives of its own."""
-        frame = self._frame
-        step = frame.here(found.step[part])[:, None]
-        face, along, by_x = (frame.here(t[part]) for t in (found.face, rays.along, rays.along_by_x))
-
-        here, b_by_x = frame.fixed_view.barycentrics_by(frame.fixed, face, along, by_x)
-
-        def sum_of_steps(x: Tensor) -> Tensor:
-            b = here + (b_by_x * x[:, None]).sum(-1)
-            hits = Hits(frame.fixed, frame.fixed_view, face, b, frame.here(found.x[part]) + x, frame.sampler.rays_at)
-            return self._step_values(hits).gather(1, step).sum()
-
-        zero = along.new_zeros((len(along), 2))
-        if transformed():
-            return torch.func.grad(sum_of_steps)(zero).detach()
-        with torch.enable_grad():
-            zero.requires_grad_()
-            return torch.autograd.grad(sum_of_steps(zero), zero, materialize_grads=True)[0].detach()
-
-    def _step_values(self, hits: Hits) -> Tensor:
-        """(N, K) the functions of all steps."""
-        (self._effort.steps or self._shade)(hits)
-        return torch.stack([values.double() for values in hits._steps.values], 1)
 
     def _with_creases(self) -> Request:
         """The request with colours that jump where the shader may."""
@@ -462,10 +348,6 @@ class _Image:
                 f"{name}: expected finite numbers, got {radiance.detach()[row].tolist()} at one of {count} hits; look for {hint}"
             )
         return radiance.to(self._frame.dtype)
-
-
-def _parts(found: Crossings) -> list[slice]:
-    return [slice(first, first + AT_ONCE) for first in range(0, max(len(found.x), 1), AT_ONCE)]
 
 
 def _warn_of_lamps(frame: Frame) -> None:

@@ -1,8 +1,8 @@
 """A strip between two faces, of which one is lit and the other sees it: how the border of what is seen moves, without samples.
 
 The image is ∫ k(x − c) ∫ h(y₁, y₂) V dα dβ dx, with y₁ on the face that is seen at x, and y₂ at the barycentrics α, β of the face
-that sends light. What the strip hides of that face from y₁ is the projection of its triangles, which are triangles in α, β too.
-So what the border alone changes is the derivative of −∫ h over these triangles, whose corners move, with the integrand as it is.
+that sends light. What the strip hides of that face from y₁ is the projection of its two triangles, four-sided in α, β too. So
+what the border alone changes is −∮ h (v × ds) around that (Reynolds), with its sides' velocity v and the integrand as it is.
 """
 
 from __future__ import annotations
@@ -60,41 +60,37 @@ class Strip(NamedTuple):
         }  # fmt: skip
 
 
-def border(moving: Strip, receiver: dict[str, Any], sender: dict[str, Any], weights: Tensor, finer: int = 1) -> Tensor:
-    """Σ weights · image, but for a constant, of which only the border depends on the tensors of `moving`. `finer`: how many times
-    as many points of quadrature on each axis."""
+def border(
+    moving: Strip, receiver: dict[str, Any], sender: dict[str, Any], weights: Tensor, finer: tuple[int, int] = (1, 1)
+) -> Tensor:
+    """Zero, with the derivative of Σ weights · image by the tensors of `moving`, as far as it is that of the border. `finer`: how
+    many times as many points of quadrature there are on each axis of a pixel, and along the border."""
     still = Strip(
         moving.receiver.detach(), moving.sender.detach(), moving.strip.detach(), moving.camera.detach(), moving.light
     )
-    pixel, x = _pixels(moving.camera.size, 3 * finer)
+    pixel, x = _pixels(moving.camera.size, 3 * finer[0])
     y, y_still = _seen(moving, x), _seen(still, x)
-    total = weights.new_zeros(())
-    for corners in ((0, 1, 2), (0, 2, 3)):
-        # (N, 3, 2): the last two barycentrics of the sender behind the corners.
-        shadow = torch.stack([_behind(moving, y, moving.strip[k]) for k in corners], 1)
-        e1, e2 = shadow[:, 1] - shadow[:, 0], shadow[:, 2] - shadow[:, 0]
-        area = (e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]).abs()
-        for b, weight in _triangle(6 * finer):
-            place = (b[:, None] * shadow).sum(1)
-            h = _integrand(still, y_still, place, receiver, sender)
-            total = total - weight * ((weights.reshape(-1, 3)[pixel] * h).sum(1) * area).sum()
-    return total / len(x) * len(weights.reshape(-1, 3))
+    # (N, 4, 2): the last two barycentrics of the sender behind the corners, around which they run.
+    shadow = torch.stack([_behind(moving, y, corner) for corner in moving.strip], 1)
+    own = weights.reshape(-1, 3)[pixel] / len(x) * len(weights.reshape(-1, 3))
+    total, around = weights.new_zeros(()), torch.zeros_like(x[:, 0])
+    for k in range(4):
+        a, b = shadow[:, k], shadow[:, (k + 1) % 4]
+        along = (b - a).detach()
+        around = around + (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).detach()
+        for s, weight in zip(*_gauss(12 * finer[1]), strict=True):
+            place = (1 - s) * a + s * b
+            h = (own * _integrand(still, y_still, place.detach(), receiver, sender)).sum(1)
+            moved = place - place.detach()
+            total = total + weight * h @ (along[:, 0] * moved[:, 1] - along[:, 1] * moved[:, 0])
+    assert bool((around > 0).all()) or bool((around < 0).all())
+    return total * torch.sign(around[0])
 
 
 def _gauss(n: int) -> tuple[Tensor, Tensor]:
     """Points in [0, 1], and weights."""
     x, w = np.polynomial.legendre.leggauss(n)
     return torch.from_numpy((x + 1) / 2), torch.from_numpy(w / 2)
-
-
-def _triangle(n: int) -> list[tuple[Tensor, float]]:
-    """Barycentrics and weights, for integrals by twice the area."""
-    x, w = _gauss(n)
-    return [
-        (torch.stack([1 - x[i], x[i] * (1 - x[j]), x[i] * x[j]]), float(w[i] * w[j] * x[i]))
-        for i in range(n)
-        for j in range(n)
-    ]
 
 
 def _pixels(size: tuple[int, int], n: int) -> tuple[Tensor, Tensor]:

@@ -8,14 +8,6 @@ import pytest
 from bounce_scenes import case_of, indirect_change, indirect_gradient
 from finite_differences import right_ratio
 
-from edgegrad.light import radiance
-
-
-@pytest.fixture
-def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets render() differentiate what moves borders by more than two bounces, too, of which not all are there yet."""
-    monkeypatch.setattr(radiance, "check_bounces", lambda *_: None)
-
 
 def check(scene: str, motion: str, spp: int, seeds: int, h: float = 0.1, bounces: int = 2, **samples: Any) -> None:
     case = case_of(scene, motion)
@@ -31,7 +23,6 @@ def test_paths_that_no_border_crosses() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("allowed")
 @pytest.mark.parametrize("bounces", [2, 3])
 @pytest.mark.parametrize("motion", ["right vertex", "left y", "lamp y"])
 def test_all_motions_of_paths_that_no_border_crosses(motion: str, bounces: int) -> None:

@@ -107,14 +107,19 @@ def photograph(view, meshes, seed=0):
     return srgb_to_linear(torch.from_numpy(np.array(Image.open(file))).float() / 255)
 
 
-def labels_of(view, meshes):
-    """(H, W) of integers."""
+def shares_of(view, meshes, spp=32):
+    """(H, W, n), of each pixel what each mesh covers."""
     colours = torch.eye(len(meshes))
     painted = [
         eg.Mesh(mesh.verts, mesh.faces, colors=colour.expand(len(mesh.verts), -1))
         for mesh, colour in zip(meshes, colours, strict=True)
     ]
-    shares = eg.render(eg.Scene(painted), view, 32)
+    return eg.render(eg.Scene(painted), view, spp)
+
+
+def labels_of(view, meshes):
+    """(H, W) of integers."""
+    shares = shares_of(view, meshes)
     return torch.where(shares.sum(-1) > 0.5, shares.argmax(-1) + 1, 0)
 
 
@@ -183,7 +188,11 @@ def depth_of(view, count):
     ("kind", "degrees", "percent"),
     [
         ("colours", 2.5, 1.0),
-        pytest.param("labels", 2.3, 1.3, marks=pytest.mark.slow),
+        pytest.param("colours and other poses", 2.5, 1.0, marks=pytest.mark.slow),
+        # Labels tell of a pixel on a contour which half of it is covered. With 40 % hidden, that leaves the distance known to
+        # ±2.3 %; shares of pixels leave next to nothing.
+        pytest.param("labels", 2.3, 1.8, marks=pytest.mark.slow),
+        pytest.param("shares", 0.2, 0.2, marks=pytest.mark.slow),
         ("depth", 0.2, 0.1),
         pytest.param("plain", 2.5, 1.4, marks=pytest.mark.slow),
     ],
@@ -191,9 +200,11 @@ def depth_of(view, count):
 def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
     """40 % of the first one are covered; the starts are 10° and 5 % off."""
     view, image = two
-    given = {}
+    given = {"search": False} if kind == "colours" else {}
     if kind == "labels":
         given = {"mask": labels_of(view, scene_of(2))}
+    if kind == "shares":
+        given = {"mask": list(shares_of(view, scene_of(2), 256).unbind(-1))}
     if kind == "depth":
         given = {"depth": depth_of(view, 2)}
     meshes = [mesh.replace(face_colors=None) for mesh in MESHES[:2]] if kind == "plain" else MESHES[:2]
@@ -201,7 +212,11 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
     for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=False):
         off = errors(fit, mesh, truth)
         assert off[0] < degrees and off[1] < percent, (kind, off, fit.explained)
-        assert fit.converged and fit.reason == "converged", (kind, off, fit.explained)
+        known = fit.uncertainty.degrees
+        if kind == "plain" and known > 2.0:  # the contour of the covered one tells its turn to about as much
+            assert fit.reason.startswith("directions unknown: ") and off[0] < known < 2.5, (off, known)
+        else:
+            assert fit.converged and fit.reason == "converged", (kind, off, fit.explained)
     assert 0.5 < fits[0].visible < 0.7 and fits[1].visible > 0.98
 
 
@@ -382,7 +397,8 @@ def test_two_meshes_that_end_in_one_place_have_not_converged():
     view = view_of(96)
     beside_it = beside(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.1), (0.3, 0.2, 0.2))
     image = photograph(view, scene_of(1), seed=4)
-    fits = fit_poses([MESHES[0]] * 2, image, view, init=[STARTS[0], beside_it], spp=8, progress=False)
+    starts = [STARTS[0], beside_it]
+    fits = fit_poses([MESHES[0]] * 2, image, view, init=starts, spp=8, search=False, progress=False)
     for k, fit in enumerate(fits):
         assert not fit.converged and fit.reason.startswith(f"in one place: meshes[{k}] ends where")
 

@@ -13,9 +13,9 @@ from test_fit_photo import clutter, photograph
 import edgegrad as eg
 from edgegrad.files.image import linear_to_srgb, srgb_to_linear
 from edgegrad.fit import Parameter, Pose, PoseParameter, fit_scene, fit_shape, fit_texture, losses
-from edgegrad.fit.descent.regions import BLUR, EVERY, Regions
+from edgegrad.fit.descent.regions import EVERY, Regions
 from edgegrad.fit.region import OUTLIERS, Palette, smoothed
-from edgegrad.fit.sides import Sides
+from edgegrad.fit.sides import BLURS, Sides
 from edgegrad.fit.views import outlined_views, views_of
 
 RADII = torch.tensor([0.55, 0.75, 0.35, 0.5])
@@ -120,6 +120,8 @@ def test_loss_and_curvature_are_those_of_the_likelihood(taken):
     regions = Regions(outlined_views(views_of(VIEW, taken)), 0)
     alpha = eg.render_aovs(vase(RADII), VIEW, ["alpha"], spp=16)["alpha"]
     regions.renew(0, alpha)
+    sharp = regions.blur  # what the picture shows
+    assert sharp in BLURS
     P, near = regions.posteriors[0].double(), regions.near[0].double() / regions.near[0].sum()
     inside, outside = (
         float(P[(alpha[..., 0] > 0.99) == side][near[(alpha[..., 0] > 0.99) == side] > 0].mean())
@@ -143,10 +145,10 @@ def test_loss_and_curvature_are_those_of_the_likelihood(taken):
         squares = off(soft).square().sum(-1)
         return near * sides.band * 0.5 * squares / (1 + squares / 12.0)
 
-    for step, blur in ((0, 3.0), (EVERY, 1.8), (5 * EVERY, BLUR)):  # the contour counts where alpha is sharp
+    for step, blur in ((0, 3.0), (EVERY, 1.8), (5 * EVERY, sharp)):  # the contour counts where alpha is sharp
         regions.renew(0, alpha, step)
         soft = smoothed(moving[None, ..., 0], blur)[0].double()
-        parts = [of_regions(soft)] + [of_contour(soft)] * (blur == BLUR)
+        parts = [of_regions(soft)] + [of_contour(soft)] * (blur == sharp)
         expected, found = sum(part.sum() for part in parts), regions.loss([0], moving[None])
         assert float(found) == pytest.approx(float(expected), rel=1e-6)
         by = [torch.autograd.grad(loss, moving, retain_graph=True)[0] for loss in (found, expected)]
@@ -154,7 +156,7 @@ def test_loss_and_curvature_are_those_of_the_likelihood(taken):
         # Fisher's information is the square of what each pixel gives, by its share of the mean.
         slope = torch.autograd.grad(parts[0].sum(), soft, retain_graph=True)[0]
         expected = torch.where(near > 0.0, slope.square() / near.clamp(min=1e-12), 0.0)
-        if blur == BLUR:  # of the contour that of a squared difference, with a weight that is held fixed
+        if blur == sharp:  # of the contour that of a squared difference, with a weight that is held fixed
             weight = (1 + off(soft).square().sum(-1) / 12.0).pow(-2) * near * sides.band
             along = (off(soft + 1e-5) - off(soft - 1e-5)) / 2e-5
             expected = expected + weight * along.square().sum(-1)

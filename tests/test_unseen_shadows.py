@@ -13,16 +13,9 @@ from room_scenes import vector
 from torch import Tensor
 
 import edgegrad as eg
-from edgegrad.light import radiance
 
 PLACE = (-3.0, 1.2, 0.2)
 FEW = {"surface_samples": 4_000, "edge_samples": 16_000}
-
-
-@pytest.fixture
-def allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets render() differentiate what moves borders by more than two bounces, too, of which not all are there yet."""
-    monkeypatch.setattr(radiance, "check_bounces", lambda *_: None)
 
 
 def bright_spot() -> Tensor:
@@ -96,7 +89,6 @@ def test_surfaces_that_move(kind: str, moved: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("allowed")
 @pytest.mark.parametrize("bounces", [3, 4])
 def test_more_bounces(bounces: int) -> None:
     check(case_of("lamp", "caster"), 1024, 8, bounces=bounces, **{name: 4 * n for name, n in FEW.items()})
@@ -125,7 +117,6 @@ def derivatives(threads: int) -> tuple[Tensor, Tensor]:
     return moved, slope
 
 
-@pytest.mark.usefixtures("allowed")
 def test_both_modes_and_any_number_of_threads() -> None:
     forward, reverse = derivatives(1)
     again = derivatives(3)

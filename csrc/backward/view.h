@@ -53,6 +53,12 @@ std::array<Vec3, 3> corners_of(const BackwardView<T>& view, int64_t face) {
     return {q[v[0]], q[v[1]], q[v[2]]};
 }
 
+// Whether the filter of a pixel reaches y, in camera coordinates, and what is there belongs to this window.
+template <class T>
+bool is_in_view(const BackwardView<T>& view, Vec3 y) {
+    return view.camera.depth_weight(y) > 0 && view.volume.outcode(y) == 0;
+}
+
 template <class T>
 uint8_t side_of(const BackwardView<T>& view, int64_t face) {
     const auto q = corners_of(view, face);

@@ -28,12 +28,6 @@ namespace {
 constexpr int64_t fewest_samples = 256, most_samples = 1 << 18;
 constexpr int64_t fewest_pilots = 1 << 10, most_pilots = 1 << 14, samples_of_pilot = 4, pilots_of_block = 1 << 8;
 
-// Whether the filter of a pixel reaches x, and what is there belongs to this window.
-template <class T>
-bool is_in_view(const BackwardView<T>& view, Vec3 y) {
-    return view.camera.depth_weight(y) > 0 && view.volume.outcode(y) == 0;
-}
-
 // What chunks of lines share.
 template <class T>
 struct LineScene {
@@ -42,14 +36,20 @@ struct LineScene {
     const LitPaths& lit;
     LitOptions at_sender;  // how often light may be scattered up to there
     PooledLines& pooled;
+    Mirrors mirrors;
     std::vector<double> means = {};  // of its cells; empty: not known yet
 
     LineScene(const BackwardView<T>& view_, const SceneView<T>& casters_, const LitPaths& lit_, PooledLines& pooled_)
-        : view(view_), casters(casters_), lit(lit_), at_sender(lit_.options), pooled(pooled_) {
+        : view(view_),
+          casters(casters_),
+          lit(lit_),
+          at_sender(lit_.options),
+          pooled(pooled_),
+          mirrors(lit_.lit, is_seen()) {
         at_sender.bounces -= 1 + lit.further;
     }
     bool is_seen() const { return lit.further == 0; }  // whether the viewer sees the ends to which light comes
-    EdgeLines<T> lines() const { return {view.scene, view.geometry.topology(), pooled, means}; }
+    EdgeLines<T> lines() const { return {view.scene, view.geometry.topology(), pooled, means, mirrors}; }
 
     // What is drawn of each edge, relative to others.
     Array<double> measure() const {
@@ -150,15 +150,21 @@ template <class T, class Body>
 class LineChunk {
    public:
     LineChunk(const LineScene<T>& scene, const Systematic& edges, uint64_t seed, Body body)
-        : edges_(edges), sequence_(seed), body_(body), edge_lines_(scene.lines()), lines_(scene.view, scene.casters) {}
+        : edges_(edges),
+          seed_(seed),
+          sequence_(seed),
+          body_(body),
+          edge_lines_(scene.lines()),
+          lines_(scene.view, scene.casters) {}
 
     // The i-th line, at a position along the edges; these ascend. The cell that it is pooled in.
     int64_t add(int64_t i, double position) {
         const int64_t k = edge_ < 0 ? edges_.primitive(position) : edges_.primitive(position, edge_);
         if (k != edge_) edge_ = k, edge_lines_.set(k);
         const double along = std::clamp((position - edges_.begin_of(k)) / edges_.measure_of(k), 0.0, 1.0);
-        const auto [t, w, area] = edge_lines_.at(along, sequence_(uint64_t(i)));
+        const auto [t, w, area] = edge_lines_.at(along, sequence_(uint64_t(i)), to_unit(hash(seed_, 1, uint64_t(i))));
         const int64_t cell = edge_lines_.cell(w);
+        if (area == 0) return cell;
         lines_.add(k, t, w, cell, edges_.weight(k) * area);
         if (lines_.is_full()) cast();
         return cell;
@@ -167,6 +173,7 @@ class LineChunk {
 
    private:
     const Systematic& edges_;
+    const uint64_t seed_;
     const ShiftedSequence sequence_;
     const Body body_;
     int64_t edge_ = -1;

@@ -5,6 +5,8 @@
 // ignores, then which surfaces the two sides show, and at last, given their radiance, adds the adjoint of the motion.
 #pragma once
 
+#include <algorithm>
+#include <cmath>
 #include <concepts>
 #include <cstdint>
 #include <limits>
@@ -29,6 +31,18 @@ struct SurfacePoint {
 struct CurveFaces {
     std::span<const int32_t> faces;
     double coordinate = 0, spacing = 0;
+
+    // Of a curve on one face, which is kept where `face` lies.
+    template <class T>
+    static CurveFaces on(const SceneView<T>& scene, const int32_t& face) {
+        const int32_t* vertex = scene.faces + 3 * int64_t(face);
+        CurveFaces out{{&face, 1}, 0, scene.spacing->of(vertex[0])};
+        for (int i = 0; i < 3; ++i)
+            for (int axis = 0; axis < 3; ++axis)
+                out.coordinate =
+                    std::max(out.coordinate, std::fabs(double(scene.verts[3 * int64_t(vertex[i]) + axis])));
+        return out;
+    }
 };
 
 struct CurveSample {

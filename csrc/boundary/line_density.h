@@ -1,7 +1,9 @@
 // How densely lines past edges are drawn: by how much light passes along them, as far as it is known.
 //
 // Edges of one connected part of a scene see alike along parallel lines, and each of many has few lines of its own. So
-// what is found of some lines is pooled: by their parts, and by cells of directions.
+// what is found of some lines is pooled: by their parts, and by cells of directions. Where there are glossy faces, some
+// lines are drawn by how these mirror (mirrored_lines.h); as all lines could come by either way, their densities are
+// mixed.
 #pragma once
 
 #include <algorithm>
@@ -11,6 +13,7 @@
 
 #include "backward/view.h"
 #include "boundary/lune.h"
+#include "boundary/mirrored_lines.h"
 #include "rays/meeting.h"
 
 namespace edgegrad {
@@ -77,8 +80,8 @@ class EdgeLines {
    public:
     // `means`: of the cells of `pooled`; empty: all are alike.
     EdgeLines(const SceneView<T>& scene, const Topology& topology, const PooledLines& pooled,
-              const std::vector<double>& means)
-        : scene_(scene), topology_(topology), pooled_(pooled), means_(means) {}
+              const std::vector<double>& means, const Mirrors& mirrors)
+        : scene_(scene), topology_(topology), pooled_(pooled), means_(means), mirrors_(mirrors) {}
 
     // How many lines of the edge are drawn, relative to others.
     double set(int64_t edge) {
@@ -87,7 +90,8 @@ class EdgeLines {
         for (const HalfEdge& h : halves) opposite_.push_back(corner(scene_, h.face, (h.corner + 2) % 3));
         const HalfEdge& h = halves[0];
         vertex_ = scene_.faces[3 * int64_t(h.face) + h.first()];
-        lune_ = {corner(scene_, h.face, h.first()), corner(scene_, h.face, h.second()), opposite_};
+        a_ = corner(scene_, h.face, h.first()), b_ = corner(scene_, h.face, h.second());
+        lune_ = {a_, b_, opposite_};
         across_ = means_.empty() ? 1 : int(std::clamp(std::ceil(lune_.width() / widest), 1.0, most_across));
         sum_.clear();
         if (means_.empty() || lune_.empty()) return lune_.measure();
@@ -103,18 +107,31 @@ class EdgeLines {
     struct Line {
         double t;     // on the edge
         Vec3 w;       // unit
-        double area;  // ∫ dt dω over what it stands for, were one line drawn of this edge
+        double area;  // ∫ dt dω over what it stands for, were one line drawn of this edge; 0: none is drawn
     };
-    // For numbers in [0, 1).
-    Line at(double along_edge, Vec2 u) const {
-        if (sum_.empty()) return line(along_edge, u, 1);
-        const double total = sum_.back(), s = along_edge * total;
-        const int64_t k =
-            std::min<int64_t>(std::upper_bound(sum_.begin(), sum_.end(), s) - sum_.begin(), int64_t(sum_.size()) - 1);
-        const double begin = k ? sum_[k - 1] : 0, own = sum_[k] - begin;
-        const Vec2 cell{double(k / across_), double(k % across_)};
-        const Vec2 there{(cell.x + u.x) / along, (cell.y + u.y) / across_};
-        return line(std::clamp((s - begin) / own, 0.0, 1.0), there, total / (own * double(sum_.size())));
+    // For numbers in [0, 1), of which the last chooses how it is drawn.
+    Line at(double along_edge, Vec2 u, double choice) {
+        double t = along_edge;
+        Vec2 there = u;
+        if (!sum_.empty()) {
+            const double s = along_edge * sum_.back();
+            const int64_t k = std::min<int64_t>(std::upper_bound(sum_.begin(), sum_.end(), s) - sum_.begin(),
+                                                int64_t(sum_.size()) - 1);
+            t = std::clamp((s - before(k)) / (sum_[k] - before(k)), 0.0, 1.0);
+            there = {(double(k / across_) + u.x) / along, (double(k % across_) + u.y) / across_};
+        }
+        Lune::Place place{lune_.direction(there.x, there.y), there.x, there.y};
+        if (mirrors_.empty() || lune_.empty()) return {t, place.w, area(place)};
+        mirrored_.set(mirrors_, (1 - t) * a_ + t * b_, lune_);
+        const double share = mirrored_.share();
+        if (choice < share) {
+            const Vec3 w = mirrored_.draw(choice / share, u);
+            place = dot(w, w) > 0 ? lune_.locate(w) : Lune::Place();
+            if (!place.is_there()) return {t, place.w, 0};
+        }
+        double density = (1 - share) / area(place);
+        if (share > 0) density += share * mirrored_.density(place.w);
+        return {t, place.w, 1 / density};
     }
     int64_t cell(Vec3 w) const { return pooled_.cell(vertex_, w); }
 
@@ -130,18 +147,26 @@ class EdgeLines {
         }();
         return angles[j];
     }
-    Line line(double t, Vec2 u, double share) const {
-        const Vec3 w = lune_.direction(u.x, u.y);
-        return {t, w, share * lune_.weight(w)};
+    double before(int64_t k) const { return k ? sum_[k - 1] : 0; }
+    // One over the density of lines that cells draw.
+    double area(const Lune::Place& place) const {
+        const double all = lune_.weight(place.w);
+        if (sum_.empty()) return all;
+        const int j = std::min(int(place.u * along), along - 1), i = std::min(int(place.v * across_), across_ - 1);
+        const int64_t k = int64_t(j) * across_ + i;
+        return all * sum_.back() / ((sum_[k] - before(k)) * double(sum_.size()));
     }
 
     const SceneView<T>& scene_;
     const Topology& topology_;
     const PooledLines& pooled_;
     const std::vector<double>& means_;
+    const Mirrors& mirrors_;
     std::vector<Vec3> opposite_;
     int32_t vertex_ = 0;
+    Vec3 a_, b_;
     Lune lune_;
+    MirroredLines mirrored_;
     int across_ = 1;
     std::vector<double> sum_;  // of the means of its cells
 };

@@ -53,6 +53,26 @@ class Lune {
         const double phi = low_ + width_ * v;
         return std::cos(theta) * e_ + std::sin(theta) * (std::cos(phi) * x_ + std::sin(phi) * y_);
     }
+    // The line along w, as at(θ, v) has it, and by which share of the polar angles' measure θ comes first; v < 0: it is
+    // none of these lines.
+    struct Place {
+        Vec3 w;
+        double u, v = -1;
+        bool is_there() const { return v >= 0; }
+    };
+    Place locate(Vec3 w) const {
+        if (!(width_ > 0)) return {};
+        for (const double sign : {1.0, -1.0}) {
+            const Vec3 l = sign * w;
+            double turned = std::atan2(dot(l, y_), dot(l, x_)) - low_;
+            turned -= 2 * M_PI * std::floor(turned / (2 * M_PI));
+            if (turned > width_) continue;
+            const double cosine = std::clamp(dot(l, e_), -1.0, 1.0), sine = length(cross(e_, l));
+            const double theta = std::atan2(sine, cosine);
+            return {l, (theta - sine * cosine) / M_PI, turned / width_};
+        }
+        return {};
+    }
     // One over that density.
     double weight(Vec3 w) const { return M_PI / 2 * width_ / length(cross(e_, w)); }
 

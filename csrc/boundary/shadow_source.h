@@ -151,12 +151,7 @@ class ShadowSource {
         if (!std::isfinite(sample.scale)) return false;
 
         sample.ignored = {&sample.receiver, 1};
-        const int32_t* vertex = view_.scene.faces + 3 * int64_t(curve.face);
-        sample.faces = {sample.ignored, 0, view_.scene.spacing->of(vertex[0])};
-        for (int i = 0; i < 3; ++i)
-            for (int axis = 0; axis < 3; ++axis)
-                sample.faces.coordinate =
-                    std::max(sample.faces.coordinate, std::fabs(view_.scene.verts[3 * int64_t(vertex[i]) + axis]));
+        sample.faces = CurveFaces::on(view_.scene, sample.receiver);
         return true;
     }
 

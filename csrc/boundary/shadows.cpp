@@ -24,12 +24,6 @@ namespace {
 
 constexpr double samples_a_pixel = 24;  // of the border of a point's shadow
 
-// Whether the filter of a pixel reaches x, and what is there belongs to this window.
-template <class T>
-bool is_in_view(const BackwardView<T>& view, Vec3 y) {
-    return view.camera.depth_weight(y) > 0 && view.volume.outcode(y) == 0;
-}
-
 // The contraction of pilots.
 template <class T>
 class Pilots {

@@ -73,12 +73,7 @@ class StepSource {
         sample.point = sample.b[0] * corner[0] + sample.b[1] * corner[1] + sample.b[2] * corner[2];
         sample.behind = {};
         sample.ignored = {&sample.face, 1};
-        sample.faces = {sample.ignored, 0, view_.scene.spacing->of(vertex_of(curve.face, 0))};
-        for (int i = 0; i < 3; ++i)
-            for (int axis = 0; axis < 3; ++axis)
-                sample.faces.coordinate =
-                    std::max(sample.faces.coordinate,
-                             std::fabs(view_.scene.verts[3 * int64_t(vertex_of(curve.face, i)) + axis]));
+        sample.faces = CurveFaces::on(view_.scene, sample.face);
         return true;
     }
 

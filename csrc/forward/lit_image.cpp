@@ -71,8 +71,12 @@ class LitRow : public RowVisitor {
         }
         const double* spread = filtered_ ? spread_.data() : nullptr;
         const LitPoints points{int64_t(n), face_.data(), b_.data(), seed_.data(), {}, spread};
-        shade_some(in_.lit, in_.scene, in_.caster, points, in_.options, *buffers_, radiance_.data(), seen_.data());
-        if (paths_) add_indirect(in_.lit, in_.scene, in_.caster, points, *paths_, radiance_.data());
+        if (paths_ && in_.options.samples == 1) {
+            shade_whole(in_.lit, in_.scene, in_.caster, points, *paths_, radiance_.data(), seen_.data());
+        } else {
+            shade_some(in_.lit, in_.scene, in_.caster, points, in_.options, *buffers_, radiance_.data(), seen_.data());
+            if (paths_) add_indirect(in_.lit, in_.scene, in_.caster, points, *paths_, radiance_.data());
+        }
         for (size_t i = 0; i < n; ++i) {
             const PixelHit& hit = hits[first + i];
             double* sum = &sums_[int64_t(hit.pixel % in_.width) * C];

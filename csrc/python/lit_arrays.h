@@ -1,4 +1,4 @@
-// Lit scenes as Python hands them over (edgegrad/light/in_kernel.py): tables, and meshes and lights that refer to them
+// Lit scenes as Python hands them over (edgegrad/light/layout.py): tables, and meshes and lights that refer to them
 // by number; kept alive, and checked.
 #pragma once
 

@@ -8,6 +8,7 @@ found by mixing those would lie on the dark side of edges, by a tenth of a pixel
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,6 +26,8 @@ PURE = 0.03  # share of the other side in a pixel of one side alone
 SUPPORT = 0.03  # of a window
 CONTRAST = 2.0  # of both sides of a contour that shows, in standard deviations
 BLUR = 0.9  # pixels, of alpha: about that of photographs at full size
+BLURS = 0.3, 0.5, 0.7, BLUR  # that of one picture; softer ones are not told from contours that are off
+TOLERANCE = 12.0  # squared differences, in variances, that are far above this hardly count (Geman and McClure 1987)
 # Share of the contour that has to show, where the contour is all that is compared; with less, less is explained. Wrong places
 # show 0.5 … 0.7 of it in clutter, right ones 0.85 and more.
 ALONE_SHOWN = 0.85
@@ -32,6 +35,7 @@ ALONE_SHOWN = 0.85
 # alone, on another object's contour up to 0.45, and mostly 0.48 … 0.9 where the object is.
 ALONE_TOLD = 0.48
 OUTLINE = 1.0, 0.8, 0.0  # linear radiance
+WHOLE = 0.1  # of the pixels along a mask's border: one in which fewer are mixed is of zeros and ones
 RIM = 0.3  # of alpha, between neighbours
 
 
@@ -47,13 +51,14 @@ class Sides:
     curved: bool = True  # colours, in sRGB values; a mask's values mix as they are
 
     @staticmethod
-    def of(image: Tensor, alpha: Tensor, near: Tensor, curved: bool = True) -> Sides:
-        """Of an image (h, w, C) in sRGB values, or a mask, which is not `curved`; `near` (h, w): what may be used of it."""
+    def of(image: Tensor, alpha: Tensor, near: Tensor, curved: bool = True, noise: float = NOISE) -> Sides:
+        """Of an image (h, w, C) in sRGB values, or a mask, which is not `curved`; `near` (h, w): what may be used of it. `noise`
+        is the standard deviation of a pixel that is mixed."""
         front, front_spread, front_count = _local(image, (alpha > 1.0 - PURE) * near)
         behind, behind_spread, behind_count = _local(image, (alpha < PURE) * near)
         known = (front_count > SUPPORT) & (behind_count > SUPPORT) & (near > 0.0)
         a = alpha[..., None]
-        variance = NOISE**2 + a.square() * front_spread + (1.0 - a).square() * behind_spread
+        variance = noise**2 + a.square() * front_spread + (1.0 - a).square() * behind_spread
         return Sides(alpha, front, behind, variance, (alpha > PURE) & (alpha < 1.0 - PURE) & known, curved)
 
     @property
@@ -97,6 +102,30 @@ def outlines_explained(parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> float:
         shown += float((on * (sides.contrast > CONTRAST) * sides.band).sum())
         pairs.append((sides.mixed, sides.mixed, image, (sides.band * near)[..., None]))
     return explained(pairs) * min(1.0, shown / length / ALONE_SHOWN) if length > 0.0 else 0.0
+
+
+def blur_losses(sides: Sides, image: Tensor, weight: Tensor, alpha: Tensor) -> Tensor:
+    """(n,): half the robust squares of the differences of an image (h, w, C) from what `sides` mix, weighted (h, w), with alpha
+    (h, w) blurred by each of BLURS: the tails of a blur show far in the values of a display, and one that is too wide puts bright
+    contours too far out."""
+    found = []
+    for blur in BLURS:
+        off = (sides.mixed_by(smoothed(alpha[None], blur)[0]) - image).square() / sides.variance
+        squares = off.sum(-1)
+        found.append(0.5 * (sides.band * weight * squares / (1.0 + squares / TOLERANCE)).sum())
+    return torch.stack(found)
+
+
+def noise_of_mask(mask: Tensor, factor: float) -> float:
+    """Standard deviation of the mixed pixels of a mask (H, W) after its sides were multiplied by `factor`. One of zeros and ones
+    says of a contour in a pixel only on which side of the middle it runs, which is off by 1/√12, evenly distributed; among the
+    1/factor² pixels that become one, 1/factor lie on it."""
+    between = (mask > PURE) & (mask < 1.0 - PURE)
+    rows = mask[None, None]
+    border = F.max_pool2d(rows, 3, 1, 1) + F.max_pool2d(-rows, 3, 1, 1) > 0.5
+    if int(between.sum()) >= WHOLE * int(border.sum()):
+        return NOISE
+    return math.hypot(NOISE, min(1.0, factor) ** 1.5 / math.sqrt(12.0))
 
 
 def outlined(image: Tensor, alpha: Tensor) -> Tensor:

@@ -45,7 +45,7 @@ class Options(NamedTuple):
 class AtPoints(NamedTuple):
     """Points of a scene, given as tensors (b, spread, *points, *tables, *flat)."""
 
-    layout: Any  # of the tables (in_kernel.py)
+    layout: Any  # of the tables (layout.py)
     tables: int  # how many
     forced: int  # the light whose visibility is given, −1: none
     dtype: torch.dtype  # of the vertices

@@ -27,6 +27,8 @@ AT_ONCE = 1 << 17  # samples whose light is followed together
 
 def bounce_edges(frame: Frame, options: Options) -> list[Term]:
     """What samples on these borders give to the image."""
+    if not moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics):
+        return []
     terms = _seen(frame, options)
     if moves(frame.surfaces.verts):  # as the camera moves these stay
         for further in range(1, options.bounces - 1):

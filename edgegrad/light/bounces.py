@@ -1,7 +1,7 @@
 """What render() can differentiate where light is scattered more than once.
 
 Inside surfaces every tensor of a scene has its derivative (csrc/shading/lit/path_radiance.h), the borders of lights' shadows have
-theirs (unseen_shadows.py), and so have edges on the way of light from one surface to another (csrc/boundary/bounces.h). Of some
+theirs (unseen_shadows.py), and so have edges on the way of light from one surface to another (bounce_edges.py). Of some
 borders there are no samples. Without them a gradient would be wrong without notice, so it is refused.
 """
 
@@ -22,7 +22,7 @@ from ..scene.tree import named_tensors
 from .in_kernel import is_fused, nearest_textures
 
 
-def check_bounces(scene: Scene, camera: Camera, request: Request, bounces: int) -> None:
+def check_bounces(scene: Scene, camera: Camera, request: Request) -> None:
     """Raises ValueError for scenes whose surfaces do not light each other, and for derivatives that are not whole."""
     if not is_fused(scene):
         raise ValueError(
@@ -31,7 +31,7 @@ def check_bounces(scene: Scene, camera: Camera, request: Request, bounces: int) 
         )
     if not request.gradient.visibility:
         return
-    if missing := _missing(scene, bounces):
+    if missing := _missing(scene):
         for name, tensor in (*_moving(scene, camera), *(_lights(scene) if scene.blends else ())):
             if _has_derivative(tensor):
                 raise _refused(name, missing)
@@ -48,7 +48,7 @@ def _refused(name: str, where: str) -> ValueError:
     )
 
 
-def _missing(scene: Scene, bounces: int) -> str | None:
+def _missing(scene: Scene) -> str | None:
     """Where borders that may move have no samples."""
     if scene.blends:
         return "where one sees through surfaces"
@@ -56,7 +56,7 @@ def _missing(scene: Scene, bounces: int) -> str | None:
         return "at the rims of what alpha cuts out"
     if any(nearest_textures(mesh) for mesh in scene.meshes):
         return "at the borders of nearest texels"
-    return "with more than two bounces yet" if bounces > 2 else None
+    return None
 
 
 def _moving(scene: Scene, camera: Camera) -> Iterator[tuple[str, Tensor]]:

@@ -24,8 +24,6 @@ from ..kernel.request import Request
 from ..library import core
 from ..points.frame import Frame
 from ..points.hits import Hits
-from ..points.records import CurveRecords
-from ..points.shadows import ShadowLight
 from ..points.splat import Term
 from ..points.surfaces import View
 from ..scene.appearance import OnMesh, coordinates
@@ -92,7 +90,7 @@ class Lighting(NamedTuple):
                 "eg.Environment(torch.ones(3)), or leave the materials out: colours are then radiance",
             )
         if self.bounces > 1:
-            check_bounces(scene, camera, request, self.bounces)
+            check_bounces(scene, camera, request)
         # Each shaded point draws points of its own on extended lights; and a path of its own, whose noise falls the faster the
         # more there are in a pixel, for they are spread evenly.
         extended = any(not light.punctual for light in scene.casting)
@@ -113,8 +111,7 @@ class Lighting(NamedTuple):
             gives_derivatives=fused and additive,
             additive=additive,
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
-            bounce_edges=self._bounce_edges if self.bounces > 1 else None,
-            passed_on=self._passed_on if self.bounces > 1 and self.shadows else None,
+            indirect=self._indirect if self.bounces > 1 else None,
             watch=watch,
         )
         image = render_shaded(scene, camera, self, request, creases, False, effort)
@@ -125,11 +122,15 @@ class Lighting(NamedTuple):
             image = image + tensor.reshape(-1)[:0].sum().to(image)
         return image
 
-    def _bounce_edges(self, frame: Frame) -> list[Term]:
-        return bounce_edges(frame, Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces))
-
-    def _passed_on(self, frame: Frame, light: ShadowLight, records: CurveRecords) -> list[Term]:
-        return unseen_shadows(frame, light, records, self.bounces)
+    def _indirect(self, frame: Frame, watch: Watch) -> list[Term]:
+        """What samples on the borders of light that is scattered more than once give to the image."""
+        terms: list[Term] = []
+        if self.shadows:
+            with watch.part("unseen shadows"):
+                terms += unseen_shadows(frame, self.bounces, watch)
+        with watch.part("bounce edges"):
+            terms += bounce_edges(frame, Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces))
+        return terms
 
     @staticmethod
     def resamples(scene: Scene) -> bool:

@@ -12,6 +12,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..kernel.counts import Watch
+from ..kernel.derivatives import moves
+from ..kernel.request import derived_seed
+from ..library import core
 from ..points.frame import Frame
 from ..points.moving import Form, velocity
 from ..points.records import CurveRecords
@@ -23,8 +27,27 @@ from .bsdf import dot
 AT_ONCE = 1 << 17  # samples whose light is followed together
 
 
-def unseen_shadows(frame: Frame, light: ShadowLight, records: CurveRecords, bounces: int) -> list[Term]:
-    """What samples on the borders of a light's shadows give to the image, by light that is scattered `bounces` times at most."""
+def unseen_shadows(frame: Frame, bounces: int, watch: Watch) -> list[Term]:
+    """What samples on these borders give to the image, by light that is scattered `bounces` times at most."""
+    request, surfaces, sampler = frame.request, frame.surfaces, frame.sampler
+    count = request.gradient.edge_samples
+    if count < 0:
+        count = core.most_shadow_samples(frame.width, frame.height, request.image.spp)
+    flat = surfaces.casters
+    # As the camera moves these borders stay.
+    moving = moves(surfaces.verts) or (bool(len(flat.cut_outs)) and moves(flat.alphas, flat.uvs))
+    terms: list[Term] = []
+    for index, casting in enumerate(surfaces.scene.casting):
+        if moving or ShadowLight.moves(casting):
+            seed = derived_seed(sampler.grad_seed, index + 2)
+            light = ShadowLight.of(surfaces, index, seed)
+            records = sampler.shadow_samples(light.parts, seed, count, False, one=True, seen=False)
+            watch.count("unseen_shadow_samples", len(records.x))
+            terms += _of_light(frame, light, records, bounces)
+    return terms
+
+
+def _of_light(frame: Frame, light: ShadowLight, records: CurveRecords, bounces: int) -> list[Term]:
     moved = _velocity(frame, light, records)
     terms: list[Term] = []
     for first in range(0, len(records.x), AT_ONCE):

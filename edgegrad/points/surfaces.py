@@ -43,7 +43,7 @@ class Surfaces:
         self.pyramids: dict[int, tuple[Tensor, Pyramid]] = {}  # of textures, by their ids
         self._tangents: dict[int, Tensor] = {}  # of meshes
         self._moving: Surfaces | None = None  # the surfaces of which detach() made these
-        self.layout: Any = None  # of light/in_kernel.py, kept where nothing has derivatives
+        self.layout: Any = None  # of light/layout.py, kept where nothing has derivatives
         self.has_derivatives = True
 
     def detach(self) -> Surfaces:

@@ -13,6 +13,28 @@ std::shared_ptr<Paths> path_buffers(const LitScene& lit, const LitOptions& optio
 }
 
 template <class T>
+void shade_whole(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                 Paths& paths, double* out, int8_t* seen) {
+    paths.find_whole(scene, caster, points);
+    const size_t K = paths.lights().size();
+    for (int64_t i = 0; i < points.size; ++i) {
+        const Path path = paths.path(i);
+        double* total = out + i * lit.channels;
+        const auto at = [&](int k) -> const Surface<double>& { return paths.surface(i, k); };
+        path_radiance(lit, paths.lights(), path, at, total, 0);
+        if (path.points > 0) {
+            std::copy(path.seen_at(0), path.seen_at(0) + K, seen + i * K);
+        } else {
+            std::fill(seen + i * K, seen + (i + 1) * K, not_asked);
+        }
+        if (Surface<double> first = at(0); !first.is_black()) {
+            if (!first.mesh->has_material) look_up_material(lit, first);
+            add_own(lit, first, total);
+        }
+    }
+}
+
+template <class T>
 void add_indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                   Paths& paths, double* out) {
     paths.find(scene, caster, points, [](int64_t) { return true; });
@@ -91,6 +113,8 @@ void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
 #define EDGEGRAD_INDIRECT(T)                                                                                      \
     template void indirect(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,              \
                            const LitOptions&, double*, Team&);                                                    \
+    template void shade_whole(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&, Paths&,   \
+                              double*, int8_t*);                                                                  \
     template void add_indirect(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&, Paths&,  \
                                double*);                                                                          \
     template void indirect_vjp(const LitScene&, const SceneView<T>&, const RayCaster&, const LitPoints&,          \

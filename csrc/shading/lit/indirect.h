@@ -24,6 +24,11 @@ std::shared_ptr<Paths> path_buffers(const LitScene& lit, const LitOptions& optio
 template <class T>
 void add_indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                   Paths& paths, double* radiance);
+// All of their radiance, direct light as well, for an image: (N, channels), and (N, light samples) what was found of
+// lights, of each one sample.
+template <class T>
+void shade_whole(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
+                 Paths& paths, double* radiance, int8_t* seen);
 // Adds to the cotangents of the tables, and writes those of the points.
 template <class T>
 void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,

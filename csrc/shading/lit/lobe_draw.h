@@ -31,9 +31,11 @@ class DrawnLobe {
     explicit DrawnLobe(const Surface<S>& o) : n_(plain(o.n)) {
         const double roughness = plain(o.scattering.roughness);
         if (o.scattering.lambertian || roughness > widest_lobe) return;
-        alpha_ = std::max(roughness * roughness, least_alpha);
+        *this = DrawnLobe(n_, plain(o.v), std::max(roughness * roughness, least_alpha));
+    }
+    // Of a normal, a unit direction to the viewer, and the roughness squared.
+    DrawnLobe(Vec3 n, Vec3 v, double alpha) : alpha_(alpha), n_(n) {
         // An interpolated normal may be turned away from the viewer: the lobe is then that of the horizon.
-        const Vec3 v = plain(o.v);
         const double nv = dot(n_, v);
         v_ = nv >= 0 ? v : unit(v - nv * n_);
         nv_ = std::max(nv, 0.0);

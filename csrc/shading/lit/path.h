@@ -6,7 +6,9 @@
 //
 // What lights give a point of a path directly is found as it is of points that are seen (light_sample.h), with draws by
 // the light and by the material. So what a drawn direction meets of a light is counted there already, and is not
-// counted again here. A path ends at meshes without a material, at backs of faces that show none, and in the open.
+// counted again here. Only for images, which have no derivatives, such draws of Lambertian surfaces, which the light
+// alone makes else, share with the direction of the path (multiple importance sampling, Veach and Guibas 1995). A path
+// ends at meshes without a material, at backs of faces that show none, and in the open.
 #pragma once
 
 #include <algorithm>
@@ -31,6 +33,13 @@ S solid_angle(const Surface<S>& o, Vector<S> d) {
     return S(plain(facing) < 0 ? -1 : 1) * facing / (squared * sqrt(squared));
 }
 
+// A point of a lamp that the direction in which a path goes on has met. Its density, and that of points of the lamp
+// that light the same point of the path, is that of both ways to draw it (the balance heuristic).
+struct MetLamp {
+    int lamp = -1;  // none
+    LightPoint point;
+};
+
 // One path of `points` points. Arrays begin at its first point; the next one is `stride` further, or as many rows of
 // `lights`.
 struct Path {
@@ -41,12 +50,15 @@ struct Path {
     const LightPoint* drawn;
     const int8_t* seen;
     size_t stride, lights;
+    const MetLamp* met;  // null: not asked
 
     int64_t face_at(int k) const { return face[k * stride]; }
     const double* b_at(int k) const { return b + 3 * k * stride; }
     double density_at(int k) const { return density[k * stride]; }
     const LightPoint* drawn_at(int k) const { return drawn + k * stride * lights; }
     const int8_t* seen_at(int k) const { return seen + k * stride * lights; }
+    bool has_met(int k) const { return met && met[k * stride].lamp >= 0; }
+    const MetLamp& met_at(int k) const { return met[k * stride]; }
 };
 
 // The paths of some points, about shaded_at_once of them, point by point of all paths. It is kept from one call to the
@@ -56,7 +68,13 @@ class Paths {
     Paths(const LitScene& lit, const LitOptions& options) : lit_(lit), options_(options), C_(lit.channels) {
         options_.samples = 1, options_.only = -1, options_.in_fours = false;
         lights_ = light_samples(lit, options_);
-        for (const Lamp& lamp : lit.lamps) eps_ = std::max(eps_, lamp.eps);
+        lamp_of_.assign(lit.meshes.size(), -1);
+        for (int k = 0; k < int(lit.lamps.size()); ++k) {
+            const Lamp& lamp = lit.lamps[k];
+            eps_ = std::max(eps_, lamp.eps);
+            if (lamp.kind == Lamp::Kind::mesh) lamp_of_[lamp.mesh] = k;
+            if (lamp.kind == Lamp::Kind::environment && sky_ < 0) sky_ = k;
+        }
     }
 
     const std::vector<LightSample>& lights() const { return lights_; }
@@ -71,6 +89,15 @@ class Paths {
         });
         go_on(scene, caster, from);
     }
+    // For an image: lights are asked for the first points, too, and lamps that paths meet count.
+    template <class T>
+    void find_whole(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from) {
+        meets_ = options_.shadows;
+        find_lit(scene, caster, from, [&](int64_t i, Surface<double>& o) {
+            set_surface<double>(lit_, from.face[i], from.b + 3 * i, from.spread_at(i), o);
+            return true;
+        });
+    }
     // From points that `place(i, surface)` sets, if it returns true, seen from where it says; lights are asked for
     // them, too.
     template <class T, class Place>
@@ -83,9 +110,15 @@ class Paths {
     static bool scatters(const Surface<double>& o) { return o.mesh->has_material && !o.is_black(); }
 
     Path path(int64_t i) const {
-        return {
-            length_[i], &face_[i],  &b_[3 * i], density_.data() + i, drawn_.data() + i * K(), seen_.data() + i * K(),
-            size_t(n_), size_t(K())};
+        return {length_[i],
+                &face_[i],
+                &b_[3 * i],
+                density_.data() + i,
+                drawn_.data() + i * K(),
+                seen_.data() + i * K(),
+                size_t(n_),
+                size_t(K()),
+                meets_ ? &met_[i] : nullptr};
     }
     // What they were found with.
     const Surface<double>& surface(int64_t i, int k) const { return surfaces_[k * n_ + i]; }
@@ -110,6 +143,7 @@ class Paths {
         surfaces_.resize(all), density_.resize(all), face_.resize(all), b_.resize(3 * all), seed_.resize(all);
         drawn_.resize(all * lights_.size()), seen_.resize(all * lights_.size());
         length_.assign(n_, 0), through_.assign(n_ * C_, 1.0);
+        if (meets_) met_.assign(all, {});
         for (int64_t i = 0; i < n_; ++i) {
             Surface<double>& o = surfaces_[i];
             if (!place(i, o)) continue;
@@ -143,8 +177,9 @@ class Paths {
             if (k >= steps_without_roulette) {
                 const double* through = &through_[i * C_];
                 survival = std::clamp(*std::max_element(through, through + C_), least_survival, 1.0);
-                if (choice.y >= survival) continue;
             }
+            if (meets_ && o.scattering.lambertian) share_lamps(at, survival);
+            if (choice.y >= survival) continue;
             const BounceDraw draw(o, C_);
             const Vec3 l = draw.draw(choice.x, numbers.of_direction());
             if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
@@ -166,8 +201,11 @@ class Paths {
                 int64_t(rays_.index.size())},
                rays_.hit.data(), rays_.hit_b.data());
         for (size_t r = 0; r < rays_.index.size(); ++r) {
-            if (rays_.hit[r] < 0) continue;
             const int64_t i = rays_.index[r], at = (k + 1) * n_ + i;
+            if (rays_.hit[r] < 0) {
+                if (meets_ && sky_ >= 0) meet_sky(r, k);
+                continue;
+            }
             const double u = rays_.hit_b[2 * r], v = rays_.hit_b[2 * r + 1];
             const Surface<double>& o = surfaces_[k * n_ + i];
             Surface<double>& next = surfaces_[at];
@@ -176,6 +214,11 @@ class Paths {
             const Vec3 d = next.y - o.y, l = unit(d);
             const double measure = solid_angle(next, d);
             set_view(lit_, -l, next);
+            if (const int lamp = lamp_of_[next.mesh - lit_.meshes.data()];
+                meets_ && lamp >= 0 && o.scattering.lambertian) {
+                const double by_light = lit_.lamps[lamp].density[next.at.face];
+                met_[k * n_ + i] = {lamp, {next.at.face, u, v, by_light + by_area(rays_, r, next, d)}};
+            }
             if (!scatters(next) || !(measure > 0) || !(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
             density_[at] = rays_.density[r] * rays_.survival[r] * measure;
             length_[i] = k + 2;
@@ -183,6 +226,50 @@ class Paths {
             scatter(o.scattering, o.v, o.n, l, C_, f);
             const double weight = dot(o.n, l) / (rays_.density[r] * rays_.survival[r]);
             for (int c = 0; c < C_; ++c) through_[i * C_ + c] *= std::fabs(f[c]) * weight;
+        }
+    }
+
+    // -- lamps that are found in two ways ----------------------------------------------------------------------------
+
+    // The density of a direction by area on the lamp that it meets, d away.
+    static double by_area(double density, Vec3 normal, Vec3 d) {
+        const double squared = dot(d, d);
+        return density * std::fabs(dot(normal, d)) / (squared * std::sqrt(squared));
+    }
+    static double by_area(const Rays& rays, size_t r, const Surface<double>& lamp, Vec3 d) {
+        return by_area(rays.density[r] * rays.survival[r], lamp.frame.g, d);
+    }
+    void meet_sky(size_t r, int k) {
+        const int64_t i = rays_.index[r];
+        const Surface<double>& o = surfaces_[k * n_ + i];
+        if (!o.scattering.lambertian) return;
+        const double* l = &rays_.direction[3 * r];
+        const Lamp& lamp = lit_.lamps[sky_];
+        LightPoint p = point_towards(lit_.tables, lamp, {l[0], l[1], l[2]});
+        if (lamp.is_image) p = above(lit_.tables, lamp, p, o.g);
+        else p.density = rays_.density[r];  // by the cosine as well: draw_even_sky()
+        p.density += rays_.density[r] * rays_.survival[r];
+        met_[k * n_ + i] = {sky_, p};
+    }
+    // Of the points of lights that a point of a path sees.
+    void share_lamps(int64_t at, double survival) {
+        const Surface<double>& o = surfaces_[at];
+        for (int64_t j = 0; j < K(); ++j) {
+            const int number = lights_[j].lamp;
+            const Lamp& lamp = lit_.lamps[number];
+            if (seen_[at * K() + j] <= 0 || !(number == sky_ || lamp.kind == Lamp::Kind::mesh)) continue;
+            LightPoint& p = drawn_[at * K() + j];
+            Vec3 l = place(lit_, lamp, p);
+            if (number == sky_) {
+                p.density += survival * BounceDraw(o, C_).density(l);
+                continue;
+            }
+            const EmissiveFaces from = lit_.emitter(lamp);
+            Vec3 corner[3];
+            for (int c = 0; c < 3; ++c) corner[c] = lit_.tables[from.verts].vector_at<double>(from.vertex(p.index)[c]);
+            const Vec3 d = l - o.y, normal = cross(corner[1] - corner[0], corner[2] - corner[0]);
+            if (!(dot(d, d) > 0 && dot(normal, normal) > 0)) continue;
+            p.density += by_area(survival * BounceDraw(o, C_).density(unit(d)), unit(normal), d);
         }
     }
 
@@ -202,7 +289,10 @@ class Paths {
     const LitScene& lit_;
     LitOptions options_;
     const int C_;
-    double eps_ = 0;  // relative spacing of places
+    double eps_ = 0;            // relative spacing of places
+    std::vector<int> lamp_of_;  // of each mesh, −1: none
+    int sky_ = -1;              // the lamp that paths meet in the open
+    bool meets_ = false;        // whether lamps that paths meet count
     std::vector<LightSample> lights_;
     int64_t n_ = 0;
     // Of the points of paths after no step, one step, …, and of the points of lights for each.
@@ -211,6 +301,7 @@ class Paths {
     std::vector<int64_t> face_, seed_;
     std::vector<LightPoint> drawn_;
     std::vector<int8_t> seen_;
+    std::vector<MetLamp> met_;
     // Of each path how many points it has, and what its end gives to its beginning.
     std::vector<int> length_;
     std::vector<double> through_;

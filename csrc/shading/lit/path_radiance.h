@@ -63,11 +63,13 @@ void add_direct(const LitScene& lit, const std::vector<LightSample>& lights, con
                 const Surface<S>& o, S* total) {
     add_unshadowed(lit, o, total);
     add_lights(lit, lights, path.drawn_at(k), o, path.seen_at(k), total);
+    if (path.has_met(k)) add_light(lit, lit.lamps[path.met_at(k).lamp], path.met_at(k).point, 1.0, o, total);
 }
 
-// (channels,) of a path with the surfaces at(k).
+// (channels,) of a path with the surfaces at(k): D_k from k = `lit_from` on.
 template <class S, class At>
-void path_radiance(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, At at, S* total) {
+void path_radiance(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, At at, S* total,
+                   int lit_from = 1) {
     const int C = lit.channels;
     std::fill(total, total + C, S(0));
     for (int k = path.points - 1; k >= 0; --k) {
@@ -77,7 +79,7 @@ void path_radiance(const LitScene& lit, const std::vector<LightSample>& lights, 
             const S factor = step.factor();
             for (int c = 0; c < C; ++c) total[c] *= step.f[c] * factor;
         }
-        if (k > 0) add_direct(lit, lights, path, k, o, total);
+        if (k >= lit_from) add_direct(lit, lights, path, k, o, total);
     }
 }
 

@@ -6,7 +6,7 @@ robust squared difference of the picture from the mixture of the colours on both
 border lies. P and the colours of the sides are held fixed between renewals: with them, the loss is a function of the pixels'
 alpha, each by itself, which a descent can compare from step to step.
 
-Alpha is blurred, widely at first, that a step reaches far; the contour term joins when it is as sharp as pictures are.
+Alpha is blurred, widely at first, that a step reaches far; the contour term joins when it is as sharp as the pictures show it.
 """
 
 from __future__ import annotations
@@ -19,15 +19,14 @@ from torch import Tensor
 from ...files.image import linear_to_srgb
 from ..region import RADIUS, Windows, around, likelihood, palette, posterior, slope, smoothed
 from ..sides import BLUR as SOFT
-from ..sides import PURE, Sides, outlines_explained
+from ..sides import BLURS, PURE, TOLERANCE, Sides, blur_losses, outlines_explained
 from ..verdict import ENOUGH
 from ..views import View, white_of
 
 LAST = 2**20  # a step at which alpha is as sharp as pictures are
 EVERY = 3  # steps from one renewal to the next
-BLUR = 0.7  # pixels, of alpha: that of pictures, and some reach
+BLUR = 0.7  # pixels, of alpha, until the pictures show their own
 FIRST_BLUR, NARROWED = 3.0, 0.6  # pixels at the start, and the factor from one renewal to the next
-TOLERANCE = 12.0  # squared differences, in variances, that are far above this hardly count (Geman and McClure 1987)
 BESIDE = 2.5  # the same, where colours beside the contour are judged
 # Of right fits colours tell the sides apart by 0.70 … 0.81, of wrong ones on edges of clutter by up to 0.69.
 SURE = 0.695
@@ -51,10 +50,13 @@ class Regions:
         self.posteriors = [torch.full(view.camera.size, 0.5) for view in views]
         self.sides: list[Sides | None] = [None for _ in views]
         self.blur = BLUR
+        self.narrows = False  # whether alpha is blurred more than it will be
+        self._losses = [torch.zeros(len(BLURS)) for _ in views]  # of each view's contour, by its blur
 
     def renew(self, index: int, alpha: Tensor, step: int = LAST) -> None:
         """By the silhouette (H, W, 1) that a view shows at a step; without one, what was known stays."""
-        self.blur = max(BLUR, FIRST_BLUR * NARROWED ** (step // EVERY))
+        wide = FIRST_BLUR * NARROWED ** (step // EVERY)
+        self.narrows = wide > BLUR
         share = alpha[..., 0].detach().float()
         near, extent = self.around(index, share)
         if extent > 0.0 and bool((near > 0.0).any()):
@@ -62,12 +64,11 @@ class Regions:
                 (share.shape[0], share.shape[1]), self.labels[index], self.palettes[index].colours, RADIUS * extent
             )
             self.near[index], self.posteriors[index] = near, posterior(windows, share, near)
-            self.sides[index] = Sides.of(self.displays[index], smoothed(share[None], SOFT)[0], near)
-
-    @property
-    def narrows(self) -> bool:
-        """Whether alpha is blurred more than it will be."""
-        return self.blur > BLUR
+            sides = Sides.of(self.displays[index], smoothed(share[None], SOFT)[0], near)
+            self.sides[index] = sides
+            self._losses[index] = blur_losses(sides, self.displays[index], near, share)
+        known = torch.stack(self._losses).sum(0)
+        self.blur = wide if self.narrows else BLURS[int(known.argmin())] if bool(known.any()) else BLUR
 
     def around(self, index: int, alpha: Tensor) -> tuple[Tensor, float]:
         """Weights (H, W) of what surrounds the object, and its extent, pixels; 0 where it is not seen."""

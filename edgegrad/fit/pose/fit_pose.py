@@ -38,7 +38,7 @@ from .pose import Pose, angle, pose_from_matrix
 from .result import PoseFit
 from .search import Search
 from .task import Lens, PoseTask
-from .uncertainty import Uncertainty
+from .uncertainty import SHARE, Uncertainty
 
 MOST_STARTS = 1000
 
@@ -206,7 +206,7 @@ def search_pose(
         known = None
         if ways.curvature is not None:
             known = Uncertainty.of(task, best, ways.curvature, task.free, symmetries)
-        conflict = _alike(best, ways.alike, symmetries, task.colourless)
+        conflict = looks_alike(best, ways.alike, symmetries, task)
         sure = ways.converged and not interrupted and not conflict and (known is None or not known.unknown)
         return PoseFit(
             best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), seconds(), sure, interrupted,
@@ -244,15 +244,17 @@ def search_pose(
     return result()
 
 
-def _alike(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None, colourless: bool) -> str:
+def looks_alike(pose: Pose, others: Sequence[Pose], symmetries: Symmetries | None, task: PoseTask) -> str:
     """In words, that another pose may be the right one, if it is not known to be the same; else empty."""
     same = others if symmetries is None else [other.closest(symmetries, pose) for other in others]
     apart = max((angle(pose.R, other.R) for other in same), default=0.0)
-    if apart < NEAR:
+    away = max((task.between(pose, other) for other in same), default=0.0)
+    if apart < NEAR and away < SHARE:
         return ""
-    colours = "the mesh's colours, " if colourless else ""
+    other = f"turned by {math.degrees(apart):.0f}°" if apart >= NEAR else f"{away:.0%} of the size away"
+    colours = "the mesh's colours, " if task.colourless else ""
     return (
-        f"looks alike: the pictures hardly tell it from a pose that is turned by {math.degrees(apart):.0f}°; give {colours}"
+        f"looks alike: the pictures hardly tell it from a pose that is {other}; give {colours}"
         "symmetries of the mesh, depth, or another picture"
     )
 

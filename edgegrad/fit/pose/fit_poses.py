@@ -15,7 +15,7 @@ from ...check import as_tensor, check_flag, check_int, check_positive_int, check
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ...scene.symmetries import Symmetries
-from .fit_pose import check_callback, check_tolerance, depth_images, symmetries_of
+from .fit_pose import check_callback, check_tolerance, depth_images, looks_alike, symmetries_of
 from .given import Names, check_in_front, check_max_size, check_seen, one_for_each
 from .photo.depth import warn_of_units
 from .photo.poses import PosesSearch
@@ -115,8 +115,10 @@ def fit_poses(
             best = ways.best[k] if own is None else ways.best[k].closest(own, starts[k])
             history, curvature = list(ways.history[k]), ways.known(k)
             known = None if curvature is None else Uncertainty.of(task, best, curvature, task.free, own)
+            unknown = known is not None and bool(known.unknown)
             conflict = _conflict(tasks, ways.best, k) if curvature is not None else ""
-            sure = ways.converged[k] and not interrupted and not conflict and (known is None or not known.unknown)
+            conflict = conflict or ("" if unknown else looks_alike(best, ways.alike[k], own, task))
+            sure = ways.converged[k] and not interrupted and not conflict and not unknown
             found.append(PoseFit(
                 best.R, best.t, float(best.scale), cameras[0], ways.loss, len(history), time.perf_counter() - began,
                 sure, interrupted, ways.explained[k], history, task, cameras, known, ways.visible[k], conflict,

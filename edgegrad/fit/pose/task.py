@@ -263,6 +263,11 @@ class PoseTask:
         bend = pose.distortion + step[BEND:]
         return Pose(R, t, scale, pose.focal * zoom, pose.principal + step[PRINCIPAL:BEND], bend)
 
+    def between(self, one: Pose, other: Pose) -> float:
+        """How far apart the object's centres are, in parts of its size."""
+        ways = [pose.scale * (pose.R @ self.center) + pose.t for pose in (one, other)]
+        return float((ways[0] - ways[1]).norm()) / self.size
+
     def lens(self, camera: Camera, pose: Pose) -> Camera:
         """The camera with what was found of its lens."""
         if ZOOM not in self.free and PRINCIPAL not in self.free and BEND not in self.free:

@@ -8,25 +8,11 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ...region import smoothed
-from ...sides import Sides
+from ...sides import TOLERANCE, Sides
 from ..gauss_newton import Normal
 from .picture import Picture
 
-TOLERANCE = 12.0  # squared differences, in variances, that are far above this hardly count (Geman and McClure 1987)
 FEWEST = 20  # pixels on the contour
-CONTOUR_BLURS = 0.3, 0.5, 0.7, 0.9  # pixels; softer ones are not told from poses that are off
-
-
-def blur_losses(picture: Picture, sides: Sides, alpha: Tensor) -> list[float]:
-    """Half the robust squares of the differences where `sides` are mixed, from alpha (h, w) blurred by each of CONTOUR_BLURS: the
-    tails of a blur show far in the values of a display, and one that is too wide puts bright contours too far out."""
-    found = []
-    for blur in CONTOUR_BLURS:
-        off = (sides.mixed_by(smoothed(alpha[None], blur)[0]) - picture.outlined).square() / sides.variance
-        squares = off.sum(-1)
-        found.append(0.5 * float((sides.band * picture.weight * squares / (1.0 + squares / TOLERANCE)).sum()))
-    return found
 
 
 def contour_loss(picture: Picture, sides: Sides) -> float:

@@ -16,8 +16,9 @@ from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
 from ....scene.scene import Scene
 from ...region import RADIUS, Palette, Windows, around, likelihood, palette, posterior, smoothed, told
-from ...sides import ALONE_SHOWN, ALONE_TOLD, CONTRAST, PURE, REACH, Sides
+from ...sides import ALONE_SHOWN, ALONE_TOLD, CONTRAST, PURE, REACH, Sides, blur_losses
 from ...sides import BLUR as CONTOUR_BLUR
+from ...sides import BLURS as CONTOUR_BLURS
 from ...verdict import explained
 from ..gauss_newton import Normal
 from ..given import bare
@@ -25,7 +26,7 @@ from ..jacobian import Motion, Rendered
 from ..observed import motion
 from ..pose import Pose
 from ..task import ZOOM, Level, PoseTask, Shot
-from .contour import CONTOUR_BLURS, blur_losses, contour_loss, contour_term
+from .contour import contour_loss, contour_term
 from .depth import depth_term
 from .light import HARMONICS, Lit
 from .picture import Picture
@@ -96,7 +97,8 @@ class Seen:
     def sides(self, blur: float = CONTOUR_BLUR) -> Sides:
         """Of the contour, in the box, when alpha is blurred by so many pixels."""
         contour = smoothed(self.alpha[self.box][None], blur)[0]
-        return Sides.of(self.part.outlined, contour, self.near[self.box], self.part.mask is None)
+        part = self.part
+        return Sides.of(part.outlined, contour, self.near[self.box], part.mask is None, part.noise)
 
 
 @dataclass(frozen=True)
@@ -175,20 +177,18 @@ class PhotoLevel:
 
     def focused(self, seen: Sequence[Seen]) -> PhotoLevel:
         """With contours as sharp as the pictures show them where the object is: one blur for all, of CONTOUR_BLURS."""
-        losses = [0.0] * len(CONTOUR_BLURS)
-        for one in seen:
-            for k, found in enumerate(blur_losses(one.part, one.sides(max(CONTOUR_BLURS)), one.alpha[one.box])):
-                losses[k] += found
-        return replace(self, blur_of_contours=CONTOUR_BLURS[losses.index(min(losses))])
+        return replace(self, blur_of_contours=sharpest(seen))
 
     def unlikely(self, poses: Sequence[Pose], seed: int) -> list[float]:
         """Of each pose, −log of the likelihood of the pictures by all terms but depth, in nats of independent pixels, up to a
-        constant that poses of about one size share."""
+        constant that all share."""
         views = [self.see(pose, seed) for pose in poses]
+        # All are asked about the same pixels: those around any of them.
+        near = [torch.stack([seen[k].near for seen in views]).amax(0) for k in range(len(self.pictures))]
         totals = []
         for seen in views:
             total = 0.0
-            for k, one in enumerate(seen):
+            for k, one in enumerate(replace(one, near=wide) for one, wide in zip(seen, near, strict=True)):
                 total -= float((one.near * likelihood(self._posterior(k, one), one.alpha).log()).sum())
                 total += contour_loss(one.part, one.sides())
                 if one.lit is not None:  # one noise for all: that of the pose which leaves the least
@@ -253,6 +253,15 @@ class PhotoLevel:
             return mask.clamp(MASKED, 1.0 - MASKED)
         windows = Windows(seen.picture.size, self.labels[k], self.palettes[k].colours, RADIUS * seen.extent)
         return posterior(windows, seen.alpha, seen.near)
+
+
+def sharpest(seen: Sequence[Seen]) -> float:
+    """The one of CONTOUR_BLURS, pixels, with which the pictures' contours are likeliest."""
+    losses = torch.zeros(len(CONTOUR_BLURS))
+    for one in seen:
+        part = one.part
+        losses += blur_losses(one.sides(max(CONTOUR_BLURS)), part.outlined, part.weight, one.alpha[one.box])
+    return CONTOUR_BLURS[int(losses.argmin())]
 
 
 def photo_levels(

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ....camera.camera import Camera
 from ....files.image import linear_to_srgb
+from ...sides import NOISE, noise_of_mask
 from ...views import area_mean
 from ..task import Shot
 
@@ -25,6 +26,7 @@ class Picture:
     mask: Tensor | None  # (h, w), 1 on the object
     weight: Tensor  # (h, w), how much a pixel counts
     depth: Tensor | None  # (h, w), NaN where it was not measured
+    noise: float = NOISE  # standard deviation of what `outlined` shows, where it is mixed
 
     @staticmethod
     def of(shot: Shot, masked: bool, depth: Tensor | None, size: tuple[int, int], white: float) -> Picture:
@@ -34,9 +36,10 @@ class Picture:
             radiance, mask = radiance[..., :-1], radiance[..., -1].clamp(0.0, 1.0)
         radiance = radiance / white
         weight = torch.ones(size) if shot.weight is None else area_mean(shot.weight, size)[..., 0]
+        noise = NOISE if mask is None else noise_of_mask(shot.target[..., -1], size[0] / shot.target.shape[0])
         nearest = None if depth is None else F.interpolate(depth[None, None], size, mode="nearest-exact")[0, 0]
         return Picture(
-            shot.camera.resized(size), radiance, linear_to_srgb(radiance.clamp(0.0, 1.0)), mask, weight, nearest
+            shot.camera.resized(size), radiance, linear_to_srgb(radiance.clamp(0.0, 1.0)), mask, weight, nearest, noise
         )
 
     @property
@@ -48,7 +51,7 @@ class Picture:
         """What lies in so many rows and columns, which the camera sees."""
         mask, depth = (None if one is None else one[rows, columns] for one in (self.mask, self.depth))
         radiance, display, weight = (one[rows, columns] for one in (self.radiance, self.display, self.weight))
-        return Picture(camera, radiance, display, mask, weight, depth)
+        return Picture(camera, radiance, display, mask, weight, depth, self.noise)
 
     @property
     def outlined(self) -> Tensor:

@@ -17,9 +17,10 @@ from ..pose import Pose
 from ..result import HIDDEN, Step
 from ..search import distinct, norms_of
 from ..task import PoseTask
+from ..uncertainty import Uncertainty
 from .nearby import turns
-from .search import APART, FOLLOWED, ROUNDS, SURE, UNCOVERED
-from .together import Together, together_levels
+from .search import APART, FOLLOWED, ROUNDS, SHARP, SURE, UNCOVERED, PhotoSearch
+from .together import Together, together_levels, without_fronts
 from .ways import (
     ALONE_ENOUGH,
     DAMPING,
@@ -50,6 +51,7 @@ class PosesSearch:
         self.short = [False] * len(tasks)
         self.explained = [math.nan] * len(tasks)
         self.visible = [math.nan] * len(tasks)
+        self.alike: list[list[Pose]] = [[] for _ in tasks]  # others, which the pictures hardly tell from the answer
         self.history: list[list[Step]] = [[] for _ in tasks]
         self.curvature: Tensor | None = None  # JᵀJ of the terms at the answer, of the entries of all
         self.after_step: Callable[[], Any] = lambda: None
@@ -94,15 +96,42 @@ class PosesSearch:
                     self._from_aside(k)
         self._surrounded()
         self.curvature = self.levels[-1].equations(self.best, self.seed)[0].curvature
+        alone = self.further and all(depth is None for depth in self.depths)
+        doubtful = [k for k in everything if alone and self.converged[k] and self._vague(k)]
+        if any([self._of_alike(k) for k in doubtful]):  # all of them
+            self._surrounded()
+            self.curvature = self.levels[-1].equations(self.best, self.seed)[0].curvature
         for steps, pose in zip(self.history, self.best, strict=True):
             steps.append(Step(self.levels[-1].size, self.loss, pose, True, {}))
+
+    def _vague(self, k: int) -> bool:
+        """Whether the pictures show an object's rotation so little that others may look alike."""
+        task, curvature = self.tasks[k], self.known(k)
+        if task.colourless or curvature is None:
+            return True
+        return Uncertainty.of(task, self.best[k], curvature, task.free, None).degrees > SHARP
+
+    def _of_alike(self, k: int) -> bool:
+        """Whether another pose of one object makes the pictures likelier, which it takes then: compared where no other object is
+        before it, while all others stay where they are."""
+        task = without_fronts(self.tasks, self.best, k, self.spp, self.seed)
+        search = PhotoSearch(
+            task, self.starts[k], self.depths, self.max_size, self.spp, self.steps, self.tolerance, self.seed
+        )
+        search.after_step = self.after_step
+        found, self.alike[k] = search.likeliest(self.best[k], self.short[k])
+        if found is None:
+            return False
+        self.best[k], self.short[k] = found.pose, found.short
+        self.history[k] = [*(step._replace(best=False) for step in self.history[k]), *search.history]
+        return True
 
     def _surrounded(self) -> None:
         """The last steps, with what surrounds the objects where they are now, and without what covers them: the end depends
         neither on the start nor on the cover any more. Where an object is lost by that, all stay where they were."""
         before = list(self.best), list(self.short), list(self.explained), list(self.visible)
         last = together_levels(self.tasks, self.best, self.depths, self.max_size, self.spp, self.seed)[-1]
-        level = last
+        level = last = last.focused(self.best, self.seed)
         for _ in range(ROUNDS):
             level = last.uncovered(self.best, self.seed)
             self._follow(level, list(range(len(self.tasks))))

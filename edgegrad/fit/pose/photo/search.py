@@ -19,7 +19,7 @@ from ..result import Step
 from ..search import Search, distinct
 from ..task import Level, PoseTask
 from ..uncertainty import TOGETHER, Uncertainty
-from .cover import SIDES, at_one_side, covers, weighted
+from .cover import SIDES, at_one_side, covers, left, weighted
 from .level import PhotoLevel, photo_levels
 from .nearby import comparable, nearby, turns
 from .ways import End, Ways
@@ -34,6 +34,7 @@ APART = 0.05  # radians between poses that are followed both
 AS_THEY_ARE = 0.05  # mean change of colours, in parts of them, by light that leaves them as they are
 UNCOVERED = 0.85  # of the object's pixels: with fewer, something covers it
 COVERED_ENOUGH = 0.7  # of the edges, where a way that leaves out a side of the object ends
+SAME = 0.01  # radians, and object sizes, between a way and the place where another one came to rest: it will, too
 NEAR = 0.1  # radians: a polished pose that is farther off is another one
 # Other ends may be the answer if they are within so many radians of the start. One that is less likely by a smaller factor than
 # exp(this) looks alike.
@@ -144,17 +145,32 @@ class PhotoSearch(Ways):
                 break
         return best
 
+    def likeliest(self, pose: Pose, short: bool) -> tuple[End | None, list[Pose]]:
+        """Of poses that look like one that was found otherwise, whose last step was `short` or not, the one that makes the
+        pictures likelier, if there is one, and the others that these hardly tell from the answer."""
+        last = photo_levels(self.task, pose, self.depths, self.max_size, self.spp, self.seed)[-1]
+        views = last.see(pose, self.seed)
+        last, weights = last.focused(views), covers(views)
+        self.levels = [*self.levels[:-1], last]
+        kept = 1.0 if weights is None else left(views, weights)
+        here = self._judge(pose, short, last if weights is None else weighted(last, weights))._replace(left=kept)
+        answer = self._of_alike(here, 0)
+        return None if answer is here else answer, self.alike
+
     def _of_alike(self, best: End, begins: int) -> End:
         """Of poses that look alike, the one that makes the pictures most likely. An object that is its own mirror image has, from
         afar, the contour that it has behind a mirror, and so one contour in two poses; a bottle that shows hardly more than its
-        bottom, a disc of one colour, looks alike in many."""
-        coarse, *finer = self.levels
+        bottom, a disc of one colour, looks alike in many.
+
+        Ways of an object with colours begin on the coarsest level, which tells the light. Of a contour it shows so little that
+        ways which begin apart end in one place there, and it ranks them by chance."""
         plain = self.task.colourless
+        first, *finer = self.levels[plain:]
         turned = [self.task.moved(self.start if plain else best.pose, *turn) for turn in turns()]
         before = len(self.history)
         self._answered = True
-        here, *ends = (self._follow(coarse, pose)[0] for pose in [best.pose, *turned])
-        costs = self.journal.numbers(lambda: coarse.unlikely([here, *ends], self.seed))
+        here, *ends = (self._follow(first, pose)[0] for pose in [best.pose, *turned])
+        costs = self.journal.numbers(lambda: first.unlikely([here, *ends], self.seed))
         sure = ALIKE * TOGETHER**2
         order = sorted(range(len(ends)), key=lambda k: costs[1 + k])
         if not plain:  # where colours tell the others from this one in so few pixels, they do in more
@@ -162,13 +178,13 @@ class PhotoSearch(Ways):
         found = [best]
         level = self._left_of(best)
         for pose in distinct([here, *(ends[k] for k in order)], 1 + FOLLOWED, APART)[1:]:
-            if (way := self._apart(pose, finer, None if plain else best.pose)) is None:
+            if (way := self._apart(pose, finer, best.pose)) is None:
                 continue
             end = self._judge(*way, level)
-            if end.explained >= self.enough and angle(end.pose.R, self.start.R) < REACH:
+            if end.explained >= min(self.enough, DOUBTFUL) and angle(end.pose.R, self.start.R) < REACH:
                 found.append(end)
         costs = self.journal.numbers(lambda: level.unlikely([end.pose for end in found], self.seed))
-        k = min(range(len(found)), key=costs.__getitem__)
+        k = min((k for k, end in enumerate(found) if end.explained >= self.enough), key=costs.__getitem__, default=0)
         # One that is hardly likelier is no better an answer, but answers would then depend on the start.
         won = costs[0] - costs[k] > sure and (plain or found[k].explained > best.explained)
         answer, cost = (found[k], costs[k]) if won else (best, costs[0])
@@ -183,12 +199,16 @@ class PhotoSearch(Ways):
             self._take(answer)
         return self._surrounded(answer)
 
-    def _apart(self, pose: Pose, levels: list[PhotoLevel], other: Pose | None) -> tuple[Pose, bool] | None:
+    def _apart(self, pose: Pose, levels: list[PhotoLevel], other: Pose) -> tuple[Pose, bool] | None:
         """As _down(), but None as soon as the way comes to the other pose."""
+
+        def there(pose: Pose) -> bool:
+            return angle(pose.R, other.R) < SAME and self.task.between(pose, other) < SAME
+
         short = False
         for level in levels:
-            pose, short = self._follow(level, pose)
-            if other is not None and angle(pose.R, other.R) < APART:
+            pose, short = self._follow(level, pose, there)
+            if there(pose) or (not self.task.colourless and angle(pose.R, other.R) < APART):
                 return None
         return pose, short
 

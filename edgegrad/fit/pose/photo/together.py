@@ -12,20 +12,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from ....aovs import render_aovs
+from ....render import render
 from ....scene.mesh import Mesh
 from ....scene.scene import Scene
 from ...region import RADIUS, Windows, smoothed
 from ..gauss_newton import Normal
+from ..given import bare
 from ..jacobian import Motions, Rendered
 from ..observed import motion
 from ..pose import Pose
 from ..task import PoseTask
 from .contour import contour_term
-from .cover import covers, weighted
+from .cover import BESIDE, covers, weighted
 from .depth import depth_term
-from .level import CONTOUR_BLUR, MASKED, Crop, PhotoLevel, Seen, photo_levels
+from .level import MASKED, Crop, PhotoLevel, Seen, photo_levels, sharpest
 from .region import posteriors, regions_term
 
 
@@ -56,11 +60,7 @@ class Together:
             level.task.scene.transformed(pose.R, pose.t, pose.scale)
             for level, pose in zip(self.objects, poses, strict=True)
         ]
-        labels = torch.eye(len(scenes), dtype=torch.float64)
-        labelled = Scene([
-            Mesh(mesh.verts, mesh.faces, colors=label.expand(len(mesh.verts), -1))
-            for scene, label in zip(scenes, labels, strict=True) for mesh in scene.meshes
-        ])  # fmt: skip
+        labelled = _labelled(scenes)
         counts = [sum(len(mesh.verts) for mesh in scene.meshes) for scene in scenes]
         found: list[list[Seen]] = [[] for _ in scenes]
         first = self.objects[0]
@@ -102,12 +102,18 @@ class Together:
                     size = level.task.size
                     terms.append((part, depth_term(one.surface, one.part.depth, one.part.weight, size)))
             if self.last:
-                terms += [(slice(0, D), term) for term in _contours(seen)]
+                terms += [(slice(0, D), term) for term in self._contours(seen)]
             for part, term in terms:
                 if term is not None:
                     curvature[part, part] += term.curvature
                     gradient[part] += term.gradient
         return Normal(curvature, gradient), sum(losses) / len(losses) if losses else math.inf
+
+    def focused(self, poses: Sequence[Pose], seed: int) -> Together:
+        """As PhotoLevel.focused(), with one blur for the contours of all objects."""
+        views = self.see(poses, seed)
+        blur = sharpest([one for view in views for one in view])
+        return Together([replace(level, blur_of_contours=blur) for level in self.objects])
 
     def explained(self, poses: Sequence[Pose], seed: int) -> list[float]:
         """Of each object, PhotoLevel.explained() where it is seen."""
@@ -147,6 +153,47 @@ class Together:
         ]
         return posteriors(windows, torch.stack([one.alpha for one in seen]), near)
 
+    def _contours(self, seen: list[Seen]) -> list[Normal | None]:
+        """The contour term of each object. Where two of them meet, each has half a say."""
+        blur = self.objects[0].blur_of_contours
+        sides = [one.sides(blur) for one in seen]
+        count = torch.zeros(seen[0].picture.size)
+        for one, side in zip(seen, sides, strict=True):
+            count[one.box] += side.band
+        return [
+            contour_term(
+                replace(one.part, weight=one.part.weight / count[one.box].clamp(min=1.0)), side,
+                smoothed(one.tangents[:, one.box[0], one.box[1]], blur),
+            )
+            for one, side in zip(seen, sides, strict=True)
+        ]  # fmt: skip
+
+
+def without_fronts(tasks: Sequence[PoseTask], poses: Sequence[Pose], k: int, spp: int, seed: int) -> PoseTask:
+    """The task of one object, with a weight of 0 where others that cover a part of it are seen, and a little beside them."""
+    moved = [task.scene.transformed(pose.R, pose.t, pose.scale) for task, pose in zip(tasks, poses, strict=True)]
+    shots = []
+    for shot in tasks[k].shots:
+        with torch.no_grad():
+            seen = render(_labelled(moved), shot.camera, spp, seed)
+            alone = render_aovs(bare(moved[k]), shot.camera, ["alpha"], spp, seed)["alpha"][..., 0]
+        hidden = alone - seen[..., k] > 0.5
+        fronts = [j for j in range(len(moved)) if j != k and float(seen[hidden][:, j].sum()) > 1.0]
+        before = seen[..., fronts].sum(-1)[None, None]
+        before = F.max_pool2d(before, 2 * BESIDE + 1, 1, BESIDE)[0, 0, ..., None].float()
+        weight = 1.0 - before if shot.weight is None else shot.weight * (1.0 - before)
+        shots.append(shot._replace(weight=weight.clamp(min=0.0)))
+    return replace(tasks[k], shots=shots)
+
+
+def _labelled(scenes: Sequence[Scene]) -> Scene:
+    """All objects in one, each with a channel of its own, which is 1 on it."""
+    labels = torch.eye(len(scenes), dtype=torch.float64)
+    return Scene([
+        Mesh(mesh.verts, mesh.faces, colors=label.expand(len(mesh.verts), -1))
+        for scene, label in zip(scenes, labels, strict=True) for mesh in scene.meshes
+    ])  # fmt: skip
+
 
 def together_levels(
     tasks: Sequence[PoseTask],
@@ -166,18 +213,3 @@ def together_levels(
         for task, pose in zip(tasks, poses, strict=True)
     ]
     return [Together(list(objects)) for objects in zip(*columns, strict=True)]
-
-
-def _contours(seen: list[Seen]) -> list[Normal | None]:
-    """The contour term of each object. Where two of them meet, each has half a say."""
-    sides = [one.sides() for one in seen]
-    count = torch.zeros(seen[0].picture.size)
-    for one, side in zip(seen, sides, strict=True):
-        count[one.box] += side.band
-    return [
-        contour_term(
-            replace(one.part, weight=one.part.weight / count[one.box].clamp(min=1.0)), side,
-            smoothed(one.tangents[:, one.box[0], one.box[1]], CONTOUR_BLUR),
-        )
-        for one, side in zip(seen, sides, strict=True)
-    ]  # fmt: skip

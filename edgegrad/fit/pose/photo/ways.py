@@ -95,8 +95,10 @@ class Ways:
             pose, short = self._follow(level, pose)
         return pose, short
 
-    def _follow(self, level: PhotoLevel, origin: Pose) -> tuple[Pose, bool]:
-        """Steps on one level; the pose, and whether the last step was short."""
+    def _follow(
+        self, level: PhotoLevel, origin: Pose, until: Callable[[Pose], bool] = lambda _: False
+    ) -> tuple[Pose, bool]:
+        """Steps on one level; the pose, and whether the last step was short. They end `until` a pose where no more are needed."""
         way = self.journal.entered() or Way(origin, origin, math.inf, search={})
         for step in way.steps:
             self._note(step)
@@ -117,6 +119,7 @@ class Ways:
                 pose=self.task.moved(way.pose, level.plain.free, move), here=way.pose, lowest=loss, short=short,
                 done=short or len(steps) >= self._most(level), steps=steps,
             )  # fmt: skip
+            way = way._replace(done=way.done or until(way.pose))
             self.journal.keep(way)
             self._note(step)
             self.after_step()

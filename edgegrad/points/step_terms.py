@@ -1,0 +1,135 @@
+"""What samples on the steps that a shader declares give to the image:
+
+    δI = Σ k(x − c) [L₊ − L₋] δs / |∇ₓs| · weight
+
+over where lines cross the steps s = 0 (steps.py). L₊ and L₋ are the shader's values with the step forced to either side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from ..check import values_visible
+from ..kernel.counts import Watch
+from ..kernel.derivatives import transformed
+from .frame import Frame
+from .hits import Hits
+from .records import RayRecords
+from .splat import Term, boundary
+from .steps import Crossings, Points, Steps, find_crossings
+
+# By which a pixel's filter reaches out of the image, in px.
+MARGIN = {"box": 0.0, "tent": 0.5, "gaussian": 1.0}
+
+
+class StepTerms(NamedTuple):
+    """The steps of one image, and who declares them."""
+
+    frame: Frame
+    kinds: list[str]
+    shade: Callable[[Hits], Tensor]  # (N, C)
+    declare: Callable[[Hits], object]  # calls hits.where() and hits.floor(); what it returns is not used
+    at_once: int  # points that are shaded together
+
+    def found(self, watch: Watch) -> list[Term]:
+        crossings = self._crossings()
+        watch.count("step_samples", len(crossings.x))
+        rays = self.frame.rays_at(crossings.x)
+        jump, weight = self._jumps(crossings, rays)
+        s = self._values_of_scene(crossings, rays)
+        return boundary(crossings.x, weight * (s - s.detach()), jump, None, None)
+
+    def _crossings(self) -> Crossings:
+        frame, options = self.frame, self.frame.request.gradient
+
+        def at(x: Tensor) -> Points:
+            starts = range(0, max(len(x), 1), self.at_once)
+            places = [frame.sampler.hits_at(x[k : k + self.at_once]) for k in starts]
+            face, part, b = (torch.cat(field) for field in zip(*places, strict=True))
+            values = torch.full((len(x), len(self.kinds)), torch.nan, dtype=torch.float64)
+            there = (face >= 0).nonzero()[:, 0]
+            for some in there.split(self.at_once):
+                found = self._values(frame.fixed_hits(face[some], b[some], x[some])).detach()
+                if not values_visible(found):
+                    raise RuntimeError(
+                        "torch.vmap: expected declared steps that are the same for all of a batch, for where they lie is "
+                        "looked for once; render one by one where s of hits.where() or t of hits.floor() differs"
+                    )
+                values[some] = found.cpu()
+            return Points(x, face, part, b, values)
+
+        with torch.no_grad():
+            size, margin = (frame.height, frame.width), MARGIN[frame.request.image.filter]
+            return find_crossings(at, self.kinds, size, margin, options.step_spacing, frame.sampler.grad_seed)
+
+    def _jumps(self, found: Crossings, rays: RayRecords) -> tuple[Tensor, Tensor]:
+        """(M, C) L₊ − L₋ and (M,) the weight over |∇ₓs|, of constants."""
+        frame = self.frame
+        seed = frame.seeds("steps", len(found.x))
+        gradient = torch.cat([self._by_place(found, rays, part) for part in self._parts(found)])
+        with torch.no_grad():
+            jumps = []
+            for part in self._parts(found):
+                face, b, x = found.face[part], found.b[part], found.x[part]
+                before, after = (
+                    self.shade(frame.fixed_hits(face, b, x, seed[part], Steps(states[part])))
+                    for states in (found.before, found.after)
+                )
+                jumps.append((after - before).detach())
+            jump = torch.cat(jumps) * torch.where(frame.here(found.rises), 1.0, -1.0).to(frame.dtype)[:, None]
+            # |n_x| / |∇s|, and none where s has no direction.
+            length = gradient.norm(dim=1)
+            across = gradient.gather(1, frame.here(found.axis)[:, None])[:, 0].abs()
+            weight = frame.here(found.weight) * torch.where(length > 0, across / length**2, 0.0)
+        return jump, torch.nan_to_num(weight, nan=0.0, posinf=0.0)
+
+    def _values_of_scene(self, found: Crossings, rays: RayRecords) -> Tensor:
+        """(M,) the function of each crossing's step, with a graph of vertices and camera."""
+        frame = self.frame
+        step = frame.here(found.step)[:, None]
+        values = []
+        for part in self._parts(found):
+
+            def of_scene(part: slice = part) -> Tensor:
+                here = RayRecords(*(field[part] for field in rays))
+                hits = frame.moving_hits(found.face[part], here, found.x[part])
+                return self._values(hits).gather(1, step[part])[:, 0]
+
+            many = len(found.x) > self.at_once and not transformed()
+            s = checkpoint(of_scene, use_reentrant=False) if many else of_scene()
+            assert isinstance(s, Tensor)
+            values.append(s)
+        return torch.cat(values)
+
+    def _by_place(self, found: Crossings, rays: RayRecords, part: slice) -> Tensor:
+        """(M, 2): ∇ₓs of each crossing's step, without derivatives of its own."""
+        frame = self.frame
+        step = frame.here(found.step[part])[:, None]
+        face, along, by_x = (frame.here(t[part]) for t in (found.face, rays.along, rays.along_by_x))
+
+        here, b_by_x = frame.fixed_view.barycentrics_by(frame.fixed, face, along, by_x)
+
+        def sum_of_steps(x: Tensor) -> Tensor:
+            b = here + (b_by_x * x[:, None]).sum(-1)
+            hits = Hits(frame.fixed, frame.fixed_view, face, b, frame.here(found.x[part]) + x, frame.sampler.rays_at)
+            return self._values(hits).gather(1, step).sum()
+
+        zero = along.new_zeros((len(along), 2))
+        if transformed():
+            return torch.func.grad(sum_of_steps)(zero).detach()
+        with torch.enable_grad():
+            zero.requires_grad_()
+            return torch.autograd.grad(sum_of_steps(zero), zero, materialize_grads=True)[0].detach()
+
+    def _values(self, hits: Hits) -> Tensor:
+        """(N, K) the functions of all steps."""
+        self.declare(hits)
+        return torch.stack([values.double() for values in hits._steps.values], 1)
+
+    def _parts(self, found: Crossings) -> list[slice]:
+        return [slice(first, first + self.at_once) for first in range(0, max(len(found.x), 1), self.at_once)]
