@@ -78,7 +78,8 @@ def render(
     shader           a function or module of Hits that gives the radiance (N, C) of N points, in place of the meshes' colours
                      and textures: any PyTorch, as long as each point is by itself. It is asked once for each face in a
                      pixel, and for each 16 samples, in parts of some 131,072 points. Where it jumps within a face, that has a
-                     gradient if it says so by hits.where(), hits.floor() or a nearest lookup
+                     gradient if it says so by hits.where(), hits.floor() or a nearest lookup. Meshes that blend are composed
+                     with what it gives behind them, where such jumps have no gradient
     creases          at which edges between two visible faces the shader may jump: "auto", where a property of the hits
                      jumps that it asked for (normals; texture coordinates at seams; attributes of interpolate(); all
                      edges if it asked for `face` or `barycentrics`); True, at all; False, at none
@@ -93,10 +94,10 @@ def render(
     bounces          of lit scenes: how often light is scattered on its way from a light to the eye, at most; 1: direct light. A
                      path goes on from each point that is shaded, as the material there scatters, and draws one point of
                      each light wherever it comes to; from the third bounce on it may end early (Russian roulette). Colours
-                     of meshes without a material light nothing. With 2, everything has its gradient, but for scenes
-                     of which one mesh blends, is cut out by alpha or has a nearest texture, and for vertices of meshes that
-                     pass through each other; there, and by vertices and camera with 3 or more, it is refused, unless
-                     visibility=False. Lights that are no meshes may always move
+                     of meshes without a material light nothing. Everything has its gradient, but for scenes of
+                     which one mesh blends, is cut out by alpha or has a nearest texture, and for vertices of meshes that pass
+                     through each other: there it is refused, unless visibility=False. Lights that are no meshes may
+                     always move
 
     A scene with a light, or with a mesh that has a material, is lit: see Scene and Material. Its image has the dtype of the
     vertices.

@@ -95,7 +95,7 @@ def render_shaded(
         raise TypeError(f"shader: expected a function of Hits, got {type(shader).__name__}")
     if creases not in CREASES or not isinstance(creases, (bool, str)):
         raise ValueError(f'creases: expected "auto", True or False, got {creases!r}')
-    effort = effort or Effort(shaded_points(request.image.spp))
+    effort = effort or Effort(shaded_points(request.image.spp), blended=scene.blends)
     with shaded_room(request, textured=effort.lit and scene.textured_faces is not None):
         images = [
             _Image(Frame(scene, request, k), shader, creases, check, effort).render() for k in range(request.cameras)

@@ -68,6 +68,30 @@ def test_gradients_by_alpha_radiance_and_background() -> None:
         assert float((a - b).abs().max()) < 0.01 * float(b.abs().max())
 
 
+def test_a_shader_is_composed_with_what_it_gives_behind() -> None:
+    """As the materials are: values, and gradients by alpha and by what moves before what is seen through."""
+    scene = eg.Scene([sheet(0, 0.9, 0.25), sheet(-1, 0.5, 0.6, size=0.6)], torch.full((3,), 0.4, dtype=F64))
+
+    def shader(hits: eg.Hits) -> Tensor:
+        return torch.where(hits.position[:, 2:] > -0.5, 0.9, 0.5).expand(-1, 3)
+
+    adjoint = torch.rand(8, 8, 3, dtype=F64, generator=torch.Generator().manual_seed(1))
+
+    def found(shader: object) -> tuple[Tensor, list[Tensor]]:
+        alphas = [mesh.alpha.clone().requires_grad_() for mesh in scene.meshes]
+        x = torch.tensor(0.0, dtype=F64, requires_grad=True)
+        meshes = [mesh.replace(alpha=alpha) for mesh, alpha in zip(scene.meshes, alphas, strict=True)]
+        meshes[1] = meshes[1].replace(verts=meshes[1].verts + torch.stack([x, 0 * x, 0 * x]))
+        image = eg.render(scene.replace(meshes=meshes), from_above(8), 16, shader=shader, edge_samples=20_000)
+        return image.detach(), list(torch.autograd.grad((image * adjoint).sum(), [*alphas, x]))
+
+    (image, gradients), (wanted, others) = found(shader), found(None)
+    # Of a face in a pixel one point is shaded, and with it what lies behind that one: the border is noisier.
+    assert float((image - wanted).mean().abs()) < 0.002 and torch.allclose(image[3:5, 3:5], wanted[3:5, 3:5], atol=1e-9)
+    for a, b in zip(gradients, others, strict=True):
+        assert float((a - b).abs().max()) < 0.02 * float(b.abs().max())
+
+
 def test_a_texture_behind_moves_inside_and_the_border_of_the_first_sheet() -> None:
     """Finite differences of a shift of either sheet: the border of the hidden one has no gradient, so it fills the image."""
     draw = torch.Generator().manual_seed(1)
