@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from bounce_scenes import case_of, indirect_change, indirect_gradient
+from bounce_scenes import case_of, indirect_change, indirect_gradient, plates
 from finite_differences import right_ratio
+
+import edgegrad as eg
 
 
 def check(scene: str, motion: str, spp: int, seeds: int, h: float = 0.1, bounces: int = 2, **samples: Any) -> None:
@@ -32,3 +34,15 @@ def test_all_motions_of_paths_that_no_border_crosses(motion: str, bounces: int) 
 @pytest.mark.slow
 def test_strip_between_plates() -> None:
     check("plates", "strip y", 4096, 6, surface_samples=1 << 18, edge_samples=1 << 16)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("roughness", [0.5, 0.2])
+@pytest.mark.parametrize("glossy", ["left", "right"])
+def test_strip_between_glossy_plates(glossy: str, roughness: float) -> None:
+    found = plates()
+    material = eg.Material(metallic=0.5, roughness=roughness)
+    scene = found._replace(meshes=found.meshes | {glossy: found.meshes[glossy].replace(material=material)})
+    case = scene.moving("strip", (0.0, 1.0, 0.0))
+    change = indirect_change(case, 0.1, 8192, 12)
+    print(right_ratio(change, indirect_gradient(case, 0.1, 12, surface_samples=1_000, edge_samples=60_000)))
