@@ -323,9 +323,10 @@ def test_from_the_shell(two, tmp_path, capsys):
         off = errors(fit, MESHES[k], TRUTHS[k])
         assert off[0] < 2.5 and off[1] < 1.4, off
     said = capsys.readouterr().out
-    # The contour of the first tells its rotation to about 2°, and what is less exact is unknown.
-    assert f"{tmp_path}/0.ply: converged" in said or f"{tmp_path}/0.ply: directions unknown" in said
-    assert f"{tmp_path}/1.ply: converged" in said
+    # The contour of the first tells its rotation to about 2°, and what is less exact is unknown. That of a box in so few
+    # pixels is nearly the same in a pose that is turned by 10°.
+    assert f"{tmp_path}/0.ply: converged" in said or f"{tmp_path}/0.ply: directions unknown" in said, said
+    assert f"{tmp_path}/1.ply: converged" in said or f"{tmp_path}/1.ply: looks alike" in said, said
     assert main(given[:-2]) == 2
     assert "--init: expected 2, one for each --mesh, got 1" in capsys.readouterr().err
     Image.fromarray((labels_of(view, scene_of(2)) == 1).byte().numpy()).save(tmp_path / "labels.png")
