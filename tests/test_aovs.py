@@ -247,6 +247,7 @@ def finite_difference_ratio(lens: str, k: int, names: list[str], step: float = 5
     assert len(tested) >= len(names) - 2, f"too noisy to tell: {differences}"
 
 
+@pytest.mark.unwatched
 def test_finite_differences_of_a_direction() -> None:
     finite_difference_ratio("perspective", 0, ["shading_normal"])
 

@@ -344,7 +344,7 @@ def by_material(name: str) -> Case:
         "emission",
         "normals",
         pytest.param("verts", marks=pytest.mark.slow),
-        "flat",
+        pytest.param("flat", marks=pytest.mark.slow),
     ],
 )
 def test_gradients_by_materials_are_finite_differences(name: str):

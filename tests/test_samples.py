@@ -460,6 +460,7 @@ def test_meshes_with_mipmaps_are_shaded_by_them():
         eg.screen_gradient(fine, camera, found[0])
 
 
+@pytest.mark.unwatched
 def test_meshes_with_mipmaps_have_gradients():
     """Along the texture it is the image; along a shift across the image, which changes no level, finite differences."""
     generator = torch.Generator().manual_seed(2)

@@ -224,6 +224,7 @@ def lamp(s: Setting) -> object:
     return eg.Mesh(verts, faces, material=eg.Material(emission=torch.ones(1, dtype=DOUBLE), two_sided=True))
 
 
+@pytest.mark.unwatched
 def test_lamp_of_many_faces() -> None:
     """It casts the shadows of a panel of two faces, and moves with all its vertices."""
     for motion in ("caster moves", "light moves"):
