@@ -215,6 +215,8 @@ def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
         known = fit.uncertainty.degrees
         if kind == "plain" and known > 2.0:  # the contour of the covered one tells its turn to about as much
             assert fit.reason.startswith("directions unknown: ") and off[0] < known < 2.5, (off, known)
+        elif kind == "plain":  # a plain box shows nearly the same contour in a pose that is turned by 10°
+            assert fit.converged or fit.reason.startswith("looks alike: "), (off, fit.reason)
         else:
             assert fit.converged and fit.reason == "converged", (kind, off, fit.explained)
     assert 0.5 < fits[0].visible < 0.7 and fits[1].visible > 0.98
