@@ -56,13 +56,14 @@ def fit_rig(
     keypoints  by the name of a joint, where each camera sees it: (B, 2) pixels, NaN where it does not. Robust: some may be wrong
     keypoint_weight  of the mean over all of them, of squared distances in units of 2 % of the picture
     coarsest   pixels on the shorter side of the pictures of the first level; each further one has twice as many
-    tries      how often at most a limb is drawn anew, on each level of some 32 to 64 pixels, to leave places where a descent
+    tries      how often at most a limb is drawn anew, on each level of 24 to 96 pixels, to leave places where a descent
                ends; it ends where pictures are explained. 0 for a start nearby
     look       makes of what is posed what is rendered: with lights, a background
     parameters  of `look`, which are sought too and given to it by name: look(posed, light=…)
     options    see edgegrad.fit.Options; `steps` are those of the last level, at most 15 on those before, and the last has four
                times `spp`. Up to 200 numbers are sought by "gauss-newton", more by "adam", unless `method` says. With
-               loss="region" photographs need no masks, and limbs are not drawn anew: the start must overlap what is shown
+               loss="region" photographs need no masks; the start must overlap what is shown, and limbs are drawn anew a
+               quarter as often, on one level
 
     The other arguments are those of fit_scene(). Raises TypeError or ValueError that names the argument.
     """

@@ -22,7 +22,7 @@ MOVED = 0.05  # of the largest derivative by a joint: pixels that it moves
 BESIDE = 2  # pixels around these
 FEWEST = 8.0  # pixels of edges in all views: of less nothing is said
 SPP = 32
-STEPS = 2**22, 2**23  # that no fit comes to
+STEPS = 2**22, 2**23  # that no fit comes to: their samples are those of no loss that was made small
 
 
 def explained_by_joint(

@@ -18,11 +18,10 @@ from torch import Tensor
 
 from ..descent.curvature import scores
 from ..descent.objective import Objective
-from .shown import places_of
+from .shown import STEPS, places_of
 
 WIDEST = 1.0  # radian, or as many learning rates as make one: the deviation of what the pictures do not show at all
 DEGREES = 5.0  # a joint that is known less exactly is unknown
-STEP = 2**22  # a step that no fit comes to: its samples are those of no loss that was made small
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +60,7 @@ def uncertainty_of(
     rates   of each, of which 1 / 0.03 make as much as a radian does
     joints  of the values that are turns of joints, their names
     """
-    H, S = scores(objective, tensors, STEP)
+    H, S = scores(objective, tensors, STEPS[0])
     unit = torch.cat([torch.full((v.numel(),), rates[name] / 0.03, dtype=torch.float64) for name, v in tensors.items()])
     H, S = H * unit * unit[:, None], S * unit * unit[:, None]
     # What the pictures do not show: as if one more picture, of the pixels' own noise, had told it to WIDEST.
