@@ -396,14 +396,17 @@ def test_white_may_be_any_brighter_colour():
 
 
 def test_two_meshes_that_end_in_one_place_have_not_converged():
-    """The picture shows one of them."""
+    """The picture shows one of them. Two steps leave both about where they start; where many take them depends on rounding."""
     view = view_of(96)
-    beside_it = beside(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.1), (0.3, 0.2, 0.2))
+    beside_it = beside(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (0.03, 0.02, 0.02))
     image = photograph(view, scene_of(1), seed=4)
-    starts = [STARTS[0], beside_it]
-    fits = fit_poses([MESHES[0]] * 2, image, view, init=starts, spp=8, search=False, progress=False)
+    starts = [TRUTHS[0], beside_it]
+    fits = fit_poses([MESHES[0]] * 2, image, view, init=starts, spp=8, steps=2, search=False, progress=False)
     for k, fit in enumerate(fits):
         assert not fit.converged and fit.reason.startswith(f"in one place: meshes[{k}] ends where")
+    apart = [TRUTHS[0], beside(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (2.5, 0.02, 0.02))]
+    fits = fit_poses([MESHES[0]] * 2, image, view, init=apart, spp=8, steps=2, search=False, progress=False)
+    assert not any(fit.reason.startswith("in one place") for fit in fits)
 
 
 def test_a_direction_that_contours_do_not_show_is_unknown():
