@@ -73,24 +73,24 @@ class Templates:
     def near(self, crops: Tensor, masked: bool) -> Tensor:
         """(n, k, k) of a crop (n, C + 1, T + k − 1, T + k − 1) for each view, at k × k shifts. The last channel is surprise(), or
         a mask; then it is how likely colours and mask are, for a view of the same size."""
-        T, parts = self.alpha.shape[-1], []
+        parts = []
         for at in range(0, len(crops), AT_ONCE):
             rows = slice(at, at + AT_ONCE)
-            places = crops[rows].unfold(2, T, 1).unfold(3, T, 1)  # (n, C + 1, k, k, T, T)
-            n, k = len(places), places.shape[2]
-            pixels = places.permute(0, 2, 3, 1, 4, 5).reshape(n, k * k, self.C + 1, T * T)
-            colours, last = pixels[:, :, :-1], pixels[:, :, -1]
-            filters = self.filters[rows].reshape(n, self.C, 4, T * T)
-            b = torch.einsum("nscp,ncfp->ncfs", colours, filters).reshape(n, 4 * self.C, k, k)
-            sides = torch.stack([self.inside[rows], self.around[rows]], 1).flatten(2)
-            squares = torch.einsum("nsp,nop->nos", colours.square().sum(2), sides).reshape(n, 2, k, k)
-            if masked:
-                shape = (last - self.alpha[rows].flatten(1)[:, None]).square().sum(-1).reshape(n, k, k)
-                error = self._error(b, squares[:, 0], rows) + SHAPE * shape
+            colours, last = crops[rows, :-1], crops[rows, -1:]
+            sides = torch.stack([self.inside[rows], self.around[rows]], 1)
+            n, k = len(sides), crops.shape[-1] - sides.shape[-1] + 1
+            filters = torch.cat([self.filters[rows], sides[:, None].expand(-1, self.C, -1, -1, -1)], 2)
+            out = _one_by_one(colours.flatten(0, 1), filters.flatten(0, 1)).reshape(n, self.C, 6, k, k)
+            b, sums = out[:, :, :4].reshape(n, 4 * self.C, k, k), out[:, :, 4:].transpose(1, 2)
+            squares = _one_by_one(colours.square().sum(1), sides)
+            if masked:  # Σ(m − α)² = Σm² − 2Σmα + Σα²
+                alpha = self.alpha[rows, None]
+                of_masks = _one_by_one(last[:, 0].square(), torch.ones_like(alpha))
+                shape = of_masks - 2.0 * _one_by_one(last[:, 0], alpha) + alpha.square().sum((2, 3), keepdim=True)
+                error = self._error(b, squares[:, 0], rows) + SHAPE * shape[:, 0].clamp(min=0.0)
                 parts.append(-torch.log(error / self.alpha[rows].sum((1, 2)).clamp(min=1.0)[:, None, None] + NOISE**2))
                 continue
-            sums = torch.einsum("nscp,nop->nocs", colours, sides).reshape(n, 2, self.C, k, k)
-            rare = torch.einsum("nsp,np->ns", last, sides[:, 0]).reshape(n, k, k)
+            rare = _one_by_one(last[:, 0], sides[:, :1])[:, 0]
             parts.append(self._ratios(b, sums, squares, rare, rows))
         return torch.cat(parts)
 
@@ -109,6 +109,15 @@ class Templates:
         variance = error / (self.C * inside) + NOISE**2
         to_all = rare - 0.5 * self.C * inside * (variance.log() + math.log(2.0 * math.pi) + 1.0)
         return to_one + self.rare * to_all
+
+
+def _one_by_one(pictures: Tensor, filters: Tensor) -> Tensor:
+    """(n, f, k, k), the correlations of each picture (n, h, w) with filters of its own (n, f, T, T)."""
+    if not len(pictures):  # of masks without colours
+        k = pictures.shape[-1] - filters.shape[-1] + 1
+        return pictures.new_zeros(*filters.shape[:2], k, k)
+    found = F.conv2d(pictures[None], filters.flatten(0, 1)[:, None], groups=len(pictures))
+    return found[0].unflatten(0, filters.shape[:2])
 
 
 def surprise(picture: Tensor) -> Tensor:
