@@ -31,6 +31,7 @@ from ..options import Options, Parameter
 from ..placement import Coordinates
 from ..priors import Prior
 from ..views import View
+from .exchange import exchange_of
 from .limbs import ByContour, ByLoss, Limb, Search, limbs
 from .result import RigFit
 from .shown import explained_by_joint, left_out
@@ -201,8 +202,9 @@ class Levels:
             parameters = self.sought.parameters
             judge = ByLoss(objective, name) if objective.regions is None else ByContour(objective, name, joints)
             search = Search(
-                objective, judge, name, groups, parameters, control.rest[rows], steps, options.seed, bar.update
-            )
+                objective, judge, name, groups, parameters, control.rest[rows], exchange_of(self.rig, self.sought, name),
+                steps, options.seed, bar.update,
+            )  # fmt: skip
             return search.run(dict(values), self.tries if objective.regions is None else -(-self.tries // BY_REGIONS))
         finally:
             bar.close()

@@ -23,6 +23,7 @@ from ..descent.objective import Objective
 from ..descent.regions import LAST
 from ..options import Parameter
 from ..verdict import ENOUGH
+from .exchange import Exchange
 from .shown import explained_by_joint
 
 DRAWS = 64  # turns of a limb that are looked at
@@ -59,9 +60,16 @@ def limbs(rig: Rig, rows: Sequence[int]) -> list[Limb]:
             whole[row] = group
         found.append(Limb(whole.get(row, [list(rows).index(row)])))
     for a, b in itertools.combinations(whole, 2):
-        if parents[a] == parents[b] and len(whole[a]) == len(whole[b]) > 1:
-            found.append(Limb([*whole[a], *whole[b]], (whole[a], whole[b])))
+        one, other = whole[a], whole[b]
+        if parents[a] == parents[b] and len(one) > 1 and _hung(parents, rows, one) == _hung(parents, rows, other):
+            found.append(Limb([*one, *other], (one, other)))
     return found
+
+
+def _hung(parents: Sequence[int], rows: Sequence[int], limb: Sequence[int]) -> list[int]:
+    """Of each joint of a limb, which of these it hangs on, −1 of none."""
+    places = {rows[place]: k for k, place in enumerate(limb)}
+    return [places.get(parents[rows[place]], -1) for place in limb]
 
 
 class Judge(Protocol):
@@ -148,7 +156,8 @@ def loss_of(objective: Objective, values: Values, seeds: Sequence[int] = SEEDS) 
 class Search:
     """At groups of rows of one of the values.
 
-    steps  goes down from the values of parameters, of an objective
+    exchange  puts two limbs each where the other one is
+    steps     goes down from the values of parameters, of an objective
     """
 
     objective: Objective
@@ -157,6 +166,7 @@ class Search:
     groups: Sequence[Limb]
     parameters: Mapping[str, Parameter]
     rest: Tensor
+    exchange: Exchange
     steps: Callable[[Objective, Mapping[str, Parameter]], Values]
     seed: int
     tell: Callable[[], Any] = lambda: None
@@ -167,23 +177,34 @@ class Search:
         if self.judge.explained(values):
             return values
         self.generator = torch.Generator().manual_seed(self.seed)
-        best, least, chances = values, self.judge.cost(values), self.chances(values)
-        for _ in range(tries):
+        best = values, self.judge.cost(values)
+        for pair in self.groups:
+            if pair.twins is not None:
+                start = {**best[0], self.name: self.within(self.exchange(best[0], *pair.twins))}
+                best = self.better(best, [start], pair)
+        chances = self.chances(best[0])
+        for _ in range(0 if self.judge.explained(best[0]) else tries):
             limb = self.groups[int(torch.multinomial(chances, 1, generator=self.generator))]
-            self.judge.renew(best)
-            found = min(
-                (self.alone(start, limb) for start in self.drawn(best, limb)), key=self.judge.cost, default=None
-            )
-            # What lies in the limb's true place must often leave it before the loss is lower.
-            if found is not None and self.judge.cost(found) < self.judge.worse * least:
-                found = self.steps(self.objective, self.started(found))
-                if (now := self.judge.cost(found)) < least - self.judge.gain:
-                    best, least = found, now
-                    if self.judge.explained(best):
-                        break
-                    chances = self.chances(best)
+            found = self.better(best, self.drawn(best[0], limb), limb)
+            if found is not best:
+                best = found
+                if self.judge.explained(best[0]):
+                    break
+                chances = self.chances(best[0])
             self.tell()
-        self.judge.renew(best)
+        self.judge.renew(best[0])
+        return best[0]
+
+    def better(self, best: tuple[Values, float], starts: Sequence[Values], limb: Limb) -> tuple[Values, float]:
+        """What starts of a limb lead to, where its cost is lower than that of the best so far; else that."""
+        values, least = best
+        self.judge.renew(values)
+        found = min((self.alone(start, limb) for start in starts), key=self.judge.cost, default=None)
+        # What lies in the limb's true place must often leave it before the loss is lower.
+        if found is not None and self.judge.cost(found) < self.judge.worse * least:
+            found = self.steps(self.objective, self.started(found))
+            if (now := self.judge.cost(found)) < least - self.judge.gain:
+                return found, now
         return best
 
     def chances(self, values: Values) -> Tensor:
@@ -196,18 +217,18 @@ class Search:
     def drawn(self, values: Values, limb: Limb) -> list[Values]:
         """With a limb turned at random: the best of many turns that are not about where it is."""
         now, low = values[self.name], []
+        across = now if limb.twins is None else self.exchange(values, *limb.twins)
         for k in range(DRAWS):
             turned = now.clone()
             if limb.twins is not None and k % 2:
-                one, other = limb.twins
-                turned[[*one, *other]] = turned[[*other, *one]]
+                turned = across.clone()
             # Half of them from rest, half from where it is; some turn the first joint alone.
             chosen = limb.rows[: 1 if k % 4 > 1 else None]
             middle = turned[chosen] if k % 8 < 4 else self.rest[chosen].to(turned)
             turned[chosen] = middle + SPREADS[k % 3 % 2] * torch.randn(
                 middle.shape, generator=self.generator, dtype=turned.dtype
             )
-            start = {**values, self.name: self.parameters[self.name].within(turned)}
+            start = {**values, self.name: self.within(turned)}
             if float((start[self.name] - now)[limb.rows].reshape(len(limb.rows), -1).norm(dim=1).max()) > APART:
                 low.append((loss_of(self.objective, start, SEEDS[:1]), k, start))
         return [start for _, _, start in sorted(low)[:STARTS]]
@@ -227,6 +248,9 @@ class Search:
         low, high = (None if b is None else torch.as_tensor(b)[place] for b in (parameter.low, parameter.high))
         own = Parameter(parameter.lr, start[self.name][place], low, high)
         return whole(self.steps(self.objective.of(whole), {self.name: own}))
+
+    def within(self, value: Tensor) -> Tensor:
+        return self.parameters[self.name].within(value)
 
     def started(self, values: Values) -> dict[str, Parameter]:
         return {n: Parameter(p.lr, p.within(values[n]), p.low, p.high) for n, p in self.parameters.items()}
