@@ -147,23 +147,29 @@ class Browser:
                     handle = old.handle
                     handle.vertices = _floats(mesh.verts)
                 else:
-                    handle = self._added(f"/meshes/{i}", mesh)
-                    if simple is not None and frame.bones is not None:
-                        handle.opacity = SEE_THROUGH
+                    handle = self._added(f"/meshes/{i}", mesh, 1.0 if frame.bones is None else SEE_THROUGH)
                 self._meshes[i] = _Shown(mesh, handle)
             for name, value in place.items():
                 setattr(self._meshes[i].handle, name, value)
 
-    def _added(self, name: str, mesh: Mesh) -> Any:
+    def _added(self, name: str, mesh: Mesh, opacity: float) -> Any:
         """Takes the place of one of that name."""
         if (simple := _Simple.of(mesh)) is not None:
             faces = mesh.faces.numpy().astype(np.uint32)
-            return self.server.scene.add_mesh_simple(name, _floats(mesh.verts), faces, **simple._asdict())
+            see_through = {"opacity": opacity} if opacity < 1.0 else {}
+            return self.server.scene.add_mesh_simple(
+                name, _floats(mesh.verts), faces, **simple._asdict(), **see_through
+            )
         mesh = mesh.detach()
         if mesh.face_colors is not None:  # of corners they are written faster
             mesh = mesh.replace(corner_colors=mesh.face_colors[:, None].expand(-1, 3, -1))
         if mesh.material is None:  # matt and smooth
             mesh = mesh.replace(material=Material(), normals=vertex_normals(mesh.verts, mesh.faces), normal_faces=None)
+        if opacity < 1.0 and mesh.alpha is None and mesh.material is not None:
+            own = mesh.uvs is not None
+            anywhere = {} if own else {"uvs": torch.zeros(1, 2), "uv_faces": torch.zeros_like(mesh.faces)}
+            blends = mesh.material.replace(alpha_mode="BLEND")
+            mesh = mesh.replace(alpha=torch.full((1, 1), opacity), material=blends, **anywhere)
         return self.server.scene.add_glb(name, to_glb(mesh)[0])
 
     def _draw_bones(self, frame: Frame) -> None:

@@ -31,8 +31,8 @@ from ..options import Options, Parameter
 from ..placement import Coordinates
 from ..priors import Prior
 from ..views import View
-from .exchange import exchange_of
-from .limbs import ByContour, ByLoss, Limb, Search, limbs
+from .alternatives import Alternatives
+from .limbs import EXPLAINED, ByContour, ByLoss, Limb, Search, limbs
 from .result import RigFit
 from .shown import explained_by_joint, left_out
 from .sought import Sought
@@ -40,6 +40,7 @@ from .uncertainty import JointUncertainty, uncertainty_of
 
 TRIED = range(24, 97)  # pixels on the shorter side of pictures on levels where limbs are drawn anew
 TRY_STEPS = 6  # of each of these
+TWIST_STEPS = 12  # of a limb of which a joint is twisted, on the last level
 BY_REGIONS = 4  # a try by regions takes so many times as long, and there are so many times fewer
 FINER = 4  # times as many samples on the last level, where twists of limbs are told by little
 NEAR = 10.0  # what is left of the loss, in units of its noise, from which steps go far where pictures show little:
@@ -170,7 +171,8 @@ class Levels:
         objective = Objective(build, views, options, prior=prior, many=self.many(views))
         if fresh and level == 0:
             objective.check(values)
-        found = self._steps(objective, values, options, save, saved, f"level {level + 1} of {len(self.factors)}", fine)
+        title = f"level {level + 1} of {len(self.factors)}"
+        found = self._steps(objective, values, options, save, saved, title, fine)
         name = next((n for n in ("rotations", "angles") if n in values and self.rig.deformer.parents), None)
         if (
             level in self.tried
@@ -181,12 +183,37 @@ class Levels:
             and found.ending is not Ending.INTERRUPTED
         ):
             found = found._replace(values=self._searched(objective, found.values, options, name))
+        if (
+            fine
+            and self.tries
+            and name == "rotations"
+            and objective.regions is None
+            and found.ending is not Ending.INTERRUPTED
+            and EXPLAINED < objective.left(found.values) < NEAR
+        ):
+            search = self._search(objective, found.values, options, name, TWIST_STEPS)
+            values = search.untwisted(dict(found.values))
+            more = self._steps(objective, values, options, save, None, title, fine)
+            later = [record._replace(step=len(found.history) + k) for k, record in enumerate(more.history)]
+            found = more._replace(history=found.history + later, seconds=found.seconds + more.seconds)
         return found
 
     def _searched(
         self, objective: Objective, values: Mapping[str, Tensor], options: Options, name: str
     ) -> dict[str, Tensor]:
-        few = dataclasses.replace(options, steps=TRY_STEPS, tolerance=0.0, progress=False, callback=None)
+        bar = tqdm(total=self.tries, desc="limbs drawn anew", disable=not options.progress, leave=False)
+        try:
+            search = self._search(objective, values, options, name, TRY_STEPS, bar.update)
+            return search.run(dict(values), self.tries if objective.regions is None else -(-self.tries // BY_REGIONS))
+        finally:
+            bar.close()
+
+    def _search(
+        self, objective: Objective, values: Mapping[str, Tensor], options: Options, name: str, count: int,
+        tell: Callable[[], Any] = lambda: None,
+    ) -> Search:  # fmt: skip
+        """Each way of so many steps."""
+        few = dataclasses.replace(options, steps=count, tolerance=0.0, progress=False, callback=None)
         control, rows = self.rig.controls[name], self.sought.rows.get(name, torch.arange(len(values[name])))
         joints = self.sought.joints.get(name, ())
         if name == "rotations":
@@ -197,17 +224,11 @@ class Levels:
         def steps(objective: Objective, parameters: Mapping[str, Parameter]) -> dict[str, Tensor]:
             return descend(way_of(parameters, few), objective, lambda state: None).values
 
-        bar = tqdm(total=self.tries, desc="limbs drawn anew", disable=not options.progress, leave=False)
-        try:
-            parameters = self.sought.parameters
-            judge = ByLoss(objective, name) if objective.regions is None else ByContour(objective, name, joints)
-            search = Search(
-                objective, judge, name, groups, parameters, control.rest[rows], exchange_of(self.rig, self.sought, name),
-                steps, options.seed, bar.update,
-            )  # fmt: skip
-            return search.run(dict(values), self.tries if objective.regions is None else -(-self.tries // BY_REGIONS))
-        finally:
-            bar.close()
+        judge = ByLoss(objective, name) if objective.regions is None else ByContour(objective, name, joints)
+        return Search(
+            objective, judge, name, groups, self.sought.parameters, control.rest[rows],
+            Alternatives(self.rig, self.sought, name), steps, options.seed, tell,
+        )  # fmt: skip
 
     def _steps(
         self, objective: Objective, values: Mapping[str, Tensor], options: Options, save: Callable[[dict[str, Any]], None],

@@ -23,7 +23,7 @@ from ..descent.objective import Objective
 from ..descent.regions import LAST
 from ..options import Parameter
 from ..verdict import ENOUGH
-from .exchange import Exchange
+from .alternatives import Alternatives
 from .shown import explained_by_joint
 
 DRAWS = 64  # turns of a limb that are looked at
@@ -31,6 +31,7 @@ SPREADS = 0.2, 0.4  # radians, of each component, by turns
 SHARE = 0.4  # of all rows: a joint with more below it is turned alone
 EXPLAINED = 1.5  # of the loss by noise alone: less is not to be mended
 APART = 0.3  # radians of a joint at least, by which a turn is another place
+TWISTS = -0.7, -0.35, 0.35, 0.7  # radians
 STARTS = 2  # of the turns, that go down
 LEAST = 0.05  # of the largest chance of a limb to be drawn
 SEEDS = 0, 1  # by which losses are compared
@@ -156,8 +157,7 @@ def loss_of(objective: Objective, values: Values, seeds: Sequence[int] = SEEDS) 
 class Search:
     """At groups of rows of one of the values.
 
-    exchange  puts two limbs each where the other one is
-    steps     goes down from the values of parameters, of an objective
+    steps  goes down from the values of parameters, of an objective
     """
 
     objective: Objective
@@ -166,7 +166,7 @@ class Search:
     groups: Sequence[Limb]
     parameters: Mapping[str, Parameter]
     rest: Tensor
-    exchange: Exchange
+    alternatives: Alternatives
     steps: Callable[[Objective, Mapping[str, Parameter]], Values]
     seed: int
     tell: Callable[[], Any] = lambda: None
@@ -180,7 +180,7 @@ class Search:
         best = values, self.judge.cost(values)
         for pair in self.groups:
             if pair.twins is not None:
-                start = {**best[0], self.name: self.within(self.exchange(best[0], *pair.twins))}
+                start = {**best[0], self.name: self.within(self.alternatives.exchanged(best[0], *pair.twins))}
                 best = self.better(best, [start], pair)
         chances = self.chances(best[0])
         for _ in range(0 if self.judge.explained(best[0]) else tries):
@@ -194,6 +194,24 @@ class Search:
             self.tell()
         self.judge.renew(best[0])
         return best[0]
+
+    def untwisted(self, values: Values) -> Values:
+        """Twists that the joints of a limb share in another way, limb by limb, as long as the pictures are not explained."""
+        best, least = values, self.judge.cost(values)
+        chances = self.chances(values).tolist()
+        order = sorted(zip(chances, self.groups, strict=True), key=lambda one: -one[0])
+        for limb in (limb for _, limb in order if limb.twins is None):
+            for row, child in self.alternatives.links(best, limb.rows):
+                if self.judge.explained(best):
+                    return best
+                starts = [
+                    {**best, self.name: self.within(self.alternatives.twisted(best, row, child, angle))}
+                    for angle in TWISTS
+                ]
+                found = self.alone(min(starts, key=lambda start: loss_of(self.objective, start, SEEDS[:1])), limb)
+                if (now := self.judge.cost(found)) < least:
+                    best, least = found, now
+        return best
 
     def better(self, best: tuple[Values, float], starts: Sequence[Values], limb: Limb) -> tuple[Values, float]:
         """What starts of a limb lead to, where its cost is lower than that of the best so far; else that."""
@@ -217,7 +235,7 @@ class Search:
     def drawn(self, values: Values, limb: Limb) -> list[Values]:
         """With a limb turned at random: the best of many turns that are not about where it is."""
         now, low = values[self.name], []
-        across = now if limb.twins is None else self.exchange(values, *limb.twins)
+        across = now if limb.twins is None else self.alternatives.exchanged(values, *limb.twins)
         for k in range(DRAWS):
             turned = now.clone()
             if limb.twins is not None and k % 2:

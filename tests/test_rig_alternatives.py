@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import edgegrad as eg
-from edgegrad.fit.rig.exchange import exchanged
+from edgegrad.fit.rig.alternatives import exchanged
 from edgegrad.fit.rig.limbs import limbs
 
 roma = pytest.importorskip("roma")

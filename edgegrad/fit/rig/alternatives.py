@@ -1,0 +1,123 @@
+"""Poses that outlines hardly tell from another one, and that no descent from that one reaches.
+
+Two limbs of one build, as two legs, may each be where the other one is; joints in a row may share a twist in another way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...rig.joints import Joints
+from ...rig.rig import Rig
+from ...rig.rotations import roma
+from ...rig.skinned import Skinned
+from .sought import Sought
+
+
+@dataclass(frozen=True)
+class Alternatives:
+    """Of values that are sought, other ones of the value `name`, which are rotation vectors."""
+
+    rig: Rig
+    sought: Sought
+    name: str
+
+    @property
+    def joints(self) -> Joints | None:
+        """None where a rig does not say how they hang."""
+        return self.rig.deformer.joints if isinstance(self.rig.deformer, Skinned) else None
+
+    def exchanged(self, values: Mapping[str, Tensor], one: Sequence[int], other: Sequence[int]) -> Tensor:
+        """Two groups of rows, each where the other one is. Without joints each row takes its counterpart's rotation vector."""
+        both = [*one, *other]
+        if self.joints is None:
+            value = values[self.name].clone()
+            value[both] = value[[*other, *one]]
+            return value
+        rotations, every = self._rotations(values), self.sought.all(values)
+        ours, theirs = (self._places(values)[list(limb)].tolist() for limb in (one, other))
+        found = exchanged(self.joints, rotations, ours, theirs, every["joint_translations"], every["joint_scales"])
+        return self._changed(values, found, both)
+
+    def links(self, values: Mapping[str, Tensor], rows: Sequence[int]) -> list[tuple[int, int]]:
+        """Of these rows, pairs of a joint and the only one that hangs on it."""
+        if self.joints is None:
+            return []
+        places = self._places(values).tolist()
+        row_of, found = {place: row for row, place in enumerate(places)}, []
+        for row in rows:
+            below = [j for j, parent in enumerate(self.joints.parents) if parent == places[row]]
+            if len(below) == 1 and row_of.get(below[0]) in rows:
+                found.append((row, row_of[below[0]]))
+        return found
+
+    def twisted(self, values: Mapping[str, Tensor], row: int, child: int, angle: float) -> Tensor:
+        """A joint twisted by so many radians about the line to its child, which stays as it is."""
+        assert self.joints is not None
+        places, rotations = self._places(values), self._rotations(values)
+        at, below = int(places[row]), int(places[child])
+        along = self.sought.all(values)["joint_translations"][below]
+        Q = roma().rotvec_to_rotmat(angle * along / along.norm().clamp(min=1e-12))
+        hung = self.joints.rotations[below]
+        found = rotations.clone()
+        found[at] = rotations[at] @ Q
+        found[below] = hung.mT @ Q.mT @ hung @ rotations[below]
+        return self._changed(values, found, [row, child])
+
+    def _places(self, values: Mapping[str, Tensor]) -> Tensor:
+        """Among all joints, of the rows."""
+        return self.sought.rows.get(self.name, torch.arange(len(values[self.name])))
+
+    def _rotations(self, values: Mapping[str, Tensor]) -> Tensor:
+        """(J, 3, 3)"""
+        return roma().rotvec_to_rotmat(self.sought.all(values)[self.name].double())
+
+    def _changed(self, values: Mapping[str, Tensor], rotations: Tensor, rows: list[int]) -> Tensor:
+        value = values[self.name].clone()
+        value[rows] = roma().rotmat_to_rotvec(rotations[self._places(values)[rows]]).to(value)
+        return value
+
+
+def exchanged(
+    joints: Joints, rotations: Tensor, one: Sequence[int], other: Sequence[int],
+    translations: Tensor | None = None, scales: Tensor | None = None,
+) -> Tensor:  # fmt: skip
+    """(J, 3, 3) rotations of all joints, as Joints.world() takes them.
+
+    one, other   joints of the two limbs, each with its parents before it, in one order
+
+    Each joint turns from rest as its counterpart does, and then by the smallest rotation that points it to where the
+    counterpart's children are.
+    """
+    rest, before = (joints.world(R, translations, scales) for R in (None, rotations))
+    turned, upright = _orientations(before), _orientations(rest)
+    found = rotations.clone()
+    for ours, theirs in ((one, other), (other, one)):
+        for j, twin in zip(ours, theirs, strict=True):
+            after = joints.world(found, translations, scales)
+            orientation = turned[twin] @ upright[twin].mT @ upright[j]
+            below = [(a, b) for a, b in zip(ours, theirs, strict=True) if joints.parents[a] == j]
+            if below:
+                own, wanted = [a for a, _ in below], [b for _, b in below]
+                along = orientation @ upright[j].mT @ (rest[own, :3, 3].mean(0) - rest[j, :3, 3])
+                orientation = _smallest(along, before[wanted, :3, 3].mean(0) - after[j, :3, 3]) @ orientation
+            parent = joints.parents[j]
+            above = torch.eye(3).to(orientation) if parent < 0 else _orientations(after)[parent]
+            found[j] = (above @ joints.rotations[j]).mT @ orientation
+    return found
+
+
+def _orientations(world: Tensor) -> Tensor:
+    """(J, 3, 3) without what stretches."""
+    return roma().special_procrustes(world[:, :3, :3])
+
+
+def _smallest(along: Tensor, wanted: Tensor) -> Tensor:
+    """(3, 3), the rotation by the smallest angle that turns one direction (3,) to another."""
+    axis = torch.linalg.cross(along, wanted)
+    angle = torch.atan2(axis.norm(), along @ wanted)
+    return roma().rotvec_to_rotmat(angle * axis / axis.norm().clamp(min=1e-12))
