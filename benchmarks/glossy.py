@@ -89,8 +89,8 @@ class LampImages:
         floor = eg.Mesh(corners, torch.tensor([[0, 2, 1], [0, 3, 2]]), material=metal)
         if kind in QUADS:
             center, u, v, radiance = QUADS[kind]
-            corner = [torch.tensor(part) for part in (center, u, v)]
-            lamp = eg.AreaLight.rectangle(*corner, radiance, two_sided=False)
+            vectors = torch.tensor(center), torch.tensor(u), torch.tensor(v)
+            lamp = eg.AreaLight.rectangle(*vectors, radiance, two_sided=False)
         else:
             place, size = LAMP_BALL
             verts = torch.nn.functional.normalize(sphere(3).verts.float(), dim=1) * size + torch.tensor(place)
