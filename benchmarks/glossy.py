@@ -88,8 +88,9 @@ class LampImages:
         corners = FLOOR * torch.tensor([[-1.0, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]])
         floor = eg.Mesh(corners, torch.tensor([[0, 2, 1], [0, 3, 2]]), material=metal)
         if kind in QUADS:
-            *parts, radiance = QUADS[kind]
-            lamp = eg.AreaLight.rectangle(*map(torch.tensor, parts), radiance, two_sided=False)
+            center, u, v, radiance = QUADS[kind]
+            vectors = torch.tensor(center), torch.tensor(u), torch.tensor(v)
+            lamp = eg.AreaLight.rectangle(*vectors, radiance, two_sided=False)
         else:
             place, size = LAMP_BALL
             verts = torch.nn.functional.normalize(sphere(3).verts.float(), dim=1) * size + torch.tensor(place)

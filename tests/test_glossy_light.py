@@ -196,5 +196,6 @@ SPIN = torch.tensor([[0.0, 0.5, -0.3], [-0.5, 0.0, 0.4], [0.3, -0.4, 0.0]], dtyp
     "name", ["base color", "metallic", "roughness", "normals", "translation", "texels", "rotation"]
 )
 def test_gradients_are_finite_differences(name: str):
-    samples = {"surface_samples": 60_000, "edge_samples": 10_000 if name == "translation" else 500}
-    check_ratio(by(name), 0.1, spp=256, seeds=64, filter="box", light_samples=4, **samples)
+    samples = {"surface_samples": 5000, "edge_samples": 5000 if name == "translation" else 500}
+    # At a step of 0.1 differences by rotation are 1 % off for the step alone.
+    check_ratio(by(name), 0.05, spp=256, seeds=64, filter="box", light_samples=4, **samples)

@@ -212,6 +212,23 @@ def test_images_in_reverse_and_forward_mode() -> None:
     assert abs(float(forward) - reverse[0]) < 1e-6 * abs(reverse[0])
 
 
+def test_texture_coordinates_in_single_precision() -> None:
+    """The same scene in float32 has the same derivative."""
+    camera = eg.Camera.look_at((0.3, -2.0, 1.0), PLACE.tolist(), fov_y=30.0, size=(4, 4)).to(F64)
+
+    def gradient(dtype: torch.dtype) -> Tensor:
+        uvs = COORDINATES["askew"].to(dtype).requires_grad_()
+        lit = scene(COORDINATES["askew"]).to(dtype)
+        floor, lamp = lit.meshes
+        image = eg.render(lit.replace(meshes=[floor, lamp.replace(uvs=uvs)]), camera.to(dtype), 4)
+        assert image.dtype == dtype
+        return torch.autograd.grad(image.sum(), uvs)[0]
+
+    exact = gradient(F64)
+    assert bool(exact.any())
+    torch.testing.assert_close(gradient(torch.float32).double(), exact, rtol=1e-3, atol=1e-3 * float(exact.abs().max()))
+
+
 def test_steps_are_declared_as_shading_looks_them_up() -> None:
     """By declare_steps() alone, in the same order."""
     draw = torch.Generator().manual_seed(5)

@@ -401,8 +401,8 @@ def _of_moving_borders(hits: Hits, lamps: list[_Lamp], lighting: Lighting) -> Te
                         surface,
                         lighting.shadows,
                         lambda rows, y, drawn=drawn, light=light: (
-                            light.facing(drawn.face[rows], drawn.b[rows], y) * drawn.weight[rows].to(y)
-                        ),
+                            light.facing(drawn.face[rows], drawn.b[rows], y) * drawn.weight[rows]
+                        ).to(y),
                     )
                     reaches = _where_seen(own, material, reaches / lighting.samples)
                 total = total + reaches * borders.motion(drawn).to(reaches)
