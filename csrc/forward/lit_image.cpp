@@ -42,9 +42,10 @@ class LitRow : public RowVisitor {
     void visit(int y, std::vector<PixelHit>& hits) override {
         std::fill(sums_.begin(), sums_.end(), 0.0);
         among_ = 0;
-        for (size_t first = 0; first < hits.size(); first += shaded_at_once) {
+        const size_t at_once = paths_ ? shaded_at_once / paths_of_point : shaded_at_once;
+        for (size_t first = 0; first < hits.size(); first += at_once) {
             in_.team.check();  // with many points of lights a row takes long
-            shade(hits, first, std::min(hits.size() - first, size_t(shaded_at_once)));
+            shade(hits, first, std::min(hits.size() - first, at_once));
         }
         const int C = in_.lit.channels;
         for (int x = 0; x < in_.width; ++x) {
@@ -111,7 +112,7 @@ LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Cam
                     std::vector<uint8_t>(lit.lamps.size(), 0)};
     std::unique_ptr<ImageBorders> borders;
     if (image.spp > 1) borders = std::make_unique<ImageBorders>(camera.width, camera.height, lit, options);
-    const auto shade_pixels = [&](const PixelChoice& choice, uint64_t seed) {
+    const auto shade_pixels = [&](const ImageOptions& image, const PixelChoice& choice, uint64_t seed) {
         const RowInput<T> rows{lit,         scene, caster,      options, camera.width,
                                choice.most, seed,  choice.only, out,     choice.only ? nullptr : borders.get(),
                                team};
@@ -119,11 +120,13 @@ LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Cam
                          [&] { return std::make_unique<LitRow<T>>(rows); });
     };
     const bool spread = lit.is_filtered();
-    shade_pixels({0, camera.height, sampling.points, nullptr, spread}, sampling.seed);
+    shade_pixels(image, {0, camera.height, sampling.points, nullptr, spread}, sampling.seed);
     if (!borders) return out;
     std::vector<uint8_t> pixels;
+    ImageOptions finer = image;
+    if (options.bounces > 1) finer.spp *= rays_again;
     if (const int times = borders->find(pixels, team))
-        shade_pixels({0, camera.height, times * sampling.points, pixels.data(), spread}, sampling.again);
+        shade_pixels(finer, {0, camera.height, times * sampling.points, pixels.data(), spread}, sampling.again);
     return out;
 }
 
