@@ -172,7 +172,7 @@ def _bounces(scene: Scene, points: int, lighting: Lighting) -> Term:
     shadows = len(scene.casting) if lighting.shadows else 0
     return Term(
         True,
-        f"a path for each point of the gradient, and for each face in a pixel; {1 + shadows} rays for each of at most "
+        f"a path for each point of the gradient, and two for each ray of the image; {1 + shadows} rays for each of at most "
         f"{lighting.bounces - 1} further points",
         samples=(lighting.bounces - 1) * (1 + shadows) * points,
     )

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from path_oracle import PathOracle
+from room_scenes import ROOMS as ALL_ROOMS
 from room_scenes import box_room, lamp, quad, towards_room, vector
 from scenes import icosphere
 from torch import Tensor
@@ -58,6 +59,23 @@ def test_points(room: str) -> None:
 @pytest.mark.parametrize("room", ROOMS)
 def test_points_of_all_rooms(room: str, bounces: int) -> None:
     check_points(room, bounces, (20, 45, 55), 300_000)
+
+
+# Shares of the radiance are drawn in two ways where a path may meet a lamp (csrc/shading/lit/path.h); with two light samples
+# nothing is, each point has one path, and no pixel is asked again.
+@pytest.mark.parametrize("room", ["sky", "sky through an opening", "large lamp", "point"])
+def test_images_whose_points_have_several_paths(room: str) -> None:
+    scene, camera = ALL_ROOMS[room](), towards_room(12)
+    with torch.no_grad():
+        several, single = (
+            torch.stack([eg.render(scene, camera, 16, seed, bounces=2, light_samples=n) for seed in range(16)]).mean(
+                (1, 2)
+            )
+            for n in (1, 2)
+        )
+    error = ((several.var(0) + single.var(0)) / 16).sqrt()  # of the mean over the image, by channels
+    assert bool((error < 0.01 * single.mean(0)).all())
+    assert bool(((several.mean(0) - single.mean(0)).abs() < 4 * error).all())
 
 
 def furnace(albedo: Tensor) -> eg.Scene:

@@ -1,5 +1,5 @@
 // Pixels that borders run through, where one point of a face is a poor guess at the whole pixel: of shadows of punctual
-// lamps, and of nearest texels.
+// lamps, and of nearest texels; and where paths are traced of what emits, which is brighter than all that it lights.
 //
 // A pixel is one of them where the pixels around it are on both sides. What was found in the pixel itself is not asked:
 // whether it is shaded again, with other points, must not depend on the points that it then does without, or the mean
@@ -19,6 +19,8 @@ namespace edgegrad {
 
 constexpr int most_again = 8;   // times the points of a face in a pixel, where it is shaded again
 constexpr int share_again = 4;  // times the points of the first pass, in all
+// With paths, of which each pixel has many: times the points of a face, and the rays of the camera.
+constexpr int points_again = 2, rays_again = 4;
 
 // An image of values with a pixel around it, of which nothing is known.
 template <class V>
@@ -155,43 +157,85 @@ class NearestTexels {
     PaddedImage<Texels> seen_;
 };
 
+// What emits.
+class SeenEmitters {
+   public:
+    SeenEmitters(int width, int height, const LitScene& lit, const LitOptions& options)
+        : width_(width), lit_(lit), seen_(width, is_empty(lit, options) ? 0 : height, 1, 0) {}
+
+    static bool is_empty(const LitScene& lit, const LitOptions& options) {
+        return options.bounces == 1 || std::none_of(lit.meshes.begin(), lit.meshes.end(),
+                                                    [](const LitMesh& mesh) { return mesh.emission.exists(); });
+    }
+
+    // A point of a face.
+    void add(int x, int y, int64_t face) { *seen_.at(x, y) |= lit_.mesh_of(face).emission.exists() ? emits : dark; }
+
+    // Marks those of a row of pixels. Where nothing is seen it is dark.
+    void mark(int y, uint8_t* pixels) const {
+        for (int x = 0; x < width_; ++x) {
+            uint8_t around = 0;
+            for (int dy = -1; dy <= 1; ++dy)
+                for (int dx = -1; dx <= 1; ++dx)
+                    if (dx || dy) around |= *seen_.at(x + dx, y + dy) ? *seen_.at(x + dx, y + dy) : dark;
+            if (around == (emits | dark)) pixels[x] = 1;
+        }
+    }
+
+   private:
+    enum : uint8_t { dark = 1, emits = 2 };
+
+    int width_;
+    const LitScene& lit_;
+    PaddedImage<uint8_t> seen_;
+};
+
 class ImageBorders {
    public:
     ImageBorders(int width, int height, const LitScene& lit, const LitOptions& options)
         : width_(width),
           height_(height),
+          paths_(options.bounces > 1),
           points_(size_t(width) * size_t(height), 0),
           lamps_(width, height, lit, options),
           texels_(width, height, lit),
-          has_texels_(!NearestTexels::empty(lit)) {}
+          has_texels_(!NearestTexels::empty(lit)),
+          emitters_(width, height, lit, options),
+          has_emitters_(!SeenEmitters::is_empty(lit, options)) {}
 
     // A point that was shaded, and what it sees of light samples.
     void add(int32_t pixel, int32_t face, const double* b, const int8_t* seen) {
         ++points_[pixel];
         lamps_.add(pixel % width_, pixel / width_, seen);
         if (has_texels_) texels_.add(pixel % width_, pixel / width_, face, b);
+        if (has_emitters_) emitters_.add(pixel % width_, pixel / width_, face);
     }
 
     // How many times as many points of each face are to be shaded in those pixels, 0: there are none.
     int find(std::vector<uint8_t>& pixels, Team& team) const {
         pixels.assign(points_.size(), 0);
-        if (lamps_.empty() && !has_texels_) return 0;
+        if (lamps_.empty() && !has_texels_ && !has_emitters_) return 0;
         team.each(height_, [&](int64_t y) {
             if (!lamps_.empty()) lamps_.mark(int(y), &pixels[y * width_]);
             if (has_texels_) texels_.mark(int(y), &pixels[y * width_]);
+            if (has_emitters_) emitters_.mark(int(y), &pixels[y * width_]);
         });
         int64_t first = 0, there = 0;
         for (size_t i = 0; i < pixels.size(); ++i) first += points_[i], there += pixels[i] ? points_[i] : 0;
         if (std::none_of(pixels.begin(), pixels.end(), [](uint8_t p) { return p != 0; })) return 0;
+        if (paths_) return points_again;
         return int(std::clamp<int64_t>(share_again * first / std::max<int64_t>(there, 1), 2, most_again));
     }
 
    private:
     int width_, height_;
+    bool paths_;
     std::vector<int32_t> points_;
     LampVisibility lamps_;
     NearestTexels texels_;
     bool has_texels_;
+    SeenEmitters emitters_;
+    bool has_emitters_;
 };
 
 }  // namespace edgegrad

@@ -3,10 +3,12 @@
 #include <algorithm>
 #include <atomic>
 #include <memory>
+#include <optional>
 
 #include "core/sobol.h"
 #include "forward/image_borders.h"
 #include "forward/pixel_hits.h"
+#include "forward/sky_guide.h"
 #include "shading/lit/indirect.h"
 
 namespace edgegrad {
@@ -25,6 +27,7 @@ struct RowInput {
     const uint8_t* only;  // pixels, null: all
     LitImage<T>& to;
     ImageBorders* borders;  // null: not wanted
+    SkyGuide* guide;        // null: not wanted
     Team& team;
 };
 
@@ -42,9 +45,10 @@ class LitRow : public RowVisitor {
     void visit(int y, std::vector<PixelHit>& hits) override {
         std::fill(sums_.begin(), sums_.end(), 0.0);
         among_ = 0;
-        for (size_t first = 0; first < hits.size(); first += shaded_at_once) {
+        const size_t at_once = paths_ ? shaded_at_once / paths_of_point : shaded_at_once;
+        for (size_t first = 0; first < hits.size(); first += at_once) {
             in_.team.check();  // with many points of lights a row takes long
-            shade(hits, first, std::min(hits.size() - first, size_t(shaded_at_once)));
+            shade(hits, first, std::min(hits.size() - first, at_once));
         }
         const int C = in_.lit.channels;
         for (int x = 0; x < in_.width; ++x) {
@@ -73,6 +77,7 @@ class LitRow : public RowVisitor {
         const LitPoints points{int64_t(n), face_.data(), b_.data(), seed_.data(), {}, spread};
         if (paths_ && in_.options.samples == 1) {
             shade_whole(in_.lit, in_.scene, in_.caster, points, *paths_, radiance_.data(), seen_.data());
+            if (in_.guide) in_.guide->add(*paths_, paths_of_point * int64_t(n));
         } else {
             shade_some(in_.lit, in_.scene, in_.caster, points, in_.options, *buffers_, radiance_.data(), seen_.data());
             if (paths_) add_indirect(in_.lit, in_.scene, in_.caster, points, *paths_, radiance_.data());
@@ -101,29 +106,54 @@ class LitRow : public RowVisitor {
     std::vector<int8_t> seen_;
 };
 
+constexpr uint64_t pilot = 0x70696c6f74;  // its random numbers
+
+// Every second pixel of every second row, or fewer of large images.
+std::vector<uint8_t> sparse_pixels(const Camera& camera) {
+    constexpr double enough = 4096;
+    const int step = std::max(2, int(std::sqrt(double(camera.width) * camera.height / enough)));
+    std::vector<uint8_t> out(size_t(camera.width) * camera.height, 0);
+    for (int y = step / 2; y < camera.height; y += step)
+        for (int x = step / 2; x < camera.width; x += step) out[size_t(y) * camera.width + x] = 1;
+    return out;
+}
+
 }  // namespace
 
 template <class T>
-LitImage<T> render_lit(const LitScene& lit, const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
+LitImage<T> render_lit(const LitScene& given, const SceneView<T>& scene, const Camera& camera, const RayCaster& caster,
                        const ImageOptions& image, const LitOptions& options, const LitSampling& sampling, Team& team,
                        const HitBuffers<T>& hits) {
-    LitImage<T> out{Array<T>(int64_t(camera.width) * camera.height * lit.channels),
-                    std::vector<uint8_t>(lit.lamps.size(), 0)};
+    LitImage<T> out{Array<T>(int64_t(camera.width) * camera.height * given.channels),
+                    std::vector<uint8_t>(given.lamps.size(), 0)};
     std::unique_ptr<ImageBorders> borders;
-    if (image.spp > 1) borders = std::make_unique<ImageBorders>(camera.width, camera.height, lit, options);
-    const auto shade_pixels = [&](const PixelChoice& choice, uint64_t seed) {
+    if (image.spp > 1) borders = std::make_unique<ImageBorders>(camera.width, camera.height, given, options);
+    const auto shade_pixels = [&](const LitScene& lit, const ImageOptions& image, const PixelChoice& choice,
+                                  uint64_t seed, SkyGuide* guide = nullptr) {
         const RowInput<T> rows{lit,         scene, caster,      options, camera.width,
                                choice.most, seed,  choice.only, out,     choice.only ? nullptr : borders.get(),
-                               team};
+                               guide,       team};
         visit_pixel_hits(scene, camera, caster, image, choice, team, hits,
                          [&] { return std::make_unique<LitRow<T>>(rows); });
     };
-    const bool spread = lit.is_filtered();
-    shade_pixels({0, camera.height, sampling.points, nullptr, spread}, sampling.seed);
+    const bool spread = given.is_filtered();
+    SkyGuide guide(given);
+    const bool guides = options.bounces > 1 && options.samples == 1 && options.shadows && guide.has_sky();
+    if (guides) {
+        // With numbers that the image does not use, for else where it draws points would depend on what it finds.
+        const std::vector<uint8_t> pixels = sparse_pixels(camera);
+        const ImageOptions few{1, image.filter, hash(image.seed, pilot)};
+        shade_pixels(given, few, {0, camera.height, 1, pixels.data(), spread}, hash(sampling.again, pilot), &guide);
+    }
+    const std::optional<LitScene> guided = guides ? std::optional(guide.guided()) : std::nullopt;
+    const LitScene& lit = guided ? *guided : given;
+    shade_pixels(lit, image, {0, camera.height, sampling.points, nullptr, spread}, sampling.seed);
     if (!borders) return out;
     std::vector<uint8_t> pixels;
+    ImageOptions finer = image;
+    if (options.bounces > 1) finer.spp *= rays_again;
     if (const int times = borders->find(pixels, team))
-        shade_pixels({0, camera.height, times * sampling.points, pixels.data(), spread}, sampling.again);
+        shade_pixels(lit, finer, {0, camera.height, times * sampling.points, pixels.data(), spread}, sampling.again);
     return out;
 }
 

@@ -34,6 +34,13 @@ Barycentrics onto_face(const Meeting& m) {
     return {u, v};
 }
 
+// Whether a distance is beyond `contact`, or, for faces that share a vertex, beyond `rounding`. Few are so near that
+// this is asked.
+template <class Shares>
+bool lies_beyond(double t, double contact, double rounding, Shares shares) {
+    return t > std::max(contact, rounding) || (t > std::min(contact, rounding) && t > (shares() ? rounding : contact));
+}
+
 double extent(Vec3 v) { return std::max({std::fabs(v.x), std::fabs(v.y), std::fabs(v.z)}); }
 
 }  // namespace
@@ -80,10 +87,11 @@ void see(const SceneView<T>& scene, const RayCaster& caster, const Sightlines& l
             const int32_t own = lines.face[first + i];
             if (face == own) return false;
             const Meeting m = meet(scene, face, ray[i]);
+            if (!(m.exists() && m.inside() && m.t < 1 - contact[i])) return false;
             // How faces that share a vertex with the point's own lie to it is exact, however near they are.
-            const double nearest = share_vertex(scene, face, own) ? Meeting::rounding : contact[i];
-            return m.exists() && m.inside() && m.t > nearest && m.t < 1 - contact[i] &&
-                   shows(scene, face, inside({m.u, m.v}));
+            if (!lies_beyond(m.t, contact[i], Meeting::rounding, [&] { return share_vertex(scene, face, own); }))
+                return false;
+            return shows(scene, face, inside({m.u, m.v}));
         });
         for (int i = 0; i < batch.count; ++i) out[first + i] = !batch.hidden[i];
     }
@@ -116,10 +124,9 @@ void depart(const SceneView<T>& scene, const RayCaster& caster, const Departures
                 const int64_t k = first + i;
                 const Meeting m = meet(scene, hit, ray[i]);
                 // As in see(): how faces that share a vertex lie to one another is exact.
-                const double nearest = share_vertex(scene, hit, rays.face[k])
-                                           ? Meeting::rounding * extent(ray[i].origin)
-                                           : rays.contact[k];
-                if (!m.exists() || m.t < nearest) return false;
+                if (!m.exists() || !lies_beyond(m.t, rays.contact[k], Meeting::rounding * extent(ray[i].origin),
+                                                [&] { return share_vertex(scene, hit, rays.face[k]); }))
+                    return false;
                 const Barycentrics at = onto_face(m);
                 if (!shows(scene, hit, at)) return false;
                 b[2 * k] = at.u, b[2 * k + 1] = at.v;

@@ -98,7 +98,9 @@ class Lighting(NamedTuple):
         points = max(FEWEST_IN_PENUMBRA, spp // 4) if extended else shaded_points(spp)
         if self.bounces > 1:
             points = max(FEWEST_IN_PENUMBRA, spp)
-        in_image = self._in_image(scene, points, spp)
+        # From each point that the kernel shades for an image go several paths (csrc/shading/lit/path.h).
+        several = self.bounces > 1 and self.samples == 1
+        in_image = self._in_image(scene, max(FEWEST_IN_PENUMBRA, points // 2) if several else points, spp)
         fused = is_fused(scene)
         additive = not scene.blends
         effort = Effort(

@@ -47,26 +47,32 @@ class BounceDraw {
     double by_lobe_ = 0;
 };
 
-// Uniform numbers of the point of a path that is reached after so many steps, from the seed of its first. The sequences
-// know nothing of each other, and each is spread evenly over pixels (core/sobol.h).
+// Uniform numbers of the points of paths that are reached after so many steps, from the seeds of the first ones. The
+// upper half of a seed says which sequences, the lower which of their points. They know nothing of each other, and each
+// is spread evenly over pixels (core/sobol.h).
 class BounceNumbers {
    public:
-    BounceNumbers(int64_t seed, int steps) : sequence_(uint64_t(seed) >> 32), index_(uint32_t(seed)), steps_(steps) {}
+    BounceNumbers(uint64_t seed, int steps)
+        : sequence_(seed >> 32), direction_(start(direction, steps)), choice_(start(choice, steps)) {}
 
-    Vec2 of_direction() const { return of(direction); }
-    Vec2 of_choice() const { return of(choice); }  // of what draws the direction, and of whether the path goes on
+    // Whether a seed has the same sequences.
+    bool are_of(uint64_t seed) const { return seed >> 32 == sequence_; }
+    Vec2 of_direction(uint64_t seed) const { return direction_(uint32_t(seed)); }
+    // Of what draws the direction, and of whether the path goes on.
+    Vec2 of_choice(uint64_t seed) const { return choice_(uint32_t(seed)); }
     // The seed of points of lights.
-    int64_t of_lights() const { return int64_t(hash(sequence_, stream(lights)) << 32 | index_); }
+    static int64_t of_lights(uint64_t seed, int steps) {
+        return int64_t(hash(seed >> 32, stream(lights, steps)) << 32 | uint32_t(seed));
+    }
 
    private:
     enum Kind { direction, choice, lights, kinds };
-    uint64_t stream(Kind kind) const { return uint64_t(steps_) * kinds + kind; }
-    Vec2 of(Kind kind) const { return ShuffledSobol(hash(sequence_, stream(kind), paths))(index_); }
+    static uint64_t stream(Kind kind, int steps) { return uint64_t(steps) * kinds + kind; }
+    uint64_t start(Kind kind, int steps) const { return hash(sequence_, stream(kind, steps), paths); }
 
     static constexpr uint64_t paths = 0x7061746873;  // so that they meet no numbers of lights
     uint64_t sequence_;
-    uint32_t index_;
-    int steps_;
+    ShuffledSobol direction_, choice_;
 };
 
 }  // namespace edgegrad

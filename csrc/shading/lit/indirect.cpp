@@ -17,17 +17,26 @@ void shade_whole(const LitScene& lit, const SceneView<T>& scene, const RayCaster
                  Paths& paths, double* out, int8_t* seen) {
     paths.find_whole(scene, caster, points);
     const size_t K = paths.lights().size();
+    double along[most_lit_channels];
     for (int64_t i = 0; i < points.size; ++i) {
-        const Path path = paths.path(i);
         double* total = out + i * lit.channels;
-        const auto at = [&](int k) -> const Surface<double>& { return paths.surface(i, k); };
-        path_radiance(lit, paths.lights(), path, at, total, 0);
+        std::fill(total, total + lit.channels, 0.0);
+        const int64_t own = paths_of_point * i;
+        for (int64_t j = own; j < own + paths_of_point; ++j) {
+            const Path path = paths.path(j);
+            const auto at = [&](int k) -> const Surface<double>& { return paths.surface(j, k); };
+            path_radiance(lit, paths.lights(), path, at, along);
+            for (int c = 0; c < lit.channels; ++c) total[c] += along[c] / paths_of_point;
+            if (path.points > 0) add_met(lit, path, 0, at(0), total);
+        }
+        const Path path = paths.path(own);
         if (path.points > 0) {
+            add_drawn(lit, paths.lights(), path, 0, paths.surface(own, 0), total);
             std::copy(path.seen_at(0), path.seen_at(0) + K, seen + i * K);
         } else {
             std::fill(seen + i * K, seen + (i + 1) * K, not_asked);
         }
-        if (Surface<double> first = at(0); !first.is_black()) {
+        if (Surface<double> first = paths.surface(own, 0); !first.is_black()) {
             if (!first.mesh->has_material) look_up_material(lit, first);
             add_own(lit, first, total);
         }

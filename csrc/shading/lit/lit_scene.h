@@ -94,6 +94,9 @@ struct LitPlaces {
 };
 
 constexpr int most_bounces = 64;
+// Paths of an image that go on from one point. They share its ray from the camera and its points of lights, and their
+// directions fill the sphere more evenly (docs/tried.md).
+constexpr int paths_of_point = 4;
 
 struct LitOptions {
     bool shadows = true;
@@ -101,8 +104,9 @@ struct LitOptions {
     int only = -1;    // the lamp of which alone radiance is wanted; −1: of all that there is
     // Whether only derivatives are wanted: on glossy surfaces points of environments are then drawn in fours.
     bool in_fours = false;
-    double dark = 0;  // points of lights are drawn as if no glossy surface were darker: what is black has derivatives
-    int bounces = 1;  // how often light is scattered on its way, at most (path.h)
+    double dark = 0;    // points of lights are drawn as if no glossy surface were darker: what is black has derivatives
+    int bounces = 1;    // how often light is scattered on its way, at most (path.h)
+    int by_paths = -1;  // a lamp of which no points are drawn for Lambertian surfaces: paths from them find it
 };
 
 // Whether a point sees a light sample: 1, or 0 where it is in shadow, or that it was not asked, for the surface is

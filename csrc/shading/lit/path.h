@@ -13,6 +13,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <optional>
 #include <vector>
 
 #include "forward/trace.h"
@@ -89,10 +90,13 @@ class Paths {
         });
         go_on(scene, caster, from);
     }
-    // For an image: lights are asked for the first points, too, and lamps that paths meet count.
+    // For an image: lights are asked for the first points, too, and lamps that paths meet count. From each point go
+    // paths_of_point paths, path(paths_of_point · i) and those after it, of which the first has what is asked of
+    // lights.
     template <class T>
     void find_whole(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from) {
-        meets_ = options_.shadows;
+        meets_ = options_.shadows, each_ = paths_of_point;
+        by_paths_ = meets_ && sky_ >= 0 && !lit_.lamps[sky_].is_image ? sky_ : -1;
         find_lit(scene, caster, from, [&](int64_t i, Surface<double>& o) {
             set_surface<double>(lit_, from.face[i], from.b + 3 * i, from.spread_at(i), o);
             return true;
@@ -138,19 +142,28 @@ class Paths {
 
     template <class Place>
     void begin(const LitPoints& from, Place place) {
-        n_ = from.size;
+        n_ = from.size * each_;
         const int64_t all = n_ * options_.bounces;
         surfaces_.resize(all), density_.resize(all), face_.resize(all), b_.resize(3 * all), seed_.resize(all);
         drawn_.resize(all * lights_.size()), seen_.resize(all * lights_.size());
         length_.assign(n_, 0), through_.assign(n_ * C_, 1.0);
         if (meets_) met_.assign(all, {});
-        for (int64_t i = 0; i < n_; ++i) {
-            Surface<double>& o = surfaces_[i];
+        for (int64_t i = 0; i < from.size; ++i) {
+            const int64_t first = i * each_;
+            Surface<double>& o = surfaces_[first];
             if (!place(i, o)) continue;
-            face_[i] = from.face[i], std::copy(from.b + 3 * i, from.b + 3 * i + 3, &b_[3 * i]);
-            if (!scatters(o)) continue;
-            look_up_material(lit_, o), length_[i] = 1;
+            if (scatters(o)) look_up_material(lit_, o);
+            for (int64_t at = first; at < first + each_; ++at) {
+                if (at > first) surfaces_[at] = o;
+                face_[at] = from.face[i], std::copy(from.b + 3 * i, from.b + 3 * i + 3, &b_[3 * at]);
+                length_[at] = scatters(o) ? 1 : 0;
+            }
         }
+    }
+    // Paths from one point have numbers one after another.
+    uint64_t seed_of(const LitPoints& from, int64_t i) const {
+        const uint64_t seed = uint64_t(from.seed[i / each_]), sequence = seed >> 32 << 32;
+        return sequence | uint32_t(uint32_t(seed) * uint32_t(each_) + uint32_t(i % each_));
     }
     template <class T>
     void go_on(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from) {
@@ -167,21 +180,23 @@ class Paths {
     // Draws where the paths go on to from their points after k steps.
     void leave(const LitPoints& from, int k) {
         rays_.clear();
+        std::optional<BounceNumbers> numbers;
         for (int64_t i = 0; i < n_; ++i) {
             if (length_[i] != k + 1) continue;
             const int64_t at = k * n_ + i;
             const Surface<double>& o = surfaces_[at];
-            const BounceNumbers numbers(from.seed[i], k);
-            const Vec2 choice = numbers.of_choice();
+            const uint64_t seed = seed_of(from, i);
+            if (!numbers || !numbers->are_of(seed)) numbers.emplace(seed, k);
+            const Vec2 choice = numbers->of_choice(seed);
             double survival = 1;
             if (k >= steps_without_roulette) {
                 const double* through = &through_[i * C_];
                 survival = std::clamp(*std::max_element(through, through + C_), least_survival, 1.0);
             }
-            if (meets_ && o.scattering.lambertian) share_lamps(at, survival);
+            if (meets_ && o.scattering.lambertian && (k > 0 || i % each_ == 0)) share_lamps(at, paths_at(k) * survival);
             if (choice.y >= survival) continue;
             const BounceDraw draw(o, C_);
-            const Vec3 l = draw.draw(choice.x, numbers.of_direction());
+            const Vec3 l = draw.draw(choice.x, numbers->of_direction(seed));
             if (!(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
             const double size = std::max({std::fabs(o.y.x), std::fabs(o.y.y), std::fabs(o.y.z)});
             rays_.index.push_back(i), rays_.face.push_back(int32_t(face_[at]));
@@ -217,7 +232,7 @@ class Paths {
             if (const int lamp = lamp_of_[next.mesh - lit_.meshes.data()];
                 meets_ && lamp >= 0 && o.scattering.lambertian) {
                 const double by_light = lit_.lamps[lamp].density[next.at.face];
-                met_[k * n_ + i] = {lamp, {next.at.face, u, v, by_light + by_area(rays_, r, next, d)}};
+                met_[k * n_ + i] = {lamp, {next.at.face, u, v, by_light + paths_at(k) * by_area(rays_, r, next, d)}};
             }
             if (!scatters(next) || !(measure > 0) || !(dot(o.n, l) > 0 && dot(o.g, l) > 0)) continue;
             density_[at] = rays_.density[r] * rays_.survival[r] * measure;
@@ -228,6 +243,9 @@ class Paths {
             for (int c = 0; c < C_; ++c) through_[i * C_ + c] *= std::fabs(f[c]) * weight;
         }
     }
+
+    // How many draw what a point is lit by after k steps.
+    int paths_at(int k) const { return k == 0 ? each_ : 1; }
 
     // -- lamps that are found in two ways ----------------------------------------------------------------------------
 
@@ -247,12 +265,12 @@ class Paths {
         const Lamp& lamp = lit_.lamps[sky_];
         LightPoint p = point_towards(lit_.tables, lamp, {l[0], l[1], l[2]});
         if (lamp.is_image) p = above(lit_.tables, lamp, p, o.g);
-        else p.density = rays_.density[r];  // by the cosine as well: draw_even_sky()
-        p.density += rays_.density[r] * rays_.survival[r];
+        else p.density = k == 0 && by_paths_ >= 0 ? 0 : rays_.density[r];  // by the cosine as well: draw_even_sky()
+        p.density += paths_at(k) * rays_.density[r] * rays_.survival[r];
         met_[k * n_ + i] = {sky_, p};
     }
     // Of the points of lights that a point of a path sees.
-    void share_lamps(int64_t at, double survival) {
+    void share_lamps(int64_t at, double paths) {
         const Surface<double>& o = surfaces_[at];
         for (int64_t j = 0; j < K(); ++j) {
             const int number = lights_[j].lamp;
@@ -261,7 +279,7 @@ class Paths {
             LightPoint& p = drawn_[at * K() + j];
             Vec3 l = place(lit_, lamp, p);
             if (number == sky_) {
-                p.density += survival * BounceDraw(o, C_).density(l);
+                p.density += paths * BounceDraw(o, C_).density(l);
                 continue;
             }
             const EmissiveFaces from = lit_.emitter(lamp);
@@ -269,7 +287,7 @@ class Paths {
             for (int c = 0; c < 3; ++c) corner[c] = lit_.tables[from.verts].vector_at<double>(from.vertex(p.index)[c]);
             const Vec3 d = l - o.y, normal = cross(corner[1] - corner[0], corner[2] - corner[0]);
             if (!(dot(d, d) > 0 && dot(normal, normal) > 0)) continue;
-            p.density += by_area(survival * BounceDraw(o, C_).density(unit(d)), unit(normal), d);
+            p.density += by_area(paths * BounceDraw(o, C_).density(unit(d)), unit(normal), d);
         }
     }
 
@@ -277,10 +295,13 @@ class Paths {
     template <class T>
     void light(const SceneView<T>& scene, const RayCaster& caster, const LitPoints& from, int k) {
         const int64_t first = k * n_;
-        for (int64_t i = 0; i < n_; ++i) seed_[first + i] = BounceNumbers(from.seed[i], k).of_lights();
+        for (int64_t i = 0; i < n_; ++i)
+            seed_[first + i] = BounceNumbers::of_lights(k == 0 ? uint64_t(from.seed[i / each_]) : seed_of(from, i), k);
+        LitOptions options = options_;
+        if (k == 0) options.by_paths = by_paths_;
         const LitPoints here{n_, &face_[first], &b_[3 * first], &seed_[first], {}, nullptr};
-        const auto came = [&](int64_t i) { return length_[i] == k + 1; };
-        query_lights(lit_, scene, caster, here, options_, lights_,
+        const auto came = [&](int64_t i) { return length_[i] == k + 1 && (k > 0 || i % each_ == 0); };
+        query_lights(lit_, scene, caster, here, options, lights_,
                      {&surfaces_[first], drawn_.data() + first * K(), seen_.data() + first * K()}, shadow_rays_, came);
         for (int64_t i = 0; i < n_; ++i)
             if (came(i) && surfaces_[first + i].scattering.lambertian) look_up_material(lit_, surfaces_[first + i]);
@@ -293,8 +314,10 @@ class Paths {
     std::vector<int> lamp_of_;  // of each mesh, −1: none
     int sky_ = -1;              // the lamp that paths meet in the open
     bool meets_ = false;        // whether lamps that paths meet count
+    int each_ = 1;              // paths from one point
+    int by_paths_ = -1;         // the lamp of which these find enough there
     std::vector<LightSample> lights_;
-    int64_t n_ = 0;
+    int64_t n_ = 0;  // paths
     // Of the points of paths after no step, one step, …, and of the points of lights for each.
     std::vector<Surface<double>> surfaces_;
     std::vector<double> density_, b_;

@@ -57,19 +57,27 @@ inline void step_vjp(const LitScene& lit, const Surface<double>& o, const Surfac
     next_bar.y += d_bar, bar.y -= d_bar;
 }
 
-// What a point scatters of direct light.
+// What a point scatters of direct light: by the points of lights that are drawn for it, and by the lamp that the path
+// meets there.
+template <class S>
+void add_drawn(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, int k,
+               const Surface<S>& o, S* total) {
+    add_unshadowed(lit, o, total);
+    add_lights(lit, lights, path.drawn_at(k), o, path.seen_at(k), total);
+}
+template <class S>
+void add_met(const LitScene& lit, const Path& path, int k, const Surface<S>& o, S* total) {
+    if (path.has_met(k)) add_light(lit, lit.lamps[path.met_at(k).lamp], path.met_at(k).point, 1.0, o, total);
+}
 template <class S>
 void add_direct(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, int k,
                 const Surface<S>& o, S* total) {
-    add_unshadowed(lit, o, total);
-    add_lights(lit, lights, path.drawn_at(k), o, path.seen_at(k), total);
-    if (path.has_met(k)) add_light(lit, lit.lamps[path.met_at(k).lamp], path.met_at(k).point, 1.0, o, total);
+    add_drawn(lit, lights, path, k, o, total), add_met(lit, path, k, o, total);
 }
 
-// (channels,) of a path with the surfaces at(k): D_k from k = `lit_from` on.
+// (channels,) of a path with the surfaces at(k).
 template <class S, class At>
-void path_radiance(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, At at, S* total,
-                   int lit_from = 1) {
+void path_radiance(const LitScene& lit, const std::vector<LightSample>& lights, const Path& path, At at, S* total) {
     const int C = lit.channels;
     std::fill(total, total + C, S(0));
     for (int k = path.points - 1; k >= 0; --k) {
@@ -79,7 +87,7 @@ void path_radiance(const LitScene& lit, const std::vector<LightSample>& lights, 
             const S factor = step.factor();
             for (int c = 0; c < C; ++c) total[c] *= step.f[c] * factor;
         }
-        if (k >= lit_from) add_direct(lit, lights, path, k, o, total);
+        if (k > 0) add_direct(lit, lights, path, k, o, total);
     }
 }
 

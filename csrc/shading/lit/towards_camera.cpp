@@ -120,8 +120,9 @@ class LightPaths {
     void go_on(int k) {
         leaving_.clear(), rays_.clear();
         for (const End& end : ends_) {
-            const BounceNumbers numbers(end.seed, k);
-            const Vec2 choice = numbers.of_choice();
+            const uint64_t seed = uint64_t(end.seed);
+            const BounceNumbers numbers(seed, k);
+            const Vec2 choice = numbers.of_choice(seed);
             double survival = 1;
             if (k >= steps_without_roulette) {
                 survival = std::clamp(end.through, least_survival, 1.0);
@@ -129,7 +130,7 @@ class LightPaths {
             }
             const Surface<double>& o = end.o;
             const BounceDraw draw(o, C_);
-            const Vec3 w = draw.draw(choice.x, numbers.of_direction());
+            const Vec3 w = draw.draw(choice.x, numbers.of_direction(seed));
             double f[most_lit_channels];
             if (!scatters(o, w, end.in, f)) continue;
             const double weight = dot(o.g, w) / (draw.density(w) * survival);

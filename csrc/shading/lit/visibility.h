@@ -76,6 +76,10 @@ void query_lights(const LitScene& lit, const SceneView<T>& scene, const RayCaste
             const Surface<double>& o = query.surfaces[i];
             int8_t& found = query.seen[i * K + k] = not_asked;
             if (!o.mesh->has_material || o.is_black()) continue;
+            if (lights[k].lamp == options.by_paths && o.scattering.lambertian) {
+                found = 0;
+                continue;
+            }
             const LightPoint& point = query.drawn[i * K + k];
             if (!point.exists()) continue;
             if (lamp.kind == Lamp::Kind::mesh &&
