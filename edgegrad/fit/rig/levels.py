@@ -173,12 +173,11 @@ class Levels:
             objective.check(values)
         title = f"level {level + 1} of {len(self.factors)}"
         found = self._steps(objective, values, options, save, saved, title, fine)
-        name = next((n for n in ("rotations", "angles") if n in values and self.rig.deformer.parents), None)
+        name = next((n for n in ("rotations", "angles") if n in values and n in self.sought.joints), None)
         if (
             level in self.tried
             and self.tries
             and name is not None
-            and (objective.regions is None or name in self.sought.joints)
             and saved is None
             and found.ending is not Ending.INTERRUPTED
         ):
@@ -216,7 +215,9 @@ class Levels:
         few = dataclasses.replace(options, steps=count, tolerance=0.0, progress=False, callback=None)
         control, rows = self.rig.controls[name], self.sought.rows.get(name, torch.arange(len(values[name])))
         joints = self.sought.joints.get(name, ())
-        if name == "rotations":
+        if not self.rig.deformer.parents:  # nothing says what hangs on what
+            groups = [Limb([k]) for k in range(len(values[name]))]
+        elif name == "rotations":
             groups = limbs(self.rig, rows.tolist())
         else:
             groups = [Limb(list(range(k, len(values[name])))) for k in range(len(values[name]))]
