@@ -20,8 +20,8 @@ def add(commands: Any) -> None:
         "--scene",
         nargs="+",
         metavar="NAME",
-        help="triangle, sphere, tangled, flat-colors, noise, slivers, globe, quad, scan, million, lit-point, lit-area, lit-sky "
-        "(all)",
+        help="triangle, sphere, tangled, flat-colors, noise, slivers, globe, quad, scan, million, lit-point, lit-area, lit-sky, "
+        "bounce-lamp, bounce-up (all)",
     )
     curve.add_argument(
         "--methods", nargs="+", metavar="NAME",

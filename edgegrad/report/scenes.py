@@ -36,6 +36,7 @@ class ReportScene:
     camera: Camera
     adjoint: Tensor  # (H, W, C) ∂loss/∂image
     objects: int | None = None  # of the gradient: so many meshes, the first ones; all when None
+    bounces: int = 1  # how often light is scattered
 
     @property
     def moving(self) -> Sequence[Mesh]:
@@ -72,6 +73,7 @@ class ReportScene:
             tensors += [] if mesh.alpha is None else [mesh.alpha]
         if self.scene.is_lit:
             digest.update(repr((self.objects, [type(light).__name__ for light in self.scene.lights])).encode())
+            digest.update(str(self.bounces).encode() if self.bounces > 1 else b"")
             tensors += tensors_in(self.scene)
         for tensor in tensors:
             digest.update(b"-" if tensor is None else tensor.detach().cpu().contiguous().numpy().tobytes())
@@ -93,8 +95,8 @@ def build(name: str, size: int = 256, mesh: Path | None = None, **variant: float
     # As users have them: meshes in float32.
     scene, camera = scene.to(torch.float32), camera.to(torch.float64)
     adjoint = noise_adjoint if name == "noise" else smooth_adjoint
-    objects = 1 if name in LIT else None
-    return ReportScene(name, title, scene, camera, adjoint(size, size, scene.channels).float(), objects)
+    objects, bounces = 1 if name in LIT else None, 2 if name in BOUNCED else 1
+    return ReportScene(name, title, scene, camera, adjoint(size, size, scene.channels).float(), objects, bounces)
 
 
 # -- pieces that the tests use as well -------------------------------------------------------------------------------
@@ -340,6 +342,47 @@ def _lit_sky(size: int, subdivisions: int = 6) -> Built:
     return _lit(size, Environment(torch.ones(3, dtype=torch.float64)), "constant environment", subdivisions)
 
 
+def _room(size: int, light: Mesh, at: tuple[float, float, float], title: str, subdivisions: int = 3) -> Built:
+    """A black ellipsoid in a room with coloured walls, open towards −y. As in `_lit`, its edges are no creases."""
+    ball, (x, y, z) = sphere(subdivisions), at
+    size_of, centre = torch.tensor([[0.45, 0.25, 0.35], [x, y, z]], dtype=torch.float64)
+    meshes = [Mesh(ball.verts * size_of + centre, ball.faces, colors=torch.zeros_like(ball.verts))]
+    white, red, green = (0.75, 0.75, 0.75), (0.7, 0.15, 0.1), (0.15, 0.6, 0.2)
+    walls = [
+        (white, [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]),
+        (white, [[-1, 1, 0], [1, 1, 0], [1, 1, 2], [-1, 1, 2]]),
+        (white, [[-1, -1, 2], [-1, 1, 2], [1, 1, 2], [1, -1, 2]]),
+        (red, [[-1, -1, 0], [-1, 1, 0], [-1, 1, 2], [-1, -1, 2]]),
+        (green, [[1, -1, 0], [1, -1, 2], [1, 1, 2], [1, 1, 0]]),
+    ]
+    for color, corners in walls:
+        look = Material(base_color=torch.tensor(color, dtype=torch.float64))
+        verts = torch.tensor(corners, dtype=torch.float64)
+        meshes.append(Mesh(verts, torch.tensor([[0, 1, 2], [0, 2, 3]]), material=look))
+    camera = Camera.look_at((0.1, -3.4, 1.1), (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), 38.0, (size, size))
+    return (
+        f"black ellipsoid of {len(ball.faces):,} faces in a room, {title}, 2 bounces",
+        Scene([*meshes, light]),
+        camera,
+    )
+
+
+def _panel(height: float, x: float, side: float, down: bool) -> Mesh:
+    corners = [[x - side, -side, height], [x - side, side, height], [x + side, side, height], [x + side, -side, height]]
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]] if down else [[0, 2, 1], [0, 3, 2]])
+    look = Material(base_color=0.0, emission=torch.full((3,), 8.0, dtype=torch.float64), two_sided=False)
+    return Mesh(torch.tensor(corners, dtype=torch.float64), faces, material=look)
+
+
+def _bounce_lamp(size: int, subdivisions: int = 3) -> Built:
+    return _room(size, _panel(1.95, 0.1, 0.3, True), (0.15, -0.1, 0.75), "lamp above", subdivisions)
+
+
+def _bounce_up(size: int, subdivisions: int = 3) -> Built:
+    """What the camera sees below the ceiling is lit by the bounce alone."""
+    return _room(size, _panel(1.2, -0.45, 0.25, False), (0.3, 0.0, 0.7), "lamp towards the ceiling", subdivisions)
+
+
 def _scan(size: int, path: Path | None) -> Built:
     if path is None:
         from ..demo import airliner
@@ -376,5 +419,8 @@ SCENES: dict[str, Callable[..., Built]] = {
     "lit-point": _lit_point,
     "lit-area": _lit_area,
     "lit-sky": _lit_sky,
+    "bounce-lamp": _bounce_lamp,
+    "bounce-up": _bounce_up,
 }
-LIT = ("lit-point", "lit-area", "lit-sky")
+BOUNCED = ("bounce-lamp", "bounce-up")
+LIT = ("lit-point", "lit-area", "lit-sky", *BOUNCED)

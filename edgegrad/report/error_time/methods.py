@@ -78,7 +78,7 @@ def differentiate(scene: ReportScene, **options: object) -> tuple[Tensor, float,
     begin = time.perf_counter()
     meshes = [mesh.replace(verts=verts) for mesh, verts in zip(scene.moving, leaves, strict=True)]
     meshes += scene.scene.meshes[len(meshes) :]
-    image = render(scene.scene.replace(meshes=meshes), scene.camera, **options)  # type: ignore[arg-type]
+    image = render(scene.scene.replace(meshes=meshes), scene.camera, bounces=scene.bounces, **options)  # type: ignore[arg-type]
     middle = time.perf_counter()
     image.backward(scene.adjoint)
     end = time.perf_counter()
@@ -183,7 +183,8 @@ class FiniteDifferences:
         with torch.no_grad():
             scene = self._scene.moved(verts)
             times = round(spp**0.5) if scene.is_lit else 1
-            image = finer_image(scene, self._scene.camera, times, spp=round(spp / times**2), seed=seed)
+            options = {"spp": round(spp / times**2), "seed": seed, "bounces": self._scene.bounces}
+            image = finer_image(scene, self._scene.camera, times, **options)
         return float((image * self._scene.adjoint.double()).sum())
 
     def _turned(self, vector: Tensor) -> Tensor:
@@ -203,7 +204,13 @@ class Peer:
         self.name, self._scene = name + (GUIDED if guiding else ""), scene
         self.version = f"mitsuba {mitsuba.available()}"
         self._peer = mitsuba.Mitsuba(
-            scene.scene, scene.camera, scene.adjoint, name, guiding=guiding, objects=scene.objects
+            scene.scene,
+            scene.camera,
+            scene.adjoint,
+            name,
+            guiding=guiding,
+            objects=scene.objects,
+            bounces=scene.bounces,
         )
 
     @classmethod

@@ -75,6 +75,7 @@ class Mitsuba:
     interior  False leaves out the inside of faces (sppc = 0); so it is anyway where no radiance varies over a face
     guiding   of lit scenes: samples of the borders of shadows are guided, by its octree
     objects   of the gradient: so many meshes, the first ones; all when None
+    bounces   of lit scenes: how often light is scattered; more than once by prb_projective alone
 
     Its best settings: stops at the first hit, no indirect boundary samples (and so no guiding, which serves only those), the
     stratified sampler "multijitter", SPLIT interior samples for each boundary sample. In lit scenes it stops at the first light,
@@ -97,9 +98,12 @@ class Mitsuba:
         interior: bool = True,
         guiding: bool = False,
         objects: int | None = None,
+        bounces: int = 1,
     ) -> None:
         if integrator not in INTEGRATORS:
             raise ValueError(f"integrator: expected one of {', '.join(INTEGRATORS)}, got {integrator!r}")
+        if bounces > 1 and integrator == "direct_projective":
+            raise ValueError(f"bounces: expected 1 of direct_projective, got {bounces}; prb_projective has more")
         if scene.channels != 3:
             raise ValueError(f"scene: expected 3 channels, got {scene.channels}; not supported by this peer")
         background = torch.zeros(3) if scene.background is None else scene.background
@@ -117,7 +121,9 @@ class Mitsuba:
         scene, camera, self._scale = _resized(scene, camera)
         self._warm: set[tuple[int, int, int]] = set()
         self._integrator = mi.load_dict({"type": integrator, "sppi": 0, "guiding": "octree" if guiding else "none"})
-        self._integrator.max_depth = 2 if self._lit else 1  # an attribute, as direct_projective overrides the setting
+        self._integrator.max_depth = (
+            bounces + 1 if self._lit else 1
+        )  # an attribute, as direct_projective overrides the setting
         self._integrator.sample_border_warning = False  # only for filters wider than a pixel
         description = {
             "type": "scene",

@@ -251,7 +251,7 @@ def opposed() -> Problem:
     return stage(point(), caster=ball.replace(normals=-vertex_normals(ball.verts, ball.faces)))
 
 
-@group.add("million", "a caster of 1.0 M faces", slow=True)
+@group.add("million", "a caster of 3.1 M faces", slow=True)
 def million() -> Problem:
     """Each side of the box in fine squares; the float64 of the vertices keeps them flat."""
     many = {"edge_samples": 300_000, "surface_samples": 200_000}
