@@ -7,11 +7,14 @@ import pytest
 import torch
 
 import edgegrad as eg
-from edgegrad.fit.rig.alternatives import exchanged
+from edgegrad.fit import fit_rig
+from edgegrad.fit.rig.alternatives import Alternatives, exchanged
 from edgegrad.fit.rig.limbs import limbs
+from edgegrad.fit.rig.sought import Sought
 
 roma = pytest.importorskip("roma")
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
+import body  # noqa: E402
 import figure  # noqa: E402
 
 LEGS = [f"{side} {part}" for side in ("left", "right") for part in ("hip", "knee", "foot")]
@@ -60,3 +63,27 @@ def test_what_is_exchanged_hangs_alike() -> None:
     pairs = [limb.twins for limb in limbs(rig, range(20)) if limb.twins is not None]
     names = [[rig.joints.names[k].removeprefix("left ") for k in one] for one, _ in pairs]
     assert sorted(names) == [["hip", "knee", "foot"], ["shoulder", "arm", "elbow", "hand"]]
+
+
+@pytest.mark.slow
+def test_crossed_legs_are_found() -> None:
+    """A descent from rest, and limbs drawn anew by themselves, end with each leg in the outline of the other one."""
+    rig, truth, _, fit = body.trial(6, size=96, progress=False)
+    legs = [rig.joints.names.index(name) for name in LEGS]
+    assert fit.converged and float(body.Errors.of(rig, fit.values["rotations"], truth).direction[legs].max()) < 2.0
+
+
+@pytest.mark.slow
+def test_a_shared_twist_is_found() -> None:
+    """The arm is as it should be but for a twist of 40° that its lower part turns back."""
+    rig = figure.figure(fine=6)
+    cameras, truth = figure.cameras(128), figure.pose(7, 25.0)
+    masks = [eg.render_aovs(rig.posed(truth), camera, ["alpha"], spp=64, seed=5)["alpha"] for camera in cameras]
+    sought = Sought.of(rig, ["rotations"], None, {"rotations": truth}, {})
+    arm, elbow = (rig.joints.names.index(name) for name in ("left arm", "left elbow"))
+    start = Alternatives(rig, sought, "rotations").twisted({"rotations": truth}, arm, elbow, 0.7)
+    assert float(body.Errors.of(rig, start, truth).rotation[[arm, elbow]].min()) > 35.0
+    given = {"masks": masks, "start": {"rotations": start}, "coarsest": 128, "seek": ["rotations"], "progress": False}
+    alone, helped = (fit_rig(rig, cameras, tries=tries, **given) for tries in (0, 1))
+    off = [float(body.Errors.of(rig, fit.values["rotations"], truth).rotation.max()) for fit in (alone, helped)]
+    assert off[0] > 20.0 and off[1] < 5.0, off
