@@ -152,8 +152,15 @@ class Material:
                     "an image is eg.Texture(image)"
                 )
         for name in ("metallic", "roughness"):
-            if (n := _channels(getattr(self, name))) not in (None, 1):
-                raise ValueError(f"{name}: expected one channel, got {n}; take one of them, such as image[..., 2:3]")
+            value = getattr(self, name)
+            if (n := _channels(value)) not in (None, 1):
+                of_vertices = isinstance(value, Tensor) and value.dim() == 1
+                fix = (
+                    "of vertices give (V, 1), as x[:, None]"
+                    if of_vertices
+                    else "take one of them, such as image[..., 2:3]"
+                )
+                raise ValueError(f"{name}: expected one channel, got {n}; {fix}")
         if self.normal_map is not None:
             if not isinstance(self.normal_map, Texture):
                 raise TypeError(f"normal_map: expected a Texture, got {type(self.normal_map).__name__}")
