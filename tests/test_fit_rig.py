@@ -142,6 +142,17 @@ def test_a_limb_that_is_drawn_anew() -> None:
     assert helped.loss < 0.3 * alone.loss and not alone.converged
 
 
+def test_ctrl_c_while_limbs_are_drawn_anew_keeps_what_there_is(monkeypatch) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("edgegrad.fit.rig.limbs.Search.run", stop)
+    rig, cameras = arm(), views(32, 2)
+    found = fit_rig(rig, cameras, masks=shown(rig.posed(TRUTH), cameras), steps=2, progress=False)
+    assert found.fit.interrupted and not found.converged
+    assert float(found.values["rotations"].abs().max()) > 0.05  # of the descent before
+
+
 @pytest.mark.slow
 def test_a_sequence() -> None:
     rig, cameras = arm(), views()

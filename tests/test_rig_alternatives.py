@@ -1,4 +1,4 @@
-"""Two limbs that a fit of a rig puts where the other one is."""
+"""Poses that outlines hardly tell from another one: two limbs exchanged, a twist shared in another way."""
 
 import sys
 from pathlib import Path

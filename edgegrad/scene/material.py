@@ -154,12 +154,9 @@ class Material:
         for name in ("metallic", "roughness"):
             value = getattr(self, name)
             if (n := _channels(value)) not in (None, 1):
-                of_vertices = isinstance(value, Tensor) and value.dim() == 1
-                fix = (
-                    "of vertices give (V, 1), as x[:, None]"
-                    if of_vertices
-                    else "take one of them, such as image[..., 2:3]"
-                )
+                fix = "take one of them, such as image[..., 2:3]"
+                if isinstance(value, Tensor) and value.dim() == 1:
+                    fix = "of vertices give (V, 1), as x[:, None]"
                 raise ValueError(f"{name}: expected one channel, got {n}; {fix}")
         if self.normal_map is not None:
             if not isinstance(self.normal_map, Texture):

@@ -181,7 +181,10 @@ class Levels:
             and saved is None
             and found.ending is not Ending.INTERRUPTED
         ):
-            found = found._replace(values=self._searched(objective, found.values, options, name))
+            try:
+                found = found._replace(values=self._searched(objective, found.values, options, name))
+            except KeyboardInterrupt:
+                return found._replace(ending=Ending.INTERRUPTED)
         if (
             fine
             and self.tries
@@ -191,7 +194,10 @@ class Levels:
             and EXPLAINED < objective.left(found.values) < NEAR
         ):
             search = self._search(objective, found.values, options, name, TWIST_STEPS)
-            values = search.untwisted(dict(found.values))
+            try:
+                values = search.untwisted(dict(found.values))
+            except KeyboardInterrupt:
+                return found._replace(ending=Ending.INTERRUPTED)
             more = self._steps(objective, values, options, save, None, title, fine)
             later = [record._replace(step=len(found.history) + k) for k, record in enumerate(more.history)]
             found = more._replace(history=found.history + later, seconds=found.seconds + more.seconds)
@@ -223,7 +229,10 @@ class Levels:
             groups = [Limb(list(range(k, len(values[name])))) for k in range(len(values[name]))]
 
         def steps(objective: Objective, parameters: Mapping[str, Parameter]) -> dict[str, Tensor]:
-            return descend(way_of(parameters, few), objective, lambda state: None).values
+            found = descend(way_of(parameters, few), objective, lambda state: None)
+            if found.ending is Ending.INTERRUPTED:
+                raise KeyboardInterrupt
+            return found.values
 
         judge = ByLoss(objective, name) if objective.regions is None else ByContour(objective, name, joints)
         return Search(

@@ -121,9 +121,8 @@ class Mitsuba:
         scene, camera, self._scale = _resized(scene, camera)
         self._warm: set[tuple[int, int, int]] = set()
         self._integrator = mi.load_dict({"type": integrator, "sppi": 0, "guiding": "octree" if guiding else "none"})
-        self._integrator.max_depth = (
-            bounces + 1 if self._lit else 1
-        )  # an attribute, as direct_projective overrides the setting
+        # An attribute, as direct_projective overrides the setting.
+        self._integrator.max_depth = bounces + 1 if self._lit else 1
         self._integrator.sample_border_warning = False  # only for filters wider than a pixel
         description = {
             "type": "scene",
