@@ -22,7 +22,7 @@ from .light.bounces import check_bounces
 from .light.companions import FOURS, MOST_FOURS
 from .light.radiance import LIGHTING, Lighting
 from .light.resampled import how_drawn
-from .points.records import CURVE_BYTES, SURFACE_BYTES, without_colors
+from .points.records import CURVE_BYTES, SURFACE_BYTES, has_intersections, without_colors
 from .points.shadows import ShadowLight
 from .points.surfaces import every_face
 from .render import SHADING, check_options
@@ -162,6 +162,7 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     terms["shadow edges"] = _shadow_edges(scene, request, lighting)
     terms["unseen shadow edges"] = _unseen_shadow_edges(scene, request, lighting)
     terms["bounce edges"] = _bounce_edges(scene, request, lighting)
+    terms["surface borders"] = _surface_borders(scene, request, lighting)
     terms["texels of lamps"] = _texels_of_lamps(scene, lighting)
     return terms
 
@@ -232,17 +233,42 @@ def _bounce_edges(scene: Scene, request: Request, lighting: Lighting) -> Term:
         return Term(False, "bounces=1: no surface lights another")
     if not request.gradient.visibility:
         return Term(False, "visibility=False")
-    moving = [name for name in required(request) if name in MOVING]
-    if not moving:
+    moving, cut = required(request), _cuts_that_move(scene, request)
+    if not cut and not any(name in MOVING for name in moving):
         return Term(False, "neither surfaces nor the camera move")
     # What only the camera moves are borders that it sees.
-    kinds = lighting.bounces - 1 if "verts" in moving else 1
-    each, size = request.gradient.edge_samples, (request.camera.width, request.camera.height)
-    samples = request.cameras * kinds * (each if each >= 0 else core.most_bounce_samples(*size, request.image.spp))
-    why = "what surfaces see of one another: lines past edges, each two rays, one to the camera and a path at its other end"
+    kinds = lighting.bounces - 1 if cut or "verts" in moving else 1
+    samples = request.cameras * kinds * _most_bounce_samples(request)
+    past = "edges and rims of cut-outs" if _cuts(scene) else "edges"
+    why = f"what surfaces see of one another: lines past {past}, each two rays, one to the camera and a path at its other end"
     if kinds > 1:
         why += f"; as many whose light goes on to the camera after each of {kinds - 1} further bounces"
     return Term(True, why, samples=samples, bytes=samples * CURVE_BYTES)
+
+
+def _surface_borders(scene: Scene, request: Request, lighting: Lighting) -> Term:
+    if lighting.bounces == 1:
+        return Term(False, "bounces=1: no surface lights another")
+    if not request.gradient.visibility:
+        return Term(False, "visibility=False")
+    crossings = "verts" in required(request) and has_intersections(request.scene)
+    cut = _cuts_that_move(scene, request)
+    if not (crossings or cut):
+        return Term(False, "no faces that move pass through each other" + ", no rims move on theirs" * _cuts(scene))
+    kinds = lighting.bounces - 1
+    samples = request.cameras * kinds * max(_most_bounce_samples(request) // 4, 256)
+    where = " and ".join(["where faces pass through each other"] * crossings + ["at rims of cut-outs"] * cut)
+    why = f"light that surfaces send beside curves {where}: up to 8 rays for each place, each with a path and one to the camera"
+    return Term(True, why, samples=samples, bytes=8 * samples * CURVE_BYTES)
+
+
+def _cuts_that_move(scene: Scene, request: Request) -> bool:
+    return _cuts(scene) and any(name in ("uvs", "alphas") for name in required(request))
+
+
+def _most_bounce_samples(request: Request) -> int:
+    each, size = request.gradient.edge_samples, (request.camera.width, request.camera.height)
+    return each if each >= 0 else core.most_bounce_samples(*size, request.image.spp)
 
 
 def _cuts(scene: Scene) -> bool:

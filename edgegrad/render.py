@@ -94,10 +94,9 @@ def render(
     bounces          of lit scenes: how often light is scattered on its way from a light to the eye, at most; 1: direct light. A
                      path goes on from each point that is shaded, as the material there scatters, and draws one point of
                      each light wherever it comes to; from the third bounce on it may end early (Russian roulette). Colours
-                     of meshes without a material light nothing. Everything has its gradient, but for scenes of
-                     which one mesh blends, is cut out by alpha or has a nearest texture, and for vertices of meshes that pass
-                     through each other: there it is refused, unless visibility=False. Lights that are no meshes may
-                     always move
+                     of meshes without a material light nothing. Everything has its gradient, but for what moves in scenes of
+                     which one mesh blends, and for texture coordinates of nearest textures: there it is refused, unless
+                     visibility=False
 
     A scene with a light, or with a mesh that has a material, is lit: see Scene and Material. Its image has the dtype of the
     vertices.

@@ -22,7 +22,8 @@ F64 = torch.float64
 
 
 class Strip(NamedTuple):
-    """Vertices of the three meshes: the receiver and the sender are triangles, the strip is two."""
+    """Vertices of the three meshes: the receiver and the sender are triangles, the strip is two, or, for the oracle alone, any
+    polygon of which nothing hides another part."""
 
     receiver: Tensor
     sender: Tensor
@@ -61,23 +62,31 @@ class Strip(NamedTuple):
 
 
 def border(
-    moving: Strip, receiver: dict[str, Any], sender: dict[str, Any], weights: Tensor, finer: tuple[int, int] = (1, 1)
+    moving: Strip,
+    receiver: dict[str, Any],
+    sender: dict[str, Any],
+    weights: Tensor,
+    finer: tuple[int, int] = (1, 1),
+    side: int | None = None,
 ) -> Tensor:
-    """Zero, with the derivative of Σ weights · image by the tensors of `moving`, as far as it is that of the border. `finer`: how
-    many times as many points of quadrature there are on each axis of a pixel, and along the border."""
+    """Zero, with the derivative of Σ weights · image by the tensors of `moving`, as far as it is that of the border, or of one
+    side of it alone. `finer`: how many times as many points of quadrature there are on each axis of a pixel, and along the
+    border."""
     still = Strip(
         moving.receiver.detach(), moving.sender.detach(), moving.strip.detach(), moving.camera.detach(), moving.light
     )
     pixel, x = _pixels(moving.camera.size, 3 * finer[0])
     y, y_still = _seen(moving, x), _seen(still, x)
-    # (N, 4, 2): the last two barycentrics of the sender behind the corners, around which they run.
+    # (N, corners, 2): the last two barycentrics of the sender behind the corners, around which they run.
     shadow = torch.stack([_behind(moving, y, corner) for corner in moving.strip], 1)
     own = weights.reshape(-1, 3)[pixel] / len(x) * len(weights.reshape(-1, 3))
     total, around = weights.new_zeros(()), torch.zeros_like(x[:, 0])
-    for k in range(4):
-        a, b = shadow[:, k], shadow[:, (k + 1) % 4]
+    for k in range(len(moving.strip)):
+        a, b = shadow[:, k], shadow[:, (k + 1) % len(moving.strip)]
         along = (b - a).detach()
         around = around + (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).detach()
+        if side not in (None, k):
+            continue
         for s, weight in zip(*_gauss(12 * finer[1]), strict=True):
             place = (1 - s) * a + s * b
             h = (own * _integrand(still, y_still, place.detach(), receiver, sender)).sum(1)
@@ -85,6 +94,20 @@ def border(
             total = total + weight * h @ (along[:, 0] * moved[:, 1] - along[:, 1] * moved[:, 0])
     assert bool((around > 0).all()) or bool((around < 0).all())
     return total * torch.sign(around[0])
+
+
+def sent_from_line(
+    strip: Strip, a: Tensor, b: Tensor, receiver: dict[str, Any], sender: dict[str, Any], weights: Tensor
+) -> Tensor:
+    """Σ weights · image for light that the sender sends from a line between two places (2,) in its last two barycentrics, without
+    the strip, per unit of the other barycentrics: ∫ h ds, ds = |b − a| dt."""
+    pixel, x = _pixels(strip.camera.size, 3)
+    y, total = _seen(strip, x), weights.new_zeros(())
+    own = weights.reshape(-1, 3)[pixel] / len(x) * len(weights.reshape(-1, 3))
+    for s, weight in zip(*_gauss(24), strict=True):
+        place = ((1 - s) * a + s * b).expand(len(x), 2)
+        total = total + weight * (b - a).norm() * (own * _integrand(strip, y, place, receiver, sender)).sum()
+    return total
 
 
 def _gauss(n: int) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,9 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad import shader
 from edgegrad.light import bounce_edges, in_kernel
+from edgegrad.light.at_points import Options
+from edgegrad.points.frame import Frame
+from edgegrad.points.splat import Term
 
 F64 = torch.float64
 LOOKS: dict[str, dict[str, Any]] = {
@@ -92,11 +95,14 @@ def test_strip_between_mirrors(looks: tuple[str, str]) -> None:
 def test_light_that_is_followed_to_the_camera(looks: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     """From ends of lines that could be out of sight, light goes on to the camera; without any step in between, the same border is
     found that the camera sees."""
-    follow, passed_on = in_kernel.towards_camera, bounce_edges._passed_on
+    follow = in_kernel.towards_camera
     monkeypatch.setattr(in_kernel, "towards_camera", lambda frame, arrivals, _: follow(frame, arrivals, (0, 0)))
-    monkeypatch.setattr(
-        bounce_edges, "_seen", lambda frame, options: passed_on(frame, options._replace(bounces=3), further=1)
-    )
+
+    def passed_on(frame: Frame, options: Options) -> list[Term]:
+        found = in_kernel.bounce_samples(frame, options._replace(bounces=3), 1)
+        return bounce_edges._passed_on(frame, found, "bounce edges", 1)
+
+    monkeypatch.setattr(bounce_edges, "_seen", passed_on)
     exact, weights = leaves_of(Strip.standard()), weights_of(Strip.standard())
     value = border(exact, LOOKS[looks[0]], LOOKS[looks[1]], weights)
     found = gradients(Strip.standard(), looks, weights, 400_000)

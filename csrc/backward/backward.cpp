@@ -15,6 +15,7 @@
 #include "boundary/curve_measure.h"
 #include "boundary/shadows.h"
 #include "boundary/steps.h"
+#include "boundary/surface_borders.h"
 #include "boundary/unseen_shadows.h"
 #include "camera/windows.h"
 #include "interior/interior.h"
@@ -415,8 +416,21 @@ std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const Sc
     const auto add = [&](const BackwardView<T>& view) {
         add_bounces(view, casters, paths, samples, Record{o.intrinsics}, to, out);
     };
-    if (paths.further == 0) each_view(input, o, Terms{}, team, add);
+    if (paths.seen) each_view(input, o, Terms{}, team, add);
     else with_any_window<T>(input, o, team, add);
+    return std::move(records.curves);
+}
+
+template <class T>
+std::vector<CurveRecords> record_surface_borders(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                                 const GradientOptions& o, const LitPaths& paths, MovingBorders moving,
+                                                 int64_t samples, Team& team, BounceSamples& out) {
+    RecordList records;
+    Destination to;
+    to.records = &records;
+    with_any_window<T>(input, o, team, [&](const BackwardView<T>& view) {
+        add_surface_borders(view, casters, paths, moving, samples, to, out);
+    });
     return std::move(records.curves);
 }
 
@@ -432,19 +446,22 @@ std::vector<CurveRecords> record_unseen_shadows(const BackwardInput<T>& input, c
     return std::move(records.curves);
 }
 
-#define EDGEGRAD_INSTANTIATE(T)                                                                                   \
-    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,              \
-                                             const Gradients&);                                                   \
-    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&,  \
-                                  double*);                                                                       \
-    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);               \
-    template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                          \
-    template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,               \
-                                                      const GradientOptions&, const LightParts&, int64_t, Team&); \
-    template std::vector<CurveRecords> record_bounces(const BackwardInput<T>&, const SceneView<T>&,               \
-                                                      const GradientOptions&, const LitPaths&, int64_t, Team&,    \
-                                                      BounceSamples&);                                            \
-    template std::vector<CurveRecords> record_unseen_shadows(                                                     \
+#define EDGEGRAD_INSTANTIATE(T)                                                                                       \
+    template BackwardProfile render_backward(const BackwardInput<T>&, const GradientOptions&, Team&,                  \
+                                             const Gradients&);                                                       \
+    template void render_tangents(const BackwardInput<T>&, GradientOptions, Team&, const std::vector<Tangents>&,      \
+                                  double*);                                                                           \
+    template void render_screen_gradient(const BackwardInput<T>&, GradientOptions, Team&, double*);                   \
+    template RecordList record_samples(const BackwardInput<T>&, GradientOptions, Team&);                              \
+    template std::vector<CurveRecords> record_shadows(const BackwardInput<T>&, const SceneView<T>&,                   \
+                                                      const GradientOptions&, const LightParts&, int64_t, Team&);     \
+    template std::vector<CurveRecords> record_bounces(const BackwardInput<T>&, const SceneView<T>&,                   \
+                                                      const GradientOptions&, const LitPaths&, int64_t, Team&,        \
+                                                      BounceSamples&);                                                \
+    template std::vector<CurveRecords> record_surface_borders(const BackwardInput<T>&, const SceneView<T>&,           \
+                                                              const GradientOptions&, const LitPaths&, MovingBorders, \
+                                                              int64_t, Team&, BounceSamples&);                        \
+    template std::vector<CurveRecords> record_unseen_shadows(                                                         \
         const BackwardInput<T>&, const SceneView<T>&, const GradientOptions&, const LightParts&, int64_t, Team&);
 EDGEGRAD_INSTANTIATE(float)
 EDGEGRAD_INSTANTIATE(double)

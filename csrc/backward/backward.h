@@ -14,6 +14,7 @@ namespace edgegrad {
 
 struct LitPaths;  // boundary/bounces.h
 struct BounceSamples;
+struct MovingBorders;
 
 struct GradientOptions {
     int64_t surface_samples = -1;  // in all; −1: the default (surface_measure.cpp)
@@ -106,6 +107,11 @@ template <class T>
 std::vector<CurveRecords> record_bounces(const BackwardInput<T>& input, const SceneView<T>& casters,
                                          const GradientOptions& options, const LitPaths& paths, int64_t samples,
                                          Team& team, BounceSamples& out);
+// Those on curves at which surfaces begin to send light (boundary/surface_borders.h).
+template <class T>
+std::vector<CurveRecords> record_surface_borders(const BackwardInput<T>& input, const SceneView<T>& casters,
+                                                 const GradientOptions& options, const LitPaths& paths,
+                                                 MovingBorders moving, int64_t samples, Team& team, BounceSamples& out);
 
 // q = T (R p + t), backwards: p̄ = (T R)ᵀ q̄, R̄ = Tᵀ Σ q̄ pᵀ, t̄ = Tᵀ Σ q̄, for q_bar (V, 3), with the turn T of a window.
 void add_world(const Camera& window, const double* verts, const Array<double>& q_bar, Team& team,

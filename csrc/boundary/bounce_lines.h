@@ -1,4 +1,4 @@
-// Lines past edges, and what lies at both of their ends.
+// Lines past edges and rims of cut-outs, and what lies at both of their ends.
 #pragma once
 
 #include <algorithm>
@@ -8,6 +8,8 @@
 #include "backward/view.h"
 #include "boundary/bounce_source.h"
 #include "boundary/curve.h"
+#include "boundary/lune.h"
+#include "boundary/occluder.h"
 #include "rays/meeting.h"
 #include "scene/contact.h"
 #include "shading/cut_outs.h"
@@ -18,24 +20,27 @@ namespace edgegrad {
 template <class T>
 class BounceLines {
    public:
-    BounceLines(const BackwardView<T>& view, const SceneView<T>& casters)
-        : view_(view), casters_(casters), caster_(view.geometry.caster()) {
+    BounceLines(const BackwardView<T>& view, const SceneView<T>& casters, const std::vector<Rim>& rims)
+        : view_(view), casters_(casters), rims_(rims), caster_(view.geometry.caster()) {
         // So far before the edge a ray begins that floats find what touches it there.
         const RayFrame& frame = caster_.frame();
         constexpr double floats = 0x1p-18;
         size_ = frame.radius * frame.unit, before_ = floats * size_;
     }
 
-    // The place t of an edge, and the unit direction w of a line past it, for whoever knows the segment by this number.
-    void add(int64_t edge, double t, Vec3 w, int64_t segment, double weight) {
+    // The place t of an edge, or, numbered after all edges, of a rim, and the unit direction w of a line past it,
+    // either way, for whoever knows the segment by this number.
+    void add(int64_t piece, double t, Vec3 w, int64_t segment, double weight) {
         Waiting& o = waiting_[count_];
-        const HalfEdge& h = view_.geometry.topology().half_edges(edge)[0];
-        o.edge = edge, o.weight = weight;
+        const int64_t edges = view_.geometry.topology().n_edges();
         o.line = BounceLine();
-        o.line.vertex[0] = vertex(view_.scene, h, h.first()), o.line.vertex[1] = vertex(view_.scene, h, h.second());
-        o.line.t = t, o.line.w = w, o.line.segment = segment;
-        o.a = corner(view_.scene, h.face, h.first()), o.b = corner(view_.scene, h.face, h.second());
-        o.p = (1 - t) * o.a + t * o.b;
+        o.edge = piece < edges ? piece : -1, o.weight = weight, o.line.w = w, o.line.segment = segment;
+        if (!(o.edge < 0 ? set_rim(rims_[piece - edges], t, o) : set_edge(t, o))) return;
+        const Occluder& occluder = o.line.occluder;
+        o.tangent = occluder.sum(occluder.tangent, vertices());
+        const auto beside = faces_beside(o);
+        without_[count_].assign(beside.begin(), beside.end());
+        std::sort(without_[count_].begin(), without_[count_].end());
         ++count_;
     }
 
@@ -67,20 +72,53 @@ class BounceLines {
     struct Waiting {
         BounceLine line;
         double weight;
-        int64_t edge;
-        Vec3 a, b, p;  // world coordinates
+        int64_t edge;     // −1: a rim
+        int32_t face;     // of a rim
+        Vec3 p, tangent;  // world coordinates
         End end[2];
 
         Vec3 direction(int side) const { return side ? line.w : -line.w; }
     };
 
+    auto vertices() const {
+        return [&](int32_t i) { return vec(view_.scene.verts + 3 * int64_t(i)); };
+    }
+    // Of the edge, or that of the rim.
+    std::span<const int32_t> faces_beside(const Waiting& o) const {
+        return o.edge < 0 ? std::span<const int32_t>(&o.face, 1) : view_.geometry.topology().faces(o.edge);
+    }
+
+    // Where some of its faces may be cut out, lines are drawn as if all passed; those past the others are kept.
+    bool set_edge(double t, Waiting& o) {
+        const auto halves = view_.geometry.topology().half_edges(o.edge);
+        const HalfEdge& own = halves[0];
+        o.line.occluder = occluder_of(view_.scene, own, t);
+        o.p = o.line.occluder.sum(o.line.occluder.weight, vertices());
+        if (!casters_.cut_outs.face) return true;
+        opposite_.clear();
+        for (const HalfEdge& h : halves)
+            if (is_there(casters_, h, t)) opposite_.push_back(corner(view_.scene, h.face, (h.corner + 2) % 3));
+        if (opposite_.size() == halves.size() && !cut_outs_jump(casters_, view_.geometry.topology(), o.edge))
+            return true;
+        const Lune lune(corner(view_.scene, own.face, own.first()), corner(view_.scene, own.face, own.second()),
+                        opposite_);
+        const Lune::Place place = lune.locate(o.line.w);
+        o.line.w = place.w;
+        return place.is_there();
+    }
+    bool set_rim(const Rim& rim, double t, Waiting& o) const {
+        RimPlace place{};
+        if (!RimFinder<T>(casters_).place(rim, t, place)) return false;
+        o.line.occluder = occluder_of(casters_, rim, place);
+        const double turned = o.line.occluder.turned(o.line.w, vertices());
+        if (!(std::fabs(turned) > 0)) return false;
+        if (turned > 0) o.line.w = -o.line.w;  // the face is there where κ D F > 0
+        o.p = beside_rim(casters_, rim, place), o.face = rim.face;
+        return true;
+    }
+
     void find_ends(int side) {
         int32_t face[RayBatch::size];
-        for (int i = 0; i < count_; ++i) {
-            const auto beside = view_.geometry.topology().faces(waiting_[i].edge);
-            without_[i].assign(beside.begin(), beside.end());
-            std::sort(without_[i].begin(), without_[i].end());
-        }
         cast_each(
             caster_, count_, face, without_,
             [&](int i) {
@@ -106,7 +144,7 @@ class BounceLines {
         constexpr double near = 4;  // sizes of the face
         const bool meets = !outside || met.t * met.t > near * near * length(m);
         // How faces that share a vertex with those of the edge lie to it is exact, however near they are.
-        const auto own = view_.geometry.topology().faces(o.edge);
+        const auto own = faces_beside(o);
         if (std::any_of(own.begin(), own.end(), [&](int32_t f) { return share_vertex(scene, face, f); }))
             return meets && met.t > Meeting::rounding * size_;
         const double touching = distance_in_contact(o, face, length(m) / std::fabs(dot(m, d)));
@@ -132,7 +170,7 @@ class BounceLines {
     }
     double spacing_at(const Waiting& o, int32_t face) const {
         const Spacing& spacing = *view_.scene.spacing;
-        return std::max(spacing.of(view_.scene.faces[3 * int64_t(face)]), spacing.of(o.line.vertex[0]));
+        return std::max(spacing.of(view_.scene.faces[3 * int64_t(face)]), spacing.of(o.line.occluder.vertex[0]));
     }
 
     // How high faces stand over the plane of another, on the side where they do most; 0: they lie in it.
@@ -166,10 +204,10 @@ class BounceLines {
     Barycentrics beside(const Waiting& o, int32_t face) const {
         const SceneView<T>& scene = view_.scene;
         const Vec3 q = corner(scene, face, 0), e1 = corner(scene, face, 1) - q, e2 = corner(scene, face, 2) - q;
-        const Vec3 m = cross(e1, e2), edge = o.b - o.a, across = unit(cross(m, edge));
-        const double side = dot(cross(edge, o.line.w), across) > 0 ? 1 : -1;
+        const Vec3 m = cross(e1, e2), across = unit(cross(m, o.tangent));
+        const double side = dot(cross(o.tangent, o.line.w), across) > 0 ? 1 : -1;
         constexpr double little = 1e-5, roundings = 64;  // of the edge; of the input, for rays to lights
-        const double aside = little * length(edge) + roundings * spacing_at(o, face) * extent(face);
+        const double aside = little * length(o.tangent) + roundings * spacing_at(o, face) * extent(face);
         const Vec3 there = o.p + (side * aside) * across - q;
         const double scale = 1 / dot(m, m);
         return inside({dot(cross(there, e2), m) * scale, dot(cross(e1, there), m) * scale});
@@ -179,10 +217,12 @@ class BounceLines {
 
     const BackwardView<T>& view_;
     const SceneView<T>& casters_;
+    const std::vector<Rim>& rims_;
     const RayCaster& caster_;
     double size_, before_;
     Waiting waiting_[RayBatch::size];
     std::vector<int32_t> without_[RayBatch::size];
+    std::vector<Vec3> opposite_;
     int count_ = 0;
 };
 

@@ -1,5 +1,5 @@
-// Borders of what surfaces see of one another, as a source of curves: an edge (a, b) on the line between two points of
-// a path of light, y₁ that is seen in the image and y₂ that sends light to it.
+// Borders of what surfaces see of one another, as a source of curves: an edge (a, b), or the rim of a cut-out, on the
+// line between two points of a path of light, y₁ that is seen in the image and y₂ that sends light to it.
 //
 // In place of a light there is a surface of the scene, so that one border in the image has no one place: for each point
 // of the edge and each line past it there is another. Lines are drawn by the point p = (1 − t) a + t b and the unit
@@ -15,7 +15,8 @@
 //
 //     δF = λ c m · Σ β_i δv_i + (1 − λ) N · Σ γ_i δv_i − N · ((1 − t) δa + t δb) + λ (N − c m) · δq(x),
 //
-// δq(x) at a fixed depth, as for borders of shadows (shadow_source.h).
+// δq(x) at a fixed depth, as for borders of shadows (shadow_source.h). On a rim p = Σ b_i v_i moves with its face and,
+// as f grows by δf, gives way by −N·δp = κ D δf (occluder.h).
 #pragma once
 
 #include <algorithm>
@@ -24,14 +25,14 @@
 
 #include "backward/view.h"
 #include "boundary/curve_source.h"
+#include "boundary/occluder.h"
 
 namespace edgegrad {
 
-// A line past an edge, of which both ends lie on faces.
+// A line past an edge or a rim, of which both ends lie on faces.
 struct BounceLine {
-    int32_t vertex[2] = {};              // of the edge
-    double t = 0;                        // on it
-    Vec3 w = {};                         // unit, world coordinates
+    Occluder occluder = {};
+    Vec3 w = {};                         // unit, world coordinates; the faces lie where N · (y − p) < 0
     int64_t segment = 0;                 // of the sampler (bounces.cpp)
     int32_t receiver = -1, sender = -1;  // the faces of y₁ and y₂
     Barycentrics at = {}, from = {};     // y₁ and y₂ on them
@@ -49,9 +50,10 @@ class BounceSource {
         BounceLine line;
         int32_t own;  // the receiver, which the ray ignores
         CurveFaces faces;
-        Vec3 N, m;     // the latter times λ c
-        Vec2 by_n;     // ∂F/∂n
-        double scale;  // px² of the straight image for each unit of the receiver's area
+        Vec3 N, m;      // the latter times λ c
+        Vec2 by_n;      // ∂F/∂n
+        double by_rim;  // ∂F/∂f
+        double scale;   // px² of the straight image for each unit of the receiver's area
     };
 
     explicit BounceSource(const BackwardView<T>& view) : view_(view) {}
@@ -74,7 +76,10 @@ class BounceSource {
 
         sample.line = line, sample.own = line.receiver;
         sample.point = y, sample.behind = {};
-        const Vec3 N = cross(q[line.vertex[1]] - q[line.vertex[0]], camera.R * line.w);
+        const Vec3 w = camera.R * line.w;
+        const auto at = [&](int32_t i) { return q[i]; };
+        const Vec3 N = cross(line.occluder.sum(line.occluder.tangent, at), w);
+        sample.by_rim = line.occluder.is_rim() ? line.occluder.turned(w, at) : 0;
         const double along = camera.along_ray(m, sample.n), unit_there = camera.unit_at_depth(y.z);
         sample.N = N, sample.m = (line.share * camera.along_ray(N, sample.n) / along) * m;
         const Vec3 slope = unit_there * (line.share * N - sample.m);
@@ -109,11 +114,12 @@ class BounceSource {
             const int32_t* vertex = view_.scene.faces + 3 * int64_t(face);
             return b[0] * direction.q[vertex[0]] + b[1] * direction.q[vertex[1]] + b[2] * direction.q[vertex[2]];
         };
-        const Vec3 edge = (1 - line.t) * direction.q[line.vertex[0]] + line.t * direction.q[line.vertex[1]];
+        const Vec3 p = line.occluder.sum(line.occluder.weight, [&](int32_t i) { return direction.q[i]; });
         const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
         const double F_dot = dot(sample.m, moved(line.receiver, line.at)) +
-                             dot(sample.N, (1 - line.share) * moved(line.sender, line.from) - edge) +
-                             sample.by_n.x * n_dot.x + sample.by_n.y * n_dot.y;
+                             dot(sample.N, (1 - line.share) * moved(line.sender, line.from) - p) +
+                             sample.by_rim * line.occluder.rim_jvp(direction.tangents) + sample.by_n.x * n_dot.x +
+                             sample.by_n.y * n_dot.y;
         return {sample.scale * sample.area_scale * F_dot, 0};
     }
 
@@ -125,8 +131,9 @@ class BounceSource {
             add(view_.scene.faces[3 * int64_t(line.receiver) + i], (F_bar * line.at[i]) * sample.m);
             add(view_.scene.faces[3 * int64_t(line.sender) + i], (F_bar * (1 - line.share) * line.from[i]) * sample.N);
         }
-        add(line.vertex[0], (-F_bar * (1 - line.t)) * sample.N);
-        add(line.vertex[1], (-F_bar * line.t) * sample.N);
+        const Occluder& occluder = line.occluder;
+        for (int i = 0; i < occluder.count; ++i) add(occluder.vertex[i], (-F_bar * occluder.weight[i]) * sample.N);
+        occluder.rim_vjp(F_bar * sample.by_rim, grad);
         normalised_vjp(view_.camera, sample.n, F_bar * sample.by_n, grad.k);
     }
 

@@ -1,8 +1,8 @@
 // Samples on the borders of what surfaces of a path see of one another.
 //
-// Edges are laid end to end by their length times the azimuths of lines past them (lune.h). Some lines, pilots, say how
-// much light passes by the edges of each connected part of the scene, direction by direction; the samples go in
-// proportion to that, with a floor (line_density.h).
+// Edges and rims of cut-outs are laid end to end by their length times the azimuths of lines past them (lune.h). Some
+// lines, pilots, say how much light passes by those of each connected part of the scene, direction by direction; the
+// samples go in proportion to that, with a floor (line_density.h).
 
 #include "boundary/bounces.h"
 
@@ -15,9 +15,9 @@
 #include "boundary/contractions.h"
 #include "boundary/curve_samples.h"
 #include "boundary/line_density.h"
+#include "boundary/line_ends.h"
 #include "core/sampler.h"
 #include "core/systematic.h"
-#include "shading/lit/between.h"
 #include "shading/lit/indirect.h"
 #include "shading/lit/lit.h"
 
@@ -30,89 +30,29 @@ constexpr int64_t fewest_pilots = 1 << 10, most_pilots = 1 << 14, samples_of_pil
 
 // What chunks of lines share.
 template <class T>
-struct LineScene {
-    const BackwardView<T>& view;
-    const SceneView<T>& casters;
-    const LitPaths& lit;
-    LitOptions at_sender;  // how often light may be scattered up to there
+struct LineScene : LineLight<T> {
     PooledLines& pooled;
     Mirrors mirrors;
+    const std::vector<Rim> rims;
     std::vector<double> means = {};  // of its cells; empty: not known yet
 
-    LineScene(const BackwardView<T>& view_, const SceneView<T>& casters_, const LitPaths& lit_, PooledLines& pooled_)
-        : view(view_),
-          casters(casters_),
-          lit(lit_),
-          at_sender(lit_.options),
+    LineScene(const LineLight<T>& light, PooledLines& pooled_)
+        : LineLight<T>(light),
           pooled(pooled_),
-          mirrors(lit_.lit, is_seen()) {
-        at_sender.bounces -= 1 + lit.further;
-    }
-    bool is_seen() const { return lit.further == 0; }  // whether the viewer sees the ends to which light comes
-    EdgeLines<T> lines() const { return {view.scene, view.geometry.topology(), pooled, means, mirrors}; }
+          mirrors(this->lit.lit, this->is_seen()),
+          rims(RimFinder<T>(this->casters).find(hash(this->view.options.seed, 13, gradient_stream), this->view.team)) {}
+    EdgeLines<T> lines() const { return {this->casters, this->view.geometry.topology(), rims, pooled, means, mirrors}; }
 
-    // What is drawn of each edge, relative to others.
+    // What is drawn of each edge and rim, relative to others.
     Array<double> measure() const {
-        const int64_t n = view.geometry.topology().n_edges();
+        const int64_t n = this->view.geometry.topology().n_edges() + int64_t(rims.size());
         Array<double> out(n);
-        view.team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
+        this->view.team.each_block(n, [&](int64_t, int64_t first, int64_t last) {
             EdgeLines<T> edge = lines();
             for (int64_t k = first; k < last; ++k) out[k] = edge.set(k);
         });
         return out;
     }
-};
-
-// Pairs of points, a receiver and a sender of light each.
-class Ends {
-   public:
-    int64_t size() const { return int64_t(face_[0].size()); }
-    void add(int receiver_or_sender, int64_t face, double u, double v) {
-        face_[receiver_or_sender].push_back(face), append(b_[receiver_or_sender], {1 - u - v, u, v});
-    }
-
-    // (N, channels) what passes between them (between.h), with the numbers of so many pairs from `first` on.
-    template <class T>
-    std::vector<double> sent(const LineScene<T>& scene, uint64_t stream, int64_t first, Paths& paths) const {
-        const int C = scene.lit.lit.channels;
-        std::vector<double> out(size() * C);
-        std::vector<int64_t> seed;
-        const uint64_t numbers = hash(scene.view.options.seed, stream, gradient_stream) << 32;
-        for (int64_t i = 0; i < size(); ++i) seed.push_back(int64_t(numbers | uint32_t(first + i)));
-        for (int64_t i = 0; i < size(); i += shaded_at_once) {
-            const LitLines some{std::min(shaded_at_once, size() - i),
-                                &face_[0][i],
-                                &face_[1][i],
-                                &b_[0][3 * i],
-                                &b_[1][3 * i],
-                                &seed[i]};
-            send_between(scene.lit.lit, scene.casters, scene.view.geometry.caster(), some,
-                         scene.is_seen() ? Received::by_viewer : Received::there, paths, &out[i * C]);
-        }
-        return out;
-    }
-
-    // (N, 3) unit directions from receivers to senders.
-    template <class T>
-    std::vector<double> directions(const LineScene<T>& scene) const {
-        std::vector<double> out;
-        for (int64_t i = 0; i < size(); ++i) {
-            const Vec3 l = unit(place(scene, 1, i) - place(scene, 0, i));
-            append(out, {l.x, l.y, l.z});
-        }
-        return out;
-    }
-
-   private:
-    template <class T>
-    Vec3 place(const LineScene<T>& scene, int end, int64_t i) const {
-        Vec3 out;
-        for (int k = 0; k < 3; ++k) out += b_[end][3 * i + k] * corner(scene.view.scene, face_[end][i], k);
-        return out;
-    }
-
-    std::vector<int64_t> face_[2];
-    std::vector<double> b_[2];
 };
 
 // What pilots find.
@@ -155,7 +95,7 @@ class LineChunk {
           sequence_(seed),
           body_(body),
           edge_lines_(scene.lines()),
-          lines_(scene.view, scene.casters) {}
+          lines_(scene.view, scene.casters, scene.rims) {}
 
     // The i-th line, at a position along the edges; these ascend. The cell that it is pooled in.
     int64_t add(int64_t i, double position) {
@@ -193,9 +133,12 @@ void each_seen(const BackwardView<T>& view, Contraction& contraction, ChunkGrad&
 }
 
 template <class T>
+auto places_of(const BackwardView<T>& view) {
+    return [&](int32_t i) { return vec(view.scene.verts + 3 * int64_t(i)); };
+}
+template <class T>
 Vec3 normal_of(const BackwardView<T>& view, const BounceLine& line) {
-    const auto at = [&](int i) { return vec(view.scene.verts + 3 * int64_t(line.vertex[i])); };
-    return cross(at(1) - at(0), line.w);
+    return cross(line.occluder.sum(line.occluder.tangent, places_of(view)), line.w);
 }
 
 // A line of which no end need be seen: F by places in the world, y₁ stays at its barycentrics (bounce_source.h).
@@ -217,7 +160,9 @@ void append_unseen(const BackwardView<T>& view, const BounceLine& line, double w
         add(view.scene.faces[3 * int64_t(line.receiver) + i], line.share * line.at[i]);
         add(view.scene.faces[3 * int64_t(line.sender) + i], (1 - line.share) * line.from[i]);
     }
-    add(line.vertex[0], line.t - 1), add(line.vertex[1], -line.t);
+    const Occluder& occluder = line.occluder;
+    for (int i = 0; i < occluder.count; ++i) add(occluder.vertex[i], -occluder.weight[i]);
+    if (occluder.is_rim()) occluder.append_rim(occluder.turned(line.w, places_of(view)), sample, records);
 }
 
 // Fills what is pooled.
@@ -270,24 +215,6 @@ void cast_pilots(LineScene<T>& scene, int64_t n) {
     scene.means = scene.pooled.means();
 }
 
-// Of the samples of a record, of which the first is number `first`.
-template <class T>
-void add_jumps(const LineScene<T>& scene, const CurveRecords& record, int64_t first, Paths& paths,
-               std::vector<double>& jump, std::vector<double>& origin) {
-    constexpr int surfaces = CurveRecords::surfaces;
-    Ends ends;
-    for (int64_t i = 0; i < record.size(); ++i)
-        for (int k = 0; k < 2; ++k) {
-            const int64_t at = surfaces * i + k;
-            ends.add(k, record.face[at], record.b[2 * at], record.b[2 * at + 1]);
-        }
-    jump = ends.sent(scene, 15, first, paths);
-    const int C = scene.lit.lit.channels;
-    for (int64_t i = 0; i < record.size(); ++i)
-        for (int c = 0; c < C; ++c) jump[i * C + c] *= record.factor[surfaces * i];
-    if (!scene.is_seen()) origin = ends.directions(scene);
-}
-
 }  // namespace
 
 int64_t most_bounce_samples(int64_t width, int64_t height, int spp) {
@@ -301,7 +228,7 @@ void add_bounces(const BackwardView<T>& view, const SceneView<T>& casters, const
         samples >= 0 ? samples : most_bounce_samples(view.camera.width, view.camera.height, view.image.spp);
     if (n == 0) return;
     PooledLines pooled(view.geometry.parts());
-    LineScene<T> scene(view, casters, lit, pooled);
+    LineScene<T> scene({view, casters, lit}, pooled);
     cast_pilots(scene, std::clamp(n / samples_of_pilot, fewest_pilots, most_pilots));
     Array<double> measure = scene.measure();
     Systematic edges(measure, view.team);
@@ -322,17 +249,7 @@ void add_bounces(const BackwardView<T>& view, const SceneView<T>& casters, const
                 [&](const BounceLine& line, double weight) { append_unseen(view, line, weight, grad.records.curves); });
         }
     });
-    const std::vector<CurveRecords>& found = to.records->curves;
-    std::vector<int64_t> first(found.size() + 1, 0);
-    for (size_t k = before; k < found.size(); ++k) first[k + 1] = first[k] + found[k].size();
-    out.jump.resize(found.size()), out.origin.resize(found.size());
-    view.team.each_with(
-        int64_t(found.size() - before), [&] { return path_buffers(lit.lit, scene.at_sender); },
-        [&](Paths& paths, int64_t i) {
-            view.team.check();
-            const size_t k = before + size_t(i);
-            add_jumps(scene, found[k], first[k], paths, out.jump[k], out.origin[k]);
-        });
+    ask_senders(scene, to.records->curves, before, 15, out);
 }
 
 template void add_bounces(const BackwardView<float>&, const SceneView<float>&, const LitPaths&, int64_t, const Record&,

@@ -104,46 +104,28 @@ class LightRays {
 
     bool set_edge(int64_t edge, double t, Waiting& w) const {
         if (!casts(edge, t, w.point)) return false;
-        const HalfEdge& h = view_.geometry.topology().half_edges(edge)[0];
-        const SceneView<T>& scene = view_.scene;
-        const auto vertex_of = [&](int c) { return scene.faces[3 * int64_t(h.face) + c]; };
-        const Vec3 a = corner(scene, h.face, h.first()), b = corner(scene, h.face, h.second());
-        w.point.caster.vertex[0] = vertex_of(h.first()), w.point.caster.vertex[1] = vertex_of(h.second());
-        w.point.caster.weight[0] = 1 - t, w.point.caster.weight[1] = t;
-        w.point.caster.tangent[0] = -1, w.point.caster.tangent[1] = 1;
-        w.p = (1 - t) * a + t * b;
+        w.point.caster = occluder_of(view_.scene, view_.geometry.topology().half_edges(edge)[0], t);
+        w.p = w.point.caster.sum(w.point.caster.weight, vertices());
         return true;
     }
 
     bool set_rim(const Rim& rim, double t, Waiting& w) const {
-        RimPlace place;
+        RimPlace place{};
         if (!RimFinder<T>(casters_).place(rim, t, place)) return false;
-        ShadowCaster& caster = w.point.caster;
-        caster.count = 3;
-        const Barycentrics tangent{-place.kappa * place.slope.v, place.kappa * place.slope.u};
-        Vec3 v[3], p;
-        for (int i = 0; i < 3; ++i) {
-            caster.vertex[i] = casters_.faces[3 * int64_t(rim.face) + i];
-            caster.uv_row[i] = casters_.uv_corners[3 * int64_t(rim.face) + i];
-            caster.weight[i] = place.b[i], v[i] = corner(casters_, rim.face, i), p += place.b[i] * v[i];
-        }
-        caster.tangent[0] = -tangent.u - tangent.v, caster.tangent[1] = tangent.u, caster.tangent[2] = tangent.v;
-        caster.kappa = place.kappa, caster.by_uv = place.by_uv, caster.alpha = place.alpha;
-        caster.of_alpha = rim.border == 0;
-        // Dark is where f > 0, and there N · (y − p) has the sign of κ D (shadow_source.h).
-        const Vec3 d = light_.infinite ? -w.point.light : p - w.point.light;
-        const double turned = place.kappa * dot(d, cross(v[1] - v[0], v[2] - v[0]));
+        w.point.caster = occluder_of(casters_, rim, place);
+        // It is dark where f > 0.
+        const Vec3 p = w.point.caster.sum(w.point.caster.weight, vertices());
+        const double turned = w.point.caster.turned(light_.infinite ? -w.point.light : p - w.point.light, vertices());
         if (!(std::fabs(turned) > 0)) return false;
         w.point.side = turned > 0 ? 1 : -1;
-        // The ray goes by where the face is cut out: a neighbour that has the rim in common, where it runs along their
-        // edge, is cut out there too, or not met.
-        constexpr double aside = 1e-7;
-        const double size = length(Vec2{place.slope.u, place.slope.v});
-        w.p = p - (aside / size) * (place.slope.u * (v[1] - v[0]) + place.slope.v * (v[2] - v[0]));
+        w.p = beside_rim(casters_, rim, place);
         w.face = rim.face;
         return true;
     }
 
+    auto vertices() const {
+        return [&](int32_t i) { return vec(view_.scene.verts + 3 * int64_t(i)); };
+    }
     // Of the edge, or that of the rim.
     std::span<const int32_t> faces_beside(const Waiting& w) const {
         return w.edge < 0 ? std::span<const int32_t>(&w.face, 1) : view_.geometry.topology().faces(w.edge);
@@ -153,7 +135,7 @@ class LightRays {
     // Where some are there and others cut out, those that are must lie on one side, which then is known.
     bool casts(int64_t edge, double t, ShadowPoint& point) const {
         const auto halves = view_.geometry.topology().half_edges(edge);
-        const auto there = [&](const HalfEdge& h) { return shows(casters_, h.face, beside_edge(casters_, h, t)); };
+        const auto there = [&](const HalfEdge& h) { return is_there(casters_, h, t); };
         if (!cut_outs_jump(casters_, view_.geometry.topology(), edge))
             return std::any_of(halves.begin(), halves.end(), there);
         bool on_side[2] = {};

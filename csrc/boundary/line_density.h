@@ -1,4 +1,5 @@
-// How densely lines past edges are drawn: by how much light passes along them, as far as it is known.
+// How densely lines past edges and rims of cut-outs are drawn: by how much light passes along them, as far as it is
+// known.
 //
 // Edges of one connected part of a scene see alike along parallel lines, and each of many has few lines of its own. So
 // what is found of some lines is pooled: by their parts, and by cells of directions. Where there are glossy faces, some
@@ -14,6 +15,7 @@
 #include "backward/view.h"
 #include "boundary/lune.h"
 #include "boundary/mirrored_lines.h"
+#include "boundary/occluder.h"
 #include "rays/meeting.h"
 
 namespace edgegrad {
@@ -74,40 +76,38 @@ class PooledLines {
     std::vector<int64_t> lines_;
 };
 
-// The lines past one edge after another, cut into cells of even density.
+// The lines past one edge or rim after another, cut into cells of even density.
 template <class T>
 class EdgeLines {
    public:
     // `means`: of the cells of `pooled`; empty: all are alike.
-    EdgeLines(const SceneView<T>& scene, const Topology& topology, const PooledLines& pooled,
-              const std::vector<double>& means, const Mirrors& mirrors)
-        : scene_(scene), topology_(topology), pooled_(pooled), means_(means), mirrors_(mirrors) {}
+    EdgeLines(const SceneView<T>& casters, const Topology& topology, const std::vector<Rim>& rims,
+              const PooledLines& pooled, const std::vector<double>& means, const Mirrors& mirrors)
+        : scene_(casters), topology_(topology), rims_(rims), pooled_(pooled), means_(means), mirrors_(mirrors) {}
 
-    // How many lines of the edge are drawn, relative to others.
-    double set(int64_t edge) {
-        const auto halves = topology_.half_edges(edge);
-        opposite_.clear();
-        for (const HalfEdge& h : halves) opposite_.push_back(corner(scene_, h.face, (h.corner + 2) % 3));
-        const HalfEdge& h = halves[0];
-        vertex_ = scene_.faces[3 * int64_t(h.face) + h.first()];
-        a_ = corner(scene_, h.face, h.first()), b_ = corner(scene_, h.face, h.second());
+    // How many lines of an edge, or, numbered after all edges, of a rim are drawn, relative to others.
+    double set(int64_t piece) {
+        opposite_.clear(), stands_for_ = 1;
+        if (piece < topology_.n_edges()) set_edge(piece);
+        else set_rim(rims_[piece - topology_.n_edges()]);
         lune_ = {a_, b_, opposite_};
         across_ = means_.empty() ? 1 : int(std::clamp(std::ceil(lune_.width() / widest), 1.0, most_across));
         sum_.clear();
-        if (means_.empty() || lune_.empty()) return lune_.measure();
+        const double measure = stands_for_ * lune_.measure();
+        if (means_.empty() || lune_.empty()) return measure;
         double sum = 0;
         for (int j = 0; j < along; ++j)
             for (int k = 0; k < across_; ++k) {
                 const Vec3 w = lune_.at(angle_at_middle(j), (k + 0.5) / across_);
                 sum_.push_back(sum += means_[pooled_.cell(vertex_, w)]);
             }
-        return lune_.measure() * sum / double(sum_.size());
+        return measure * sum / double(sum_.size());
     }
 
     struct Line {
         double t;     // on the edge
         Vec3 w;       // unit
-        double area;  // ∫ dt dω over what it stands for, were one line drawn of this edge; 0: none is drawn
+        double area;  // ∫ dt dω over what it stands for, were one line drawn of this piece; 0: none is drawn
     };
     // For numbers in [0, 1), of which the last chooses how it is drawn.
     Line at(double along_edge, Vec2 u, double choice) {
@@ -121,7 +121,7 @@ class EdgeLines {
             there = {(double(k / across_) + u.x) / along, (double(k % across_) + u.y) / across_};
         }
         Lune::Place place{lune_.direction(there.x, there.y), there.x, there.y};
-        if (mirrors_.empty() || lune_.empty()) return {t, place.w, area(place)};
+        if (mirrors_.empty() || lune_.empty()) return {t, place.w, stands_for_ * area(place)};
         mirrored_.set(mirrors_, (1 - t) * a_ + t * b_, lune_);
         const double share = mirrored_.share();
         if (choice < share) {
@@ -131,11 +131,31 @@ class EdgeLines {
         }
         double density = (1 - share) / area(place);
         if (share > 0) density += share * mirrored_.density(place.w);
-        return {t, place.w, 1 / density};
+        return {t, place.w, stands_for_ / density};
     }
     int64_t cell(Vec3 w) const { return pooled_.cell(vertex_, w); }
 
    private:
+    // Where one of its faces may be there and others not, lines may pass in all directions (BounceLines).
+    void set_edge(int64_t edge) {
+        const auto halves = topology_.half_edges(edge);
+        const HalfEdge& h = halves[0];
+        const bool any = cut_outs_jump(scene_, topology_, edge);
+        for (const HalfEdge& o : any ? halves.first(1) : halves)
+            opposite_.push_back(corner(scene_, o.face, (o.corner + 2) % 3));
+        vertex_ = vertex(scene_, h, h.first());
+        a_ = corner(scene_, h.face, h.first()), b_ = corner(scene_, h.face, h.second());
+    }
+    // Its chord: a rim is passed in all directions, but for those in its plane.
+    void set_rim(const Rim& rim) {
+        const Vec3 v[3] = {corner(scene_, rim.face, 0), corner(scene_, rim.face, 1), corner(scene_, rim.face, 2)};
+        const auto at = [&](Barycentrics b) { return b[0] * v[0] + b[1] * v[1] + b[2] * v[2]; };
+        vertex_ = scene_.faces[3 * int64_t(rim.face)], stands_for_ = rim.share;
+        a_ = at(rim.begin), b_ = at(rim.end);
+        const auto apart = [&](Vec3 p) { return length(cross(p - a_, b_ - a_)); };
+        opposite_.push_back(*std::max_element(v, v + 3, [&](Vec3 p, Vec3 q) { return apart(p) < apart(q); }));
+    }
+
     static constexpr int along = 8;
     static constexpr double widest = M_PI / 8, most_across = 8;  // azimuths of a cell
 
@@ -159,11 +179,13 @@ class EdgeLines {
 
     const SceneView<T>& scene_;
     const Topology& topology_;
+    const std::vector<Rim>& rims_;
     const PooledLines& pooled_;
     const std::vector<double>& means_;
     const Mirrors& mirrors_;
     std::vector<Vec3> opposite_;
     int32_t vertex_ = 0;
+    double stands_for_ = 1;
     Vec3 a_, b_;
     Lune lune_;
     MirroredLines mirrored_;

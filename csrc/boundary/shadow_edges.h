@@ -8,9 +8,8 @@
 #include <vector>
 
 #include "backward/view.h"
-#include "boundary/curve.h"
 #include "boundary/light_wedge.h"
-#include "boundary/rims.h"
+#include "boundary/occluder.h"
 #include "core/sampler.h"
 #include "rays/meeting.h"
 #include "scene/light_parts.h"
@@ -29,15 +28,6 @@ struct ShadowPiece {
     int64_t rim() const { return -1 - edge; }
     static int64_t of_rim(int64_t rim) { return -1 - rim; }
 };
-
-// Whether of two faces on an edge one may be there and the other cut out along it.
-template <class T>
-bool cut_outs_jump(const SceneView<T>& casters, const Topology& topology, int64_t edge) {
-    if (!casters.cut_outs.face) return false;
-    const auto halves = topology.half_edges(edge);
-    return std::any_of(halves.begin() + 1, halves.end(),
-                       [&](const HalfEdge& h) { return cut_outs_jump(casters, halves[0], h); });
-}
 
 // A light's parts as many edges ask for them.
 struct PartsBall {

@@ -14,10 +14,7 @@
 // δq(x) at a fixed depth. The last factor is also ∇F, by the place in the image. Per unit of t on the edge the border
 // has the length |y′| with y′ = S / (m·d) · m × N, S = |y − l| / |p − l|, or 1 if the light is at infinity: so all that
 // is asked of the place on the edge is that rays go there. A light at infinity moves by its direction towards it.
-//
-// A rim of a cut-out, f(b; uv, α) = 0 on a face with the sides e₁, e₂, does the same by its tangent in place of b − a.
-// With ∂p/∂t = κ (−f_v e₁ + f_u e₂) as it stands, N·e₁ = κ D f_u and N·e₂ = κ D f_v with D = d · (e₁ × e₂), so where f
-// grows by δf, the rim gives way by N·δp = −κ D δf, beside the motion N · Σ b_i δv_i of the face.
+// A rim of a cut-out does the same by its tangent in place of b − a (occluder.h).
 #pragma once
 
 #include <algorithm>
@@ -26,36 +23,13 @@
 
 #include "backward/view.h"
 #include "boundary/curve_source.h"
-#include "boundary/rims.h"
+#include "boundary/occluder.h"
 
 namespace edgegrad {
 
-// A place p of a curve that casts a shadow, and dp/dt along it, as sums of vertices: of the two of an edge, (1 − t) a +
-// t b and b − a, or of the three of a face with a rim.
-struct ShadowCaster {
-    int count = 2;
-    int32_t vertex[3];
-    double weight[3], tangent[3];
-    // Of a rim.
-    int32_t uv_row[3];
-    double kappa = 0;
-    Vec2 by_uv;       // ∂f/∂uv
-    Footprint alpha;  // of which f is made, if it is
-    bool of_alpha = false;
-
-    bool is_rim() const { return count == 3; }
-    // Of one vector a vertex.
-    template <class Values>
-    Vec3 sum(const double (&by)[3], Values values) const {
-        Vec3 out = by[0] * values(vertex[0]) + by[1] * values(vertex[1]);
-        if (count == 3) out += by[2] * values(vertex[2]);
-        return out;
-    }
-};
-
 // Where the ray of a light past an edge or a rim meets a face.
 struct ShadowPoint {
-    ShadowCaster caster;
+    Occluder caster;
     int32_t part;         // of the light
     Vec2 uv;              // on it
     Vec3 light;           // that place, world coordinates, or the direction towards it
@@ -76,20 +50,17 @@ struct ShadowBorder {
     // at(i): a vertex; `light`: the point, or the direction towards it.
     template <class At>
     static ShadowBorder of(const ShadowPoint& point, bool infinite, Vec3 light, At at) {
-        const ShadowCaster& caster = point.caster;
+        const Occluder& caster = point.caster;
         const Vec3 p = caster.sum(caster.weight, at), along = caster.sum(caster.tangent, at);
         ShadowBorder o;
         o.d = infinite ? -light : p - light, o.N = cross(along, o.d), o.S = infinite ? 1 : point.along;
         for (int i = 0; i < caster.count; ++i) o.by_caster[i] = o.S * caster.weight[i];
         o.by_light = infinite ? -point.along : 1 - point.along;
-        if (caster.is_rim()) {
-            const Vec3 a = at(caster.vertex[0]);
-            o.by_rim = o.S * caster.kappa * dot(o.d, cross(at(caster.vertex[1]) - a, at(caster.vertex[2]) - a));
-        }
+        if (caster.is_rim()) o.by_rim = o.S * caster.turned(o.d, at);
         return o;
     }
     // What is swept where F may change by `most` times the length of how what casts the border moves along N.
-    double swept(double most, const ShadowCaster& caster) const {
+    double swept(double most, const Occluder& caster) const {
         double sum = by_caster[0] + by_caster[1];
         if (caster.is_rim()) sum += by_caster[2];
         return most * sum * length(N);
@@ -177,19 +148,12 @@ class ShadowSource {
         const int32_t* vertex = view_.scene.faces + 3 * int64_t(sample.receiver);
         Vec3 receiver;
         for (int i = 0; i < 3; ++i) receiver += sample.shadow.on[i] * direction.q[vertex[i]];
-        const ShadowCaster& edge = sample.shadow.caster;
+        const Occluder& edge = sample.shadow.caster;
         const Vec3 caster = edge.sum(sample.border.by_caster, [&](int32_t i) { return direction.q[i]; });
         const Vec2 n_dot = normalised_jvp(view_.camera, sample.n, direction.intrinsics);
         double F_dot =
             dot(sample.m, receiver) - dot(sample.border.N, caster) + sample.by_n.x * n_dot.x + sample.by_n.y * n_dot.y;
-        if (const double* uvs = direction.tangents.uvs; uvs && edge.is_rim())
-            for (int i = 0; i < 3; ++i) {
-                const double* uv_dot = uvs + 2 * int64_t(edge.uv_row[i]);
-                F_dot += sample.border.by_rim * edge.weight[i] * (edge.by_uv.x * uv_dot[0] + edge.by_uv.y * uv_dot[1]);
-            }
-        if (const double* alphas = direction.tangents.alphas; alphas && edge.of_alpha)
-            for (int k = 0; k < 4; ++k)
-                F_dot += sample.border.by_rim * edge.alpha.weight(k) * alphas[edge.alpha.texel[k]];
+        F_dot += sample.border.by_rim * edge.rim_jvp(direction.tangents);
         return {sample.scale * sample.area_scale * F_dot, 0};
     }
 
@@ -200,22 +164,12 @@ class ShadowSource {
             const Vec3 bar = (F_bar * sample.shadow.on[i]) * sample.m;
             grad.q.add<3>(vertex[i], &bar.x);
         }
-        const ShadowCaster& caster = sample.shadow.caster;
+        const Occluder& caster = sample.shadow.caster;
         for (int i = 0; i < caster.count; ++i) {
             const Vec3 bar = (-F_bar * sample.border.by_caster[i]) * sample.border.N;
             grad.q.add<3>(caster.vertex[i], &bar.x);
         }
-        const double rim_bar = F_bar * sample.border.by_rim;
-        if (caster.is_rim() && grad.uvs.is_wanted())
-            for (int i = 0; i < 3; ++i) {
-                const Vec2 uv_bar = (rim_bar * caster.weight[i]) * caster.by_uv;
-                grad.uvs.add<2>(caster.uv_row[i], &uv_bar.x);
-            }
-        if (caster.of_alpha && grad.alphas.is_wanted())
-            for (int k = 0; k < 4; ++k) {
-                const double alpha_bar = rim_bar * caster.alpha.weight(k);
-                grad.alphas.add<1>(caster.alpha.texel[k], &alpha_bar);
-            }
+        caster.rim_vjp(F_bar * sample.border.by_rim, grad);
         grad.light = {sample.shadow.part, sample.shadow.uv, (-F_bar * sample.border.by_light) * sample.border.N};
         normalised_vjp(view_.camera, sample.n, F_bar * sample.by_n, grad.k);
     }

@@ -59,19 +59,9 @@ struct BorderOnFace {
             append(records.by_q, {by * border.N.x, by * border.N.y, by * border.N.z});
         };
         for (int i = 0; i < 3; ++i) add_vertex(scene.faces[3 * int64_t(point.face) + i], point.on[i]);
-        const ShadowCaster& caster = point.caster;
+        const Occluder& caster = point.caster;
         for (int i = 0; i < caster.count; ++i) add_vertex(caster.vertex[i], -border.by_caster[i]);
-        if (caster.is_rim())
-            for (int i = 0; i < 3; ++i) {
-                const Vec2 by_uv = (border.by_rim * caster.weight[i]) * caster.by_uv;
-                records.uv_row_of.push_back(sample), records.uv.push_back(caster.uv_row[i]);
-                append(records.by_uv, {by_uv.x, by_uv.y});
-            }
-        if (caster.of_alpha)
-            for (int k = 0; k < 4; ++k) {
-                records.alpha_row_of.push_back(sample), records.alpha.push_back(caster.alpha.texel[k]);
-                records.by_alpha.push_back(border.by_rim * caster.alpha.weight(k));
-            }
+        caster.append_rim(border.by_rim, sample, records);
         const Vec3 by_light = -border.by_light * border.N;
         records.light.push_back(point.part), append(records.light_uv, {point.uv.x, point.uv.y});
         append(records.by_light, {by_light.x, by_light.y, by_light.z});

@@ -1,7 +1,8 @@
-"""Borders of what surfaces of paths of light see of one another (csrc/boundary/bounce_source.h): an edge on the line between a
-point that sends light and one that receives it.
+"""Borders of what surfaces of paths of light see of one another (csrc/boundary/bounce_source.h): an edge, or the rim of a
+cut-out, on the line between a point that sends light and one that receives it. And curves at which surfaces of paths begin to
+send light (csrc/boundary/surface_borders.cpp): where faces pass through each other, and rims of cut-outs as textures move.
 
-Where the camera sees the one that receives, the border is a curve in the image. From where it need not, light is followed on to
+Where the camera sees the point that receives, the first are curves in the image. From where it need not, light is followed on to
 the camera, by so many steps more:
 
     δI = Σ_k k(x_k − c) B_k δF        over samples
@@ -12,11 +13,13 @@ of borders F = 0, with the light B_k that comes to the place x_k of the image (c
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from ..kernel.derivatives import moves
 from ..points.blend import let_through
 from ..points.frame import Frame
 from ..points.moving import Form, velocity
+from ..points.records import CurveRecords, has_intersections
 from ..points.samples import EdgeSamples
 from ..points.splat import Term, boundary
 from . import in_kernel
@@ -27,13 +30,32 @@ AT_ONCE = 1 << 17  # samples whose light is followed together
 
 def bounce_edges(frame: Frame, options: Options) -> list[Term]:
     """What samples on these borders give to the image."""
-    if not moves(frame.surfaces.verts, frame.view.world_to_camera, frame.intrinsics):
+    surfaces = frame.surfaces
+    flat = surfaces.casters
+    rims = bool(len(flat.cut_outs)) and moves(flat.alphas, flat.uvs)
+    on_surfaces = moves(surfaces.verts) or rims  # as the camera moves these stay
+    if not (on_surfaces or moves(frame.view.world_to_camera, frame.intrinsics)):
         return []
     terms = _seen(frame, options)
-    if moves(frame.surfaces.verts):  # as the camera moves these stay
+    if on_surfaces:
         for further in range(1, options.bounces - 1):
-            terms += _passed_on(frame, options, further)
+            terms += _passed_on(frame, in_kernel.bounce_samples(frame, options, further), "bounce edges", further)
+    crossings = moves(surfaces.verts) and has_intersections(frame.request.scene)
+    if crossings or rims:
+        for further in range(options.bounces - 1):
+            found = in_kernel.surface_border_samples(frame, options, further, crossings, rims)
+            terms += _passed_on(frame, found, "surface borders", further)
     return terms
+
+
+def world_velocity(frame: Frame, records: CurveRecords) -> list[tuple[Form, Tensor]]:
+    """How F of samples that have no place in the image moves, by vertices in the world and by the textures of cut-outs."""
+    flat = frame.surfaces.casters
+    return [
+        (Form(records.row_of, records.vertex, records.by_q), frame.surfaces.verts),
+        (Form(records.uv_row_of, records.uv, records.by_uv), flat.uvs),
+        (Form(records.alpha_row_of, records.alpha, records.by_alpha[:, None]), flat.alphas[:, :1]),
+    ]
 
 
 def _seen(frame: Frame, options: Options) -> list[Term]:
@@ -48,21 +70,21 @@ def _seen(frame: Frame, options: Options) -> list[Term]:
     return boundary(samples.x, samples.velocity, jump, None, None)
 
 
-def _passed_on(frame: Frame, options: Options, further: int) -> list[Term]:
+def _passed_on(frame: Frame, found: tuple[CurveRecords, Tensor, Tensor], kind: str, further: int) -> list[Term]:
     """By light that is scattered so many times more after the point that receives it."""
-    records, carried, origin = in_kernel.bounce_samples(frame, options, further)
+    records, carried, origin = found
     count = len(records.x)
     if not count:
         return []
-    moved = velocity(count, [(Form(records.row_of, records.vertex, records.by_q), frame.surfaces.verts)])
-    seed = frame.seeds("bounce edges", count).cpu()
+    moved = velocity(count, world_velocity(frame, records))
+    seed = frame.seeds(kind, count).cpu()
     terms = []
     for first in range(0, count, AT_ONCE):
         some = slice(first, first + AT_ONCE)
         arrivals = [part[some] for part in (records.hit_face, records.hit_b, seed, origin, carried)]
         with torch.no_grad():
-            found = in_kernel.towards_camera(frame, arrivals, (further, further))
-            sample, x, radiance = (frame.here(part) for part in found)
-        own = moved.index_select(0, sample + first).to(frame.dtype)
+            image = in_kernel.towards_camera(frame, arrivals, (further, further))
+            sample, x, radiance = (frame.here(part) for part in image)
+        own = frame.here(moved).index_select(0, sample + first).to(frame.dtype)
         terms.append(Term(x, own[:, None] * radiance.to(frame.dtype)))
     return terms

@@ -1,8 +1,9 @@
 """What render() can differentiate where light is scattered more than once.
 
 Inside surfaces every tensor of a scene has its derivative (csrc/shading/lit/path_radiance.h), the borders of lights' shadows have
-theirs (unseen_shadows.py), and so have edges on the way of light from one surface to another (bounce_edges.py). Of some
-borders there are no samples. Without them a gradient would be wrong without notice, so it is refused.
+theirs (unseen_shadows.py), and so have edges on the way of light from one surface to another, and the lines along which surfaces
+pass through each other (bounce_edges.py). Of some borders there are no samples. Without them a gradient would be wrong without
+notice, so it is refused.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from torch import Tensor
 
 from ..camera.camera import Camera
 from ..kernel.request import Request
-from ..points.records import has_intersections
 from ..scene.environment import Environment
 from ..scene.lights import DirectionalLight, PointLight, SpotLight
 from ..scene.scene import Scene
@@ -31,13 +31,9 @@ def check_bounces(scene: Scene, camera: Camera, request: Request) -> None:
         )
     if not request.gradient.visibility:
         return
-    if missing := _missing(scene):
-        for name, tensor in (*_moving(scene, camera), *(_lights(scene) if scene.blends else ())):
-            if _has_derivative(tensor):
-                raise _refused(name, missing)
-    for number, mesh in enumerate(scene.meshes):
-        if _has_derivative(mesh.verts) and has_intersections(request.scene):
-            raise _refused(f"meshes[{number}].verts", "where meshes pass through each other")
+    for name, tensor, where in _without_samples(scene, camera):
+        if _has_derivative(tensor):
+            raise _refused(name, where)
 
 
 def _refused(name: str, where: str) -> ValueError:
@@ -48,30 +44,29 @@ def _refused(name: str, where: str) -> ValueError:
     )
 
 
-def _missing(scene: Scene) -> str | None:
-    """Where borders that may move have no samples."""
+def _without_samples(scene: Scene, camera: Camera) -> Iterator[tuple[str, Tensor, str]]:
+    """Tensors that move borders of which there are no samples: their names, and where these borders are."""
     if scene.blends:
-        return "where one sees through surfaces"
-    if any(mesh.alpha is not None for mesh in scene.meshes):
-        return "at the rims of what alpha cuts out"
-    if any(nearest_textures(mesh) for mesh in scene.meshes):
-        return "at the borders of nearest texels"
-    return None
+        for name, tensor in (*_moving(scene, camera), *_lights(scene)):
+            yield name, tensor, "where one sees through surfaces"
+    for number, mesh in enumerate(scene.meshes):
+        for texture in nearest_textures(mesh):
+            where = "at the borders of nearest texels"
+            if texture.uvs is not None:
+                yield f"uvs of a nearest texture of meshes[{number}]", texture.uvs, where
+            elif mesh.uvs is not None:
+                yield f"meshes[{number}].uvs", mesh.uvs, where
 
 
 def _moving(scene: Scene, camera: Camera) -> Iterator[tuple[str, Tensor]]:
-    """The tensors of the camera and of meshes, by name, that move borders."""
+    """The tensors of the camera and of meshes, by name, that move borders of what one sees through."""
     yield from named_tensors(camera, "camera")
     for number, mesh in enumerate(scene.meshes):
-        name = f"meshes[{number}]"
-        yield f"{name}.verts", mesh.verts
+        yield f"meshes[{number}].verts", mesh.verts
         if mesh.alpha is not None:
-            yield f"{name}.alpha", mesh.alpha
-        if mesh.uvs is not None and (mesh.alpha is not None or nearest_textures(mesh)):
-            yield f"{name}.uvs", mesh.uvs
-        for texture in nearest_textures(mesh):
-            if texture.uvs is not None:
-                yield f"uvs of a nearest texture of {name}", texture.uvs
+            yield f"meshes[{number}].alpha", mesh.alpha
+            if mesh.uvs is not None:
+                yield f"meshes[{number}].uvs", mesh.uvs
 
 
 def _lights(scene: Scene) -> Iterator[tuple[str, Tensor]]:

@@ -134,16 +134,31 @@ def bounce_samples(frame: Frame, options: Options, further: int) -> tuple[CurveR
     """Samples on the borders of what surfaces of paths see of one another, and (S, C) float64 by how much the image jumps there,
     times what a sample stands for. Where light goes `further` steps after that: what has come to the first point of each, and
     (S, 3) from which unit directions (csrc/boundary/bounces.h)."""
+    own = {"further": further, "seen": further == 0}
+    return _samples_of_lines(frame, options, "bounce_samples", derived_seed(frame.sampler.grad_seed, -further), own)
+
+
+def surface_border_samples(
+    frame: Frame, options: Options, further: int, crossings: bool, rims: bool
+) -> tuple[CurveRecords, Tensor, Tensor]:
+    """Samples on the curves at which surfaces begin to send light: where faces pass through each other, and on rims of cut-outs.
+    The first point of each gets light from there, that may go `further` steps after that; see bounce_samples()."""
+    own = {"further": further, "crossings": crossings, "rims": rims}
+    seed = derived_seed(frame.sampler.grad_seed, -core.MOST_BOUNCES - further)
+    return _samples_of_lines(frame, options, "surface_border_samples", seed, own)
+
+
+def _samples_of_lines(
+    frame: Frame, options: Options, method: str, seed: int, own: dict[str, Any]
+) -> tuple[CurveRecords, Tensor, Tensor]:
     layout, tables = layout_of(frame.fixed, frame.fixed_view)
 
     def compute(
         kernel: Any, casters: Any, faces: Tensor, arguments: dict[str, Any], *tables: Tensor
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-        return kernel.bounce_samples(
-            casters, layout.kernel(tables, faces), options.kernel, further=further, **arguments
-        )
+        return getattr(kernel, method)(casters, layout.kernel(tables, faces), options.kernel, **own, **arguments)
 
-    count, seed = frame.request.gradient.edge_samples, derived_seed(frame.sampler.grad_seed, -further)
+    count = frame.request.gradient.edge_samples
     casters = frame.fixed.casters if frame.surfaces.scene.blends else None
     return frame.sampler.bounce_samples(compute, tables, seed, count, moves(frame.intrinsics), casters)
 

@@ -22,6 +22,7 @@ from ..points.records import CurveRecords
 from ..points.shadows import ShadowLight
 from ..points.splat import Term
 from . import in_kernel
+from .bounce_edges import world_velocity
 from .bsdf import dot
 
 AT_ONCE = 1 << 17  # samples whose light is followed together
@@ -80,12 +81,7 @@ def _towards_camera(
 
 def _velocity(frame: Frame, light: ShadowLight, records: CurveRecords) -> Tensor:
     """(S,): zeros with the derivatives of F."""
-    count, flat = len(records.x), frame.surfaces.casters
-    forms = [
-        (Form(records.row_of, records.vertex, records.by_q), frame.surfaces.verts),
-        (Form(records.uv_row_of, records.uv, records.by_uv), flat.uvs),
-        (Form(records.alpha_row_of, records.alpha, records.by_alpha[:, None]), flat.alphas[:, :1]),
-    ]
+    count, forms = len(records.x), world_velocity(frame, records)
     if light.moves(light.light):
         points, _ = light.points(frame.here(records.light), frame.here(records.light_uv))
         every = torch.arange(count)

@@ -23,7 +23,9 @@ from .surfaces import Surfaces, View
 
 _Rays = TypeVar("_Rays", bound=RayRecords | SurfaceRecords)
 # Each kind has its own random numbers.
-SAMPLES = ("image", "inside", "edges", "steps", "shadows", "image again", "unseen shadows", "bounce edges")
+SAMPLES = (
+    "image", "inside", "edges", "steps", "shadows", "image again", "unseen shadows", "bounce edges", "surface borders",
+)  # fmt: skip
 
 
 class Frame:
