@@ -25,7 +25,7 @@ from .camera.camera import Camera
 from .check import all_finite, values_visible
 from .kernel.counts import Watch
 from .kernel.derivatives import differentiates, moves, transformed
-from .kernel.request import Request, derived_seed
+from .kernel.request import LEAST_SPACING, Request, derived_seed
 from .points.background import environments
 from .points.blend import Blended, let_through, panes
 from .points.borders import Borders
@@ -69,6 +69,9 @@ class Effort(NamedTuple):
     glossy: bool = False
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
+    closer: float = (
+        1.0  # by which lines that look for rims of cut-outs lie closer, for what is shaded beside them is noisy
+    )
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
     # What samples on the borders of light that surfaces scatter to one another give to the image.
@@ -289,14 +292,18 @@ class _Image:
         return boundary(samples.x, samples.velocity, jump, to_background, self._background)
 
     def _with_creases(self) -> Request:
-        """The request with colours that jump where the shader may."""
+        """The request for samples on curves, with colours that jump where the shader may."""
         frame = self._frame
         with torch.no_grad():
             if self._creases is True:
                 attributes = every_face(len(frame.fixed.faces))
             else:
                 attributes = frame.fixed.crease_attributes().cpu() if self._creases else None
-        return frame.request._replace(scene=without_colors(frame.request.scene, attributes))
+        gradient = frame.request.gradient
+        spacing = max(gradient.step_spacing / self._effort.closer, LEAST_SPACING)
+        return frame.request._replace(
+            scene=without_colors(frame.request.scene, attributes), gradient=gradient._replace(step_spacing=spacing)
+        )
 
     # -- the shader ----------------------------------------------------------------------------------------------------
 

@@ -111,6 +111,7 @@ _LABELS = {"texels": "texture", "alphas": "alpha"}
 PER_CAMERA = (*PackedCamera._fields, "vertex_attributes")  # slots with a row for each camera
 MOVING = ("verts", *(name for name in SLOTS if name in PackedCamera._fields))  # slots that move the image
 APPEARANCE = ("colors", "uvs", "texels", "vertex_attributes", "face_attributes")
+LEAST_SPACING = 1 / 64  # px, of step_spacing
 STEPPING = (*MOVING, "uvs", "alphas")  # slots that move what is cut out, and the borders of nearest texels
 
 
@@ -193,7 +194,7 @@ def make_request(
         raise TypeError(f"visibility: expected True or False, got {type(visibility).__name__} ({visibility!r})")
     if filter not in FILTERS:
         raise ValueError(f"filter: expected one of {', '.join(FILTERS)}, got {filter!r}")
-    step_spacing = check_positive("step_spacing", step_spacing, least=1 / 64, most=64)
+    step_spacing = check_positive("step_spacing", step_spacing, least=LEAST_SPACING, most=64)
     if scene.background is not None and scene.background.dim() == 3:
         check_shape("background", scene.background, (*camera.size, "C"), fix="give it the camera's size")
     _check_devices(scene, camera)
