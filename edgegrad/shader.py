@@ -74,6 +74,9 @@ class Effort(NamedTuple):
     )
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
+    beside_steps: float = 0.0  # how far from a step its sides are shaded
+    # Of samples inside faces: how light from nearby changes as they slide on these, and how near that is (light/sliding.py).
+    sliding: Callable[[Frame, Hits], tuple[float, Tensor]] | None = None
     # What samples on the borders of light that surfaces scatter to one another give to the image.
     indirect: Callable[[Frame, Watch], list[Term]] | None = None
     watch: Watch = Watch()  # is told what it takes
@@ -166,7 +169,9 @@ class _Image:
         if visibility and self._kinds:
             with watch.part("steps"):
                 declare = self._effort.steps or self._shade
-                terms += StepTerms(frame, self._kinds, self._shade, declare, AT_ONCE).found(watch)
+                terms += StepTerms(frame, self._kinds, self._shade, declare, AT_ONCE, self._effort.beside_steps).found(
+                    watch
+                )
         if visibility:
             with watch.part("shadows"):
                 terms += self._shadows()
@@ -245,7 +250,10 @@ class _Image:
                 # Hits of its own each time, for these keep what was computed from them.
                 hits = samples.part(first, first + at_once).hits
                 hits._needs_values = not self._effort.gives_derivatives
-                return self._shade(hits)
+                if self._effort.sliding is None:
+                    return self._shade(hits)
+                hits._near, slid = self._effort.sliding(self._frame, hits)
+                return self._shade(hits) + slid
 
             # So that memory is that of some points, not of all.
             many = len(samples) > at_once and not transformed() and not self._effort.keeps_little

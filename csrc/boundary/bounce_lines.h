@@ -192,7 +192,7 @@ class BounceLines {
         if (near.distance == 0) return false;
         BounceLine& line = o.line;
         line.receiver = near.face, line.sender = far.face, line.at = near.at, line.from = line.asked = far.at;
-        line.share = far.distance / (near.distance + far.distance);
+        line.distance = near.distance + far.distance, line.share = far.distance / line.distance;
         const Vec3 q = corner(view_.scene, near.face, 0);
         const Vec3 m = cross(corner(view_.scene, near.face, 1) - q, corner(view_.scene, near.face, 2) - q);
         line.facing = -dot(m, o.direction(receiver));

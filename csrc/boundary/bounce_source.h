@@ -15,6 +15,9 @@
 //
 //     δF = λ c m · Σ β_i δv_i + (1 − λ) N · Σ γ_i δv_i − N · ((1 − t) δa + t δb) + λ (N − c m) · δq(x),
 //
+// of which λ (N − c m) · (δq(x) − Σ β_i δv_i) is that y₁ slides on its face. That part counts as far as light does not
+// come from nearby, times 1 − φ(|y₂ − y₁|): sliding before what is near is found otherwise (near_part.h).
+//
 // δq(x) at a fixed depth, as for borders of shadows (shadow_source.h). On a rim p = Σ b_i v_i moves with its face and,
 // as f grows by δf, gives way by −N·δp = κ D δf (occluder.h).
 #pragma once
@@ -26,6 +29,7 @@
 #include "backward/view.h"
 #include "boundary/curve_source.h"
 #include "boundary/occluder.h"
+#include "shading/lit/near_part.h"
 
 namespace edgegrad {
 
@@ -38,6 +42,7 @@ struct BounceLine {
     Barycentrics at = {}, from = {};     // y₁ and y₂ on them
     Barycentrics asked = {};  // where the sender's radiance is asked: beside y₂, if the edge lies on that face
     double share = 0;         // λ
+    double distance = 0;      // |y₂ − y₁|
     double facing = 0;        // on which side of the receiver's plane the sender is
 };
 
@@ -50,13 +55,14 @@ class BounceSource {
         BounceLine line;
         int32_t own;  // the receiver, which the ray ignores
         CurveFaces faces;
-        Vec3 N, m;      // the latter times λ c
+        Vec3 N, m;      // ∂F/∂y₂ / (1 − λ), and ∂F/∂v_i / β_i of the receiver
         Vec2 by_n;      // ∂F/∂n
         double by_rim;  // ∂F/∂f
         double scale;   // px² of the straight image for each unit of the receiver's area
     };
 
-    explicit BounceSource(const BackwardView<T>& view) : view_(view) {}
+    // near  the radius of what slides are found of otherwise, world units
+    BounceSource(const BackwardView<T>& view, double near) : view_(view), near_(near) {}
 
     Vec2 position(const Curve& line, double) const { return project(view_.camera, place_of(line)); }
 
@@ -81,9 +87,10 @@ class BounceSource {
         const Vec3 N = cross(line.occluder.sum(line.occluder.tangent, at), w);
         sample.by_rim = line.occluder.is_rim() ? line.occluder.turned(w, at) : 0;
         const double along = camera.along_ray(m, sample.n), unit_there = camera.unit_at_depth(y.z);
-        sample.N = N, sample.m = (line.share * camera.along_ray(N, sample.n) / along) * m;
-        const Vec3 slope = unit_there * (line.share * N - sample.m);
-        sample.by_n = {slope.x, slope.y};
+        const double slides = line.share * (1 - near_.share(line.distance * w));
+        const Vec3 slope = slides * (N - (camera.along_ray(N, sample.n) / along) * m);
+        sample.N = N, sample.m = line.share * N - slope;
+        sample.by_n = {unit_there * slope.x, unit_there * slope.y};
         sample.scale = std::fabs(camera.k_det * along) / (length(m) * unit_there * unit_there);
         if (!std::isfinite(sample.scale) || !std::isfinite(dot(sample.m, sample.m))) return false;
 
@@ -142,6 +149,7 @@ class BounceSource {
 
    private:
     const BackwardView<T>& view_;
+    const NearPart near_;
 };
 
 }  // namespace edgegrad

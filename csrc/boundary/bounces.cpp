@@ -123,8 +123,8 @@ class LineChunk {
 
 // Calls lines(body) with a body that gives the contraction those of which the camera sees an end.
 template <class T, class Contraction, class Lines>
-void each_seen(const BackwardView<T>& view, Contraction& contraction, ChunkGrad& grad, Lines lines) {
-    BounceSource<T> source(view);
+void each_seen(const BackwardView<T>& view, double near, Contraction& contraction, ChunkGrad& grad, Lines lines) {
+    BounceSource<T> source(view, near);
     CurveSamples samples(view, source, contraction);
     lines([&](const BounceLine& line, double weight) {
         if (is_in_view(view, source.place_of(line))) samples.add(line, 0, weight);
@@ -194,7 +194,7 @@ void cast_pilots(LineScene<T>& scene, int64_t n) {
             if (scene.is_seen()) {
                 ChunkGrad unused;
                 SeenPilots seen(view, pilots);
-                each_seen(view, seen, unused, lines);
+                each_seen(view, scene.lit.options.near, seen, unused, lines);
             } else {
                 lines([&](const BounceLine& line, double weight) {
                     pilots.add(line, weight * length(normal_of(view, line)));
@@ -243,7 +243,7 @@ void add_bounces(const BackwardView<T>& view, const SceneView<T>& casters, const
             chunk.cast();
         };
         if (scene.is_seen()) {
-            each_seen(view, *contract_curves(view, record, grad), grad, lines);
+            each_seen(view, lit.options.near, *contract_curves(view, record, grad), grad, lines);
         } else {
             lines(
                 [&](const BounceLine& line, double weight) { append_unseen(view, line, weight, grad.records.curves); });

@@ -294,11 +294,14 @@ void bind_lit_arrays(nb::module_& m) {
         .def("crossings", &crossings, "origins"_a.noconvert(), "directions"_a.noconvert(), "start"_a.noconvert(),
              "end"_a.noconvert());
     nb::class_<LitOptions>(m, "LitOptions")
-        .def(nb::new_([](bool shadows, int samples, int only, bool in_fours, double dark, int bounces) {
+        .def(nb::new_([](bool shadows, int samples, int only, bool in_fours, double dark, int bounces, double near,
+                         bool only_near) {
                  if (bounces < 1 || bounces > most_bounces) refuse("bounces: expected 1 to MOST_BOUNCES");
-                 return LitOptions{shadows, samples, only, in_fours, dark, bounces};
+                 if (!(near >= 0)) refuse("near: expected no less than 0");
+                 return LitOptions{shadows, samples, only, in_fours, dark, bounces, near, only_near};
              }),
-             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a, "in_fours"_a, "dark"_a, "bounces"_a = 1);
+             nb::kw_only(), "shadows"_a, "samples"_a, "only"_a, "in_fours"_a, "dark"_a, "bounces"_a = 1, "near"_a = 0.0,
+             "only_near"_a = false);
 }
 
 }  // namespace edgegrad

@@ -36,6 +36,8 @@ class Options(NamedTuple):
     in_fours: bool = False  # on glossy surfaces points of environments come in fours, for derivatives (companions.h)
     dark: float = DARK
     bounces: int = 1  # how often light is scattered on its way, at most
+    near: float = 0.0  # world units: derivatives by barycentrics leave out light from nearer (near_part.h)
+    only_near: bool = False  # whether values are those of that light alone
 
     @property
     def kernel(self) -> Any:

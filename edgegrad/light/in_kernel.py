@@ -85,11 +85,11 @@ def radiance(hits: Hits, shadows: bool, samples: int) -> Tensor:
     return found.to(surfaces.verts)
 
 
-def indirect(hits: Hits, shadows: bool, bounces: int) -> Tensor:
-    """(N, C) what is to be added of light that is scattered more than once, `bounces` times at most. Zeros with the same
-    derivatives, if the hits need no values."""
+def indirect(hits: Hits, shadows: bool, bounces: int, only_near: float = 0.0) -> Tensor:
+    """(N, C) what is to be added of light that is scattered more than once, `bounces` times at most; or, of light that comes from
+    so near, world units. Zeros with the same derivatives, if the hits need no values."""
     at, tensors = _at(hits)
-    options = Options(shadows=shadows, samples=1, bounces=bounces)
+    options = Options(shadows, 1, bounces=bounces, near=only_near or hits._near, only_near=only_near > 0)
     return apply(Indirect(at, options, hits._needs_values), tensors)[0].to(hits._surfaces.verts)
 
 

@@ -46,6 +46,7 @@ from .creases import note_jumps
 from .in_kernel import is_fused, nearest_textures
 from .lamp_trees import MeshTowards, tree_of
 from .resampled import Glossy, resampled
+from .sliding import Nearby, radius
 from .unseen_shadows import unseen_shadows
 
 FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that are shaded: at least these, or spp / 4
@@ -55,6 +56,9 @@ AT_CURVES = 4
 # By which lines that look for rims of cut-outs lie closer where surfaces light each other: a rim has some samples a pixel, and
 # each side of it one path.
 CLOSER_RIMS = 8.0
+BESIDE_TEXELS = (
+    1e-4  # of a texel, from the border of nearest ones, where light that is scattered more than once is asked for
+)
 
 LIGHTING = ("shadows", "light_samples", "bounces")  # the options of render() that it is made of
 
@@ -117,6 +121,9 @@ class Lighting(NamedTuple):
             additive=additive,
             closer=CLOSER_RIMS if self.bounces > 1 else 1.0,
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
+            # The kernel, which finds light that is scattered more than once, looks up its texels by itself.
+            beside_steps=BESIDE_TEXELS if self.bounces > 1 else 0.0,
+            sliding=self._sliding if self.bounces > 1 else None,
             indirect=self._indirect if self.bounces > 1 else None,
             watch=watch,
         )
@@ -135,8 +142,16 @@ class Lighting(NamedTuple):
             with watch.part("unseen shadows"):
                 terms += unseen_shadows(frame, self.bounces, watch)
         with watch.part("bounce edges"):
-            terms += bounce_edges(frame, Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces))
+            options = Options(self.shadows, samples=1, dark=0.0, bounces=self.bounces, near=radius(frame))
+            terms += bounce_edges(frame, options)
         return terms
+
+    def _sliding(self, frame: Frame, hits: Hits) -> tuple[float, Tensor]:
+        """How light from nearby changes as hits slide on their faces, and how near that is."""
+        near, scene = radius(frame), frame.surfaces.scene
+        declare = declare_steps if any(nearest_textures(mesh) for mesh in scene.meshes) else None
+        nearby = Nearby(frame, hits, lambda there: in_kernel.indirect(there, self.shadows, self.bounces, near), declare)
+        return near, nearby.slid() if near > 0 else hits._exact.new_zeros((len(hits), 1)).to(frame.dtype)
 
     @staticmethod
     def resamples(scene: Scene) -> bool:

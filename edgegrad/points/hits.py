@@ -53,6 +53,7 @@ class Hits:
         self._surfaces, self._view, self._rays_at = surfaces, view, rays_at
         self._needs_values = True  # False: radiance may be zeros that have its derivatives (light/in_kernel.py)
         self._on_curve = False  # whether it is asked how radiance jumps there
+        self._near = 0.0  # world units: light from nearer has no derivatives by where these lie (light/sliding.py)
         self._seed = torch.arange(len(face), device=face.device) if seed is None else seed
         self._forced = forced
         self._face, self._exact = face, barycentrics
@@ -94,6 +95,7 @@ class Hits:
         place = self._face[index], self._exact[index], pixel
         some = Hits(self._surfaces, view, *place, self._rays_at, steps, self._seed[index], forced)
         some._needs_values, some._on_curve = self._needs_values, self._on_curve
+        some._near = self._near
         if self._all is None:
             rows = torch.arange(len(self), device=self._face.device)[index] if isinstance(index, slice) else index
             some._all = self, rows

@@ -35,6 +35,9 @@ class StepTerms(NamedTuple):
     shade: Callable[[Hits], Tensor]  # (N, C)
     declare: Callable[[Hits], object]  # calls hits.where() and hits.floor(); what it returns is not used
     at_once: int  # points that are shaded together
+    # How far from a step its sides are shaded, in units of its function: more than 0 for shaders that may look for themselves
+    # on which side they are.
+    beside: float = 0.0
 
     def found(self, watch: Watch) -> list[Term]:
         crossings = self._crossings()
@@ -76,9 +79,10 @@ class StepTerms(NamedTuple):
             jumps = []
             for part in self._parts(found):
                 face, b, x = found.face[part], found.b[part], found.x[part]
+                aside = self._aside(found, rays, part, gradient[part]) if self.beside else torch.zeros_like(b)
                 before, after = (
-                    self.shade(frame.fixed_hits(face, b, x, seed[part], Steps(states[part])))
-                    for states in (found.before, found.after)
+                    self.shade(frame.fixed_hits(face, b + shift, x, seed[part], Steps(states[part])))
+                    for states, shift in ((found.before, -aside), (found.after, aside))
                 )
                 jumps.append((after - before).detach())
             jump = torch.cat(jumps) * torch.where(frame.here(found.rises), 1.0, -1.0).to(frame.dtype)[:, None]
@@ -87,6 +91,16 @@ class StepTerms(NamedTuple):
             across = gradient.gather(1, frame.here(found.axis)[:, None])[:, 0].abs()
             weight = frame.here(found.weight) * torch.where(length > 0, across / length**2, 0.0)
         return jump, torch.nan_to_num(weight, nan=0.0, posinf=0.0)
+
+    def _aside(self, found: Crossings, rays: RayRecords, part: slice, gradient: Tensor) -> Tensor:
+        """(M, 2) by how much barycentrics change from a step to its side after it, where its gradient is ∇ₓs."""
+        frame = self.frame
+        face, along, by_x = (frame.here(t[part]) for t in (found.face, rays.along, rays.along_by_x))
+        _, b_by_x = frame.fixed_view.barycentrics_by(frame.fixed, face, along, by_x)
+        squared = (gradient * gradient).sum(1, keepdim=True)
+        rises = torch.where(frame.here(found.rises), self.beside, -self.beside)[:, None]
+        x = torch.where(squared > 0, rises[part] * gradient / squared, 0.0)
+        return (b_by_x * x[:, None]).sum(-1)[:, 1:].to(found.b)
 
     def _values_of_scene(self, found: Crossings, rays: RayRecords) -> Tensor:
         """(M,) the function of each crossing's step, with a graph of vertices and camera."""

@@ -3,6 +3,7 @@
 #include <algorithm>
 
 #include "shading/lit/lit.h"
+#include "shading/lit/near_part.h"
 #include "shading/lit/path_radiance.h"
 #include "shading/lit/point_cotangents.h"
 
@@ -43,6 +44,26 @@ void shade_whole(const LitScene& lit, const SceneView<T>& scene, const RayCaster
     }
 }
 
+namespace {
+
+// Of a path from the point at(0): the cotangent of its place on its face, as that of what does not come from nearby.
+template <class At>
+void leave_out_near(const LitScene& lit, const LitOptions& options, const Path& path, At at, const double* total_bar,
+                    const PathBuffers& found, FacePointBar& at_bar) {
+    const NearPart near(options.near);
+    const Surface<double>& o = at(0);
+    const Vec3 d = at(1).y - o.y;
+    if (!(near.share(d) > 0)) return;
+    double carried = 0;
+    const double factor = found.steps[0].factor();
+    for (int c = 0; c < lit.channels; ++c)
+        carried += total_bar[c] * found.steps[0].f[c] * factor * found.L[lit.channels + c];
+    const Vec3 away = carried * near.slope(d);  // −∂φ/∂x₁
+    for (int i = 0; i < 3; ++i) at_bar.b[i] = (1 - near.share(d)) * at_bar.b[i] + dot(away, o.frame.corner[i]);
+}
+
+}  // namespace
+
 template <class T>
 void add_indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaster& caster, const LitPoints& points,
                   Paths& paths, double* out) {
@@ -50,8 +71,12 @@ void add_indirect(const LitScene& lit, const SceneView<T>& scene, const RayCaste
     double total[most_lit_channels];
     for (int64_t i = 0; i < points.size; ++i) {
         const auto at = [&](int k) -> const Surface<double>& { return paths.surface(i, k); };
-        path_radiance(lit, paths.lights(), paths.path(i), at, total);
-        for (int c = 0; c < lit.channels; ++c) out[i * lit.channels + c] += total[c];
+        const Path path = paths.path(i);
+        path_radiance(lit, paths.lights(), path, at, total);
+        double share = 1;
+        if (paths.options().only_near)
+            share = path.points > 1 ? NearPart(paths.options().near).share(at(1).y - at(0).y) : 0;
+        for (int c = 0; c < lit.channels; ++c) out[i * lit.channels + c] += share * total[c];
     }
 }
 
@@ -91,6 +116,8 @@ void indirect_vjp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
                 FacePointBar at_bar;
                 path_radiance_vjp(lit, paths.lights(), path, at, bar + (first + i) * lit.channels, buffers, at_bar,
                                   chunk);
+                if (options.near > 0)
+                    leave_out_near(lit, options, path, at, bar + (first + i) * lit.channels, buffers, at_bar);
                 write(at_bar, places, first + i);
             }
         }
@@ -108,13 +135,27 @@ void indirect_jvp(const LitScene& lit, const SceneView<T>& scene, const RayCaste
                        paths.find(scene, caster, some, [](int64_t) { return true; });
                        for (int64_t i = 0; i < some.size; ++i) {
                            const Path path = paths.path(i);
-                           Dual total[most_lit_channels];
-                           const MovingPoint point(lit, points, dot, first + i);
-                           const std::vector<Surface<Dual>> surfaces = moving_surfaces(lit, path, point.surface);
-                           const auto at = [&](int k) -> const Surface<Dual>& { return surfaces[k]; };
-                           path_radiance(lit, paths.lights(), path, at, total);
+                           double* out = radiance_dot + (first + i) * lit.channels;
+                           const auto find = [&](LitPlaces<const double> own, Dual* total) {
+                               const MovingPoint point(lit, points, own, first + i);
+                               const std::vector<Surface<Dual>> surfaces = moving_surfaces(lit, path, point.surface);
+                               const auto at = [&](int k) -> const Surface<Dual>& { return surfaces[k]; };
+                               path_radiance(lit, paths.lights(), path, at, total);
+                           };
+                           Dual total[most_lit_channels], held[most_lit_channels];
+                           find(dot, total);
+                           for (int c = 0; c < lit.channels; ++c) out[c] = total[c].dot;
+                           if (!(options.near > 0) || !dot.b || path.points < 2) continue;
+                           // Without what nearby gives as the point slides, as leave_out_near() has it.
+                           const Vec3 d = paths.surface(i, 1).y - paths.surface(i, 0).y;
+                           const NearPart near(options.near);
+                           Vec3 slid;
+                           for (int k = 0; k < 3; ++k)
+                               slid += dot.b[3 * (first + i) + k] * paths.surface(i, 0).frame.corner[k];
+                           find({nullptr, dot.spread}, held);
                            for (int c = 0; c < lit.channels; ++c)
-                               radiance_dot[(first + i) * lit.channels + c] = total[c].dot;
+                               out[c] += near.share(d) * (held[c].dot - total[c].dot) +
+                                         edgegrad::dot(near.slope(d), slid) * total[c].value;
                        }
                    });
 }

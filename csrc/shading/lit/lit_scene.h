@@ -104,8 +104,12 @@ struct LitOptions {
     int only = -1;    // the lamp of which alone radiance is wanted; −1: of all that there is
     // Whether only derivatives are wanted: on glossy surfaces points of environments are then drawn in fours.
     bool in_fours = false;
-    double dark = 0;    // points of lights are drawn as if no glossy surface were darker: what is black has derivatives
-    int bounces = 1;    // how often light is scattered on its way, at most (path.h)
+    double dark = 0;  // points of lights are drawn as if no glossy surface were darker: what is black has derivatives
+    int bounces = 1;  // how often light is scattered on its way, at most (path.h)
+    // World units, 0: none. Derivatives by where points lie on their faces, of light that is scattered more than once,
+    // are those of what does not come from nearer (near_part.h); `only_near`: values are those of what does.
+    double near = 0;
+    bool only_near = false;
     int by_paths = -1;  // a lamp of which no points are drawn for Lambertian surfaces: paths from them find it
 };
 

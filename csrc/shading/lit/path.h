@@ -79,6 +79,7 @@ class Paths {
     }
 
     const std::vector<LightSample>& lights() const { return lights_; }
+    const LitOptions& options() const { return options_; }
 
     // From points that are `wanted`; the others get paths without any points.
     template <class T, class Wanted>

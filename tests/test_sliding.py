@@ -1,0 +1,107 @@
+"""Light that nearby surfaces scatter on what is seen, as that slides on its face: gradients by the camera in corners."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from bounce_scenes import QUAD, SCENES, BounceScene, indirect_change, indirect_gradient, mesh, seen_from
+from finite_differences import Case, estimate, right_ratio
+from torch import Tensor
+
+import edgegrad as eg
+from edgegrad.light import sliding
+
+F64 = torch.float64
+ASIDE = torch.tensor([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.6], [0.0, 0.0, 0.0, 0.0], [0.0] * 4], dtype=F64)
+
+
+def corner(filter: str | None = None) -> BounceScene:
+    """A floor and a wall, seen from near, and a lamp on which a point light shines from above; with the filter of a texture."""
+    floor = mesh([[-2, 0, 0], [-2, 0, 2], [2, 0, 2], [2, 0, 0]], QUAD, 0.7)
+    wall = mesh([[-2, 0, 0], [2, 0, 0], [2, 2, 0], [-2, 2, 0]], QUAD, 0.8)
+    if filter is not None:
+        texels = 0.2 + 0.7 * torch.rand(3, 3, 1, dtype=F64, generator=torch.Generator().manual_seed(5))
+        uvs = 0.3 + 0.4 * floor.verts[:, [0, 2]]
+        look = eg.Material(eg.Texture(texels, filter=filter))
+        floor = floor.replace(face_colors=None, uvs=uvs, uv_faces=floor.faces, material=look)
+    light = eg.PointLight(torch.tensor([0.3, 1.6, 1.7], dtype=F64), torch.tensor([9.0], dtype=F64))
+    return BounceScene({"floor": floor, "wall": wall}, seen_from((0.4, 1.1, 2.3), (0.0, 0.25, 0.1), 0.45), (light,))
+
+
+def camera_of(scene: BounceScene) -> Case:
+    """The camera moves aside."""
+
+    def case(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
+        pose = scene.camera.world_to_camera
+        moved = scene.camera.replace(world_to_camera=pose + theta * ASIDE[: len(pose)])
+        return eg.Scene(list(scene.meshes.values()), lights=list(scene.lights)), moved
+
+    return case
+
+
+def test_without_differences_noise_has_no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    def noise() -> float:
+        found = []
+        for seed in range(6):
+            theta = torch.zeros((), dtype=F64, requires_grad=True)
+            scene, camera = camera_of(corner())(theta)
+            counts = {"surface_samples": 4_000, "edge_samples": 1_000}
+            further, direct = (eg.render(scene, camera, 1, seed, bounces=n, **counts).mean() for n in (2, 1))
+            found.append(float(torch.autograd.grad(further - direct, theta)[0]))
+        return estimate(found).error
+
+    quiet = noise()
+    monkeypatch.setattr(sliding, "RADIUS", 0.0)
+    assert noise() > 5 * quiet
+
+
+def test_forward_mode_is_the_adjoint_of_reverse_mode() -> None:
+    scene, weights = corner(), torch.rand(32, 32, 1, dtype=F64, generator=torch.Generator().manual_seed(0))
+    pose = scene.camera.world_to_camera
+    tangent = torch.rand(pose.shape, dtype=F64, generator=torch.Generator().manual_seed(1))
+    tangent[3:] = 0
+
+    def image(pose: Tensor) -> Tensor:
+        moved = scene.camera.replace(world_to_camera=pose)
+        lit = eg.Scene(list(scene.meshes.values()), lights=list(scene.lights))
+        return eg.render(lit, moved, 1, bounces=2, surface_samples=2_000, edge_samples=1_000)
+
+    own = pose.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad((weights * image(own)).sum(), own)
+    moved: Tensor = torch.func.jvp(image, (pose,), (tangent,))[1]
+    expected = float((gradient * tangent).sum())
+    assert abs(float((weights * moved).sum()) - expected) < 1e-9 * abs(expected)
+
+
+COUNTS = {"surface_samples": 200_000, "edge_samples": 100_000}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("filter", [None, "linear", "nearest"])
+def test_textures_in_a_corner(filter: str | None) -> None:
+    case = camera_of(corner(filter))
+    print(right_ratio(indirect_change(case, 0.3, 2048, 8), indirect_gradient(case, 0.3, 8, **COUNTS)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["cornell", "standing", "ball", "plates"])
+def test_rooms(scene: str) -> None:
+    case = camera_of(SCENES[scene][0]())
+    print(right_ratio(indirect_change(case, 0.2, 4096, 12), indirect_gradient(case, 0.2, 12, **COUNTS)))
+
+
+def test_other_filters_compare_within_a_quarter_of_a_pixel() -> None:
+    scene, camera = camera_of(corner())(torch.zeros((), dtype=F64))
+    slopes: dict[str, list[float]] = {"box": [], "tent": []}
+    for seed in range(6):
+        for filter, found in slopes.items():
+            theta = torch.zeros((), dtype=F64, requires_grad=True)
+            moved = camera.replace(
+                world_to_camera=camera.world_to_camera + theta * ASIDE[: len(camera.world_to_camera)]
+            )
+            options = {"filter": filter, "surface_samples": 10_000, "edge_samples": 2_000}
+            image = eg.render(scene, moved, 1, seed, bounces=2, **options)
+            found.append(float(torch.autograd.grad(image.mean(), theta)[0]))
+    # The mean of an image loses little to a wider filter.
+    a, b = (estimate(found) for found in slopes.values())
+    assert abs(a.mean - b.mean) < 4 * (a.error**2 + b.error**2) ** 0.5 + 0.02 * abs(a.mean)
