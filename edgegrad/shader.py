@@ -69,9 +69,7 @@ class Effort(NamedTuple):
     glossy: bool = False
     keeps_little: bool = False  # whether its graph is small: else it is computed again in the backward pass
     gives_derivatives: bool = False  # whether it leaves out values where Hits._needs_values is False
-    closer: float = (
-        1.0  # by which lines that look for rims of cut-outs lie closer, for what is shaded beside them is noisy
-    )
+    closer: float = 1.0  # by which lines that look for steps lie closer, for what is shaded beside them is noisy
     additive: bool = False  # whether it is a sum over lights, and gives one alone for Hits._only_light
     steps: Callable[[Hits], None] | None = None  # declares its steps and shades nothing; None: it does while it shades
     beside_steps: float = 0.0  # how far from a step its sides are shaded
@@ -169,9 +167,9 @@ class _Image:
         if visibility and self._kinds:
             with watch.part("steps"):
                 declare = self._effort.steps or self._shade
-                terms += StepTerms(frame, self._kinds, self._shade, declare, AT_ONCE, self._effort.beside_steps).found(
-                    watch
-                )
+                beside = self._effort.beside_steps
+                found = StepTerms(frame, self._kinds, self._shade, declare, AT_ONCE, self._step_spacing, beside)
+                terms += found.found(watch)
         if visibility:
             with watch.part("shadows"):
                 terms += self._shadows()
@@ -299,6 +297,10 @@ class _Image:
                 jump, to_background = through[:, None].to(jump) * jump, through * to_background
         return boundary(samples.x, samples.velocity, jump, to_background, self._background)
 
+    @property
+    def _step_spacing(self) -> float:
+        return max(self._frame.request.gradient.step_spacing / self._effort.closer, LEAST_SPACING)
+
     def _with_creases(self) -> Request:
         """The request for samples on curves, with colours that jump where the shader may."""
         frame = self._frame
@@ -307,11 +309,8 @@ class _Image:
                 attributes = every_face(len(frame.fixed.faces))
             else:
                 attributes = frame.fixed.crease_attributes().cpu() if self._creases else None
-        gradient = frame.request.gradient
-        spacing = max(gradient.step_spacing / self._effort.closer, LEAST_SPACING)
-        return frame.request._replace(
-            scene=without_colors(frame.request.scene, attributes), gradient=gradient._replace(step_spacing=spacing)
-        )
+        gradient = frame.request.gradient._replace(step_spacing=self._step_spacing)
+        return frame.request._replace(scene=without_colors(frame.request.scene, attributes), gradient=gradient)
 
     # -- the shader ----------------------------------------------------------------------------------------------------
 

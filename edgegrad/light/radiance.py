@@ -53,9 +53,9 @@ FEWEST_IN_PENUMBRA = 4  # with extended lights, points of a face in a pixel that
 # Where glossy surfaces end or meet, points of a light for each sample of it: these are few points, and what is wanted of them is
 # the difference of both sides.
 AT_CURVES = 4
-# By which lines that look for rims of cut-outs lie closer where surfaces light each other: a rim has some samples a pixel, and
-# each side of it one path.
-CLOSER_RIMS = 8.0
+# By which lines that look for rims of cut-outs and borders of nearest texels lie closer where surfaces light each other: these
+# have some samples a pixel, and each side of a sample has one path.
+CLOSER_STEPS = 8.0
 BESIDE_TEXELS = (
     1e-4  # of a texel, from the border of nearest ones, where light that is scattered more than once is asked for
 )
@@ -119,7 +119,7 @@ class Lighting(NamedTuple):
             keeps_little=fused,
             gives_derivatives=fused and additive,
             additive=additive,
-            closer=CLOSER_RIMS if self.bounces > 1 else 1.0,
+            closer=CLOSER_STEPS if self.bounces > 1 else 1.0,
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
             # The kernel, which finds light that is scattered more than once, looks up its texels by itself.
             beside_steps=BESIDE_TEXELS if self.bounces > 1 else 0.0,

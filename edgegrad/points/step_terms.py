@@ -35,6 +35,7 @@ class StepTerms(NamedTuple):
     shade: Callable[[Hits], Tensor]  # (N, C)
     declare: Callable[[Hits], object]  # calls hits.where() and hits.floor(); what it returns is not used
     at_once: int  # points that are shaded together
+    spacing: float  # px between the lines along which steps are looked for
     # How far from a step its sides are shaded, in units of its function: more than 0 for shaders that may look for themselves
     # on which side they are.
     beside: float = 0.0
@@ -48,7 +49,7 @@ class StepTerms(NamedTuple):
         return boundary(crossings.x, weight * (s - s.detach()), jump, None, None)
 
     def _crossings(self) -> Crossings:
-        frame, options = self.frame, self.frame.request.gradient
+        frame = self.frame
 
         def at(x: Tensor) -> Points:
             starts = range(0, max(len(x), 1), self.at_once)
@@ -68,7 +69,7 @@ class StepTerms(NamedTuple):
 
         with torch.no_grad():
             size, margin = (frame.height, frame.width), MARGIN[frame.request.image.filter]
-            return find_crossings(at, self.kinds, size, margin, options.step_spacing, frame.sampler.grad_seed)
+            return find_crossings(at, self.kinds, size, margin, self.spacing, frame.sampler.grad_seed)
 
     def _jumps(self, found: Crossings, rays: RayRecords) -> tuple[Tensor, Tensor]:
         """(M, C) L₊ − L₋ and (M,) the weight over |∇ₓs|, of constants."""
