@@ -20,13 +20,13 @@ import edgegrad as eg
 import edgegrad_cli as cli
 from edgegrad.fit.smooth import Smooth
 from edgegrad.report.stability import fits, statistics, steps
-from edgegrad.report.stability.cases import CASES, measure
+from edgegrad.report.stability.cases import CASES, bounced, measure
 from edgegrad.report.stability.cases.case import Case, Problem, everything
 from edgegrad.report.stability.cases.measure import LIMIT, NOISY, QUICK, RAISED, RIGHT, WRONG, Effort
 from edgegrad.report.stability.painted import PAINTED
 
 stability = importlib.import_module("edgegrad.report.stability.run")  # the package has a function of this name
-FAST = [name for name, case in CASES.items() if not case.slow and case.group != "light"]
+FAST = [name for name, case in CASES.items() if not case.slow and case.group not in ("light", "bounces")]
 
 
 def check(name: str, effort: Effort) -> dict:
@@ -46,7 +46,9 @@ def test_case(name):
 @pytest.mark.parametrize("name", CASES)
 def test_case_at_full_accuracy(name):
     row = check(name, Effort())
-    if CASES[name].more > 1:  # for a gradient that is 5 % off to be wrong, beyond four standard errors and 2 %
+    if (
+        CASES[name].more > 1 or CASES[name].group == "bounces"
+    ):  # for a gradient that is 5 % off to be wrong, beyond four standard errors and 2 %
         assert max(part["noise"] for part in row["parts"].values()) < 0.0075, row
 
 
@@ -138,6 +140,17 @@ def test_a_wrong_gradient_is_rejected(triangle):
 
     row = measure.measure(case_of(dataclasses.replace(triangle, make=stretched)), QUICK)
     assert (row["verdict"], row["worst"]) == (WRONG, "skew")
+
+
+@pytest.mark.parametrize("name", ["keyhole", "bounced-mirror", "all-cancels", "bounced-standing", "bounced-million"])
+def test_bounces_without_borders_are_rejected(name, monkeypatch):
+    """Without the borders of what surfaces see of one another the gradient is wrong."""
+    if name == "bounced-million":
+        monkeypatch.setitem(CASES, name, dataclasses.replace(CASES[name], build=lambda: bounced.million(3)))
+    problem = CASES[name].build()
+    options = {**problem.options, "edge_samples": 1, "visibility": False}
+    row = measure.measure(case_of(dataclasses.replace(problem, options=options)), Effort(seeds=(4,)))
+    assert row["verdict"] == WRONG, row
 
 
 def test_a_wrong_image_is_rejected(triangle):

@@ -42,6 +42,8 @@ class Effort:
 
 # Lit scenes are shaded in PyTorch, point by point.
 LIT = Effort(1 << 18, 1 << 21, 64.0, 1 << 21, runs=4)
+# Of light that is scattered more than once each sample follows a path.
+BOUNCED = Effort(1 << 18, 1 << 19, 64.0, 1 << 21, runs=4, check_spp=64)
 QUICK = Effort(1 << 16, 1 << 14, 4.0, 1 << 21, runs=2, check_spp=16, check_seeds=2)
 
 

@@ -24,7 +24,7 @@ from ...profile import profile
 from ..document import METRICS, Document, duration, percent, settings
 from ..scenes import SCENES, ReportScene, build
 from .methods import METHODS, Method, missing
-from .references import LIT, QUICK, Effort, Reference, disagrees, reference
+from .references import BOUNCED, LIT, QUICK, Effort, Reference, disagrees, reference
 
 NAME = "error-time"
 WARM_UP = 1 << 20  # a seed that is not measured
@@ -158,7 +158,8 @@ class _Run:
             self.bar.update(len(methods))
             return
         self.bar.set_description(f"{name}: reference")
-        effort = QUICK if self.quick else LIT if scene.scene.is_lit else Effort()
+        lit = BOUNCED if scene.bounces > 1 else LIT
+        effort = QUICK if self.quick else lit if scene.scene.is_lit else Effort()
         correct = reference(scene, self.out, effort, self.say)
         self._describe(scene, correct)
         for method_name in methods:

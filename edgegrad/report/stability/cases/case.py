@@ -68,6 +68,7 @@ class Case:
     most: float = 0.0  # relative error that a limit may show before it counts as wrong
     slow: bool = False
     more: int = 1  # times the seeds, where the gradient of a part is small beside its noise
+    seeds: int = 512  # no more than these, where each takes long
 
 
 class Group:

@@ -67,6 +67,7 @@ def measure(case: Case, effort: Effort) -> dict[str, Any]:
     begin = time.perf_counter()
     row: dict[str, Any] = {"group": case.group, "name": case.name, "extreme": case.extreme}
     try:
+        effort = replace(effort, seeds=tuple(n for n in effort.seeds if n <= case.seeds))
         row |= compare(case.build(), effort.up_to(case.more))
         row["verdict"], row["worst"] = verdict(row, case)
     except (ValueError, TypeError) as error:
@@ -187,10 +188,11 @@ def differences(problem: Problem, adjoint: Tensor, name: str, scale: float, effo
     units = torch.eye(value.numel(), dtype=value.dtype).reshape(-1, *value.shape)
     # Of two samples in each finer pixel differences vary about half as much as of one, which costs nearly the same.
     spp = max(2 if finer > 1 else 1, effort.difference_spp // finer**2)
+    bounces = problem.options.get("bounces", 1)
 
     def loss(value: Tensor, seed: int) -> float:
         scene, camera = make({**problem.parts, name: value})
-        return float((finer_image(scene, camera, finer, spp=spp, seed=seed) * adjoint).sum())
+        return float((finer_image(scene, camera, finer, spp=spp, seed=seed, bounces=bounces) * adjoint).sum())
 
     run = Running()
     with torch.no_grad():
