@@ -105,7 +105,7 @@ def derivatives(
                 own = {tensor: tangent for tensor, tangent in tangents if id(tensor) in held}
                 if not own:
                     continue
-                seed = objective.seed(step) + some[0]
+                seed = objective.seed(step) + 1 + some[0]  # not the samples of the slope
                 found = jvp(scene, whole, own, options.spp, seed % 2**32, aovs=aovs, **options.render)
                 for name in aovs:
                     image, J = (x if len(some) > 1 else x.unsqueeze(-4) for x in (found[0][name], found[1][name]))
