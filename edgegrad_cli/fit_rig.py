@@ -41,7 +41,8 @@ def run(args: argparse.Namespace) -> int:
     with live(args) as view:
         found = fit_rig(rig, cameras, masks=masks, callback=view, **told)
         code = finish(found.fit, args.out, found.save, found.reason)
-        if found.uncertainty is not None and found.uncertainty.unknown:
-            print(f"not determined by the masks: {found.uncertainty.unknown}", flush=True)
+        unknown = "" if found.uncertainty is None else found.uncertainty.unknown
+        if unknown and unknown not in found.reason:
+            print(f"not determined by the masks: {unknown}", flush=True)
         linger(view, found.fit)
     return code

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -59,6 +60,9 @@ def test_a_pose_from_masks() -> None:
     assert found.converged and degrees(found.values["rotations"], TRUTH) < 2.0
     assert torch.allclose(found.values["translation"], torch.tensor([0.05, 0.0, -0.1]).double(), atol=0.02)
     assert torch.allclose(found.posed().verts, found.fit.mesh.verts, atol=1e-6)
+    assert found.uncertainty is not None and found.reason == "converged"
+    unsure = replace(found, uncertainty=replace(found.uncertainty, degrees={"bone 0": 1.0, "bone 1": 7.0}, axes={}))
+    assert not unsure.converged and "rotations unknown: bone 1 known to ±7° only" in unsure.reason
 
 
 def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:

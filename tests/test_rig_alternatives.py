@@ -7,9 +7,13 @@ import pytest
 import torch
 
 import edgegrad as eg
+from edgegrad.fit import Options
+from edgegrad.fit.descent.objective import Objective
 from edgegrad.fit.rig.alternatives import Alternatives, exchanged
 from edgegrad.fit.rig.limbs import limbs
 from edgegrad.fit.rig.sought import Sought
+from edgegrad.fit.rig.twists import untwisted
+from edgegrad.fit.views import views_of
 
 roma = pytest.importorskip("roma")
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
@@ -17,6 +21,7 @@ import body  # noqa: E402
 import figure  # noqa: E402
 
 LEGS = [f"{side} {part}" for side in ("left", "right") for part in ("hip", "knee", "foot")]
+ARM = ["left arm", "left elbow", "left hand"]
 F64 = torch.float64
 
 
@@ -73,22 +78,60 @@ def test_crossed_legs_are_found() -> None:
 
 
 @pytest.mark.slow
-def test_a_shared_twist_is_found() -> None:
-    """Descents end with an arm and its elbow 20° to 45° twisted against each other, and the outlines less than a pixel off."""
-    _, truth, _, fit = body.trial(7, progress=False)
+@pytest.mark.parametrize("seed", (4, 7))
+def test_twists_are_found(seed: int) -> None:
+    """Descents end with an arm and its elbow 20° to 45° twisted against each other, and the outlines less than a pixel off (7);
+    with a hand across its true place, and a shoulder and its arm twisted by 15° (4)."""
+    _, truth, _, fit = body.trial(seed, progress=False)
     assert fit.converged and float(body.Errors.of(fit.rig, fit.values["rotations"], truth).rotation.max()) < 3.0
+
+
+def arm_of(rig: eg.Rig) -> tuple[Sought, Alternatives]:
+    """Of a figure, the joints of one arm, by whose rotations it is posed."""
+    sought = Sought.of(rig, ["rotations"], ARM, {"rotations": figure.pose(7, 40.0)}, {})
+    return sought, Alternatives(rig, sought, "rotations")
 
 
 def test_a_twist_keeps_what_hangs_below_in_place() -> None:
     rig = figure.figure(fine=3)
-    sought, turns = Sought.of(rig, ["rotations"], None, {}, {}), figure.pose(7, 40.0)
-    alternatives = Alternatives(rig, sought, "rotations")
-    arm, elbow = (rig.joints.names.index(name) for name in ("left arm", "left elbow"))
-    assert (arm, elbow) in alternatives.links({"rotations": turns}, range(20))
-    found = alternatives.twisted({"rotations": turns}, arm, elbow, 0.7)
-    before, after = (rig.joints.world(roma.rotvec_to_rotmat(one)) for one in (turns, found))
-    others = [k for k in range(20) if k != arm]
-    torch.testing.assert_close(after[others], before[others])
-    torch.testing.assert_close(after[arm, :3, 3], before[arm, :3, 3])
-    turned = roma.rotmat_geodesic_distance(after[arm, :3, :3], before[arm, :3, :3])
-    assert float(turned) == pytest.approx(0.7, abs=1e-6)
+    sought, alternatives = arm_of(rig)
+    values = {"rotations": figure.pose(7, 40.0)[[rig.joints.names.index(name) for name in ARM]]}
+    twists = {(ARM[t.row], None if t.child is None else ARM[t.child]): t for t in alternatives.twists(values)}
+    assert list(twists) == [("left arm", "left elbow"), ("left elbow", "left hand"), ("left hand", None)]
+    # The hand's own axis points to the middle of its ellipsoid.
+    along = torch.tensor(figure.BONES_ALONG[8], dtype=F64)
+    assert float(twists["left hand", None].axis @ along / along.norm()) > 0.99
+    before = rig.joints.world(roma.rotvec_to_rotmat(sought.all(values)["rotations"]))
+    for (name, _), twist in twists.items():
+        found = sought.all({"rotations": alternatives.twisted(values, twist, 0.7)})["rotations"]
+        after = rig.joints.world(roma.rotvec_to_rotmat(found))
+        at = rig.joints.names.index(name)
+        others = [k for k in range(20) if k != at]
+        torch.testing.assert_close(after[others], before[others])
+        torch.testing.assert_close(after[at, :3, 3], before[at, :3, 3])
+        turned = roma.rotmat_geodesic_distance(after[at, :3, :3], before[at, :3, :3])
+        assert float(turned) == pytest.approx(0.7, abs=1e-6)
+
+
+def test_twists_are_found_by_the_loss_along_them() -> None:
+    """A hand turned across its true place, and an arm and its elbow twisted against each other; what is right stays."""
+    rig, cameras = figure.figure(fine=4), figure.cameras(64)[:3]
+    sought, alternatives = arm_of(rig)
+    parameter = sought.parameters["rotations"]
+    truth = {"rotations": parameter.value}
+    masks = [
+        eg.render_aovs(rig.posed(sought.fixed["rotations"]), c, ["alpha"], spp=64, seed=5)["alpha"] for c in cameras
+    ]
+    views = views_of(cameras, None, masks, None)
+    objective = Objective(
+        lambda values: (eg.Scene([rig.posed(**sought.all(values))]), cameras),
+        views,
+        Options(spp=32),
+    )
+    shared, _, across = alternatives.twists(truth)
+    wrong = {"rotations": alternatives.twisted(truth, shared, 0.35)}
+    wrong = {"rotations": alternatives.twisted(wrong, across, 1.5)}
+    for start, most in ((wrong, 0.1), (truth, 0.06)):
+        found = untwisted(objective, alternatives, parameter, start)["rotations"]
+        R, S = (roma.rotvec_to_rotmat(one) for one in (found, truth["rotations"]))
+        assert float(roma.rotmat_geodesic_distance(R, S).max()) < most

@@ -10,6 +10,7 @@ from test_fit_rig import arm, shown, views
 
 import edgegrad as eg
 from edgegrad.fit import Options, Parameter, fit_rig
+from edgegrad.fit.descent.curvature import curvature, derivatives
 from edgegrad.fit.descent.objective import Objective
 from edgegrad.fit.rig.shown import explained_by_joint, left_out
 from edgegrad.fit.rig.uncertainty import uncertainty_of
@@ -68,6 +69,22 @@ def test_uncertainty_is_that_of_noise() -> None:
     expected = (sigma**2 * torch.linalg.inv(JTJ)).diagonal().sqrt()
     ratio = found.covariance.diagonal().sqrt() / expected
     assert float(ratio.min()) > 0.8 and float(ratio.max()) < 1.25
+
+
+def test_curvature_of_views_in_one_call(monkeypatch) -> None:
+    """As of each by itself, with samples of its own, apart from those of the slope."""
+    rig, cameras = arm(2), views(32, 3)
+    judged, values = objective(rig, cameras, masks=shown(rig.posed(TRUTH[:2]), cameras)), {"rotations": 0.9 * TRUTH[:2]}
+    ((_, group, images, slopes),) = derivatives(judged, values, 0)
+    ((_, of_slope),) = judged.renders(*judged.build(values), group, judged.options.spp, judged.seed(0))
+    assert images.shape == of_slope["alpha"].shape and slopes[0].shape == (6, 32, 32, 1)
+    assert not any(torch.equal(a, b) for a, b in zip(images, of_slope["alpha"], strict=True))
+    assert float((images - of_slope["alpha"]).abs().max()) < 0.3  # the same views in the same order
+    together = curvature(judged, values, 0)
+    monkeypatch.setattr("edgegrad.fit.descent.curvature.ROOM", 0)
+    alone = curvature(judged, values, 0)
+    off = float((together - alone).norm() / alone.norm())
+    assert off < 0.02 < float((1.05 * together - alone).norm() / alone.norm())
 
 
 def test_what_no_picture_shows_is_unknown() -> None:

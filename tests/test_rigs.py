@@ -223,7 +223,7 @@ BAD: dict[str, tuple[Sample, str]] = {
     "joint not in the scene": (
         spoilt(lambda s: s.tree["scenes"].__setitem__(0, {"nodes": [0]})), r"skin 0: expected joints in the scene, got node 1"
     ),
-    "cycle": (spoilt(lambda s: s.tree["nodes"][2].update(children=[1])), "expected a tree of nodes"),
+    "cycle": (spoilt(lambda s: s.tree["nodes"][2].update(children=[1])), "expected a tree of nodes, got node 1"),
     "target of another length": (
         spoilt(lambda s: primitive(s)["targets"][1].update(POSITION=s.add([[0, 0, 1]] * 4)), simple_morph),
         r"POSITION of shape \(3, 3\) in morph target 1, got \(4, 3\)",

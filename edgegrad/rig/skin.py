@@ -66,10 +66,10 @@ class Skin:
         """Vertices (…, V, 3) and normals (…, N, 3) by the joints' world transformations (…, J, 4, 4) and morph weights (…, M)."""
         # In double: a joint may be far from the origin, and its inverse bind takes it back.
         A = (world.index_select(-3, self.joints) @ self.inverse_binds)[..., :3, :]
-        bases, turns = (_linear if skinning == "linear" else _dual_quaternion)(A, self.weights)
+        bases, turns = (_linear if skinning == "linear" else _dual_quaternion)(A, self.weights, normals is not None)
         points = _morphed(verts, self.targets, morphs, self.morphs)
         bent = (bases[..., :3] * points[..., None, :]).sum(-1) + bases[..., 3]
-        if normals is None:
+        if normals is None or turns is None:
             return bent, None
         turns = turns if self.normal_verts is None else turns.index_select(-3, self.normal_verts)
         n = _morphed(normals, self.normal_targets, morphs, self.morphs)
@@ -97,9 +97,12 @@ def _morphed(rows: Tensor, targets: Tensor | None, morphs: Tensor, first: int) -
     return rows + (own @ targets.flatten(1)).unflatten(-1, rows.shape)
 
 
-def _linear(A: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Linear blend skinning: (…, V, 3, 4) of points, Σ w A, and (…, V, 3, 3) of normals, the cofactors of its linear part."""
+def _linear(A: Tensor, weights: Tensor, normals: bool) -> tuple[Tensor, Tensor | None]:
+    """Linear blend skinning: (…, V, 3, 4) of points, Σ w A, and (…, V, 3, 3) of normals, the cofactors of its linear part, where
+    they are asked for."""
     bases = (weights @ A.flatten(-2).to(weights)).unflatten(-1, (3, 4))
+    if not normals:
+        return bases, None
     a, b, c = bases[..., :3].unbind(-2)
     cross = torch.linalg.cross
     # The inverse transpose times the determinant: it is there for any matrix. In a mirror normals keep their side.
@@ -108,7 +111,7 @@ def _linear(A: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     return bases, cofactors * side[..., None, None]
 
 
-def _dual_quaternion(A: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def _dual_quaternion(A: Tensor, weights: Tensor, normals: bool) -> tuple[Tensor, Tensor]:
     """Dual-quaternion blending (Kavan, Collins, Žára and O'Sullivan, Skinning with Dual Quaternions, 2007): the same of rigid
     transformations with one scale each, which is blended apart. Raises ValueError for others."""
     L, t = A[..., :3], A[..., 3]

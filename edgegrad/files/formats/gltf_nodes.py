@@ -47,7 +47,10 @@ def placed(tree: dict[str, Any]) -> Iterator[Placed]:
     while waiting:
         index, parent, above, visible = waiting.pop()
         if index in seen:
-            raise Fault("expected a tree of nodes, got some inside two others; export it again")
+            name = entry(tree, "nodes", index).get("name", "without a name")
+            raise Fault(
+                f"expected a tree of nodes, got node {index} ({name}) below itself or two others; export it again"
+            )
         seen.add(index)
         node = entry(tree, "nodes", index)
         found = Placed(index, parent, node, above @ matrix_of(node), visible and _is_visible(node))

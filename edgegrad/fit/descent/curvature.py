@@ -7,13 +7,14 @@ squared loss the exact one (Gauss-Newton).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from ...camera.camera import Camera
 from ...render import jvp
 from ...scene.tree import map_tensors, tensors_in
 from .building import Built
@@ -21,6 +22,7 @@ from .objective import Objective
 
 MOST = 400  # numbers, each of which is a direction
 CHUNK = 32  # of them at a time, where scenes are made in batches
+ROOM = 2**23  # numbers of a channel's derivatives in one call
 FAINT = 1e-3  # of the range of the pictures: differences below count as these, for some losses have no weight at 0
 
 
@@ -97,16 +99,18 @@ def derivatives(
             aovs = objective.views[group[0]].aovs
             images: dict[str, list[Tensor]] = {name: [] for name in aovs}
             slopes: dict[str, list[Tensor]] = {name: [] for name in aovs}
-            for i in group:
-                held = {id(tensor) for tensor in (*tensors_in(scene), *tensors_in(cameras[i]))}
+            for some in _together(cameras, group, tangents):
+                whole = cameras[some[0]] if len(some) == 1 else Camera.stack([cameras[i] for i in some])
+                held = {id(tensor) for tensor in (*tensors_in(scene), *tensors_in(whole))}
                 own = {tensor: tangent for tensor, tangent in tangents if id(tensor) in held}
                 if not own:
                     continue
-                seed = objective.seed(step) + i
-                found = jvp(scene, cameras[i], own, options.spp, seed % 2**32, aovs=aovs, **options.render)
+                seed = objective.seed(step) + 1 + some[0]  # not the samples of the slope
+                found = jvp(scene, whole, own, options.spp, seed % 2**32, aovs=aovs, **options.render)
                 for name in aovs:
-                    images[name].append(found[0][name])
-                    slopes[name].append(found[1][name])
+                    image, J = (x if len(some) > 1 else x.unsqueeze(-4) for x in (found[0][name], found[1][name]))
+                    images[name] += image.unbind(0)
+                    slopes[name] += J.unbind(1)
             for name in aovs if images[aovs[0]] else ():
                 yield name, group, torch.stack(images[name]), slopes[name]
     except (NotImplementedError, RuntimeError) as error:
@@ -116,6 +120,19 @@ def derivatives(
             "method: expected a scene and cameras that PyTorch differentiates in forward mode by what is sought, as "
             f'"gauss-newton" needs, got {error}; give method="adam"'
         ) from error
+
+
+def _together(
+    cameras: Sequence[Camera], group: Sequence[int], tangents: Sequence[tuple[Tensor, Tensor]]
+) -> list[list[int]]:
+    """Places of views whose derivatives are taken in one call, which costs less than one each where pictures are small. A camera
+    that moves has its own."""
+    moved = {id(tensor) for tensor, _ in tangents}
+    if any(id(tensor) in moved for i in group for tensor in tensors_in(cameras[i])):
+        return [[i] for i in group]
+    height, width = cameras[group[0]].size
+    count = max(1, ROOM // (len(tangents[0][1]) * height * width)) if tangents else len(group)
+    return [list(group[k : k + count]) for k in range(0, len(group), count)]
 
 
 def _tangents(objective: Objective, tensors: Mapping[str, Tensor]) -> tuple[Built, list[tuple[Tensor, Tensor]]]:

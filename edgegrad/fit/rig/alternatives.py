@@ -18,6 +18,15 @@ from ...rig.skinned import Skinned
 from .sought import Sought
 
 
+@dataclass(frozen=True, eq=False)
+class Twist:
+    """A turn of a row about the line to its child, which is turned back; about its own limb where nothing hangs on it."""
+
+    row: int
+    child: int | None
+    axis: Tensor  # (3,) among its own, of length 1
+
+
 @dataclass(frozen=True)
 class Alternatives:
     """Of values that are sought, other ones of the value `name`, which are rotation vectors."""
@@ -43,30 +52,57 @@ class Alternatives:
         found = exchanged(self.joints, rotations, ours, theirs, every["joint_translations"], every["joint_scales"])
         return self._changed(values, found, both)
 
-    def links(self, values: Mapping[str, Tensor], rows: Sequence[int]) -> list[tuple[int, int]]:
-        """Of these rows, pairs of a joint and the only one that hangs on it."""
+    def twists(self, values: Mapping[str, Tensor]) -> list[Twist]:
+        """Of each joint on which one other hangs, of those that are sought, or none."""
         if self.joints is None:
             return []
         places = self._places(values).tolist()
-        row_of, found = {place: row for row, place in enumerate(places)}, []
-        for row in rows:
-            below = [j for j, parent in enumerate(self.joints.parents) if parent == places[row]]
-            if len(below) == 1 and row_of.get(below[0]) in rows:
-                found.append((row, row_of[below[0]]))
+        row_of, below = {place: row for row, place in enumerate(places)}, dict.fromkeys(range(len(self.joints)), 0)
+        for place in places:
+            at = self.joints.parents[place]
+            while at >= 0:
+                below[at] += 1
+                at = self.joints.parents[at]
+        found = []
+        for row, place in enumerate(places):
+            branches = [
+                j for j, parent in enumerate(self.joints.parents) if parent == place and (below[j] or j in row_of)
+            ]
+            if not branches:
+                along = self._middle(place)
+            elif len(branches) == 1 and branches[0] in row_of:
+                along = self.sought.all(values)["joint_translations"][branches[0]]
+            else:
+                continue
+            if float(along.norm()) > 0.0:
+                found.append(Twist(row, row_of[branches[0]] if branches else None, along / along.norm()))
         return found
 
-    def twisted(self, values: Mapping[str, Tensor], row: int, child: int, angle: float) -> Tensor:
-        """A joint twisted by so many radians about the line to its child, which stays as it is."""
+    def twisted(self, values: Mapping[str, Tensor], twist: Twist, angle: float) -> Tensor:
+        """By so many radians. What hangs on it stays as it is."""
         assert self.joints is not None
         places, rotations = self._places(values), self._rotations(values)
-        at, below = int(places[row]), int(places[child])
-        along = self.sought.all(values)["joint_translations"][below]
-        Q = roma().rotvec_to_rotmat(angle * along / along.norm().clamp(min=1e-12))
-        hung = self.joints.rotations[below]
+        at, rows = int(places[twist.row]), [twist.row]
+        Q = roma().rotvec_to_rotmat(angle * twist.axis)
         found = rotations.clone()
         found[at] = rotations[at] @ Q
-        found[below] = hung.mT @ Q.mT @ hung @ rotations[below]
-        return self._changed(values, found, [row, child])
+        if twist.child is not None:
+            below = int(places[twist.child])
+            hung = self.joints.rotations[below]
+            found[below] = hung.mT @ Q.mT @ hung @ rotations[below]
+            rows.append(twist.child)
+        return self._changed(values, found, rows)
+
+    def _middle(self, place: int) -> Tensor:
+        """(3,) of the vertices that hang on a joint, by their weights, from it, along its own axes at rest."""
+        assert isinstance(self.rig.deformer, Skinned)
+        total, count = torch.zeros(3, dtype=torch.float64), 0.0
+        for skin, mesh in zip(self.rig.deformer.skins, self.rig.meshes, strict=True):
+            for k in (skin.joints == place).nonzero()[:, 0].tolist():
+                weights, bind = skin.weights[:, k].double(), skin.inverse_binds[k]
+                total = total + (weights[:, None] * (mesh.verts.double() @ bind[:3, :3].mT + bind[:3, 3])).sum(0)
+                count += float(weights.sum())
+        return total / max(count, 1e-12)
 
     def _places(self, values: Mapping[str, Tensor]) -> Tensor:
         """Among all joints, of the rows."""

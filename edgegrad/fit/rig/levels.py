@@ -32,15 +32,15 @@ from ..placement import Coordinates
 from ..priors import Prior
 from ..views import View
 from .alternatives import Alternatives
-from .limbs import EXPLAINED, ByContour, ByLoss, Limb, Search, limbs
+from .limbs import ByContour, ByLoss, Limb, Search, limbs
 from .result import RigFit
 from .shown import explained_by_joint, left_out
 from .sought import Sought
+from .twists import untwisted
 from .uncertainty import JointUncertainty, uncertainty_of
 
 TRIED = range(24, 97)  # pixels on the shorter side of pictures on levels where limbs are drawn anew
 TRY_STEPS = 6  # of each of these
-TWIST_STEPS = 12  # of a limb of which a joint is twisted, on the last level
 BY_REGIONS = 4  # a try by regions takes so many times as long, and there are so many times fewer
 FINER = 4  # times as many samples on the last level, where twists of limbs are told by little
 NEAR = 10.0  # what is left of the loss, in units of its noise, from which steps go far where pictures show little:
@@ -191,13 +191,14 @@ class Levels:
             and name == "rotations"
             and objective.regions is None
             and found.ending is not Ending.INTERRUPTED
-            and EXPLAINED < objective.left(found.values) < NEAR
         ):
-            search = self._search(objective, found.values, options, name, TWIST_STEPS)
             try:
-                values = search.untwisted(dict(found.values))
+                alternatives = Alternatives(self.rig, self.sought, name)
+                values = untwisted(objective, alternatives, self.sought.parameters[name], found.values)
             except KeyboardInterrupt:
                 return found._replace(ending=Ending.INTERRUPTED)
+            if values is found.values:
+                return found
             more = self._steps(objective, values, options, save, None, title, fine)
             later = [record._replace(step=len(found.history) + k) for k, record in enumerate(more.history)]
             found = more._replace(history=found.history + later, seconds=found.seconds + more.seconds)

@@ -31,8 +31,6 @@ SPREADS = 0.2, 0.4  # radians, of each component, by turns
 SHARE = 0.4  # of all rows: a joint with more below it is turned alone
 EXPLAINED = 1.5  # of the loss by noise alone: less is not to be mended
 APART = 0.3  # radians of a joint at least, by which a turn is another place
-TWISTS = -0.7, -0.35, 0.35, 0.7  # radians
-SWEEPS = 2  # over all joints with one below
 STARTS = 2  # of the turns, that go down
 LEAST = 0.05  # of the largest chance of a limb to be drawn
 SEEDS = 0, 1  # by which losses are compared
@@ -195,29 +193,6 @@ class Search:
             self.tell()
         self.judge.renew(best[0])
         return best[0]
-
-    def untwisted(self, values: Values) -> Values:
-        """Twists that the joints of a limb share in another way, where pixels are most off first, as long as the pictures are not
-        explained."""
-        best, least = values, self.judge.cost(values)
-        for _ in range(SWEEPS):
-            whole = {}  # the largest limb of each link
-            for limb in sorted(self.groups, key=lambda limb: len(limb.rows)):
-                if limb.twins is None:
-                    whole |= dict.fromkeys(self.alternatives.links(best, limb.rows), limb)
-            off = dict(zip(map(id, self.groups), self.chances(best).tolist(), strict=True))
-            before = least
-            for (row, child), limb in sorted(whole.items(), key=lambda one: -off[id(one[1])]):
-                if self.judge.explained(best):
-                    return best
-                twisted = [self.alternatives.twisted(best, row, child, angle) for angle in TWISTS]
-                starts = [{**best, self.name: self.within(value)} for value in twisted]
-                found = self.alone(min(starts, key=lambda start: loss_of(self.objective, start, SEEDS[:1])), limb)
-                if (now := self.judge.cost(found)) < least:
-                    best, least = found, now
-            if least == before:
-                break
-        return best
 
     def better(self, best: tuple[Values, float], starts: Sequence[Values], limb: Limb) -> tuple[Values, float]:
         """What starts of a limb lead to, where its cost is lower than that of the best so far; else that."""

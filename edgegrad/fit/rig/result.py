@@ -51,27 +51,34 @@ class RigFit:
 
     @property
     def converged(self) -> bool:
-        """Further steps lead no further, and the pictures show what the fit has found, each joint of it; see Fit.converged."""
-        return self.fit.converged and not self._missing and self.left_out < REGION
+        """Further steps lead no further, and the pictures show what the fit has found, each joint of it, and how it is turned;
+        see Fit.converged."""
+        return self.fit.converged and not self._missing and self.left_out < REGION and not self._unknown
 
     @property
     def reason(self) -> str:
         """In words: "converged", or what kept the fit from that; see Fit.reason."""
         if not self.fit.converged:
             return self.fit.reason
-        if not self._missing:
-            if self.left_out < REGION:
-                return self.fit.reason
+        if self._missing:
+            worst = sorted(self._missing, key=lambda name: self.explained[name])[:3]
+            said = ", ".join(f"{self.explained[name]:.0%} at {name}" for name in worst)
+            return (
+                f"edges not explained: the pictures show too few of the edges of {len(self._missing)} joints ({said}); start "
+                "nearer, give more tries or keypoints, or look for what covers them"
+            )
+        if self.left_out >= REGION:
             return (
                 f"masks not explained: a region of {self.left_out:.0%} of one is without the fit, or of the fit beside it; give "
                 "more tries or keypoints, or look for what else the masks show"
             )
-        worst = sorted(self._missing, key=lambda name: self.explained[name])[:3]
-        said = ", ".join(f"{self.explained[name]:.0%} at {name}" for name in worst)
-        return (
-            f"edges not explained: the pictures show too few of the edges of {len(self._missing)} joints ({said}); start nearer, "
-            "give more tries or keypoints, or look for what covers them"
-        )
+        if self._unknown:
+            return f"rotations unknown: {self._unknown}; give more pictures or colours, or seek other joints alone"
+        return self.fit.reason
+
+    @property
+    def _unknown(self) -> str:
+        return "" if self.uncertainty is None else self.uncertainty.unknown
 
     @property
     def _missing(self) -> list[str]:
