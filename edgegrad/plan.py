@@ -158,7 +158,9 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     )
     rays = inside * terms["interior"].samples + lights * terms["boundary"].samples
     terms["shadows"] = Term(lights > 0 and lighting.shadows, why if lights else "no lights", samples=rays)
-    terms["bounces"] = _bounces(scene, terms["interior"].samples + terms["boundary"].samples, lighting)
+    slides = request.gradient.visibility and any(name in MOVING for name in required(request))
+    interior, boundary = terms["interior"].samples, terms["boundary"].samples
+    terms["bounces"] = _bounces(scene, interior + boundary, 4 * interior if slides else 0, lighting)
     terms["shadow edges"] = _shadow_edges(scene, request, lighting)
     terms["unseen shadow edges"] = _unseen_shadow_edges(scene, request, lighting)
     terms["bounce edges"] = _bounce_edges(scene, request, lighting)
@@ -167,15 +169,17 @@ def _lit_terms(scene: Scene, request: Request, creases: object, lighting: Lighti
     return terms
 
 
-def _bounces(scene: Scene, points: int, lighting: Lighting) -> Term:
+def _bounces(scene: Scene, points: int, beside: int, lighting: Lighting) -> Term:
+    """By points of the gradient, and at how many places beside them light from nearby is compared."""
     if lighting.bounces == 1:
         return Term(False, "bounces=1: light is scattered once on its way")
     shadows = len(scene.casting) if lighting.shadows else 0
     return Term(
         True,
         f"a path for each point of the gradient, and two for each ray of the image; {1 + shadows} rays for each of at most "
-        f"{lighting.bounces - 1} further points",
-        samples=(lighting.bounces - 1) * (1 + shadows) * points,
+        f"{lighting.bounces - 1} further points"
+        + ("; where what is seen slides on its face, four beside each point" if beside else ""),
+        samples=(lighting.bounces - 1) * (1 + shadows) * (points + beside),
     )
 
 

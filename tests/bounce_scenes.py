@@ -20,6 +20,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.kernel.request import make_request
 from edgegrad.light import in_kernel
+from edgegrad.light.radiance import CLOSER_STEPS
 from edgegrad.points.frame import Frame
 from edgegrad.scene.lights import Light
 
@@ -170,6 +171,31 @@ def ball() -> BounceScene:
     return BounceScene({"room": room(), "lamp": panel((0.1, 0.97, 0), (0.3, 0.25)), "ball": round_}, before_room())
 
 
+def sunk() -> BounceScene:
+    """The block is sunk into the floor, and leans."""
+    found = cornell()
+    return found._replace(meshes=found.meshes | {"block": block((0.15, -0.85, 0.1), (0.3, 0.35, 0.3), 0.4, 0.15)})
+
+
+def shelf() -> BounceScene:
+    """A shelf is stuck through a wall, and a lamp shines at the ceiling."""
+    board, lamp = block((-0.9, -0.1, 0.1), (0.5, 0.05, 0.5), 0.2, 0.1), panel((-0.3, 0.3, 0), (0.3, 0.25), down=False)
+    return BounceScene({"room": room(), "lamp": lamp, "shelf": board}, before_room())
+
+
+def leaf() -> BounceScene:
+    """A sheet in the room of which alpha leaves a leaf."""
+    corners = torch.tensor([[-0.4, -0.6, 0.4], [0.6, -0.65, 0.35], [0.6, 0.05, -0.4], [-0.4, 0.0, -0.35]], dtype=F64)
+    at = (torch.arange(6, dtype=F64) + 0.5) / 6
+    away = ((at[:, None] - 0.52) ** 2 + (at[None, :] - 0.45) ** 2).sqrt()
+    alpha = (1.2 - 2.0 * away * (1 + 0.3 * torch.sin(7 * at[None, :]))).clamp(0.05, 0.95)
+    uvs, faces = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64), torch.tensor(QUAD)
+    own = eg.Mesh(
+        corners, faces, uvs=uvs, uv_faces=faces, alpha=alpha, material=eg.Material(torch.tensor([0.6], dtype=F64))
+    )
+    return BounceScene({"room": room(), "lamp": panel((0.1, 0.97, 0), (0.3, 0.25)), "leaf": own}, before_room())
+
+
 # A mesh that moves, its direction, and the vertex that alone does.
 Motion = tuple[str, tuple[float, float, float]] | tuple[str, tuple[float, float, float], int]
 ASKEW = (1.0, 0.5, -0.3)
@@ -205,6 +231,9 @@ SCENES: dict[str, tuple[Callable[[], BounceScene], dict[str, Motion]]] = {
         open_plates,
         {"right vertex": ("right", (1.0, 0.3, 0.2), 2), "left y": ("left", Y), "lamp y": ("lamp", Y)},
     ),
+    "sunk": (sunk, {"block x": ("block", X), "block y": ("block", Y)}),
+    "shelf": (shelf, {"shelf x": ("shelf", X)}),
+    "leaf": (leaf, {"leaf y": ("leaf", Y)}),
     "ball": (ball, {"ball x": ("ball", X), "ball y": ("ball", Y)}),
 }
 
@@ -252,7 +281,8 @@ def indirect_gradient(case: Case, h: float, seeds: int, bounces: int = 2, **opti
         for at, share in GAUSS:
             for sign, n in ((1, bounces), (-1, 1)):
                 theta = torch.tensor(at * h, dtype=F64, requires_grad=True)
-                image = eg.render(*case(theta), 1, 1000 + seed, bounces=n, **options)
+                spacing = 1.0 if n > 1 else 1 / CLOSER_STEPS  # of the same samples
+                image = eg.render(*case(theta), 1, 1000 + seed, bounces=n, step_spacing=spacing, **options)
                 (slope,) = torch.autograd.grad((adjoint()[:, :, None] * image).sum() / SIZE**2, theta)
                 values[seed] += sign * share * float(slope)
     return estimate(values)
