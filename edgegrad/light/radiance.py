@@ -123,7 +123,8 @@ class Lighting(NamedTuple):
             steps=declare_steps if additive and _has_moving_steps(scene, camera) else None,
             # The kernel, which finds light that is scattered more than once, looks up its texels by itself.
             beside_steps=BESIDE_TEXELS if self.bounces > 1 else 0.0,
-            sliding=self._sliding if self.bounces > 1 else None,
+            # Comparisons see borders, which visibility=False leaves out; and layers behind others have none.
+            sliding=self._sliding if self.bounces > 1 and additive and request.gradient.visibility else None,
             indirect=self._indirect if self.bounces > 1 else None,
             watch=watch,
         )
