@@ -1,30 +1,40 @@
-"""Light that is scattered more than once: noise and time of images over those of Mitsuba's path tracer, and the gradient's."""
+"""Light that is scattered more than once: noise and time of images over those of Mitsuba's path tracer, and of gradients."""
 
 from __future__ import annotations
 
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import torch
 from table import Bench, Row, Skipped, median_row
 from torch import Tensor
 
 import edgegrad as eg
+from edgegrad import shader
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 
+from bounce_scenes import BounceScene, before_room, cornell, panel, plates
+from bounce_scenes import room as walls
 from mitsuba_rooms import MitsubaRoom
 from room_scenes import ROOMS, box_room, towards_room, vector, without_alpha
+from scenes import icosphere
 
 SIZE, SPP = 64, 64
 SAMPLERS = {"independent": {"must": 1.0, "aim": 0.5}, "multijitter": {}}  # Mitsuba's default, and its best one
 
 
 def bounces(bench: Bench) -> list[Row]:
-    return [*gradients(bench), *(row for room in ROOMS for row in images(bench, room))]
+    return [row for room in ROOMS for row in images(bench, room)]
+
+
+def bounced_gradients(bench: Bench) -> list[Row]:
+    return [*gradients(bench), *borders(bench), *mirrors(bench)]
 
 
 def gradients(bench: Bench) -> list[Row]:
@@ -50,6 +60,73 @@ def gradients(bench: Bench) -> list[Row]:
             ratios.append((time.process_time() - middle) / (middle - begin) - 1)
         rows.append(median_row(f"2 bounces: gradient over image, by {what}", ratios, must=1.5, aim=1.0))
     return rows
+
+
+def borders(bench: Bench) -> list[Row]:
+    """Of what surfaces see of one another, alone, past a ball of 20,480 faces: samples double until its translation has 2 %."""
+    ball = icosphere(5)
+    verts = 0.4 * ball.verts.double() + vector(0.15, -0.35, 0.1).double()
+    ball = eg.Mesh(verts, ball.faces, material=eg.Material(torch.tensor([0.6], dtype=torch.float64)))
+    found = BounceScene({"room": walls(), "lamp": panel((0.1, 0.97, 0), (0.3, 0.25)), "ball": ball}, before_room())
+
+    def gradient(samples: int, seed: int) -> tuple[Tensor, float]:
+        shift, begin = torch.zeros(3, dtype=torch.float64, requires_grad=True), time.process_time()
+        moved = found.meshes | {"ball": ball.replace(verts=verts + shift)}
+        counts: dict[str, Any] = {"surface_samples": 1, "edge_samples": samples}
+        image = eg.render(eg.Scene(list(moved.values())), _larger(found), 1, seed, bounces=2, shadows=False, **counts)
+        (slope,) = torch.autograd.grad(image.mean(), shift)
+        return slope, time.process_time() - begin
+
+    def image() -> float:
+        begin = time.process_time()
+        with torch.no_grad():
+            eg.render(eg.Scene(list(found.meshes.values())), _larger(found), 16, bounces=2)
+        return time.process_time() - begin
+
+    below, samples, noise, seeds = statistics.median(image() for _ in range(bench.repeats(8))), 10_000, 1.0, 8
+    taken: Sequence[float] = ()
+    terms = dict.fromkeys(("_interior", "_boundary", "_shadows"), lambda *_: [])
+    with mock.patch.multiple(shader._Image, **terms):
+        gradient(1_000, 0)
+        while noise > 0.02:
+            samples *= 2
+            slopes, taken = zip(*(gradient(samples, seed) for seed in range(seeds)), strict=True)
+            noise = _noise(torch.stack(slopes))
+    what = "2 bounces: borders past 20,480 faces, translation at 2 %, over the image of 64² × 16"
+    note = f"{samples:,} samples, noise {100 * noise:.1f} % over {seeds} seeds"
+    return [median_row(what, [seconds / below for seconds in taken], must=10.0, note=note)]
+
+
+def mirrors(bench: Bench) -> list[Row]:
+    """The gradient inside of faces at default samples, by what a surface of roughness 0.2 is made of and by its motion."""
+    rows = []
+    for what, found, name in (("a block", cornell(), "block"), ("a plate that lights another", plates(), "left")):
+        slopes: dict[str, list[Tensor]] = {"base colour": [], "roughness": [], "translation": []}
+        for seed in range(bench.repeats(16)):
+            made = torch.tensor([0.7]), torch.tensor(0.2), torch.zeros(3)
+            base, roughness, shift = leaves = [value.double().requires_grad_() for value in made]
+            mesh = found.meshes[name]
+            look = eg.Material(base, metallic=0.5, roughness=roughness)
+            moved = found.meshes | {name: eg.Mesh(mesh.verts + shift, mesh.faces, material=look)}
+            scene = eg.Scene(list(moved.values()))
+            image = eg.render(scene, _larger(found), 16, seed, bounces=2, visibility=False)
+            for values, slope in zip(slopes.values(), torch.autograd.grad(image.mean(), leaves), strict=True):
+                values.append(slope.reshape(-1))
+        for by, values in slopes.items():
+            noise = 100 * _noise(torch.stack(values))
+            rows.append(Row(f"2 bounces, roughness 0.2, {what}: noise inside of faces, by {by}", noise, unit=" %"))
+    return rows
+
+
+def _larger(found: BounceScene) -> eg.Camera:
+    """Its view, in SIZE pixels."""
+    scale = torch.tensor([[SIZE], [SIZE], [1.0]]).double() / torch.tensor([[32.0], [32.0], [1.0]]).double()
+    return found.camera.replace(K=found.camera.K * scale, size=(SIZE, SIZE))
+
+
+def _noise(values: Tensor) -> float:
+    """(N, n) of single seeds: the standard deviation of all components over the size of the mean."""
+    return float(values.var(0).sum().sqrt() / values.mean(0).norm())
 
 
 def images(bench: Bench, room: str) -> list[Row]:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from bounces import bounces
+from bounces import bounced_gradients, bounces
 from costs import aovs, backward, bits, forward, large, small, sparse, textures, threads, update
 from defaults import deep, flat_colors, kernel_hash, noise, tangled
 from equal_error import boundary, interior, step
@@ -59,6 +59,7 @@ ROWS: dict[str, Callable[[Bench], list[Row]]] = {
     "noise": noise,
     "light": light,
     "bounces": bounces,
+    "bounced gradients": bounced_gradients,
     "glossy": glossy,
     "glossy gradients": glossy_gradients,
     "materials": material_grid,

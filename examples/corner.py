@@ -17,7 +17,7 @@ from torch import Tensor
 import edgegrad as eg
 from edgegrad.fit import Fit, Parameter, fit_scene
 
-SIZE = 64
+SIZE, SHOWN = 64, 160  # pixels on a side, of the pictures and of what is drawn
 WALLS = {
     "floor": (torch.tensor([0.75, 0.75, 0.75]), [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]),
     "left": (torch.tensor([0.7, 0.2, 0.15]), [[0, 0, 0], [0, 2, 0], [0, 2, 2], [0, 0, 2]]),
@@ -69,13 +69,13 @@ def main() -> None:
     parser.add_argument("--out", default="corner.png")
     args = parser.parse_args()
     seen = pictures(TRUTH, args.size, 8)
-    rows = [seen[0]]
+    shown = [pictures(TRUTH, SHOWN, 8)[0]]
     for bounces in (1, 4):
         found = fit(seen, bounces)
         said = ", ".join(f"{name} {100 * error:.1f} %" for name, error in errors(found).items())
         print(f"bounces={bounces}: off by {said}; {found.seconds:.0f} s; {found.reason}", flush=True)
-        rows.append(pictures(found.values, args.size, 8)[0])
-    eg.write_image(args.out, torch.cat(rows, 1))
+        shown.append(pictures(found.values, SHOWN, 8)[0])
+    eg.write_image(args.out, torch.cat(shown, 1))
     print(f"{args.out}: the corner, and what was found in direct light and with 4 bounces, in all its light")
 
 

@@ -148,8 +148,8 @@ def test_bounces_without_borders_are_rejected(name, monkeypatch):
     if name == "bounced-million":
         monkeypatch.setitem(CASES, name, dataclasses.replace(CASES[name], build=lambda: bounced.million(3)))
     problem = CASES[name].build()
-    options = {**problem.options, "edge_samples": 1, "visibility": False}
-    row = measure.measure(case_of(dataclasses.replace(problem, options=options)), Effort(seeds=(4,)))
+    options = {**problem.options, "surface_samples": 20_000, "edge_samples": 1, "visibility": False}
+    row = measure.measure(case_of(dataclasses.replace(problem, options=options, spp=16)), Effort(seeds=(4,)))
     assert row["verdict"] == WRONG, row
 
 
