@@ -87,6 +87,31 @@ def misfit(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> di
     return {name: part.reshape(value.shape) for (name, value), part in zip(plain.items(), parts, strict=True)}
 
 
+def left(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict[str, Tensor]:
+    """What is left of the squared differences where each number moves pixels, Σ J² r² / Σ J² n², in units of the noise n² of the
+    render's samples, of the tensors' shapes: about 1 of what is where the pictures have it."""
+    plain = {name: value.detach() for name, value in tensors.items()}
+    n = sum(value.numel() for value in plain.values())
+    off, noise = (torch.full((n,), 1e-30, dtype=torch.float64) for _ in range(2))
+    with torch.no_grad():
+        scene, cameras = objective.build(plain)
+        picks = objective.picks(step)
+        again = {
+            (name, i): image
+            for group, channels in objective.renders(scene, cameras, picks, objective.options.spp, objective.seed(step))
+            for name, images in channels.items()
+            for i, image in zip(group, images, strict=True)
+        }
+    for name, group, render, slopes in derivatives(objective, plain, step):
+        for i, image, J in zip(group, render, slopes, strict=True):
+            if (wanted := objective.views[i].wanted.get(name)) is not None:
+                rows = J.square().reshape(n, -1)
+                off += (rows @ (image - wanted).square().flatten()).double()
+                noise += (rows @ (0.5 * (image - again[name, i]).square()).flatten()).double()
+    parts = (off / noise).split([value.numel() for value in plain.values()])
+    return {name: part.reshape(value.shape) for (name, value), part in zip(plain.items(), parts, strict=True)}
+
+
 def derivatives(
     objective: Objective, plain: Mapping[str, Tensor], step: int
 ) -> Iterator[tuple[str, list[int], Tensor, list[Tensor]]]:

@@ -41,6 +41,7 @@ from .uncertainty import JointUncertainty, uncertainty_of
 
 TRIED = range(24, 97)  # pixels on the shorter side of pictures on levels where limbs are drawn anew
 TRY_STEPS = 6  # of each of these
+TWIST_STEPS = 12  # of a limb of which a joint is twisted, on the last level
 BY_REGIONS = 4  # a try by regions takes so many times as long, and there are so many times fewer
 FINER = 4  # times as many samples on the last level, where twists of limbs are told by little
 NEAR = 10.0  # what is left of the loss, in units of its noise, from which steps go far where pictures show little:
@@ -193,8 +194,10 @@ class Levels:
             and found.ending is not Ending.INTERRUPTED
         ):
             try:
-                alternatives = Alternatives(self.rig, self.sought, name)
-                values = untwisted(objective, alternatives, self.sought.parameters[name], found.values)
+                search = self._search(objective, found.values, options, name, TWIST_STEPS)
+                near = objective.left(found.values) < NEAR
+                values = search.twisted(found.values) if near else found.values
+                values = untwisted(objective, search.alternatives, self.sought.parameters[name], values)
             except KeyboardInterrupt:
                 return found._replace(ending=Ending.INTERRUPTED)
             if values is found.values:

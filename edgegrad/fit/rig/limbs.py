@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ...rig.rig import Rig
-from ..descent.curvature import misfit
+from ..descent.curvature import left, misfit
 from ..descent.objective import Objective
 from ..descent.regions import LAST
 from ..options import Parameter
@@ -31,6 +31,8 @@ SPREADS = 0.2, 0.4  # radians, of each component, by turns
 SHARE = 0.4  # of all rows: a joint with more below it is turned alone
 EXPLAINED = 1.5  # of the loss by noise alone: less is not to be mended
 APART = 0.3  # radians of a joint at least, by which a turn is another place
+TWISTS = -0.7, -0.35, 0.35, 0.7  # radians
+SWEEPS, WORST = 2, 5  # and the joints in each, where most is left of the pictures in units of noise
 STARTS = 2  # of the turns, that go down
 LEAST = 0.05  # of the largest chance of a limb to be drawn
 SEEDS = 0, 1  # by which losses are compared
@@ -193,6 +195,31 @@ class Search:
             self.tell()
         self.judge.renew(best[0])
         return best[0]
+
+    def twisted(self, values: Values) -> Values:
+        """Twists that joints of a limb share in another way, from which the limb goes down by itself, as long as the pictures
+        are not explained."""
+        twists = [twist for twist in self.alternatives.twists(values) if twist.child is not None]
+        if not twists or self.judge.explained(values):
+            return values
+        best, least = values, self.judge.cost(values)
+        for _ in range(SWEEPS):
+            remaining, before = left(self.objective, best, 0)[self.name].mean(1), least
+            for twist in sorted(twists, key=lambda twist: -float(remaining[twist.row]))[:WORST]:
+                if self.judge.explained(best):
+                    return best
+                rows = {twist.row, twist.child}
+                among = [limb for limb in self.groups if limb.twins is None and rows <= set(limb.rows)]
+                if among:
+                    turned = [self.within(self.alternatives.twisted(best, twist, angle)) for angle in TWISTS]
+                    starts = [{**best, self.name: value} for value in turned]
+                    start = min(starts, key=lambda start: loss_of(self.objective, start, SEEDS[:1]))
+                    found = self.alone(start, max(among, key=lambda limb: len(limb.rows)))
+                    if (now := self.judge.cost(found)) < least:
+                        best, least = found, now
+            if least == before:
+                break
+        return best
 
     def better(self, best: tuple[Values, float], starts: Sequence[Values], limb: Limb) -> tuple[Values, float]:
         """What starts of a limb lead to, where its cost is lower than that of the best so far; else that."""

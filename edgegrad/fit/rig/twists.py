@@ -17,7 +17,7 @@ from ..options import Parameter
 from .alternatives import Alternatives, Twist
 from .limbs import Values, loss_of
 
-ANGLES = 0.15, 0.35, 0.8  # radians, to both sides
+ANGLES = 0.15, 0.3, 0.5, 0.7  # radians, to both sides
 ACROSS = 0.5 * math.pi  # and of what nothing hangs on
 FINER = 0.1, 0.05  # one after the other, where one of them was better
 LOOKED, TOLD = (0,), (1, 2, 3)  # seeds by which the best angle is chosen, and those by which it must be better
