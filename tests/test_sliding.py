@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
-from bounce_scenes import QUAD, SCENES, BounceScene, indirect_change, indirect_gradient, mesh, seen_from
-from finite_differences import Case, estimate, right_ratio
+from bounce_scenes import QUAD, SCENES, BounceScene, indirect_change, indirect_gradient, mesh
+from finite_differences import Case, estimate
 from torch import Tensor
 
 import edgegrad as eg
@@ -25,11 +27,13 @@ def corner(filter: str | None = None) -> BounceScene:
         look = eg.Material(eg.Texture(texels, filter=filter))
         floor = floor.replace(face_colors=None, uvs=uvs, uv_faces=floor.faces, material=look)
     light = eg.PointLight(torch.tensor([0.3, 1.6, 1.7], dtype=F64), torch.tensor([9.0], dtype=F64))
-    return BounceScene({"floor": floor, "wall": wall}, seen_from((0.4, 1.1, 2.3), (0.0, 0.25, 0.1), 0.45), (light,))
+    camera = eg.Camera.look_at((0.4, 1.1, 2.3), (0.0, 0.25, 0.1), (0.4, 1.0, 0.01), 48.5, (32, 32)).to(F64)
+    return BounceScene({"floor": floor, "wall": wall}, camera, (light,))
 
 
-def camera_of(scene: BounceScene) -> Case:
-    """The camera moves aside."""
+def camera_of(scene: BounceScene, camera: eg.Camera | None = None) -> Case:
+    """The camera, of the scene or another one, moves aside."""
+    scene = scene if camera is None else scene._replace(camera=camera)
 
     def case(theta: Tensor) -> tuple[eg.Scene, eg.Camera]:
         pose = scene.camera.world_to_camera
@@ -73,21 +77,30 @@ def test_forward_mode_is_the_adjoint_of_reverse_mode() -> None:
     assert abs(float((weights * moved).sum()) - expected) < 1e-9 * abs(expected)
 
 
-COUNTS = {"surface_samples": 200_000, "edge_samples": 100_000}
+COUNTS = {"surface_samples": 100_000, "edge_samples": 100_000}
+# Edges of rooms do not run along rows of pixels: where they come to the next row, all along, the derivative jumps.
+ROLLED = eg.Camera.look_at((0.3, 0.35, 3.5), (0.05, -0.1, 0.0), (0.4, 1.0, 0.0), 45.6, (32, 32)).to(F64)
+
+
+def check(case: Case, h: float) -> None:
+    """Within three standard errors of the difference, which are 8 % at most."""
+    change, found = indirect_change(case, h, 2048, 8), indirect_gradient(case, h, 8, **COUNTS)
+    error = math.hypot(change.error, found.error)
+    print(f"{found.mean / change.mean:.4f} ± {error / abs(change.mean):.4f}")
+    assert error < 0.08 * abs(change.mean), f"too noisy to tell: {change}, {found}"
+    assert abs(found.mean - change.mean) < 3 * error, f"{change}, {found}"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("filter", [None, "linear", "nearest"])
 def test_textures_in_a_corner(filter: str | None) -> None:
-    case = camera_of(corner(filter))
-    print(right_ratio(indirect_change(case, 0.3, 2048, 8), indirect_gradient(case, 0.3, 8, **COUNTS)))
+    check(camera_of(corner(filter)), 0.2)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", ["cornell", "standing", "ball", "plates"])
+@pytest.mark.parametrize("scene", ["cornell", "standing", "ball"])
 def test_rooms(scene: str) -> None:
-    case = camera_of(SCENES[scene][0]())
-    print(right_ratio(indirect_change(case, 0.2, 4096, 12), indirect_gradient(case, 0.2, 12, **COUNTS)))
+    check(camera_of(SCENES[scene][0](), ROLLED), 0.15)
 
 
 def test_other_filters_compare_within_a_quarter_of_a_pixel() -> None:
