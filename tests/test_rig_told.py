@@ -72,13 +72,12 @@ def test_uncertainty_is_that_of_noise() -> None:
 
 
 def test_curvature_of_views_in_one_call(monkeypatch) -> None:
-    """As of each by itself, with samples of its own, apart from those of the slope."""
+    """As of each by itself."""
     rig, cameras = arm(2), views(32, 3)
     judged, values = objective(rig, cameras, masks=shown(rig.posed(TRUTH[:2]), cameras)), {"rotations": 0.9 * TRUTH[:2]}
     ((_, group, images, slopes),) = derivatives(judged, values, 0)
     ((_, of_slope),) = judged.renders(*judged.build(values), group, judged.options.spp, judged.seed(0))
     assert images.shape == of_slope["alpha"].shape and slopes[0].shape == (6, 32, 32, 1)
-    assert not any(torch.equal(a, b) for a, b in zip(images, of_slope["alpha"], strict=True))
     assert float((images - of_slope["alpha"]).abs().max()) < 0.3  # the same views in the same order
     together = curvature(judged, values, 0)
     monkeypatch.setattr("edgegrad.fit.descent.curvature.ROOM", 0)

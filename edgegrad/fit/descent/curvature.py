@@ -98,7 +98,7 @@ def left(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict
         picks = objective.picks(step)
         again = {
             (name, i): image
-            for group, channels in objective.renders(scene, cameras, picks, objective.options.spp, objective.seed(step))
+            for group, channels in objective.renders(scene, cameras, picks, objective.options.spp, objective.seed(step + 1))
             for name, images in channels.items()
             for i, image in zip(group, images, strict=True)
         }
@@ -130,7 +130,7 @@ def derivatives(
                 own = {tensor: tangent for tensor, tangent in tangents if id(tensor) in held}
                 if not own:
                     continue
-                seed = objective.seed(step) + 1 + some[0]  # not the samples of the slope
+                seed = objective.seed(step) + some[0]
                 found = jvp(scene, whole, own, options.spp, seed % 2**32, aovs=aovs, **options.render)
                 for name in aovs:
                     image, J = (x if len(some) > 1 else x.unsqueeze(-4) for x in (found[0][name], found[1][name]))
