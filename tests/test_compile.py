@@ -44,6 +44,7 @@ def test_compile_mesh_transformed_inside(compiled):
     compiled(function, [leaf(x) for x in (*values, CAMERA.world_to_camera)])
 
 
+@pytest.mark.slow
 def test_compile_everything_inside(compiled):
     """Meshes of every kind from their tensors, one index tensor for two purposes, the camera from its parameters."""
 
@@ -63,6 +64,7 @@ def test_compile_everything_inside(compiled):
     compiled(function, [*arguments, MESH.faces.int()])
 
 
+@pytest.mark.slow
 def test_compile_once_for_many_seeds(compiled):
     """From the second seed on it is a symbol; the seeds that follow from it must come out as they do in Python."""
 

@@ -132,6 +132,7 @@ def estimates(light: eg.Environment, roughness: float, seeds: int, in_fours: boo
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.unwatched
 @pytest.mark.parametrize("lamps", [False, True], ids=["smooth", "lamps"])
 @pytest.mark.parametrize("roughness", [0.2, 0.5])

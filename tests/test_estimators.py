@@ -41,6 +41,7 @@ def textured_scene(ball: bool) -> eg.Scene:
     return eg.Scene(meshes, torch.zeros(3, dtype=F64))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ball", "filter"), diagonal([False, True], ["gaussian", "box"]))
 def test_large_textured_triangles_agree_with_exact_derivatives(ball: bool, filter: str) -> None:
     """Along the gradient, where nothing cancels."""

@@ -46,6 +46,7 @@ def test_steps() -> None:
     assert abs(found.stripe - step.TRUTH.stripe) < 0.004
 
 
+@pytest.mark.slow
 def test_a_sun_and_a_pose() -> None:
     sun = example("sun")
     camera = sun.view(48)

@@ -38,6 +38,7 @@ def check_right(problem, method, seed):
     assert fit.steps <= MOST[method], said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "problem"), cases(QUICK))
 def test_a_right_answer_is_converged_and_ends_early(method, problem):
     check_right(problem, method, 0)

@@ -189,6 +189,7 @@ def test_a_folder_without_permission_is_named_before_the_fit(files, monkeypatch,
     assert f"got {files / 'out'} (Permission denied)" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @linux
 @pytest.mark.filterwarnings("ignore:checkpoint. expected to write")  # of files larger than the limits
 @pytest.mark.parametrize(("limit", "file"), [(100, "pose.json"), (4096, "fit.png")])
@@ -210,6 +211,7 @@ def test_a_file_that_cannot_grow(files, limit, file):
         assert PoseFit.from_json((files / "out" / "pose.json").read_text()).steps > 5
 
 
+@pytest.mark.slow
 @linux
 def test_a_result_that_cannot_be_printed_is_written(files, monkeypatch, capsys):
     with open("/dev/full", "w") as full:

@@ -355,6 +355,7 @@ def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
     assert fit.uncertainty is None or off[0] < 2.0 * fit.uncertainty.degrees
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("unit", "weight"), [(40.0, 1.0), (1e-3, 1.0), (1.0, 0.01), (1.0, 255.0)])
 def test_radiance_and_weights_of_any_unit(taken, unit, weight):
     view, image = taken
@@ -408,6 +409,7 @@ def test_a_faint_contour_proves_little(step, least, most):
     assert least <= level.explained(pose, 0) <= most
 
 
+@pytest.mark.slow
 def test_noise_is_refused_without_following_other_starts():
     noise = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0))
     fit = fit_pose(bracket(), noise, camera(96), init=START, progress=False)
@@ -452,6 +454,7 @@ def test_errors_of_depth(taken, depth, error, message):
         fit_pose(bracket(), image, view, init=START, depth=depth, progress=False)
 
 
+@pytest.mark.slow
 def test_what_looks_alike_in_unknown_light_is_not_converged():
     """A box of one colour, before a camera without perspective: turned to the left and to the right it has nearly one contour,
     and a light makes its faces as bright as they are. The way down from a start at the wrong one stays there."""

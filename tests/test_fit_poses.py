@@ -242,6 +242,7 @@ def test_a_mesh_that_is_not_there_makes_no_other_wrong(two):
     assert errors(fits[1], MESHES[1], TRUTHS[1])[0] < 1.5
 
 
+@pytest.mark.slow
 def test_a_hidden_mesh_is_said_to_be_hidden(two):
     """Behind the box as the camera sees it."""
     view, image = two
@@ -303,6 +304,7 @@ def test_errors(two, meshes, given, error, message):
         fit_poses(meshes, image, view, progress=False, **given)
 
 
+@pytest.mark.slow
 def test_from_the_shell(two, tmp_path, capsys):
     view, image = two
     eg.write_image(tmp_path / "photo.png", image)
@@ -374,6 +376,7 @@ def test_what_covers_an_object_is_told_by_its_light(covered, strength):
     assert left_of(level.see(pose, 0), [weight]) == pytest.approx(0.75, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_quarter_covered(covered):
     view, image, _, _ = covered
     fit = fit_pose(bracket(), image, view, init=STARTS[0], progress=False)
@@ -409,6 +412,7 @@ def test_two_meshes_that_end_in_one_place_have_not_converged():
     assert not any(fit.reason.startswith("in one place") for fit in fits)
 
 
+@pytest.mark.slow
 def test_a_direction_that_contours_do_not_show_is_unknown():
     view = view_of(96)
     plain = [mesh.replace(face_colors=None) for mesh in MESHES[:2]]

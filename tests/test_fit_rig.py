@@ -113,6 +113,7 @@ def test_by_regions_from_rest_a_limb_is_found_or_missed() -> None:
     assert off[1] < 0.1 and helped.converged
 
 
+@pytest.mark.slow
 def test_keypoints_find_what_masks_do_not() -> None:
     """A limb far from its mask, by its joints, of which one is wrong in one picture."""
     rig, cameras = arm(3), views(count=4)
@@ -129,6 +130,7 @@ def test_keypoints_find_what_masks_do_not() -> None:
     assert (found.rig.shape({"rotations": found.values["rotations"]}).joints - joints).norm(dim=1).max() < 0.1
 
 
+@pytest.mark.slow
 def test_a_limb_that_is_drawn_anew() -> None:
     """From where a descent alone does not lead: the limb is bent to the other side."""
     rig, cameras = arm(3), views(count=2)

@@ -203,6 +203,7 @@ def test_several_pictures_share_the_pose():
     assert len(figure.axes) == 8
 
 
+@pytest.mark.slow
 def test_the_start_is_placed_where_the_picture_shows_the_object():
     view, away = camera(48), torch.tensor([40.0, -30.0, 25.0]).double()
     far = bracket().transformed(t=away)

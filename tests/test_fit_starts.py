@@ -133,6 +133,7 @@ def test_matches_come_closer_than_views_are_apart() -> None:
     assert not any(near(pose, R, t, task, 0.2, 0.1) for pose in coarse.poses(task)[:4])
 
 
+@pytest.mark.slow
 def test_a_covered_object_is_found_near_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a quarter nothing is seen: one side has to be left out, and the right one."""
     monkeypatch.setattr("edgegrad.fit.pose.photo.nearby.STARTS", 24)
@@ -158,6 +159,7 @@ def test_matches_that_are_kept_are_distinct() -> None:
     assert found.distinct(2, 0.05, 0.1, 1.2).scores.tolist() == [5.0, 4.0]
 
 
+@pytest.mark.slow
 def test_with_a_mask_no_start_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
     R, t = truth((0.4, 2.0, -0.7), (0.3, -0.2, 0.4))
     mesh, picture, mask = pictured(R, t)

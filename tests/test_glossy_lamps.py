@@ -227,6 +227,7 @@ def seen_from_origin(corner: Tensor, there: Tensor) -> Tensor:
     return ~(crossed & (t > 0) & (t < 1 - 1e-9)).any(1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAMPS)
 def test_points_are_unbiased(name: str):
     """The mean over draws against quadrature over the lamp's faces, of what reaches the origin past the lamp itself."""

@@ -79,6 +79,7 @@ MATERIALS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.unwatched
 @pytest.mark.parametrize("roughness", [0.3, 0.9])
 @pytest.mark.parametrize("name", MATERIALS)

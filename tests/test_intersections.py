@@ -210,6 +210,7 @@ def large_tangle(copies: int = 1) -> tuple[Tensor, Tensor]:
     return torch.cat([verts] * copies), torch.cat([ball.faces + k * len(verts) for k in range(copies)])
 
 
+@pytest.mark.slow
 def test_many_pairs_are_drawn():
     """Each pair with the product of the probabilities of its faces, for as many as there are."""
     verts, faces = large_tangle()
@@ -227,6 +228,7 @@ def test_many_pairs_are_drawn():
     assert found(verts, faces, share=share, seed=seed, threads=3)[0] == some
 
 
+@pytest.mark.slow
 def test_copies_share_what_is_drawn():
     """Whichever of them are."""
     pairs = len(found(*large_tangle())[0])

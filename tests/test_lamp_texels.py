@@ -179,6 +179,7 @@ def test_a_texture_of_one_colour_has_no_borders() -> None:
     assert MeshLight(plain).borders((0.5, 0.5)) is None
 
 
+@pytest.mark.slow
 def test_images_in_reverse_and_forward_mode() -> None:
     """Of the floor alone, by the kernel; the exact derivative is that of a fine grid of points."""
     wraps, uvs, motion = ("repeat", "repeat"), COORDINATES["askew"], torch.tensor([0.7, -0.7], dtype=F64)

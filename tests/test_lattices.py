@@ -120,6 +120,7 @@ def check_shared(seed: int, kind: str, joined: str, seeds: int, edge_samples: in
         assert abs(mean - exact) <= allowed, f"{seed} {name}: gradient {mean:.4f} ± {error:.4f}, exact {exact:.4f}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joined", JOINED)
 @pytest.mark.parametrize("kind", KINDS)
 def test_motions_that_all_share(kind: str, joined: str) -> None:

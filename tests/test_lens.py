@@ -125,6 +125,7 @@ def test_area_in_a_wide_fisheye(degrees: int) -> None:
     check_area(view, ahead @ turn.mT)
 
 
+@pytest.mark.slow
 @lenses
 def test_wall(lens: str) -> None:
     """A triangle that fills the view has an interior term alone: against quadrature in double, differentiated by autograd."""

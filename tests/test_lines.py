@@ -70,6 +70,7 @@ def peak_memory() -> float:
     return 1024.0 * int(found[1])
 
 
+@pytest.mark.slow
 def test_time_of_copies_grows_with_their_number() -> None:
     """Not with its square, which for ten times as many would be a hundred times as long. Time of the processor, of many
     samples a curve and many curves on a line."""

@@ -179,6 +179,7 @@ def dent():
 OPTIONS = {"levels": 2, "faces": 1600, "steps": 60, **QUIET}
 
 
+@pytest.mark.slow
 def test_a_dent_that_masks_do_not_tell(dent):
     cameras, views = dent
     masks = [v["alpha"] for v in views]
@@ -189,6 +190,7 @@ def test_a_dent_that_masks_do_not_tell(dent):
     assert depths < 0.03 and normals < 0.03, (depths, normals)  # of a dent 0.4 deep; by masks alone 0.07
 
 
+@pytest.mark.slow
 def test_a_sensor_with_holes_noise_and_mixed_pixels(dent):
     """From its pictures alone: positions in five views, of which two come as depths."""
     cameras, views = dent

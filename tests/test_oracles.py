@@ -240,6 +240,7 @@ def test_interior_gradient_suffices_where_no_edge_is_seen() -> None:
 # -- reference --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "projection"), diagonal(list(SCENES), PROJECTIONS))
 def test_reference_converges_to_exact(name: str, projection: str) -> None:
     """A pixel that an edge crosses has an error of O(1/grid), and less where edges lie at odd angles to the grid."""

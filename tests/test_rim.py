@@ -151,6 +151,7 @@ def test_area_in_closed_form(lens: str) -> None:
     check(gradient, truth)
 
 
+@pytest.mark.slow
 @pytest.mark.unwatched
 @pytest.mark.parametrize(
     ("lens", "filter"), [*((lens, "box") for lens in LENSES), ("fold", "gaussian"), ("all around", "gaussian")]
@@ -214,6 +215,7 @@ def case(lens: str, what: str) -> Case:
     return distortion
 
 
+@pytest.mark.slow
 @pytest.mark.unwatched
 @pytest.mark.parametrize(("lens", "what"), [("fold", "d0"), ("decentred", "K02"), ("all around", "d0")])
 def test_finite_differences(lens: str, what: str) -> None:

@@ -45,6 +45,7 @@ TETRAHEDRON = trimesh.Trimesh(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solid, order",
     [
@@ -157,6 +158,7 @@ def test_colors_break_them() -> None:
     assert len(eg.find_symmetries(top, color_tolerance=1.0).motions) == 8
 
 
+@pytest.mark.slow
 def test_a_texture_breaks_them() -> None:
     """A cube whose sides all show one picture: a letter; or the same picture turned by any quarter."""
     faces = trimesh.creation.box((1, 1, 1))

@@ -40,6 +40,7 @@ def test_a_stone_that_turns(film, frames):
     assert torch.equal(found[-1].matrix[:3, :3], found[-1].R) and torch.equal(found[-1].matrix[:3, 3], found[-1].t)
 
 
+@pytest.mark.slow
 def test_lost_and_found_again(film):
     gone = replace(film, poses=[film.poses[0]] * 8, gone=(1, 6))
     found = list(track(film.mesh, gone, film.camera, film.poses[0], spp=2))
@@ -172,6 +173,7 @@ def test_a_pose_of_a_film_is_the_last_one_that_is_not_lost():
         pose_from_json(json.dumps({"poses": [{}]}))
 
 
+@pytest.mark.slow
 def test_a_hand_that_covers_more_than_half(film):
     """Over three pictures, while the stone turns on: then the light of one picture alone would be the hand's."""
     going = replace(film, poses=film.poses[:3] + [film.poses[k] for k in range(3, COUNT)], hand=(-4, 9))
