@@ -4,7 +4,7 @@ render(bounces=n), against exact derivatives."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 import torch
@@ -40,7 +40,7 @@ def gradients_of(found: Border, samples: int, bounces: int = 2) -> tuple[Tensor,
     """Of the weighted image, by all tensors."""
     weights = weights_of(Strip.standard())
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in found.leaves.items()}
-    options = {"shadows": False, "bounces": bounces, "edge_samples": samples, "surface_samples": 1}
+    options: dict[str, Any] = {"shadows": False, "bounces": bounces, "edge_samples": samples, "surface_samples": 1}
     image = eg.render(found.scene(leaves), found.camera, 1, 0, **options)
     return torch.autograd.grad((weights.to(image) * image).sum(), list(leaves.values()))
 

@@ -4,6 +4,7 @@ rejected (Holm 1979)."""
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -33,7 +34,7 @@ def of_few_samples(case: Case) -> Estimate:
         value = 0.0
         for sign, bounces in ((1, 2), (-1, 1)):
             theta = torch.tensor(at, dtype=F64, requires_grad=True)
-            options = {"surface_samples": 2_000, "edge_samples": 2_000}
+            options: dict[str, Any] = {"surface_samples": 2_000, "edge_samples": 2_000}
             spacing = 1.0 if bounces > 1 else 1 / CLOSER_STEPS  # of the same samples
             image = eg.render(*case(theta), 1, seed, bounces=bounces, step_spacing=spacing, **options)
             (slope,) = torch.autograd.grad((adjoint()[:, :, None] * image).sum() / SIZE**2, theta)

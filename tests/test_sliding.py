@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -49,7 +50,7 @@ def test_without_differences_noise_has_no_bound(monkeypatch: pytest.MonkeyPatch)
         for seed in range(6):
             theta = torch.zeros((), dtype=F64, requires_grad=True)
             scene, camera = camera_of(corner())(theta)
-            counts = {"surface_samples": 4_000, "edge_samples": 1_000}
+            counts: dict[str, Any] = {"surface_samples": 4_000, "edge_samples": 1_000}
             further, direct = (eg.render(scene, camera, 1, seed, bounces=n, **counts).mean() for n in (2, 1))
             found.append(float(torch.autograd.grad(further - direct, theta)[0]))
         return estimate(found).error
@@ -112,7 +113,7 @@ def test_other_filters_compare_within_a_quarter_of_a_pixel() -> None:
             moved = camera.replace(
                 world_to_camera=camera.world_to_camera + theta * ASIDE[: len(camera.world_to_camera)]
             )
-            options = {"filter": filter, "surface_samples": 10_000, "edge_samples": 2_000}
+            options: dict[str, Any] = {"filter": filter, "surface_samples": 10_000, "edge_samples": 2_000}
             image = eg.render(scene, moved, 1, seed, bounces=2, **options)
             found.append(float(torch.autograd.grad(image.mean(), theta)[0]))
     # The mean of an image loses little to a wider filter.

@@ -129,6 +129,7 @@ class Nearby(NamedTuple):
     def _sees(self, axis: int, t: Tensor) -> Tensor:
         """(N,) bool: whether one sees the same face t px further along an axis, and between the same steps."""
         there = self._there(axis, t)
+        assert there._pixel is not None
         seen = self.frame.here(self.frame.sampler.hits_at(there._pixel).face) == self.hits._face
         if self.declare is None:
             return seen

@@ -98,7 +98,9 @@ def left(objective: Objective, tensors: Mapping[str, Tensor], step: int) -> dict
         picks = objective.picks(step)
         again = {
             (name, i): image
-            for group, channels in objective.renders(scene, cameras, picks, objective.options.spp, objective.seed(step + 1))
+            for group, channels in objective.renders(
+                scene, cameras, picks, objective.options.spp, objective.seed(step + 1)
+            )
             for name, images in channels.items()
             for i, image in zip(group, images, strict=True)
         }
