@@ -15,6 +15,7 @@ From afar the derivative is the quieter one. So L is only what comes from within
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -51,7 +52,8 @@ def radius(frame: Frame) -> float:
             face, b = frame.here(found.face[some]), frame.here(barycentrics(found.b[some]))
             position = (b[:, :, None] * frame.fixed.corners(face)).sum(1)
             by_x = by_x * (position.double() - frame.fixed_view.eye).norm(dim=1) / frame.here(rays.along).norm(dim=1)
-        return RADIUS * float(by_x.median())
+        near = RADIUS * float(by_x.median())
+    return near if math.isfinite(near) else 0.0
 
 
 class Nearby(NamedTuple):
