@@ -196,6 +196,16 @@ def leaf() -> BounceScene:
     return BounceScene({"room": room(), "lamp": panel((0.1, 0.97, 0), (0.3, 0.25)), "leaf": own}, before_room())
 
 
+def texels() -> BounceScene:
+    """The block has texels of which the nearest is taken."""
+    found = cornell()
+    own = found.meshes["block"]
+    look = eg.Texture(torch.rand(4, 4, 1, dtype=F64, generator=torch.Generator().manual_seed(1)), filter="nearest")
+    uvs = 1.5 * own.verts[:, :2]
+    own = own.replace(face_colors=None, uvs=uvs, uv_faces=own.faces, material=eg.Material(look))
+    return found._replace(meshes=found.meshes | {"block": own})
+
+
 # A mesh that moves, its direction, and the vertex that alone does.
 Motion = tuple[str, tuple[float, float, float]] | tuple[str, tuple[float, float, float], int]
 ASKEW = (1.0, 0.5, -0.3)
@@ -231,6 +241,7 @@ SCENES: dict[str, tuple[Callable[[], BounceScene], dict[str, Motion]]] = {
         open_plates,
         {"right vertex": ("right", (1.0, 0.3, 0.2), 2), "left y": ("left", Y), "lamp y": ("lamp", Y)},
     ),
+    "texels": (texels, {"block x": ("block", X)}),
     "sunk": (sunk, {"block x": ("block", X), "block y": ("block", Y)}),
     "shelf": (shelf, {"shelf x": ("shelf", X)}),
     "leaf": (leaf, {"leaf y": ("leaf", Y)}),
