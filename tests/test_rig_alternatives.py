@@ -78,12 +78,12 @@ def test_crossed_legs_are_found() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "most"), ((4, 12.0), (7, 3.0)))
-def test_twists_are_found(seed: int, most: float) -> None:
+@pytest.mark.parametrize("seed", (pytest.param(4, marks=pytest.mark.xfail(reason="half of the shared twist stays")), 7))
+def test_twists_are_found(seed: int) -> None:
     """Descents end with an arm and its elbow 20° to 45° twisted against each other, and the outlines less than a pixel off (7);
-    with a hand 86° across its true place, and a shoulder and its arm twisted by 15°, of which half may stay (4)."""
+    with a hand 86° across its true place, and a shoulder and its arm twisted by 15° (4)."""
     _, truth, _, fit = body.trial(seed, progress=False)
-    assert fit.converged and float(body.Errors.of(fit.rig, fit.values["rotations"], truth).rotation.max()) < most
+    assert fit.converged and float(body.Errors.of(fit.rig, fit.values["rotations"], truth).rotation.max()) < 3.0
 
 
 def arm_of(rig: eg.Rig) -> tuple[Sought, Alternatives]:
@@ -118,6 +118,7 @@ def test_twists_are_found_by_the_loss_along_them() -> None:
     rig, cameras = figure.figure(fine=4), figure.cameras(64)[:3]
     sought, alternatives = arm_of(rig)
     parameter = sought.parameters["rotations"]
+    assert parameter.value is not None
     truth = {"rotations": parameter.value}
     masks = [
         eg.render_aovs(rig.posed(sought.fixed["rotations"]), c, ["alpha"], spp=64, seed=5)["alpha"] for c in cameras
