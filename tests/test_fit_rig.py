@@ -63,6 +63,10 @@ def test_a_pose_from_masks() -> None:
     assert found.uncertainty is not None and found.reason == "converged"
     unsure = replace(found, uncertainty=replace(found.uncertainty, degrees={"bone 0": 1.0, "bone 1": 7.0}, axes={}))
     assert not unsure.converged and "rotations unknown: bone 1 known to ±7° only" in unsure.reason
+    # A limb in another's place still shows some edges, but fewer than the others.
+    for share, enough in ((0.8, False), (0.9, True)):
+        aside = replace(found, explained={"bone 0": 0.99, "bone 1": share, "bone 2": 0.98, "bone 3": 0.99})
+        assert aside.converged == enough and ("80% at bone 1" in aside.reason) != enough
 
 
 def test_a_pose_from_pictures_with_limits_and_some_joints() -> None:

@@ -15,7 +15,7 @@ Prior = Callable[[Mapping[str, Tensor]], Tensor]
 PLACE = ("translation", "orientation", "scale")
 
 
-def towards(rest: Mapping[str, Tensor], weight: float = 1e-6) -> Prior:
+def towards(rest: Mapping[str, Tensor], weight: float = 1e-7) -> Prior:
     """Σ (x − rest)² over all values but those of the whole's place; rotations are in radians."""
 
     def prior(values: Mapping[str, Tensor]) -> Tensor:
@@ -29,7 +29,7 @@ def towards(rest: Mapping[str, Tensor], weight: float = 1e-6) -> Prior:
 
 
 def mirrored(
-    name: str, pairs: Sequence[tuple[int, int]], signs: Sequence[float] = (1.0, -1.0, -1.0), weight: float = 1e-6
+    name: str, pairs: Sequence[tuple[int, int]], signs: Sequence[float] = (1.0, -1.0, -1.0), weight: float = 1e-7
 ) -> Prior:
     """Σ |x_left − s x_right|² over pairs of rows of a control: with these signs of rotation vectors, mirrored at x = 0 where the
     joints' own axes are the world's."""
@@ -42,7 +42,7 @@ def mirrored(
     return prior
 
 
-def near(before: Mapping[str, Tensor], weight: float = 1e-5) -> Prior:
+def near(before: Mapping[str, Tensor], weight: float = 1e-6) -> Prior:
     """Σ (x − before)² over all values: smooth over time, where `before` is the pose of the last frame, or what it leads to."""
 
     def prior(values: Mapping[str, Tensor]) -> Tensor:

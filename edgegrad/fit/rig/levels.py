@@ -47,7 +47,8 @@ FINER = 4  # times as many samples on the last level, where twists of limbs are 
 NEAR = 10.0  # what is left of the loss, in units of its noise, from which steps go far where pictures show little:
 HARDLY_SEEN = 1e-6  # of the largest curvature, beside what damps a step,
 NEAR_DAMPING = 1e-4  # and that: shared twists go all the way before the loss, which hardly tells, seems at rest
-GROWTH = 3.0  # a prior's weight grows by this power of how much coarser the pictures are
+GROWTH = 3.0  # a prior's weight grows by this power of how much coarser than their own size pictures are,
+COARSER = 10.0  # and so many times: at their own size a pull to rest would outweigh what tells twists
 COARSE = 15  # steps at most of each level before the last
 F64 = torch.float64
 
@@ -153,7 +154,7 @@ class Levels:
         """One level; the best values are in the result's."""
         factor = self.factors[level]
         views = [view.resized(factor) for view in self.views]
-        grown = factor**-GROWTH
+        grown = COARSER * factor**-GROWTH if factor < 1.0 else 1.0
 
         def prior(tensors: Mapping[str, Tensor]) -> Tensor:
             known = self.sought.values(tensors)

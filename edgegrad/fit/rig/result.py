@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from ..verdict import ENOUGH
 from .uncertainty import JointUncertainty
 
 REGION = 0.01  # of a mask's area: a region of it is a limb that is missed
+BESIDE_OTHERS = 0.85  # of the median joint's share of edges, which a wrong place has less of
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,10 @@ class RigFit:
 
     @property
     def _missing(self) -> list[str]:
-        return [name for name, share in self.explained.items() if share < ENOUGH]
+        if not self.explained:
+            return []
+        least = max(ENOUGH, BESIDE_OTHERS * statistics.median(self.explained.values()))
+        return [name for name, share in self.explained.items() if share < least]
 
     @property
     def loss(self) -> float:
