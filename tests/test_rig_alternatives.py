@@ -1,7 +1,9 @@
 """Poses that outlines hardly tell from another one: two limbs exchanged, a twist shared in another way."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -10,7 +12,7 @@ import edgegrad as eg
 from edgegrad.fit import Options
 from edgegrad.fit.descent.objective import Objective
 from edgegrad.fit.rig.alternatives import Alternatives, exchanged
-from edgegrad.fit.rig.limbs import limbs
+from edgegrad.fit.rig.limbs import Limb, Search, Values, limbs
 from edgegrad.fit.rig.sought import Sought
 from edgegrad.fit.rig.twists import untwisted
 from edgegrad.fit.views import views_of
@@ -136,3 +138,39 @@ def test_twists_are_found_by_the_loss_along_them() -> None:
         found = untwisted(objective, alternatives, parameter, start)["rotations"]
         R, S = (roma.rotvec_to_rotmat(one) for one in (found, truth["rotations"]))
         assert float(roma.rotmat_geodesic_distance(R, S).max()) < most
+
+
+@pytest.mark.parametrize(("nearly", "costs", "tries"), [(True, [1.0], 6), (False, [1.0], 20), (True, [0.9, 0.89], 7)])
+def test_tries_that_gain_nothing_end(nearly: bool, costs: list[float], tries: int) -> None:
+    """Where pictures are explained but for what a finer level tells, after six; else all of them."""
+
+    class Same:
+        worse, gain = 2.0, 0.0
+
+        def cost(self, values: Values) -> float:
+            return 1.0
+
+        def explained(self, values: Values) -> bool:
+            return False
+
+        def nearly(self, values: Values) -> bool:
+            return nearly
+
+        def off(self, values: Values) -> torch.Tensor:
+            return torch.ones(1)
+
+        def renew(self, values: Values) -> None:
+            pass
+
+    class Few(Search):
+        def better(self, best: tuple[Values, float], starts: Sequence[Values], limb: Limb) -> tuple[Values, float]:
+            return (dict(best[0]), costs[len(told)]) if len(told) < len(costs) and costs[len(told)] < 1.0 else best
+
+        def drawn(self, best: Values, limb: Limb) -> list[Values]:
+            return []
+
+    told: list[None] = []
+    nothing: Any = None
+    search = Few(nothing, Same(), "x", [Limb([0])], {}, torch.zeros(1), nothing, nothing, 0, lambda: told.append(None))
+    search.run({"x": torch.zeros(1)}, 20)
+    assert len(told) == tries

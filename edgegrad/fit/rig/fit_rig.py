@@ -57,8 +57,8 @@ def fit_rig(
     keypoint_weight  of the mean over all of them, of squared distances in units of 2 % of the picture
     coarsest   pixels on the shorter side of the pictures of the first level; each further one has twice as many
     tries      how often at most a limb is drawn anew, on each level of 24 to 96 pixels, to leave places where a descent
-               ends; it ends where pictures are explained. Pairs of limbs change places before that, and other twists are tried
-               on the last level. 0, without all this, for a start nearby
+               ends; it ends where pictures are explained, or nearly so while tries gain nothing. Pairs of limbs change places
+               before that, and other twists are tried on the last level. 0, without all this, for a start nearby
     look       makes of what is posed what is rendered: with lights, a background
     parameters  of `look`, which are sought too and given to it by name: look(posed, light=…)
     options    see edgegrad.fit.Options; `steps` are those of the last level, at most 15 on those before, and the last has four

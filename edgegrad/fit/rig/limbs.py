@@ -30,6 +30,8 @@ DRAWS = 64  # turns of a limb that are looked at
 SPREADS = 0.2, 0.4  # radians, of each component, by turns
 SHARE = 0.4  # of all rows: a joint with more below it is turned alone
 EXPLAINED = 1.5  # of the loss by noise alone: less is not to be mended
+NEARLY = 3.0  # and less than this is left to a finer level, once
+IDLE, FALL = 6, 0.05  # so many tries one after the other have not lowered the loss by this part
 APART = 0.3  # radians of a joint at least, by which a turn is another place
 TWISTS = -0.7, -0.35, 0.35, 0.7  # radians
 SWEEPS, WORST = 2, 5  # and the joints in each, where most is left of the pictures in units of noise
@@ -91,6 +93,10 @@ class Judge(Protocol):
 
     def explained(self, values: Values) -> bool: ...
 
+    def nearly(self, values: Values) -> bool:
+        """Whether it is explained but for what a finer level tells better."""
+        ...
+
     def off(self, values: Values) -> Tensor:
         """(rows, …): how wrong the pictures are where each row of the value that is searched moves them."""
         ...
@@ -113,8 +119,14 @@ class ByLoss:
         return loss_of(self.objective, values)
 
     def explained(self, values: Values) -> bool:
+        return self._left(values) < EXPLAINED
+
+    def nearly(self, values: Values) -> bool:
+        return self._left(values) < NEARLY
+
+    def _left(self, values: Values) -> float:
         with torch.no_grad():
-            return self.objective.left(values) < EXPLAINED
+            return self.objective.left(values)
 
     def off(self, values: Values) -> Tensor:
         return misfit(self.objective, values, 0)[self.name]
@@ -139,6 +151,9 @@ class ByContour:
 
     def explained(self, values: Values) -> bool:
         return float(self.off(values).max()) < 1.0 - ENOUGH
+
+    def nearly(self, values: Values) -> bool:
+        return False  # no finer level draws limbs anew
 
     def off(self, values: Values) -> Tensor:
         self.renew(values)
@@ -183,16 +198,19 @@ class Search:
             if pair.twins is not None:
                 start = {**best[0], self.name: self.within(self.alternatives.exchanged(best[0], *pair.twins))}
                 best = self.better(best, [start], pair)
-        chances = self.chances(best[0])
+        chances, idle = self.chances(best[0]), 0
         for _ in range(0 if self.judge.explained(best[0]) else tries):
             limb = self.groups[int(torch.multinomial(chances, 1, generator=self.generator))]
             found = self.better(best, self.drawn(best[0], limb), limb)
+            idle = 0 if found[1] < (1.0 - FALL) * best[1] else idle + 1
             if found is not best:
                 best = found
                 if self.judge.explained(best[0]):
                     break
                 chances = self.chances(best[0])
             self.tell()
+            if idle >= IDLE and self.judge.nearly(best[0]):
+                break
         self.judge.renew(best[0])
         return best[0]
 
