@@ -58,7 +58,7 @@ fit = eg.fit.fit_pose(mesh, target, camera, init=torch.eye(4), callback=stop, pr
 assert fit.interrupted and fit.steps
 eg.fit.fit_scene(mesh, camera, [target], {"verts": 1e-3}, steps=1, progress=False)
 derivatives(eg.Scene([mesh]), camera, ["image", "alpha", "normal"], Motion.about(torch.zeros(3)))
-libraries = {"roma", "trimesh", "matplotlib", "OpenImageIO"}
+libraries = {"roma", "trimesh", "matplotlib", "OpenImageIO", "PIL", "viser"}
 slow = sorted({"torch._dynamo", "torch._inductor", "torch._decomp.decompositions_for_jvp", *libraries} & set(sys.modules))
 assert not slow, slow
 """
