@@ -38,6 +38,7 @@ def test_a_network_and_the_shape_under_it() -> None:
     assert abs(tube - network.TRUE_TUBE) < 0.5 * abs(network.FIRST_TUBE - network.TRUE_TUBE)
 
 
+@pytest.mark.slow
 def test_steps() -> None:
     step = example("step", size=64)
     _, found = step.fit(steps=50)

@@ -172,13 +172,13 @@ def test_boxes_hold_what_they_say(view: eg.Camera) -> None:
 def test_bending(view: eg.Camera) -> None:
     """The kernel's derivatives of a position by the point, K and the coefficients: against autograd, in both modes."""
     rng = np.random.default_rng(2)
-    M, bar, k_dot = view.world_to_camera, rng.normal(size=2), rng.normal(size=14)
+    M, bar, k_dot, end = view.world_to_camera, rng.normal(size=2), rng.normal(size=14), rim(view)
     for window, turn in windows(view):
         for n in rng.uniform(-0.95, 0.95, (5, 2)):
             q = torch.from_numpy(np.array(turn).T @ [*n, 1.0]).requires_grad_()
             leaves = [q, view.K.clone().requires_grad_(), view.coefficients.clone().requires_grad_()]
             x, y, z = q.tolist()
-            if math.atan2(math.hypot(x, y), z) > rim(view):
+            if math.atan2(math.hypot(x, y), z) > end:
                 continue
             p = (leaves[0] - M[:3, 3]) @ M[:3, :3]
             x = view.replace(K=torch.cat([leaves[1][:2], view.K[2:]]), distortion=leaves[2]).project(p)
