@@ -349,18 +349,20 @@ def test_transforms() -> None:
     def channels(theta: Tensor) -> dict[str, Tensor]:
         return eg.render_aovs(*moved(scene, camera, theta), names, 16, **many)
 
+    still = channels(torch.zeros(3, dtype=F64))
     primal, tangent = cast(Any, torch.func.jvp)(channels, (torch.zeros(3, dtype=F64),), (direction,))
     theta = torch.zeros(3, dtype=F64, requires_grad=True)
     for name, product in products(channels(theta)).items():
-        assert torch.equal(primal[name], channels(torch.zeros(3, dtype=F64))[name])
+        assert torch.equal(primal[name], still[name])
         (reverse,) = torch.autograd.grad(product, theta, retain_graph=True)
         forward = products({name: tangent[name]})[name]
         assert abs(forward - reverse @ direction) < 0.03 * (reverse * direction).abs().sum(), name
     ids = torch.func.vmap(lambda t: eg.render_aovs(*moved(scene, camera, t), ["face_id", "alpha"]))
     rows = torch.stack([torch.zeros(3, dtype=F64), 0.1 * direction])
+    found = ids(rows)
     for i, row in enumerate(rows):
         for name, x in eg.render_aovs(*moved(scene, camera, row), ["face_id", "alpha"]).items():
-            assert torch.equal(ids(rows)[name][i], x)
+            assert torch.equal(found[name][i], x)
 
 
 def test_jvp_of_channels() -> None:

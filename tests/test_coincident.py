@@ -269,7 +269,7 @@ def test_what_a_convex_surface_hides_moves_nothing() -> None:
     colors = torch.rand(len(faces), 3, generator=torch.Generator().manual_seed(0), dtype=F64)
     camera = eg.Camera.look_at((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 45.0, (256, 256)).to(F64)
     wrong = seen = 0
-    for seed in range(6):
+    for seed in range(4):
         turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=F64))
         verts = (sphere.verts @ turn * turn.det()).float().requires_grad_()
         mesh = eg.Mesh(verts, faces, face_colors=colors)
@@ -282,6 +282,6 @@ def test_what_a_convex_surface_hides_moves_nothing() -> None:
         assert verts.grad is not None
         wrong += int((verts.grad[hidden] != 0).any(1).sum())
         seen += int((verts.grad[~hidden] != 0).any(1).sum())
-    assert seen > 6 * 0.3 * len(sphere.verts)
+    assert seen > 4 * 0.3 * len(sphere.verts)
     # One in a million may be left, where the faces before it are narrower than rays err.
     assert wrong <= 1

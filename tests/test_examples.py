@@ -82,6 +82,7 @@ def test_a_focal_length_and_a_pose() -> None:
     assert abs(before) > 3.0 and abs(after) < 1.0 and fit.converged
 
 
+@pytest.mark.slow
 def test_a_texture() -> None:
     texture = example("texture")
     mesh = texture.objects.pebble(64, 3)

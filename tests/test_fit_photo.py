@@ -340,7 +340,12 @@ def depth_of(view):
 
 @pytest.mark.parametrize(
     ("kind", "degrees", "percent"),
-    [("colours", 2.5, 0.6), ("plain", 3.0, 0.9), ("mask", 1.1, 0.6), ("depth", 0.3, 0.1)],
+    [
+        ("colours", 2.5, 0.6),
+        pytest.param("plain", 3.0, 0.9, marks=pytest.mark.slow),
+        ("mask", 1.1, 0.6),
+        ("depth", 0.3, 0.1),
+    ],
 )
 def test_a_pose_in_a_photograph(taken, kind, degrees, percent):
     view, image = taken

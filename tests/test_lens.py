@@ -115,7 +115,7 @@ def test_area_of_a_triangle(lens: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:distortion")
-@pytest.mark.parametrize("degrees", [0, 40, 70, 80])
+@pytest.mark.parametrize("degrees", [*(pytest.param(d, marks=pytest.mark.slow) for d in (0, 40)), 70, 80])
 def test_area_in_a_wide_fisheye(degrees: int) -> None:
     """The image reaches beyond 88°, where a fisheye ends."""
     K = torch.tensor([[14.0, 0.0, 23.5], [0.0, 14.0, 19.5], [0.0, 0.0, 1.0]], dtype=F64)

@@ -142,7 +142,13 @@ def test_a_wrong_gradient_is_rejected(triangle):
     assert (row["verdict"], row["worst"]) == (WRONG, "skew")
 
 
-@pytest.mark.parametrize("name", ["keyhole", "bounced-mirror", "all-cancels", "bounced-standing", "bounced-million"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("keyhole", "bounced-mirror", "bounced-million"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("all-cancels", "bounced-standing")),
+    ],
+)
 def test_bounces_without_borders_are_rejected(name, monkeypatch):
     """Without the borders of what surfaces see of one another the gradient is wrong."""
     if name == "bounced-million":
@@ -321,13 +327,13 @@ def run(*arguments):
 
 
 def test_command(tmp_path, capsys, monkeypatch):
-    for name in [case.name for case in CASES.values() if case.group == "coincident"][6:]:
+    for name in [case.name for case in CASES.values() if case.group == "coincident"][2:]:
         monkeypatch.delitem(CASES, name)
     assert run("--case", "crop", "coincident", "--quick", "--out", tmp_path) == 0
     document = json.loads((tmp_path / "stability.json").read_text())
     names = [row["name"] for row in document["cases"]]
     assert names[0] == "crop" and {case.name for case in CASES.values() if case.group == "coincident"} == set(names[1:])
-    assert len(names) == 7
+    assert len(names) == 3
     assert document["settings"]["quick"] and document["settings"]["kernel"]
     text = (tmp_path / "stability.md").read_text()
     assert all(f"| {name} |" in text for name in names)

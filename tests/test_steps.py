@@ -232,7 +232,9 @@ def test_texels_much_smaller_than_pixels(repeats):
 # -- the image --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("camera", [CAMERA, FLAT], ids=["perspective", "orthographic"])
+@pytest.mark.parametrize(
+    "camera", [pytest.param(CAMERA, id="perspective"), pytest.param(FLAT, id="orthographic", marks=pytest.mark.slow)]
+)
 def test_equals_the_twin(camera):
     """Which is brute force over all faces."""
     scene = eg.Scene([cut(2), ball(), behind()], BACK)
