@@ -171,7 +171,7 @@ def test_a_picture_from_the_bottom_up_is_named(masked):
     target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
     told = {"mask": mask} if masked else {"background": BACKGROUND}
     with pytest.warns(UserWarning, match=r"^target: expected the upper row first.*image\.flip\(0\)"):
-        fit = fit_pose(bracket(), target, view, init=START, progress=False, steps=4, **told)
+        fit = fit_pose(bracket(), target, view, init=START, progress=False, search=False, steps=4, **told)
     assert not fit.converged
 
 
@@ -377,12 +377,12 @@ def test_pictures_and_masks_of_bytes_are_named():
     image = picture(view)
     bytes_ = (255 * image / image.max()).round()
     with pytest.warns(UserWarning, match=r"target: expected linear radiance.*whole numbers up to 255.*srgb_to_linear"):
-        fit_pose(bracket(), bytes_, view, silhouette(view), init=START, steps=1, progress=False)
+        fit_pose(bracket(), bytes_, view, silhouette(view), init=START, steps=1, search=False, progress=False)
     resized = 40.0 + 0.7 * bytes_  # no whole numbers any more
     with pytest.warns(
         UserWarning, match=r"target: expected linear radiance.*got numbers up to 218.*srgb_to_linear\(x / 255"
     ):
-        fit_pose(bracket(), resized, view, silhouette(view), init=START, steps=1, progress=False)
+        fit_pose(bracket(), resized, view, silhouette(view), init=START, steps=1, search=False, progress=False)
     with pytest.raises(
         ValueError, match=r"mask: expected numbers from 0 to 1, got 0 to 255; of 8-bit numbers take x / 255"
     ):

@@ -399,7 +399,7 @@ def test_a_sphere_sunk_to_edges_that_lie_in_a_sheet(mesh):
             return eg.Scene([both.transformed(t=theta * ALONG)], BACKGROUND), camera
         return eg.Scene([ball.transformed(t=theta * ALONG), sheet.transformed(t=theta * ALONG)], BACKGROUND), camera
 
-    check_ratio(shifted, 0.006, spp=768, **SAMPLES)
+    check_ratio(shifted, 0.006, spp=384, **SAMPLES)
 
     def sunk(theta: Tensor):
         t = theta * torch.tensor([0.0, 0.0, 1.0], dtype=F64)

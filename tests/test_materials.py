@@ -348,10 +348,11 @@ def by_material(name: str) -> Case:
     ],
 )
 def test_gradients_by_materials_are_finite_differences(name: str):
-    moves = name in ("verts", "flat")
+    moves, smooth = name in ("verts", "flat"), name in ("base_color", "metallic", "emission")
     options = {"shadows": False}
-    exact = by_quadrature(by_material(name), 0.02 if moves else 1e-3, 24 if moves else 10, **options)
-    samples = {"surface_samples": 40_000 if moves else 30_000, "edge_samples": 40_000 if moves else 1000}
+    exact = by_quadrature(by_material(name), 0.02 if moves else 1e-3, 24 if moves else 6 if smooth else 8, **options)
+    samples = {"surface_samples": 40_000 if moves else 6_000 if smooth else 30_000}
+    samples["edge_samples"] = 40_000 if moves else 1000
     seeds = {"flat": 8, "verts": 12, "normals": 8, "roughness": 8}.get(name, 4)
     check(name, exact, gradient(by_material(name), seeds, **samples, **options))
 
