@@ -171,7 +171,7 @@ def test_a_picture_from_the_bottom_up_is_named(masked):
     target, mask = picture(view).flip(0), silhouette(view).flip(0) if masked else None
     told = {"mask": mask} if masked else {"background": BACKGROUND}
     with pytest.warns(UserWarning, match=r"^target: expected the upper row first.*image\.flip\(0\)"):
-        fit = fit_pose(bracket(), target, view, init=START, progress=False, search=False, steps=4, **told)
+        fit = fit_pose(bracket(), target, view, init=START, progress=False, steps=4, **told)
     assert not fit.converged
 
 
