@@ -37,9 +37,7 @@ def face_colored(mesh: eg.Mesh, seed: int = 0) -> eg.Mesh:
 def check(
     case: Callable[[Tensor], list[eg.Mesh]], view: str, step: float = 0.004, spp: int = 1024, **options: object
 ) -> None:
-    check_ratio(
-        lambda theta: (eg.Scene(case(theta), BACKGROUND), VIEWS[view]), step, spp=spp, **{**SAMPLES, **options}
-    )
+    check_ratio(lambda theta: (eg.Scene(case(theta), BACKGROUND), VIEWS[view]), step, spp=spp, **{**SAMPLES, **options})
 
 
 @pytest.mark.parametrize("moved", ["along", "scale", "turn"])

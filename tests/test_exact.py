@@ -30,7 +30,10 @@ SCENES = {
 }
 # The slivers are laid out for the perspective camera.
 CASES = [
-    (name, p) for name in SCENES for p in ("perspective", "orthographic") if (name, p) != ("slivers", "orthographic")
+    pytest.param(name, p, marks=[pytest.mark.slow] if (name, p) == ("sphere", "orthographic") else [])
+    for name in SCENES
+    for p in ("perspective", "orthographic")
+    if (name, p) != ("slivers", "orthographic")
 ]
 Render = Callable[[eg.Scene, eg.Camera], Tensor]
 

@@ -400,7 +400,7 @@ def test_white_may_be_any_brighter_colour():
 
 def test_two_meshes_that_end_in_one_place_have_not_converged():
     """The picture shows one of them. Two steps leave both about where they start; where many take them depends on rounding."""
-    view = view_of(96)
+    view = view_of(72)
     beside_it = beside(MESHES[0], TRUTHS[0], (0.0, 0.0, 0.03), (0.03, 0.02, 0.02))
     image = photograph(view, scene_of(1), seed=4)
     starts = [TRUTHS[0], beside_it]

@@ -150,7 +150,7 @@ def test_a_border_of_many_colours_is_clutter():
     ("size", "steps", "alike"),
     [
         pytest.param(64, 4, 0.6, marks=pytest.mark.slow),
-        (32, 4, 0.8),
+        pytest.param(32, 4, 0.8, marks=pytest.mark.slow),  # quick for photographs, in test_fit_photo.py
         pytest.param(32, 21, 0.8, marks=pytest.mark.slow),
     ],
 )

@@ -527,7 +527,7 @@ def test_textured_faces_by_samples_of_pixels(samples: int | None, view: str, fil
     generator = torch.Generator().manual_seed(3)
     texture, camera = torch.rand(16, 16, 3, generator=generator), AROUND_PYRAMID[view]
     weights, found = torch.rand(*camera.size, 3, generator=generator), []
-    for seed in range(24 if samples is None else 96):
+    for seed in range(12 if samples is None else 48):
         texture = texture.detach().requires_grad_()
         image = eg.render(
             pyramid(texture), camera, spp=64, seed=seed, filter=filter, surface_samples=samples, visibility=False
