@@ -27,14 +27,14 @@ def example(name: str, size: int | None = None) -> ModuleType:
 
 
 def test_a_texture_and_its_light() -> None:
-    pictures, before, after = example("harmonics").fit(steps=20)
+    pictures, before, after = example("harmonics", size=64).fit(steps=20)
     assert after < 0.5 * before
     assert len(pictures) == 3
 
 
 def test_a_network_and_the_shape_under_it() -> None:
     network = example("network", size=48)
-    _, tube = network.fit(steps=60)
+    _, tube = network.fit(steps=45)
     assert abs(tube - network.TRUE_TUBE) < 0.5 * abs(network.FIRST_TUBE - network.TRUE_TUBE)
 
 
@@ -198,7 +198,7 @@ def test_the_corners_of_a_cube_from_16_pixels(exact: bool, steps: int, off: floa
 
 def test_a_texture_with_mipmaps_and_without() -> None:
     earth = example("raster_earth")
-    (_, without), (_, mipmaps) = (earth.fit(mipmaps, steps=60, size=32) for mipmaps in (False, True))
+    (_, without), (_, mipmaps) = (earth.fit(mipmaps, steps=40, size=32) for mipmaps in (False, True))
     assert mipmaps > without + 1.0
 
 

@@ -105,7 +105,10 @@ def test_shadow_of_nearest_texels(motion: str) -> None:
     check(f"nearest, {motion}", exact(motion, kind=Nearest), found)
 
 
-@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize(
+    "motion",
+    [m if m in ("light moves", "u moves") else pytest.param(m, marks=pytest.mark.slow) for m in Setting.motions],
+)
 def test_penumbra_of_a_rim(motion: str) -> None:
     found = estimate([gradient(motion, panel, seed, Setting, edge_samples=16_000) for seed in range(4)])
     check(f"panel, {motion}", of_panel(motion, Setting), found)
