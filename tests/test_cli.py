@@ -17,7 +17,7 @@ import edgegrad_cli as cli
 from edgegrad import demo
 from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
-from edgegrad.fit import PoseFit, fit_pose
+from edgegrad.fit import PoseFit, fit_camera, fit_pose
 from edgegrad_cli import doctor, inputs, outputs
 
 
@@ -402,7 +402,8 @@ def test_fit_texture(sphere, capsys):
     assert "--camera: expected 1, one for each image, got 2" in capsys.readouterr().err
 
 
-def test_fit_camera(files, capsys):
+def test_fit_camera(files, capsys, monkeypatch):
+    monkeypatch.setattr("edgegrad.fit.fit_camera", partial(fit_camera, search=False))
     out = files / "out"
     said = ["fit-camera", files / "mesh.ply", files / "target.png", "--camera", files / "camera.json", "--steps", 4]
     assert run(*said, "--no-focal", "--out", out) == 0

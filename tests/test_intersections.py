@@ -502,7 +502,7 @@ def test_whether_they_are_drawn_does_not_depend_on_where_the_vertices_were():
         verts = (ball.verts + size * noise).requires_grad_()
         return torch.autograd.grad(eg.render(ball.replace(verts=verts), camera, spp=4), verts, adjoint)[0]
 
-    for size in torch.linspace(0.05, 0.062, 13).tolist():
+    for size in torch.linspace(0.05, 0.062, 7).tolist():
         core.clear_geometry()
         first = gradient(size)
         for before in (0.3, 0.6):

@@ -272,7 +272,11 @@ def test_area_of_a_triangle_that_reaches_around() -> None:
 
 @pytest.mark.unwatched
 @pytest.mark.parametrize(
-    ("place", "what"), [("beside", "vertices"), ("behind", "d1"), pytest.param("behind", "K11", marks=pytest.mark.slow)]
+    ("place", "what"),
+    [
+        ("behind", "d1"),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("beside", "vertices"), ("behind", "K11"))),
+    ],
 )
 def test_gradient(place: str, what: str) -> None:
     case = moved(lambda dx=0.0: both(PLACES[place], dx), camera(), what)
