@@ -154,7 +154,7 @@ def exact(motion: str, points: Tensor | None = None, infinite: bool = False, kin
     ],
 )
 def test_shadow_of_a_rectangle(motion: str, light: str) -> None:
-    found = estimate([gradient(motion, LIGHTS[light], seed) for seed in range(6)])
+    found = estimate([gradient(motion, LIGHTS[light], seed) for seed in range(4)])
     check(f"{light}, {motion}", exact(motion, infinite=light == "sun"), found)
 
 
@@ -185,7 +185,7 @@ OF_PANELS = ("caster moves", "caster rises", "light moves", "ground rises")
     "motion", [motion if motion in OF_PANELS else pytest.param(motion, marks=pytest.mark.slow) for motion in MOTIONS]
 )
 def test_penumbra_of_a_rectangle(motion: str) -> None:
-    found = estimate([gradient(motion, panel, seed) for seed in range(8)])
+    found = estimate([gradient(motion, panel, seed) for seed in range(4)])
     check(f"panel, {motion}", of_panel(motion), found)
 
 
