@@ -76,7 +76,7 @@ def check_strip(strip: Strip, looks: tuple[str, str], samples: int, finer: tuple
 @pytest.mark.usefixtures("alone")
 @pytest.mark.parametrize("looks", [("lambert", "lambert"), ("glossy", "lambert"), ("lambert", "glossy")], ids="-".join)
 def test_strip_between_two_faces(looks: tuple[str, str]) -> None:
-    check_strip(Strip.standard(), looks, 1_600_000 if looks[1] == "glossy" else 800_000)
+    check_strip(Strip.standard(), looks, 1_600_000)
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ def face_colored(mesh: eg.Mesh, seed: int = 0) -> eg.Mesh:
 
 
 def check(
-    case: Callable[[Tensor], list[eg.Mesh]], view: str, step: float = 0.004, spp: int = 512, **options: object
+    case: Callable[[Tensor], list[eg.Mesh]], view: str, step: float = 0.004, spp: int = 1024, **options: object
 ) -> None:
     check_ratio(lambda theta: (eg.Scene(case(theta), BACKGROUND), VIEWS[view]), step, spp=spp, **{**SAMPLES, **options})
 
@@ -75,7 +75,7 @@ def test_two_sheets_behind_one_another(moved: str) -> None:
 @pytest.mark.parametrize(("copies", "view"), diagonal([2, 3], list(VIEWS)))
 def test_meshes_in_the_same_place(copies: int, view: str) -> None:
     sphere = icosphere(2).transformed(scale=0.7)
-    check(lambda theta: [sphere.transformed(t=theta * ALONG)] * copies, view, spp=1024, edge_samples=20_000)
+    check(lambda theta: [sphere.transformed(t=theta * ALONG)] * copies, view, edge_samples=20_000)
 
 
 @pytest.mark.parametrize(
