@@ -67,7 +67,10 @@ def mean_z2(samples: list[Tensor], exact: Tensor) -> float:
     return (deviation[varies] / error[varies]).square().mean().item()
 
 
-@pytest.mark.parametrize(("name", "projection"), CASES)
+@pytest.mark.parametrize(
+    ("name", "projection"),
+    [pytest.param(*case.values, marks=pytest.mark.slow) if "slivers" in case.values else case for case in CASES],
+)
 def test_image(name: str, projection: str) -> None:
     scene, camera = SCENES[name](), front_camera(SIZE, projection)
     exact = exact_image(scene, camera)

@@ -32,6 +32,7 @@ def test_a_texture_and_its_light() -> None:
     assert len(pictures) == 3
 
 
+@pytest.mark.slow
 def test_a_network_and_the_shape_under_it() -> None:
     network = example("network", size=48)
     _, tube = network.fit(steps=45)
@@ -63,6 +64,7 @@ def test_an_environment_in_a_mirror() -> None:
     assert mirror.error(found) < 0.4 * mirror.error(torch.full_like(found, 0.4))
 
 
+@pytest.mark.slow
 def test_a_shape_and_its_shadow() -> None:
     _, shape, found = example("shadow").fit(steps=72, size=32)
     before, after = ((d - shape.truth()).square().mean().sqrt() for d in (torch.full_like(found, 0.45), found))
@@ -196,6 +198,7 @@ def test_the_corners_of_a_cube_from_16_pixels(exact: bool, steps: int, off: floa
     assert before.corners > 0.5 and after.corners < off and after.colors < off
 
 
+@pytest.mark.slow
 def test_a_texture_with_mipmaps_and_without() -> None:
     earth = example("raster_earth")
     (_, without), (_, mipmaps) = (earth.fit(mipmaps, steps=40, size=32) for mipmaps in (False, True))

@@ -223,7 +223,9 @@ class Stopped(Exception):
     pass
 
 
-@pytest.mark.parametrize("soup", [False, True], ids=["grid", "soup"])
+@pytest.mark.parametrize(
+    "soup", [pytest.param(False, id="grid", marks=pytest.mark.slow), pytest.param(True, id="soup")]
+)
 def test_a_signal_handler_stops_the_making_of_geometry(soup: bool):
     """At whatever point of it, in less than a fifth of the time that it takes; and what is rendered next is right."""
     n = 200 if soup else 300
