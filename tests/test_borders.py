@@ -41,7 +41,7 @@ def dots(hits: eg.Hits) -> Tensor:
     return hits.where(0.3 - x.norm(dim=1), 1.0, 0.0)
 
 
-@pytest.mark.parametrize("spp", [2, 16])
+@pytest.mark.parametrize("spp", [2, pytest.param(16, marks=pytest.mark.slow)])
 def test_what_one_pixel_alone_shows_keeps_its_mean(spp: int):
     found = images(300, dots, quad(), FLAT, spp)[:, 1::3, 1::3, 0]
     found = found.mean((1, 2))

@@ -74,7 +74,14 @@ def check_strip(strip: Strip, looks: tuple[str, str], samples: int, finer: tuple
 
 
 @pytest.mark.usefixtures("alone")
-@pytest.mark.parametrize("looks", [("lambert", "lambert"), ("glossy", "lambert"), ("lambert", "glossy")], ids="-".join)
+@pytest.mark.parametrize(
+    "looks",
+    [
+        pytest.param(("lambert", "lambert"), id="lambert-lambert"),
+        pytest.param(("glossy", "lambert"), id="glossy-lambert"),
+        pytest.param(("lambert", "glossy"), id="lambert-glossy", marks=pytest.mark.slow),
+    ],
+)
 def test_strip_between_two_faces(looks: tuple[str, str]) -> None:
     check_strip(Strip.standard(), looks, 1_600_000)
 

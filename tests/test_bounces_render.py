@@ -49,7 +49,7 @@ def check_points(room: str, bounces: int, rows: tuple[int, ...], paths: int) -> 
         )
 
 
-@pytest.mark.parametrize("room", ["lamp", "point"])
+@pytest.mark.parametrize("room", ["lamp", pytest.param("point", marks=pytest.mark.slow)])
 def test_points(room: str) -> None:
     check_points(room, 3, (20, 55), 30_000)
 

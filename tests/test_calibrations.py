@@ -292,7 +292,7 @@ CHILD = """
 import sys
 import edgegrad as eg
 for path in sys.argv[1:]:
-    for _ in range(5):
+    for _ in range(3):
         try:
             eg.load_cameras(path)
         except ValueError as error:

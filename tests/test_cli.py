@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ import edgegrad_cli as cli
 from edgegrad import demo
 from edgegrad.files.cameras import save_camera
 from edgegrad.files.image import linear_to_srgb, read_image, srgb_to_linear, write_image
-from edgegrad.fit import PoseFit
+from edgegrad.fit import PoseFit, fit_camera, fit_pose
 from edgegrad_cli import doctor, inputs, outputs
 
 
@@ -75,8 +76,9 @@ def test_fit_pose(files, capsys):
 
 
 @pytest.mark.parametrize("what", ["mask", *(pytest.param(w, marks=pytest.mark.slow) for w in ("background", "alpha"))])
-def test_fit_pose_with(what, files):
+def test_fit_pose_with(what, files, monkeypatch):
     view = camera(48)
+    monkeypatch.setattr("edgegrad.fit.fit_pose", partial(fit_pose, search=False))
     colour = "#" + bytes((linear_to_srgb(BACKGROUND) * 255).round().to(torch.uint8).tolist()).hex()
     more = {"mask": ["--mask", files / "mask.png"], "background": ["--background", colour], "alpha": []}[what]
     if what == "alpha":
@@ -400,7 +402,8 @@ def test_fit_texture(sphere, capsys):
     assert "--camera: expected 1, one for each image, got 2" in capsys.readouterr().err
 
 
-def test_fit_camera(files, capsys):
+def test_fit_camera(files, capsys, monkeypatch):
+    monkeypatch.setattr("edgegrad.fit.fit_camera", partial(fit_camera, search=False))
     out = files / "out"
     said = ["fit-camera", files / "mesh.ply", files / "target.png", "--camera", files / "camera.json", "--steps", 4]
     assert run(*said, "--no-focal", "--out", out) == 0

@@ -34,10 +34,10 @@ def face_colored(mesh: eg.Mesh, seed: int = 0) -> eg.Mesh:
     return eg.Mesh(mesh.verts, mesh.faces, face_colors=colors.repeat_interleave(2, 0))
 
 
-def check(case: Callable[[Tensor], list[eg.Mesh]], view: str, step: float = 0.004, **options: object) -> None:
-    check_ratio(
-        lambda theta: (eg.Scene(case(theta), BACKGROUND), VIEWS[view]), step, spp=1024, **{**SAMPLES, **options}
-    )
+def check(
+    case: Callable[[Tensor], list[eg.Mesh]], view: str, step: float = 0.004, spp: int = 1024, **options: object
+) -> None:
+    check_ratio(lambda theta: (eg.Scene(case(theta), BACKGROUND), VIEWS[view]), step, spp=spp, **{**SAMPLES, **options})
 
 
 @pytest.mark.parametrize("moved", ["along", "scale", "turn"])
@@ -75,7 +75,7 @@ def test_two_sheets_behind_one_another(moved: str) -> None:
 @pytest.mark.parametrize(("copies", "view"), diagonal([2, 3], list(VIEWS)))
 def test_meshes_in_the_same_place(copies: int, view: str) -> None:
     sphere = icosphere(2).transformed(scale=0.7)
-    check(lambda theta: [sphere.transformed(t=theta * ALONG)] * copies, view, edge_samples=80_000)
+    check(lambda theta: [sphere.transformed(t=theta * ALONG)] * copies, view, edge_samples=20_000)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,8 @@ def test_curves_of_which_no_sample_is_seen(flat: bool) -> None:
     check(
         lambda theta: [mesh.transformed(t=sign * depth + theta * ALONG) for mesh, sign in ((back, 1.0), (front, -1.0))],
         "orthographic",
-        edge_samples=40_000,
+        spp=256,
+        edge_samples=10_000,
     )
 
 
@@ -269,7 +270,7 @@ def test_what_a_convex_surface_hides_moves_nothing() -> None:
     colors = torch.rand(len(faces), 3, generator=torch.Generator().manual_seed(0), dtype=F64)
     camera = eg.Camera.look_at((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 45.0, (256, 256)).to(F64)
     wrong = seen = 0
-    for seed in range(6):
+    for seed in range(4):
         turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(seed), dtype=F64))
         verts = (sphere.verts @ turn * turn.det()).float().requires_grad_()
         mesh = eg.Mesh(verts, faces, face_colors=colors)
@@ -282,6 +283,6 @@ def test_what_a_convex_surface_hides_moves_nothing() -> None:
         assert verts.grad is not None
         wrong += int((verts.grad[hidden] != 0).any(1).sum())
         seen += int((verts.grad[~hidden] != 0).any(1).sum())
-    assert seen > 6 * 0.3 * len(sphere.verts)
+    assert seen > 4 * 0.3 * len(sphere.verts)
     # One in a million may be left, where the faces before it are narrower than rays err.
     assert wrong <= 1

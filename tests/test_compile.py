@@ -14,11 +14,13 @@ import edgegrad as eg
 
 
 @pytest.fixture
-def compiled() -> Iterator[Callable[..., None]]:
+def compiled() -> Iterator[Callable[..., Callable[..., Tensor]]]:
     """A check that a function, compiled in one graph, gives the image and the gradients that it gives by itself."""
     torch._dynamo.reset()
 
-    def check(function: Callable[..., Tensor], *calls: Sequence[object], backend: str = "aot_eager") -> None:
+    def check(
+        function: Callable[..., Tensor], *calls: Sequence[object], backend: str = "aot_eager"
+    ) -> Callable[..., Tensor]:
         fast = torch.compile(function, fullgraph=True, backend=backend)
         for arguments in calls:
             leaves = [a for a in arguments if isinstance(a, Tensor) and a.requires_grad]
@@ -29,6 +31,7 @@ def compiled() -> Iterator[Callable[..., None]]:
             # The same bits but for the order in which those of a tensor that is used several times are summed.
             for a, b in zip(grads, expected, strict=True):
                 assert float((a - b).abs().max()) <= 4 * torch.finfo(b.dtype).eps * float(b.abs().max())
+        return fast
 
     yield check
     torch._dynamo.reset()
@@ -75,23 +78,20 @@ def test_compile_once_for_many_seeds(compiled):
     compiled(function, *[(leaf(MESH.verts), *call) for call in calls])
 
 
+def refuses_what_is_not_finite(function, verts, *arguments):
+    """Values are not looked at while tracing; then the kernel's own checks take over."""
+    broken = verts.clone()
+    broken[1, 2] = torch.nan
+    with pytest.raises(ValueError, match=r"verts: expected finite numbers, got nan at \[1, 2\]"):
+        function(leaf(broken), *arguments)
+
+
 def test_compile_other_numbers_of_vertices(compiled):
     def function(verts, faces, colors):
         return eg.render(eg.Mesh(verts, faces, colors=colors), CAMERA, 4)
 
-    meshes = [cube(), icosphere(0), icosphere(1)]
-    compiled(function, *[(leaf(m.verts), m.faces, leaf(m.colors)) for m in meshes])
-
-
-def test_compile_still_refuses_what_is_not_finite():
-    """Values are not looked at while tracing; then the kernel's own checks take over."""
-    torch._dynamo.reset()
-    function = torch.compile(lambda v: eg.render(MESH.replace(verts=v), CAMERA, 4), fullgraph=True, backend="aot_eager")
-    function(MESH.verts)
-    broken = MESH.verts.clone()
-    broken[1, 2] = torch.nan
-    with pytest.raises(ValueError, match=r"verts: expected finite numbers, got nan at \[1, 2\]"):
-        function(broken)
+    calls = [(leaf(m.verts), m.faces, leaf(m.colors)) for m in (cube(), icosphere(0), icosphere(1))]
+    refuses_what_is_not_finite(compiled(function, *calls), *calls[-1])
 
 
 QUAD = torch.tensor([[-2.0, -2.0, -1.0], [2.0, -2.0, -1.0], [2.0, 2.0, -1.2], [-2.0, 2.0, -1.0]], dtype=F64)
@@ -104,7 +104,8 @@ def test_compile_lit_scene(compiled):
         return eg.render(eg.Scene(mesh, lights=[eg.PointLight(place, 9.0)]), CAMERA, 1, seed)
 
     values = (MESH.verts, torch.tensor([1.0, 1.5, 4.0], dtype=F64), torch.tensor(0.4, dtype=F64))
-    compiled(function, [*map(leaf, values), 3])
+    call = [*map(leaf, values), 3]
+    refuses_what_is_not_finite(compiled(function, call), *call)
 
 
 @pytest.mark.slow
@@ -148,20 +149,6 @@ def test_compile_mipmaps_and_batches(compiled):
         return eg.render(mesh, CAMERA.replace(K=K), 4)
 
     compiled(function, [leaf(MESH.verts), leaf(ADJOINT.to(F32)), leaf(CAMERA.K.expand(2, 3, 3))])
-
-
-def test_compile_of_lit_scenes_refuses_what_is_not_finite():
-    torch._dynamo.reset()
-    lit = eg.Scene(MESH.replace(material=eg.Material()), lights=[eg.DirectionalLight((0.0, 0.0, -1.0))])
-
-    def function(verts):
-        return eg.render(lit.replace(meshes=[lit.meshes[0].replace(verts=verts)]), CAMERA, 1)
-
-    function = torch.compile(function, fullgraph=True, backend="aot_eager")
-    broken = MESH.verts.clone()
-    broken[1, 2] = torch.nan
-    with pytest.raises(ValueError, match=r"verts: expected finite numbers, got nan at \[1, 2\]"):
-        function(broken)
 
 
 @pytest.mark.slow  # the C++ compiler takes up to a minute the first time

@@ -44,7 +44,7 @@ def test_a_straight_step_is_exact():
     assert float(grad) == pytest.approx(-2 * 2 * scale**2, rel=1.01 * 0.5 / (2 * scale))
 
 
-@pytest.mark.parametrize("spacing", [2.0, 1.0, 0.5])
+@pytest.mark.parametrize("spacing", [2.0, pytest.param(1.0, marks=pytest.mark.slow), 0.5])
 def test_a_discs_area_grows_by_its_circumference(spacing: float):
     def gradient(seed: int) -> Tensor:
         r = torch.tensor(0.6, dtype=F64, requires_grad=True)

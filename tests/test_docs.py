@@ -26,6 +26,7 @@ import edgegrad.raster
 
 FOLDER = Path(__file__).parents[1] / "docs"
 PAGES = ["quick-start.md", "concepts.md", *(str(p.relative_to(FOLDER)) for p in sorted(FOLDER.glob("how-to/*.md")))]
+LONG = ("how-to/shape-from-depth.md", "how-to/bop.md")
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"[-−+]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
 TOLERANCE = 0.2
@@ -44,7 +45,7 @@ def test_outputs_are_compared() -> None:
     assert not same("loss 1.0", "loss 1.5") and not same("loss 1.0", "error 1.0")
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", [pytest.param(p, marks=pytest.mark.slow) if p in LONG else p for p in PAGES])
 def test_page(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")

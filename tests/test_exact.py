@@ -30,7 +30,10 @@ SCENES = {
 }
 # The slivers are laid out for the perspective camera.
 CASES = [
-    (name, p) for name in SCENES for p in ("perspective", "orthographic") if (name, p) != ("slivers", "orthographic")
+    pytest.param(name, p, marks=[pytest.mark.slow] if (name, p) == ("sphere", "orthographic") else [])
+    for name in SCENES
+    for p in ("perspective", "orthographic")
+    if (name, p) != ("slivers", "orthographic")
 ]
 Render = Callable[[eg.Scene, eg.Camera], Tensor]
 
@@ -64,7 +67,10 @@ def mean_z2(samples: list[Tensor], exact: Tensor) -> float:
     return (deviation[varies] / error[varies]).square().mean().item()
 
 
-@pytest.mark.parametrize(("name", "projection"), CASES)
+@pytest.mark.parametrize(
+    ("name", "projection"),
+    [pytest.param(*case.values, marks=pytest.mark.slow) if "slivers" in case.values else case for case in CASES],
+)
 def test_image(name: str, projection: str) -> None:
     scene, camera = SCENES[name](), front_camera(SIZE, projection)
     exact = exact_image(scene, camera)

@@ -27,17 +27,19 @@ def example(name: str, size: int | None = None) -> ModuleType:
 
 
 def test_a_texture_and_its_light() -> None:
-    pictures, before, after = example("harmonics").fit(steps=20)
+    pictures, before, after = example("harmonics", size=64).fit(steps=20)
     assert after < 0.5 * before
     assert len(pictures) == 3
 
 
+@pytest.mark.slow
 def test_a_network_and_the_shape_under_it() -> None:
     network = example("network", size=48)
-    _, tube = network.fit(steps=60)
+    _, tube = network.fit(steps=45)
     assert abs(tube - network.TRUE_TUBE) < 0.5 * abs(network.FIRST_TUBE - network.TRUE_TUBE)
 
 
+@pytest.mark.slow
 def test_steps() -> None:
     step = example("step", size=64)
     _, found = step.fit(steps=50)
@@ -62,6 +64,7 @@ def test_an_environment_in_a_mirror() -> None:
     assert mirror.error(found) < 0.4 * mirror.error(torch.full_like(found, 0.4))
 
 
+@pytest.mark.slow
 def test_a_shape_and_its_shadow() -> None:
     _, shape, found = example("shadow").fit(steps=72, size=32)
     before, after = ((d - shape.truth()).square().mean().sqrt() for d in (torch.full_like(found, 0.45), found))
@@ -81,6 +84,7 @@ def test_a_focal_length_and_a_pose() -> None:
     assert abs(before) > 3.0 and abs(after) < 1.0 and fit.converged
 
 
+@pytest.mark.slow
 def test_a_texture() -> None:
     texture = example("texture")
     mesh = texture.objects.pebble(64, 3)
@@ -194,9 +198,10 @@ def test_the_corners_of_a_cube_from_16_pixels(exact: bool, steps: int, off: floa
     assert before.corners > 0.5 and after.corners < off and after.colors < off
 
 
+@pytest.mark.slow
 def test_a_texture_with_mipmaps_and_without() -> None:
     earth = example("raster_earth")
-    (_, without), (_, mipmaps) = (earth.fit(mipmaps, steps=60, size=32) for mipmaps in (False, True))
+    (_, without), (_, mipmaps) = (earth.fit(mipmaps, steps=40, size=32) for mipmaps in (False, True))
     assert mipmaps > without + 1.0
 
 

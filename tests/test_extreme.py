@@ -223,10 +223,12 @@ class Stopped(Exception):
     pass
 
 
-@pytest.mark.parametrize("soup", [False, True], ids=["grid", "soup"])
+@pytest.mark.parametrize(
+    "soup", [pytest.param(False, id="grid", marks=pytest.mark.slow), pytest.param(True, id="soup")]
+)
 def test_a_signal_handler_stops_the_making_of_geometry(soup: bool):
     """At whatever point of it, in less than a fifth of the time that it takes; and what is rendered next is right."""
-    n = 300
+    n = 200 if soup else 300
     x, y = torch.meshgrid(torch.linspace(-1, 1, n + 1), torch.linspace(-1, 1, n + 1), indexing="ij")
     verts = torch.stack([x, y, 0.1 * torch.sin(9 * x)], -1).reshape(-1, 3)
     i = torch.arange(n * (n + 1)).reshape(n, n + 1)[:, :-1].reshape(-1)

@@ -8,6 +8,7 @@ import shutil
 import signal
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -148,6 +149,7 @@ def test_a_fit_that_cannot_be_written_is_printed(files, code, monkeypatch, capsy
         raise OSError(code, os.strerror(code), source, None, target)
 
     monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr(edgegrad.fit, "fit_pose", partial(FIT_POSE, search=False))
     with pytest.warns(UserWarning, match=rf"checkpoint\.pt, got: {os.strerror(code)}; the fit goes on without"):
         assert cli.main(arguments(files, steps=1)) == 2
     said = capsys.readouterr()
@@ -158,15 +160,13 @@ def test_a_fit_that_cannot_be_written_is_printed(files, code, monkeypatch, capsy
 
 
 def test_a_folder_that_vanishes_during_the_fit(files, monkeypatch, capsys):
-    search = edgegrad.fit.fit_pose
-
     def vanishing(*args, callback, **options):
         def after_step(fit):
             callback(fit)
             if fit.steps == 3:
                 shutil.rmtree(files / "out")
 
-        return search(*args, callback=after_step, **options)
+        return FIT_POSE(*args, callback=after_step, search=False, **options)
 
     monkeypatch.setattr(edgegrad.fit, "fit_pose", vanishing)
     assert cli.main(arguments(files, steps=1)) == 0  # it is made again

@@ -200,13 +200,13 @@ def depth_of(view, count):
 def test_two_objects_of_which_one_covers_the_other(two, kind, degrees, percent):
     """40 % of the first one are covered; the starts are 10° and 5 % off."""
     view, image = two
-    given = {"search": False} if kind == "colours" else {}
+    given = {"search": kind not in ("colours", "depth")}
     if kind == "labels":
         given = {"mask": labels_of(view, scene_of(2))}
     if kind == "shares":
         given = {"mask": list(shares_of(view, scene_of(2), 256).unbind(-1))}
     if kind == "depth":
-        given = {"depth": depth_of(view, 2)}
+        given["depth"] = depth_of(view, 2)
     meshes = [mesh.replace(face_colors=None) for mesh in MESHES[:2]] if kind == "plain" else MESHES[:2]
     fits = fit_poses(meshes, image, view, init=STARTS[:2], progress=False, **given)
     for fit, mesh, truth in zip(fits, MESHES, TRUTHS, strict=False):

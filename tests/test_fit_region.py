@@ -68,7 +68,7 @@ def test_a_shape_and_its_place():
     assert losses.iou(fit.render(), shown) < 0.04
 
 
-@pytest.mark.parametrize("method", ["adam", "gauss-newton"])
+@pytest.mark.parametrize("method", [pytest.param("adam", marks=pytest.mark.slow), "gauss-newton"])
 def test_a_pose(method):
     """Of a bracket without colours, 12.3° and 8.4 % of its size off."""
     view = camera(128)

@@ -95,10 +95,10 @@ def photographs(rig: eg.Rig, cameras: list[eg.Camera], seed: int) -> tuple[eg.Me
 
 
 def test_a_pose_from_photographs_without_masks() -> None:
-    rig, cameras = arm(), views(64)
+    rig, cameras = arm(), views(48)
     _, photos = photographs(rig, cameras, 5)
     start = {"rotations": 0.5 * TRUTH}
-    found = fit_rig(rig, cameras, photos, loss="region", start=start, coarsest=32, progress=False)
+    found = fit_rig(rig, cameras, photos, loss="region", start=start, coarsest=24, progress=False)
     assert degrees(0.5 * TRUTH, TRUTH) > 15.0 and degrees(found.values["rotations"], TRUTH) < 5.0
     assert found.converged and all(view.outlined for view in found.fit.views)
     far = {"translation": [50.0, 0.0, 0.0]}

@@ -84,7 +84,7 @@ WORN = {
 }
 
 
-@pytest.mark.parametrize("kind", WORN)
+@pytest.mark.parametrize("kind", ["sharp", "soft", pytest.param("compressed", marks=pytest.mark.slow), "both"])
 def test_blur_and_compression_cost_no_second_search(kind):
     """One way down is enough, and ends as near."""
     view = camera(80)
@@ -150,7 +150,7 @@ def test_a_border_of_many_colours_is_clutter():
     ("size", "steps", "alike"),
     [
         pytest.param(64, 4, 0.6, marks=pytest.mark.slow),
-        (32, 4, 0.8),
+        pytest.param(32, 4, 0.8, marks=pytest.mark.slow),  # quick for photographs, in test_fit_photo.py
         pytest.param(32, 21, 0.8, marks=pytest.mark.slow),
     ],
 )
@@ -377,12 +377,12 @@ def test_pictures_and_masks_of_bytes_are_named():
     image = picture(view)
     bytes_ = (255 * image / image.max()).round()
     with pytest.warns(UserWarning, match=r"target: expected linear radiance.*whole numbers up to 255.*srgb_to_linear"):
-        fit_pose(bracket(), bytes_, view, silhouette(view), init=START, steps=1, progress=False)
+        fit_pose(bracket(), bytes_, view, silhouette(view), init=START, steps=1, search=False, progress=False)
     resized = 40.0 + 0.7 * bytes_  # no whole numbers any more
     with pytest.warns(
         UserWarning, match=r"target: expected linear radiance.*got numbers up to 218.*srgb_to_linear\(x / 255"
     ):
-        fit_pose(bracket(), resized, view, silhouette(view), init=START, steps=1, progress=False)
+        fit_pose(bracket(), resized, view, silhouette(view), init=START, steps=1, search=False, progress=False)
     with pytest.raises(
         ValueError, match=r"mask: expected numbers from 0 to 1, got 0 to 255; of 8-bit numbers take x / 255"
     ):

@@ -8,7 +8,11 @@ from pathlib import Path
 
 import grimp
 import pytest
+import trimesh
 from importlinter.cli import EXIT_STATUS_ERROR, EXIT_STATUS_SUCCESS, lint_imports
+from PIL import Image
+
+from edgegrad.files.load import load_mesh
 
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "docs"))
@@ -58,16 +62,32 @@ fit = eg.fit.fit_pose(mesh, target, camera, init=torch.eye(4), callback=stop, pr
 assert fit.interrupted and fit.steps
 eg.fit.fit_scene(mesh, camera, [target], {"verts": 1e-3}, steps=1, progress=False)
 derivatives(eg.Scene([mesh]), camera, ["image", "alpha", "normal"], Motion.about(torch.zeros(3)))
-libraries = {"roma", "trimesh", "matplotlib", "OpenImageIO"}
+libraries = {"roma", "trimesh", "matplotlib", "OpenImageIO", "PIL", "viser"}
 slow = sorted({"torch._dynamo", "torch._inductor", "torch._decomp.decompositions_for_jvp", *libraries} & set(sys.modules))
 assert not slow, slow
+sys.modules["PIL"] = None
+for path in sys.argv[1:]:
+    try: eg.load_mesh(path)
+    except ImportError as error: print(error)
 """
 
 
-def test_a_fit_imports_no_compiler() -> None:
-    """torch's compiler takes longer to import than torch itself, and than a fit; its rules of forward mode take up to seconds."""
-    done = subprocess.run([sys.executable, "-c", FIRST_STEP], capture_output=True, text=True, check=False)
+def test_a_fit_imports_no_compiler(tmp_path: Path) -> None:
+    """torch's compiler takes longer to import than torch itself, and than a fit; its rules of forward mode take up to seconds.
+    What files need is imported late, and where it is missing the error says how to get it."""
+    box = trimesh.creation.box()
+    box.visual = trimesh.visual.TextureVisuals(uv=box.vertices[:, :2], image=Image.new("RGB", (2, 2)))
+    files = [tmp_path / "a.glb", tmp_path / "a.obj"]
+    for file in files:
+        box.export(file)
+        assert len(load_mesh(file).faces) == 12
+    command = [sys.executable, "-c", FIRST_STEP, *map(str, files)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+    said = done.stdout.splitlines()
+    assert len(said) == len(files)
+    for line in said:
+        assert line.startswith("reading") and "pip install 'edgegrad[files]'" in line
 
 
 def test_names_of_the_package_are_public() -> None:

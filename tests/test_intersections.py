@@ -149,7 +149,7 @@ THROUGH = set(SMOOTH) - {"torus", "spiral", "shells", "large beside small"}
 
 
 @pytest.mark.parametrize("name", SMOOTH)
-@pytest.mark.parametrize("turned", [0.0, 1.0])
+@pytest.mark.parametrize("turned", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_height_fields_hide_no_pair(name, turned):
     """Where a closed surface is a height field no pairs are compared. With every second face turned round there is no
     surface that goes on, so all are; and which faces pass through each other is the same."""
@@ -241,8 +241,9 @@ def test_copies_share_what_is_drawn():
     check("pairs", pairs, estimate(totals))
 
 
-@pytest.mark.parametrize("copies", [1, 2])
-@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize(
+    ("copies", "apart"), [(2, False), (2, True), *(pytest.param(1, a, marks=pytest.mark.slow) for a in (False, True))]
+)
 def test_one_side_of_an_edge_in_a_face_is_drawn_without_the_other(copies, apart):
     """A roof whose ridge lies in a sheet, beside a tangle. The other side of the ridge is mostly hidden, and counts no less."""
     verts = torch.tensor(
@@ -381,7 +382,7 @@ def test_boxes_through_each_other(projection, dtype):
     check_ratio(one_moves, 0.006, spp=2048, **SAMPLES)
 
 
-@pytest.mark.parametrize("mesh", ["itself", "another"])
+@pytest.mark.parametrize("mesh", [pytest.param("itself", marks=pytest.mark.slow), "another"])
 def test_a_sphere_sunk_to_edges_that_lie_in_a_sheet(mesh):
     """Of an icosphere a third of its equator are edges. Which of their two faces passes through the sheet depends on the
     direction of the motion, so the gradient is the mean."""
@@ -398,7 +399,7 @@ def test_a_sphere_sunk_to_edges_that_lie_in_a_sheet(mesh):
             return eg.Scene([both.transformed(t=theta * ALONG)], BACKGROUND), camera
         return eg.Scene([ball.transformed(t=theta * ALONG), sheet.transformed(t=theta * ALONG)], BACKGROUND), camera
 
-    check_ratio(shifted, 0.006, spp=768, **SAMPLES)
+    check_ratio(shifted, 0.006, spp=384, **SAMPLES)
 
     def sunk(theta: Tensor):
         t = theta * torch.tensor([0.0, 0.0, 1.0], dtype=F64)
@@ -501,7 +502,7 @@ def test_whether_they_are_drawn_does_not_depend_on_where_the_vertices_were():
         verts = (ball.verts + size * noise).requires_grad_()
         return torch.autograd.grad(eg.render(ball.replace(verts=verts), camera, spp=4), verts, adjoint)[0]
 
-    for size in torch.linspace(0.05, 0.062, 13).tolist():
+    for size in torch.linspace(0.05, 0.062, 7).tolist():
         core.clear_geometry()
         first = gradient(size)
         for before in (0.3, 0.6):

@@ -54,7 +54,7 @@ QUIET = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.
 
 @pytest.mark.parametrize("kind", FILES)
 def test_odd_files(tmp_path: Path, kind: str) -> None:
-    run(tmp_path, kind, 75)
+    run(tmp_path, kind, 40)
 
 
 @pytest.mark.slow

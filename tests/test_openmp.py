@@ -82,30 +82,34 @@ def lines_of(code: str, **variables: str) -> list[str]:
 
 
 @functools.cache
-def whole(order: str) -> list[str]:
-    """What a process prints that imports in this order."""
-    return lines_of(RENDER.format(imports=ORDERS[order]) + FORK + DYNAMIC)
+def whole() -> list[str]:
+    """What a process prints that imports torch first, and forks."""
+    return lines_of(RENDER.format(imports=ORDERS["torch first"]) + FORK + DYNAMIC)
 
 
-@pytest.mark.parametrize("order", ORDERS)
-def test_one_runtime(order):
+@functools.cache
+def limited() -> list[str]:
+    """What a process prints that imports edgegrad first, and has one thread beside the calling one."""
+    return lines_of(RENDER.format(imports=ORDERS["edgegrad first"]), OMP_THREAD_LIMIT="2")
+
+
+def test_one_runtime():
     """Also in a forked child. A second one would keep threads of its own beside torch's."""
-    _, _, parent, own, *child, _ = whole(order)
+    _, _, parent, own, *child, _ = whole()
     assert parent == own and child == [parent, own]
     assert Path(own).name.startswith(("libgomp", "libomp", "libiomp"))
+    assert limited()[2:] == [parent, own]
 
 
-@pytest.mark.parametrize("order", ORDERS)
-def test_the_environment_stays_as_it_is(order):
+def test_the_environment_stays_as_it_is():
     """How threads wait is the kernel's own matter, whatever was imported first: it asks for no variable."""
-    assert whole(order)[1] == "True"
+    assert whole()[1] == limited()[1] == "True"
 
 
 def test_fewer_threads_than_asked_for():
     """The runtime may give fewer, here one beside the calling thread; the items are shared by those that there are."""
-    code = RENDER.format(imports=ORDERS["torch first"])
-    bits, *_, dynamic = whole("torch first")
-    assert bits == dynamic == lines_of(code, OMP_THREAD_LIMIT="2")[0]
+    bits, *_, dynamic = whole()
+    assert bits == dynamic == limited()[0]
 
 
 def test_the_doctor_names_the_runtime(capsys):

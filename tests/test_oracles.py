@@ -166,7 +166,13 @@ def test_gauss_rule_has_converged(name: str) -> None:
 # -- exact_image: gradients -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "projection"), diagonal(list(SCENES), PROJECTIONS))
+@pytest.mark.parametrize(
+    ("name", "projection"),
+    [
+        *diagonal([name for name in SCENES if name != "slivers"], PROJECTIONS),
+        *(pytest.param("slivers", projection, marks=pytest.mark.slow) for projection in PROJECTIONS),
+    ],
+)
 def test_exact_gradient(name: str, projection: str) -> None:
     """All inputs moved together, in a random direction, against central differences.
 

@@ -55,7 +55,7 @@ def test_edge_that_crosses_the_camera_plane() -> None:
         move[0] = torch.tensor([0.6, -0.5, 0.7])
         return eg.Scene([mesh.replace(verts=verts + theta * move)], BACKGROUND), camera
 
-    check_ratio(vertex_behind, 0.02, **SAMPLES)
+    check_ratio(vertex_behind, 0.02, spp=256, **SAMPLES)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

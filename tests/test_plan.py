@@ -379,7 +379,8 @@ print(measured, eg.plan(mesh, camera, 1).bytes)
 @pytest.mark.parametrize(
     ("subdivisions", "size", "colors"),
     [
-        pytest.param(6, 512, 1, id="faces and pixels"),
+        pytest.param(5, 360, 1, id="faces and pixels"),
+        pytest.param(6, 512, 1, id="more faces and pixels", marks=pytest.mark.slow),
         pytest.param(7, 64, 0, id="faces", marks=pytest.mark.slow),
         pytest.param(3, 1024, 0, id="pixels", marks=pytest.mark.slow),
     ],

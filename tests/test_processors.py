@@ -21,9 +21,9 @@ from edgegrad.library import core
 def results() -> dict[str, Tensor]:
     """Images and gradients of some scenes, with samples that fill packets and that do not."""
     views = {
-        "perspective": front_camera(24),
-        "far": eg.Camera.look_at((0.0, 20.0, -300.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 0.6, (24, 24)),
-        "orthographic": eg.Camera.orthographic((0.0, 0.4, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.4, (24, 24)),
+        "perspective": front_camera(16),
+        "far": eg.Camera.look_at((0.0, 20.0, -300.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 0.6, (16, 16)),
+        "orthographic": eg.Camera.orthographic((0.0, 0.4, -3.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.4, (16, 16)),
     }
     found = {}
     for name, camera in views.items():

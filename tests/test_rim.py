@@ -124,7 +124,10 @@ def check(gradient: Tensor, truth: Tensor, relative: float = 2e-3) -> None:
     torch.testing.assert_close(gradient, truth, rtol=relative, atol=relative * float(truth.abs().max()))
 
 
-@pytest.mark.parametrize(("lens", "mirror"), [*((lens, 1) for lens in LENSES), ("decentred", -1), ("wide fisheye", -1)])
+@pytest.mark.parametrize(
+    ("lens", "mirror"),
+    [*((lens, 1) for lens in LENSES), pytest.param("decentred", -1, marks=pytest.mark.slow), ("wide fisheye", -1)],
+)
 def test_area(lens: str, mirror: int) -> None:
     """A white room before grey is an ellipse, for what is radial π |det K| ρ²: its area, and the derivative of that."""
     view = camera(lens, mirror)

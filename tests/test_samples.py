@@ -379,7 +379,7 @@ def test_texels_get_gradients_through_mipmaps():
 
 
 @pytest.mark.unwatched
-@pytest.mark.parametrize("view", ["perspective", "orthographic"])
+@pytest.mark.parametrize("view", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
 def test_levels_of_mipmaps_have_derivatives(view: str):
     """By what is seen and by the camera, at fixed places in the image; of a square that is turned away from it, so that the level
     differs from place to place."""

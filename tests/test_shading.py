@@ -142,8 +142,14 @@ def check_gradient(scene: eg.Scene, camera: eg.Camera, inputs: dict[str, Tensor]
     assert torch.autograd.gradcheck(function, leaves, eps=STEP, atol=ATOL, rtol=RTOL)
 
 
-@pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize(
+    ("look", "view"),
+    [
+        pytest.param(look, view, marks=[pytest.mark.slow] if "uvs" in LOOKS[look] and view != VIEWS[k % 2] else [])
+        for k, look in enumerate(LOOKS)
+        for view in VIEWS
+    ],
+)
 def test_gradcheck(look, view):
     """Every input at once: vertices, what the mesh looks like, the pose's entries and those of K."""
     camera = skewed_camera(view)

@@ -27,6 +27,30 @@ from edgegrad.report.stability.painted import PAINTED
 
 stability = importlib.import_module("edgegrad.report.stability.run")  # the package has a function of this name
 FAST = [name for name, case in CASES.items() if not case.slow and case.group not in ("light", "bounces")]
+# Of each there is another that is more extreme, or differs in one thing.
+LIKE_OTHERS = {
+    *(
+        "scale-1e-3",
+        "scale-1e3",
+        "offset-1e3",
+        "fov-120",
+        "inside-smooth",
+        "on-surface",
+        "4096x1",
+        "sliver-long-smooth",
+    ),
+    *(
+        "sliver-thin-smooth",
+        "fan-3",
+        "fan-5",
+        "soup-64",
+        "through-each-other-orthographic",
+        "ortho-box-32",
+        "copies-32",
+    ),
+    *("copies-sphere", "t-junction-32", "t-junction-silhouette-32", "stacked-32", "ortho-box-plain", "stacked-plain"),
+    *("lattice-behind-plain", "lattice-isometric-dent", "adjoint-1e8", "emerging-1e-3", "hiding-1e-3"),
+}
 
 
 def check(name: str, effort: Effort) -> dict:
@@ -37,9 +61,13 @@ def check(name: str, effort: Effort) -> dict:
     return row
 
 
-@pytest.mark.parametrize("name", FAST)
+@pytest.mark.parametrize("name", [name for name in FAST if name not in LIKE_OTHERS])
 def test_case(name):
     check(name, QUICK)
+
+
+def test_cases_that_wait_for_full_accuracy_are_there():
+    assert set(FAST) >= LIKE_OTHERS
 
 
 @pytest.mark.slow
@@ -142,7 +170,13 @@ def test_a_wrong_gradient_is_rejected(triangle):
     assert (row["verdict"], row["worst"]) == (WRONG, "skew")
 
 
-@pytest.mark.parametrize("name", ["keyhole", "bounced-mirror", "all-cancels", "bounced-standing", "bounced-million"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("keyhole", "bounced-mirror", "bounced-million"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("all-cancels", "bounced-standing")),
+    ],
+)
 def test_bounces_without_borders_are_rejected(name, monkeypatch):
     """Without the borders of what surfaces see of one another the gradient is wrong."""
     if name == "bounced-million":
@@ -295,8 +329,8 @@ def test_ill_conditioned_fits():
 def test_painted_areas(name):
     """From lines that are close: within 3.5 %, which a derivative that is 5 % off is not."""
     case = steps.cases()[name]
-    found = torch.stack([steps.derivative(case, 0.25, seed) for seed in range(8)]) / (case.area * steps.SCALE**2)
-    error = float(found.std()) / 8**0.5
+    found = torch.stack([steps.derivative(case, 0.25, seed) for seed in range(4)]) / (case.area * steps.SCALE**2)
+    error = float(found.std()) / 4**0.5
     assert error < 0.01
     assert float(found.mean()) == pytest.approx(1.0, abs=0.005 + 3.0 * error)
 
@@ -321,13 +355,13 @@ def run(*arguments):
 
 
 def test_command(tmp_path, capsys, monkeypatch):
-    for name in [case.name for case in CASES.values() if case.group == "coincident"][6:]:
+    for name in [case.name for case in CASES.values() if case.group == "coincident"][2:]:
         monkeypatch.delitem(CASES, name)
     assert run("--case", "crop", "coincident", "--quick", "--out", tmp_path) == 0
     document = json.loads((tmp_path / "stability.json").read_text())
     names = [row["name"] for row in document["cases"]]
     assert names[0] == "crop" and {case.name for case in CASES.values() if case.group == "coincident"} == set(names[1:])
-    assert len(names) == 7
+    assert len(names) == 3
     assert document["settings"]["quick"] and document["settings"]["kernel"]
     text = (tmp_path / "stability.md").read_text()
     assert all(f"| {name} |" in text for name in names)

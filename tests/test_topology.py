@@ -106,7 +106,7 @@ def test_faces_that_repeat_a_vertex_are_ignored():
     assert faces_at(edges_of(verts, torch.cat([good, torch.tensor([[0, 4, 1]])]))) == [1] * 4 + [2]
 
 
-@pytest.mark.parametrize("scale, shift", [(1.0, 0.0), (1e-4, 0.0), (1e4, 0.0), (1.0, 50.0)])
+@pytest.mark.parametrize("scale, shift", [(1e-4, 0.0), (1e4, 50.0)])
 def test_rotated_soup_welds(scale, shift):
     """A user's own matrix product may round the copies of a vertex differently, by some float32 spacings."""
     mesh = icosphere(3)

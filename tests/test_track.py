@@ -72,19 +72,19 @@ def test_found_again_elsewhere_and_turned(film):
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda image: image.index_fill(0, torch.tensor([3]), torch.nan), "frames[2]: expected finite numbers"),
-        (lambda image: image[:-1], "frames[2]: expected shape"),
-        (lambda image: image[..., :2], "frames[2]: expected 3 channels"),
-        (lambda image: "missing.png", "frames[2]"),
+        (lambda image: image.index_fill(0, torch.tensor([3]), torch.nan), "frames[1]: expected finite numbers"),
+        (lambda image: image[:-1], "frames[1]: expected shape"),
+        (lambda image: image[..., :2], "frames[1]: expected 3 channels"),
+        (lambda image: "missing.png", "frames[1]"),
     ],
 )
 def test_a_broken_frame_is_named(film, frames, spoil, words):
     found = []
     with pytest.raises((ValueError, OSError)) as caught:
         found.extend(track(film.mesh, [], film.camera, film.poses[0]))
-        for pose in track(film.mesh, [*frames[:2], spoil(frames[2])], film.camera, film.poses[0]):
+        for pose in track(film.mesh, [frames[0], spoil(frames[1])], film.camera, film.poses[0]):
             found.append(pose)
-    assert words in str(caught.value) and len(found) == 2
+    assert words in str(caught.value) and len(found) == 1
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def write_sound(path):
         container.mux(stream.encode())
 
 
-CODECS = [("film.mp4", "libx264"), ("film.avi", "mpeg4")]
+CODECS = [("film.mp4", "libx264"), pytest.param("film.avi", "mpeg4", marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize(("name", "codec"), CODECS)

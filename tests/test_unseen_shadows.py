@@ -68,11 +68,11 @@ def check(case: Case, spp: int, seeds: int, h: float = 0.2, bounces: int = 2, **
 
 
 def test_lamp() -> None:
-    check(case_of("lamp", "caster"), 512, 4, **FEW)
+    check(case_of("lamp", "caster"), 128, 4, **FEW)
 
 
 def test_a_point_light_moves() -> None:
-    check(case_of("point", "light"), 512, 4, **FEW)
+    check(case_of("point", "light"), 128, 4, **FEW)
 
 
 @pytest.mark.slow
