@@ -91,7 +91,7 @@ def render(
     light_samples    of lit scenes: points drawn of each light that has an extent, for each point that is shaded. Of a face in a
                      pixel at most a quarter of its samples are, or 4 if spp is below 16; in images of glossy surfaces under an
                      Environment all are, with fewer points of lights each and no fewer in all
-    bounces          of lit scenes: how often light is scattered on its way from a light to the eye, at most; 1: direct light. A
+    bounces          of lit scenes without a shader: how often light is scattered on its way, at most, 1 … 64; 1: direct light. A
                      path goes on from each point that is shaded, as the material there scatters, and draws one point of
                      each light wherever it comes to; from the third bounce on it may end early (Russian roulette). Colours
                      of meshes without a material light nothing. Everything has its gradient, but for what moves in scenes of

@@ -173,6 +173,28 @@ def test_a_sequence() -> None:
     assert max(errors) < 3.0
 
 
+def test_frames_have_checkpoints_of_their_own(tmp_path) -> None:
+    rig, cameras = arm(), views(16, 2)
+    frames = [{"masks": shown(rig.posed(TRUTH * k), cameras)} for k in (0.1, 0.2)]
+    told = {"tries": 0, "steps": 2, "coarsest": 16, "progress": False, "checkpoint": tmp_path / "walk.ckpt"}
+    first, again = (list(track_rig(rig, cameras, frames, start={}, resume=True, **told)) for _ in range(2))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["walk-0001.ckpt", "walk-0002.ckpt"]
+    for a, b in zip(first, again, strict=True):
+        assert torch.equal(a.values["rotations"], b.values["rotations"])
+    for error, message, given in (
+        (ValueError, "smooth: expected", {"frames": frames, "smooth": -1.0}),
+        (TypeError, r"frames\[0\]: expected arguments by name", {"frames": [frames[0]["masks"]]}),
+    ):
+        with pytest.raises(error, match=message):
+            next(track_rig(rig, cameras, **given))
+
+
+def test_a_start_within_limits_that_leave_out_rest() -> None:
+    rig, cameras = arm().with_limits(rotations={"bone 1": ([0.1] * 3, [0.6] * 3)}), views(16, 2)
+    found = fit_rig(rig, cameras, masks=shown(rig.posed(TRUTH.abs()), cameras), tries=0, steps=1, progress=False)
+    assert float(found.values["rotations"][1].min()) >= 0.1
+
+
 def test_it_goes_on_where_it_stopped(tmp_path) -> None:
     rig, cameras = arm(), views(32, 2)
     told = {"masks": shown(rig.posed(TRUTH), cameras), "tries": 0, "steps": 4, "progress": False, "tolerance": 0.0}
@@ -241,6 +263,24 @@ def test_bad_input() -> None:
         (ValueError, "keypoints: expected joints among", {"keypoints": {"elbow": torch.zeros(2, 2)}}),
         (ValueError, "a pixel for each camera", {"keypoints": {"bone 0": torch.zeros(3, 2)}}),
         (ValueError, "expected numbers for one at least", {"keypoints": {"bone 0": torch.full((2, 2), math.nan)}}),
+        (TypeError, "keypoints: expected pixels .*got none", {"keypoints": {}}),
+        (TypeError, "keypoints: expected pixels .*got Tensor", {"keypoints": torch.zeros(2, 2)}),
+        (ValueError, "joints: expected names of joints .*got none", {"joints": []}),
+        (ValueError, "joints: expected None where turns", {"joints": ["bone 0"], "seek": ["translation"]}),
+        (
+            ValueError,
+            r"start\['rotations'\]: expected shape .*one pose",
+            {"start": {"rotations": torch.zeros(2, 2, 3)}},
+        ),
+        (TypeError, "priors: expected a list of functions", {"priors": lambda values: 0.0}),
+        (TypeError, r"priors\[0\]: expected a function", {"priors": [0.5]}),
+        (
+            ValueError,
+            r"priors\[0\]: expected it to return a number, got \(2, 3\)",
+            {"priors": [lambda v: v["rotations"]]},
+        ),
+        (TypeError, "look: expected it to return a Mesh or a Scene, got NoneType", {"look": lambda posed: None}),
+        (ValueError, "parameters: expected a look that takes light", {"parameters": {"light": None}}),
         (TypeError, "expected options among", {"step": 3}),
         (ValueError, "images: expected pictures or masks", {"masks": None}),
     ):

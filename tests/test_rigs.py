@@ -147,6 +147,21 @@ def test_a_batch_of_one_value_and_the_rest_for_all() -> None:
         assert torch.allclose(mesh.verts, one.verts, atol=1e-12) and torch.allclose(mesh.normals, one.normals)
 
 
+def test_a_batch_of_named_joints() -> None:
+    rig, g = small(), torch.Generator().manual_seed(3)
+    vectors = torch.randn(5, 3, generator=g, dtype=torch.float64)
+    whole = torch.zeros(5, 3, 3, dtype=torch.float64)
+    whole[:, 0], whole[:, 1] = vectors, torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64)
+    longs = torch.linspace(0.0, 1.0, 5, dtype=torch.float64)
+    morphs = torch.stack([torch.zeros_like(longs), longs], 1)
+    expected = rig.posed(whole, morphs=morphs)
+    for form in (vectors, roma.rotvec_to_rotmat(vectors)):
+        for one, other in zip(
+            rig.posed({"a": form, "b": [0.0, 0.3, 0.0]}, morphs={"long": longs}), expected, strict=True
+        ):
+            assert torch.allclose(one.verts, other.verts, atol=1e-12)
+
+
 def test_the_whole_is_placed_about_its_middle() -> None:
     rig = small()
     R = roma.rotvec_to_rotmat(torch.tensor([0.1, -0.4, 0.9], dtype=torch.float64))
@@ -288,6 +303,13 @@ def test_bad_arguments() -> None:
         (ValueError, "rotations: expected finite", lambda: rig.posed(torch.full((3, 3), math.nan))),
         (TypeError, "expected values of rotations, .*got 'angles'", lambda: rig.posed(angles=torch.zeros(3))),
         (ValueError, "as many poses", lambda: rig.posed(torch.zeros(2, 3, 3), translation=torch.zeros(4, 3))),
+        (ValueError, r"rotations\['a'\]: expected shape \(3,\).*got \(2,\)", lambda: rig.posed({"a": [0.0, 0.0]})),
+        (ValueError, r"rotations\['a'\]: expected finite.*\[2\]", lambda: rig.posed({"a": [0.0, 0.0, math.nan]})),
+        (ValueError, r"orientation: expected shape \(3,\)", lambda: rig.posed(orientation=[0.0, 0.0])),
+        (ValueError, "low: expected numbers, .*got nan", lambda: rig.with_limits(rotations=(math.nan, 1.0))),
+        (TypeError, "clamped: expected values of rotations", lambda: rig.clamped(translation=torch.zeros(3))),
+        (ValueError, "controls: expected names other than .*got 'scale'", lambda: eg.Rig.from_function(
+            lambda scale: rig.scene.verts * scale, rig.scene.faces, {"scale": torch.ones(())})),
         (ValueError, "skinning: expected one of", lambda: rig.posed(skinning="smooth")),
         (ValueError, "expected an animation among none", lambda: rig.animation("Walk")),
         (ValueError, "cycle: a → b → a", lambda: eg.Joints(["a", "b"], [1, 0], torch.zeros(2, 3), torch.zeros(2, 3))),

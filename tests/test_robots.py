@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import edgegrad as eg
+from edgegrad.fit import fit_rig
 
 yourdfpy = pytest.importorskip("yourdfpy")
 pytest.importorskip("pytorch_kinematics")
@@ -98,6 +99,21 @@ def test_gradients_by_angles(tmp_path) -> None:
     angles = (0.3 * torch.arange(7, dtype=torch.float64)).requires_grad_()
     where = lambda a: robot.shape({"angles": a}).joints  # noqa: E731
     assert torch.autograd.gradcheck(where, (angles,), check_forward_ad=True)
+
+
+def test_only_the_joints_that_are_named_turn(tmp_path) -> None:
+    robot = eg.load_robot(arm.write(tmp_path / "arm.urdf"))
+    names = robot.controls["angles"].names
+    middle, size = robot.center.tolist(), 2.0 * robot.size
+    camera = eg.Camera.look_at((middle[0], middle[1] - size, middle[2]), middle, up=(0, 0, 1), fov_y=40, size=(24, 24))
+    truth = 0.2 * torch.ones(7, dtype=torch.float64)
+    with torch.no_grad():
+        mask = eg.render_aovs(robot.posed(angles=truth), camera, ["alpha"], spp=16)["alpha"]
+    told = {"masks": [mask], "tries": 0, "steps": 2, "coarsest": 24, "progress": False}
+    found = fit_rig(robot, [camera], joints=[names[1]], **told).values["angles"]
+    assert float(found[1]) != 0.0 and float(found.abs().sum()) == float(found[1].abs())
+    with pytest.raises(ValueError, match="angles: expected names among"):
+        fit_rig(robot, [camera], joints=["nope"], **told)
 
 
 BAD = {

@@ -15,6 +15,22 @@ Prior = Callable[[Mapping[str, Tensor]], Tensor]
 PLACE = ("translation", "orientation", "scale")
 
 
+def checked_priors(priors: Sequence[Prior], values: Mapping[str, Tensor]) -> list[Prior]:
+    """That each makes one number of such values. Raises TypeError or ValueError."""
+    if not isinstance(priors, Sequence) or isinstance(priors, str):
+        raise TypeError(f"priors: expected a list of functions of values, got {type(priors).__name__}")
+    for k, term in enumerate(priors):
+        if not callable(term):
+            raise TypeError(
+                f"priors[{k}]: expected a function of values, as towards() makes one, got {type(term).__name__}"
+            )
+        given = term(values)
+        if not isinstance(given, Tensor | float | int) or (isinstance(given, Tensor) and given.dim()):
+            got = tuple(given.shape) if isinstance(given, Tensor) else type(given).__name__
+            raise ValueError(f"priors[{k}]: expected it to return a number, got {got}; add up its terms")
+    return list(priors)
+
+
 def towards(rest: Mapping[str, Tensor], weight: float = 1e-7) -> Prior:
     """Σ (x − rest)² over all values but those of the whole's place; rotations are in radians."""
 

@@ -210,7 +210,8 @@ def check_image(name: str, value: object, size: tuple[int, int]) -> Tensor:
     if name.startswith(("mask", "weight")):
         if not image.is_floating_point():
             raise TypeError(
-                f"{name}: expected floating-point numbers, got {image.dtype}; of 8-bit numbers take x / 255"
+                f"{name}: expected floating-point numbers, got {image.dtype}; of 8-bit numbers take x / 255, of 0 "
+                "and 1 x.float()"
             )
         check_shape(name, image, size, (*size, 1), fix=fix)
     else:

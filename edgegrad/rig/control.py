@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..check import as_tensor, check_finite, check_shape
-from .rotations import as_matrices
+from .rotations import as_matrices, one_as_matrix
 
 Values = Mapping[str, Any]
 
@@ -45,6 +45,8 @@ class Control:
         bounds = []
         for side, bound in (("low", low), ("high", high)):
             tensor = None if bound is None else as_tensor(f"{name}: {side}", bound, like=self.rest).detach().double()
+            if tensor is not None and bool(tensor.isnan().any()):
+                raise ValueError(f"{name}: {side}: expected numbers, or infinity for no limit, got nan")
             try:
                 bounds.append(None if tensor is None else tensor.expand(self.rest.shape))
             except RuntimeError as error:
@@ -66,16 +68,7 @@ class Control:
         if given is None:
             value = self.rest
         elif isinstance(given, Mapping):
-            rows = list(as_matrices(name, self.rest, len(self.rest)) if self.rotates else self.rest)
-            for key, row in given.items():
-                one = as_tensor(f"{name}[{key!r}]", row, like=self.rest).double()
-                k = self.row(name, key)
-                if self.rotates:
-                    one = as_matrices(f"{name}[{key!r}]", one[None], 1)[0]
-                check_shape(f"{name}[{key!r}]", one, tuple(rows[k].shape))
-                check_finite(f"{name}[{key!r}]", one)
-                rows[k] = one
-            return torch.stack(rows)
+            return self._of_rows(name, given)
         else:
             value = as_tensor(name, given, like=self.rest).double()
         check_finite(name, value)
@@ -83,6 +76,25 @@ class Control:
             return as_matrices(name, value, len(self.rest))
         check_shape(name, value, tuple(self.rest.shape), ("B", *self.rest.shape))
         return value
+
+    def _of_rows(self, name: str, given: Mapping[str, Any]) -> Tensor:
+        """Of some rows by their names, each with or without a batch in front."""
+        rows, several = list(as_matrices(name, self.rest, len(self.rest)) if self.rotates else self.rest), []
+        dims = rows[0].dim()
+        for key, row in given.items():
+            which = f"{name}[{key!r}]"
+            one, k = as_tensor(which, row, like=self.rest).double(), self.row(name, key)
+            if self.rotates:
+                one = one_as_matrix(which, one)
+            else:
+                check_shape(which, one, tuple(rows[k].shape), ("B", *rows[k].shape))
+                check_finite(which, one)
+            several.append((which, one, dims))
+            rows[k] = one
+        batch = batch_of(several)
+        if batch is not None:
+            rows = [row.expand(batch, *row.shape[row.dim() - dims :]) for row in rows]
+        return torch.stack(rows, -1 - dims)
 
     def within(self, value: Tensor) -> Tensor:
         """Clamped to the limits."""
@@ -97,5 +109,5 @@ def batch_of(values: Sequence[tuple[str, Tensor, int]]) -> int | None:
     counts = {name: len(value) for name, value, dims in values if value.dim() > dims}
     if len(set(counts.values())) > 1:
         said = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise ValueError(f"expected as many poses of each value, or one for all, got {said}")
+        raise ValueError(f"expected as many poses of each value, or one without that dimension for all, got {said}")
     return next(iter(counts.values()), None)

@@ -15,6 +15,13 @@ from ..scene.mesh import Mesh
 from .control import Control
 from .rotations import roma
 
+PLACING = (
+    "translation",
+    "scale",
+    "orientation",
+    "skinning",
+)  # arguments of posed() that no control may have the names of
+
 
 @dataclass(frozen=True, eq=False)
 class OfFunction:
@@ -34,6 +41,12 @@ class OfFunction:
         joints: Sequence[tuple[str, int]],
     ) -> OfFunction:
         """Raises TypeError or ValueError."""
+        for name in controls:
+            if name in PLACING:
+                raise ValueError(
+                    f"controls: expected names other than {', '.join(PLACING)}, which posed() takes for the whole, got {name!r}; "
+                    "give the function's argument another name"
+                )
         made = {
             str(name): (given if isinstance(given, Control) else Control(given)).checked(str(name))
             for name, given in controls.items()

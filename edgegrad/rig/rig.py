@@ -16,6 +16,7 @@ from .animation import Animation
 from .control import Control, batch_of
 from .function import OfFunction
 from .joints import Joints
+from .rotations import one_as_matrix
 from .skin import Skin
 from .skinned import Skinned
 
@@ -116,7 +117,7 @@ class Rig:
         joint_translations  (J, 3) of joints within their parents, in place of those at rest
         joint_scales        (J, 3), likewise, along the joint's own axes
         translation         (3,) then the whole is turned and scaled about the middle of its box at rest, `center`, and moved
-        orientation         (3,), (4,) or (3, 3)
+        orientation         (3,), (4,) or (3, 3), which is a matrix
         scale               a number
         skinning            "linear" (the default), or "dual quaternion", which keeps volume where joints twist
         values              of other rigs: those of their controls, as `angles` of a robot
@@ -125,6 +126,8 @@ class Rig:
         see clamped(). Raises TypeError or ValueError that names the argument, ImportError without roma.
         """
         given = {**values, **({} if rotations is None else {"rotations": rotations})}
+        for name in given:
+            self._control("posed", name)
         settings = {} if skinning is None else {"skinning": skinning}
         shape = self.shape(given, translation=translation, scale=scale, orientation=orientation, **settings)
         if shape.verts[0].dim() == 2:
@@ -144,7 +147,9 @@ class Rig:
         **settings: Any,
     ) -> Shape:
         """Vertices, normals and joints of what posed() makes, as tensors, of values by the names of controls."""
-        known = {name: self._control(name).value(name, value) for name, value in values.items() if value is not None}
+        known = {
+            name: self._control("shape", name).value(name, value) for name, value in values.items() if value is not None
+        }
         f64 = torch.float64
         whole = {
             "translation": Control(torch.zeros(3, dtype=f64)).value("translation", translation),
@@ -186,11 +191,10 @@ class Rig:
         ]
         return meshes[0] if isinstance(self.scene, Mesh) else self.scene.replace(meshes=meshes)
 
-    def _control(self, name: str) -> Control:
+    def _control(self, asked: str, name: str) -> Control:
         if name not in self.controls:
-            raise TypeError(
-                f"posed: expected values of {', '.join(self.controls)}, or translation, scale and orientation, got {name!r}"
-            )
+            place = ", or translation, scale and orientation," if asked == "posed" else ""
+            raise TypeError(f"{asked}: expected values of {', '.join(self.controls)}{place} got {name!r}")
         return self.controls[name]
 
     def bones(self, values: Mapping[str, Any]) -> Tensor | None:
@@ -212,7 +216,7 @@ class Rig:
         """
         controls = dict(self.controls)
         for name, given in limits.items():
-            control = self._control(name)
+            control = self._control("with_limits", name)
             if isinstance(given, Mapping):
                 low = torch.full_like(control.rest, -torch.inf) if control.low is None else control.low.clone()
                 high = torch.full_like(control.rest, torch.inf) if control.high is None else control.high.clone()
@@ -232,7 +236,7 @@ class Rig:
 
         found = {}
         for name, given in values.items():
-            control = self._control(name)
+            control = self._control("clamped", name)
             value = control.value(name, given)
             found[name] = control.within(roma().rotmat_to_rotvec(value) if control.rotates else value)
         return found
@@ -327,13 +331,8 @@ class Rig:
 
 def _turn(given: object) -> Tensor:
     """(…, 3, 3) from what posed() takes as orientation."""
-    control = Control(torch.zeros(1, 3, dtype=torch.float64), rotates=True)
-    if given is None:
-        return torch.eye(3, dtype=torch.float64)
-    value = as_tensor("orientation", given, like=control.rest)
-    matrices = value.dim() >= 2 and value.shape[-2:] == (3, 3)
-    value = value[None] if value.dim() == 1 or (value.dim() == 2 and matrices) else value[:, None]
-    return control.value("orientation", value).squeeze(-3)
+    eye = torch.eye(3, dtype=torch.float64)
+    return eye if given is None else one_as_matrix("orientation", as_tensor("orientation", given, like=eye).double())
 
 
 def _pair(name: str, given: object) -> tuple[object, object]:

@@ -7,7 +7,7 @@ from types import ModuleType
 import torch
 from torch import Tensor
 
-from ..check import check_shape, values_visible
+from ..check import check_finite, check_shape, values_visible
 from ..optional import require
 
 STRAY = 1e-3  # of a matrix from a rotation, of a quaternion from length 1
@@ -16,6 +16,15 @@ STRAY = 1e-3  # of a matrix from a rotation, of a quaternion from length 1
 def roma() -> ModuleType:
     """Raises ImportError."""
     return require("roma", "edgegrad[rigs]", "rotations of joints")
+
+
+def one_as_matrix(name: str, value: Tensor) -> Tensor:
+    """(…, 3, 3) from one rotation vector (3,), quaternion (4,) or matrix (3, 3), with or without a batch in front; (3, 3) is a
+    matrix. Raises ValueError."""
+    check_shape(name, value, *(s for one in ((3,), (4,), (3, 3)) for s in (one, ("B", *one))))
+    check_finite(name, value)
+    matrices = value.dim() > 1 and value.shape[-2:] == (3, 3)
+    return as_matrices(name, value.unsqueeze(-3 if matrices else -2), 1).squeeze(-3)
 
 
 def as_matrices(name: str, value: Tensor, count: int) -> Tensor:

@@ -15,7 +15,7 @@ from ...scene.scene import Scene
 from ..descent.fit_scene import options_of
 from ..losses import REGION
 from ..options import Parameter
-from ..priors import Prior, towards
+from ..priors import Prior, checked_priors, towards
 from ..views import Images, outlined_views, views_of
 from .keypoints import keypoint_term
 from .levels import Levels
@@ -73,15 +73,16 @@ def fit_rig(
     check_int("coarsest", coarsest, 4, 65536)
     check_int("tries", tries, 0, 10**6)
     check_positive("keypoint_weight", keypoint_weight, least=0.0, most=1e9)
+    if parameters and look is None:
+        raise ValueError(f"parameters: expected a look that takes {', '.join(parameters)}, got none; give look=")
     sought = Sought.of(rig, seek, joints, start or {}, parameters or {})
     count = sum(p.value.numel() for p in sought.parameters.values() if p.value is not None)
     opts = options_of({"method": "gauss-newton" if count <= FEW else "adam", "steps": STEPS, "spp": 8, **options})
     views = views_of(cameras, images, masks, weights)
     if opts.loss == REGION:
         views = outlined_views(views)
-    terms = (
-        [towards({name: control.rest for name, control in rig.controls.items()})] if priors is None else list(priors)
-    )
+    rest = {name: control.rest for name, control in rig.controls.items()}
+    terms = [towards(rest)] if priors is None else checked_priors(priors, sought.values(sought.start))
     points = (
         None if keypoints is None else keypoint_term(rig, [view.camera for view in views], keypoints, keypoint_weight)
     )

@@ -24,6 +24,9 @@ def keypoint_term(
     names = rig.deformer.names
     if not names:
         raise ValueError("keypoints: expected a rig with joints, got one without; give from_function(…, joints=…)")
+    if not isinstance(keypoints, Mapping) or not keypoints:
+        got = type(keypoints).__name__ if not isinstance(keypoints, Mapping) else "none"
+        raise TypeError(f"keypoints: expected pixels (B, 2) by the names of joints, got {got}; None is without them")
     rows, where = [], []
     for name, given in keypoints.items():
         if name not in names:

@@ -76,7 +76,7 @@ class Levels:
     @torch.enable_grad()
     def run(self) -> RigFit:
         parameters = self.sought.parameters
-        values = {name: p.value for name, p in parameters.items() if p.value is not None}
+        values = self.sought.start
         first = dict(values)
         given = {"start": self.sought.fixed, "parameters": parameters, "tries": self.tries, "factors": self.factors}
         checkpoint = Checkpoint.of(self.options, self.views, given)
@@ -142,6 +142,8 @@ class Levels:
 
     def _scene(self, posed: Scene | Mesh, values: Mapping[str, Tensor], views: Sequence[View]) -> Built:
         posed = self.look(posed, **values)
+        if not isinstance(posed, Mesh | Scene):
+            raise TypeError(f"look: expected it to return a Mesh or a Scene, got {type(posed).__name__}")
         scene = Scene([posed]) if isinstance(posed, Mesh) else posed
         masked = any(view.mask is not None for view in views)
         scene = scene.replace(background=None) if masked and scene.background is not None else scene

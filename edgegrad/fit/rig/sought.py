@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...check import as_tensor
+from ...check import as_tensor, check_finite, check_shape
 from ...rig.control import Control
 from ...rig.rig import Rig
 from ...rig.skinned import Skinned
@@ -53,18 +53,25 @@ class Sought:
                     raise ValueError(f"{kind}: expected names among {', '.join(known)}, got {name!r}")
         fixed = {}
         for name, rest in known.items():
-            given = start.get(name)
-            if given is None:
-                fixed[name] = rest.clone()
-            elif name in rig.controls:
-                fixed[name] = rig.clamped(**{name: given})[name].detach()
-            else:
-                fixed[name] = as_tensor(f"start[{name!r}]", given, like=rest).detach().double().reshape(rest.shape)
+            given, value = start.get(name), rest.clone()
+            if name in rig.controls:
+                value = (
+                    rig.controls[name].within(value) if given is None else rig.clamped(**{name: given})[name].detach()
+                )
+            elif given is not None:
+                value = as_tensor(f"start[{name!r}]", given, like=rest).detach().double()
+            check_shape(f"start[{name!r}]", value, tuple(rest.shape), fix="one pose")
+            check_finite(f"start[{name!r}]", value)
+            fixed[name] = value
+        if joints is not None and not [*joints]:
+            raise ValueError(
+                "joints: expected names of joints whose rotations are sought, got none; None is all of them"
+            )
         parameters, rows = {}, {}
         for name in seek:
             value, control = fixed[name], rig.controls.get(name, Control(known[name]))
             low, high = control.low, control.high
-            if control.rotates and (chosen := _free(rig, name, control, joints)) is not None:
+            if (control.rotates or name == "angles") and (chosen := _free(rig, name, control, joints)) is not None:
                 rows[name] = torch.tensor(chosen)
                 value, low, high = (None if x is None else x[chosen] for x in (value, low, high))
             assert value is not None
@@ -77,9 +84,17 @@ class Sought:
             if not isinstance(parameter, Parameter):
                 raise TypeError(f"parameters[{name!r}]: expected a Parameter, got {type(parameter).__name__}")
             parameters[name] = parameter.checked(name)
+        if joints is not None and not rows:
+            raise ValueError(
+                f"joints: expected None where turns of joints are not sought, got {', '.join(map(str, joints))}"
+            )
         if not parameters:
             raise ValueError("seek: expected a name or more of what is sought, got none")
         return Sought(rig, fixed, parameters, rows, tuple(looks))
+
+    @property
+    def start(self) -> dict[str, Tensor]:
+        return {name: p.value for name, p in self.parameters.items() if p.value is not None}
 
     @property
     def joints(self) -> dict[str, tuple[str, ...]]:

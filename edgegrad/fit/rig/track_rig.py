@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
 from ...camera.camera import Camera
+from ...check import check_positive
 from ...rig.rig import Rig
 from ..priors import near, towards
 from .fit_rig import fit_rig
@@ -32,13 +34,19 @@ def track_rig(
     frames     of each moment the arguments of fit_rig() that belong to it: {"masks": …}, or {"images": …, "keypoints": …}
     start      of the first; without one it is searched for
     smooth     the weight of edgegrad.fit.priors.near()
-    arguments  the others of fit_rig()
+    arguments  the others of fit_rig(); of a `checkpoint` each frame has a file of its own, with its number in the name
 
     Raises what fit_rig() raises.
     """
+    check_positive("smooth", smooth, least=0.0, most=1e9)
     before: list[dict[str, Tensor]] = []
-    for frame in frames:
+    for k, frame in enumerate(frames):
+        if not isinstance(frame, Mapping):
+            raise TypeError(f'frames[{k}]: expected arguments by name, as {{"masks": …}}, got {type(frame).__name__}')
         told = {**arguments, **frame}
+        if told.get("checkpoint") is not None:
+            path = Path(told["checkpoint"])
+            told["checkpoint"] = path.with_name(f"{path.stem}-{k + 1:04d}{path.suffix}")
         if not before:
             found = fit_rig(rig, cameras, start=start, **told)
         else:
