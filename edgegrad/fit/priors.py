@@ -31,7 +31,7 @@ def checked_priors(priors: Sequence[Prior], values: Mapping[str, Tensor]) -> lis
     return list(priors)
 
 
-def towards(rest: Mapping[str, Tensor], weight: float = 1e-7) -> Prior:
+def towards(rest: Mapping[str, Tensor], weight: float = 1e-6) -> Prior:
     """Σ (x − rest)² over all values but those of the whole's place; rotations are in radians."""
 
     def prior(values: Mapping[str, Tensor]) -> Tensor:
@@ -45,7 +45,7 @@ def towards(rest: Mapping[str, Tensor], weight: float = 1e-7) -> Prior:
 
 
 def mirrored(
-    name: str, pairs: Sequence[tuple[int, int]], signs: Sequence[float] = (1.0, -1.0, -1.0), weight: float = 1e-7
+    name: str, pairs: Sequence[tuple[int, int]], signs: Sequence[float] = (1.0, -1.0, -1.0), weight: float = 1e-6
 ) -> Prior:
     """Σ |x_left − s x_right|² over pairs of rows of a control: with these signs of rotation vectors, mirrored at x = 0 where the
     joints' own axes are the world's."""
@@ -58,7 +58,7 @@ def mirrored(
     return prior
 
 
-def near(before: Mapping[str, Tensor], weight: float = 1e-6) -> Prior:
+def near(before: Mapping[str, Tensor], weight: float = 1e-5) -> Prior:
     """Σ (x − before)² over all values: smooth over time, where `before` is the pose of the last frame, or what it leads to."""
 
     def prior(values: Mapping[str, Tensor]) -> Tensor:

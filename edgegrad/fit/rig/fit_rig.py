@@ -52,7 +52,8 @@ def fit_rig(
                robot its angles alone
     joints     whose rotations are sought; None: those that vertices hang on. The others stay as they start
     start      values to begin with, by the names that posed() takes; what is not named is at rest
-    priors     see edgegrad.fit.priors; None: towards rest, weakly. Limits of the rig's controls are always kept
+    priors     see edgegrad.fit.priors; None: towards rest, weakly, and least at the pictures' own size. Limits of the
+               rig's controls are always kept
     keypoints  by the name of a joint, where each camera sees it: (B, 2) pixels, NaN where it does not. Robust: some may be wrong
     keypoint_weight  of the mean over all of them, of squared distances in units of 2 % of the picture
     coarsest   pixels on the shorter side of the pictures of the first level; each further one has twice as many
@@ -86,4 +87,5 @@ def fit_rig(
     points = (
         None if keypoints is None else keypoint_term(rig, [view.camera for view in views], keypoints, keypoint_weight)
     )
-    return Levels(rig, sought, views, opts, terms, points, coarsest, tries, look or (lambda scene: scene)).run()
+    scene_of = look or (lambda scene: scene)
+    return Levels(rig, sought, views, opts, terms, priors is None, points, coarsest, tries, scene_of).run()

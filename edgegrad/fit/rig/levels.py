@@ -47,8 +47,8 @@ FINER = 4  # times as many samples on the last level, where twists of limbs are 
 NEAR = 10.0  # what is left of the loss, in units of its noise, from which steps go far where pictures show little:
 HARDLY_SEEN = 1e-6  # of the largest curvature, beside what damps a step,
 NEAR_DAMPING = 1e-4  # and that: shared twists go all the way before the loss, which hardly tells, seems at rest
-GROWTH = 3.0  # a prior's weight grows by this power of how much coarser than their own size pictures are,
-COARSER = 10.0  # and so many times: at their own size a pull to rest would outweigh what tells twists
+GROWTH = 3.0  # a prior's weight grows by this power of how much coarser the pictures are
+EASED = 0.1  # of a prior that nobody asked for, at the pictures' own size, where it would outweigh what tells twists
 COARSE = 15  # steps at most of each level before the last
 F64 = torch.float64
 
@@ -57,10 +57,11 @@ class Levels:
     """The levels of one fit."""
 
     def __init__(
-        self, rig: Rig, sought: Sought, views: list[View], options: Options, priors: Sequence[Prior], points: Prior | None,
-        coarsest: int, tries: int, look: Callable[..., Scene | Mesh],
+        self, rig: Rig, sought: Sought, views: list[View], options: Options, priors: Sequence[Prior], eased: bool,
+        points: Prior | None, coarsest: int, tries: int, look: Callable[..., Scene | Mesh],
     ) -> None:  # fmt: skip
-        self.rig, self.sought, self.views, self.options, self.priors = rig, sought, views, options, priors
+        self.rig, self.sought, self.views, self.options = rig, sought, views, options
+        self.priors, self.eased = priors, eased
         self.points, self.tries, self.look = points, tries, look
         full = min(min(view.camera.size) for view in views)
         sizes = [coarsest]
@@ -156,7 +157,7 @@ class Levels:
         """One level; the best values are in the result's."""
         factor = self.factors[level]
         views = [view.resized(factor) for view in self.views]
-        grown = COARSER * factor**-GROWTH if factor < 1.0 else 1.0
+        grown = factor**-GROWTH if factor < 1.0 or not self.eased else EASED
 
         def prior(tensors: Mapping[str, Tensor]) -> Tensor:
             known = self.sought.values(tensors)

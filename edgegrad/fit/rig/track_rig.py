@@ -26,7 +26,7 @@ def track_rig(
     frames: Sequence[Mapping[str, Any]],
     *,
     start: Mapping[str, Any] | None = None,
-    smooth: float = 1e-6,
+    smooth: float = 1e-5,
     **arguments: Any,
 ) -> Iterator[RigFit]:
     """The pose in each picture of a sequence, one after the other: each begins on the way of the last two, and stays near it.
