@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -173,6 +175,31 @@ def test_a_sequence() -> None:
     found = list(track_rig(rig, cameras, frames, start={}, tries=0, steps=8, progress=False))
     errors = [degrees(one.values["rotations"], truth) for one, truth in zip(found, truths, strict=True)]
     assert max(errors) < 3.0
+
+
+@pytest.mark.parametrize(("loss", "angles"), [(0.5, [0.0, 2.0, 3.0]), (2.0, [0.0, 1.0, 2.0])])
+def test_what_a_frame_misses_is_looked_for_once(monkeypatch, loss: float, angles: list[float]) -> None:
+    """What is found is kept where it is better, and a limb that is missed still is not looked for in the next frame."""
+    calls: list[tuple[int | None, float]] = []
+
+    def fit(rig: eg.Rig, cameras: object, *, start: dict[str, torch.Tensor], **told: Any) -> Any:
+        angle = float(start["rotations"][0, 0]) + (1.0 if calls else 0.0)
+        calls.append((told.get("tries"), angle))
+        values = {"rotations": torch.full((2, 3), angle, dtype=torch.float64)}
+        missed = ["bone 1"] if len(calls) > 1 else []
+        return SimpleNamespace(
+            values=values,
+            missed=missed,
+            loss=loss if told.get("tries") else 1.0,
+            fit=SimpleNamespace(interrupted=False),
+        )
+
+    monkeypatch.setattr("edgegrad.fit.rig.track_rig.fit_rig", fit)
+    monkeypatch.setattr("edgegrad.fit.rig.track_rig.ONWARD", 0.0)
+    start = {"rotations": torch.zeros(2, 3, dtype=torch.float64)}
+    found = list(track_rig(arm(), views(16, 1), [{}, {}, {}], start=start, again=5))
+    assert [float(one.values["rotations"][0, 0]) for one in found] == angles
+    assert [tries for tries, _ in calls] == [None, 0, 5, 0]
 
 
 def test_frames_have_checkpoints_of_their_own(tmp_path) -> None:

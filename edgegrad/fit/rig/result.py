@@ -55,18 +55,18 @@ class RigFit:
     def converged(self) -> bool:
         """Further steps lead no further, and the pictures show what the fit has found, each joint of it, and how it is turned;
         see Fit.converged."""
-        return self.fit.converged and not self._missing and self.left_out < REGION and not self._unknown
+        return self.fit.converged and not self.missed and self.left_out < REGION and not self._unknown
 
     @property
     def reason(self) -> str:
         """In words: "converged", or what kept the fit from that; see Fit.reason."""
         if not self.fit.converged:
             return self.fit.reason
-        if self._missing:
-            worst = sorted(self._missing, key=lambda name: self.explained[name])[:3]
+        if self.missed:
+            worst = sorted(self.missed, key=lambda name: self.explained[name])[:3]
             said = ", ".join(f"{self.explained[name]:.0%} at {name}" for name in worst)
             return (
-                f"edges not explained: the pictures show too few of the edges of {len(self._missing)} joints ({said}); start "
+                f"edges not explained: the pictures show too few of the edges of {len(self.missed)} joints ({said}); start "
                 "nearer, give more tries or keypoints, or look for what covers them"
             )
         if self.left_out >= REGION:
@@ -83,7 +83,8 @@ class RigFit:
         return "" if self.uncertainty is None else self.uncertainty.unknown
 
     @property
-    def _missing(self) -> list[str]:
+    def missed(self) -> list[str]:
+        """Joints of whose edges the pictures show too few: they lie in another place."""
         if not self.explained:
             return []
         least = max(ENOUGH, BESIDE_OTHERS * statistics.median(self.explained.values()))

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from ...camera.camera import Camera
-from ...check import check_positive
+from ...check import check_int, check_positive
 from ...rig.rig import Rig
 from ..priors import near, towards
 from .fit_rig import fit_rig
@@ -27,6 +27,7 @@ def track_rig(
     *,
     start: Mapping[str, Any] | None = None,
     smooth: float = 1e-5,
+    again: int = 10,
     **arguments: Any,
 ) -> Iterator[RigFit]:
     """The pose in each picture of a sequence, one after the other: each begins on the way of the last two, and stays near it.
@@ -34,12 +35,16 @@ def track_rig(
     frames     of each moment the arguments of fit_rig() that belong to it: {"masks": …}, or {"images": …, "keypoints": …}
     start      of the first; without one it is searched for
     smooth     the weight of edgegrad.fit.priors.near()
+    again      how often at most limbs are drawn anew in a frame that shows too few of the edges of one, as fit_rig() does `tries`
+               times in the first; where it is missed still, not in the next frames
     arguments  the others of fit_rig(); of a `checkpoint` each frame has a file of its own, with its number in the name
 
     Raises what fit_rig() raises.
     """
     check_positive("smooth", smooth, least=0.0, most=1e9)
+    check_int("again", again, 0, 10**6)
     before: list[dict[str, Tensor]] = []
+    missed: set[str] = set()
     for k, frame in enumerate(frames):
         if not isinstance(frame, Mapping):
             raise TypeError(f'frames[{k}]: expected arguments by name, as {{"masks": …}}, got {type(frame).__name__}')
@@ -55,7 +60,12 @@ def track_rig(
             ahead = {n: rig.controls[n].within(v) if n in rig.controls else v for n, v in ahead.items()}
             still = towards({name: control.rest for name, control in rig.controls.items()})
             terms = [near(ahead, smooth), *(told.get("priors") or [still])]
-            whole = {"coarsest": 48, "tries": 0, **told, "priors": terms}
+            whole = {"coarsest": 48, **told, "priors": terms, "tries": 0}
             found = fit_rig(rig, cameras, start=ahead, **whole)
+            if again and set(found.missed) - missed and not found.fit.interrupted:
+                # A limb in another place would stay there in the frames to come.
+                other = fit_rig(rig, cameras, start=found.values, **{**whole, "tries": again, "checkpoint": None})
+                found = other if other.loss < found.loss else found
+        missed = set(found.missed)
         before = [*before[-1:], found.values]
         yield found
