@@ -32,8 +32,8 @@ class RigFit:
     fit          the numbers that were sought, loss, views and history
     explained    by the name of each joint that was sought and that pictures can show, the share of its edges that they do, 0 … 1
     left_out     the largest share of a mask's area that lies in regions which the fit does not cover, or has too much
-    uncertainty  how exactly the pictures show each joint; None where nothing tells: of a rig without joints, or one that PyTorch
-                 does not differentiate in forward mode
+    uncertainty  how exactly the pictures show each joint; None where nothing tells: of a rig whose controls have no names, or
+                 one that PyTorch does not differentiate in forward mode
     """
 
     rig: Rig
