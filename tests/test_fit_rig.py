@@ -185,6 +185,7 @@ def test_what_a_frame_misses_is_looked_for_once(monkeypatch, loss: float, angles
     def fit(rig: eg.Rig, cameras: object, *, start: dict[str, torch.Tensor], **told: Any) -> Any:
         angle = float(start["rotations"][0, 0]) + (1.0 if calls else 0.0)
         calls.append((told.get("tries"), angle))
+        assert told["resume"] == (told["checkpoint"] is not None)
         values = {"rotations": torch.full((2, 3), angle, dtype=torch.float64)}
         missed = ["bone 1"] if len(calls) > 1 else []
         return SimpleNamespace(
@@ -197,7 +198,7 @@ def test_what_a_frame_misses_is_looked_for_once(monkeypatch, loss: float, angles
     monkeypatch.setattr("edgegrad.fit.rig.track_rig.fit_rig", fit)
     monkeypatch.setattr("edgegrad.fit.rig.track_rig.ONWARD", 0.0)
     start = {"rotations": torch.zeros(2, 3, dtype=torch.float64)}
-    found = list(track_rig(arm(), views(16, 1), [{}, {}, {}], start=start, again=5))
+    found = list(track_rig(arm(), views(16, 1), [{}, {}, {}], start=start, again=5, checkpoint="a.ckpt", resume=True))
     assert [float(one.values["rotations"][0, 0]) for one in found] == angles
     assert [tries for tries, _ in calls] == [None, 0, 5, 0]
 

@@ -15,12 +15,8 @@ from ..scene.mesh import Mesh
 from .control import Control
 from .rotations import roma
 
-PLACING = (
-    "translation",
-    "scale",
-    "orientation",
-    "skinning",
-)  # arguments of posed() that no control may have the names of
+# Arguments of posed() for the whole, which would never reach a function.
+PLACING = "translation", "scale", "orientation", "skinning"
 
 
 @dataclass(frozen=True, eq=False)

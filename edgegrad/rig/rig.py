@@ -193,8 +193,8 @@ class Rig:
 
     def _control(self, asked: str, name: str) -> Control:
         if name not in self.controls:
-            place = ", or translation, scale and orientation," if asked == "posed" else ""
-            raise TypeError(f"{asked}: expected values of {', '.join(self.controls)}{place} got {name!r}")
+            place = ", or translation, scale and orientation" if asked == "posed" else ""
+            raise TypeError(f"{asked}: expected values of {', '.join(self.controls)}{place}, got {name!r}")
         return self.controls[name]
 
     def bones(self, values: Mapping[str, Any]) -> Tensor | None:

@@ -64,8 +64,9 @@ def track_rig(
             found = fit_rig(rig, cameras, start=ahead, **whole)
             if again and set(found.missed) - missed and not found.fit.interrupted:
                 # A limb in another place would stay there in the frames to come.
-                other = fit_rig(rig, cameras, start=found.values, **{**whole, "tries": again, "checkpoint": None})
-                found = other if other.loss < found.loss else found
+                anew = {**whole, "tries": again, "checkpoint": None, "resume": False}
+                other = fit_rig(rig, cameras, start=found.values, **anew)
+                found = other if other.fit.interrupted or other.loss < found.loss else found
         missed = set(found.missed)
         before = [*before[-1:], found.values]
         yield found
