@@ -138,7 +138,8 @@ void with_view(const BackwardInput<T>& input, const Camera& camera, const InImag
                          .detailed = detailed,
                          .seen = hit_buffers.seen,
                          .hit = hit_buffers.hit,
-                         .vertex_adjoint = vertex_adjoint});
+                         .vertex_adjoint = vertex_adjoint,
+                         .curve_offset = curve_offset_of(camera, frame, vertices, team)});
 }
 
 // Where the terms are to sample, and how often.

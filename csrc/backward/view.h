@@ -38,6 +38,7 @@ struct BackwardView {
     const uint8_t* seen;             // (F,): 0, or the side from which the forward pass hit the face
     const int32_t* hit;              // (H, W, 2): the first and the last of the faces hit in each pixel
     const Array<T>& vertex_adjoint;  // (V, C): Ã at the vertices of faces that were hit (vertex_image.h)
+    double curve_offset;             // px of the undistorted image, see curve_offset_of()
 
     // That holds x.
     int64_t pixel(Vec2 x) const {
@@ -89,6 +90,34 @@ double where_unhit(const BackwardView<T>& view, int64_t face, double area) {
 // so near is decided with it in double (coincident.h), and where a crease ends at one its samples keep so far from the
 // end.
 constexpr double float_reach = 0.01;
+
+// px of the undistorted image by which the surfaces on either side of a curve are taken off it.
+//
+// Where the light stands at the eye, or in a plane through the eye and an edge, the boundary of the edge's shadow lies
+// on its silhouette in the image. Then two estimators must agree on what lies between the two curves. The silhouette
+// asks whether the surface behind it is lit, the shadow boundary asks whether the camera sees it, and the sum of both
+// is
+//
+//     [L_edge − L_lit] v_silhouette                                      if the shadow is hidden,
+//     [L_edge − L_dark] v_silhouette + [L_dark − L_lit] v_shadow         if it is visible,
+//
+// which are equal for what moves both curves together. So both ask at the same distance from their curve: a silhouette
+// on its outer side, a shadow boundary on its dark side. A shadow that shows less than that distance counts as hidden.
+// The distance exceeds what the rays of Embree err, for a ray along the border of a face may meet it in float or not.
+constexpr double least_curve_offset = 1e-5;   // px; coincident curves touch by less
+constexpr double curve_offset_in_errors = 4;  // of float rays at the vertex in view that they miss by most
+inline double curve_offset_of(const Camera& camera, const CameraFrame& frame, const VertexView& vertices, Team& team) {
+    const auto worst = team.of_blocks(vertices.q.size(), [&](int64_t first, int64_t last) {
+        double most = 0;
+        for (int64_t v = first; v < last; ++v)
+            if (!vertices.outcode[v])
+                most = std::max(most, frame.error(camera.R_inverse * (vertices.q[v] - camera.t)) /
+                                          camera.pixel_at_depth(vertices.q[v].z));
+        return most;
+    });
+    const double most = worst.empty() ? 0 : *std::max_element(worst.begin(), worst.end());
+    return std::clamp(curve_offset_in_errors * most, least_curve_offset, float_reach);
+}
 
 // Whether a face that the ray at n meets is there, not cut out.
 template <class T>

@@ -213,13 +213,13 @@ class RecordBoundary final : public CurveContraction {
     // A point of a surface moved a little off the curve to the side where it is visible: there alone is it known what
     // lies between it and a light, where the curve is one of contact, and which of two steps along it was taken.
     Barycentrics aside(const SurfacePoint& p, const CurveSample& sample, Vec2 normal, double side) const {
-        constexpr double little = 1e-5, most = 1e-2;  // px; of the face
+        constexpr double most = 1e-2;  // of the face
         const double size = length(normal);
         if (!(size > 0 && std::isfinite(size))) return p.b;
         const auto corner = corners_of(view_, p.face);
         Barycentrics b;
         if (!barycentrics(face_map(camera_, corner.data()),
-                          normalised(camera_, sample.u + (side * little / size) * normal), b))
+                          normalised(camera_, sample.u + (side * view_.curve_offset / size) * normal), b))
             return p.b;
         const double u = b.u - p.b.u, v = b.v - p.b.v, moved = std::max(std::fabs(u), std::fabs(v));
         const double part = moved > most ? most / moved : 1;

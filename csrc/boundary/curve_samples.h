@@ -27,8 +27,9 @@ class CurveSamples {
         typename Source::Sample& sample = sample_[i];
         sample.u = u, sample.n = normalised(view_.camera, u), sample.weight = weight;
         sample.x = x, sample.area_scale = area_scale, sample.panes.clear();
+        sample.sight = sample.n;
         if (!source_.place(curve, s, sample)) return;
-        rays_.n_x[i] = sample.n.x, rays_.n_y[i] = sample.n.y;
+        rays_.n_x[i] = sample.sight.x, rays_.n_y[i] = sample.sight.y;
         ignored_[i] = sample.ignored;
         if (++rays_.count == RayBatch::size) cast();
     }
@@ -68,7 +69,7 @@ class CurveSamples {
             ignored.insert(std::upper_bound(ignored.begin(), ignored.end(), hit), hit);
             sample.ignored = ignored;
             CameraRays ray(view_.frame);
-            ray.n_x[0] = sample.n.x, ray.n_y[0] = sample.n.y, ray.count = 1;
+            ray.n_x[0] = sample.sight.x, ray.n_y[0] = sample.sight.y, ray.count = 1;
             ray.prepare();
             view_.frame.cast(ray, &sample.ignored);
             hit = hiding(sample, ray.face[0]);

@@ -47,6 +47,7 @@ struct CurveFaces {
 
 struct CurveSample {
     Vec2 u, n;              // the place in the straight image, and its normalised coordinates
+    Vec2 sight;             // the normalised coordinates at which the camera's ray asks what hides the point
     Vec2 x;                 // the pixel position
     double area_scale = 1;  // how much larger an area is there than in the straight image
     Vec3 point;             // camera coordinates

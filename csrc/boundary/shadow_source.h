@@ -101,8 +101,7 @@ class ShadowSource {
     bool place(const Curve& curve, double, Sample& sample) const {
         const Camera& camera = view_.camera;
         const auto v = corners_of(view_, curve.face);
-        const ShadowBorder border =
-            ShadowBorder::of(curve, infinite_, light_of(curve), [&](int32_t i) { return view_.vertices.q[i]; });
+        const ShadowBorder border = ShadowBorder::of(curve, infinite_, light_of(curve), vertices());
         const Vec3 m = cross(v[1] - v[0], v[2] - v[0]), y = place_of(curve), d = border.d, N = border.N;
         // What is lit from behind is dark on both sides of the border.
         if (!(dot(m, d) * dot(m, camera.view_direction(y)) > 0)) return false;
@@ -120,6 +119,10 @@ class ShadowSource {
         sample.scale = sample.speed / length(place_vjp(camera, sample.by_n));
         sample.lit_ahead = curve.side < 0;
         if (!std::isfinite(sample.scale)) return false;
+        // On the dark side: see BackwardView::curve_offset.
+        const Vec2 by_u = place_vjp(camera, sample.by_n);
+        const double moved_by = (sample.lit_ahead ? -1 : 1) * view_.curve_offset / length(by_u);
+        sample.sight = normalised(camera, sample.u + moved_by * by_u);
 
         sample.ignored = {&sample.receiver, 1};
         sample.faces = CurveFaces::on(view_.scene, sample.receiver);
@@ -178,6 +181,11 @@ class ShadowSource {
     void finish(ChunkGrad&) {}
 
    private:
+    // In camera coordinates.
+    auto vertices() const {
+        return [&](int32_t i) { return view_.vertices.q[i]; };
+    }
+
     const BackwardView<T>& view_;
     const bool infinite_;
 };

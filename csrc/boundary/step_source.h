@@ -64,7 +64,7 @@ class StepSource {
             // The ray goes by on the side where the face is cut out: a neighbour that has the rim in common, where it
             // runs along their edge, is cut out there too.
             constexpr double aside = 1e-6;  // px
-            sample.n = normalised(view_.camera, curve.u + (-aside / std::sqrt(squared)) * gradient);
+            sample.sight = normalised(view_.camera, curve.u + (-aside / std::sqrt(squared)) * gradient);
         } else {
             // Between texels there is a jump where the face is there on both sides.
             for (const Barycentrics& side : sample.side)

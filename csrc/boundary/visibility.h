@@ -25,9 +25,9 @@ class Visibility {
     bool lies_behind(int64_t face, const CurveFaces& own, CurveSample& sample) const {
         const auto corner = corners_of(view_, face);
         if (lies_far_before(view_, face, sample.point.z) || hides(face, corner.data(), sample.point, own)) return false;
-        const double depth = depth_of(view_, face, sample.n);
+        const double depth = depth_of(view_, face, sample.sight);
         if (depth < sample.behind.depth)
-            sample.behind = {face, barycentrics_of_hit(face_map(view_.camera, corner.data()), sample.n), depth};
+            sample.behind = {face, barycentrics_of_hit(face_map(view_.camera, corner.data()), sample.sight), depth};
         return true;
     }
 
@@ -37,7 +37,7 @@ class Visibility {
     // the neighbour that double would meet; so beside the ray that passes through the refused face go others that are
     // moved off that face: by as much as floats may err, and by less, for the neighbour may be narrower than that.
     int32_t beyond_float(const CurveSample& sample, int32_t face) const {
-        const Vec2 n = sample.n;
+        const Vec2 n = sample.sight;
         const auto decide = [&](int32_t f) {
             return lies_far_before(view_, f, sample.point.z) ? is_there(view_, f, n) : meets(view_, f, n);
         };
