@@ -272,7 +272,8 @@ def test_what_one_light_adds() -> None:
 
 
 def test_borders_of_shadows_by_what_the_light_adds() -> None:
-    """As by the radiance on both sides, 1e-5 px beside the border, which is what any other shader gives."""
+    """As by the radiance on both sides of the boundary, as far off it as the kernel takes them, some 1e-4 px. Any other shader is
+    asked there."""
     leaves = {
         name: value.clone().requires_grad_() for name, value in numbers_of("normals point area sky colors").items()
     }
@@ -283,7 +284,7 @@ def test_borders_of_shadows_by_what_the_light_adds() -> None:
         image = eg.render(scene, camera, spp=4, shader=shader, edge_samples=4000)
         found.append(torch.autograd.grad((weights * image).sum(), [leaves["verts"], leaves["point"]]))
     for a, b in zip(*found, strict=True):
-        assert float((a - b).norm()) < 1e-5 * float(a.norm()) > 0
+        assert float((a - b).norm()) < 1e-4 * float(a.norm()) > 0
 
 
 def test_borders_of_shadows_of_what_is_looked_up_nearest() -> None:
