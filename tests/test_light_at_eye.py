@@ -156,7 +156,8 @@ def test_of_a_fisheye() -> None:
 @pytest.mark.parametrize("shape", ["grid", "box", "sphere"])
 def test_of_all_small_offsets(shape: str, kind: str, sign: int, dtype: torch.dtype) -> None:
     for offset in (1e-12, 1e-10, 1e-8, 1e-7, 3e-7, 1e-6, 3e-6, 1e-5, 3e-5, 1e-4):
-        check(lit(kind, shape=shape, offset=sign * offset, dtype=dtype), seeds=8)
+        # What a lamp lights is noisier, for each sample of a boundary has one of its points.
+        check(lit(kind, shape=shape, offset=sign * offset, dtype=dtype), 8, 40_000 if kind == "area" else 4_000)
 
 
 CLEARLY_APART = 3e-3  # world units: the derivative has changed by half a percent
@@ -177,16 +178,21 @@ def test_a_light_above_the_eye_and_upright_edges(shape: str, offset: float) -> N
 @pytest.mark.parametrize("shape", ["grid", "box"])
 @pytest.mark.parametrize("offset", [0.0, CLEARLY_APART, 0.1])
 def test_a_light_above_the_eye_against_differences(shape: str, offset: float) -> None:
+    """With a short step: within 0.01 the derivative by the box changes by 2 %."""
     case = Case(shape, above=2.0, offset=offset)
     found = estimate(gradients(case, 12, edge_samples=16_000, surface_samples=16_000))
-    right_ratio(finite_difference(case, 0.01, 4096, 12), found)
+    right_ratio(finite_difference(case, 0.003, 8192, 20), found)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("offset", [0.0, 1e-6])
 def test_with_indirect_light(offset: float) -> None:
     near, apart = (
-        estimate(gradients(lit("point", shape="box", offset=away), 16, edge_samples=20_000, bounces=2))
+        estimate(
+            gradients(
+                lit("point", shape="box", offset=away), 32, edge_samples=60_000, surface_samples=60_000, bounces=2
+            )
+        )
         for away in (offset, CLEARLY_APART)
     )
     finite_differences.check("bounces", apart.mean, near, slack=0.01)
