@@ -189,6 +189,47 @@ def aovs(bench: Bench) -> list[Row]:
     return rows
 
 
+# Names of lenses, their projection and coefficients, and the most that a pass may take over that of a pinhole.
+LENSES: dict[str, tuple[str, list[float] | None, float | None]] = {
+    "a lens of zeros": ("perspective", [0.0, 0.0, 0.0, 0.0], 1.05),
+    "a lens with k1": ("perspective", [-0.1, 0.0, 0.0, 0.0], 1.3),
+    "a lens with decentring": ("perspective", [-0.1, 0.02, 0.001, -0.002], None),
+    "a fisheye": ("fisheye", None, 1.3),
+    "a fisheye with k1 to k4": ("fisheye", [-0.05, 0.02, -0.01, 0.002], 1.3),
+}
+
+
+def lenses(bench: Bench) -> list[Row]:
+    """Images and steps through lenses that distort, over those of a pinhole."""
+    mesh, adjoint = single(icosphere(5)), smooth_channels(3)
+    pinhole = front_camera(256)
+    cameras = [pinhole] + [
+        pinhole.replace(
+            projection=projection, distortion=None if values is None else torch.tensor(values, dtype=torch.float64)
+        )
+        for projection, values, _ in LENSES.values()
+    ]
+
+    def image(camera: eg.Camera, spp: int) -> None:
+        with torch.no_grad():
+            eg.render(mesh, camera, spp)
+
+    def both(camera: eg.Camera, spp: int) -> None:
+        verts = mesh.verts.detach().clone().requires_grad_()
+        eg.render(mesh.replace(verts=verts), camera, spp).backward(adjoint)
+
+    rows = []
+    for spp in (16, 1):
+        for what, work in (("image", image), ("image and gradient", both)):
+            run = [partial(seconds_of, partial(work, camera, spp)) for camera in cameras]
+            straight, *bent = bench.interleaved(21, *run)
+            for (name, (_, _, most)), times in zip(LENSES.items(), bent, strict=True):
+                note = f"{milliseconds(times)} over {milliseconds(straight)}, 20,480 faces at 256² × {spp}"
+                must = most if spp == 16 else None
+                rows.append(ratio_row(f"{name} over a pinhole, {what}", times, straight, must=must, note=note))
+    return rows
+
+
 def sparse(bench: Bench) -> list[Row]:
     mesh, camera, adjoint = sphere(512)
     window = torch.zeros_like(adjoint)

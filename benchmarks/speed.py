@@ -22,7 +22,7 @@ from typing import Any
 
 import torch
 from bounces import bounced_gradients, bounces
-from costs import aovs, backward, bits, forward, large, small, sparse, textures, threads, update
+from costs import aovs, backward, bits, forward, large, lenses, small, sparse, textures, threads, update
 from defaults import deep, flat_colors, kernel_hash, noise, tangled
 from equal_error import boundary, interior, step
 from glossy import glossy
@@ -53,6 +53,7 @@ ROWS: dict[str, Callable[[Bench], list[Row]]] = {
     "textures": textures,
     "aovs": aovs,
     "sparse": sparse,
+    "lenses": lenses,
     "deep": deep,
     "tangled": tangled,
     "flat-colors": flat_colors,

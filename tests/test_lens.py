@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -400,3 +401,137 @@ def test_what_is_refused() -> None:
         view.replace(projection="orthographic")
     with pytest.raises(ValueError, match="distortion: expected a batch of 2 like K, got 3"):
         view.replace(K=view.K.repeat(2, 1, 1), distortion=torch.zeros((3, 4), dtype=F64))
+
+
+# -- tables ---------------------------------------------------------------------------------------------------------------
+
+
+def normalised_places(view: eg.Camera, pixels: list[tuple[int, int]], places: np.ndarray) -> np.ndarray:
+    """n (P, N, 2) of the rays through places (N, 2) of the unit square of each pixel, as images have them."""
+    kernel = kernel_camera(pack_camera(view))
+    return np.array([core.for_tests.place_in_pixel(kernel, x, y, places.tolist()) for x, y in pixels])
+
+
+RADIAL = {
+    "k1": ("perspective", [-0.1, 0.0, 0.0, 0.0]),
+    "stronger": ("perspective", [-0.25, 0.08, 0.0, 0.0, 0.03]),
+    "rational": ("perspective", [0.3, 0.05, 0.0, 0.0, 0.02, 0.4, 0.1, 0.03]),
+    "pincushion": ("perspective", [0.4, 0.1, 0.0, 0.0]),
+    "decentred": ("perspective", DISTORTION["four"]),
+    "fisheye": ("fisheye", DISTORTION["fisheye"]),
+    "equidistant": ("fisheye", [0.0, 0.0, 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("focal", [2000.0, 60.0, 25.0])
+@pytest.mark.parametrize("lens", RADIAL)
+def test_rays_of_pixels_come_back_to_where_they_were_drawn(lens: str, focal: float) -> None:
+    """The inverse, by tables or by steps, within a few spacings of doubles; also near the fold, where tables end."""
+    projection, values = RADIAL[lens]
+    K = torch.tensor([[focal, 0.3, 23.0], [0.0, 1.1 * focal, 19.0], [0.0, 0.0, 1.0]], dtype=F64)
+    distortion = torch.tensor(values, dtype=F64)
+    view = eg.Camera(torch.eye(4, dtype=F64), K, SIZE, projection, distortion)
+    pixels = [(x, y) for x in range(0, SIZE[1], 3) for y in range(0, SIZE[0], 3)]
+    places = np.random.default_rng(3).uniform(0, 1, (16, 2))
+    n = torch.from_numpy(normalised_places(view, pixels, places))
+    seen = n.isfinite().all(-1)
+    assert bool(seen[len(seen) // 2].all())
+    m = bend(projection, torch.cat([n, torch.ones_like(n[..., :1])], -1), distortion)
+    x = m @ K[:2, :2].T + K[:2, 2]
+    expected = torch.tensor(pixels, dtype=F64)[:, None] + torch.from_numpy(places)
+    torch.testing.assert_close(x[seen], expected[seen], rtol=0, atol=1e-11 * max(focal, 100.0))
+
+
+def test_each_camera_has_a_table_of_its_own() -> None:
+    """Cameras in turns, which differ in their coefficients, K or size alone, show what they show when they come first."""
+    first = camera("fisheye")
+    others = [
+        first.replace(distortion=first.coefficients * 1.05),
+        first.replace(K=first.K * torch.tensor([[1.05, 1, 1], [1, 1, 1], [1, 1, 1]], dtype=F64)),
+        first.replace(size=(SIZE[0], SIZE[1] + 2)),
+        first.replace(projection="perspective"),
+        first,
+    ]
+    places = np.array([[0.25, 0.75], [0.5, 0.5]])
+    pixels = [(2, 3), (40, 30)]
+    found = [normalised_places(view, pixels, places) for view in others]
+    for view, n in zip(others, found, strict=True):
+        q = torch.from_numpy(np.concatenate([n, np.ones_like(n[..., :1])], -1))
+        x = bend(view.projection, q, view.coefficients) @ view.K[:2, :2].T + view.K[:2, 2]
+        np.testing.assert_allclose(x.numpy(), np.array(pixels)[:, None] + places, rtol=0, atol=1e-8)
+    # Many more than are remembered.
+    for step in range(100):
+        normalised_places(
+            first.replace(
+                K=first.K + torch.tensor(1e-3 * step, dtype=F64) * torch.tensor([[1.0, 0, 0], [0, 0, 0], [0, 0, 0]])
+            ),
+            pixels[:1],
+            places,
+        )
+    np.testing.assert_array_equal(normalised_places(first, pixels, places), found[-1])
+
+
+def test_threads_that_change_lenses_find_their_own() -> None:
+    views = [
+        camera("fisheye").replace(K=camera("fisheye").K * torch.tensor([[s, s, 1], [s, s, 1], [1, 1, 1]]))
+        for s in (1.0, 1.1)
+    ]
+    mesh = colored_sphere()
+    right = [eg.render(mesh, view, 4) for view in views]
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(lambda i: eg.render(mesh, views[i % 2], 4), range(12)))
+    for i, image in enumerate(found):
+        assert torch.equal(image, right[i % 2])
+
+
+@pytest.mark.parametrize("spp", [1, 16])
+def test_a_lens_of_zeros_renders_as_its_pinhole(spp: int) -> None:
+    """The same bits, of images and of gradients that leave the coefficients alone."""
+    mesh, view = colored_sphere(), camera("four").replace(distortion=None)
+    zero = view.replace(distortion=torch.zeros(5, dtype=F64))
+    adjoint = smooth_adjoint(*SIZE, 3)
+
+    def image_and_gradient(view: eg.Camera) -> tuple[Tensor, Tensor]:
+        verts = mesh.verts.clone().requires_grad_()
+        image = eg.render(mesh.replace(verts=verts), view, spp)
+        return image.detach(), torch.autograd.grad((image * adjoint).sum(), verts)[0]
+
+    for found, right in zip(image_and_gradient(zero), image_and_gradient(view), strict=True):
+        assert torch.equal(found, right)
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_gradient_by_coefficients_of_zero(index: int) -> None:
+    """Of the mean image, against a difference over coefficients on both sides of zero; and forward mode agrees."""
+    mesh, view = colored_sphere(0.3), camera("four").replace(distortion=None)
+    adjoint = smooth_adjoint(*SIZE, 3)
+    direction = torch.eye(4, dtype=F64)[index]
+
+    def loss_at(t: Tensor, spp: int) -> Tensor:
+        return (eg.render(mesh, view.replace(distortion=t * direction), spp, edge_samples=40_000) * adjoint).sum()
+
+    t = torch.zeros((), dtype=F64, requires_grad=True)
+    (found,) = torch.autograd.grad(loss_at(t, 64), t)
+    step = 0.02
+    with torch.no_grad():
+        ahead, behind = (float(loss_at(torch.tensor(s, dtype=F64), 1024)) for s in (step, -step))
+    assert float(found) == pytest.approx((ahead - behind) / (2 * step), rel=0.02)
+    _, forward = torch.func.jvp(lambda t: loss_at(t, 64), (torch.zeros((), dtype=F64),), (torch.ones((), dtype=F64),))
+    assert float(forward) == pytest.approx(float(found), rel=0.02)
+
+
+@lenses
+def test_pixels_that_are_left_out_show_nothing(lens: str) -> None:
+    """Only pixels near the mesh get rays; a far wall behind it makes that all pixels, and hides nothing of the mesh."""
+    view = camera(lens)
+    mesh = colored_sphere(0.4)
+    wall = eg.Mesh(
+        torch.tensor([[-90.0, -90, 9], [90, -90, 9], [0, 90, 9]], dtype=F64) @ view.world_to_camera[:3, :3]
+        - view.world_to_camera[:3, 3] @ view.world_to_camera[:3, :3],
+        torch.tensor([[0, 1, 2]]),
+        colors=torch.zeros((3, 3), dtype=F64),
+    )
+    alone = eg.render(mesh, view, 16)
+    before = eg.render(eg.Scene([mesh, wall]), view, 16)
+    assert float(alone.amax()) > 0.5
+    torch.testing.assert_close(alone, before, rtol=0, atol=1e-12)

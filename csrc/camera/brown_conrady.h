@@ -40,6 +40,13 @@ struct BrownConrady {
         c_bar[5] += b_bar * s, c_bar[6] += b_bar * s * s, c_bar[7] += b_bar * s * s * s;
     }
 
+    bool is_radial() const { return p1 == 0 && p2 == 0; }
+    // Whether the image is that of a pinhole.
+    bool is_identity() const {
+        for (const double c : {k1, k2, p1, p2, k3, k4, k5, k6})
+            if (c != 0) return false;
+        return true;
+    }
     double radius(double r) const { return r * (above(r * r) / below(r * r)); }
     double radius_slope(double r) const {
         const double s = r * r, g = above(s) / below(s);

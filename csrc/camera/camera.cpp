@@ -1,6 +1,13 @@
 #include "camera/camera.h"
 
 #include <algorithm>
+#include <array>
+#include <bit>
+#include <memory>
+#include <mutex>
+#include <vector>
+
+#include "camera/radial_inverse.h"
 
 namespace edgegrad {
 
@@ -8,9 +15,61 @@ namespace {
 
 constexpr double margin = 1;  // px, by which a filter may reach over the border of the image
 
+// What is visible through the lenses that were asked for last: it depends on a camera's size, K and coefficients alone,
+// and takes as long to find out as a small image. Each takes about 10 KiB.
+class LensViews {
+   public:
+    using Key = std::array<uint64_t, 9 + most_coefficients>;
+    struct View {
+        Key key;
+        AnyLens lens;  // a fisheye may have become a wide one
+        LensView view;
+    };
+
+    static Key key_of(const Camera& c) {
+        Key key{c.lens.index(), uint64_t(c.width), uint64_t(c.height)};
+        for (int i = 0; i < 6; ++i) key[3 + i] = std::bit_cast<uint64_t>(c.k[i]);
+        with_radial_lens(c.lens, [&]<class L>(const L& lens) {
+            const auto words = std::bit_cast<std::array<uint64_t, L::coefficients>>(lens);
+            std::copy(words.begin(), words.end(), key.begin() + 9);
+        });
+        return key;
+    }
+
+    bool find(const Key& key, Camera& c) {
+        const std::lock_guard lock(mutex_);
+        for (const View& kept : kept_)
+            if (kept.key == key) return c.lens = kept.lens, c.lens_view = kept.view, true;
+        return false;
+    }
+    void keep(const Key& key, const Camera& c) {
+        const std::lock_guard lock(mutex_);
+        if (kept_.size() < most) kept_.push_back({key, c.lens, c.lens_view});
+        else kept_[oldest_++ % most] = {key, c.lens, c.lens_view};
+    }
+
+   private:
+    static constexpr size_t most = 64;
+    std::mutex mutex_;
+    std::vector<View> kept_;
+    size_t oldest_ = 0;
+};
+
+LensViews& lens_views() {
+    static auto* views = new LensViews;  // for threads that outlive the end of main()
+    return *views;
+}
+
 }  // namespace
 
 void Camera::look_through_lens() {
+    const LensViews::Key key = LensViews::key_of(*this);
+    if (lens_views().find(key, *this)) return;
+    find_lens_view();
+    lens_views().keep(key, *this);
+}
+
+void Camera::find_lens_view() {
     lens_view = view_through_lens();
     const auto* fisheye = std::get_if<Fisheye>(&lens);
     if (!fisheye || !lens_view.end || lens_view.disc.fold < greatest_radius) return;
@@ -23,6 +82,13 @@ void Camera::look_through_lens() {
 LensView Camera::view_through_lens() const {
     LensView view;
     view.disc = disc_of(lens);
+    double most = 0;
+    for (const Vec2 x : {Vec2{-margin, -margin},
+                         {width + margin, -margin},
+                         {-margin, height + margin},
+                         {width + margin, height + margin}})
+        most = std::max(most, length(normalised(*this, x)));
+    view.disc.inverse = std::make_shared<const RadialInverse>(lens, view.disc.fold, (1 + 1e-9) * most);
     // The border of the image: what is seen within it lies within its image.
     constexpr int points = 256;  // a side
     constexpr double infinite = std::numeric_limits<double>::infinity();

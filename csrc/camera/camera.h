@@ -178,8 +178,9 @@ struct Camera {
     }
 
    private:
-    // Finds out what is visible; a fisheye that shows more than one side becomes a wide one.
+    // Finds out what is visible, or remembers it; a fisheye that shows more than one side becomes a wide one.
     void look_through_lens();
+    void find_lens_view();
     LensView view_through_lens() const;
 };
 

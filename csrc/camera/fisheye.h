@@ -36,6 +36,7 @@ struct Fisheye {
         for (int i = 0; i < 4; ++i) c_bar[i] += power *= angle * angle;
     }
 
+    static bool is_radial() { return true; }
     double radius(double r) const { return at_angle(std::atan(r)); }
     double radius_slope(double r) const { return slope_at_angle(std::atan(r)) / (1 + r * r); }
     std::vector<double> turning_radii(double most) const {

@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <limits>
 
+#include "camera/radial_inverse.h"
+
 namespace edgegrad {
 
 namespace {
@@ -32,6 +34,7 @@ double straight_radius(const L& lens, double fold, double m) {
     double low = 0, high = fold, r = std::min(m, fold);
     for (int i = 0; i < 64; ++i) {
         const double error = lens.radius(r) - m;
+        if (error == 0) return r;  // a bracket that ends there would be halved
         (error < 0 ? low : high) = r;
         const double next = r - error / lens.radius_slope(r);
         const double step = next > low && next < high ? next : 0.5 * (low + high);
@@ -41,13 +44,22 @@ double straight_radius(const L& lens, double fold, double m) {
     return r;
 }
 
-// Newton's steps from the solution without what is not radial.
+// The solution without what is not radial.
+template <RadialLens L>
+Vec2 straighten_radial(const L& lens, const LensDisc& disc, Vec2 m) {
+    Vec2 n = m;
+    if (disc.inverse && disc.inverse->straighten(1, &n.x, &n.y)) return n;
+    const double size = length(m);
+    return size > 0 ? (straight_radius(lens, disc.fold, size) / size) * m : m;
+}
+
+// Newton's steps from there.
 template <RadialLens L>
 std::optional<Vec2> straighten(const L& lens, const LensDisc& disc, Vec2 m) {
-    const double size = length(m), fold = disc.fold;
+    const double size = length(m);
     if (size > disc.reach) return {};
     if (size == 0 && length(lens.bend(m)) == 0) return m;
-    Vec2 n = size > 0 ? (straight_radius(lens, fold, size) / size) * m : m;
+    Vec2 n = straighten_radial(lens, disc, m);
     for (int i = 0; i < 32; ++i) {
         const Vec2 step = solve(lens.jacobian(n), m - lens.bend(n));
         if (!std::isfinite(step.x + step.y)) return {};
@@ -69,18 +81,22 @@ struct Points {
 };
 
 // A step n + J⁻¹ (m − bend(n)) of all, with J where the pixel's middle is: over a pixel it changes by a hundredth or
-// less, and so much smaller is each error than the last. Returns the greatest before the step.
+// less, and so much smaller is each error than the last. Returns whether all errors were small before the step: the
+// last one but for a hundredth is taken away.
+constexpr double small_error = 1e-10;
 template <RadialLens L>
-[[gnu::always_inline]] inline double chord_step(const L lens, const Mat2 inverse, Points& p) {
+[[gnu::always_inline]] inline bool chord_step(const L lens, const Mat2 inverse, Points& p) {
     for (int i = 0; i < p.count; ++i) {
         const Vec2 m = lens.bend({p.n_x[i], p.n_y[i]}), error{p.m_x[i] - m.x, p.m_y[i] - m.y}, step = inverse * error;
         p.n_x[i] += step.x, p.n_y[i] += step.y;
         p.error[i] = std::fabs(error.x) + std::fabs(error.y);
     }
-    return *std::max_element(p.error, p.error + p.count);
+    int64_t large = 0;
+    for (int i = 0; i < p.count; ++i) large |= int64_t(!(p.error[i] < small_error));
+    return !large;
 }
 
-EDGEGRAD_VECTORIZED double chord_step(const AnyLens& lens, Mat2 inverse, Points& p) {
+EDGEGRAD_VECTORIZED bool chord_step(const AnyLens& lens, Mat2 inverse, Points& p) {
     if (const auto* l = std::get_if<BrownConrady>(&lens)) return chord_step(*l, inverse, p);
     return chord_step(*std::get_if<Fisheye>(&lens), inverse, p);
 }
@@ -137,11 +153,30 @@ Vec2 folding_place(const BrownConrady& lens, const LensDisc& disc) {
     return on_circle(disc.fold, least);
 }
 
+double straight_radius(const AnyLens& lens, double fold, double m) {
+    return with_radial_lens(lens, [&](const auto& l) { return straight_radius(l, fold, m); });
+}
+
 std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m) {
     if (has_sides(lens))
         return with_side_lens(lens, std::optional<Vec2>(), [&](const auto& l) { return l.straighten(m); });
     return with_radial_lens(lens, [&](const auto& l) { return straighten(l, disc, m); });
 }
+
+namespace {
+
+// By the table of a radial lens, if it holds all of the points.
+bool straighten_by_table(const AnyLens& lens, const LensDisc& disc, int k, double* x, double* y) {
+    if (!disc.inverse || k > Points::size || !with_radial_lens(lens, [](const auto& l) { return l.is_radial(); }))
+        return false;
+    double n_x[Points::size], n_y[Points::size];
+    std::copy(x, x + k, n_x), std::copy(y, y + k, n_y);
+    if (!disc.inverse->straighten(k, n_x, n_y)) return false;
+    std::copy(n_x, n_x + k, x), std::copy(n_y, n_y + k, y);
+    return true;
+}
+
+}  // namespace
 
 void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, double* x, double* y) {
     constexpr double nan = std::numeric_limits<double>::quiet_NaN();
@@ -153,11 +188,10 @@ void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, 
         }
         return;
     }
+    if (straighten_by_table(lens, disc, k, x, y)) return;
     const std::optional<Vec2> n0 = straighten(lens, disc, m0);
     const Mat2 inverse =
         edgegrad::inverse(with_radial_lens(lens, [&](const auto& l) { return l.jacobian(n0.value_or(Vec2{})); }));
-    // The last error but for a hundredth is taken away.
-    constexpr double small = 1e-10;
     constexpr int most_steps = 12;
     Points p;
     for (int first = 0; first < k; first += Points::size) {
@@ -169,11 +203,11 @@ void straighten_near(const AnyLens& lens, const LensDisc& disc, Vec2 m0, int k, 
                 const Vec2 n = *n0 + inverse * (Vec2{p.m_x[i], p.m_y[i]} - m0);
                 p.n_x[i] = n.x, p.n_y[i] = n.y;
             }
-            for (int i = 0; i < most_steps && !(chord_step(lens, inverse, p) < small);) ++i;
+            for (int i = 0; i < most_steps && !chord_step(lens, inverse, p);) ++i;
         }
         for (int i = 0; i < p.count; ++i) {
             Vec2 n{p.n_x[i], p.n_y[i]};
-            if (!(p.error[i] < small && length(n) < disc.fold)) {
+            if (!(p.error[i] < small_error && length(n) < disc.fold)) {
                 n = straighten(lens, disc, {p.m_x[i], p.m_y[i]}).value_or(Vec2{nan, nan});
             }
             x[first + i] = n.x, y[first + i] = n.y;

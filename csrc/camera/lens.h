@@ -6,6 +6,7 @@
 #include <cmath>
 #include <concepts>
 #include <limits>
+#include <memory>
 #include <optional>
 #include <variant>
 #include <vector>
@@ -45,12 +46,13 @@ concept SideLens = Lens<L> && requires(const L lens, Vec2 x, double reach, Box2 
 static_assert(SideLens<Equirectangular> && SideLens<WideFisheye>);
 
 // One that is radial, nearly: |m| at |n| = r but for what is not, its derivative, and the radii up to a greatest at
-// which one of these changes its sign.
+// which one of these changes its sign. And whether it is radial altogether.
 template <class L>
 concept RadialLens = Lens<L> && requires(const L lens, double r) {
     { lens.radius(r) } -> std::same_as<double>;
     { lens.radius_slope(r) } -> std::same_as<double>;
     { lens.turning_radii(r) } -> std::same_as<std::vector<double>>;
+    { lens.is_radial() } -> std::same_as<bool>;
 };
 static_assert(RadialLens<BrownConrady> && RadialLens<Fisheye>);
 
@@ -85,15 +87,22 @@ inline bool has_sides(const AnyLens& lens) {
     return with_side_lens(lens, false, [](const auto&) { return true; });
 }
 
+class RadialInverse;
+
 // The disc in which every m of a radial lens has one n: what lies beyond is not seen.
 struct LensDisc {
     double fold = std::numeric_limits<double>::infinity();  // the least |n| with det ∂m/∂n ≤ 0; or greatest_radius
     double reach = fold;                                    // no |m| from within is greater
+    // The table of the lens's radial part (radial_inverse.h); null where there is none.
+    std::shared_ptr<const RadialInverse> inverse = {};
 };
 LensDisc disc_of(const AnyLens& lens);
 // The n with |n| = fold at which det ∂m/∂n is least, of those by which the fold was found.
 Vec2 folding_place(const BrownConrady& lens, const LensDisc& disc);
 constexpr double greatest_radius = 30;  // 88° from the axis; what shows more sees through sides
+
+// The r in [0, fold] that the radial part of a lens takes to m, or the fold.
+double straight_radius(const AnyLens& lens, double fold, double m);
 
 // The n in the disc that is bent to m; none if there is none.
 std::optional<Vec2> straighten(const AnyLens& lens, const LensDisc& disc, Vec2 m);

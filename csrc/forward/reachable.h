@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <limits>
 #include <numeric>
+#include <vector>
 
 #include "camera/camera.h"
 #include "core/array.h"
@@ -17,7 +18,8 @@ namespace edgegrad {
 inline int pixels_of_batches(int spp) { return RayBatch::size / std::gcd(RayBatch::size, spp); }
 
 // The pixels whose samples may hit something: those in an octagon around the images of all vertices of faces, if these
-// lie before the eye of a pinhole. With a pixel more on each side, for Embree sees positions rounded to floats.
+// lie before the eye. With a pixel more on each side, for Embree sees positions rounded to floats. Through a lens the
+// octagon of the straight image is bent, and each row reaches from its first place there to its last.
 class ReachablePixels {
    public:
     // `q` are the vertices in the camera's frame.
@@ -43,9 +45,18 @@ class ReachablePixels {
         }
         void add(int k, double x) { low[k] = std::min(low[k], x), high[k] = std::max(high[k], x); }
     };
+    // The part of the octagon in a box.
+    static std::vector<Vec2> polygon(const Bounds& bounds, Vec2 low, Vec2 high);
+    void bend_bounds(const Camera& camera);
+
     int width_;
     double margin_;
     Bounds bounds_;
+    // Of a lens: what the octagon's image spans in each row, px; empty for a pinhole.
+    struct Span {
+        double from = infinite, to = -infinite;
+    };
+    std::vector<Span> spans_;
 };
 
 }  // namespace edgegrad

@@ -205,7 +205,7 @@ void HitArrays<T>::check(const SceneArrays<T>& scene, const Camera& camera) cons
 }
 
 Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, In<double, 1> distortion, bool perspective,
-                   const std::string& lens, int width, int height) {
+                   const std::string& lens, int width, int height, bool by_distortion) {
     if (world_to_camera.shape(0) != 4 || world_to_camera.shape(1) != 4)
         refuse("world_to_camera: expected shape (4, 4)");
     if (K.shape(0) != 3 || K.shape(1) != 3) refuse("K: expected shape (3, 3)");
@@ -215,6 +215,9 @@ Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, In<double, 1>
     const Camera camera(world_to_camera.data(), K.data(), perspective, width, height, make_lens(lens, K, distortion));
     if (camera.k_det == 0) refuse("K: expected focal lengths that are not zero, got a singular matrix");
     if (is_too_wide(camera)) refuse("K: expected a panorama that reaches around no more than 4 times");
+    const auto* bends = std::get_if<BrownConrady>(&camera.lens);
+    if (bends && bends->is_identity() && !by_distortion && !camera.lens_view.end)
+        return Camera(world_to_camera.data(), K.data(), perspective, width, height);
     return camera;
 }
 

@@ -94,8 +94,10 @@ void with_geometry(const SceneArrays<T>& arrays, bool boundary, int threads, Wor
     });
 }
 
+// `by_distortion`: whether derivatives by the coefficients are asked for. Without them a lens that distorts nothing is
+// a pinhole, as far as it shows all of the image.
 Camera make_camera(In<double, 2> world_to_camera, In<double, 2> K, In<double, 1> distortion, bool perspective,
-                   const std::string& lens, int width, int height);
+                   const std::string& lens, int width, int height, bool by_distortion);
 Filter make_filter(const std::string& name);
 ImageOptions make_image_options(int spp, const std::string& filter, uint64_t seed);
 

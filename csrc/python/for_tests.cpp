@@ -21,6 +21,7 @@
 #include "core/systematic.h"
 #include "film/film.h"
 #include "film/importance.h"
+#include "forward/forward.h"
 #include "python/arrays.h"
 #include "python/unlocked.h"
 #include "scene/intersections.h"
@@ -161,6 +162,15 @@ void bind_for_tests(nb::module_& m) {
         IntrinsicsGrad grad;
         normalised_vjp(c, normalised(c, straighten(c, vec(x))), vec(bar), grad);
         return of_camera(c, grad);
+    });
+    // Where the rays through places (N, 2) of the unit square of pixel (x, y) go.
+    p.def("place_in_pixel", [](const Camera& c, int x, int y, const std::vector<A2>& places) {
+        std::vector<double> n_x, n_y;
+        for (const A2& u : places) n_x.push_back(u[0]), n_y.push_back(u[1]);
+        place_in_pixel(c, Filter(FilterKind::box), x, y, int(places.size()), n_x.data(), n_y.data());
+        std::vector<A2> out;
+        for (size_t i = 0; i < places.size(); ++i) out.push_back({n_x[i], n_y[i]});
+        return out;
     });
     // By the bend of the straight image: where a place is seen, the area scale, and what becomes of a tangent there.
     p.def("bend", [](const Camera& c, A2 u, A2 tangent) {

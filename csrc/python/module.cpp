@@ -240,7 +240,7 @@ NB_MODULE(_core, m) {
         "child"_a);
     nb::class_<Camera>(m, "Camera")
         .def(nb::new_(&make_camera), "world_to_camera"_a.noconvert(), "K"_a.noconvert(), "distortion"_a.noconvert(),
-             "perspective"_a, "lens"_a, "width"_a, "height"_a)
+             "perspective"_a, "lens"_a, "width"_a, "height"_a, "by_distortion"_a = true)
         // Where the lens folds over or ends in the image: the angle to the axis; none if it does not.
         .def_prop_ro("end", [](const Camera& c) { return c.lens_view.end; })
         // How many pinholes it sees through.

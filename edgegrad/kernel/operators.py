@@ -54,8 +54,10 @@ def kernel_scene(scene: Flat) -> Any:
     return kind(**arrays, threads=threads())
 
 
-def kernel_camera(camera: PackedCamera, index: int = 0) -> Any:
-    return core.Camera(**{n: _array(v[index]) if isinstance(v, Tensor) else v for n, v in camera._asdict().items()})
+def kernel_camera(camera: PackedCamera, index: int = 0, by_distortion: bool = True) -> Any:
+    """One camera of a batch. Without derivatives `by_distortion` the kernel takes a lens that distorts nothing for a pinhole."""
+    arrays = {n: _array(v[index]) if isinstance(v, Tensor) else v for n, v in camera._asdict().items()}
+    return core.Camera(**arrays, by_distortion=by_distortion)
 
 
 def kernel_channels(request: Request, index: int = 0) -> Any:
@@ -95,7 +97,7 @@ def forward_kernel(request: Request) -> tuple[Tensor, Hits, list[Profile]]:
         B, height, width = request.cameras, request.camera.height, request.camera.width
         image = request.scene.colors.new_empty((B, height, width, request.channels))
         hits = Hits.empty(request)
-        cameras = [kernel_camera(request.camera, b) for b in range(B)]
+        cameras = [kernel_camera(request.camera, b, by_distortion=False) for b in range(B)]
         warn_of_ends(cameras)
         profiles = []
         for b in range(B):
@@ -136,7 +138,7 @@ def backward_kernel(
         try:
             profiles = [
                 scene.backward(
-                    camera=kernel_camera(request.camera, b),
+                    camera=kernel_camera(request.camera, b, "distortion" in wanted),
                     channels=kernel_channels(request, b),
                     image=image,
                     options=_gradient_options(request, wanted, b, dry, lit is not None),
@@ -166,7 +168,7 @@ def jvp_kernel(hits: Hits, request: Request, tangents: Mapping[str, Tensor], dir
         out = np.zeros((request.cameras, *adjoint.shape[:2], directions, request.channels))
         for b in range(request.cameras):
             scene.jvp(
-                camera=kernel_camera(request.camera, b),
+                camera=kernel_camera(request.camera, b, "distortion" in tangents),
                 channels=kernel_channels(request, b),
                 image=image,
                 options=_gradient_options(request, tangents, b),
@@ -200,7 +202,7 @@ def screen_gradient_kernel(adjoint: Tensor, hits: Hits, request: Request) -> Ten
         out = np.zeros((*adjoint.shape[:3], 2))
         for b in range(request.cameras):
             scene.screen_gradient(
-                camera=kernel_camera(request.camera, b),
+                camera=kernel_camera(request.camera, b, by_distortion=False),
                 channels=kernel_channels(request, b),
                 image=image,
                 options=_gradient_options(request, ["verts"], b),
@@ -371,7 +373,7 @@ def _faces_at_centers_cpu(*args: Any) -> Tensor:
         faces = _faces_at_centers_fake(*args)
         for b in range(request.cameras):
             scene.faces_at_centers(
-                camera=kernel_camera(request.camera, b),
+                camera=kernel_camera(request.camera, b, by_distortion=False),
                 channels=kernel_channels(request, b),
                 threads=threads(),
                 face=faces[b].numpy(),

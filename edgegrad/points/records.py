@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..kernel import memory as memory
+from ..kernel.derivatives import moves
 from ..kernel.first_order import without_derivatives
 from ..kernel.flat import Flat, flatten
 from ..kernel.operators import Hits as ImageHits
@@ -300,9 +301,11 @@ class Sampler:
     def _compute(self, request: Request, compute: Callable[..., Sequence[Tensor]], *more: Tensor) -> tuple[Tensor, ...]:
         """compute(request, the kernel's camera, *more), with the values of tensors."""
 
+        by_distortion = moves(request.camera.distortion)
+
         def with_request(values: list[Any], *more: Tensor) -> Sequence[Tensor]:
             values_of = Request.unpack(values)
-            return compute(values_of, kernel_camera(values_of.camera, self._camera), *more)
+            return compute(values_of, kernel_camera(values_of.camera, self._camera, by_distortion), *more)
 
         return _of_values(request.pack(), with_request, *more)
 
