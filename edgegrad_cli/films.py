@@ -27,23 +27,26 @@ class Film(NamedTuple):
     fps: Fraction | None  # None of a folder, and of a video that does not tell
 
 
-def read_film(path: Path) -> Film:
-    """At least one frame. Raises OSError, ValueError or ImportError, also as frames are read."""
+def read_film(path: Path, camera: Path | None = None) -> Film:
+    """At least one frame, as the camera of a file speaks of it. Raises OSError, ValueError or ImportError, also later."""
     if path.is_dir():
-        return _folder(path)
+        return _folder(path, camera)
     if not path.is_file():
         raise FileNotFoundError(2, "expected a video or a folder of images, got neither", str(path))
     return _video(path)
 
 
-def _folder(folder: Path) -> Film:
+def _folder(folder: Path, camera: Path | None) -> Film:
     from edgegrad import read_image
     from edgegrad.files.image import READABLE
+
+    from .inputs import seen_by
 
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in READABLE)
     if not paths:
         raise ValueError(f"{folder}: expected a folder with images, got none of {', '.join(READABLE)} in it")
-    return Film((read_image(path, channels=3) for path in paths), None)
+    kind = type(seen_by(camera, paths[0]))  # of all frames, upright or stored
+    return Film((read_image(kind(path), channels=3) for path in paths), None)
 
 
 def _video(path: Path) -> Film:

@@ -14,7 +14,7 @@ from ..check import check_positive_int
 from .formats import calibration, colmap, transforms
 from .formats.part import Fault, naming
 from .formats.source import Unsupported
-from .formats.views import View
+from .formats.views import View, matched
 from .parts import GLTFS, read_cameras
 from .paths import PathLike, check_readable, check_suffix, replacing
 
@@ -126,6 +126,10 @@ def load_cameras(
 ) -> dict[str, View]:
     """The cameras of a file or folder by name, each with its image: `View(camera, image)`.
 
+    A camera speaks of the pixels that its image stores: read_image(view.image) does not apply an EXIF orientation, unless the
+    camera's size tells that it speaks of the upright image. Where an image has another size than the file of cameras says, a
+    warning tells which: the camera is scaled to it, or, where they are not in proportion, View.image is None.
+
     - a folder with COLMAP's cameras and images, text or binary, or with sparse/0 in it; names are the images'
     - transforms.json of NeRF, instant-ngp and nerfstudio; names are the frames' file_path. What a frame says goes before what the
       file says of all, whatever the key: its camera_angle_x before the file's fl_x. Keys that are null count as absent
@@ -149,7 +153,7 @@ def load_cameras(
     TypeError, ValueError that names the file, or ImportError without OpenCV or PyYAML (edgegrad[cameras]).
     """
     unread = Unsupported()
-    views = _views(path, size, images, unread)
+    views = matched(_views(path, size, images, unread), unread)
     cameras = _typed(path, [view.camera for view in views.values()], dtype, unread)
     return {name: View(c, view.image) for (name, view), c in zip(views.items(), cameras, strict=True)}
 

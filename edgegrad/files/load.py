@@ -42,7 +42,7 @@ from ..scene.scene import Scene
 from .formats.part import Wanted, naming
 from .image import read_image
 from .parts import read_model
-from .paths import PathLike
+from .paths import PathLike, StoredPath
 from .welding import merge, to_mesh
 
 
@@ -63,7 +63,8 @@ def load_mesh(
     vertex colours, all with face colours, all on one texture; lit, all with one material) become one Mesh. Files that the
     file names are read from its folder and below, and from nowhere else.
 
-    texture    an image file, or (h, w, C) linear radiance, to lay on the file's texture coordinates instead of its look
+    texture    an image file, or (h, w, C) linear radiance, to lay on the file's texture coordinates instead of its look. Pixels
+               are those that are stored, as of textures that the file names: an EXIF orientation is not applied
     materials  False leaves out the file's textures and materials, and does not miss their files
     lit        True: a mesh for lit scenes, with a material and normals; Lambertian where the file's own is left out. Lights of
                the file come by load_scene
@@ -80,7 +81,7 @@ def load_mesh(
         model = read_model(path, wanted)
         parts = model.parts
         if texture is not None:
-            image = texture if isinstance(texture, Tensor) else read_image(texture, channels=3)
+            image = texture if isinstance(texture, Tensor) else read_image(StoredPath(texture), channels=3)
             parts = [part._replace(colors=None, face_colors=None, texture=image) for part in parts]
         return to_mesh(merge(parts), model.dtype)
 

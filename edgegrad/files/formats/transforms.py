@@ -12,6 +12,7 @@ import torch
 
 from ...camera.camera import Camera
 from ..image import IMAGES, read_size
+from ..paths import StoredPath
 from .keys import image_size, note_unread
 from .part import Fault
 from .source import Unsupported
@@ -142,7 +143,7 @@ def _camera(
     elif size is not None:
         H, W = size
     elif found.file is not None:
-        H, W = read_size(found.file)
+        H, W = read_size(StoredPath(found.file))
     else:
         why = ": it is outside of the file's folder, where nobody looks" * found.outside
         raise ValueError(
