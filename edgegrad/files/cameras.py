@@ -112,10 +112,10 @@ def _gltf_camera(path: PathLike, size: tuple[int, int] | None, index: int) -> Ca
             f"{path}: size: expected (height, width) in pixels for the camera of a glTF, got None; pass size="
         )
     with naming(path):
-        found = read_cameras(path, _whole(size))
+        found = list(read_cameras(path, _whole(size)).values())
         if not isinstance(index, int) or not 0 <= index < len(found):
             raise ValueError(f"index: expected that of one of {len(found)} cameras in the file, from 0, got {index!r}")
-        return list(found.values())[index]
+        return _sound(found[index])
 
 
 def load_cameras(
@@ -186,7 +186,7 @@ def _views(
                 raise ValueError(
                     "size: expected (height, width) in pixels for the cameras of a glTF, got None; pass size="
                 )
-            return _some({name: View(camera, None) for name, camera in read_cameras(path, whole).items()})
+            return _of_gltf(read_cameras(path, whole), unread)
         if file.suffix.lower() in CALIBRATIONS:
             return calibration.read(file, whole, unread)
         fields = _json(file)
@@ -195,6 +195,24 @@ def _views(
         _check_no_images(images)
         camera = _our_camera(fields)
         return {str(i): View(one, None) for i, one in enumerate(camera if camera.batch is not None else [camera])}
+
+
+def _of_gltf(found: dict[str, Camera | Fault], unread: Unsupported) -> dict[str, View]:
+    """Those that can be read; notes the others. Raises Fault where none can."""
+    views = {name: View(camera, None) for name, camera in found.items() if isinstance(camera, Camera)}
+    for name, fault in found.items():
+        if isinstance(fault, Fault):
+            if not views:
+                raise fault
+            unread.note(f"camera {name[:60]!r}", f"left out: {fault}")
+    return _some(views)
+
+
+def _sound(camera: Camera | Fault) -> Camera:
+    """Raises Fault in place of one."""
+    if isinstance(camera, Fault):
+        raise camera
+    return camera
 
 
 def _typed(path: PathLike, cameras: list[Camera], dtype: torch.dtype | None, unread: Unsupported) -> list[Camera]:

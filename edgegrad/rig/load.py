@@ -27,8 +27,12 @@ def load_rig(path: PathLike, materials: bool = True, lit: bool = False, dtype: t
     JOINTS_n and WEIGHTS_n are read for all n. Morphs have the names of mesh.extras.targetNames. Vertices are welded where they
     are equal in all poses. Lights stand where they are at rest.
 
+    One warning names what does not fit, and the rest is loaded: vertices whose weights are all 0 are bound to the skin's first
+    joint, primitives without JOINTS_0 are rigid with their node, rotations of another length than 1 are divided by it, and
+    channels of animations, morph targets and lights that cannot be read are left out.
+
     The other arguments are those of load_scene, and so are the errors; beside them ValueError for a skin whose joints are not in
-    the scene, weights that are all zero, nodes in a circle, and morph targets of another length than their mesh.
+    the scene, other faults of a skin, and nodes in a circle.
     """
     roma()
     wanted = Wanted(materials, lit, rigged=True, dtype=dtype)
