@@ -34,14 +34,19 @@ and lights alone. Nodes that KHR_node_visibility hides are not there.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from torch import Tensor
 
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
-from .formats.part import Wanted, naming
+from .formats import trimesh_parts
+from .formats.geometry import typed
+from .formats.part import Fault, Model, Wanted, naming
+from .formats.source import Source
 from .image import read_image
-from .parts import read_model
+from .parts import MESHES, read_model
 from .paths import PathLike, StoredPath
 from .welding import merge, to_mesh
 
@@ -98,6 +103,24 @@ def load_scene(path: PathLike, materials: bool = True, lit: bool = False, dtype:
     with naming(path):
         model = read_model(path, wanted)
         return Scene([to_mesh(part, model.dtype) for part in model.parts], lights=model.lights)
+
+
+def load_parts(path: PathLike, materials: bool = True) -> list[Mesh]:
+    """One Mesh of a file whose parts look alike, else one for each of them; also of formats that trimesh alone reads, such as
+    DAE, in metres where the file says its unit. See load_mesh for the rest, and for the errors."""
+    wanted = Wanted(materials)
+    with naming(path):
+        if Path(path).suffix.lower() in MESHES:
+            model = read_model(path, wanted)
+        else:
+            source = Source.of(path, wanted)
+            model = typed(Model(trimesh_parts.read(Path(path), source.unsupported), []), None, source)
+            source.unsupported.say(path)
+        try:
+            parts = [merge(model.parts)]
+        except Fault:
+            parts = model.parts
+        return [to_mesh(part, model.dtype) for part in parts]
 
 
 def _checked_lit(lit: object) -> bool:

@@ -65,12 +65,11 @@ def _bound(part: Part, bound: Bound, world: np.ndarray, dtype: torch.dtype) -> t
     # In a mirror the front of a face stays its front.
     blended = np.einsum("vn,nij->vij", bound.weights[by.kept], (world[bound.joints] @ bound.inverse_binds)[:, :3, :3])
     mirrored = np.median(np.linalg.det(blended)) < 0.0
-    faces = part.faces[:, ::-1].copy() if mirrored else part.faces
     by = by._replace(faces=by.faces[:, ::-1].copy()) if mirrored else by
-    part = part._replace(faces=faces)
+    part = part.reversed() if mirrored else part
     normals, index, owners, of_normals = None, None, None, None
     if part.normals is not None:
-        each = part.normal_faces if part.normal_faces is not None else faces
+        each = part.normal_faces if part.normal_faces is not None else part.faces
         # One row for each vertex and normal that meet at a corner.
         at = np.zeros(len(part.normals), np.int64)
         at[each] = by.faces
