@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from fractions import Fraction
@@ -77,13 +78,30 @@ def _decoded(path: Path, av: Any) -> Iterator[Tensor]:
         with av.open(str(path)) as container:
             for frame in container.decode(video=0):
                 picture = torch.from_numpy(frame.to_ndarray(format="rgb24")).float() / 255.0
-                yield srgb_to_linear(upright(picture, getattr(frame, "rotation", 0)))
+                yield srgb_to_linear(upright(picture, *_orientation(frame)))
     except av.error.FFmpegError as error:
         raise _fault(path, error) from error
 
 
-def upright(picture: Tensor, degrees: int) -> Tensor:
-    """As players show a picture (H, W, C) that the file says to turn counterclockwise, which phones do; by right angles."""
+def _orientation(frame: Any) -> tuple[float, bool]:
+    """By how many degrees a frame is to be turned counterclockwise, and whether it is mirrored left to right before.
+
+    A display matrix (a b u; c d v; x y w) takes a pixel (p, q) to (a p + c q, b p + d q), of which y runs down (ISO 14496-12)."""
+    import numpy as np
+
+    for data in frame.side_data:
+        if "DISPLAYMATRIX" in str(data.type):
+            a, b, _, c, d = np.frombuffer(data, np.int32)[:5].astype(np.float64)
+            mirrored = a * d - b * c < 0.0
+            a, b = (-a, -b) if mirrored else (a, b)  # what turns the mirrored frame
+            return -math.degrees(math.atan2(b - c, a + d)), mirrored
+    return getattr(frame, "rotation", 0), False
+
+
+def upright(picture: Tensor, degrees: float, mirrored: bool = False) -> Tensor:
+    """A picture (H, W, C) as players show it: mirrored left to right where the file says so, as front cameras do, then turned
+    counterclockwise by the nearest right angle, as phones do."""
+    picture = picture.flip(1) if mirrored else picture
     return picture.rot90(round(degrees / 90) % 4, (0, 1))
 
 
