@@ -84,7 +84,7 @@ def _decoded(path: Path, av: Any) -> Iterator[Tensor]:
 
 
 def _orientation(frame: Any) -> tuple[float, bool]:
-    """By how many degrees a frame is to be turned counterclockwise, and whether it is mirrored left to right before.
+    """Return the degrees to turn a frame by counterclockwise, and whether it is mirrored left to right before.
 
     A display matrix (a b u; c d v; x y w) takes a pixel (p, q) to (a p + c q, b p + d q), of which y runs down (ISO 14496-12)."""
     import numpy as np

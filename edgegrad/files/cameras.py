@@ -198,7 +198,7 @@ def _views(
 
 
 def _of_gltf(found: dict[str, Camera | Fault], unread: Unsupported) -> dict[str, View]:
-    """Those that can be read; notes the others. Raises Fault where none can."""
+    """Return views of the cameras that can be read, and note the others. Raises Fault where none can."""
     views = {name: View(camera, None) for name, camera in found.items() if isinstance(camera, Camera)}
     for name, fault in found.items():
         if isinstance(fault, Fault):

@@ -106,8 +106,8 @@ def load_scene(path: PathLike, materials: bool = True, lit: bool = False, dtype:
 
 
 def load_parts(path: PathLike, materials: bool = True) -> list[Mesh]:
-    """One Mesh of a file whose parts look alike, else one for each of them; also of formats that trimesh alone reads, such as
-    DAE, in metres where the file says its unit. See load_mesh for the rest, and for the errors."""
+    """Return one Mesh of a file whose parts have one kind of look, else one for each of them. Reads DAE files, too, and others
+    of trimesh, in metres where the file says its unit. See load_mesh for the rest, and for the errors."""
     wanted = Wanted(materials)
     with naming(path):
         if Path(path).suffix.lower() in MESHES:

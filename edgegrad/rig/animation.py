@@ -88,7 +88,7 @@ def _of_unit_length(values: Tensor, quaternions: Tensor) -> Tensor:
         k = int(bad.nonzero()[0])
         raise ValueError(
             f"values: expected unit quaternions x, y, z, w, got one of length {float(length[k]):.3g} at key {k}; divide each by "
-            "its length, and the tangents beside it"
+            "its length, and its tangents, too"
         )
     return values / length.reshape(-1, *[1] * (values.dim() - 1))
 

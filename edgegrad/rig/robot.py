@@ -33,7 +33,7 @@ def load_robot(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ())
         scene = robot.posed(angles=[0.0, 0.4, -1.2, 0.0, 0.7, 0.0, 0.0])
 
     package_dirs  a folder or several, in which package://NAME/… is looked for as FOLDER/NAME/…, or as FOLDER/… where the folder
-                  itself is called NAME; by default, and then, beside the file and in the folders above it
+                  itself is called NAME; by default, and then, in the folder of the file and those above it
 
     One Mesh for each visual, or for each part of it where parts look different: OBJ, glTF, GLB, PLY, STL, OFF, 3MF or DAE files
     (in the unit that a DAE says), boxes, cylinders and spheres. A mesh file's own look goes before the visual's material, whose

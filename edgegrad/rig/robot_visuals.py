@@ -1,4 +1,4 @@
-"""What the links of a robot look like."""
+"""The meshes of a robot's links, and their materials."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Visuals:
         return found
 
     def _painted(self, mesh: Mesh, look: Look, name: str) -> Mesh:
-        """What a mesh file says goes before what the URDF says."""
+        """Return the mesh with the look of its file, or else with that of the URDF."""
         if mesh.channels is not None:
             return mesh
         if look.texture is not None and mesh.uvs is not None:
@@ -69,7 +69,7 @@ class Visuals:
         return mesh.replace(face_colors=faces, uvs=mesh.uvs, uv_faces=mesh.uv_faces)
 
     def _look(self, link: str, material: Any) -> Look:
-        """As displays show it."""
+        """Return what a material says; its numbers are sRGB, as displays show them."""
         if material is None:
             return Look(None, None)
         shared = [one for one in self.robot.materials if one.name == material.name]  # defined once for the whole robot

@@ -119,7 +119,7 @@ def _mesh_name(at: Placed, mesh: dict[str, Any]) -> str:
 
 
 def _morph_names(rig: RigFile, k: int, mesh: dict[str, Any], count: int) -> list[str]:
-    """Those of extras.targetNames where these are as many, each once among all of the rig."""
+    """Return the names of extras.targetNames where there are as many as targets, each once among all of the rig."""
     extras = mesh.get("extras", {})
     given = extras.get("targetNames", []) if isinstance(extras, dict) else []
     given = given if isinstance(given, list) and len(given) == count else [""] * count
@@ -131,7 +131,7 @@ def _morph_names(rig: RigFile, k: int, mesh: dict[str, Any], count: int) -> list
 
 
 def _morph_weights(at: Placed, mesh: dict[str, Any], count: int, source: Source) -> list[float]:
-    """At rest."""
+    """Return the weights at rest."""
     given = at.node.get("weights", mesh.get("weights", [0.0] * count))
     if len(given) != count:
         what = f"weights of {_mesh_name(at, mesh)!r}, {len(given)} for {count} morph targets"
@@ -245,7 +245,7 @@ def _targets(geometry: Geometry, name: str, positions: np.ndarray, count: int) -
 def _animations(
     arrays: Arrays, tree: dict[str, Any], places: dict[int, int], source: Source
 ) -> list[tuple[str, list[Channel]]]:
-    """By name. Notes the channels that cannot be read."""
+    """Return the channels of each animation by its name, and note those that cannot be read."""
     found: dict[str, list[Channel]] = {}
     for number, animation in enumerate(tree.get("animations", [])):
         name = str(animation.get("name") or f"animation {number}")

@@ -41,7 +41,7 @@ class Part(NamedTuple):
     material_uvs: Mapping[str, np.ndarray] = MappingProxyType({})  # (N, 2) of those of its textures that have their own
 
     def reversed(self) -> Part:
-        """With the corners of all faces in reverse order, in all that has indices by corners."""
+        """Return the part with the corners of all faces in reverse order, in every array of indices."""
         indices = {name: getattr(self, name) for name in ("faces", "uv_faces", "normal_faces")}
         return self._replace(**{n: np.ascontiguousarray(i[:, ::-1]) for n, i in indices.items() if i is not None})
 

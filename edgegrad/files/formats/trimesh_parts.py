@@ -74,7 +74,7 @@ def read(file: Path, unsupported: Unsupported) -> list[Part]:
 
 
 def _resolver(file: Path, unsupported: Unsupported) -> Any:
-    """What trimesh finds the files by that a mesh names. It goes on without those that are not there, which are noted."""
+    """Return a resolver that finds the files a mesh names. trimesh goes on without those that are missing; they are noted."""
     base = require("trimesh.resolvers", "trimesh", "reading meshes").FilePathResolver
 
     class Noting(base):  # type: ignore[misc, valid-type]

@@ -24,7 +24,7 @@ class View(NamedTuple):
 def resized(camera: Camera, size: tuple[int, int]) -> Camera | None:
     """The camera for (H, W) pixels, where these are in proportion to its own; None where they are not."""
     (H, W), (h, w) = size, camera.size
-    # One that is scaled to the other ends less than a pixel beside it: sizes of scaled images are rounded.
+    # One that is scaled to the other ends less than a pixel from it: sizes of scaled images are rounded.
     return camera.resized(size) if abs(H * w - W * h) <= max(H, W, h, w) else None
 
 
