@@ -36,10 +36,10 @@ def load_robot(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ())
                   itself is called NAME; by default, and then, in the folder of the file and those above it
 
     One Mesh for each visual, or for each part of it where parts look different: OBJ, glTF, GLB, PLY, STL, OFF, 3MF or DAE files
-    (in the unit that a DAE says, along its own axes), boxes, cylinders and spheres. A mesh file's own look goes before the visual's material, whose
-    colour or texture is shown else. One warning names what is not shown. At rest all are 0, or at the limit nearest to 0. Limits
-    are those of the file, 0 where a <limit> lacks lower or upper; fits keep them, robot.clamped(angles=…) applies them. Links are
-    its joints, by their names.
+    (in the unit that a DAE says, along its own axes), boxes, cylinders and spheres. A mesh file's own look goes before the
+    visual's material, whose colour or texture is shown else. One warning names what is not shown. At rest all are 0, or at the
+    limit nearest to 0. Limits are those of the file, 0 where a <limit> lacks lower or upper; fits keep them,
+    robot.clamped(angles=…) applies them. Links are its joints, by their names.
 
     Files by yourdfpy, kinematics by pytorch-kinematics (`pip install 'edgegrad[robots]'`). Raises FileNotFoundError (the file, or
     a mesh that it names), ValueError that names the file (no URDF, no visuals, no tree of links, a joint of another type or
