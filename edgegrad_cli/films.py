@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from fractions import Fraction
@@ -27,23 +28,26 @@ class Film(NamedTuple):
     fps: Fraction | None  # None of a folder, and of a video that does not tell
 
 
-def read_film(path: Path) -> Film:
-    """At least one frame. Raises OSError, ValueError or ImportError, also as frames are read."""
+def read_film(path: Path, camera: Path | None = None) -> Film:
+    """At least one frame, as the camera of a file speaks of it. Raises OSError, ValueError or ImportError, also later."""
     if path.is_dir():
-        return _folder(path)
+        return _folder(path, camera)
     if not path.is_file():
         raise FileNotFoundError(2, "expected a video or a folder of images, got neither", str(path))
     return _video(path)
 
 
-def _folder(folder: Path) -> Film:
+def _folder(folder: Path, camera: Path | None) -> Film:
     from edgegrad import read_image
     from edgegrad.files.image import READABLE
+
+    from .inputs import seen_by
 
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in READABLE)
     if not paths:
         raise ValueError(f"{folder}: expected a folder with images, got none of {', '.join(READABLE)} in it")
-    return Film((read_image(path, channels=3) for path in paths), None)
+    kind = type(seen_by(camera, paths[0]))  # of all frames, upright or stored
+    return Film((read_image(kind(path), channels=3) for path in paths), None)
 
 
 def _video(path: Path) -> Film:
@@ -74,13 +78,30 @@ def _decoded(path: Path, av: Any) -> Iterator[Tensor]:
         with av.open(str(path)) as container:
             for frame in container.decode(video=0):
                 picture = torch.from_numpy(frame.to_ndarray(format="rgb24")).float() / 255.0
-                yield srgb_to_linear(upright(picture, getattr(frame, "rotation", 0)))
+                yield srgb_to_linear(upright(picture, *_orientation(frame)))
     except av.error.FFmpegError as error:
         raise _fault(path, error) from error
 
 
-def upright(picture: Tensor, degrees: int) -> Tensor:
-    """As players show a picture (H, W, C) that the file says to turn counterclockwise, which phones do; by right angles."""
+def _orientation(frame: Any) -> tuple[float, bool]:
+    """Return the degrees to turn a frame by counterclockwise, and whether it is mirrored left to right before.
+
+    A display matrix (a b u; c d v; x y w) takes a pixel (p, q) to (a p + c q, b p + d q), of which y runs down (ISO 14496-12)."""
+    import numpy as np
+
+    for data in frame.side_data:
+        if "DISPLAYMATRIX" in str(data.type):
+            a, b, _, c, d = np.frombuffer(data, np.int32)[:5].astype(np.float64)
+            mirrored = a * d - b * c < 0.0
+            a, b = (-a, -b) if mirrored else (a, b)  # what turns the mirrored frame
+            return -math.degrees(math.atan2(b - c, a + d)), mirrored
+    return getattr(frame, "rotation", 0), False
+
+
+def upright(picture: Tensor, degrees: float, mirrored: bool = False) -> Tensor:
+    """A picture (H, W, C) as players show it: mirrored left to right where the file says so, as front cameras do, then turned
+    counterclockwise by the nearest right angle, as phones do."""
+    picture = picture.flip(1) if mirrored else picture
     return picture.rot90(round(degrees / 90) % 4, (0, 1))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from .arguments import CHECKPOINT, add_live, add_mesh, add_resume, add_view, count, number
-from .inputs import read_background, read_picture, read_scene, read_view
+from .inputs import read_background, read_picture, read_scene, read_view, seen_by
 from .outputs import linger, live, make_folder, write_outputs
 
 
@@ -44,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from . import INTERRUPTED
 
     scene = read_scene(args)
+    args.image = seen_by(args.camera, args.image)
     picture, mask = read_picture(args.image)
     if mask is not None and args.background is not None:
         raise ValueError("--background: expected none with an image that has alpha, got both; leave one out")

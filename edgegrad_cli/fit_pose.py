@@ -19,6 +19,7 @@ from .inputs import (
     read_scene,
     read_view,
     read_weight,
+    seen_by,
 )
 
 if TYPE_CHECKING:
@@ -77,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
     if args.label is not None and args.mask is None:
         raise ValueError("--label: expected --mask with it, an image that has labels, got none; name it")
     scene = read_scene(args)
+    args.image = seen_by(args.camera, args.image)
     picture, mask = read_picture(args.image)
     if args.mask is not None:
         mask = read_coverage(args.mask, args.label)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from . import outputs
 from .arguments import add_depth, add_view, count, number
-from .inputs import check_size, read_depth, read_labels, read_picture, read_pose, read_view
+from .inputs import check_size, read_depth, read_labels, read_picture, read_pose, read_view, seen_by
 
 if TYPE_CHECKING:
     from edgegrad.fit import PoseFit
@@ -53,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
     if args.init and len(args.init) != len(args.mesh):
         raise ValueError(f"--init: expected {len(args.mesh)}, one for each --mesh, got {len(args.init)}")
     scenes = [load_scene(path) for path in args.mesh]
+    args.image = seen_by(args.camera, args.image)
     picture, _ = read_picture(args.image)
     mask = None
     if args.mask is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -53,6 +54,27 @@ def read_picture(path: Path) -> tuple[Tensor, Tensor | None]:
     image = read_image(path, channels=4)
     alpha = image[..., 3]
     return image[..., :3].contiguous(), alpha if bool((alpha < 1.0).any()) else None
+
+
+def seen_by(camera: Path | None, image: Path) -> Path:
+    """The image as the camera of a file speaks of it: upright, for so commands read pictures whose cameras they write; or as it
+    is stored, where that alone is in proportion to the camera. Tells which, where the EXIF orientation leaves it open."""
+    from edgegrad import load_camera
+    from edgegrad.files.formats.views import resized
+    from edgegrad.files.image import read_orientation, read_size
+    from edgegrad.files.paths import StoredPath
+
+    if camera is None or camera.suffix.lower() != ".json" or (orientation := read_orientation(image)) == 1:
+        return image
+    known, stored = load_camera(camera), StoredPath(image)
+    upright, sideways = (resized(known, read_size(path)) is not None for path in (image, stored))
+    if upright and sideways:
+        print(
+            f"edgegrad: {image}: read upright, as its EXIF orientation {orientation} says; if {camera} speaks of the pixels as "
+            "they are stored, as COLMAP's cameras do, remove the orientation from a copy of the image",
+            file=sys.stderr,
+        )
+    return stored if sideways and not upright else image
 
 
 def read_coverage(path: Path, label: int | None = None) -> Tensor:
@@ -177,13 +199,15 @@ def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | No
 
 def fitting(camera: Camera, size: tuple[int, int], source: Path) -> Camera:
     """The camera for a picture of that size. Raises ValueError that names its file, unless they are in proportion."""
-    (H, W), (h, w) = size, camera.size
-    # More than a pixel apart when one is scaled to the other: not the same view.
-    if abs(H * w - W * h) > max(H, W, h, w):
+    from edgegrad.files.formats.views import resized
+
+    found = resized(camera, size)
+    if found is None:
+        (H, W), (h, w) = size, camera.size
         raise ValueError(
             f"{source}: expected a camera for {W} × {H} pixels or in proportion, got {w} × {h}; crop alike"
         )
-    return camera.resized(size)
+    return found
 
 
 def read_views(args: argparse.Namespace) -> tuple[list[Camera], list[Tensor], list[Tensor | None]]:
@@ -192,6 +216,7 @@ def read_views(args: argparse.Namespace) -> tuple[list[Camera], list[Tensor], li
 
     if len(args.camera) != len(args.images):
         raise ValueError(f"--camera: expected {len(args.images)}, one for each image, got {len(args.camera)}")
+    args.images = [seen_by(path, image) for path, image in zip(args.camera, args.images, strict=True)]
     cameras, pictures, alphas = [], [], []
     for path, image in zip(args.camera, args.images, strict=True):
         picture, alpha = read_picture(image)

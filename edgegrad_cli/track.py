@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     from . import INTERRUPTED
 
     scene, init = read_scene(args), read_pose(args.init)
-    frames, fps = read_film(args.film)
+    frames, fps = read_film(args.film, args.camera)
     first = next(frames)
     camera = read_view(args, scene, (first.shape[0], first.shape[1]), args.init)
     outputs.make_folder(args.out)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from bop_scenes import SIZE, TRUTHS, K, camera, estimates, meshes, pose
+from PIL import Image
 
 import edgegrad as eg
 import edgegrad_cli as cli
@@ -49,6 +50,19 @@ def test_what_is_written_is_read(made: Path) -> None:
     inside = torch.nn.functional.max_pool2d(1.0 - own.float()[None, None], 3, 1, 1)[0, 0] == 0
     assert float((frame.picture() - again)[inside].abs().mean()) < 0.004
     assert data.targets() == [bop.Target(3, 0, 1, 1), bop.Target(3, 0, 5, 1), bop.Target(3, 1, 5, 2)]
+
+
+def test_pictures_are_read_as_they_are_stored(folder: Path) -> None:
+    """K and poses speak of these pixels, whatever an EXIF orientation says."""
+    frame = bop.Dataset(folder).frame(3, 1)
+    before, size = frame.picture(), frame.camera.size
+    exif = Image.Exif()
+    exif[0x112] = 6
+    with Image.open(frame.picture_path) as image:
+        image.load()
+    image.save(frame.picture_path, exif=exif)
+    again = bop.Dataset(folder).frame(3, 1)
+    assert again.camera.size == size and torch.equal(again.picture(), before)
 
 
 def test_targets_without_a_list(folder: Path) -> None:

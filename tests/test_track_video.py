@@ -100,6 +100,31 @@ def test_a_picture_is_turned_as_the_file_says():
     assert torch.equal(upright(picture, 180), picture.flip(0, 1))
 
 
+@pytest.mark.parametrize("matrix", [(1, 0, 0, 1), (0, 1, -1, 0), (-1, 0, 0, -1), (0, -1, 1, 0), (-1, 0, 0, 1), (1, 0, 0, -1),
+                                    (0, 1, 1, 0), (0, -1, -1, 0)])  # fmt: skip
+def test_all_orientations_of_a_film_are_shown_as_players_do(matrix, tmp_path):
+    """By the display matrix in its tkhd, which takes a pixel (p, q) to (a p + c q, b p + d q); those of front cameras mirror."""
+    stored = np.zeros((48, 64, 3), np.uint8)
+    stored[:24, :32, 0], stored[:24, 32:, 1], stored[24:, :32, 2] = 255, 255, 255
+    write_video(tmp_path / "a.mp4", [stored] * 2, "mpeg4")
+    content = (tmp_path / "a.mp4").read_bytes()
+    a, b, c, d = matrix
+    at = content.index(b"tkhd") + 44
+    rows = (np.array([a, b, 0, c, d, 0, 0, 0, 1 << 14]) << 16).astype(">i4")
+    (tmp_path / "a.mp4").write_bytes(content[:at] + rows.tobytes() + content[at + 36 :])
+    # Each pixel of the stored picture where the matrix takes its middle, from the corner that the picture then begins at.
+    q, p = np.mgrid[:48, :64] + 0.5
+    x, y = a * p + c * q, b * p + d * q
+    x, y = (x - x.min()).astype(int), (y - y.min()).astype(int)
+    expected = np.zeros((y.max() + 1, x.max() + 1, 3))
+    expected[y, x] = stored / 255.0
+    frames = list(read_film(tmp_path / "a.mp4").frames)
+    assert len(frames) == 2
+    for frame in frames:
+        assert frame.shape == expected.shape
+        assert float((frame - torch.tensor(expected)).abs().mean()) < 0.05
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [

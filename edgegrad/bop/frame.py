@@ -13,6 +13,7 @@ from torch import Tensor
 from ..camera.camera import Camera
 from ..files.image import read_image, read_size, read_stored
 from ..files.mask import read_mask
+from ..files.paths import StoredPath
 from .json_files import by_number, listed, numbers, read_json, rigid
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
@@ -92,7 +93,7 @@ class Frame:
         for folder in folders:
             for suffix in PICTURES:
                 if (path := self._scene.folder / folder / (name + suffix)).is_file():
-                    return path
+                    return StoredPath(path)  # K and poses speak of these pixels
         raise FileNotFoundError(
             f"{self._scene.folder}: expected {name}.png (or .jpg, .tif) in {' or '.join(folders)}, got no such file; "
             "download the images of this split"

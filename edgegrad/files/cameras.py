@@ -14,7 +14,7 @@ from ..check import check_positive_int
 from .formats import calibration, colmap, transforms
 from .formats.part import Fault, naming
 from .formats.source import Unsupported
-from .formats.views import View
+from .formats.views import View, matched
 from .parts import GLTFS, read_cameras
 from .paths import PathLike, check_readable, check_suffix, replacing
 
@@ -112,10 +112,10 @@ def _gltf_camera(path: PathLike, size: tuple[int, int] | None, index: int) -> Ca
             f"{path}: size: expected (height, width) in pixels for the camera of a glTF, got None; pass size="
         )
     with naming(path):
-        found = read_cameras(path, _whole(size))
+        found = list(read_cameras(path, _whole(size)).values())
         if not isinstance(index, int) or not 0 <= index < len(found):
             raise ValueError(f"index: expected that of one of {len(found)} cameras in the file, from 0, got {index!r}")
-        return list(found.values())[index]
+        return _sound(found[index])
 
 
 def load_cameras(
@@ -125,6 +125,10 @@ def load_cameras(
     dtype: torch.dtype | None = None,
 ) -> dict[str, View]:
     """The cameras of a file or folder by name, each with its image: `View(camera, image)`.
+
+    A camera speaks of the pixels that its image stores: read_image(view.image) does not apply an EXIF orientation, unless the
+    camera's size tells that it speaks of the upright image. Where an image has another size than the file of cameras says, a
+    warning tells which: the camera is scaled to it, or, where they are not in proportion, View.image is None.
 
     - a folder with COLMAP's cameras and images, text or binary, or with sparse/0 in it; names are the images'
     - transforms.json of NeRF, instant-ngp and nerfstudio; names are the frames' file_path. What a frame says goes before what the
@@ -149,7 +153,7 @@ def load_cameras(
     TypeError, ValueError that names the file, or ImportError without OpenCV or PyYAML (edgegrad[cameras]).
     """
     unread = Unsupported()
-    views = _views(path, size, images, unread)
+    views = matched(_views(path, size, images, unread), unread)
     cameras = _typed(path, [view.camera for view in views.values()], dtype, unread)
     return {name: View(c, view.image) for (name, view), c in zip(views.items(), cameras, strict=True)}
 
@@ -182,7 +186,7 @@ def _views(
                 raise ValueError(
                     "size: expected (height, width) in pixels for the cameras of a glTF, got None; pass size="
                 )
-            return _some({name: View(camera, None) for name, camera in read_cameras(path, whole).items()})
+            return _of_gltf(read_cameras(path, whole), unread)
         if file.suffix.lower() in CALIBRATIONS:
             return calibration.read(file, whole, unread)
         fields = _json(file)
@@ -191,6 +195,24 @@ def _views(
         _check_no_images(images)
         camera = _our_camera(fields)
         return {str(i): View(one, None) for i, one in enumerate(camera if camera.batch is not None else [camera])}
+
+
+def _of_gltf(found: dict[str, Camera | Fault], unread: Unsupported) -> dict[str, View]:
+    """Return views of the cameras that can be read, and note the others. Raises Fault where none can."""
+    views = {name: View(camera, None) for name, camera in found.items() if isinstance(camera, Camera)}
+    for name, fault in found.items():
+        if isinstance(fault, Fault):
+            if not views:
+                raise fault
+            unread.note(f"camera {name[:60]!r}", f"left out: {fault}")
+    return _some(views)
+
+
+def _sound(camera: Camera | Fault) -> Camera:
+    """Raises Fault in place of one."""
+    if isinstance(camera, Fault):
+        raise camera
+    return camera
 
 
 def _typed(path: PathLike, cameras: list[Camera], dtype: torch.dtype | None, unread: Unsupported) -> list[Camera]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from ..check import as_tensor, check_finite, check_not_meta, check_shape
 from ..optional import require
 from ..warnings import warn
 from .curve import Curve, decoder
-from .paths import PathLike, check_readable, check_suffix, replacing
+from .paths import PathLike, StoredPath, check_readable, check_suffix, replacing
 
 DISPLAY = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")  # 8 bit, sRGB
 RADIANCE = (".exr", ".hdr")  # floating point, linear
@@ -45,7 +45,7 @@ def srgb_slope(values: Tensor) -> Tensor:
 
 
 class Stored(NamedTuple):
-    """An image upright, with the numbers that are in its file."""
+    """An image with the numbers that are in its file: upright, or of a StoredPath as it is stored."""
 
     # (H, W, C) float32 or, where asked for, float64; not multiplied by alpha unless the file is an EXR; integers are from 0 to 1
     color: Tensor
@@ -72,8 +72,10 @@ def read_stored(path: PathLike, exact: bool = False) -> Stored:
     native = stored.nativespec().format
     deep = exact and native.basetype in (oiio.UINT32, oiio.INT32)  # even to doubles OpenImageIO converts them by floats
     kind = native.basetype if deep else oiio.FLOAT
-    upright = oiio.ImageBufAlgo.reorient(stored) if stored.read(0, 0, True, kind) else None
-    pixels = None if upright is None else upright.get_pixels(kind, upright.roi_full)
+    whole = stored if stored.read(0, 0, True, kind) else None
+    if whole is not None and not isinstance(path, StoredPath):
+        whole = oiio.ImageBufAlgo.reorient(whole)
+    pixels = None if whole is None else whole.get_pixels(kind, whole.roi_full)
     if pixels is None or (stored.file_format_name == "jpeg" and not _jpeg_ends(file.read_bytes())):
         reason = _reason(stored)
         fix = "; save it as 8, 16 or 32 bit, by array.astype(numpy.uint16)" * ("64 bits per sample" in reason)
@@ -99,7 +101,8 @@ def read_stored(path: PathLike, exact: bool = False) -> Stored:
 
 
 def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb") -> Tensor:
-    """(H, W, C) float32 from an image file: linear radiance, row 0 on top, upright as its EXIF orientation says.
+    """(H, W, C) float32 from an image file: linear radiance, row 0 on top, upright as its EXIF orientation says. A path that
+    load_cameras() found is read as it is stored, for its camera speaks of these pixels.
 
     Integer pixels (PNG, JPEG, BMP, WebP, most TIFF; 8 or 16 bit, palette, CMYK) are sRGB and become linear, 0 … 1;
     floating-point pixels (EXR, HDR, float TIFF) are linear as they are. Alpha is the last channel, not gamma-corrected and
@@ -144,13 +147,24 @@ def read_image(path: PathLike, channels: int | None = None, curve: Curve = "srgb
 
 def read_size(path: PathLike) -> tuple[int, int]:
     """(H, W) of an image file as read_image reads it, by its header alone. Raises what read_image does."""
+    spec = _header(path).spec()
+    turned = spec.getattribute("Orientation") in (5, 6, 7, 8) and not isinstance(path, StoredPath)
+    return (spec.full_width, spec.full_height) if turned else (spec.full_height, spec.full_width)
+
+
+def read_orientation(path: PathLike) -> int:
+    """The EXIF orientation of an image file, 1 to 8; 1 where it says none. Raises what read_image does."""
+    return _header(path).spec().getattribute("Orientation") or 1
+
+
+def _header(path: PathLike) -> Any:
+    """An ImageBuf of which the header alone is read."""
     file = check_readable(path, READABLE)
     stored = require("OpenImageIO", "OpenImageIO", "reading images").ImageBuf(str(file))
     spec = stored.spec()
     if not spec.full_width or not spec.full_height:
         raise ValueError(f"{path}: expected a whole image, got one that cannot be read ({_reason(stored)})")
-    turned = spec.getattribute("Orientation") in (5, 6, 7, 8)
-    return (spec.full_width, spec.full_height) if turned else (spec.full_height, spec.full_width)
+    return stored
 
 
 def write_image(path: PathLike, img: Tensor) -> None:

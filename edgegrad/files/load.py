@@ -34,15 +34,20 @@ and lights alone. Nodes that KHR_node_visibility hides are not there.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from torch import Tensor
 
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
-from .formats.part import Wanted, naming
+from .formats import trimesh_parts
+from .formats.geometry import typed
+from .formats.part import Fault, Model, Wanted, naming
+from .formats.source import Source
 from .image import read_image
-from .parts import read_model
-from .paths import PathLike
+from .parts import MESHES, read_model
+from .paths import PathLike, StoredPath
 from .welding import merge, to_mesh
 
 
@@ -63,7 +68,8 @@ def load_mesh(
     vertex colours, all with face colours, all on one texture; lit, all with one material) become one Mesh. Files that the
     file names are read from its folder and below, and from nowhere else.
 
-    texture    an image file, or (h, w, C) linear radiance, to lay on the file's texture coordinates instead of its look
+    texture    an image file, or (h, w, C) linear radiance, to lay on the file's texture coordinates instead of its look. Pixels
+               are those that are stored, as of textures that the file names: an EXIF orientation is not applied
     materials  False leaves out the file's textures and materials, and does not miss their files
     lit        True: a mesh for lit scenes, with a material and normals; Lambertian where the file's own is left out. Lights of
                the file come by load_scene
@@ -80,7 +86,7 @@ def load_mesh(
         model = read_model(path, wanted)
         parts = model.parts
         if texture is not None:
-            image = texture if isinstance(texture, Tensor) else read_image(texture, channels=3)
+            image = texture if isinstance(texture, Tensor) else read_image(StoredPath(texture), channels=3)
             parts = [part._replace(colors=None, face_colors=None, texture=image) for part in parts]
         return to_mesh(merge(parts), model.dtype)
 
@@ -97,6 +103,24 @@ def load_scene(path: PathLike, materials: bool = True, lit: bool = False, dtype:
     with naming(path):
         model = read_model(path, wanted)
         return Scene([to_mesh(part, model.dtype) for part in model.parts], lights=model.lights)
+
+
+def load_parts(path: PathLike, materials: bool = True) -> list[Mesh]:
+    """Return one Mesh of a file whose parts have one kind of look, else one for each of them. Reads DAE files, too, and others
+    of trimesh, in metres where the file says its unit. See load_mesh for the rest, and for the errors."""
+    wanted = Wanted(materials)
+    with naming(path):
+        if Path(path).suffix.lower() in MESHES:
+            model = read_model(path, wanted)
+        else:
+            source = Source.of(path, wanted)
+            model = typed(Model(trimesh_parts.read(Path(path), source.unsupported), []), None, source)
+            source.unsupported.say(path)
+        try:
+            parts = [merge(model.parts)]
+        except Fault:
+            parts = model.parts
+        return [to_mesh(part, model.dtype) for part in parts]
 
 
 def _checked_lit(lit: object) -> bool:

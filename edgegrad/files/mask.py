@@ -12,7 +12,7 @@ from ..check import check_int
 from ..optional import require
 from ..warnings import warn
 from .image import DISPLAY, read_stored
-from .paths import PathLike
+from .paths import PathLike, StoredPath
 
 GREY = 8 / 255  # by which channels of a grey image may differ, for JPEG does not keep them equal; unless all are faint
 FAINT = 1 / 8  # whole numbers below this share of their range are labels: no mask covers so little at most
@@ -213,7 +213,7 @@ def _indexed(path: PathLike) -> tuple[Tensor, list[int]] | None:
         with pillow.open(path) as stored:
             if stored.mode not in ("P", "1"):
                 return None
-            image = turned(stored)
+            image = stored.copy() if isinstance(path, StoredPath) else turned(stored)
     except (
         OSError,
         SyntaxError,

@@ -73,8 +73,9 @@ def read_rig(path: PathLike, wanted: Wanted) -> tuple[gltf_rig.RigFile, Model]:
     return found, model
 
 
-def read_cameras(path: PathLike, size: tuple[int, int]) -> dict[str, Camera]:
-    """Those in float64 of a glTF or GLB file, by name. Raises Fault, FileNotFoundError or ValueError."""
+def read_cameras(path: PathLike, size: tuple[int, int]) -> dict[str, Camera | Fault]:
+    """Return the cameras of a glTF or GLB file by name, in float64; in place of one that cannot be read its Fault. Raises
+    Fault, FileNotFoundError or ValueError."""
     file = check_readable(path, GLTFS)
     data, kind = file.read_bytes(), file.suffix.lower()[1:]
     check_disguised(data, f"a {kind.upper()} file")

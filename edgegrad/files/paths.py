@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import os
 import secrets
+import sys
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+if sys.platform == "win32":
+    from pathlib import WindowsPath as NativePath
+else:
+    from pathlib import PosixPath as NativePath
+
 PathLike = str | os.PathLike[str]
+
+
+class StoredPath(NativePath):
+    """The path of an image whose pixels are read as they are stored: its EXIF orientation is not applied.
+
+    Cameras and texture coordinates in files speak of these pixels. COLMAP, instant-ngp, nerfstudio and Blender do not apply
+    the orientation either."""
 
 
 def check_readable(path: PathLike, suffixes: Collection[str]) -> Path:

@@ -20,9 +20,9 @@ from ..scene.scene import Scene
 from ..warnings import warn
 from .formats.geometry import in_double, rounding
 from .formats.gltf_pack import scene_to_gltf, to_glb
-from .formats.part import Fault, Part
-from .formats.source import Textures, linear_colors
+from .formats.part import Fault
 from .formats.text_write import to_obj, to_off
+from .formats.trimesh_parts import of_trimesh
 from .image import to_bytes
 from .paths import PathLike, check_suffix, replacing
 from .welding import to_mesh
@@ -42,25 +42,11 @@ def from_trimesh(given: Any) -> Mesh:
         raise ValueError(
             "mesh: expected a trimesh.Trimesh with faces, got one without; was it loaded from an empty file?"
         )
-    look: dict[str, Any] = {}
-    visual = given.visual
     try:
-        if visual.kind == "vertex":
-            look["colors"] = linear_colors("vertex", visual.vertex_colors, srgb=True)
-        elif visual.kind == "face":
-            look["face_colors"] = linear_colors("face", visual.face_colors, srgb=True)
-        elif visual.kind == "texture" and visual.uv is not None:
-            look["uvs"] = np.asarray(visual.uv, np.float32)
-            material = visual.material
-            image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
-            if image is not None:
-                image.format = image.format or "PNG"  # one that was made, not read
-                look["texture"] = Textures().get("texture", image)
-        verts = np.asarray(given.vertices, np.float64)
-        if rounding(verts)[1]:
-            (part,) = in_double([Part("", verts, np.asarray(given.faces, np.int64), **look)])
-            return to_mesh(part, torch.float64)
-        return to_mesh(Part("", verts.astype(np.float32), np.asarray(given.faces, np.int64), **look))
+        part = of_trimesh(given)
+        if rounding(part.verts)[1]:
+            return to_mesh(in_double([part])[0], torch.float64)
+        return to_mesh(part._replace(verts=part.verts.astype(np.float32)))
     except Fault as fault:
         raise ValueError(f"mesh: {fault}") from fault.__cause__
 

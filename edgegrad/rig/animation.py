@@ -12,6 +12,7 @@ from .joints import Joints
 from .rotations import roma
 
 PATHS = ("translation", "rotation", "scale", "weights")
+ROUNDED = 0.01  # what rounding to normalised bytes changes of a quaternion's length, at most
 INTERPOLATIONS = ("LINEAR", "STEP", "CUBICSPLINE")
 
 
@@ -23,7 +24,8 @@ class Channel:
     target         the joint's place, or that of the first morph
     times          (K,) seconds, ascending
     values         (K, n): 3 numbers, 4 of a unit quaternion x, y, z, w, or as many as there are morphs; of a CUBICSPLINE
-                   (K, 3, n): the tangent that it comes in by, the value, the tangent that it goes out by
+                   (K, 3, n): the tangent that it comes in by, the value, the tangent that it goes out by. Quaternions of
+                   length 1 to 0.01, as normalised bytes have it, are divided by it, with their tangents; others are refused
     interpolation  "LINEAR", which of rotations is along the shorter arc, "STEP" or "CUBICSPLINE"
     """
 
@@ -47,6 +49,8 @@ class Channel:
         check_finite("values", values)
         if not bool((times.diff() > 0).all()):
             raise ValueError(f"times: expected ascending numbers, got {times.tolist()[:5]}")
+        if self.path == "rotation":
+            values = _of_unit_length(values, values[:, 1] if self.interpolation == "CUBICSPLINE" else values)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
 
@@ -74,6 +78,19 @@ class Channel:
             + (s3 - s2) * into
         )
         return value / value.norm(dim=-1, keepdim=True) if self.path == "rotation" else value
+
+
+def _of_unit_length(values: Tensor, quaternions: Tensor) -> Tensor:
+    """Rows of values divided by the lengths of their quaternions (K, 4). Raises ValueError."""
+    length = quaternions.norm(dim=-1)
+    bad = (length - 1.0).abs() > ROUNDED
+    if bool(bad.any()):
+        k = int(bad.nonzero()[0])
+        raise ValueError(
+            f"values: expected unit quaternions x, y, z, w, got one of length {float(length[k]):.3g} at key {k}; divide each by "
+            "its length, and its tangents, too"
+        )
+    return values / length.reshape(-1, *[1] * (values.dim() - 1))
 
 
 def _slerp(first: Tensor, last: Tensor, s: Tensor) -> Tensor:

@@ -27,8 +27,12 @@ def load_rig(path: PathLike, materials: bool = True, lit: bool = False, dtype: t
     JOINTS_n and WEIGHTS_n are read for all n. Morphs have the names of mesh.extras.targetNames. Vertices are welded where they
     are equal in all poses. Lights stand where they are at rest.
 
+    One warning names what does not fit, and the rest is loaded: vertices whose weights are all 0 are bound to the skin's first
+    joint, primitives without JOINTS_0 are rigid with their node, rotations of another length than 1 are divided by it, and
+    channels of animations, morph targets and lights that cannot be read are left out.
+
     The other arguments are those of load_scene, and so are the errors; beside them ValueError for a skin whose joints are not in
-    the scene, weights that are all zero, nodes in a circle, and morph targets of another length than their mesh.
+    the scene, other faults of a skin, and nodes in a circle.
     """
     roma()
     wanted = Wanted(materials, lit, rigged=True, dtype=dtype)
@@ -61,12 +65,11 @@ def _bound(part: Part, bound: Bound, world: np.ndarray, dtype: torch.dtype) -> t
     # In a mirror the front of a face stays its front.
     blended = np.einsum("vn,nij->vij", bound.weights[by.kept], (world[bound.joints] @ bound.inverse_binds)[:, :3, :3])
     mirrored = np.median(np.linalg.det(blended)) < 0.0
-    faces = part.faces[:, ::-1].copy() if mirrored else part.faces
     by = by._replace(faces=by.faces[:, ::-1].copy()) if mirrored else by
-    part = part._replace(faces=faces)
+    part = part.reversed() if mirrored else part
     normals, index, owners, of_normals = None, None, None, None
     if part.normals is not None:
-        each = part.normal_faces if part.normal_faces is not None else faces
+        each = part.normal_faces if part.normal_faces is not None else part.faces
         # One row for each vertex and normal that meet at a corner.
         at = np.zeros(len(part.normals), np.int64)
         at[each] = by.faces

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,66 +12,70 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..files.image import srgb_to_linear
-from ..files.load import load_mesh
-from ..files.parts import MESHES
+from ..files.formats.source import Unsupported
 from ..files.paths import PathLike, check_readable
-from ..files.save import from_trimesh
 from ..optional import require
-from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from .control import Control
 from .links import Links
 from .rig import Rig
+from .robot_visuals import Visuals
 
 EXTRA = "edgegrad[robots]", "reading a robot"
 MOVING = ("revolute", "continuous", "prismatic")
 
 
-def load_robot(path: PathLike) -> Rig:
+def load_robot(path: PathLike, package_dirs: PathLike | Sequence[PathLike] = ()) -> Rig:
     """A Rig from a URDF file, whose control `angles` (m,) has the positions of its joints in the file's order: radians, or metres
     of prismatic ones. Joints that mimic others follow them and have none of their own.
 
         robot = eg.load_robot("arm.urdf")
         scene = robot.posed(angles=[0.0, 0.4, -1.2, 0.0, 0.7, 0.0, 0.0])
 
-    One Mesh for each visual, from OBJ, glTF, GLB, PLY, STL, OFF, 3MF or DAE files, boxes, cylinders and spheres, in the colour of
-    the visual's material where it has one. At rest all are 0, or at the limit nearest to 0. Limits are those of the file; fits
-    keep them, robot.clamped(angles=…) applies them. Links are its joints, by their names.
+    package_dirs  a folder or several, in which package://NAME/… is looked for as FOLDER/NAME/…, or as FOLDER/… where the folder
+                  itself is called NAME; by default, and then, in the folder of the file and those above it
+
+    One Mesh for each visual, or for each part of it where parts look different: OBJ, glTF, GLB, PLY, STL, OFF, 3MF or DAE files
+    (in the unit that a DAE says, along its own axes), boxes, cylinders and spheres. A mesh file's own look goes before the
+    visual's material, whose colour or texture is shown else. One warning names what is not shown. At rest all are 0, or at the
+    limit nearest to 0. Limits are those of the file, 0 where a <limit> lacks lower or upper; fits keep them,
+    robot.clamped(angles=…) applies them. Links are its joints, by their names.
 
     Files by yourdfpy, kinematics by pytorch-kinematics (`pip install 'edgegrad[robots]'`). Raises FileNotFoundError (the file, or
-    a mesh that it names), ValueError that names the file (no URDF, no visuals, joints in a circle, a joint of another type),
-    ImportError.
+    a mesh that it names), ValueError that names the file (no URDF, no visuals, no tree of links, a joint of another type or
+    without an axis), ImportError.
     """
     file = check_readable(path, (".urdf", ".xml"))
+    packages = _folders(package_dirs)
     yourdfpy, pk = require("yourdfpy", *EXTRA), require("pytorch_kinematics", *EXTRA)
     with _naming(file):
         given = yourdfpy.URDF.load(str(file), load_meshes=False, build_scene_graph=False)
-    robot = given.robot
+    robot, unread = given.robot, Unsupported()
     joints = list(robot.joints)
     links = [link.name for link in robot.links]
     parents = _parents(file, links, joints)
     for joint in joints:
-        if joint.type not in (*MOVING, "fixed"):
-            raise ValueError(
-                f"{file}: joint {joint.name!r}: expected a type among {', '.join(MOVING)} and fixed, got {joint.type!r}; "
-                "replace it by joints of these"
-            )
+        _check_joint(file, joint)
+    visuals = Visuals(file, robot, packages, unread)
     meshes, carries = [], []
     for place, link in enumerate(robot.links):
         for visual in link.visuals:
-            meshes.append(_mesh(file, link.name, visual, robot))
-            carries.append(place)
+            found = visuals.meshes(link.name, visual)
+            meshes += found
+            carries += [place] * len(found)
     if not meshes:
         raise ValueError(f"{file}: expected links with visuals, got none; nothing of it is seen")
     with _naming(file):
         # As it was understood, for the other's parser refuses what is not of the format.
-        chain = pk.build_chain_from_urdf(given.write_xml_string()).to(dtype=torch.float64)
+        chain = (pk.build_chain_from_urdf(given.write_xml_string()) if joints else _chain(pk, links[0])).to(
+            dtype=torch.float64
+        )
     order = {name: k for k, name in enumerate(chain.get_joint_parameter_names())}
     free = [joint for joint in joints if joint.type in MOVING and joint.mimic is None]
     couple, offset = _coupling(file, [joint for joint in joints if joint.type in MOVING], free, order)
     low, high = (
-        torch.tensor([_limit(joint, side) for joint in free], dtype=torch.float64) for side in ("lower", "upper")
+        torch.tensor([_limit(joint, side, unread) for joint in free], dtype=torch.float64)
+        for side in ("lower", "upper")
     )
     if bool((low > high).any()):
         bad = free[int((low > high).nonzero()[0])].name
@@ -78,11 +83,50 @@ def load_robot(path: PathLike) -> Rig:
     rest = torch.zeros(len(free), dtype=torch.float64).clamp(low, high)
     control = Control(rest, low, high, tuple(joint.name for joint in free))
     deformer = Links(chain, tuple(carries), tuple(links), parents, couple, offset, {"angles": control})
+    unread.say(path)
     return Rig(meshes[0] if len(meshes) == 1 else Scene(meshes), deformer)
+
+
+def _folders(given: PathLike | Sequence[PathLike]) -> list[Path]:
+    """Raises TypeError or FileNotFoundError."""
+    several = [given] if isinstance(given, (str, os.PathLike)) else list(given)
+    for folder in several:
+        if not isinstance(folder, (str, os.PathLike)):
+            raise TypeError(f"package_dirs: expected folders, got {type(folder).__name__}")
+        if not Path(folder).is_dir():
+            raise FileNotFoundError(
+                f"package_dirs: expected folders, got {os.fspath(folder)!r}, where there is none; name others"
+            )
+    return [Path(folder).absolute() for folder in several]
+
+
+def _check_joint(file: Path, joint: Any) -> None:
+    """Raises ValueError."""
+    if joint.type not in (*MOVING, "fixed"):
+        raise ValueError(
+            f"{file}: joint {joint.name!r}: expected a type among {', '.join(MOVING)} and fixed, got {joint.type!r}; "
+            "replace it by joints of these"
+        )
+    axis = np.asarray(joint.axis, np.float64)
+    if joint.type in MOVING and not (axis.shape == (3,) and 0.0 < np.linalg.norm(axis) < np.inf):
+        raise ValueError(
+            f"{file}: joint {joint.name!r}: expected an axis of 3 numbers that are not all 0, got {axis.tolist()}; repair it"
+        )
+
+
+def _chain(pk: Any, link: str) -> Any:
+    """A chain of one link, which its builder does not make."""
+    root = pk.frame.Frame(link)
+    root.joint, root.link = pk.frame.Joint(), pk.frame.Link(link, pk.Transform3d(), [pk.frame.Visual()])
+    return pk.Chain(root)
 
 
 def _parents(file: Path, links: list[str], joints: list[Any]) -> tuple[int, ...]:
     """By link, the place of the one that it hangs on; −1 of none. Raises ValueError."""
+    for what, names in (("link", links), ("joint", [joint.name for joint in joints])):
+        twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+        if twice is not None:
+            raise ValueError(f"{file}: {what} {twice!r}: expected each {what} once, got two of this name; rename one")
     above: dict[str, str] = {}
     for joint in joints:
         for name in (joint.parent, joint.child):
@@ -98,6 +142,12 @@ def _parents(file: Path, links: list[str], joints: list[Any]) -> tuple[int, ...]
             if at in seen:
                 raise ValueError(f"{file}: expected a tree of links, got a cycle: {' → '.join([*seen, at])}")
             seen.append(at)
+    roots = [link for link in links if link not in above]
+    if len(roots) > 1:
+        raise ValueError(
+            f"{file}: expected one link that hangs on no other, got {len(roots)}: {', '.join(map(repr, roots[:5]))}; join them "
+            "by fixed joints"
+        )
     return tuple(links.index(above[link]) if link in above else -1 for link in links)
 
 
@@ -126,76 +176,17 @@ def _coupling(file: Path, moving: list[Any], free: list[Any], order: dict[str, i
     return couple, offset
 
 
-def _limit(joint: Any, side: str) -> float:
-    value = None if joint.limit is None or joint.type == "continuous" else getattr(joint.limit, side)
-    return (-np.inf if side == "lower" else np.inf) if value is None else float(value)
-
-
-def _mesh(file: Path, link: str, visual: Any, robot: Any) -> Mesh:
-    """In the link's coordinates. Raises FileNotFoundError or ValueError."""
-    geometry = visual.geometry
-    matrix = np.eye(4) if visual.origin is None else np.asarray(visual.origin, np.float64)
-    if geometry.mesh is not None:
-        mesh = _read(file, link, geometry.mesh.filename)
-        scale = np.ones(3) if geometry.mesh.scale is None else np.broadcast_to(geometry.mesh.scale, 3)
-        matrix = matrix @ np.diag([*scale, 1.0])
-    else:
-        creation = require("trimesh.creation", "trimesh", "shapes of robots")
-        if geometry.box is not None:
-            made = creation.box(geometry.box.size)
-        elif geometry.cylinder is not None:
-            made = creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=48)
-        else:
-            made = creation.icosphere(3, geometry.sphere.radius)
-        mesh = Mesh(torch.tensor(made.vertices, dtype=torch.float32), torch.tensor(made.faces))
-    placed = torch.tensor(matrix).to(mesh.verts)
-    mesh = mesh.transformed(placed[:3, :3], placed[:3, 3])
-    if np.linalg.det(matrix[:3, :3]) < 0.0:
-        mesh = mesh.replace(faces=mesh.faces.flip(1)) if mesh.uv_faces is None and mesh.normal_faces is None else mesh
-    color = _color(visual.material, robot)
-    if color is not None and mesh.channels is None:
-        mesh = mesh.replace(face_colors=color.to(mesh.verts).repeat(len(mesh.faces), 1))
-    elif color is None and mesh.channels is None:
-        mesh = mesh.replace(face_colors=torch.full((len(mesh.faces), 3), 0.7, dtype=mesh.verts.dtype))
-    return mesh.replace(name=f"{link}: {visual.name}" if visual.name else link)
-
-
-def _read(file: Path, link: str, name: str) -> Mesh:
-    handler = require("yourdfpy.urdf", *EXTRA).filename_handler_magic
-    found = Path(handler(name, dir=str(file.absolute().parent)))
-    found = found if found.is_absolute() else file.absolute().parent / found
-    if not found.is_file():
-        raise FileNotFoundError(
-            f"{file}: link {link!r}: names the mesh {name!r}, and there is no such file in {file.absolute().parent} or above it; "
-            "put it there"
+def _limit(joint: Any, side: str, unread: Unsupported) -> float:
+    """0 where the joint's limit does not say it, as the format defines it; infinite without a limit."""
+    if joint.limit is None or joint.type == "continuous":
+        return -np.inf if side == "lower" else np.inf
+    value = getattr(joint.limit, side)
+    if value is None:
+        unread.note(
+            f"limit of joint {joint.name!r} without {side}",
+            "0, as the format says; a joint without limits is continuous",
         )
-    if found.suffix.lower() in MESHES:
-        try:
-            return load_mesh(found)
-        except ValueError as error:
-            if "look alike" not in str(error) and "different textures" not in str(error):
-                raise ValueError(f"{file}: link {link!r}: {error}") from error
-            return load_mesh(found, materials=False)
-    trimesh = require("trimesh", "trimesh", "reading meshes of robots")
-    try:
-        return from_trimesh(trimesh.load(found, force="mesh"))
-    except ImportError:
-        raise
-    except Exception as error:
-        raise ValueError(
-            f"{file}: link {link!r}: expected a mesh in {name!r}, got one that cannot be read ({type(error).__name__}: {error}); "
-            "convert it to GLB"
-        ) from error
-
-
-def _color(material: Any, robot: Any) -> Tensor | None:
-    """(3,) linear, of rgba as displays show it."""
-    if material is None:
-        return None
-    given = material.color
-    if given is None:  # defined once for the whole robot
-        given = next((m.color for m in robot.materials if m.name == material.name and m.color is not None), None)
-    return None if given is None else srgb_to_linear(torch.tensor(given.rgba[:3], dtype=torch.float32))
+    return 0.0 if value is None else float(value)
 
 
 @contextmanager

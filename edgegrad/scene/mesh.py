@@ -270,9 +270,9 @@ class Mesh:
 
     @staticmethod
     def from_trimesh(mesh: Any) -> Mesh:
-        """From a trimesh.Trimesh: equal vertices welded, with its vertex or face colours or its texture, which are sRGB there.
-        float64 where float32 would move vertices by more than a millionth of the extent, else float32. Raises TypeError,
-        ValueError or ImportError."""
+        """From a trimesh.Trimesh: equal vertices welded, with its vertex or face colours or its texture, which are sRGB there,
+        or the colour of its material, which is linear. float64 where float32 would move vertices by more than a millionth of the
+        extent, else float32. Raises TypeError, ValueError or ImportError."""
         return provided.from_trimesh(mesh)
 
     def to_trimesh(self) -> Any:

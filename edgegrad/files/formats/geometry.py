@@ -22,9 +22,9 @@ def shape(name: str, raw: dict[str, Any], matrix: np.ndarray) -> Part:
     with np.errstate(over="ignore", invalid="ignore"):
         # Elementwise: a matrix product may round equal rows differently, and they would not be welded.
         v = v[:, 0:1] * matrix[:3, 0] + v[:, 1:2] * matrix[:3, 1] + v[:, 2:3] * matrix[:3, 2] + matrix[:3, 3]
-    if np.linalg.det(matrix[:3, :3]) < 0.0:
-        faces = faces[:, ::-1]  # in a mirror the front of a face stays its front
-    return Part(name, np.ascontiguousarray(v), np.ascontiguousarray(faces))
+    part = Part(name, np.ascontiguousarray(v), np.ascontiguousarray(faces))
+    # In a mirror the front of a face stays its front.
+    return part.reversed() if np.linalg.det(matrix[:3, :3]) < 0.0 else part
 
 
 def turned(part: Part, matrix: np.ndarray) -> np.ndarray | None:

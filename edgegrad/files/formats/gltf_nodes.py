@@ -14,9 +14,12 @@ from ...camera.camera import Camera
 from ...optional import require
 from ...scene.lights import DirectionalLight, Light, PointLight, SpotLight
 from .gltf import PUNCTUAL, VISIBILITY, entry
+from .gltf_schema import explained
+from .names import free_name
 from .part import Fault
-from .source import Source
+from .source import Source, Unsupported
 
+ROUNDED = 0.01  # what rounding to normalised bytes may change of a quaternion's length
 INSTEAD_OF_RANGE = "light falls off with the square of the distance, without an end"
 
 
@@ -29,10 +32,17 @@ class Placed(NamedTuple):
     world: np.ndarray  # (4, 4), to the world
     visible: bool  # it and all nodes above it (KHR_node_visibility)
 
+    def skins(self, primitive: dict[str, Any]) -> bool:
+        """Whether the node's skin moves a primitive of its mesh; one without JOINTS_0 is rigid with the node."""
+        return "skin" in self.node and "JOINTS_0" in primitive["attributes"]
+
+    def of_primitive(self, primitive: dict[str, Any]) -> np.ndarray:
+        """(4, 4): what a skin moves stands where its joints do (glTF 2.0, section 3.7.3.3), all else where the node is."""
+        return np.eye(4) if self.skins(primitive) else self.world
+
     @property
-    def of_mesh(self) -> np.ndarray:
-        """(4, 4) of the node's mesh: one with a skin stands where its joints do (glTF 2.0, section 3.7.3.3)."""
-        return np.eye(4) if "skin" in self.node else self.world
+    def name(self) -> str:
+        return node_name(self.number, self.node)
 
 
 def placed(tree: dict[str, Any]) -> Iterator[Placed]:
@@ -70,24 +80,48 @@ def matrix_of(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     transformations = require("trimesh.transformations", "trimesh", "reading meshes")
-    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    x, y, z, w = rotation_of(node)
     shift = transformations.translation_matrix(node.get("translation", (0.0, 0.0, 0.0)))
     scale = np.diag((*node.get("scale", (1.0, 1.0, 1.0)), 1.0))
     return shift @ transformations.quaternion_matrix((w, x, y, z)) @ scale
 
 
+def rotation_of(node: dict[str, Any]) -> np.ndarray:
+    """(4,) unit quaternion x, y, z, w; the identity where the file has zeros or numbers that are not finite."""
+    given = np.asarray(node.get("rotation", (0.0, 0.0, 0.0, 1.0)), np.float64)
+    length = float(np.linalg.norm(given))
+    return given / length if 0.0 < length < math.inf else np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def node_name(number: int, node: dict[str, Any]) -> str:
+    return str(node.get("name") or f"node {number}")
+
+
+def note_rotations(tree: dict[str, Any], unsupported: Unsupported) -> None:
+    """Notes the rotations that are no unit quaternions."""
+    for number, node in enumerate(tree.get("nodes", [])):
+        length = float(np.linalg.norm(node.get("rotation", (0.0, 0.0, 0.0, 1.0))))
+        if not abs(length - 1.0) <= ROUNDED:
+            instead = "divided by it" if 0.0 < length < math.inf else "left out"
+            unsupported.note(f"rotation of node {node_name(number, node)[:60]!r} of length {length:.3g}", instead)
+
+
 def lights(tree: dict[str, Any], source: Source) -> list[Light]:
     """Those of KHR_lights_punctual at visible nodes, in float64. Scales of nodes change where they are, and nothing else
-    of them. Raises Fault."""
+    of them. Notes which cannot be read."""
     found = []
-    for _, _, node, world, visible in placed(tree):
-        reference = node.get("extensions", {}).get(PUNCTUAL)
-        if reference is not None and visible:
-            light = entry(tree.get("extensions", {}).get(PUNCTUAL, {}), "lights", reference["light"])
+    for at in placed(tree):
+        reference = at.node.get("extensions", {}).get(PUNCTUAL)
+        if reference is not None and at.visible:
+            name = at.name
             try:
-                found.append(_light(light, world, source))
-            except (TypeError, ValueError) as error:
-                raise Fault(f"light {str(light.get('name', reference['light']))[:60]!r}: {error}") from error
+                with explained(tree):
+                    light = entry(tree.get("extensions", {}).get(PUNCTUAL, {}), "lights", reference["light"])
+                    name = str(light.get("name") or name)
+                    found.append(_light(light, at.world, source))
+            except (Fault, TypeError, ValueError, KeyError) as error:
+                source.unsupported.note(f"light {name[:60]!r}", f"left out: {error}")
+                continue
             if "range" in light:
                 source.unsupported.note("range of lights", INSTEAD_OF_RANGE)
     return found
@@ -124,26 +158,36 @@ def _cone(light: dict[str, Any], source: Source) -> tuple[float, float]:
     return start, end
 
 
-def cameras(tree: dict[str, Any], size: tuple[int, int]) -> dict[str, Camera]:
+def cameras(tree: dict[str, Any], size: tuple[int, int]) -> dict[str, Camera | Fault]:
     """In float64, by the names of their nodes and in their order, (H, W) pixels, which are square: of aspectRatio, yfov and
-    ymag these give the height. Raises Fault, or ValueError about the size."""
-    found: dict[str, Camera] = {}
-    for _, _, node, world, _ in placed(tree):  # also where nothing else of it is visible
-        if "camera" not in node:
+    ymag these give the height. In place of one that cannot be read its Fault. Raises ValueError about the size."""
+    found: dict[str, Camera | Fault] = {}
+    for at in placed(tree):  # also where nothing else of it is visible
+        if "camera" not in at.node:
             continue
-        name = str(node.get("name", f"camera {len(found)}"))
-        name = f"{name} ({len(found)})" if name in found else name
-        given = entry(tree, "cameras", node["camera"])
-        length = np.linalg.norm(world[:3, :3], axis=0)  # a camera has no scale
-        pose = torch.tensor(world, dtype=torch.float64)
-        pose[:3, :3] /= torch.tensor(np.where(length > 0.0, length, 1.0))
-        kind = given.get("type")
-        if kind == "perspective":
-            found[name] = Camera.from_opengl(pose, size, math.degrees(given["perspective"]["yfov"]))
-        elif kind == "orthographic":
-            scale = size[0] / (2.0 * given["orthographic"]["ymag"])
-            K = pose.new_tensor([[scale, 0.0, size[1] / 2], [0.0, scale, size[0] / 2], [0.0, 0.0, 1.0]])
-            found[name] = dataclasses.replace(Camera.from_opengl(pose, size, K=K), projection="orthographic")
-        else:
-            raise Fault(f"expected a camera of type perspective or orthographic, got {kind!r}; export it again")
+        name = str(at.node.get("name") or f"camera {len(found)}")
+        name = free_name(found, name, f"{name} ({len(found)})")
+        try:
+            with explained(tree):
+                found[name] = _camera(entry(tree, "cameras", at.node["camera"]), at.world, size)
+        except (Fault, TypeError, ValueError, KeyError) as error:
+            found[name] = Fault(str(error))
     return found
+
+
+def _camera(given: dict[str, Any], world: np.ndarray, size: tuple[int, int]) -> Camera:
+    if np.linalg.det(world[:3, :3]) < 0.0:
+        raise Fault(
+            "expected a camera that turns and shifts, got one below a node that mirrors; export it without mirroring"
+        )
+    length = np.linalg.norm(world[:3, :3], axis=0)  # a camera has no scale
+    pose = torch.tensor(world, dtype=torch.float64)
+    pose[:3, :3] /= torch.tensor(np.where(length > 0.0, length, 1.0))
+    kind = given.get("type")
+    if kind == "perspective":
+        return Camera.from_opengl(pose, size, math.degrees(given["perspective"]["yfov"]))
+    if kind == "orthographic":
+        scale = size[0] / (2.0 * given["orthographic"]["ymag"])
+        K = pose.new_tensor([[scale, 0.0, size[1] / 2], [0.0, scale, size[0] / 2], [0.0, 0.0, 1.0]])
+        return dataclasses.replace(Camera.from_opengl(pose, size, K=K), projection="orthographic")
+    raise Fault(f"expected a camera of type perspective or orthographic, got {kind!r}; export it again")

@@ -9,9 +9,10 @@ import numpy as np
 from .gltf import File, entry
 from .gltf_arrays import Arrays, Geometry, normalised
 from .gltf_material import Primitive
-from .gltf_nodes import Placed, matrix_of, placed
+from .gltf_nodes import ROUNDED, Placed, matrix_of, node_name, placed, rotation_of
 from .gltf_scene import primitives
 from .gltf_texture import Images
+from .names import free_name
 from .part import Fault
 from .source import Source
 
@@ -83,59 +84,76 @@ def _add_mesh(
     rig: RigFile, k: int, at: Placed, file: File, images: Images, source: Source, places: dict[int, int]
 ) -> None:
     mesh, first = entry(file.tree, "meshes", at.node["mesh"]), len(rig.morphs)
-    counts = {len(primitive.get("targets", [])) for primitive in mesh["primitives"]}
-    if len(counts) > 1:
-        raise Fault(
-            f"mesh {at.node['mesh']}: expected as many morph targets in each primitive, got {sorted(counts)}; export it again"
-        )
-    if count := counts.pop():
-        given = mesh.get("extras", {})
-        own = given.get("targetNames", []) if isinstance(given, dict) else []
-        if len(own) != count:
-            own = [f"target {n}" for n in range(count)]
-        weights = at.node.get("weights", mesh.get("weights", [0.0] * count))
-        if len(weights) != count:
-            raise Fault(
-                f"mesh {at.node['mesh']}: expected {count} weights for its morph targets, got {len(weights)}; export it again"
-            )
-        taken = set(rig.morphs)
-        rig.morphs.extend(str(n) if n not in taken else f"{rig.nodes[k].name}: {n}" for n in own)
-        rig.morph_weights.extend(float(w) for w in weights)
+    found = list(primitives(file, at.node["mesh"], images, source))
+    count = max((len(primitive.given.get("targets", [])) for _, primitive in found), default=0)
+    try:
+        moves = [[_targets(p.geometry, key, p.positions, count) for key in ("POSITION", "NORMAL")] for _, p in found]
+    except Fault as fault:
+        source.unsupported.note(f"morph targets of {_mesh_name(at, mesh)!r}", f"left out: {fault}")
+        count, moves = 0, [[np.zeros((0, *primitive.positions.shape))] * 2 for _, primitive in found]
+    if count:
+        rig.morphs.extend(_morph_names(rig, k, mesh, count))
+        rig.morph_weights.extend(_morph_weights(at, mesh, count, source))
         rig.morphs_of[k] = first, count
-    for name, primitive in primitives(file, at.node["mesh"], images, source):
+    for (name, primitive), targets in zip(found, moves, strict=True):
         try:
-            if "skin" in at.node:
+            if at.skins(primitive.given):
                 joints, inverse_binds = _skin(images.arrays, file.tree, at.node["skin"], places)
                 weights = _weights(primitive.geometry, len(primitive.positions), len(joints), name, source)
                 used = np.flatnonzero(weights.any(0))  # the others move nothing
                 joints, inverse_binds, weights = joints[used], inverse_binds[used], weights[:, used]
             else:
                 joints, inverse_binds, weights = np.array([k]), np.eye(4)[None], np.ones((len(primitive.positions), 1))
-            targets = [_targets(primitive.geometry, key, primitive.positions) for key in ("POSITION", "NORMAL")]
+                if "skin" in at.node:
+                    source.unsupported.note(
+                        f"the skin of {name[:60]!r}, which has no JOINTS_0",
+                        f"rigid with node {rig.nodes[k].name[:60]!r}",
+                    )
         except Fault as fault:
             raise Fault(f"part {name[:60]!r}: {fault}") from fault.__cause__
         rig.parts.append((name, primitive, Bound(joints, inverse_binds, weights, first, *targets)))
 
 
+def _mesh_name(at: Placed, mesh: dict[str, Any]) -> str:
+    return str(mesh.get("name") or f"mesh {at.node['mesh']}")[:60]
+
+
+def _morph_names(rig: RigFile, k: int, mesh: dict[str, Any], count: int) -> list[str]:
+    """Return the names of extras.targetNames where there are as many as targets, each once among all of the rig."""
+    extras = mesh.get("extras", {})
+    given = extras.get("targetNames", []) if isinstance(extras, dict) else []
+    given = given if isinstance(given, list) and len(given) == count else [""] * count
+    found: list[str] = []
+    for number, own in enumerate(given):
+        name = str(own) if own else f"target {number}"
+        found.append(free_name({*rig.morphs, *found}, name, f"{rig.nodes[k].name}: {name}"))
+    return found
+
+
+def _morph_weights(at: Placed, mesh: dict[str, Any], count: int, source: Source) -> list[float]:
+    """Return the weights at rest."""
+    given = at.node.get("weights", mesh.get("weights", [0.0] * count))
+    if len(given) != count:
+        what = f"weights of {_mesh_name(at, mesh)!r}, {len(given)} for {count} morph targets"
+        source.unsupported.note(what, "0 for each in their place")
+        return [0.0] * count
+    return [float(weight) for weight in given]
+
+
 def _names(there: list[Placed]) -> list[str]:
     """Each once."""
-    found: list[str] = []
-    taken: set[str] = set()
+    found: dict[str, None] = {}
     for at in there:
-        name = str(at.node.get("name", f"node {at.number}"))
-        name = f"{name} ({at.number})" if name in taken else name
-        taken.add(name)
-        found.append(name)
-    return found
+        found[free_name(found, at.name, f"{at.name} ({at.number})")] = None
+    return list(found)
 
 
 def _node(name: str, at: Placed, places: dict[int, int]) -> Node:
     parent = -1 if at.above is None else places[at.above]
     matrix = matrix_of(at.node)
     if "matrix" not in at.node:
-        x = np.asarray(at.node.get("rotation", (0.0, 0.0, 0.0, 1.0)), np.float64)
         scale = np.diag(np.asarray(at.node.get("scale", (1.0, 1.0, 1.0)), np.float64))
-        return Node(name, parent, matrix[:3, 3], x / max(np.linalg.norm(x), 1e-30), scale)
+        return Node(name, parent, matrix[:3, 3], rotation_of(at.node), scale)
     # The polar decomposition A = R S; a scale by the axes gives a diagonal S.
     U, s, Vt = np.linalg.svd(matrix[:3, :3])
     mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
@@ -200,12 +218,14 @@ def _weights(geometry: Geometry, count: int, joints: int, name: str, source: Sou
             raise Fault(f"expected JOINTS_{number} from 0 to {joints - 1}, got {int(index.max())}; export it again")
         np.add.at(found, (np.arange(count)[:, None], index), weights)
         number += 1
-    if number == 0:
-        raise Fault("expected JOINTS_0 and WEIGHTS_0 for its skin, got none; export it again")
+    loose = found.sum(1) <= 0.0
+    if loose.any():
+        found[loose, 0] = 1.0
+        source.unsupported.note(
+            f"{int(loose.sum())} of {count} vertices of {name[:60]!r} whose weights are all 0, as vertex {int(loose.argmax())}",
+            "bound to the first joint of the skin",
+        )
     total = found.sum(1, keepdims=True)
-    if (total <= 0.0).any():
-        bad = int(np.argwhere(total[:, 0] <= 0.0)[0, 0])
-        raise Fault(f"expected weights that add up to 1, got 0 at vertex {bad}; bind it to a joint")
     worst = float(np.abs(total - 1.0).max())
     if worst > WHOLE:
         source.unsupported.note(
@@ -214,9 +234,10 @@ def _weights(geometry: Geometry, count: int, joints: int, name: str, source: Sou
     return found / total
 
 
-def _targets(geometry: Geometry, name: str, positions: np.ndarray) -> np.ndarray:
-    """(M, N, 3)"""
+def _targets(geometry: Geometry, name: str, positions: np.ndarray, count: int) -> np.ndarray:
+    """(M, N, 3) of so many targets, zeros of those that the primitive lacks. Raises Fault."""
     rows = geometry.targets(name, positions.shape)
+    rows += [None] * (count - len(rows))
     whole = [np.zeros(positions.shape) if row is None else row for row in rows]
     return np.stack(whole) if whole else np.zeros((0, *positions.shape))
 
@@ -224,28 +245,31 @@ def _targets(geometry: Geometry, name: str, positions: np.ndarray) -> np.ndarray
 def _animations(
     arrays: Arrays, tree: dict[str, Any], places: dict[int, int], source: Source
 ) -> list[tuple[str, list[Channel]]]:
-    found, taken = [], set()
+    """Return the channels of each animation by its name, and note those that cannot be read."""
+    found: dict[str, list[Channel]] = {}
     for number, animation in enumerate(tree.get("animations", [])):
-        name = str(animation.get("name", f"animation {number}"))
-        name = f"{name} ({number})" if name in taken else name
-        taken.add(name)
-        channels = []
+        name = str(animation.get("name") or f"animation {number}")
+        name = free_name(found, name, f"{name} ({number})")
+        found[name] = channels = []
         for channel in animation["channels"]:
             target = channel["target"]
             if target["path"] not in PATHS:
                 source.unsupported.note(f"animation of {target['path']!r}")
-            elif target.get("node") in places:
+            elif (node := target.get("node")) in places:
+                what = (
+                    f"{target['path']} of node {node_name(node, tree['nodes'][node])[:60]!r} in animation {name[:60]!r}"
+                )
                 try:
-                    channels.append(_channel(arrays, tree, animation, channel, places))
+                    channels.append(_channel(arrays, tree, animation, channel, places, what, source))
                 except Fault as fault:
-                    raise Fault(f"animation {name[:60]!r}: {fault}") from fault.__cause__
-        found.append((name, channels))
-    return found
+                    source.unsupported.note(what, f"left out: {fault}")
+    return list(found.items())
 
 
 def _channel(
-    arrays: Arrays, tree: dict[str, Any], animation: dict[str, Any], channel: dict[str, Any], places: dict[int, int]
-) -> Channel:
+    arrays: Arrays, tree: dict[str, Any], animation: dict[str, Any], channel: dict[str, Any], places: dict[int, int],
+    what: str, source: Source,
+) -> Channel:  # fmt: skip
     sampler, target = entry(animation, "samplers", channel["sampler"]), channel["target"]
     path, interpolation = target["path"], sampler.get("interpolation", "LINEAR")
     if interpolation not in INTERPOLATIONS:
@@ -262,11 +286,27 @@ def _channel(
     values = arrays.get(sampler["output"])
     values = values.astype(np.float64) if values.dtype.kind == "f" else normalised(values)
     node = entry(tree, "nodes", target["node"])
-    columns = PATHS[path] or len(entry(tree, "meshes", node.get("mesh"))["primitives"][0].get("targets", []))
+    columns = PATHS[path] or max(
+        len(primitive.get("targets", [])) for primitive in entry(tree, "meshes", node.get("mesh"))["primitives"]
+    )
     each = 3 if interpolation == "CUBICSPLINE" else 1
     if columns == 0 or values.size != len(times) * each * columns or not np.isfinite(values).all():
         raise Fault(
             f"expected {len(times)} × {each} × {columns} finite numbers for {path}, got shape {values.shape}; export it again"
         )
-    shape = (len(times), 3, columns) if each == 3 else (len(times), columns)
-    return Channel(path, places[target["node"]], times[:, 0].astype(np.float64), values.reshape(shape), interpolation)
+    values = values.reshape((len(times), 3, columns) if each == 3 else (len(times), columns))
+    if path == "rotation":
+        values = _unit(values, each == 3, what, source)
+    return Channel(path, places[target["node"]], times[:, 0].astype(np.float64), values, interpolation)
+
+
+def _unit(values: np.ndarray, cubic: bool, what: str, source: Source) -> np.ndarray:
+    """Keys of rotations divided by the lengths of their quaternions, tangents of splines with them. Bytes and shorts have these
+    lengths to rounding; notes others. Raises Fault for a quaternion of zeros."""
+    length = np.linalg.norm(values[:, 1] if cubic else values, axis=-1)
+    worst = int(np.abs(length - 1.0).argmax())
+    if not length.all():
+        raise Fault(f"expected unit quaternions, got zeros at key {int(length.argmin())}; repair it")
+    if abs(length[worst] - 1.0) > ROUNDED:
+        source.unsupported.note(f"{what}, whose key {worst} is of length {length[worst]:.3g}", "divided by it")
+    return values / length.reshape(-1, *[1] * (values.ndim - 1))

@@ -10,7 +10,7 @@ import numpy as np
 from .gltf import File, entry
 from .gltf_arrays import FAN, STRIP, TRIANGLES, Arrays, Geometry
 from .gltf_material import Primitive
-from .gltf_nodes import placed
+from .gltf_nodes import Placed, placed
 from .gltf_texture import Images
 from .part import Fault
 from .source import Source
@@ -21,15 +21,15 @@ def instances(file: File, source: Source) -> list[tuple[str, dict[str, Any], np.
     arrays are `vertices`, `faces` and `primitive`, which knows the others. Raises Fault or FileNotFoundError."""
     arrays = Arrays(file, source.folder)
     images = Images(arrays)
-    places: dict[int, list[np.ndarray]] = {}
+    places: dict[int, list[Placed]] = {}
     for at in placed(file.tree):
         if at.visible and "mesh" in at.node:
-            places.setdefault(at.node["mesh"], []).append(at.of_mesh)
+            places.setdefault(at.node["mesh"], []).append(at)
     found = []
     for number in sorted(places):
         for name, primitive in primitives(file, number, images, source):
             raw = {"vertices": primitive.positions, "faces": primitive.triangles, "primitive": primitive}
-            found += [(name, raw, world) for world in places[number]]
+            found += [(name, raw, at.of_primitive(primitive.given)) for at in places[number]]
     return found
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from .gltf import MATT, READ
+from .gltf_nodes import note_rotations
 from .gltf_schema import properties, schema
 from .source import Source
 
@@ -35,6 +36,7 @@ def note_unread(tree: dict[str, Any], source: Source) -> None:
     for name, instead in {"animations": "shown at rest", "skins": "shown in the pose of their binding"}.items():
         if tree.get(name) and not source.wanted.rigged:
             source.unsupported.note(name, f"{instead}; load_rig() has them")
+    note_rotations(tree, source.unsupported)
     used = {f"TEXCOORD_{number}" for number in _values(tree.get("materials", []), "texCoord")}
     primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
     attributes = {name for primitive in primitives for name in primitive["attributes"]}

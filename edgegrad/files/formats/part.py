@@ -40,6 +40,11 @@ class Part(NamedTuple):
     material: Material | None = None  # one for all parts that the file gives it to; None: not lit
     material_uvs: Mapping[str, np.ndarray] = MappingProxyType({})  # (N, 2) of those of its textures that have their own
 
+    def reversed(self) -> Part:
+        """Return the part with the corners of all faces in reverse order, in every array of indices."""
+        indices = {name: getattr(self, name) for name in ("faces", "uv_faces", "normal_faces")}
+        return self._replace(**{n: np.ascontiguousarray(i[:, ::-1]) for n, i in indices.items() if i is not None})
+
 
 class Model(NamedTuple):
     """All of a file."""

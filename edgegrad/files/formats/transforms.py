@@ -12,7 +12,9 @@ import torch
 
 from ...camera.camera import Camera
 from ..image import IMAGES, read_size
+from ..paths import StoredPath
 from .keys import image_size, note_unread
+from .names import free_name
 from .part import Fault
 from .source import Unsupported
 from .views import View
@@ -70,7 +72,7 @@ def read(
             view = View(_camera(own, shared, found, size), found.file)
         except (Fault, TypeError, ValueError, KeyError, OverflowError) as error:
             raise Fault(f"frames[{i}], {name}: {error}") from error
-        views[name if name not in views else f"{name} (frame {i})"] = view
+        views[free_name(views, name, f"{name} (frame {i})")] = view
         note_unread(own, READ | HARMLESS, unread, INSTEAD)
     note_unread(shared, READ | HARMLESS, unread, INSTEAD)
     for names, why in (
@@ -142,7 +144,7 @@ def _camera(
     elif size is not None:
         H, W = size
     elif found.file is not None:
-        H, W = read_size(found.file)
+        H, W = read_size(StoredPath(found.file))
     else:
         why = ": it is outside of the file's folder, where nobody looks" * found.outside
         raise ValueError(

@@ -2,14 +2,68 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 from ...camera.camera import Camera
+from ..image import read_size
+from ..paths import StoredPath
+from .source import Unsupported
 
 
 class View(NamedTuple):
     """What load_cameras() finds of each image."""
 
     camera: Camera
-    image: Path | None  # the image's file; None where none is named, or none found: see load_cameras
+    # The image's file, whose pixels read_image() reads as the camera speaks of them; None where none is named, found or fits:
+    # see load_cameras.
+    image: Path | None
+
+
+def resized(camera: Camera, size: tuple[int, int]) -> Camera | None:
+    """The camera for (H, W) pixels, where these are in proportion to its own; None where they are not."""
+    (H, W), (h, w) = size, camera.size
+    # One that is scaled to the other ends less than a pixel from it: sizes of scaled images are rounded.
+    return camera.resized(size) if abs(H * w - W * h) <= max(H, W, h, w) else None
+
+
+def matched(views: Mapping[str, View], unread: Unsupported) -> dict[str, View]:
+    """Views whose cameras have the sizes of their images.
+
+    A camera speaks of the pixels that are stored. Where the upright image alone is in proportion to it, it speaks of that.
+    Where neither is, the view loses its image. Notes which cameras are scaled and which images do not fit."""
+    found: dict[str, View] = {}
+    scaled: list[str] = []
+    unfit: list[str] = []
+    for name, (camera, image) in views.items():
+        found[name] = View(camera, image) if image is None else _matched(camera, image)
+        own, pixels = found[name], f"{camera.size[1]} × {camera.size[0]} pixels in the file of cameras"
+        if image is not None and own.image is None:
+            unfit.append(f"{name!r} ({_pixels(read_size(StoredPath(image)))}, {pixels})")
+        elif own.camera.size != camera.size:
+            scaled.append(f"{name!r} ({_pixels(own.camera.size)}, {pixels})")
+    if scaled:
+        unread.note(f"the size of {len(scaled)} of {len(views)} images, as {scaled[0]}", "cameras scaled to the images")
+    if unfit:
+        unread.note(
+            f"{len(unfit)} of {len(views)} images, as {unfit[0]}",
+            "not in proportion, so View.image is None; pass the folder of the images that were calibrated as images=, or crop "
+            "the camera by camera.crop()",
+        )
+    return found
+
+
+def _matched(camera: Camera, image: Path) -> View:
+    stored = StoredPath(image)
+    try:
+        for file in (stored, image):
+            if (fitting := resized(camera, read_size(file))) is not None:
+                return View(fitting, file)
+    except (PermissionError, ValueError):
+        return View(camera, stored)  # read_image() says what is wrong with the file
+    return View(camera, None)
+
+
+def _pixels(size: tuple[int, int]) -> str:
+    return f"{size[1]} × {size[0]}"
