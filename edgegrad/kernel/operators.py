@@ -346,7 +346,7 @@ torch.library.define(
 torch.library.define("edgegrad::faces_at_centers", f"({SCHEMA}) -> Tensor")
 torch.library.define(
     "edgegrad::render_jvp",
-    f"(Tensor coverage, Tensor depth, Tensor hit, Tensor seen, {SCHEMA}, Tensor?[] tangents, int directions) -> Tensor",
+    f"(Tensor coverage, Tensor depth, Tensor hit, Tensor seen, {SCHEMA}, Tensor?[] tangents, SymInt directions) -> Tensor",
 )
 
 
