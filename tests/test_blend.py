@@ -54,6 +54,17 @@ def test_what_lies_before_something_opaque_and_an_environment() -> None:
     assert torch.allclose(image, torch.full_like(image, over([0.9], [0.25], 0.6)), atol=1e-9)
 
 
+@pytest.mark.parametrize("image_of_directions", [False, True])
+def test_gradient_by_an_environment_that_is_seen_through(image_of_directions: bool) -> None:
+    """The image is linear in what shows behind the sheet."""
+    radiance = torch.full((3,), 0.6, dtype=F64, requires_grad=True)
+    sky = eg.Environment(radiance.expand(2, 4, 3) if image_of_directions else radiance)
+    image = eg.render(eg.Scene([sheet(0, 0.9, 0.25, size=0.5)], lights=[sky]), from_above(8), spp=4)
+    (found,) = torch.autograd.grad(image.sum(), radiance)
+    seen_through = 64 * (1 - 0.25 * 0.25)  # a quarter of the image is covered, of which a quarter is the sheet's own
+    torch.testing.assert_close(found, torch.full_like(found, seen_through), rtol=1e-9, atol=0)
+
+
 def test_gradients_by_alpha_radiance_and_background() -> None:
     values = [torch.tensor(v, dtype=F64, requires_grad=True) for v in (0.25, 0.6, 0.9, 0.5)]
     a0, a1, L0, L1 = values
