@@ -12,6 +12,7 @@ from scenes import cube
 from torch import Tensor
 
 import edgegrad as eg
+from edgegrad.points.step_terms import StepTerms
 
 F64 = torch.float64
 RADIANCES = (0.9, 0.5, 0.2, 0.7)
@@ -222,3 +223,29 @@ def test_all_that_moves_behind_a_pane(kind: str) -> None:
     noise = (through.error**2 + (0.6 * alone.error) ** 2) ** 0.5
     assert noise < 0.007 * abs(through.mean), f"too noisy to tell: {through}, {alone}"
     assert abs(through.mean - 0.6 * alone.mean) < 0.02 * abs(through.mean), f"{through}, without a pane {alone}"
+
+
+@pytest.mark.parametrize(("moving", "searched"), [("alpha", False), ("light", False), ("uvs", True), ("verts", True)])
+def test_borders_of_nearest_texels_are_searched_where_they_move(
+    moving: str, searched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of what requires a gradient, alpha and lights move none."""
+    searches: list[StepTerms] = []
+
+    def found(terms: StepTerms, watch: object) -> list[object]:
+        searches.append(terms)
+        return []
+
+    monkeypatch.setattr(StepTerms, "found", found)
+    start = plane()
+    assert start.uvs is not None
+    alpha, power = torch.full((2, 2), 0.5, dtype=F64), torch.tensor(3.0, dtype=F64)
+    values = {"alpha": alpha, "light": power, "uvs": start.uvs, "verts": start.verts}
+    values[moving] = values[moving].clone().requires_grad_()
+    image = torch.linspace(0.2, 0.8, 12, dtype=F64).reshape(2, 2, 3)
+    material = eg.Material(eg.Texture(image, filter="nearest"), alpha_mode="BLEND")
+    mesh = start.replace(verts=values["verts"], uvs=values["uvs"], alpha=values["alpha"], material=material)
+    scene = eg.Scene(mesh, lights=[eg.PointLight((0.3, 0.2, 2.0), values["light"])])
+    loss = eg.render(scene, from_above(4), spp=1).sum()
+    torch.autograd.grad(loss, values[moving])
+    assert bool(searches) == searched
