@@ -17,6 +17,7 @@ from .kernel.autograd import faces_at_centers, render_image
 from .kernel.flat import image_dtype
 from .kernel.request import Channels, Request, make_request
 from .light.radiance import Lighting
+from .light.unused_options import warn_of_unused
 from .light.whole import lit_image
 from .scene.mesh import Mesh
 from .scene.rows import areas, rows_of, unit
@@ -74,6 +75,8 @@ def render_aovs(
     names = check_aovs(aovs)
     scene = as_scene(scene)
     lighting = Lighting.of(shadows, light_samples, bounces)
+    if "image" in names:
+        warn_of_unused(scene, False, lighting.options)
     if "uv" in names:
         _check_uvs(scene)
     options: dict[str, Any] = {

@@ -237,7 +237,8 @@ def as_int(name: str, value: object) -> int:
     try:
         if isinstance(value, bool):
             raise TypeError
-        return operator.index(value)  # type: ignore[arg-type]
+        # torch.compile keeps an int symbolic here; operator.index would compile once for each value.
+        return value if isinstance(value, int) else operator.index(value)  # type: ignore[arg-type]
     except TypeError:
         raise TypeError(f"{name}: expected an int, got {type(value).__name__} ({value!r})") from None
 

@@ -22,6 +22,7 @@ from .light.bounces import check_bounces
 from .light.companions import FOURS, MOST_FOURS
 from .light.radiance import LIGHTING, Lighting
 from .light.resampled import how_drawn
+from .light.unused_options import warn_of_unused
 from .points.records import CURVE_BYTES, SURFACE_BYTES, has_intersections, without_colors
 from .points.shadows import ShadowLight
 from .points.surfaces import every_face
@@ -96,6 +97,7 @@ def plan(scene: Scene | Mesh, camera: Camera, spp: int = 16, seed: int = 0, **op
     scene = as_scene(scene)
     shading = {name: options.pop(name) for name in SHADING if name in options}
     request = make_request(scene, camera, spp, seed, **options)
+    warn_of_unused(scene, shading.get("shader") is not None, shading)
     if shading.get("shader") is not None:
         return Plan(_shaded_terms(scene, request, shading.get("creases", "auto")))
     lighting = Lighting.of(**{name: shading[name] for name in LIGHTING if name in shading})

@@ -18,6 +18,7 @@ from .kernel.counts import CURVES, Watch, table
 from .kernel.operators import backward_kernel, forward_kernel
 from .kernel.request import Request, make_request, required
 from .light.radiance import LIGHTING, Lighting
+from .light.unused_options import warn_of_unused
 from .render import SHADING, check_options
 from .scene.mesh import Mesh
 from .scene.scene import Scene, as_scene
@@ -110,6 +111,7 @@ def profile(
     check_options("profile", options)
     if options.get("shader") is not None:
         raise ValueError("shader: expected None, for profile() measures the kernel alone; torch.profiler sees a shader")
+    warn_of_unused(as_scene(scene), False, options)
     if as_scene(scene).is_shaded:
         return _of_shaded(
             as_scene(scene), camera, adjoint, (spp, seed), check_positive_int("repeats", repeats), options

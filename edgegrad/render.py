@@ -23,6 +23,7 @@ from .kernel.batch import render_images
 from .kernel.operators import forward_kernel, screen_gradient_kernel
 from .kernel.request import Request, make_request
 from .light.radiance import LIGHTING, Lighting, check_unlit
+from .light.unused_options import warn_of_unused
 from .light.whole import lit_image
 from .scene.mesh import Mesh
 from .scene.scene import Scene, as_scene
@@ -106,7 +107,7 @@ def render(
     (torch.func.jacfwd) in one pass. The image has the dtype of
     the colours and comes back on the scene's device. Raises TypeError or ValueError that names the argument, and MemoryError,
     before it allocates, with the figure and what to lower; so does its backward pass. A second derivative raises
-    RuntimeError.
+    RuntimeError. Warns of options of lit scenes and of shaders that have no effect on the image.
     """
     if shader is not None or as_scene(scene).is_shaded:
         scene, camera = savable(as_scene(scene)), savable(camera)
@@ -115,6 +116,8 @@ def render(
         filter=filter, grad_seed=grad_seed, step_spacing=step_spacing,
     )  # fmt: skip
     lighting = Lighting.of(shadows, light_samples, bounces)
+    shading = {"creases": creases, "check_shader": check_shader, **lighting.options}
+    warn_of_unused(as_scene(scene), shader is not None, shading)
     if shader is None and as_scene(scene).is_shaded:
         return lit_image(lighting, as_scene(scene), camera, request, creases)
     if shader is not None:

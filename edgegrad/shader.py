@@ -125,12 +125,17 @@ class _Image:
 
     def __init__(self, frame: Frame, shader: Shader, creases: bool | str, check: bool, effort: Effort) -> None:
         self._frame, self._creases, self._check, self._effort = frame, creases, check, effort
+        # (C,) or (H, W, C): the scene's background, or the environments that it shows. Found here, where derivatives are
+        # enabled if they are asked for; the values of an image are found without.
+        background = frame.surfaces.scene.background
+        self._behind_all = environments(frame) if background is None else background
         self._shader = shader
         if effort.blended:
-            self._shader = Blended(frame, shader, lambda: self._behind_all)
+            self._shader = Blended(frame, shader, self._behind_all)
             frame.sampler.panes = panes(frame.surfaces)
         self._channels: int | None = None
         self._kinds: list[str] | None = None  # of the steps that the shader declares
+        self.steps_move = effort.steps is not None  # whether one of their functions has a derivative
 
     def render(self) -> Tensor:
         watch = self._effort.watch
@@ -164,7 +169,7 @@ class _Image:
             watch.count("edge_samples", len(curves.x))
             with watch.part("edge shading"):
                 terms += self._boundary(EdgeSamples(frame, curves))
-        if visibility and self._kinds:
+        if visibility and self._kinds and self.steps_move:
             with watch.part("steps"):
                 declare = self._effort.steps or self._shade
                 beside = self._effort.beside_steps
@@ -217,12 +222,6 @@ class _Image:
         radiance = self._shade(hits).detach()
         weighted = radiance * frame.here(found.weight).to(radiance.dtype)[:, None]
         return frame.image(found.pixel, weighted, pixels), hits
-
-    @cached_property
-    def _behind_all(self) -> Tensor | None:
-        """(C,) or (H, W, C): the scene's background, or the environments that it shows."""
-        background = self._frame.surfaces.scene.background
-        return environments(self._frame) if background is None else background
 
     @cached_property
     def _background(self) -> Tensor | None:
@@ -322,6 +321,7 @@ class _Image:
             if self._kinds not in (None, kinds):
                 raise ValueError(UNEQUAL)
             self._kinds = kinds
+            self.steps_move = self.steps_move or moves(*hits._steps.values)
         if self._check and len(hits) > 1 and not hits._steps.forced:
             order = torch.randperm(len(hits), generator=torch.Generator().manual_seed(0)).to(radiance.device)
             order = order[: (len(hits) + 1) // 2]

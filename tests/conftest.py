@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -16,8 +17,40 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # what started the tes
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--budget", type=float, help="seconds of processor time that a test may take if it is not slow")
     parser.addoption(
+        "--failures", type=Path, help="file to which failures are written as they come, so also when interrupted"
+    )
+    parser.addoption(
         "--dearest", type=int, default=10, help="how many of the tests that took most are listed at the end"
     )
+
+
+class Failures:
+    """Shows the report of each failed test at once and appends it to a file."""
+
+    def __init__(self, config: pytest.Config, path: Path) -> None:
+        self.config, self.path = config, path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("", encoding="utf-8")
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            captured = "".join(f"\n-- {title} --\n{text}" for title, text in report.sections)
+            whole = f"==== {report.nodeid} ({report.when})\n{report.longreprtext}{captured}\n"
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(whole)
+            terminal = self.config.pluginmanager.get_plugin("terminalreporter")
+            if terminal is not None:
+                terminal.ensure_newline()
+                terminal.write_line(whole)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_configure(config: pytest.Config) -> None:
+    path = config.getoption("failures")
+    if path is not None and not hasattr(
+        config, "workerinput"
+    ):  # the workers of xdist send their reports to one process
+        config.pluginmanager.register(Failures(config, path))
 
 
 def processor_time() -> float:

@@ -12,6 +12,7 @@ from scenes import cube
 from torch import Tensor
 
 import edgegrad as eg
+from edgegrad.points.step_terms import StepTerms
 
 F64 = torch.float64
 RADIANCES = (0.9, 0.5, 0.2, 0.7)
@@ -52,6 +53,17 @@ def test_what_lies_before_something_opaque_and_an_environment() -> None:
     sky = eg.Environment(torch.tensor([0.6, 0.6, 0.6], dtype=F64))
     image = eg.render(eg.Scene([sheet(0, 0.9, 0.25)], lights=[sky]), from_above(8), spp=4)
     assert torch.allclose(image, torch.full_like(image, over([0.9], [0.25], 0.6)), atol=1e-9)
+
+
+@pytest.mark.parametrize("image_of_directions", [False, True])
+def test_gradient_by_an_environment_that_is_seen_through(image_of_directions: bool) -> None:
+    """The image is linear in what shows behind the sheet."""
+    radiance = torch.full((3,), 0.6, dtype=F64, requires_grad=True)
+    sky = eg.Environment(radiance.expand(2, 4, 3) if image_of_directions else radiance)
+    image = eg.render(eg.Scene([sheet(0, 0.9, 0.25, size=0.5)], lights=[sky]), from_above(8), spp=4)
+    (found,) = torch.autograd.grad(image.sum(), radiance)
+    seen_through = 64 * (1 - 0.25 * 0.25)  # a quarter of the image is covered, of which a quarter is the sheet's own
+    torch.testing.assert_close(found, torch.full_like(found, seen_through), rtol=1e-9, atol=0)
 
 
 def test_gradients_by_alpha_radiance_and_background() -> None:
@@ -211,3 +223,29 @@ def test_all_that_moves_behind_a_pane(kind: str) -> None:
     noise = (through.error**2 + (0.6 * alone.error) ** 2) ** 0.5
     assert noise < 0.007 * abs(through.mean), f"too noisy to tell: {through}, {alone}"
     assert abs(through.mean - 0.6 * alone.mean) < 0.02 * abs(through.mean), f"{through}, without a pane {alone}"
+
+
+@pytest.mark.parametrize(("moving", "searched"), [("alpha", False), ("light", False), ("uvs", True), ("verts", True)])
+def test_borders_of_nearest_texels_are_searched_where_they_move(
+    moving: str, searched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of what requires a gradient, alpha and lights move none."""
+    searches: list[StepTerms] = []
+
+    def found(terms: StepTerms, watch: object) -> list[object]:
+        searches.append(terms)
+        return []
+
+    monkeypatch.setattr(StepTerms, "found", found)
+    start = plane()
+    assert start.uvs is not None
+    alpha, power = torch.full((2, 2), 0.5, dtype=F64), torch.tensor(3.0, dtype=F64)
+    values = {"alpha": alpha, "light": power, "uvs": start.uvs, "verts": start.verts}
+    values[moving] = values[moving].clone().requires_grad_()
+    image = torch.linspace(0.2, 0.8, 12, dtype=F64).reshape(2, 2, 3)
+    material = eg.Material(eg.Texture(image, filter="nearest"), alpha_mode="BLEND")
+    mesh = start.replace(verts=values["verts"], uvs=values["uvs"], alpha=values["alpha"], material=material)
+    scene = eg.Scene(mesh, lights=[eg.PointLight((0.3, 0.2, 2.0), values["light"])])
+    loss = eg.render(scene, from_above(4), spp=1).sum()
+    torch.autograd.grad(loss, values[moving])
+    assert bool(searches) == searched

@@ -1,7 +1,8 @@
-"""The budget of tests (conftest.py) is kept."""
+"""The budget of tests (conftest.py) is kept, and failures are written as they come."""
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -40,3 +41,26 @@ def test_a_test_over_budget_fails(pytester: pytest.Pytester) -> None:
     result = pytester.runpytest_inprocess("--budget", "0.15")
     result.assert_outcomes(passed=3, failed=1)
     result.stdout.fnmatch_lines(["took 0.* s of processor time, may take 0.15 s; *"])
+
+
+FAILING = """
+import os, signal
+
+def test_fails():
+    print("captured words")
+    assert 1 + 1 == 3
+
+def test_is_ended():
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_failures_are_left_by_a_run_that_is_ended(pytester: pytest.Pytester) -> None:
+    """They are written and shown as they come."""
+    pytester.makeconftest(Path(__file__).with_name("conftest.py").read_text(encoding="utf-8"))
+    pytester.makepyfile(FAILING)
+    result = pytester.runpytest_subprocess("--failures", "out/failures.txt")
+    assert result.ret == -signal.SIGKILL
+    written = (pytester.path / "out" / "failures.txt").read_text(encoding="utf-8")
+    for text in (written, result.stdout.str()):
+        assert "::test_fails (call)" in text and "assert (1 + 1) == 3" in text and "captured words" in text

@@ -8,16 +8,19 @@ numbers within a fifth.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import pkgutil
 import re
 from fnmatch import fnmatch
 from pathlib import Path
 from types import ModuleType
+from typing import get_args, get_type_hints
 
 import matplotlib
 import pytest
 import torch
+from torch import Tensor
 
 import edgegrad
 import edgegrad.bop
@@ -26,7 +29,7 @@ import edgegrad.raster
 
 FOLDER = Path(__file__).parents[1] / "docs"
 PAGES = ["quick-start.md", "concepts.md", *(str(p.relative_to(FOLDER)) for p in sorted(FOLDER.glob("how-to/*.md")))]
-LONG = ("how-to/shape-from-depth.md", "how-to/bop.md")
+LONG = ("how-to/shape-from-depth.md", "how-to/bop.md", "how-to/training-loop.md")
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"[-−+]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?")
 TOLERANCE = 0.2
@@ -130,6 +133,34 @@ def test_pages_are_found_from_the_first() -> None:
     pages = {page.relative_to(FOLDER).with_suffix("") for page in FOLDER.rglob("*.md")} - {Path("index")}
     lost = [page for page in pages if not any(fnmatch(str(page), str(entry)) for entry in listed)]
     assert not lost
+
+
+def tensors_of(kind: type) -> str:
+    """The fields of a dataclass that may be fitted, as a cell of a table: tensors of floating-point numbers."""
+    hints = get_type_hints(kind)
+    fields = [field.name for field in dataclasses.fields(kind)]  # pyright: ignore[reportArgumentType]
+    may_hold = {name: (hints[name], *get_args(hints[name])) for name in fields}
+    return ", ".join(f"`{name}`" for name in fields if Tensor in may_hold[name] and not name.endswith("faces"))
+
+
+def textures_of(kind: type) -> list[str]:
+    """The fields of a dataclass that may hold a Texture."""
+    hints = get_type_hints(kind)
+    return [name for name, hint in hints.items() if edgegrad.Texture in (hint, *get_args(hint))]
+
+
+def test_names_of_parameters_are_those_of_the_classes() -> None:
+    """The table of docs/fits.md, which can be copied from the message of a failure."""
+    lights = (
+        edgegrad.PointLight, edgegrad.SpotLight, edgegrad.DirectionalLight, edgegrad.Environment,
+        edgegrad.SphericalHarmonics,
+    )  # fmt: skip
+    rows = [("", edgegrad.Scene), ("meshes.0.", edgegrad.Mesh), ("meshes.0.material.", edgegrad.Material)]
+    rows += [(f"meshes.0.material.{name}.", edgegrad.Texture) for name in textures_of(edgegrad.Material)]
+    rows += [*(("lights.0.", light) for light in lights), ("cameras.0.", edgegrad.Camera)]
+    table = [f"| {f'`{start}`' if start else '—'} | `{kind.__name__}` | {tensors_of(kind)} |" for start, kind in rows]
+    text = (FOLDER / "fits.md").read_text(encoding="utf-8")
+    assert "\n".join(table) in text, "docs/fits.md lacks these rows:\n" + "\n".join(table)
 
 
 def test_contributing_names_files_that_exist() -> None:

@@ -253,13 +253,9 @@ def _sides(camera: PackedCamera) -> int:
 
 
 def pass_size(request: Request) -> Any:
-    """What the kernel's needs depend on."""
+    """What the kernel's needs depend on, of tensors with values."""
     flat, camera, beside = request.scene, request.camera, request.beside
-    # Under a transform of torch.func a tensor may not say where it lies; then they are taken for two.
-    wrapped = torch._C._functorch.is_functorch_wrapped_tensor  # pyright: ignore[reportAttributeAccessIssue]
-    by_vertex = flat.corners is flat.faces or (
-        not wrapped(flat.corners) and not wrapped(flat.faces) and flat.corners.data_ptr() == flat.faces.data_ptr()
-    )
+    by_vertex = flat.corners is flat.faces or flat.corners.data_ptr() == flat.faces.data_ptr()
     jumps = not by_vertex or beside.barycentrics or beside.face_attributes.shape[-1] > 0
     return core.PassSize(
         verts=len(flat.verts),
@@ -348,7 +344,7 @@ torch.library.define(
 torch.library.define("edgegrad::faces_at_centers", f"({SCHEMA}) -> Tensor")
 torch.library.define(
     "edgegrad::render_jvp",
-    f"(Tensor coverage, Tensor depth, Tensor hit, Tensor seen, {SCHEMA}, Tensor?[] tangents, int directions) -> Tensor",
+    f"(Tensor coverage, Tensor depth, Tensor hit, Tensor seen, {SCHEMA}, Tensor?[] tangents, SymInt directions) -> Tensor",
 )
 
 

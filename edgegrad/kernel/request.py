@@ -100,8 +100,8 @@ FIELDS = tuple(field for record in RECORDS for field in record._fields)
 _TYPES = tuple(get_type_hints(record)[field] for record in RECORDS for field in record._fields)
 _RECORD_OF = {field: place for place, record in enumerate(RECORDS) for field in record._fields}
 IS_TENSOR = tuple(kind is Tensor for kind in _TYPES)
-_NAMES = {Tensor: "Tensor", bool: "bool", int: "int", float: "float", str: "str", list[float]: "float[]"}
-# The arguments of the operators.
+_NAMES = {Tensor: "Tensor", bool: "bool", int: "SymInt", float: "float", str: "str", list[float]: "float[]"}
+# The arguments of the operators. A SymInt may stay symbolic under torch.compile, an int would compile once for each value.
 SCHEMA = ", ".join(f"{_NAMES[kind]} {field}" for field, kind in zip(FIELDS, _TYPES, strict=True))
 
 # What a gradient can be asked for, from the kernel's table (csrc/scene/gradients.h), and where it is among the packed values.

@@ -145,7 +145,7 @@ class MeshTowards(NamedTuple):
 
     def _crossings(self, l: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Ray, face, uv and distance of what lies in directions l (N, 3)."""
-        arrays = [np.ascontiguousarray(x.cpu().numpy()) for x in (self.position, l, self.contact, end)]
+        arrays = values_of(self.position, l, self.contact, end)
         which, where = (torch.from_numpy(x).to(l.device) for x in tree_of(self.light).crossings(*arrays))
         return which[:, 0], which[:, 1], where[:, :2], where[:, 2]
 
@@ -158,7 +158,7 @@ class MeshTowards(NamedTuple):
             nearest = torch.full_like(self.contact, math.inf).scatter_reduce(0, ray, t, "amin")
             kept = t <= (nearest + self.contact)[ray]
             ray, face, uv, t = ray[kept], face[kept], uv[kept], t[kept]
-        order = torch.from_numpy(np.lexsort([x.cpu().numpy() for x in (face, t, ray)])).to(ray.device)
+        order = torch.from_numpy(np.lexsort(values_of(face, t, ray))).to(ray.device)
         ray, face, uv = ray[order], face[order], uv[order]
         return ray, LightPoints(face, uv, self.light.density[face])
 

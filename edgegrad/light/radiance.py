@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -80,6 +80,11 @@ class Lighting(NamedTuple):
             check_positive_int("light_samples", light_samples, most=1 << 16),
             check_positive_int("bounces", bounces, most=core.MOST_BOUNCES),
         )
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The arguments of render() that it is made of."""
+        return dict(zip(LIGHTING, self, strict=True))
 
     def image(
         self,

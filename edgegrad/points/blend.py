@@ -20,7 +20,7 @@ MOST = 8  # surfaces along a ray; what lies behind the last is left out
 class Blended:
     """A shader that composes what is seen along a ray: α L + (1 − α) L_behind (Porter and Duff 1984, "over")."""
 
-    def __init__(self, frame: Frame, shader: Callable[[Hits], Tensor], background: Callable[[], Tensor | None]) -> None:
+    def __init__(self, frame: Frame, shader: Callable[[Hits], Tensor], background: Tensor | None) -> None:
         self._frame, self._shader, self._background = frame, shader, background
 
     def __call__(self, hits: Hits) -> Tensor:
@@ -57,7 +57,7 @@ class Blended:
 
     def _behind_all(self, x: Tensor, channels: int) -> Tensor:
         """(N, C) the background at places (N, 2)."""
-        frame, background = self._frame, self._background()
+        frame, background = self._frame, self._background
         if background is None:
             return frame.fixed.verts.new_zeros((len(x), channels))
         if background.dim() == 1:

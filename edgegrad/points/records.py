@@ -124,7 +124,7 @@ SURFACE_BYTES, CURVE_BYTES = 8 * (1 + 2 + 3 + 3 * 14 + 1), 8 * (2 + 3 + 6 + 3 + 
 def shaded_room(request: Request, gradient: bool | None = None, textured: bool = False) -> AbstractContextManager[None]:
     """Raises MemoryError before its block if the image of a shader does not fit, and if an allocation in it fails. What the
     shader itself takes is not known. The samples of the `gradient` count too, by default where gradients are enabled."""
-    size, options = pass_size(request), request.gradient
+    size, options = size_of_values(request), request.gradient
     pixels = request.camera.height * request.camera.width
     needs = core.image_bytes(size, request.cameras)
     if torch.is_grad_enabled() if gradient is None else gradient:
@@ -170,6 +170,18 @@ def _of_values(packed: Sequence[Any], compute: Callable[..., Sequence[Tensor]], 
         return compute(values, *(tensor.detach() for tensor in tensors[len(places) :]))
 
     return without_derivatives(with_values, *(packed[i] for i in places), *more)
+
+
+def size_of_values(request: Request) -> Any:
+    """pass_size(), also under transforms of torch.func."""
+    found: list[Any] = []
+
+    def keep(packed: Sequence[Any]) -> Sequence[Tensor]:
+        found.append(pass_size(Request.unpack(packed)))
+        return (torch.zeros(0),)
+
+    _of_values(request.pack(), keep)
+    return found[0]
 
 
 def _tensors_of(flat: Flat | None) -> list[Tensor]:

@@ -1,0 +1,112 @@
+"""Forward mode against reverse mode in lit scenes of all kinds: ⟨v, J u⟩ = ⟨Jᵀ v, u⟩ with the same samples."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from combinations import diagonal
+from lit_scenes import F64, ball, picture, plane, vector
+from scenes import smooth_adjoint
+from torch import Tensor
+
+import edgegrad as eg
+
+HEIGHT, WIDTH = 5, 6
+ADJOINT = 1.5 + smooth_adjoint(HEIGHT, WIDTH, 3)
+LIGHTS = ("point", "spot", "sun", "area", "emitter", "sky", "harmonics")
+LENSES = ("pinhole", "distorted", "fisheye", "panorama", "orthographic")
+ALPHA = ("opaque", "mask", "blend")
+TEXTURES = ("none", "linear", "nearest", "mipmap", "normal map")
+
+
+def camera(lens: str, look: Tensor) -> eg.Camera:
+    """In front of the origin, at `look`."""
+    size = (HEIGHT, WIDTH)
+    view = eg.Camera.look_at(look, (0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0), fov_y=45.0, size=size).to(F64)
+    if lens == "orthographic":
+        return eg.Camera.orthographic(look, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 2.4, size).to(F64)
+    if lens == "distorted":
+        return view.replace(distortion=vector(-0.1, 0.03, 0.01, -0.02))
+    if lens in ("fisheye", "panorama"):
+        focal = 1.2 * WIDTH if lens == "fisheye" else WIDTH / 2
+        K = torch.tensor([[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]], dtype=F64)
+        return eg.Camera(view.world_to_camera, K, size, lens)
+    return view
+
+
+def light(kind: str, place: Tensor, radiance: Tensor) -> Any:
+    """At `place`, or from there, or from an image or coefficients that change with `radiance`."""
+    if kind == "point":
+        return eg.PointLight(place, 30.0, color=radiance)
+    if kind == "spot":
+        return eg.SpotLight(place, -place, 40.0, color=radiance, inner_angle=0.3)
+    if kind == "sun":
+        return eg.DirectionalLight(-place, 2.0, color=radiance)
+    if kind == "area":
+        return eg.AreaLight.rectangle(place, vector(0.5, 0, 0), vector(0, 0.5, 0.1), 10 * radiance)
+    if kind == "emitter":
+        lamp = ball(0, smooth=False)
+        return lamp.replace(verts=place + 0.3 * lamp.verts, material=eg.Material(0.0, emission=9 * radiance))
+    if kind == "sky":
+        return eg.Environment(picture() * radiance + 0.1 * place.square().sum())
+    return eg.SphericalHarmonics((torch.linspace(0.8, 0.1, 9, dtype=F64)[:, None] + 0.1 * place.sum()) * radiance)
+
+
+def material(texture: str, alpha: str, values: Tensor) -> dict[str, Any]:
+    """The appearance of a mesh with texture coordinates, from a few numbers."""
+    image = picture() * values[0]
+    found: dict[str, Any] = {}
+    color: Any = 0.3 + 0.4 * values[:3]
+    if texture in ("linear", "nearest", "mipmap"):
+        color = eg.Texture(image, filter=texture)
+    mode = "BLEND" if alpha == "blend" else "MASK"
+    own: dict[str, Any] = {"roughness": 0.5 * values[1], "alpha_mode": mode}
+    if texture == "normal map":
+        own |= {"normal_map": eg.Texture(vector(0.5, 0.5, 1.0) + 0.1 * image), "normal_scale": 0.6}
+    found["material"] = eg.Material(color, **own)
+    if alpha != "opaque":
+        found["alpha"] = torch.tensor([[0.2, 0.8, 0.6], [0.8, 0.3, 0.7]], dtype=F64) * values[2]
+    return found
+
+
+def scene_of(kind: str, alpha: str, texture: str, verts: Tensor, place: Tensor, values: Tensor) -> eg.Scene:
+    """A sheet that is cut out or blends before a ball and a floor, with a light."""
+    sheet = plane(0.9)
+    sheet = sheet.replace(verts=verts, **material(texture, alpha, values))
+    sphere = ball(0, material=eg.Material(values[:3] / 2, roughness=0.6)).transformed(
+        scale=0.5, t=vector(0.3, 0.1, -0.9)
+    )
+    floor = plane(3.0, material=eg.Material(0.6)).transformed(t=vector(0, 0, -1.5))
+    source = light(kind, place, values[:3])
+    return eg.Scene([sheet, sphere, floor], lights=[source])
+
+
+def equal_in_both_modes(kind: str, lens: str, alpha: str, texture: str, **options: Any) -> None:
+    draw = torch.Generator().manual_seed(hash_of(kind, lens, alpha, texture))
+    noise = torch.rand((12, 3), dtype=F64, generator=draw) - 0.5
+    values = [plane(0.9).verts + 0.3 * noise[:4], vector(1.2, 1.5, 2.5) + noise[4], 0.9 + 0.2 * noise[5]]
+    values.append(vector(0.4, 0.5, 3.0) + 0.2 * noise[6])
+    tangents = [0.5 + noise[:4], noise[7], 0.6 + noise[8], noise[9]]
+
+    def image(verts: Tensor, place: Tensor, numbers: Tensor, look: Tensor) -> Tensor:
+        return eg.render(scene_of(kind, alpha, texture, verts, place, numbers), camera(lens, look), 4, **options)
+
+    leaves = [value.clone().requires_grad_() for value in values]
+    gradients = torch.autograd.grad((image(*leaves) * ADJOINT).sum(), leaves)
+    found: Tensor = torch.func.jvp(image, tuple(values), tuple(tangents))[1]
+    expected = sum(float((g * t).sum()) for g, t in zip(gradients, tangents, strict=True))
+    assert all(bool(g.any()) for g in gradients[:3])
+    assert math.isclose(float((found * ADJOINT).sum()), expected, rel_tol=1e-5)  # levels of mipmaps are float32
+
+
+def hash_of(*names: str) -> int:
+    return sum((k + 1) * sum(map(ord, name)) for k, name in enumerate(names))
+
+
+@pytest.mark.unwatched
+@pytest.mark.parametrize(("kind", "lens", "alpha", "texture"), diagonal(LIGHTS, LENSES, ALPHA, TEXTURES))
+def test_forward_mode_equals_reverse_mode(kind: str, lens: str, alpha: str, texture: str) -> None:
+    equal_in_both_modes(kind, lens, alpha, texture)
