@@ -240,7 +240,8 @@ class Mesh:
         """The mesh with vertices `scale · R v + t`, differentiable in all four.
 
         R (3, 3) any matrix, identity when None; t (3,) world units, zero when None; scale a number or 0-d tensor. Normals go
-        along. Raises TypeError or ValueError.
+        along. A mirror, R of negative determinant, keeps the faces' corners in their order, so it turns a mesh inside out. Raises
+        TypeError or ValueError.
         """
         affine = Affine.of(R, t, scale, self.verts)
         fields = {} if self.normals is None else {"normals": affine.normals(self.normals)}
