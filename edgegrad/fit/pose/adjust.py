@@ -23,14 +23,11 @@ from .uncertainty import WIDEST
 MOST = 12  # steps
 STILL = 0.5  # standard deviations of a number, on average: the samples of renders move steps as far
 LONGEST = 0.1  # radians or object sizes, of a pose in one step
-FIRST_DAMPING, MORE = (
-    1e-3,
-    10.0,
-)  # relative to the diagonal of the curvature, once a step was taken back; and its factor
+DAMPING = 1e-3  # of the diagonal of the curvature, after a step that was taken back; ten times as much after the next
 
 
 class Adjusted(NamedTuple):
-    """Poses at one lens, and what the pictures tell about all numbers."""
+    """Poses at one lens, and the covariance of all numbers."""
 
     poses: list[Pose]
     covariance: Tensor  # (n, n), of the entries of all poses, place by place, and then of the lens
@@ -51,8 +48,7 @@ def poses_of(source: Source) -> list[int]:
 
 
 def lens_of(source: Source, pose: Pose) -> Tensor:
-    """What was found of the lens that is sought, zero where it is the given one: by the entries of a step, from the focal
-    length on."""
+    """Return how far the sought numbers of the lens are from the given ones, in the order of a step's entries."""
     found = torch.cat([pose.focal.log()[None], pose.principal, pose.distortion])
     return found[[entry - ZOOM for entry in source.task.free if entry >= ZOOM]]
 
@@ -77,21 +73,21 @@ def adjusted(
         slack = sum(evidence.slack for evidence in best.evidence)
         # Single pictures may each have a lower loss with a lens of their own.
         if not best.agreed or found.loss <= best.loss + slack:
-            best, damping = found, 0.0 if damping <= FIRST_DAMPING else damping / MORE
+            best, damping = found, 0.0 if damping <= DAMPING else 0.1 * damping
         else:
-            damping = max(FIRST_DAMPING, MORE * damping)
+            damping = max(DAMPING, 10.0 * damping)
     return best
 
 
 def _model(sources: Sequence[Source], poses: list[Pose]) -> Adjusted:
-    """What the pictures tell at these poses."""
+    """Return the sum of the models of all places."""
     evidence = [source.at(pose) for source, pose in zip(sources, poses, strict=True)]
     rows, n = _places(sources)
     H, S = torch.zeros(n, n, dtype=torch.float64), torch.zeros(n, n, dtype=torch.float64)
     for own, one in zip(rows, evidence, strict=True):
         H[own[:, None], own] += one.curvature
         S[own[:, None], own] += one.scores
-    # What the pictures do not show: as if one more pixel, of the others' noise, had told it to WIDEST.
+    # Numbers that the pictures do not show are one more pixel of the same noise gave them to WIDEST.
     noise = _noise(evidence)
     prior = torch.eye(n, dtype=torch.float64) * noise / WIDEST**2
     inverse = torch.linalg.inv(H + prior)
@@ -102,7 +98,7 @@ def _model(sources: Sequence[Source], poses: list[Pose]) -> Adjusted:
 
 
 def _step(sources: Sequence[Source], model: Adjusted, damping: float) -> list[Tensor]:
-    """(m,) of each place, by the entries that its task seeks."""
+    """Return the moves (m,) of each place, by the entries that its task seeks."""
     rows, n = _places(sources)
     A, b = torch.zeros(n, n, dtype=torch.float64), torch.zeros(n, dtype=torch.float64)
     lenses = [lens_of(source, pose) for source, pose in zip(sources, model.poses, strict=True)]
@@ -135,13 +131,13 @@ def _is_still(sources: Sequence[Source], model: Adjusted, moves: Sequence[Tensor
 
 
 def _noise(evidence: Sequence[Evidence]) -> float:
-    """Of the loss: the covariance of its gradient, as a part of its curvature."""
+    """Return the covariance of the loss's gradient, as a part of its curvature."""
     curvature = sum(float(one.curvature.trace()) for one in evidence)
     return sum(float(one.scores.trace()) for one in evidence) / max(curvature, 1e-300) or math.ulp(0.0)
 
 
 def _places(sources: Sequence[Source]) -> tuple[list[Tensor], int]:
-    """Of each place, where its entries are among all numbers, and how many there are."""
+    """Return where the entries of each place are among all numbers, and how many numbers there are."""
     counts = [len(poses_of(source)) for source in sources]
     n = sum(counts) + len(sources[0].task.free) - counts[0]
     return _rows(counts, n), n

@@ -40,14 +40,12 @@ from .task import BEND, ZOOM, Lens
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SEARCHED = 0.5  # of max_size, of the pictures where they are searched one by one
-STEPS = 60  # on each level of such a search
 PROJECTIONS = "perspective", "fisheye"
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What calibrate found: cameras with one lens, and how exactly each number is known.
+    """The result of calibrate(): cameras with one lens, and how exactly each number is known.
 
     fits     a CameraFit of each picture: its camera, the search by itself at a lower resolution, and the uncertainty of all
              numbers, None before the lens was found
@@ -74,7 +72,7 @@ class Calibration:
 
     @property
     def uncertainty(self) -> CameraUncertainty | None:
-        """Of the first camera, whose lens is that of all."""
+        """The uncertainty of the first camera, whose lens is that of all."""
         return self.fits[0].uncertainty
 
     @property
@@ -89,7 +87,7 @@ class Calibration:
 
     @property
     def steps(self) -> int:
-        """Of all numbers at once."""
+        """The number of steps that moved all numbers at once."""
         return len(self.history)
 
     @property
@@ -104,7 +102,7 @@ class Calibration:
     @property
     def reason(self) -> str:
         """In words: "converged", or what kept the fit from that: "images[2]: edges not explained: …", "not known: …" with
-        numbers that the pictures hardly tell, "steps ran out: …", "interrupted"."""
+        numbers that the pictures hardly show, "steps ran out: …", "interrupted"."""
         if self.ending is not Ending.FLAT:
             return reason_of(self.ending, 1.0)
         for k, fit in enumerate(self.fits):
@@ -201,7 +199,7 @@ def calibrate(
     cameras     one for each picture, or a batch, with one K and distortion: where the fit starts, each within about 30° and 15 %
                 of the mesh's size
     masks       (H, W) or (H, W, 1) each, 1 on the object and 0 elsewhere
-    principal   also find the principal point, beside the focal length, which is one factor for both of K
+    principal   also find the principal point. The focal length is found always: one factor for both of K
     distortion  also find so many coefficients, up to 8 (of a fisheye 4): the first of those of OpenCV's model (k1, k2, p1, p2,
                 k3, …) or a fisheye's, as a Camera has them; those that the cameras have beyond stay
     max_size    larger pictures are reduced to so many pixels on their longer side
@@ -235,10 +233,10 @@ def calibrate(
             "mesh", f"masks[{k}]" if images is None else f"images[{k}]", f"cameras[{k}]",
             ("fit_scale", "focal", "principal", "distortion"), f"masks[{k}]",
         )  # fmt: skip
-        smaller = max(LEAST, round(SEARCHED * min(max_size, max(camera.size))))
+        smaller = max(LEAST, min(max_size, max(camera.size)) // 2)
         search = search_pose(
             mesh, picture, camera, shape, torch.eye(4, dtype=torch.float64), lens, None, None, None, names, max_size=smaller,
-            steps=STEPS, spp=16, tolerance=3e-4, seed=seed, search=True, progress=progress, resume=resume, checkpoint_every=25,
+            steps=60, spp=16, tolerance=3e-4, seed=seed, search=True, progress=progress, resume=resume, checkpoint_every=25,
             callback=None if callback is None else told, checkpoint=None if checkpoint is None else f"{checkpoint}.{k}",
         )  # fmt: skip
         fits.append(fitted(search))

@@ -1,12 +1,12 @@
-"""What pictures tell about a pose and a lens: slope, curvature and noise of a fit's loss, at one pose.
+"""The evidence of pictures about a pose and a lens: slope, curvature and noise of a fit's loss at one pose.
 
 With the loss L = Σ ρ(r_p) over pixels p, its curvature is H = Σ w_p J_p J_pᵀ, its gradient g = Σ s_p with the scores s_p = w_p
 r_p J_p, and the noise of the pictures gives g the covariance S = Σ E[s_p s_qᵀ] over pairs of pixels. Numbers that minimise L have
 the covariance H⁻¹ S H⁻¹ (Huber, The Behavior of Maximum Likelihood Estimates under Nonstandard Conditions, 1967). Errors of
-edges, blur and shadows are alike in pixels nearby. So pairs count that are less than TOGETHER pixels apart, by Bartlett's
+edges, blur and shadows are correlated in pixels nearby. So pairs count that are less than TOGETHER pixels apart, by Bartlett's
 weights, which keep S positive (Newey and West, A Simple, Positive Semi-Definite, Heteroskedasticity and Autocorrelation
-Consistent Covariance Matrix, 1987). Where errors are independent, S is the sum over single pixels; where they are alike, a block
-of pixels counts as one.
+Consistent Covariance Matrix, 1987). Where errors are independent, S is the sum over single pixels; where they are correlated, a
+block of pixels counts as one.
 """
 
 from __future__ import annotations
@@ -27,12 +27,10 @@ from .photo.level import PhotoLevel, photo_levels
 from .photo.search import AS_THEY_ARE
 from .pose import Pose
 from .robust import NARROWEST, Comparison
-from .search import Search
+from .search import FINAL_SPP, Search
 from .soft import softness
 from .task import Level, PoseTask
 from .uncertainty import TOGETHER
-
-SPP = 64  # samples a pixel: their noise is part of the answer's
 
 
 class Evidence(NamedTuple):
@@ -67,7 +65,7 @@ class Colours:
     def __init__(self, task: PoseTask, pose: Pose, max_size: int, spp: int, seed: int) -> None:
         self.task, self.seed = task, seed
         finest = min(1.0, max_size / max(task.shots[0].camera.size))
-        sharp = task.level(finest, 0.0, 1.0, max(spp, SPP), task.free)
+        sharp = task.level(finest, 0.0, 1.0, max(spp, FINAL_SPP), task.free)
         with torch.no_grad():
             both = [task.images(sharp, pose, sharp.spp, (seed + k) % 2**32) for k in (0, 1)]
         self.level = sharp._replace(soft=softness(task, sharp, *both))

@@ -93,7 +93,7 @@ class CameraFit:
 
     @property
     def reason(self) -> str:
-        """As of PoseFit; or "not known: …" with the numbers of pose and lens that the pictures hardly tell."""
+        """The reason as PoseFit has it, or "not known: …" with the numbers of pose and lens that the pictures hardly show."""
         known = self.uncertainty
         if known is None or not known.unknown:
             return self.search.reason
@@ -217,7 +217,7 @@ def finished(
     assert task is not None
     pose, shown = pose_of(search), search.explained >= search.enough
     source = source_of(task, pose, max_size, spp, seed)
-    # A search by colours holds back what the pictures hardly tell; one by the terms of photographs is at its end.
+    # A search by colours holds back numbers that the pictures hardly show; one by the terms of photographs is at its end.
     further = shown and isinstance(source, Colours)
     try:
         end = adjusted([source], [pose], most if further else 0)

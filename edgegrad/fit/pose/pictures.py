@@ -31,7 +31,7 @@ def draw_fit(path: PathLike, fit: PoseFit) -> None:
 
 
 def sheet(*fits: PoseFit) -> Figure:
-    """What draw_fit writes: a row for each picture, of one fit or several."""
+    """Return a row for each picture, of one fit or several."""
     rows = []
     for fit in fits:
         task = _task(fit)
