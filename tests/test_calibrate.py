@@ -19,6 +19,7 @@ from edgegrad.fit.pose.pose import Pose
 from edgegrad.fit.pose.task import BEND, PRINCIPAL, ZOOM, Lens, PoseTask
 
 LENS = torch.tensor([-0.15, 0.05, 0.0, 0.0], dtype=torch.float64)
+SIMPLE = torch.tensor([-0.15, 0.0, 0.0, 0.0], dtype=torch.float64)
 DIRECTIONS = rotation(0.0, 0.0, 0.0), rotation(0.2, 0.9, 0.1), rotation(-0.3, -0.8, 0.2), rotation(0.5, 0.3, -0.4)
 
 
@@ -120,7 +121,7 @@ def test_a_lens_that_a_picture_does_not_tell() -> None:
 
 
 def test_a_near_object_tells_the_lens() -> None:
-    (true,) = taken(1, 64, distance=2.2)
+    (true,) = taken(1, 64, distance=2.2, distortion=SIMPLE)
     (start,) = guessed([true])
     fit = fit_camera(
         bracket(), picture(true), start, background=BACKGROUND, principal=True, distortion=1, progress=False
@@ -129,6 +130,8 @@ def test_a_near_object_tells_the_lens() -> None:
     assert known is not None and fit.converged and fit.search.converged
     assert fit.history[-1].loss == fit.loss and fit.steps == len(fit.history)
     torch.testing.assert_close(fit.history[-1].values["cameras.0.K"], fit.camera.K)
+    assert fit.camera.distortion is not None
+    assert abs(float(fit.camera.distortion[0]) + 0.15) < min(0.02, 4.0 * float(known.distortion[0]))
     off = (fit.camera.K - true.K)[:2, 2].abs()
     assert bool((known.principal > 0).all()) and bool((off < 4.0 * known.principal).all()) and float(off.max()) < 0.5
     assert abs(float(fit.camera.K[0, 0] / true.K[0, 0]) - 1.0) < min(0.01, 4.0 * known.focal)
@@ -160,7 +163,7 @@ def chi_square(found: eg.Camera, true: eg.Camera, known: CameraUncertainty | Non
 
 
 def test_a_lens_from_several_pictures(tmp_path) -> None:
-    true = taken(2, 48)
+    true = taken(2, 48, distortion=SIMPLE)
     seen: list[Calibration] = []
     fit = calibrate(scene(), pictures(true), guessed(true), distortion=1, progress=False, callback=seen.append)
     assert fit.converged and fit.reason == "converged" and fit.explained > 0.9 and fit.uncertainty is not None
@@ -183,7 +186,7 @@ def test_a_lens_from_several_pictures(tmp_path) -> None:
 
 @pytest.mark.slow
 def test_a_calibration_that_goes_on_ends_as_if_it_had_never_stopped(tmp_path) -> None:
-    true = taken(2, 48)
+    true = taken(2, 48, distortion=SIMPLE)
 
     def stop(now: Calibration) -> None:
         if len(now.fits) == 2 and now.fits[1].steps == 5:
@@ -248,7 +251,7 @@ def test_errors_of_calibrate(change: dict, message: str) -> None:
 
 @pytest.mark.slow
 def test_a_lens_from_masks_alone() -> None:
-    true = taken(4, 96)
+    true = taken(4, 96, distortion=SIMPLE)
     masks = [silhouette(one) for one in true]
     fit = calibrate(bracket(plain=True), None, guessed(true), masks=masks, distortion=1, progress=False)
     assert fit.explained > 0.9
@@ -258,7 +261,7 @@ def test_a_lens_from_masks_alone() -> None:
 @pytest.mark.slow
 def test_a_lens_from_photographs() -> None:
     """Before clutter, where the terms of photographs are compared."""
-    true = taken(4, 128, distance=2.8)
+    true = taken(4, 128, distance=2.8, distortion=SIMPLE)
     coarse = 0.05 + 0.5 * torch.rand(4, 3, 11, 11, generator=torch.Generator().manual_seed(3))
     clutter = torch.nn.functional.interpolate(coarse, (128, 128), mode="bilinear").movedim(1, -1)
     shot = [picture(one, background=behind) for one, behind in zip(true, clutter, strict=True)]
