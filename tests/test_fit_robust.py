@@ -454,7 +454,7 @@ def test_a_rig_of_cameras(tmp_path):
         ({"camera": 3}, "camera: expected a Camera"),
         ({"camera": []}, "camera: expected at least one"),
         ({"camera": [camera(8), camera(8)]}, "image: expected 2, one for each camera"),
-        ({"distortion": 3}, "distortion: expected 0, 4, 5 or 8"),
+        ({"distortion": 9}, "distortion: expected at most 8 for a camera that is perspective"),
         ({"focal": 1}, "focal: expected True or False"),
         ({"image": None}, "image: expected a picture, or a mask"),
         ({"image": torch.zeros(8, 9, 3)}, "image: expected "),

@@ -11,6 +11,8 @@ from .hull import visual_hull
 from .measured import Measured
 from .options import Options, Parameter
 from .placement import Pose, PoseParameter
+from .pose.calibrate import Calibration, calibrate
+from .pose.camera_uncertainty import CameraUncertainty
 from .pose.fit_camera import CameraFit, fit_camera
 from .pose.fit_pose import fit_pose
 from .pose.fit_poses import fit_poses
@@ -23,8 +25,8 @@ from .rig.track_rig import track_rig
 from .rig.uncertainty import JointUncertainty
 
 __all__ = [
-    "CameraFit", "Ending", "Fit", "JointUncertainty", "Measured", "Options", "Parameter", "Pose", "PoseFit",
-    "PoseParameter", "Progress", "Record", "RigFit", "Step", "TrackedPose", "Uncertainty", "fit_camera", "fit_pose",
-    "fit_poses", "fit_rig", "fit_scene", "fit_shape", "fit_texture", "losses", "priors", "regularizers", "track",
-    "track_rig", "visual_hull",
+    "Calibration", "CameraFit", "CameraUncertainty", "Ending", "Fit", "JointUncertainty", "Measured", "Options", "Parameter",
+    "Pose", "PoseFit", "PoseParameter", "Progress", "Record", "RigFit", "Step", "TrackedPose", "Uncertainty", "calibrate",
+    "fit_camera", "fit_pose", "fit_poses", "fit_rig", "fit_scene", "fit_shape", "fit_texture", "losses", "priors",
+    "regularizers", "track", "track_rig", "visual_hull",
 ]  # fmt: skip

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..aovs import render_aovs
 from ..camera.camera import Camera
 from ..files.image import linear_to_srgb
-from ..fit import CameraFit, Fit, PoseFit, Progress, RigFit
+from ..fit import Calibration, CameraFit, Fit, PoseFit, Progress, RigFit
 from ..fit.pose.photo.shown import shown
 from ..fit.pose.result import Step
 from ..fit.pose.task import PoseTask
@@ -49,11 +49,13 @@ class Frame(NamedTuple):
             return [as_bytes(picture) for picture in (target, shown, CONTRAST * (render - target).abs())]
 
 
-Shown = PoseFit | CameraFit | RigFit | Progress | Fit
+Shown = PoseFit | CameraFit | Calibration | RigFit | Progress | Fit
 
 
 def frame_of(fit: Shown) -> Frame:
     """Of what a fit's callback gets, or a fit returns. Raises TypeError for something else, and for a pose from a file."""
+    if isinstance(fit, Calibration):
+        return frame_of(fit.fits[-1])
     if isinstance(fit, CameraFit):  # whose search moves the scene before a camera at rest
         return frame_of(fit.search)._replace(matrix=None, cameras=[camera.detach() for camera in fit.cameras])
     if isinstance(fit, PoseFit) and fit.task is not None and fit.history:

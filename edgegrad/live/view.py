@@ -21,7 +21,7 @@ from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 
 if TYPE_CHECKING:
-    from ..fit import CameraFit, Fit, PoseFit, RigFit
+    from ..fit import Calibration, CameraFit, Fit, PoseFit, RigFit
     from .browser import Browser
     from .figure import Notebook
     from .frame import Frame, Shown
@@ -129,7 +129,7 @@ class Viewer:
         number = None if loss is None else float(loss)
         return self._step(number, lambda: frame_of_scene(scene, cameras, images, masks))
 
-    def show(self, fit: Fit | PoseFit | CameraFit | RigFit) -> None:
+    def show(self, fit: Fit | PoseFit | CameraFit | Calibration | RigFit) -> None:
         """Draws at once: what a fit returns, for its last step may not be drawn."""
         from .frame import frame_of
 

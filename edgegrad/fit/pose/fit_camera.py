@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,22 +14,25 @@ import torch
 from torch import Tensor
 
 from ...camera.camera import Camera
+from ...camera.lens import COUNTS
 from ...check import check_flag, check_int
 from ...files.cameras import save_camera
 from ...files.paths import PathLike, replacing
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..history import Record, plain_history
+from .adjust import MOST, adjusted
+from .camera_uncertainty import CameraUncertainty
+from .evidence import Colours, Source, source_of
 from .fit_pose import search_pose
 from .given import Names, bare
+from .pose import Pose
 from .result import PoseFit, Step
 from .task import PARTS, Lens
-from .uncertainty import Uncertainty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MOST_COEFFICIENTS = 8
 # Which tensor of a camera each part of a step moves.
 PARTS_OF = {
     "rotation": "world_to_camera", "shift": "world_to_camera", "focal": "K", "principal": "K", "distortion": "distortion",
@@ -45,10 +49,14 @@ class CameraFit:
     scene), "K" (logarithm of the focal length, widths of the image) and "distortion", which all cameras share: of those that are
     sought on the level, and none where the loss rose and the step was taken back. The last record is the final comparison.
     `search.history` has the size of the level and which steps were the best so far.
+
+    `uncertainty` has the standard deviation of each number that was sought; None before the last step and of a fit that was
+    interrupted.
     """
 
     cameras: list[Camera]
     search: PoseFit
+    uncertainty: CameraUncertainty | None = None
 
     @property
     def camera(self) -> Camera:
@@ -85,13 +93,11 @@ class CameraFit:
 
     @property
     def reason(self) -> str:
-        """As of PoseFit."""
-        return self.search.reason
-
-    @property
-    def uncertainty(self) -> Uncertainty | None:
-        """As of PoseFit, of the scene before the cameras; `focal` says how exactly the focal length is known."""
-        return self.search.uncertainty
+        """The reason as PoseFit has it, or "not known: …" with the numbers of pose and lens that the pictures hardly show."""
+        known = self.uncertainty
+        if known is None or not known.unknown:
+            return self.search.reason
+        return reason_with(replace(self.search, uncertainty=None, converged=True).reason, known)
 
     def plot(self) -> Figure:
         """target | start | fit | difference."""
@@ -166,53 +172,125 @@ def fit_camera(
                 for each picture, which keep their places to one another, as those of a rig, and share what is found of the lens
     focal       also find the focal length: one factor for both of K
     principal   also find the principal point
-    distortion  also find so many coefficients (0, 4, 5 or 8; of a fisheye 4), the first of those of OpenCV's model (k1, k2, p1,
-                p2, k3, …) or a fisheye's, as a Camera has them; those that the camera has beyond stay
+    distortion  also find so many coefficients, up to 8 (of a fisheye 4): the first of those of OpenCV's model (k1, k2, p1, p2,
+                k3, …) or a fisheye's, as a Camera has them; those that the camera has beyond stay
 
     mask, weight, background, search, checkpoint, resume and the rest are as for fit_pose(), whose search this is. What a
     picture does not show stays uncertain: focal length against distance where there is hardly any perspective, the
-    principal point against a turn of the camera. In photographs `uncertainty` says how exactly pose and focal length are known,
-    and one that is not known to 5 % is not `converged`. Raises TypeError or ValueError that names the argument.
+    principal point against a rotation of the camera. `uncertainty` has the standard deviation of each number. A fit is not
+    `converged` where a number of the lens is hardly known, and `reason` names it: one whose deviation moves a corner of the image
+    by more than 3 % of its distance from the principal point, or about which a guess says as much. Several pictures from
+    different sides tell more: see calibrate(). Raises TypeError or ValueError that names the argument.
     """
-    projections = set()
-    for one in camera if isinstance(camera, (list, tuple)) else [camera]:
-        if not isinstance(one, Camera):
-            raise TypeError(f"camera: expected a Camera, got {type(one).__name__}; make one with Camera.look_at(…)")
-        projections.add(one.projection)
-    count = check_int("distortion", distortion, 0, MOST_COEFFICIENTS)
-    for projection in sorted(projections) if count else []:
-        if projection not in ("perspective", "fisheye"):
-            raise ValueError(f"distortion: expected 0 for this projection, {projection}, got {count}")
-        if projection == "fisheye" and count != 4:
-            raise ValueError(f"distortion: expected 0 or 4 for a fisheye, got {count}")
-        if projection == "perspective" and count not in (4, 5, 8):
-            raise ValueError(f"distortion: expected 0, 4, 5 or 8 for a perspective camera, got {count}")
-    lens = Lens(False, check_flag("focal", focal), check_flag("principal", principal), count)
+    several = isinstance(camera, (list, tuple))
+    given = [with_coefficients("camera", one, distortion) for one in (camera if several else [camera])]
+    lens = Lens(False, check_flag("focal", focal), check_flag("principal", principal), distortion)
     if callback is not None and not callable(callback):
         raise TypeError(f"callback: expected a function of a CameraFit, got {type(callback).__name__}")
-    target: object = image
+    scene, target = compared_with("image", scene, image, "mask", mask)
     names = Names(
         "scene", "mask" if image is None else "image", "camera", ("fit_scale", "focal", "principal", "distortion")
     )
-    if image is None:
-        if mask is None:
-            raise ValueError("image: expected a picture, or a mask, to compare with, got neither")
-        scene, target = bare(scene), mask
-
-    def result(search: PoseFit) -> CameraFit:
-        return CameraFit([moved(seen, search.matrix) for seen in search.cameras], search)
 
     def step(search: PoseFit) -> None:
         assert callback is not None
-        callback(result(search))
+        callback(fitted(search))
 
     start = torch.eye(4, dtype=torch.float64)
     found = search_pose(
-        scene, target, camera, mask, start, lens, background, weight, None, names, max_size=max_size, steps=steps, spp=spp,
-        tolerance=tolerance, seed=seed, search=search, progress=progress, callback=None if callback is None else step,
-        checkpoint=checkpoint, checkpoint_every=checkpoint_every, resume=resume,
+        scene, target, given if several else given[0], mask, start, lens, background, weight, None, names, max_size=max_size,
+        steps=steps, spp=spp, tolerance=tolerance, seed=seed, search=search, progress=progress,
+        callback=None if callback is None else step, checkpoint=checkpoint, checkpoint_every=checkpoint_every, resume=resume,
     )  # fmt: skip
-    return result(found)
+    if found.interrupted:
+        return fitted(found)
+    return finished(found, given, max_size, min(MOST, steps), spp, seed)
+
+
+@torch.inference_mode(False)
+@torch.enable_grad()
+def finished(
+    search: PoseFit, cameras: Sequence[Camera], max_size: int, most: int, spp: int, seed: int
+) -> CameraFit:  # fmt: skip
+    """The end of a search, after at most so many further steps of all numbers at once, and with their uncertainty."""
+    began, task = time.perf_counter(), search.task
+    assert task is not None
+    pose, shown = pose_of(search), search.explained >= search.enough
+    source = source_of(task, pose, max_size, spp, seed)
+    # A search by colours holds back numbers that the pictures hardly show; one by the terms of photographs is at its end.
+    further = shown and isinstance(source, Colours)
+    try:
+        end = adjusted([source], [pose], most if further else 0)
+    except KeyboardInterrupt:
+        return fitted(replace(search, interrupted=True, converged=False))
+    rests = end.short if further else search.converged or search.reason.startswith("directions unknown")
+    loss = end.loss if further else search.loss
+    found = ended(search, source, end.poses[0], end.covariance, cameras, rests, loss, search.explained)
+    whole = replace(found.search, seconds=search.seconds + time.perf_counter() - began)
+    return replace(found, search=whole)
+
+
+def ended(
+    search: PoseFit, source: Source, pose: Pose, covariance: Tensor, cameras: Sequence[Camera], rests: bool, loss: float,
+    explained: float,
+) -> CameraFit:  # fmt: skip
+    """The fit whose search came to another pose and lens at last, with the covariance of the entries of a step there."""
+    task, known = source.task, CameraUncertainty.of_entries(source, pose, covariance)
+    lenses = [task.lens(one, pose) for one in cameras]
+    last = search.history[-1]
+    history = search.history if pose is last.pose else [*search.history, Step(source.level.size, loss, pose, True, {})]
+    right = rests and explained >= search.enough and not search.conflict and not known.unknown
+    found = replace(
+        search, R=pose.R, t=pose.t, scale=float(pose.scale), camera=lenses[0], cameras=lenses, loss=loss, explained=explained,
+        history=history, steps=len(history), uncertainty=known, converged=right,
+    )  # fmt: skip
+    return fitted(found, known)
+
+
+def fitted(search: PoseFit, uncertainty: CameraUncertainty | None = None) -> CameraFit:
+    """A search that moved the scene before cameras, as a fit of the cameras."""
+    return CameraFit([moved(seen, search.matrix) for seen in search.cameras], search, uncertainty)
+
+
+def pose_of(search: PoseFit) -> Pose:
+    """The best so far, with what was found of the lens."""
+    return next(step.pose for step in reversed(search.history) if step.best)
+
+
+def reason_with(words: str, known: CameraUncertainty) -> str:
+    """The reason of a fit: `words`, or where its end is right otherwise what is not known of poses and lens."""
+    if words != "converged" or not known.unknown:
+        return words
+    fix = "seek less of the lens, or give pictures that the object fills, from several sides or nearer"
+    return f"not known: {known.unknown}; {fix}"
+
+
+def compared_with(
+    name: str, scene: Mesh | Scene, image: object, name_of_mask: str, mask: object
+) -> tuple[Mesh | Scene, object]:  # fmt: skip
+    """The scene and what it is compared with: pictures, or masks alone. Raises ValueError."""
+    if image is not None:
+        return scene, image
+    if mask is None:
+        raise ValueError(f"{name}: expected a picture, or a {name_of_mask}, to compare with, got neither")
+    return bare(scene), mask
+
+
+def with_coefficients(name: str, camera: object, count: object) -> Camera:
+    """The camera, with as many coefficients of distortion as one that has the first `count` of them may have. Raises TypeError or
+    ValueError."""
+    if not isinstance(camera, Camera):
+        raise TypeError(f"{name}: expected a Camera, got {type(camera).__name__}; make one with Camera.look_at(…)")
+    counts = COUNTS[camera.projection]
+    number, most = check_int("distortion", count, 0, 2**31 - 1), max(counts, default=0)
+    if number > most:
+        raise ValueError(f"distortion: expected at most {most} for a camera that is {camera.projection}, got {number}")
+    had = 0 if camera.distortion is None else camera.distortion.shape[-1]
+    if number <= had:
+        return camera
+    wanted = min(n for n in counts if n >= number)
+    kept = camera.coefficients[..., :had]
+    return camera.replace(distortion=torch.nn.functional.pad(kept, (0, wanted - had)))
 
 
 def moved(camera: Camera, matrix: Tensor) -> Camera:

@@ -30,12 +30,15 @@ def draw_fit(path: PathLike, fit: PoseFit) -> None:
         figure.savefig(temporary)
 
 
-def sheet(fit: PoseFit) -> Figure:
-    """What draw_fit writes: a row for each picture."""
-    task = _task(fit)
-    level = _level(task, PANEL)
-    start, end = (shown(task, level, step.pose) for step in (fit.history[0], _way(fit)[-1]))
-    return comparison([(shot.target, a, b) for shot, a, b in zip(level.shots, start, end, strict=True)])
+def sheet(*fits: PoseFit) -> Figure:
+    """Return a row for each picture, of one fit or several."""
+    rows = []
+    for fit in fits:
+        task = _task(fit)
+        level = _level(task, PANEL)
+        start, end = (shown(task, level, step.pose) for step in (fit.history[0], _way(fit)[-1]))
+        rows += [(shot.target, a, b) for shot, a, b in zip(level.shots, start, end, strict=True)]
+    return comparison(rows)
 
 
 def draw_loss(path: PathLike, fit: PoseFit) -> None:
