@@ -137,6 +137,15 @@ def count(text: str) -> int:
     return number(text, least=1)
 
 
+def longer_side(text: str) -> int:
+    """Pixels on the longer side of a picture, of which the other follows."""
+    if "x" in text.lower():
+        raise argparse.ArgumentTypeError(
+            f"expected one number, pixels on the longer side, from which the other follows, got {text!r}"
+        )
+    return number(text, least=8)
+
+
 def number(text: str, least: int = 0) -> int:
     if not text.isdecimal() or int(text) < least:
         raise argparse.ArgumentTypeError(f"expected a whole number from {least} up, got {text!r}")

@@ -8,8 +8,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
-from .arguments import CHECKPOINT, add_depth, add_label, add_live, add_mesh, add_resume, add_view, count, number
+from .arguments import (
+    CHECKPOINT,
+    add_depth,
+    add_label,
+    add_live,
+    add_mesh,
+    add_resume,
+    add_view,
+    count,
+    longer_side,
+    number,
+)
 from .inputs import (
+    assume_fov,
+    check_not_black,
     check_size,
     read_background,
     read_coverage,
@@ -34,7 +47,11 @@ def add(commands: Any) -> None:
     add_label(parser)
     add_view(parser)
     parser.add_argument(
-        "--init", type=Path, metavar="POSE.json", help="pose to start from; as in the mesh file when left out"
+        "--init",
+        type=Path,
+        metavar="POSE",
+        help="pose to start from: a pose.json, or mesh to world 4 × 4 by rows as JSON, text or .npy; as in the mesh file when "
+        "left out",
     )
     parser.add_argument(
         "--starts", type=_starts, default=1, metavar="N|global",
@@ -50,7 +67,12 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--background", help="#rrggbb or an image; without it the median colour of the picture's border"
     )
-    parser.add_argument("--size", type=count, default=256, help="most pixels on the longer side (%(default)s)")
+    parser.add_argument(
+        "--size",
+        type=longer_side,
+        default=256,
+        help="most pixels on the longer side (%(default)s)",
+    )
     parser.add_argument("--steps", type=count, default=40, help="most steps on each level of resolution (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
     parser.add_argument(
@@ -65,7 +87,9 @@ def add(commands: Any) -> None:
 
 
 def _starts(text: str) -> int | str:
-    return text if text == "global" else count(text)
+    if text == "global" or (text.isdecimal() and int(text) >= 1):
+        return text if text == "global" else int(text)
+    raise argparse.ArgumentTypeError(f"expected a whole number from 1 up, or global, got {text!r}")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -83,6 +107,8 @@ def run(args: argparse.Namespace) -> int:
     if args.mask is not None:
         mask = read_coverage(args.mask, args.label)
         check_size(mask, picture, args.mask, args.image)
+    if mask is not None:
+        check_not_black(mask, args.mask or args.image)
     weight = None
     if args.weight is not None:
         weight = read_weight(args.weight)
@@ -90,9 +116,12 @@ def run(args: argparse.Namespace) -> int:
     if mask is not None and args.background is not None:
         raise ValueError("--background: expected none with a mask (or an image with alpha), got both; leave one out")
     depth = read_depth(args, picture)
+    background = read_background(args.background, picture)
     init = None if args.init is None else read_pose(args.init)
+    assumed = assume_fov(args, args.image, (picture.shape[0], picture.shape[1]), args.init)
     camera = read_view(args, scene, (picture.shape[0], picture.shape[1]), args.init)
     outputs.make_folder(args.out)
+    outputs.say(assumed)
 
     with outputs.live(args) as view:
 
@@ -105,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
 
         fit = fit_pose(
             scene, picture, camera, mask, None if init is None else init.matrix,
-            fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=read_background(args.background, picture),
+            fit_scale=args.fit_scale, fit_focal=args.fit_focal, background=background,
             weight=weight, depth=depth, max_size=args.size, steps=args.steps, seed=args.seed, starts=args.starts,
             callback=after_step, checkpoint=args.out / CHECKPOINT, resume=args.resume,
         )  # fmt: skip
@@ -123,6 +152,8 @@ def run(args: argparse.Namespace) -> int:
 def _print_fit(fit: PoseFit, focal: bool) -> None:
     lines = [f"loss {fit.loss:.3e} after {fit.steps} steps in {fit.seconds:.1f} s, {fit.reason}", "mesh to world:"]
     lines += ["  " + "  ".join(f"{value:12.6f}" for value in row) for row in fit.matrix.tolist()]
+    if fit.uncertainty is not None:
+        lines.append(f"standard deviation: {fit.uncertainty.words}")
     if focal:
         lines.append(f"focal length: {float(fit.camera.K[0, 0]):.6g} px")
     print("\n".join(lines), flush=True)

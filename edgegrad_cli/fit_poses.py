@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
-from .arguments import add_depth, add_view, count, number
-from .inputs import check_size, read_depth, read_labels, read_picture, read_pose, read_view, seen_by
+from .arguments import add_depth, add_view, count, longer_side, number
+from .inputs import assume_fov, check_size, read_depth, read_labels, read_picture, read_pose, read_view, seen_by
 
 if TYPE_CHECKING:
     from edgegrad.fit import PoseFit
@@ -33,7 +33,7 @@ def add(commands: Any) -> None:
     )
     add_view(parser)
     add_depth(parser)
-    parser.add_argument("--size", type=count, default=256, help="most pixels on the longer side (%(default)s)")
+    parser.add_argument("--size", type=longer_side, default=256, help="most pixels on the longer side (%(default)s)")
     parser.add_argument("--steps", type=count, default=40, help="most steps on each level of resolution (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
     parser.add_argument(
@@ -62,8 +62,10 @@ def run(args: argparse.Namespace) -> int:
     depth = read_depth(args, picture)
     init = [read_pose(path).matrix for path in args.init] or None
     everything = Scene([mesh for scene in scenes for mesh in scene.meshes])
+    assumed = assume_fov(args, args.image, (picture.shape[0], picture.shape[1]), args.init[0] if args.init else None)
     camera = read_view(args, everything, (picture.shape[0], picture.shape[1]), args.init[0] if args.init else None)
     outputs.make_folder(args.out)
+    outputs.say(assumed)
     fits = fit_poses(
         scenes, picture, camera, mask, init, depth=depth, max_size=args.size, steps=args.steps, seed=args.seed
     )  # fmt: skip
@@ -86,4 +88,6 @@ def _print_fit(path: Path, fit: PoseFit) -> None:
         "mesh to world:",
     ]
     lines += ["  " + "  ".join(f"{value:12.6f}" for value in row) for row in fit.matrix.tolist()]
+    if fit.uncertainty is not None:
+        lines.append(f"standard deviation: {fit.uncertainty.words}")
     print("\n".join(lines), flush=True)

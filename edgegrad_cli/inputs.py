@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from .arguments import CHECKPOINT
 
+FOV = 40.0  # degrees, the vertical field of view where nothing is said of it
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -158,12 +160,30 @@ def read_background(text: str | None, picture: Tensor) -> Tensor | None:
     return image
 
 
+def check_not_black(mask: Tensor, path: Path) -> None:
+    """Raises ValueError."""
+    if not bool((mask > 0.0).any()):
+        raise ValueError(
+            f"{path}: expected a mask, white on the object, got one that is black; is it the object's mask?"
+        )
+
+
 def read_pose(path: Path) -> Pose:
+    """From what fit-pose or track writes, or mesh to world 4 × 4 by rows: JSON, text or .npy. Raises ValueError or OSError."""
+    import numpy as np
+
     from edgegrad.files.paths import check_readable
+    from edgegrad.fit.pose.pose import pose_from_matrix
     from edgegrad.fit.pose.result import pose_from_json
 
     try:
-        return pose_from_json(check_readable(path, (".json",)).read_text(encoding="utf-8"))
+        file = check_readable(path, (".json", ".txt", ".npy"))
+        if file.suffix.lower() == ".npy":
+            return pose_from_matrix("mesh_to_world", np.load(file, allow_pickle=False))
+        text = file.read_text(encoding="utf-8")
+        if file.suffix.lower() == ".txt":
+            return pose_from_matrix("mesh_to_world", np.loadtxt(text.replace(",", " ").splitlines(), ndmin=2))
+        return pose_from_json(text)
     except ValueError as error:
         raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
@@ -186,15 +206,43 @@ def read_view(args: argparse.Namespace, scene: Scene, size: tuple[int, int] | No
         by_size = args.camera.suffix.lower() in (".gltf", ".glb")  # which have none of their own
         camera = load_camera(args.camera, torch.float64, (size or (512, 512)) if by_size else None)
     elif pose_file is not None and not described:
-        source, text = pose_file, pose_file.read_text(encoding="utf-8")
-        if '"camera"' in text:  # else a pose alone, written by hand
-            camera = PoseFit.from_json(text).camera
+        source = pose_file
+        if _has_camera(pose_file):  # else a pose alone, written by hand
+            camera = PoseFit.from_json(pose_file.read_text(encoding="utf-8")).camera
     if camera is None:
-        fov, up = 40.0 if args.fov is None else args.fov, args.up or (0.0, 1.0, 0.0)
+        fov, up = FOV if args.fov is None else args.fov, args.up or (0.0, 1.0, 0.0)
         return framing(scene, size or (512, 512), fov, args.eye, args.target, up)
     if size is None:
         return camera
     return fitting(camera, size, source)
+
+
+def assume_fov(args: argparse.Namespace, photo: Path, size: tuple[int, int], pose_file: Path | None) -> str:
+    """Where neither --camera nor --fov nor the pose file has a focal length, take --fov from the photograph's EXIF data, or else
+    40°. In words, what is assumed; empty where nothing is."""
+    import math
+
+    from edgegrad.files.focal import read_focal
+
+    placed = any(value is not None for value in (args.eye, args.target, args.up))
+    if (
+        args.camera is not None
+        or args.fov is not None
+        or (pose_file is not None and not placed and _has_camera(pose_file))
+    ):
+        return ""
+    focal = read_focal(photo) if photo.is_file() else None
+    if focal is None:
+        args.fov = FOV
+        said = f"{FOV:g}° assumed, for {photo} does not say its focal length; distances follow from it"
+    else:
+        args.fov = 2.0 * math.degrees(math.atan(0.5 * size[0] / focal.pixels))
+        said = f"{args.fov:.1f}° taken from the EXIF data of {photo} ({focal.words}), as if it were not cropped"
+    return f"edgegrad: --fov: {said}; give --camera or --fov where it is known"
+
+
+def _has_camera(pose_file: Path) -> bool:
+    return pose_file.suffix.lower() == ".json" and '"camera"' in pose_file.read_text(encoding="utf-8")
 
 
 def fitting(camera: Camera, size: tuple[int, int], source: Path) -> Camera:

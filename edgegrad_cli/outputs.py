@@ -28,6 +28,12 @@ def make_folder(folder: Path) -> None:
         ) from error
 
 
+def say(text: str) -> None:
+    """On standard error, where there is anything to say."""
+    if text:
+        print(text, file=sys.stderr)
+
+
 @contextmanager
 def live(args: argparse.Namespace) -> Iterator[Viewer | None]:
     """The live view that --view asks for. Whoever ends the block has saved the result. Raises ImportError without viser."""

@@ -20,7 +20,12 @@ def add(commands: Any) -> None:
     add_view(parser)
     parser.add_argument("--pose", type=Path, metavar="POSE.json", help="where to put the mesh, as fit-pose writes it")
     parser.add_argument("--background", help="#rrggbb or an image; black when left out")
-    parser.add_argument("--size", type=shape, metavar="WIDTHxHEIGHT", help="pixels (the camera's, or 512x512)")
+    parser.add_argument(
+        "--size",
+        type=shape,
+        metavar="WIDTHxHEIGHT",
+        help="pixels; one number for a square (the camera's, or 512x512)",
+    )
     parser.add_argument("--spp", type=count, default=64, help="samples a pixel (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
     parser.set_defaults(run=run)

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import outputs
-from .arguments import add_mesh, add_view, count, number
+from .arguments import add_mesh, add_view, count, longer_side, number
 from .films import MOST_FPS, USUAL_FPS, read_film, write_film
-from .inputs import read_pose, read_scene, read_view
+from .inputs import assume_fov, read_pose, read_scene, read_view
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -42,7 +42,7 @@ def add(commands: Any) -> None:
         help="pose in the first frame, as fit-pose writes it; or the poses.json of a film that this one goes on from: the last "
         "pose that is not lost",
     )
-    parser.add_argument("--size", type=count, default=256, help="most pixels on the longer side (%(default)s)")
+    parser.add_argument("--size", type=longer_side, default=256, help="most pixels on the longer side (%(default)s)")
     parser.add_argument("--spp", type=count, default=8, help="samples a pixel (%(default)s)")
     parser.add_argument("--seed", type=number, default=0)
     parser.add_argument(
@@ -74,8 +74,10 @@ def run(args: argparse.Namespace) -> int:
     scene, init = read_scene(args), read_pose(args.init)
     frames, fps = read_film(args.film, args.camera)
     first = next(frames)
+    assumed = assume_fov(args, args.film, (first.shape[0], first.shape[1]), args.init)
     camera = read_view(args, scene, (first.shape[0], first.shape[1]), args.init)
     outputs.make_folder(args.out)
+    outputs.say(assumed)
     overlays = args.out / "frames"
     overlays.mkdir(exist_ok=True)
     shown: list[Tensor] = []

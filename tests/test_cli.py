@@ -1,6 +1,8 @@
 """The command line end to end, on files that the tests write."""
 
+import argparse
 import json
+import math
 import subprocess
 import sys
 from functools import partial
@@ -10,6 +12,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation, silhouette
 
 import edgegrad as eg
@@ -53,6 +56,7 @@ def test_fit_pose(files, capsys):
     said = capsys.readouterr()
     assert (
         "converged" in said.out
+        and "standard deviation: ±" in said.out
         and "mesh to world:" in said.out
         and "wrote pose.json, fit.png, loss.png, fit.webp, checkpoint.pt in" in said.out
     )
@@ -211,6 +215,22 @@ def test_a_failed_write_still_prints_the_pose(files, capsys, monkeypatch):
         (["mesh.ply", "target.png", "--out", "mesh.ply/out"], "mesh.ply/out (Not a directory); choose another"),
         (["mesh.ply", "target.png", "--steps", "0"], "argument --steps: expected a whole number from 1 up, got '0'"),
         (["mesh.ply"], "the following arguments are required: IMAGE"),
+        (
+            ["mesh.ply", "target.png", "--mask", "black.png"],
+            "black.png: expected a mask, white on the object, got one that is",
+        ),
+        (
+            ["mesh.ply", "target.png", "--starts", "hello"],
+            "argument --starts: expected a whole number from 1 up, or global, got 'hello'",
+        ),
+        (
+            ["mesh.ply", "target.png", "--size", "64x48"],
+            "argument --size: expected one number, pixels on the longer side",
+        ),
+        (
+            ["mesh.ply", "target.png", "--init", "short.txt"],
+            "short.txt: mesh_to_world: expected shape (4, 4), got (1, 3)",
+        ),
     ],
 )
 def test_errors_are_one_line(files, capsys, monkeypatch, change, message):
@@ -218,6 +238,8 @@ def test_errors_are_one_line(files, capsys, monkeypatch, change, message):
     (files / "bad.json").write_text("{")
     save_camera(files / "wide.json", camera(48).replace(size=(48, 96)))
     write_image(files / "small.png", torch.ones(8, 8, 3))
+    write_image(files / "black.png", torch.zeros(48, 48, 1))
+    (files / "short.txt").write_text("1 2 3")
     labels = np.zeros((48, 48), np.uint8)
     labels[20:30, 20:30], labels[30:32] = 5, 2
     Image.fromarray(labels).save(files / "labels.png")
@@ -230,6 +252,39 @@ def test_errors_are_one_line(files, capsys, monkeypatch, change, message):
     said = capsys.readouterr().err
     assert code == 2
     assert said.startswith("edgegrad: error: ") and said.count("\n") == 1 and message in said
+
+
+def test_a_bare_matrix_is_a_pose(tmp_path):
+    matrix = START.double()
+    (tmp_path / "a.json").write_text(json.dumps(matrix.tolist()))
+    np.save(tmp_path / "b.npy", matrix.numpy())
+    np.savetxt(tmp_path / "c.txt", matrix.numpy())
+    (tmp_path / "d.txt").write_text("\n".join(", ".join(map(str, row)) for row in matrix.tolist()))
+    for name in ("a.json", "b.npy", "c.txt", "d.txt"):
+        assert float((inputs.read_pose(tmp_path / name).matrix - matrix).abs().max()) < 1e-6, name
+
+
+@pytest.mark.parametrize(
+    ("tags", "pixels"),
+    [
+        ({0xA405: 35}, 35.0 * 60.0 / 36.0),
+        # 5.6 mm at 400 pixels a mm of a sensor of 240 pixels, of which the file has a quarter.
+        ({0x920A: IFDRational(56, 10), 0xA20E: IFDRational(400), 0xA210: 4, 0xA002: 240}, 5.6 * 400.0 / 4.0),
+        ({0x920A: IFDRational(56, 10)}, None),
+    ],
+)
+def test_the_focal_length_of_a_photograph(tags, pixels, tmp_path):
+    """Of 3 : 2, as 35 mm film is."""
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update(tags)
+    Image.fromarray(np.full((40, 60, 3), 99, np.uint8)).save(tmp_path / "photo.jpg", exif=exif)
+    args = argparse.Namespace(camera=None, fov=None, eye=None, target=None, up=None)
+    said = inputs.assume_fov(args, tmp_path / "photo.jpg", (40, 60), None)
+    degrees = 40.0 if pixels is None else math.degrees(2.0 * math.atan(20.0 / pixels))
+    assert args.fov == pytest.approx(degrees, rel=0.005)
+    assert ("40° assumed" in said) == (pixels is None) and ("EXIF" in said) == (pixels is not None)
+    args.fov = 30.0
+    assert inputs.assume_fov(args, tmp_path / "photo.jpg", (40, 60), None) == "" and args.fov == 30.0
 
 
 def test_a_label_is_chosen(files):

@@ -413,7 +413,8 @@ def test_a_faint_contour_proves_little(step, least, most):
     """A plain mesh at its very place: but where colours hardly tell it from what surrounds it, chance finds as much elsewhere."""
     view, generator = camera(96), torch.Generator().manual_seed(0)
     texture = smoothed(torch.randn(3, 96, 96, generator=generator), 0.8).movedim(0, -1)
-    image = srgb_to_linear(0.3 + 0.1 * texture + step * smoothed(silhouette(view)[..., 0][None], 0.7)[0][..., None])
+    display = 0.3 + 0.1 * texture + step * smoothed(silhouette(view)[..., 0][None], 0.7)[0][..., None]
+    image = srgb_to_linear((255.0 * display).round() / 255.0)  # of 8 bits, in which 1 is white
     task = PoseTask.of(bracket(True), image, view, None, None, None, Lens(), 1.0, Names())
     pose = pose_from_matrix("init", torch.eye(4))
     level = photo_levels(task, pose, [None], 96, 16, 0)[-1]

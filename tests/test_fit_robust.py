@@ -91,7 +91,8 @@ def test_blur_and_compression_cost_no_second_search(kind):
     fit = fit_pose(bracket(), WORN[kind](picture(view)), view, init=START, background=BACKGROUND, progress=False)
     degrees, percent = errors(fit)
     limit = 0.15 if kind in ("sharp", "soft") else 1.0  # without the blur of renders: 0.5 for soft
-    assert degrees < limit and percent < limit and fit.converged and fit.explained > 0.85, (degrees, percent)
+    shown = 0.9 if kind in ("sharp", "soft") else 0.75  # what compression makes stronger is not the render's
+    assert degrees < limit and percent < limit and fit.converged and fit.explained > shown, (degrees, percent)
     sizes = [step.size for step in fit.history]
     assert sizes == sorted(sizes) and fit.steps < 60  # a second search begins at a coarse level again
 
@@ -125,7 +126,7 @@ def test_an_unlit_mesh_in_a_lit_picture_stays_near_its_start(further):
     start = about_center(rotation(0.03, -0.03, 0.02), (0.02, 0.01, 0.0))
     fit = fit_pose(bracket(), target, view, init=start, background=BACKGROUND, search=further, progress=False)
     degrees, percent = errors(fit)
-    assert degrees < 3.0 and percent < 1.5, (degrees, percent)
+    assert degrees < 3.0 and percent < 2.0, (degrees, percent)
     if not further:
         sizes = [step.size for step in fit.history]
         assert sizes == sorted(sizes)
@@ -217,8 +218,8 @@ def test_the_start_is_placed_where_the_picture_shows_the_object():
 
 @pytest.mark.parametrize("clutter", [False, True])
 def test_residuals_have_the_gradient_of_the_loss(clutter):
-    """Σ f ∂f is half the derivative of Σ ρ − (1 − (1 − α)²) c²/2 for weights at rest; here by finite differences of the loss, on
-    renders that are functions of one number."""
+    """Σ f ∂f is half the derivative of Σ ρ − (1 − (1 − α)²) c²/2 for weights at rest and gains that make it least; here by finite
+    differences of the loss, on renders that are functions of one number."""
     view = camera(16)
     background = None if clutter else BACKGROUND
     image = picture(
@@ -228,7 +229,12 @@ def test_residuals_have_the_gradient_of_the_loss(clutter):
     assert task.clutter == clutter
     level = task.level(1.0, 0.0, 1.0, 4, task.free)
     g = torch.Generator().manual_seed(0)
-    base, way = (torch.rand(16, 16, 4 if clutter else 3, generator=g, dtype=torch.float64) for _ in range(2))
+    with torch.no_grad():
+        (base,) = (layer.double() for layer in task.images(level, pose_from_matrix("", torch.eye(4)), 16, 0))
+    base, way = (
+        base + 0.05 * torch.rand(base.shape, generator=g),
+        torch.rand(base.shape, generator=g, dtype=torch.float64),
+    )
     c, h = 0.3, 1e-5
 
     def at(x):

@@ -101,7 +101,7 @@ def outlines_explained(parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> float:
         length += float(on.sum())
         shown += float((on * (sides.contrast > CONTRAST) * sides.band).sum())
         pairs.append((sides.mixed, sides.mixed, image, (sides.band * near)[..., None]))
-    return explained(pairs) * min(1.0, shown / length / ALONE_SHOWN) if length > 0.0 else 0.0
+    return explained(pairs, softer=True) * min(1.0, shown / length / ALONE_SHOWN) if length > 0.0 else 0.0
 
 
 def blur_losses(sides: Sides, image: Tensor, weight: Tensor, alpha: Tensor) -> Tensor:

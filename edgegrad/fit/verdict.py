@@ -1,20 +1,27 @@
 """Whether a picture shows what a fit claims.
 
 A loss that no longer falls may have stopped at a wrong place. What tells is whether the edges of the render r are in the picture
-p: the mean of ∇p·∇r / |∇r|² over the pixels, weighted by |∇r|. It is 1 where both are alike, whatever the noise of p, which
-has no part in ∇r on average, and 0 where an edge is missing or two pixels off; flat regions, which match wherever the object is,
-do not count.
+p, and as strong: s = ⟨∇p·∇r⟩ / ⟨|∇r|²⟩, with means over a few pixels, is 1 where both are alike, 0 where an edge is missing or
+two pixels off, and 2 where the picture's is twice as strong. The share that is explained is what the picture has of the render's
+edge, s, or, where the picture's edge is stronger by more than its noise, what the render has of the picture's, 1/s. Its mean is
+weighted by |∇r|, and noise has no part in it on average; flat regions, which match wherever the object is, do not count.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from .region import smoothed
+
 ENOUGH = 0.6  # a smaller share is a wrong place, or a picture of something else
 DEVIATIONS = 3.0  # of the noise
-WILDEST = -1.0, 2.0  # of one pixel
+WINDOW = 1.0  # pixels: standard deviation of the windows in which strengths are compared
+AROUND = 3.0  # the same, in which noise is counted
+WILDEST = -1.0, 2.0  # strengths of one edge
 BLOCK = 16  # pixels: those of JPEG with colours at half the resolution
 DISPLAY = 0.01  # of the picture's range: what eight bits and a display's curve leave
 
@@ -36,8 +43,11 @@ def edge_strength(image: Tensor) -> Tensor:
     return (high - low)[0].movedim(0, -1)
 
 
-def explained(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> float:
+def explained(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]], softer: bool = False) -> float:
     """The share, 0 … 1, over all views: of each two renders (H, W, C) of different seeds, the picture, and weights (H, W, 1).
+
+    softer  whether the renders are blurred, and the pictures' edges are as strong before the blur: they may then be stronger by a
+            factor up to 2
 
     Of renders without an edge, the share of the pixels that differ by no more than the noise.
     """
@@ -53,9 +63,18 @@ def explained(pairs: list[tuple[Tensor, Tensor, Tensor, Tensor | None]]) -> floa
         size = torch.hypot(*gradient)
         w = torch.ones_like(mean[..., :1]) if weight is None else weight
         count = w * size * (size > least) / extent
-        share = (gradient * _gradient(picture)).sum(0) / size.square().clamp(min=1e-30)
+        found = _gradient(picture)
+        own = _windowed(w * size.square(), WINDOW).clamp(min=1e-30)
+        strength = _windowed(w * (gradient * found).sum(0), WINDOW) / own
+        # What the picture's edges have along those of the render is noise, which blur, compression and clutter make, too.
+        along = (gradient[0] * found[1] - gradient[1] * found[0]).square() / size.square().clamp(min=1e-30)
+        noise = (_windowed(w * along, AROUND) / _windowed(w, AROUND).clamp(min=1e-30) + 0.5 * samples).sqrt()
+        # The squares of a Gaussian window's weights are the weights of a window narrower by √2.
+        spread = (_windowed(w * size.square(), WINDOW / math.sqrt(2.0)) / (4.0 * math.pi)).sqrt() / (WINDOW * own)
+        stronger = strength > (WILDEST[1] if softer else 1.0) + DEVIATIONS * noise * spread
+        share = torch.where(stronger, strength.clamp(min=1.0).reciprocal(), strength.clamp(*WILDEST))
         edges += float(count.sum())
-        alike += float((count * share.clamp(*WILDEST)).sum())
+        alike += float((count * share).sum())
         pixels += float(w.sum()) * mean.shape[-1]
         same += float((w * ((mean - picture).abs() <= least + DEVIATIONS * picture_noise(picture))).sum())
     return max(0.0, min(1.0, alike / edges)) if edges > 1e-4 * pixels else same / max(pixels, 1e-30)
@@ -95,6 +114,11 @@ def _blocks(image: Tensor) -> Tensor:
     """(h, w, C), means over BLOCK × BLOCK pixels."""
     H, W = (max(1, round(n / BLOCK)) for n in image.shape[:2])
     return F.adaptive_avg_pool2d(image.movedim(-1, 0)[None], (H, W))[0].movedim(0, -1)
+
+
+def _windowed(image: Tensor, sigma: float) -> Tensor:
+    """(H, W, C), means over Gaussian windows of a standard deviation in pixels."""
+    return smoothed(image.movedim(-1, 0), sigma).movedim(0, -1)
 
 
 def _gradient(image: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..camera.camera import Camera
 from ..check import as_tensor, check_finite, check_float, check_shape
+from ..files.image import linear_to_srgb
 from ..scene.tree import map_tensors
 from ..warnings import warn
 from .measured import Measurement, area_mean, measurements
@@ -25,7 +26,7 @@ WITH_ALPHA = 2, 4  # channels of pictures
 BYTE_ROUNDING = 1e-2  # of 255, by what resizes a picture
 DARKEST_BYTE = 5.0  # median of a picture of 8-bit numbers that are not whole
 HIGHLIGHTS = 0.01  # share of the pixels
-DARKEST = 0.05  # radiance of the brightest pixel: less is no picture of 8 bits
+ROUNDING = 0.02  # of a step of 8 bits: how far float32 takes a level from a whole number
 FAINT = 0.5  # a mask that covers no pixel by more was read by another curve, or holds labels
 
 
@@ -305,8 +306,19 @@ def grouped(views: Sequence[View]) -> list[list[int]]:
 
 
 def white_of(pixels: Tensor) -> float:
-    """Of (N, C) linear radiance: 1 of pictures as files of integers hold them, also dark ones. Of others, in any unit, what one
-    pixel in a hundred is brighter than."""
+    """Return what one pixel in a hundred of (N, C) is brighter than: it counts as white. Linear radiance may be in any unit.
+
+    Where that is black, the brightest pixel is white; where all are black, 1 is."""
+    if not len(pixels):
+        return 1.0
     brightest = pixels.amax(1)
     white = float(brightest.kthvalue(max(1, math.ceil((1.0 - HIGHLIGHTS) * len(brightest)))).values)
-    return white if white > 1.0 or (white > 0.0 and float(brightest.max()) < DARKEST) else 1.0
+    white = white if white > 0.0 else float(brightest.max())
+    return white if white > 0.0 else 1.0
+
+
+def has_levels(picture: Tensor) -> bool:
+    """Whether linear radiance, of any shape, has the 256 levels of a file of 8 bits. Such a picture says what is white, 1, also
+    where it is dark."""
+    levels = 255.0 * linear_to_srgb(picture)
+    return float(picture.max()) <= 1.0 and bool(((levels - levels.round()).abs() < ROUNDING).all())

@@ -21,7 +21,7 @@ from ..region import RADIUS, Windows, around, likelihood, palette, posterior, sl
 from ..sides import BLUR as SOFT
 from ..sides import BLURS, PURE, TOLERANCE, Sides, blur_losses, outlines_explained
 from ..verdict import ENOUGH
-from ..views import View, white_of
+from ..views import View, has_levels, white_of
 
 LAST = 2**20  # a step at which alpha is as sharp as pictures are
 EVERY = 3  # steps from one renewal to the next
@@ -39,7 +39,7 @@ class Regions:
 
     def __init__(self, views: Sequence[View], seed: int) -> None:
         pictures = [view.image for view in views if view.image is not None]
-        whites = [white_of(picture.flatten(0, 1)) for picture in pictures]
+        whites = [1.0 if has_levels(picture) else white_of(picture.flatten(0, 1)) for picture in pictures]
         shown = [picture / white for picture, white in zip(pictures, whites, strict=True)]
         self.displays = [linear_to_srgb(picture.clamp(0.0, 1.0)) for picture in shown]
         self.palettes = [palette(display, seed) for display in self.displays]

@@ -81,12 +81,12 @@ class Colours:
                 moved = F.pad(torch.cat([moves.linear, moves.shift[..., None]], -1), (0, 0, 0, 1))
                 by_tensor = {W: W @ moved, camera.K: moves.K, camera.distortion: moves.distortion}
                 own = {tensor: dot for tensor, dot in by_tensor.items() if tensor is not None and dot is not None}
-                channels, dots = jvp(scene, camera, _padded(own), level.spp, seed, aovs=task.aovs)
+                channels, dots = jvp(scene, camera, _padded(own), level.spp, seed, aovs=task.channels)
             else:
-                rendered = Rendered(scene, camera, task.aovs, level.spp, seed)
+                rendered = Rendered(scene, camera, task.channels, level.spp, seed)
                 channels, dots = rendered.images, rendered.derivatives(moves)
-            images.append(task.compared(level, channels))
-            tangents.append(task.compared(level, dots))
+            images.append(task.layers(level, shot, channels))
+            tangents.append(task.layers(level, shot, dots, slopes=True))
         compared = Comparison(task, level, images)
         residuals, tangents = compared.residuals(self.c), compared.tangents(self.c, tangents)
         normal = Normal.of(residuals, tangents)
@@ -125,7 +125,7 @@ def source_of(task: PoseTask, pose: Pose, max_size: int, spp: int, seed: int) ->
         levels = photo_levels(task, pose, [None] * len(task.shots), max_size, spp, seed)
         lit = [] if task.colourless else [seen.lit for seen in levels[-1].see(pose, seed)]
         # Of a surface that is too small for a light to be told, colours are compared where the background is known.
-        changes = [one.change(task.white) for one in lit if one is not None]
+        changes = [one.change() for one in lit if one is not None]
         if (task.clutter and not changes) or max(changes, default=0.0) > AS_THEY_ARE:
             return Photographs(task, pose, levels, seed)
     return Colours(task, pose, max_size, spp, seed)

@@ -27,7 +27,7 @@ from ...scene.symmetries import Symmetries
 from ..checkpoints import Checkpoint, traits
 from ..options import check_checkpoint
 from ..upside_down import BETTER, say_upside_down
-from .given import Names, check_max_size
+from .given import Names, check_max_size, warn_of_scale
 from .journal import Journal
 from .photo.depth import warn_of_units
 from .photo.match import matches
@@ -74,7 +74,8 @@ def fit_pose(
     """Rotation and translation (and scale, and focal length) of a known mesh in a picture, or in several.
 
     mesh        what the picture shows, with its colours; the meshes of a Scene move together
-    target      (H, W, C) linear radiance, as read_image gives it, with the mesh's channels; or a list of pictures
+    target      (H, W, C) linear radiance in any unit, as read_image gives it, with the mesh's channels; or a list of pictures.
+                The object's gain in each of them is found beside the pose, and so is that of a background that is given
     camera      the camera of the picture, of size (H, W), or a list of them; with fit_focal, its focal length is where the fit
                 starts
     mask        (H, W) or (H, W, 1), 1 on the object and 0 elsewhere, as read_mask gives it. Then the colours inside the mask
@@ -120,9 +121,9 @@ def fit_pose(
     the render's edges (`explained`); where they do not, it looks for better poses further off, which takes a few times as long,
     less where nothing in the picture looks like the object; where they do, but something covers the object or it is of another
     colour, nearby, in about the same time again. Another pose is the answer only if its loss is lower than that of `init` in the
-    final comparison, and its edges are as well in the picture. In photographs `uncertainty` says how exactly the terms show the
-    pose, and a rotation that is known less exactly than to 5° (of a plain mesh 2°), or a place than to 5 % of the object's size,
-    is not `converged`: `reason` names the direction, which a continuous one of the `symmetries` makes known. A plain mesh has its
+    final comparison, and its edges are as well in the picture. `uncertainty` says how exactly the pictures show the pose: a
+    rotation that is known less exactly than to 5° (of a plain mesh 2°), or a place than to 5 % of the object's size, is not
+    `converged`, and `reason` names the direction, which a continuous one of the `symmetries` makes known. A plain mesh has its
     contour alone: there other starts follow in any case, as they do of a mesh with colours whose rotation is known less exactly
     than to 1°, and a pose is not `converged` if another one is about as likely.
     KeyboardInterrupt, also from the callback, ends the fit and returns the best so far with `interrupted` set.
@@ -159,6 +160,8 @@ def search_pose(
     _check_starts(starts, init, camera, names.init)
     given = pose_from_matrix("init", torch.eye(4) if init is None else getattr(init, "matrix", init))
     task = PoseTask.of(mesh, target, camera, mask, weight, background, lens, float(given.scale), names)
+    if names == Names():  # of scenes a camera may stand inside
+        warn_of_scale(names.mesh, task.scene.transformed(given.R, given.t, given.scale), task.shots[0].camera)
     start = placed(task) if init is None else given
     given_cameras: list[Any] = list(camera) if isinstance(camera, Sequence) else [camera]
     file = Checkpoint(checkpoint, resume, {

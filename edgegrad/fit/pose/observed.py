@@ -26,9 +26,11 @@ class Observed:
             images = task.images(level, task.moved(pose, level.free, self.p), spp, seed)
         elif generator is not None:
             self.rendered = [
-                Rendered(scene, camera, task.aovs, spp, at) for scene, camera, at in task.views(level, pose, seed)
+                Rendered(scene, camera, task.channels, spp, at) for scene, camera, at in task.views(level, pose, seed)
             ]
-            images = [task.compared(level, one.images) for one in self.rendered]
+            images = [
+                task.layers(level, shot, one.images) for shot, one in zip(level.shots, self.rendered, strict=True)
+            ]
         else:
             with torch.no_grad():
                 images = task.images(level, pose, spp, seed)
@@ -41,7 +43,9 @@ class Observed:
             assert self.generator is not None
             return Normal.probed(self.p, residuals, FIRST_PROBES if first else PROBES, self.generator)
         dots = [
-            self.task.compared(self.level, one.derivatives(motion(self.task, self.level, shot, self.pose)))
+            self.task.layers(
+                self.level, shot, one.derivatives(motion(self.task, self.level, shot, self.pose)), slopes=True
+            )
             for one, shot in zip(self.rendered, self.level.shots, strict=True)
         ]
         return Normal.of(residuals, self.compared.tangents(c, dots))

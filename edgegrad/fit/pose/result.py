@@ -48,8 +48,8 @@ class PoseFit:
 
     R (3, 3), t (3,) float64 and scale place the mesh: `world = scale · R v + t`, t in world units. `camera` is the given
     one (of several the first), with the focal length found when that was asked for. `loss` is the mean squared difference to the
-    picture, linear radiance, over pixels and channels, at the finest level; where a pixel is far off, it counts no more than
-    a tenth of the picture's range does.
+    picture over pixels and channels, at the finest level, in linear radiance of which 1 is the picture's white; where a pixel is
+    far off, it counts no more than a tenth of the picture's range does.
     """
 
     R: Tensor
@@ -67,7 +67,7 @@ class PoseFit:
     cameras: list[Camera] = field(
         default_factory=list, repr=False
     )  # all that were given, as `camera`; not kept in JSON
-    # How exactly the terms of photographs show the pose; None where others decided, or before the answer. Not kept in JSON
+    # How exactly the pictures show the pose; None before the answer.
     uncertainty: Uncertainty | None = field(default=None, repr=False)
     # Of a fit of several objects, how much of this one the others leave to be seen, 0 … 1. Not kept in JSON
     visible: float = 1.0
@@ -146,8 +146,10 @@ class PoseFit:
                 "steps": self.steps,
                 "seconds": round(self.seconds, 3),
                 "converged": self.converged,
+                "reason": self.reason,
                 "interrupted": self.interrupted,
                 "explained": self.explained if math.isfinite(self.explained) else None,
+                "uncertainty": None if self.uncertainty is None else self.uncertainty.plain(),
             },
             indent=2,
         )
@@ -166,16 +168,18 @@ class PoseFit:
             steps, seconds = int(data["steps"]), float(data["seconds"])
             share = data.get("explained")
             share = math.nan if share is None else float(share)
+            known = data.get("uncertainty")
+            known = None if known is None else Uncertainty.from_plain(known)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"pose: expected what PoseFit.to_json writes, got a fault in it ({error})") from error
         flags = bool(data["converged"]), bool(data["interrupted"])
-        return PoseFit(pose.R, pose.t, float(pose.scale), view, loss, steps, seconds, *flags, share)
+        return PoseFit(pose.R, pose.t, float(pose.scale), view, loss, steps, seconds, *flags, share, uncertainty=known)
 
 
 def pose_from_json(text: str) -> Pose:
-    """The pose alone, from a JSON object with `mesh_to_world`, 4 × 4 by rows; or from one with `poses`, as `edgegrad track`
-    writes them, of which the last one that is not `lost`. Raises ValueError."""
-    data = _parsed(text)
+    """The pose alone, from a JSON object with `mesh_to_world`, 4 × 4 by rows, or from such a matrix alone; or from an object with
+    `poses`, as `edgegrad track` writes them, of which the last one that is not `lost`. Raises ValueError."""
+    data = _parsed(text, bare=True)
     if "poses" not in data:
         _check_entries(data, "mesh_to_world")
         return pose_from_matrix("mesh_to_world", data["mesh_to_world"])
@@ -188,11 +192,13 @@ def pose_from_json(text: str) -> Pose:
     return pose_from_matrix("mesh_to_world", seen[-1]["mesh_to_world"])
 
 
-def _parsed(text: str) -> dict[str, Any]:
+def _parsed(text: str, bare: bool = False) -> dict[str, Any]:
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
         raise ValueError(f"pose: expected JSON, got text that is not ({error})") from None
+    if bare and isinstance(data, list) and data:
+        return {"mesh_to_world": data}
     if not isinstance(data, dict):
         raise ValueError(f'pose: expected a JSON object, got {type(data).__name__}; write {{"mesh_to_world": …}}')
     return data

@@ -5,6 +5,11 @@ is small beside c, and c² however large it is. A step minimises Σ w r² with w
 reweighted least squares). c follows the median difference on the render's edges: wide while the object lies wrong, and narrow
 where at least half of them are found.
 
+The unit of a picture's radiance, or its exposure, is not known: the object has in each picture a gain, and so has the background.
+The render is linear in them, so the best ones of a pose are known in closed form, and are eliminated from the normal equations
+(variable projection, Golub and Pereyra 1973, as Kaufman 1975 has it). Without them, a picture that is brighter than the render
+would be compared best at a wrong pose.
+
 Where the background is not known, pixels are compared only as far as the object covers them, image − α · picture, and (1 − α)²
 c²/2 is added: to cover a pixel pays if that matches better than by chance.
 """
@@ -12,33 +17,102 @@ c²/2 is added: to cover a pixel pays if that matches better than by chance.
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ..verdict import edge_strength
-from .task import Level, PoseTask
+from .task import Level, PoseTask, Shot
 
 NARROWEST = 0.1  # c, as a part of the pictures' range
 MEDIANS = 2.5  # c, in medians
 PAYS = 0.5  # of c², what covering a pixel pays
 NOISE = 0.03  # a loss that rises by a smaller part may have risen by the noise of its samples
 FAINT = 0.03  # the noise of the area that is covered, beside it
+REWEIGHTED = 2  # times, for gains
+BLOCK = 8  # pixels, whose errors are taken to have one cause
+UNSEEN = 1e-9  # of the curvature of gains: keeps one that the picture does not show near 1
 
 
 class Comparison:
     """The differences between pictures and renders at one pose."""
 
-    def __init__(self, task: PoseTask, level: Level, renders: list[Tensor]) -> None:
-        self.task, self.level, self.renders = task, level, renders
-        self.differences, self.open = [], []
-        for shot, render in zip(level.shots, renders, strict=True):
+    def __init__(self, task: PoseTask, level: Level, layers: list[Tensor]) -> None:
+        """`layers` (h, w, n) of each picture: what PoseTask.layers() gives."""
+        self.task, self.level, self.layers = task, level, layers
+        self.gains = [layer.new_ones(1 + task.backed) for layer in layers]
+        self.renders: list[Tensor] = []  # (h, w, C) of each picture
+        self.differences: list[Tensor] = []
+        self.open: list[Tensor] = []
+        self._width = math.inf  # of the loss that the gains are fitted by
+        self._compose()
+        if self._has_gains:
+            self._fit_gains(math.inf, 1)
+            self._fit_gains(self.scale())
+
+    @property
+    def _has_gains(self) -> bool:
+        return self.task.colours > 0 and not self.task.colourless
+
+    def _compose(self) -> None:
+        """The renders with the gains as they are, and how far they are from the pictures."""
+        task, C = self.task, self.task.colours
+        self.renders, self.differences, self.open = [], [], []
+        for shot, layer, gains in zip(self.level.shots, self.layers, self.gains, strict=True):
+            parts = [gain * part for gain, part in zip(gains, self._parts(layer), strict=True)] if C else []
+            alpha = layer[..., len(parts) * C :]
+            self.renders.append(torch.cat([sum(parts[1:], parts[0]), alpha], -1) if parts else alpha)
             if task.clutter:
-                image, alpha = render[..., :-1], render[..., -1:]
-                self.differences.append(image - alpha * shot.target)
+                self.differences.append(self.renders[-1][..., :-1] - alpha * shot.target)
                 self.open.append(1.0 - alpha)
             else:
-                self.differences.append(render - shot.target)
+                self.differences.append(self.renders[-1] - shot.target)
+
+    def _parts(self, layer: Tensor) -> list[Tensor]:
+        """What has a gain, (…, h, w, C) each."""
+        C = self.task.colours
+        return [layer[..., k * C : (k + 1) * C] for k in range(1 + self.task.backed)]
+
+    def _fit_gains(self, c: float, rounds: int = REWEIGHTED) -> None:
+        """Make the renders by the gains that make the loss of width c least (iteratively reweighted least squares)."""
+        C, found = self.task.colours, []
+        for shot, layer, gains, r in zip(self.level.shots, self.layers, self.gains, self.differences, strict=True):
+            left = r.detach().flatten(0, 1)
+            rows = torch.stack([part.detach().flatten(0, 1) for part in self._parts(layer)])
+            wanted = (gains[:, None, None] * rows).sum(0) - left[:, :C]
+            for _ in range(rounds):
+                weighted = (rows * self._weights(shot, left, c)).flatten(1)
+                A, b = (weighted @ rows.flatten(1).T).double(), (weighted @ wanted.flatten()).double()
+                ridge = UNSEEN * A.diagonal() + 1e-30
+                gains = torch.linalg.solve(A + torch.diag(ridge), b + ridge).to(gains)
+                left = torch.cat([(gains[:, None, None] * rows).sum(0) - wanted, left[:, C:]], 1)
+            found.append(gains)
+        self.gains, self._width = found, c
+        self._compose()
+
+    def _settle(self, c: float) -> None:
+        """The gains as of the loss of width c."""
+        if self._has_gains and c != self._width:
+            self._fit_gains(c)
+
+    def _weights(self, shot: Shot, r: Tensor, c: float) -> Tensor:
+        """(…, 1) of differences r (…, C) of all pixels."""
+        w = (1.0 + r.square().sum(-1, keepdim=True) / c**2).pow(-2)
+        return w if shot.weight is None else w * shot.weight.reshape(w.shape)
+
+    def _without_gains(self, k: int, w: Tensor, images: Tensor) -> Tensor:
+        """Images (…, h, w, n) without what a change of the gains of picture k does, where each pixel counts w (h, w, 1)."""
+        C = self.task.colours
+        if not self._has_gains:
+            return images
+        moved = torch.stack([(w.sqrt() * part.detach()).flatten() for part in self._parts(self.layers[k])]).double()
+        pinv = torch.linalg.pinv(moved @ moved.T, rtol=1e-9, hermitian=True)
+        colours = images[..., :C]
+        rows = colours.flatten(-3).double()
+        left = rows - (rows @ moved.T @ pinv) @ moved
+        return torch.cat([left.reshape(colours.shape).to(images), images[..., C:]], -1)
 
     @property
     def channels(self) -> int:
@@ -55,21 +129,25 @@ class Comparison:
 
     def scale(self) -> float:
         """c that the median difference suggests."""
-        sizes, counts = [], []
-        for k, (r, render) in enumerate(zip(self.differences, self.renders, strict=True)):
-            sizes.append(r.detach().norm(dim=-1).flatten())
-            edge = edge_strength(render.detach()).sum(-1)
-            if self.task.clutter:
-                edge = edge * render.detach()[..., -1]
-            weight = self.level.shots[k].weight
-            counts.append((edge if weight is None else edge * weight[..., 0]).flatten())
-        size, order = torch.cat(sizes).sort()
-        share = torch.cat(counts)[order].cumsum(0)
+        size, order = torch.cat([r.detach().norm(dim=-1).flatten() for r in self.differences]).sort()
+        share = self._edges[order].cumsum(0)
         middle = size[int(torch.searchsorted(share, 0.5 * share[-1]).clamp(max=len(size) - 1))]
         return max(MEDIANS * float(middle), NARROWEST * self.task.extent, 1e-12)
 
+    @cached_property
+    def _edges(self) -> Tensor:
+        """How much of an edge each pixel of the renders is, of all pictures."""
+        found = []
+        for shot, render in zip(self.level.shots, self.renders, strict=True):
+            edge = edge_strength(render.detach()).sum(-1)
+            if self.task.clutter:
+                edge = edge * render.detach()[..., -1]
+            found.append((edge if shot.weight is None else edge * shot.weight[..., 0]).flatten())
+        return torch.cat(found)
+
     def loss(self, c: float) -> tuple[float, float]:
         """The mean over pixels and channels, and by how much that of another render may be higher by its noise."""
+        self._settle(c)
         total = near = paid = spread = 0.0
         for k, r in enumerate(self.differences):
             square = r.detach().square().sum(-1, keepdim=True)
@@ -85,31 +163,51 @@ class Comparison:
 
     def residuals(self, c: float) -> list[Tensor]:
         """Whose squares sum up to the loss's approximation for one step."""
+        self._settle(c)
         found = []
-        for k, (r, (w, open_)) in enumerate(zip(self.differences, self._factors(c), strict=True)):
-            residual = w * r
+        for k, (r, shot) in enumerate(zip(self.differences, self.level.shots, strict=True)):
+            w = self._weights(shot, r.detach(), c)
+            residual = self._without_gains(k, w, w.sqrt() * r)
             if self.open:
+                open_ = self._open(shot, c)
                 residual = torch.cat([residual, open_ * self.open[k]], -1)
             found.append(residual)
         return found
 
     def tangents(self, c: float, dots: list[Tensor]) -> list[Tensor]:
-        """Of the residuals, from those (D, h, w, C) of the renders."""
+        """Of the residuals, from those (D, h, w, n) of the layers."""
         found = []
-        for shot, dot, (w, open_) in zip(self.level.shots, dots, self._factors(c), strict=True):
+        for k, (shot, dot, r) in enumerate(zip(self.level.shots, dots, self.differences, strict=True)):
+            w = self._weights(shot, r.detach(), c)
+            parts = self._parts(dot) if self.task.colours else []
+            alpha = dot[..., len(parts) * self.task.colours :]
+            colours = [gain * part for gain, part in zip(self.gains[k], parts, strict=False)]
+            image = sum(colours[1:], colours[0]) if colours else alpha[..., :0]
             if self.open:
-                image, alpha = dot[..., :-1], dot[..., -1:]
-                dot = torch.cat([w * (image - alpha * shot.target), -open_ * alpha], -1)
+                image, alpha = image - alpha * shot.target, -self._open(shot, c) * alpha
+                found.append(torch.cat([self._without_gains(k, w, w.sqrt() * image), alpha], -1))
             else:
-                dot = w * dot
-            found.append(dot)
+                found.append(self._without_gains(k, w, w.sqrt() * torch.cat([image, alpha], -1)))
         return found
 
-    def _factors(self, c: float) -> list[tuple[Tensor, Tensor]]:
-        """Of the difference and of what is open, in the residual of each picture."""
-        found = []
-        for r, shot in zip(self.differences, self.level.shots, strict=True):
-            w = (1.0 + r.detach().square().sum(-1, keepdim=True) / c**2).pow(-2)
-            count = torch.ones_like(w) if shot.weight is None else shot.weight
-            found.append(((w * count).sqrt(), count.sqrt() * math.sqrt(PAYS) * c))
-        return found
+    def variance(self, c: float) -> float:
+        """The variance of a residual on the renders' edges, as if all were independent.
+
+        Errors of neighbouring pixels have a common cause: the light, the lens, the mesh. So the residuals of a block of pixels
+        are summed up, and the squares of these sums are what the squares of independent residuals would be in sum."""
+        total = count = 0.0
+        for k, (shot, residual) in enumerate(zip(self.level.shots, self.residuals(c), strict=True)):
+            H, W, C = residual.shape
+            edges = edge_strength(self.renders[k].detach()).norm(dim=-1, keepdim=True)
+            side = min(BLOCK, H, W)
+            sums = F.avg_pool2d(
+                (edges * residual.detach()).movedim(-1, 0)[None], side, ceil_mode=True, divisor_override=1
+            )
+            total += float(sums.square().sum())
+            count += C * float((edges.square() * self._weights(shot, self.differences[k].detach(), c)).sum())
+        return total / max(count, 1e-30)
+
+    def _open(self, shot: Shot, c: float) -> Tensor:
+        """Of what is open, in the residual of a picture."""
+        count = torch.ones(()) if shot.weight is None else shot.weight
+        return count.sqrt() * math.sqrt(PAYS) * c

@@ -26,6 +26,7 @@ from .result import Step
 from .robust import NARROWEST, NOISE, Comparison
 from .soft import softness
 from .task import GROW, PARTS, SHIFT, TURN, Level, PoseTask, blurred
+from .uncertainty import TOGETHER
 
 ASIDE, ASIDE_STEPS = 0.2, 20  # radians between the starts on the coarsest level, and steps from each
 FINAL_SPP = 64  # samples a pixel when ends are compared
@@ -69,8 +70,7 @@ class Search:
     search that is given it goes on from there."""
 
     enough = ENOUGH
-    curvature = None  # how exactly colours as they are show a pose is not known
-    alike = ()  # nor what looks alike
+    alike = ()  # what looks alike is not known
 
     def __init__(
         self, task: PoseTask, levels: list[Level], start: Pose, steps: int, tolerance: float, seed: int,
@@ -81,6 +81,7 @@ class Search:
         self.steps, self.tolerance, self.seed, self.further = steps, tolerance, seed, further
         self.generator = torch.Generator().manual_seed(seed)
         self.best, self.loss, self.converged, self.explained = start, math.nan, False, math.nan
+        self.curvature: Tensor | None = None  # JᵀJ at the answer, in units that Uncertainty.of() takes
         self.history: list[Step] = []
         self.journal = journal or Journal()
         self.after_step: Callable[[], Any] = lambda: None
@@ -113,6 +114,8 @@ class Search:
             begins = len(self.history)
             ends = self._ranked(finer[0], self._tilted(best.pose))
             self._better(best, self._judge(*self._down(ends[0], finer[1:])), begins)
+        known = self.journal.numbers(self._information)
+        self.curvature = torch.tensor(known, dtype=torch.float64).reshape((len(self.task.free),) * 2)
         self.history.append(Step(self.levels[-1].size, self.loss, self.best, True, {}))
 
     def _from_afar(self, best: _End, near: Pose) -> _End:
@@ -243,12 +246,23 @@ class Search:
         self.history.append(step)
 
     def _sharp(self, pose: Pose, level: Level) -> list[list[Tensor]]:
-        """Renders of two seeds with many samples."""
+        """Layers of renders of two seeds with many samples."""
         seeds = self.seed, (self.seed + 1) % 2**32
-        return [Observed(self.task, level, pose, FINAL_SPP, seed).compared.renders for seed in seeds]
+        return [Observed(self.task, level, pose, FINAL_SPP, seed).compared.layers for seed in seeds]
 
     def _softness(self, pose: Pose) -> float:
         return softness(self.task, self.levels[-1], *self._sharp(pose, self.levels[-1]))
+
+    def _information(self) -> list[float]:
+        """JᵀJ at the best pose, by rows, by the variance of the residuals there, whose samples are as many as those of the steps.
+        The search ends within its tolerance of where the loss is least, and knows the pose no better than that."""
+        level = self.levels[-1]._replace(soft=self._softness(self.best))
+        seen = Observed(self.task, level, self.best, level.spp, self.seed, self.generator)
+        c = seen.compared.scale()
+        curvature = seen.equations(c, first=True).curvature / max(seen.compared.variance(c), 1e-30)
+        values, ways = torch.linalg.eigh(0.5 * (curvature + curvature.T))
+        known = (values.clamp(min=1e-30).reciprocal() + self.tolerance**2).reciprocal()
+        return (TOGETHER**2 * (ways * known) @ ways.T).flatten().tolist()
 
     def _judge(self, pose: Pose, short: bool) -> _End:
         """With many samples on the finest level."""
@@ -258,9 +272,9 @@ class Search:
     def _judged(self, pose: Pose, level: Level) -> _Judged:
         task, sharp = self.task, self._sharp(pose, level)
         soft = softness(task, level, *sharp)
-        first, second = ([blurred(image, soft) for image in images] for images in sharp)
+        first, second = (Comparison(task, level, [blurred(layer, soft) for layer in layers]) for layers in sharp)
         pairs = []
-        for shot, a, b in zip(level.shots, first, second, strict=True):
+        for shot, a, b in zip(level.shots, first.renders, second.renders, strict=True):
             weight = shot.weight
             if self.task.clutter:
                 outside = (a[..., -1] < 0.999).to(a)  # and what lies beside it, whose gradient reaches there
@@ -268,7 +282,7 @@ class Search:
                 weight = inside if weight is None else weight * inside
                 a, b = a[..., :-1], b[..., :-1]
             pairs.append((a, b, shot.target, weight))
-        loss = Comparison(task, level, first).loss(NARROWEST * task.extent)[0]
+        loss = first.loss(NARROWEST * task.extent)[0]
         return _Judged(loss, explained(pairs), coherent(pairs), edges_of(pairs))
 
     def _others(self, best: Pose) -> list[Pose]:

@@ -18,13 +18,13 @@ ALIKE = 0.1  # c, as a part of the pictures' range: what differs by more than th
 
 
 def softness(task: PoseTask, level: Level, renders: list[Tensor], again: list[Tensor]) -> float:
-    """Pixels, at most the last of BLURS, from renders (h, w, C) of two seeds at one pose, not blurred.
+    """Pixels, at most the last of BLURS, from the layers of renders (h, w, n) of two seeds at one pose, not blurred.
 
     The products of both's differences to the picture have no noise of samples in their mean, which a blur would lower.
     """
     losses = []
     for sigma in BLURS:
-        both = [Comparison(task, level, [blurred(image, sigma) for image in images]) for images in (renders, again)]
+        both = [Comparison(task, level, [blurred(layer, sigma) for layer in layers]) for layers in (renders, again)]
         total = 0.0
         for shot, a, b in zip(level.shots, *(one.differences for one in both), strict=True):
             square = (0.5 * (a + b)).square().sum(-1, keepdim=True) / (ALIKE * task.extent) ** 2

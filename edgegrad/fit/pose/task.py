@@ -18,7 +18,7 @@ from ...check import as_tensor, check_finite, check_float, check_shape
 from ...scene.mesh import Mesh
 from ...scene.scene import Scene
 from ..region import VISIBLE
-from ..views import area_mean, before_black, check_image, check_without_alpha, warn_of_faint, white_of
+from ..views import area_mean, before_black, check_image, check_without_alpha, has_levels, warn_of_faint, white_of
 from .given import LEAST, Names, depth_of, shots_of
 from .pose import Pose
 
@@ -88,7 +88,7 @@ class PoseTask:
     size: float  # its diagonal at the start, world units
     free: list[int]  # entries of a step that are sought
     names: Names
-    white: float = 1.0  # radiance of the brightest that pictures show, but for highlights, where it is not about 1
+    white: float = 1.0  # radiance that the given pictures have where these have 1
 
     @staticmethod
     def of(
@@ -105,9 +105,10 @@ class PoseTask:
         plain = all(part.channels is None for part in scene.meshes)
         if mask is not None and background is not None:
             raise ValueError("background: expected None with a mask, got both; the mask leaves no background")
-        shots, masks, clutter = [], [], False
+        shots, masks, clutter, levels = [], [], False, True
         for name, view, picture, shape, count in shots_of(camera, target, mask, weight, names):
             image = check_image(f"{names.target}{name}", picture, view.size)
+            levels = levels and has_levels(image)
             if min(view.size) < LEAST:
                 raise ValueError(
                     f"{names.target}{name}: expected a picture of {LEAST} × {LEAST} pixels or more, got {view.size[1]} × "
@@ -148,6 +149,9 @@ class PoseTask:
             scene = scene.replace(meshes=[_grey(part, shots[0].target.shape[-1]) for part in scene.meshes])
         if clutter:
             shots = [shot._replace(background=None) for shot in shots]
+        white = 1.0
+        if not levels and not (plain and mask is not None):
+            shots, white = _in_units_of_white(shots, mask is not None)
         most = max((float(shot.weight.max()) for shot in shots if shot.weight is not None), default=1.0)
         shots = [shot if shot.weight is None else shot._replace(weight=shot.weight / most) for shot in shots]
         aovs = ("image", "alpha") if clutter or (mask is not None and not plain) else ("image",)
@@ -173,6 +177,10 @@ class PoseTask:
         )  # a mask's range says nothing of theirs
         # A black object before nothing has no range of colours.
         extent = next((r for x in (colours, seen) if (r := float((x.amax(0) - x.amin(0)).norm())) > 0.0), 0.0)
+        if masks and not any(bool((one > 0.0).any()) for one in masks):
+            raise ValueError(
+                f"{names.mask}: expected 1 on the object, got a mask that is black, 0 in every pixel; is it the object's mask?"
+            )
         if extent == 0.0:
             given = names.target if mask is None else names.mask
             raise ValueError(
@@ -184,8 +192,6 @@ class PoseTask:
                 f"{names.mask}: expected the object in {VISIBLE} pixels or more, got it in {most}; is it the object's mask?"
             )
         bare = scene.replace(meshes=double, background=None)
-        shown = seen[:, :-1] if mask is not None and not plain else seen
-        white = 1.0 if aovs == ("alpha",) else white_of(shown)
         return PoseTask(bare, aovs, shots, clutter, colourless, extent, (low + high) / 2, size, free, names, white)
 
     def pyramid(self, start: Pose, max_size: int, spp: int) -> list[Level]:
@@ -287,34 +293,62 @@ class PoseTask:
         return camera.replace(**fields)
 
     @property
+    def colours(self) -> int:
+        """The number of channels of the pictures that are colours; a mask is the channel after them."""
+        masked = "alpha" in self.aovs and not self.clutter
+        return 0 if self.aovs == ("alpha",) else self.shots[0].target.shape[-1] - masked
+
+    @property
+    def backed(self) -> bool:
+        """Whether something that is not black stands behind the object, and is known."""
+        return any(shot.background is not None and bool((shot.background != 0.0).any()) for shot in self.shots)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The channels to render, from which layers() makes what is compared."""
+        return (*self.aovs, "alpha") if self.backed and "alpha" not in self.aovs else self.aovs
+
+    @property
     def reverse_alone(self) -> bool:
         """Whether renders have no forward mode: radiance of a lit scene changes in ways that torch alone knows."""
         return self.scene.is_shaded and "image" in self.aovs
 
     def views(self, level: Level, pose: Pose, seed: int) -> list[tuple[Scene, Camera, int]]:
-        """The scene, the camera and the seed of each render."""
+        """The scene, the camera and the seed of each render, before black."""
         moved = self.scene.transformed(pose.R, pose.t, pose.scale)
-        return [
-            (moved.replace(background=shot.background), self.lens(shot.camera, pose), (seed + 977 * k) % 2**32)
-            for k, shot in enumerate(level.shots)
-        ]
+        return [(moved, self.lens(shot.camera, pose), (seed + 977 * k) % 2**32) for k, shot in enumerate(level.shots)]
 
-    def compared(self, level: Level, channels: Mapping[str, Tensor]) -> Tensor:
-        """(…, h, w, C): one after the other, blurred like the pictures; so of their derivatives."""
-        image = torch.cat([channels[name] for name in self.aovs], -1)
-        return blurred(image, math.hypot(level.blur, level.soft))
+    def layers(self, level: Level, shot: Shot, channels: Mapping[str, Tensor], slopes: bool = False) -> Tensor:
+        """What a picture is a sum of (…, h, w, n), blurred like the pictures: the object before black, what is seen of the
+        background, if there is one, and alpha, if it is compared. `slopes`: the channels are derivatives."""
+        parts = [channels["image"]] if "image" in self.aovs else []
+        if self.backed:
+            covered = channels["alpha"]
+            assert shot.background is not None  # where one picture has a background, all have
+            seen = -covered if slopes else 1.0 - covered
+            parts.append(seen * shot.background.to(seen))
+        parts += [channels["alpha"]] if "alpha" in self.aovs else []
+        return blurred(torch.cat(parts, -1), math.hypot(level.blur, level.soft))
 
     def images(self, level: Level, pose: Pose, spp: int, seed: int) -> list[Tensor]:
-        """The renders (h, w, C), blurred like the pictures, differentiable in the pose."""
+        """The layers (h, w, n) of each picture, differentiable in the pose."""
         return [
-            self.compared(level, render_aovs(scene, camera, self.aovs, spp=spp, seed=at))
-            for scene, camera, at in self.views(level, pose, seed)
+            self.layers(level, shot, render_aovs(scene, camera, self.channels, spp=spp, seed=at))
+            for shot, (scene, camera, at) in zip(level.shots, self.views(level, pose, seed), strict=True)
         ]
 
-    def pictures(self, level: Level, pose: Pose, seed: int = 0) -> list[Tensor]:
-        """The renders as pictures, over the background, which is known."""
-        with torch.no_grad():
-            return self.images(level, pose, level.spp, seed)
+
+def _in_units_of_white(shots: list[Shot], masked: bool) -> tuple[list[Shot], float]:
+    """Pictures whose white is 1, and the radiance that it was. `masked`: the last channel is a mask."""
+    pixels = torch.cat([shot.target.flatten(0, 1) for shot in shots])
+    white = white_of(pixels[pixels[:, -1] > 0.0, :-1] if masked else pixels)
+    found = []
+    for shot in shots:
+        target = shot.target / white
+        target = torch.cat([target[..., :-1], shot.target[..., -1:]], -1) if masked else target
+        behind = None if shot.background is None else shot.background / white
+        found.append(shot._replace(target=target, background=behind))
+    return found, white
 
 
 def _grey(mesh: Mesh, channels: int) -> Mesh:

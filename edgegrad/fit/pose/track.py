@@ -204,7 +204,7 @@ class Tracker:
         picture = self._picture(name, frame)
         if self.task is None:
             self.task = self._task(name, picture)
-        task = replace(self.task, shots=[self.task.shots[0]._replace(target=picture)])
+        task = replace(self.task, shots=[self.task.shots[0]._replace(target=picture / self.task.white)])
         near = None if measured is None else depth_image(f"depth[{index}]", measured, self.camera.size)
         if self.first:
             there = task.scene.transformed(self.pose.R, self.pose.t, self.pose.scale)
@@ -372,7 +372,7 @@ class Tracker:
         )
         # Whatever stands behind the object: a film shows it from more than one side.
         task = replace(task, clutter=True, shots=[task.shots[0]._replace(background=None)])
-        whole = Picture.of(task.shots[0], False, None, self.camera.size, task.white)
+        whole = Picture.of(task.shots[0], False, None, self.camera.size)
         self.palettes = [palette(whole.outlined, self.seed)]
         return task
 

@@ -1,14 +1,15 @@
 """How exactly the pictures show a pose: from the curvature JᵀJ of the terms at the answer.
 
-Each term of a photograph is a log likelihood in units of its own noise, so JᵀJ is Fisher's information, and its inverse the
-covariance that no unbiased estimate is below (Cramér and Rao, 1946). It speaks of the place where the fit is: of another pose
-that looks alike it knows nothing.
+Each term of a photograph is a log likelihood in units of its own noise, and residuals of colours as they are have the variance
+that is found at the answer. So JᵀJ is Fisher's information, and its inverse the covariance that no unbiased estimate is below
+(Cramér and Rao, 1946). It speaks of the place where the fit is: of another pose that looks alike it knows nothing.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -64,6 +65,32 @@ class Uncertainty:
     def direction(self) -> Tensor:
         """(3,) this direction, in the world, of length 1."""
         return _widest(self.covariance[3:, 3:])[1]
+
+    @property
+    def words(self) -> str:
+        """Both standard deviations and their directions in the world, and that of a focal length that was sought."""
+        parts = [
+            f"±{self.degrees:.2g}° about {_named(self.axis)}",
+            f"±{self.shift:.2g} along {_named(self.direction)}",
+        ]
+        if self.focal > 0.0:
+            parts.append(f"focal length ±{self.focal:.2g} of it")
+        return ", ".join(parts)
+
+    def plain(self) -> dict[str, Any]:
+        """All numbers, as JSON has them."""
+        return {
+            "degrees": self.degrees, "axis": self.axis.tolist(), "shift": self.shift, "direction": self.direction.tolist(),
+            "covariance": self.covariance.tolist(), "size": self.size, "free": self.free.tolist(), "focal": self.focal,
+            "most": self.most,
+        }  # fmt: skip
+
+    @staticmethod
+    def from_plain(data: dict[str, Any]) -> Uncertainty:
+        """From what plain() gave."""
+        covariance = torch.tensor(data["covariance"], dtype=torch.float64).reshape(6, 6)
+        free = torch.tensor(data["free"], dtype=torch.float64).reshape(-1, 3)
+        return Uncertainty(covariance, float(data["size"]), free, float(data["focal"]), float(data["most"]))
 
     @property
     def unknown(self) -> str:

@@ -233,7 +233,7 @@ class PhotoLevel:
                 pairs.append((expected, expected, picture.display, weight[..., None]))
         if length == 0.0:
             return 0.0
-        share = explained(pairs) * min(1.0, extent / RESOLVED)
+        share = explained(pairs, softer=True) * min(1.0, extent / RESOLVED)
         if self.harmonics:
             return share * min(1.0, shown / length / SHOWN)
         # The colours that a contour divides are alike on both sides where it is not the object's, however strong the edges are
@@ -290,10 +290,7 @@ def photo_levels(
     levels = []
     for k, n in enumerate(halved):
         sizes = [_reduced(shot.camera.size, f / 2**n) for shot, f in zip(shots, finest, strict=True)]
-        pictures = [
-            Picture.of(shot, masked, depth, size, task.white)
-            for shot, depth, size in zip(shots, cut, sizes, strict=True)
-        ]
+        pictures = [Picture.of(shot, masked, depth, size) for shot, depth, size in zip(shots, cut, sizes, strict=True)]
         smaller = [shot._replace(camera=picture.camera) for shot, picture in zip(shots, pictures, strict=True)]
         blur = BLURS[k] if k < len(BLURS) else 0.0
         # Perspective shows in fine detail only: on the coarsest level the focal length would run away.

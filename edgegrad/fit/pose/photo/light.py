@@ -93,13 +93,14 @@ class Lit:
         image = predicted.movedim(0, -1)
         return Lit(surface, image, light, residual, count, robust * whole, middle, B, scale, slopes, ridge)
 
-    def change(self, white: float) -> float:
-        """How much the light changes the mesh's colours, in parts of them: 0 where it leaves them as they are. `white`: the
-        radiance that the picture has as 1."""
+    def change(self) -> float:
+        """How much the light changes the mesh's colours, in parts of them: 0 where it multiplies all of them by one number."""
         inside = self.surface.inside
         colour = self.surface.channels["image"].float()[inside]
         irradiance = spherical(self.surface.normals[inside])[..., : self.coefficients.shape[1]] @ self.coefficients.T
-        return float((colour * (white * irradiance - 1.0)).abs().mean() / colour.abs().mean().clamp(min=1e-30))
+        lit = colour * irradiance
+        gain = (lit * colour).sum() / colour.square().sum().clamp(min=1e-30)
+        return float((lit - gain * colour).abs().mean() / (gain * colour).abs().mean().clamp(min=1e-30))
 
     def difference(self, light: Tensor) -> Tensor:
         """(N,): how far the picture inside is from the surface in another light (C, n), scaled as `residual` is."""

@@ -120,7 +120,7 @@ class Mips:
         self.masked = "alpha" in task.aovs and not task.clutter
         target = shot.target.float()
         mask = target[..., -1:].clamp(0.0, 1.0) if self.masked else None
-        radiance = ((target if mask is None else target[..., :-1]) / task.white).clamp(0.0, 1.0)
+        radiance = (target if mask is None else target[..., :-1]).clamp(0.0, 1.0)
         colours = linear_to_srgb(radiance if mask is None else radiance * (mask > 0.0))
         self.picture = colours if mask is None else torch.cat([colours, mask], -1)
         self.size = shot.camera.size

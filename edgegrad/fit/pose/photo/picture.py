@@ -29,12 +29,11 @@ class Picture:
     noise: float = NOISE  # standard deviation of what `outlined` shows, where it is mixed
 
     @staticmethod
-    def of(shot: Shot, masked: bool, depth: Tensor | None, size: tuple[int, int], white: float) -> Picture:
-        """`masked`: the last channel of what the shot has is a mask. `white` becomes 1."""
+    def of(shot: Shot, masked: bool, depth: Tensor | None, size: tuple[int, int]) -> Picture:
+        """`masked`: the last channel of what the shot has is a mask."""
         radiance, mask = area_mean(shot.target, size), None
         if masked:
             radiance, mask = radiance[..., :-1], radiance[..., -1].clamp(0.0, 1.0)
-        radiance = radiance / white
         weight = torch.ones(size) if shot.weight is None else area_mean(shot.weight, size)[..., 0]
         noise = NOISE if mask is None else noise_of_mask(shot.target[..., -1], size[0] / shot.target.shape[0])
         nearest = None if depth is None else F.interpolate(depth[None, None], size, mode="nearest-exact")[0, 0]

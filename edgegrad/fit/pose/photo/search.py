@@ -327,7 +327,7 @@ class PhotoSearch(Ways):
     def _change(self, pose: Pose) -> float:
         """How far colours in the light are from those of the mesh, in parts of these, of all pictures the farthest."""
         seen = self.levels[-1].see(pose, self.seed)
-        return max(math.inf if one.lit is None else one.lit.change(self.task.white) for one in seen)
+        return max(math.inf if one.lit is None else one.lit.change() for one in seen)
 
     def _by_colours(self, start: Pose, levels: list[Level], further: bool) -> Search:
         """The search that compares colours as they are, from a start; its steps follow in the history."""
@@ -347,4 +347,4 @@ class PhotoSearch(Ways):
 
     def _adopt(self, search: Search) -> None:
         self.best, self.loss, self._answered = search.best, search.loss, True
-        self.explained, self.converged, self.curvature = search.explained, search.converged, None
+        self.explained, self.converged, self.curvature = search.explained, search.converged, search.curvature

@@ -9,6 +9,7 @@ from ....aovs import render_aovs
 from ...sides import outlined
 from ..observed import motion
 from ..pose import Pose
+from ..robust import Comparison
 from ..task import FADED, Level, PoseTask
 from .light import HARMONICS, Lit, spherical
 from .picture import Picture
@@ -18,7 +19,8 @@ from .surface import AOVS, Surface
 def shown(task: PoseTask, level: Level, pose: Pose) -> list[Tensor]:
     """Linear pictures (h, w, C) of the level. Of a mesh without colours the outline is all that is drawn."""
     if not task.clutter:
-        return task.pictures(level, pose)
+        with torch.no_grad():
+            return Comparison(task, level, task.images(level, pose, level.spp, 0)).renders
     moved = task.scene.transformed(pose.R, pose.t, pose.scale)
     found = []
     for shot in level.shots:
@@ -35,7 +37,7 @@ def shown(task: PoseTask, level: Level, pose: Pose) -> list[Tensor]:
 def _lit(task: PoseTask, level: Level, pose: Pose, channels: dict[str, Tensor], k: int) -> Tensor:
     """(h, w, C) radiance times alpha."""
     shot, image = level.shots[k], channels["image"].float()
-    picture = Picture.of(shot, False, None, shot.camera.size, task.white)
+    picture = Picture.of(shot, False, None, shot.camera.size)
     surface = Surface.of(
         task.lens(shot.camera, pose), channels, motion(task, level._replace(free=task.free), shot, pose)
     )
@@ -43,4 +45,4 @@ def _lit(task: PoseTask, level: Level, pose: Pose, channels: dict[str, Tensor], 
     if lit is None:
         return image
     Y = spherical(surface.normals)[..., : lit.coefficients.shape[1]]
-    return (image * (Y @ lit.coefficients.T) * task.white).clamp(min=0.0)
+    return (image * (Y @ lit.coefficients.T)).clamp(min=0.0)

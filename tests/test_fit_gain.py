@@ -1,0 +1,132 @@
+"""Pictures in any unit of radiance, and what a fit says of one that is brighter than its renders."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from test_fit import BACKGROUND, START, about_center, bracket, camera, errors, picture, rotation
+from test_fit_photo import clutter
+
+import edgegrad as eg
+from edgegrad.files.image import srgb_to_linear
+from edgegrad.fit import PoseFit, PoseParameter, fit_pose, fit_scene
+from edgegrad.fit.pose.given import Names
+from edgegrad.fit.pose.pose import pose_from_matrix
+from edgegrad.fit.pose.robust import Comparison
+from edgegrad.fit.pose.task import Lens, PoseTask
+from edgegrad.fit.verdict import explained
+from edgegrad.fit.views import has_levels, white_of
+
+
+@pytest.fixture(scope="module")
+def expected() -> PoseFit:
+    view = camera(48)
+    return fit_pose(bracket(), picture(view), view, init=START, background=BACKGROUND, progress=False)
+
+
+@pytest.mark.parametrize("gain", [1 / 256, 0.1, 2.0, pytest.param(16.0, marks=pytest.mark.slow), 256.0])
+def test_a_picture_of_any_unit_has_one_pose(gain: float, expected: PoseFit) -> None:
+    """The background is given in the unit of the mesh's colours."""
+    view = camera(48)
+    fit = fit_pose(bracket(), gain * picture(view), view, init=START, background=BACKGROUND, progress=False)
+    off = errors(fit)
+    assert off[0] < 0.1 and off[1] < 0.1 and fit.converged and fit.explained > 0.95, (off, fit.explained)
+    assert errors(expected)[0] < 0.1 and fit.loss == pytest.approx(expected.loss, rel=0.3)
+
+
+@pytest.mark.parametrize("gain", [0.1, pytest.param(16.0, marks=pytest.mark.slow)])
+def test_a_dim_picture_before_clutter(gain: float) -> None:
+    view = camera(48)
+    with torch.no_grad():
+        image = gain * eg.render(eg.Scene([bracket()], clutter(48)), view, 64)
+    fit = fit_pose(bracket(), image, view, init=START, spp=8, search=False, progress=False)
+    assert errors(fit)[0] < 2.0 and fit.converged, errors(fit)
+
+
+@pytest.mark.parametrize(("gain", "behind"), [(0.04, 1.0), (3.0, 3.0), (3.0, 0.5)])
+def test_the_gains_of_object_and_background(gain: float, behind: float) -> None:
+    view = camera(48)
+    with torch.no_grad():
+        alpha = eg.render_aovs(bracket(), view, ["image", "alpha"], spp=64)
+    image = gain * alpha["image"] + behind * (1.0 - alpha["alpha"]) * BACKGROUND.to(alpha["image"])
+    task = PoseTask.of(bracket(), image, view, None, None, BACKGROUND, Lens(), 1.0, Names())
+    level = task.level(1.0, 0.0, 1.0, 64, task.free)
+    with torch.no_grad():
+        compared = Comparison(task, level, task.images(level, pose_from_matrix("", torch.eye(4)), 64, 1))
+    # Pictures are compared in units of their white, and so is the background.
+    assert float(compared.gains[0][0]) * task.white == pytest.approx(gain, rel=0.02)
+    assert float(compared.gains[0][1]) == pytest.approx(behind, rel=0.02)
+
+
+@pytest.mark.parametrize(("gain", "share"), [(0.5, 0.5), (1.0, 1.0), (2.0, 0.5), (16.0, 1 / 16)])
+def test_stronger_edges_are_not_those_of_the_render(gain: float, share: float) -> None:
+    view = camera(48)
+    with torch.no_grad():
+        one, other = (eg.render(eg.Scene([bracket()], BACKGROUND), view, 64, seed) for seed in (1, 2))
+    assert explained([(one, other, gain * one, None)]) == pytest.approx(share, rel=0.03)
+
+
+@pytest.mark.parametrize("noise", [0.03, 0.1])
+def test_noise_makes_no_edge_stronger(noise: float) -> None:
+    view = camera(48)
+    with torch.no_grad():
+        one, other = (eg.render(eg.Scene([bracket()], BACKGROUND), view, 64, seed) for seed in (1, 2))
+    noisy = one + noise * torch.randn(one.shape, generator=torch.Generator().manual_seed(0))
+    assert explained([(one, other, noisy, None)]) > 0.95
+
+
+@pytest.mark.parametrize("gain", [1.0, 2.5])
+def test_a_scene_whose_pictures_are_brighter_is_not_converged(gain: float) -> None:
+    """fit_scene() takes colours as they are: edges that are stronger than those of the scene are not explained by it."""
+    view = camera(32)
+    start = pose_from_matrix("", about_center(rotation(0.03, -0.1, 0.04), (0.04, 0.0, 0.0)))
+    wanted = {"meshes.0.pose": PoseParameter(start, rotation=0.02, shift=0.01)}
+    options = {"steps": 60, "spp": 4, "progress": False, "method": "gauss-newton"}
+    fit = fit_scene(eg.Scene([bracket()], BACKGROUND), view, gain * picture(view), wanted, **options)
+    assert (fit.explained > 0.9) == (gain == 1.0) and (fit.explained < 0.6) == (gain > 1.0), fit.explained
+    assert gain == 1.0 or not fit.converged
+
+
+def test_the_deviation_that_noise_leaves() -> None:
+    """Root mean square of errors in parts of the stated deviations; 1 where these are right."""
+    view, ratios = camera(32), []
+    clean = picture(view)
+    for seed in range(4):
+        noise = 0.05 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(seed))
+        fit = fit_pose(
+            bracket(), clean + noise, view, init=torch.eye(4), background=BACKGROUND, search=False, progress=False
+        )
+        assert fit.uncertainty is not None and fit.task is not None
+        degrees, percent = errors(fit)
+        ratios += [degrees / fit.uncertainty.degrees, 0.01 * percent * fit.task.size / fit.uncertainty.shift]
+    assert 0.3 < math.sqrt(sum(ratio**2 for ratio in ratios) / len(ratios)) < 2.0, ratios
+
+
+def test_the_uncertainty_is_saved(expected: PoseFit) -> None:
+    known = expected.uncertainty
+    assert known is not None and known.degrees < 0.2
+    assert known.words.startswith(f"±{known.degrees:.2g}° about (") and " along (" in known.words
+    again = PoseFit.from_json(expected.to_json())
+    assert again.uncertainty is not None and again.uncertainty.words == known.words
+    assert '"reason": "converged"' in expected.to_json()
+
+
+def test_the_white_of_a_picture() -> None:
+    levels = torch.randint(0, 40, (32, 32, 3), generator=torch.Generator().manual_seed(0))
+    dark = srgb_to_linear(levels / 255.0)
+    assert has_levels(dark) and not has_levels(0.5 * dark) and not has_levels(2.0 * picture(camera(32)))
+    assert white_of((7.0 * dark).flatten(0, 1)) == pytest.approx(7.0 * white_of(dark.flatten(0, 1)), rel=1e-5)
+    assert white_of(torch.zeros(5, 3)) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("scale", "said"),
+    [(1000.0, "mesh: the camera stands inside the mesh"), (1e-3, r"mesh: the mesh covers 0\.0\d+ px")],
+)
+def test_units_that_differ_are_named(scale: float, said: str) -> None:
+    view = camera(32)
+    mesh = bracket().transformed(scale=scale)
+    with pytest.warns(UserWarning, match=said):
+        fit_pose(mesh, picture(view), view, background=BACKGROUND, steps=1, spp=1, search=False, progress=False)
